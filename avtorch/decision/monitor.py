@@ -1,0 +1,252 @@
+"""The monitor: looks at every window's posterior and says which detectors are alarmed, for many scenarios at once.
+
+Detectors, each reported by its own name:
+
+- `stability` (default): under the belief and the setting in force the loop is probably not string stable. It takes
+  precedence over all others (paper, Strategy 1; SPEC section 4).
+- `accepted_change` (default): the paper's rule, estimate outside accepted value ± (0.2 s, 0.15), made honest: the
+  posterior mean must be outside *and* the posterior must be sure of it. The accepted value moves by `accept`.
+- `kl`, `hellinger`, `w2`: divergence from a baseline posterior beyond chance at a stated false-alarm rate.
+- `shewhart`, `ewma`, `cusum`: control charts on the standardised innovations, with a stated in-control run length.
+
+The baseline pools all excited windows since the last acceptance that raised no alarm. An unexcited window never alarms
+and moves nothing: it says nothing about the vehicle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from avtorch.decision.algorithm2 import ACCEPTED_CHANGE
+from avtorch.decision.charts import CHARTS, Chart
+from avtorch.decision.divergence import DIVERGENCES, Gaussian, divergence, divergence_p_value, innovation
+from avtorch.decision.settings import Setting, p_stable
+from avtorch.errors import InputError
+
+DETECTORS = ("stability", "accepted_change", *DIVERGENCES, *CHARTS)
+"""All detectors, in order of precedence."""
+
+DEFAULT_DETECTORS = ("stability", "accepted_change")
+
+
+@dataclass(frozen=True)
+class MonitorReport:
+    """What one window's update saw; every tensor (scenario,).
+
+    `alerts` by detector's name, in order of precedence, bool; `statistics` by name: what each detector compared;
+    `p_string_stable`, `p_local_stable` under the belief with the setting in force; `mean` (T_L [s], K_L [-]).
+    """
+
+    alerts: dict[str, Tensor]
+    statistics: dict[str, Tensor]
+    p_string_stable: Tensor
+    p_local_stable: Tensor
+    mean: tuple[Tensor, Tensor]
+    accepted: tuple[Tensor, Tensor]
+
+    @property
+    def any(self) -> Tensor:
+        """Whether any detector is alarmed, (scenario,)."""
+        return torch.stack(list(self.alerts.values())).any(dim=0)
+
+    @property
+    def actuation_changed(self) -> Tensor:
+        """Whether a detector of change (any but `stability`) is alarmed, (scenario,)."""
+        changed = [on for name, on in self.alerts.items() if name != "stability"]
+        return torch.stack(changed).any(dim=0) if changed else torch.zeros_like(self.p_string_stable, dtype=torch.bool)
+
+    def names(self, scenario: int = 0) -> list[str]:
+        """Alarmed detectors of one scenario, the one that takes precedence first."""
+        return [name for name, on in self.alerts.items() if bool(on[scenario])]
+
+    def why(self, name: str, scenario: int = 0) -> str:
+        """One sentence a person reads about one detector in one scenario."""
+        T, K = (float(m[scenario]) for m in self.mean)
+        T0, K0 = (float(a[scenario]) for a in self.accepted)
+        seen = f"T_L {T:.2f} s, K_L {K:.2f}"
+        if name == "stability":
+            p, local = float(self.p_string_stable[scenario]), float(self.p_local_stable[scenario])
+            worse = f", and P(locally stable) only {local:.2f}" if local < 0.95 else ""
+            return f"P(string stable) is {p:.2f} with the setting in force{worse} ({seen})"
+        if name == "accepted_change":
+            sure = float(self.statistics[name][scenario])
+            return f"{seen} left what was accepted ({T0:.2f} s, {K0:.2f}) with probability {sure:.3f}"
+        value = float(self.statistics[name][scenario])
+        if name in CHARTS:
+            return f"{name} chart at {value:.2f}, limit {float(self.statistics[name + '_limit'][scenario]):.2f} ({seen})"
+        p = float(self.statistics[name + "_p_value"][scenario])
+        return f"{name} divergence from the baseline {value:.3g}, by chance with probability {p:.1e} ({seen})"
+
+
+class Monitor:
+    """Watches `scenarios` beliefs; see the module's text for the detectors.
+
+    accepted: (T_L [s], K_L [-]) accepted at the start, numbers or (scenario,); change: accepted change of the two.
+    certainty: posterior probability of being outside that an `accepted_change` alarm takes. stability_level: an alarm
+    where P(string stable) or P(locally stable) is below it; a little below the 0.95 a new setting must reach, so that
+    a sufficient setting is not put in question again by the next window's scatter. false_alarm_rate: of each divergence
+    detector, per excited window. arl: in-control average run length of each chart [excited windows]. inflation: ratio
+    of window-to-window spread to posterior SD, 1 for an honest posterior. dead_time [s]: of the vehicle, number or
+    (scenario,). Raises `InputError` for unknown detectors and numbers out of range.
+    """
+
+    def __init__(
+        self,
+        scenarios: int = 1,
+        *,
+        detectors: Sequence[str] = DEFAULT_DETECTORS,
+        accepted: tuple[float | Tensor, float | Tensor] = (0.3, 1.0),
+        change: tuple[float, float] = ACCEPTED_CHANGE,
+        certainty: float = 0.9,
+        stability_level: float = 0.9,
+        false_alarm_rate: float = 0.002,
+        arl: float = 500.0,
+        inflation: float = 1.0,
+        dead_time: float | Tensor = 0.0,
+    ) -> None:
+        unknown = [name for name in detectors if name not in DETECTORS]
+        if unknown or not detectors:
+            raise InputError(f"detectors: found {unknown or 'none'}, need some of {', '.join(DETECTORS)}")
+        for name, value in (
+            ("certainty", certainty),
+            ("stability_level", stability_level),
+            ("false_alarm_rate", false_alarm_rate),
+        ):
+            if not 0.0 < value < 1.0:
+                raise InputError(f"{name}: found {value}, need a number between 0 and 1")
+        if not (change[0] > 0.0 and change[1] > 0.0):
+            raise InputError(f"change: found {change}, need two numbers above 0")
+        if not inflation >= 1.0:
+            raise InputError(f"inflation: found {inflation}, need 1 or more")
+        if scenarios < 1:
+            raise InputError(f"scenarios: found {scenarios}, need 1 or more")
+        self.detectors = tuple(name for name in DETECTORS if name in detectors)
+        self.scenarios = scenarios
+        self.change = change
+        self.certainty = certainty
+        self.stability_level = stability_level
+        self.false_alarm_rate = false_alarm_rate
+        self.inflation = inflation
+        self.dead_time = dead_time
+        self.accepted = tuple(torch.as_tensor(a, dtype=torch.float64).expand(scenarios).clone() for a in accepted)
+        self._charts = {name: Chart(name, scenarios, arl) for name in CHARTS if name in self.detectors}
+        unit = torch.eye(2, dtype=torch.float64).expand(scenarios, 2, 2)
+        self._baseline = Gaussian(torch.zeros(scenarios, 2, dtype=torch.float64), unit)
+        self._has_baseline = torch.zeros(scenarios, dtype=torch.bool)
+        self._window = self._baseline
+        self._mean = self.accepted
+
+    @torch.no_grad()
+    def update(self, T_L: Tensor, K_L: Tensor, excited: Tensor, setting: Setting) -> MonitorReport:
+        """Look at one window: posterior draws T_L [s], K_L [-] (scenario, draw), excited (scenario,), setting in force.
+
+        Raises `InputError` for shapes that do not fit.
+        """
+        if T_L.ndim != 2 or T_L.shape != K_L.shape or T_L.shape[0] != self.scenarios:
+            raise InputError(
+                f"T_L, K_L: found {tuple(T_L.shape)} and {tuple(K_L.shape)}, need ({self.scenarios}, draw) both"
+            )
+        if excited.shape != (self.scenarios,):
+            raise InputError(f"excited: found {tuple(excited.shape)}, need ({self.scenarios},)")
+        T_L, K_L = T_L.to(torch.float64), K_L.to(torch.float64)
+        mean = (T_L.mean(dim=-1), K_L.mean(dim=-1))
+        window = Gaussian.of_draws(T_L, K_L, inflation=self.inflation)
+        p_string = p_stable(setting.string_stable(T_L, K_L, dead_time=self.dead_time))
+        p_local = p_stable(setting.local_stable(T_L, K_L, dead_time=self.dead_time))
+
+        alerts: dict[str, Tensor] = {}
+        statistics: dict[str, Tensor] = {}
+        comparable = excited & self._has_baseline
+        # Scenarios without a baseline are compared with themselves: no number of theirs is used.
+        baseline = _choose(self._has_baseline, self._baseline, window)
+        for name in self.detectors:
+            if name == "stability":
+                statistics[name] = torch.minimum(p_string, p_local)
+                alerts[name] = excited & (statistics[name] < self.stability_level)
+            elif name == "accepted_change":
+                alarmed, statistics[name] = self._accepted_change(T_L, K_L, mean)
+                alerts[name] = excited & alarmed
+            elif name in self._charts:
+                chart = self._charts[name]
+                alerts[name] = chart.step(innovation(window, baseline), comparable)
+                statistics[name] = chart.last_statistic.amax(dim=-1)
+                statistics[name + "_limit"] = torch.full_like(p_string, chart.edge)
+            else:
+                statistics[name] = divergence(name, window, baseline)  # type: ignore[arg-type]
+                chance = divergence_p_value(name, window, baseline)  # type: ignore[arg-type]
+                statistics[name + "_p_value"] = chance
+                alerts[name] = comparable & (chance < self.false_alarm_rate)
+
+        report = MonitorReport(alerts, statistics, p_string, p_local, mean, self.accepted)
+        # The stability alarm may be the setting's fault; only a changed vehicle spoils the baseline.
+        calm = excited & ~report.actuation_changed
+        pooled = _choose(self._has_baseline, self._baseline.combine(window), window)
+        self._baseline = _choose(calm, pooled, self._baseline)
+        self._has_baseline = self._has_baseline | calm
+        self._window = _choose(excited, window, self._window)
+        self._mean = (torch.where(excited, mean[0], self._mean[0]), torch.where(excited, mean[1], self._mean[1]))
+        return report
+
+    def accept(self, where: Tensor, T_L: Tensor | None = None, K_L: Tensor | None = None) -> None:
+        """The change was accepted or acted on in the scenarios `where` (scenario,) bool: it is the new normal.
+
+        The accepted values become T_L [s], K_L [-] (scenario,), by default the means of the last excited window; the
+        baseline becomes that window's posterior and the charts start afresh.
+        """
+        new = (self._mean[0] if T_L is None else T_L, self._mean[1] if K_L is None else K_L)
+        self.accepted = tuple(
+            torch.where(where, torch.as_tensor(n, dtype=torch.float64), old)
+            for n, old in zip(new, self.accepted, strict=True)
+        )
+        self._baseline = _choose(where, self._window, self._baseline)
+        self._has_baseline = self._has_baseline | where
+        for chart in self._charts.values():
+            chart.restart(where)
+
+    def set_baseline(self, T_L: Tensor, K_L: Tensor) -> None:
+        """A baseline posterior from elsewhere (technical knowledge, an earlier drive): draws (scenario, draw) or (draw,)."""
+        given = Gaussian.of_draws(T_L.to(torch.float64), K_L.to(torch.float64), inflation=self.inflation)
+        self._baseline = Gaussian(given.mean.expand(self.scenarios, 2), given.cov.expand(self.scenarios, 2, 2))
+        self._has_baseline = torch.ones(self.scenarios, dtype=torch.bool)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that later updates depend on, as tensors and dicts of tensors."""
+        return {
+            "accepted": [a.clone() for a in self.accepted],
+            "mean": [m.clone() for m in self._mean],
+            "baseline": [t.clone() for t in self._baseline],
+            "window": [t.clone() for t in self._window],
+            "has_baseline": self._has_baseline.clone(),
+            "charts": {name: chart.state_dict() for name, chart in self._charts.items()},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Resume to the bit. Raises `InputError` where the state is of other detectors or another number of scenarios."""
+        if set(state["charts"]) != set(self._charts) or state["has_baseline"].shape != (self.scenarios,):
+            raise InputError("state: of a monitor with other charts or another number of scenarios")
+        self.accepted = tuple(a.clone() for a in state["accepted"])
+        self._mean = tuple(m.clone() for m in state["mean"])
+        self._baseline = Gaussian(*(t.clone() for t in state["baseline"]))
+        self._window = Gaussian(*(t.clone() for t in state["window"]))
+        self._has_baseline = state["has_baseline"].clone()
+        for name, chart in self._charts.items():
+            chart.load_state_dict(state["charts"][name])
+
+    def _accepted_change(self, T_L: Tensor, K_L: Tensor, mean: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """(alarm, probability of being outside) (scenario,): for T_L or K_L, whichever of those outside is surer."""
+        sure = torch.zeros_like(mean[0])
+        for draws, centre, accepted, width in zip((T_L, K_L), mean, self.accepted, self.change, strict=True):
+            outside = p_stable((draws - accepted.unsqueeze(-1)).abs() > width)
+            sure = torch.maximum(sure, torch.where((centre - accepted).abs() > width, outside, 0.0))
+        return sure >= self.certainty, sure
+
+
+def _choose(where: Tensor, a: Gaussian, b: Gaussian) -> Gaussian:
+    return Gaussian(
+        torch.where(where[:, None], a.mean, b.mean), torch.where(where[:, None, None], a.cov, b.cov)
+    )

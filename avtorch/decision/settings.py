@@ -1,0 +1,206 @@
+"""The whole setting of a car-following controller, for many scenarios at once, and how it is changed.
+
+Strategy 1 changes the model in the lower level, Strategy 2 the time gap, Strategy 3 the gains of the upper level (paper,
+Section 4). Formulas live in `avtorch.vehicle`; this file only carries the numbers to them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.vehicle import stability
+from avtorch.vehicle.controllers import NOMINAL_GAINS, LinearController
+from avtorch.vehicle.lower_level import LowerLevel
+from avtorch.vehicle.time_gap import RAMP_RATE
+
+Number = float | Tensor
+
+DRIVER_TIME_GAPS = (1.0, 1.6, 2.5)
+"""Time gaps [s] a driver can choose from in commercial adaptive cruise control (paper, Section 4.5; SPEC section 4)."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Everything the strategies may change; each number (scenario,), gains (scenario, 3); any batch shape will do.
+
+    `T_hat` [s], `K_hat` [-]: model in the lower level; `T_d` [s], `K_d` [-]: the actuation it imitates; `time_gap` [s];
+    `gains` (k_s [1/s²], k_v [1/s], k_a [-]). Plain numbers are broadcast. Raises `InputError` for values that are not
+    positive (gains: not finite) or shapes that do not go together.
+    """
+
+    T_hat: Tensor
+    K_hat: Tensor
+    T_d: Tensor
+    K_d: Tensor
+    time_gap: Tensor
+    gains: Tensor
+
+    def __init__(
+        self,
+        T_hat: Number = 0.3,
+        K_hat: Number = 1.0,
+        T_d: Number = 0.3,
+        K_d: Number = 1.0,
+        time_gap: Number = 1.0,
+        gains: Sequence[float] | Tensor = NOMINAL_GAINS,
+        *,
+        scenarios: int | None = None,
+    ) -> None:
+        given = {"T_hat": T_hat, "K_hat": K_hat, "T_d": T_d, "K_d": K_d, "time_gap": time_gap}
+        parts = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in given.items()}
+        for name, value in parts.items():
+            bad = ~(torch.isfinite(value) & (value > 0.0))
+            if bool(bad.any()):
+                raise InputError(f"{name}: found {float(value[bad].reshape(-1)[0])}, need a finite number above 0")
+        k = torch.as_tensor(gains, dtype=torch.float64)
+        if k.ndim == 0 or k.shape[-1] != 3 or not bool(torch.isfinite(k).all()):
+            raise InputError(f"gains: found {tuple(k.shape)} values, need finite (k_s, k_v, k_a) on the last dimension")
+        try:
+            shape = torch.broadcast_shapes(
+                *(v.shape for v in parts.values()), k.shape[:-1], (1,) if scenarios is None else (scenarios,)
+            )
+        except RuntimeError as error:
+            raise InputError(f"setting: shapes do not broadcast ({error})") from error
+        for name, value in parts.items():
+            object.__setattr__(self, name, value.expand(shape))
+        object.__setattr__(self, "gains", k.expand(*shape, 3))
+
+    @property
+    def shape(self) -> torch.Size:
+        return self.time_gap.shape
+
+    def replace(self, **changes: Any) -> Setting:
+        """A copy with some fields changed."""
+        return dataclasses.replace(self, **changes)
+
+    def where(self, condition: Tensor, other: Setting) -> Setting:
+        """This setting where `condition` (scenario,) holds, `other` elsewhere."""
+        return Setting(
+            **{
+                f.name: torch.where(
+                    condition.unsqueeze(-1) if f.name == "gains" else condition,
+                    getattr(self, f.name),
+                    getattr(other, f.name),
+                )
+                for f in fields(self)
+            }
+        )
+
+    def __getitem__(self, index: Any) -> Setting:
+        """Some of the scenarios, by index tensor, mask or slice."""
+        return Setting(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    def lower_level(self, *, accel_min: Number = -6.0, accel_max: Number = 4.0) -> LowerLevel:
+        """The lower level of this setting in a vehicle with the given limits [m/s²]."""
+        return LowerLevel(self.T_hat, self.K_hat, self.T_d, self.K_d, accel_min, accel_max)
+
+    def amplification(self) -> Tensor:
+        """Command effort T_hat K_d / (K_hat T_d) [-], (scenario,)."""
+        return self.lower_level().amplification()
+
+    def controller(self, *, standstill: Number = 5.0, feedforward: Number = 0.0) -> LinearController:
+        """The upper level of this setting with its time gap already reached."""
+        return LinearController(self.gains, self.time_gap, standstill, feedforward)
+
+    def retarget(self, controller: Any, *, at: float, rate: float = RAMP_RATE) -> Any:
+        """`controller` moved to this setting from time `at` [s] on; gains at once, the time gap at `rate` [s/s]."""
+        if isinstance(controller, LinearController):
+            return controller.retargeted(at=at, time_gap=self.time_gap, gains=self.gains, rate=rate)
+        return controller.retargeted(at=at, time_gap=float(self.time_gap.reshape(-1)[0]), rate=rate)
+
+    def effective(self, T_L: Tensor, K_L: Tensor) -> tuple[Tensor, Tensor]:
+        """(T_e, K_e) the unclipped loop behaves as with draws of the plant (scenario, draw) (SPEC section 1)."""
+        return self._over_draws().lower_level().effective(T_L, K_L)
+
+    def string_stable(self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0) -> Tensor:
+        """Exact verdicts (scenario, draw) at draws of the plant (scenario, draw), through (T_e, K_e)."""
+        T_e, K_e = self.effective(T_L, K_L)
+        theta = dead_time.unsqueeze(-1) if isinstance(dead_time, Tensor) and dead_time.ndim else dead_time
+        return stability.string_stable(T_e, K_e, self.time_gap.unsqueeze(-1), self.gains.unsqueeze(-2), dead_time=theta)
+
+    def local_stable(self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0) -> Tensor:
+        """As `string_stable`, whether disturbances die out at all."""
+        T_e, K_e = self.effective(T_L, K_L)
+        theta = dead_time.unsqueeze(-1) if isinstance(dead_time, Tensor) and dead_time.ndim else dead_time
+        return stability.local_stable(T_e, K_e, self.time_gap.unsqueeze(-1), self.gains.unsqueeze(-2), dead_time=theta)
+
+    def peak_gain(self, T_L: Number, K_L: Number, *, dead_time: Number = 0.0) -> Tensor:
+        """Peak gain (scenario,) at one plant for each scenario, through (T_e, K_e): the judge of a choice, at the truth."""
+        T_e, K_e = self.lower_level().effective(T_L, K_L)
+        return stability.peak_gain(T_e, K_e, self.time_gap, self.gains, dead_time=dead_time)
+
+    def strategies(self, default: Setting) -> list[set[int]]:
+        """Which strategies lead from `default` here, one set out of {1, 2, 3} per scenario (of a flat batch)."""
+        # The lower level acts through these two numbers only; a renamed model that sends the same commands is no change.
+        here, there = self.lower_level(), default.lower_level()
+        a, u = torch.ones((), dtype=torch.float64), torch.zeros((), dtype=torch.float64)
+        lower = _differs(here.raw_command(a, u), there.raw_command(a, u)) | _differs(
+            here.amplification(), there.amplification()
+        )
+        gap = _differs(self.time_gap, default.time_gap)
+        gains = _differs(self.gains, default.gains).any(dim=-1)
+        flags = torch.stack(torch.broadcast_tensors(lower, gap, gains), dim=-1).expand(*self.shape, 3)
+        return [{i + 1 for i, on in enumerate(row) if on} for row in flags.tolist()]
+
+    def as_dict(self, scenario: int = 0) -> dict[str, Any]:
+        """One scenario's setting as in `run.json`: T_hat, K_hat, time_gap_s, gains, and the lower level's target."""
+        return {
+            "T_hat": float(self.T_hat[scenario]),
+            "K_hat": float(self.K_hat[scenario]),
+            "time_gap_s": float(self.time_gap[scenario]),
+            "gains": [float(k) for k in self.gains[scenario]],
+            "T_d": float(self.T_d[scenario]),
+            "K_d": float(self.K_d[scenario]),
+        }
+
+    def _over_draws(self) -> Setting:
+        return Setting(
+            **{f.name: getattr(self, f.name).unsqueeze(-2 if f.name == "gains" else -1) for f in fields(self)}
+        )
+
+
+@dataclass(frozen=True)
+class DesignBounds:
+    """A box of actuation (scenario,) for a robust controller: `T_L` [s] and `K_L` [-] as (lower, upper) pairs.
+
+    The paper's further option (Section 4): instead of the handbook's [0.1, 0.4] s and [0.7, 1] the box is what the
+    posterior holds likely. `stability.local_conditions` and `string_conditions` take the pairs as they are.
+    """
+
+    T_L: tuple[Tensor, Tensor]
+    K_L: tuple[Tensor, Tensor]
+
+    @staticmethod
+    def of_belief(T_L: Tensor, K_L: Tensor, *, coverage: float = 0.95) -> DesignBounds:
+        """The box that holds at least `coverage` of the draws (scenario, draw).
+
+        Each side leaves out (1 - coverage)/2 in all, a quarter of the excess at each end, so the box keeps its promise
+        whatever the correlation of the two. Raises `InputError` for a coverage outside (0, 1).
+        """
+        if not 0.0 < coverage < 1.0:
+            raise InputError(f"coverage: found {coverage}, need a number between 0 and 1")
+        tail = (1.0 - coverage) / 4.0
+
+        def pair(draws: Tensor) -> tuple[Tensor, Tensor]:
+            low, high = torch.quantile(
+                draws, torch.tensor([tail, 1.0 - tail], dtype=draws.dtype, device=draws.device), dim=-1
+            )
+            return low, high
+
+        return DesignBounds(pair(T_L), pair(K_L))
+
+
+def p_stable(verdicts: Tensor) -> Tensor:
+    """Share of draws (scenario, draw) that are stable, (scenario,)."""
+    return verdicts.to(torch.float64).mean(dim=-1)
+
+
+def _differs(a: Tensor, b: Tensor) -> Tensor:
+    return (a - b).abs() > 1e-9 * (1.0 + b.abs())

@@ -1,0 +1,37 @@
+"""What we believe: densities and priors, SGLD, Algorithm 1, and the sequential loop."""
+
+from avtorch.inference.density import Density, ScoredDensity, SubsampledDensity
+from avtorch.inference.evidence import Evidence, Form, JerkForm
+from avtorch.inference.excitation import ExcitationRule
+from avtorch.inference.jerk import JerkDensity, JerkPoints, JerkStatistics, jerk_log_likelihood
+from avtorch.inference.map import Mode, find_mode
+from avtorch.inference.posterior import Posterior, nested_rhat
+from avtorch.inference.sampler import SamplerSettings, sample
+from avtorch.inference.sequential import Belief, SequentialInference
+from avtorch.inference.sgld import SGLD
+from avtorch.inference.stream import BeliefStream, Window
+
+__all__ = [
+    "SGLD",
+    "Belief",
+    "BeliefStream",
+    "Density",
+    "Evidence",
+    "ExcitationRule",
+    "Form",
+    "JerkDensity",
+    "JerkForm",
+    "JerkPoints",
+    "JerkStatistics",
+    "Mode",
+    "Posterior",
+    "SamplerSettings",
+    "ScoredDensity",
+    "SequentialInference",
+    "SubsampledDensity",
+    "Window",
+    "find_mode",
+    "jerk_log_likelihood",
+    "nested_rhat",
+    "sample",
+]

@@ -1,0 +1,68 @@
+"""What a window of rows says: its density, once a prior is given, and whether it can teach anything."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from avtorch.inference.density import Density
+from avtorch.inference.excitation import ExcitationRule
+from avtorch.inference.jerk import JerkDensity, JerkStatistics
+from avtorch.inference.priors import Prior, default_jerk_noise_prior
+
+Rows = Mapping[str, Tensor]
+"""One window: ``time`` ``(time,)`` [s] and ``usable`` and the measured columns, each ``(vehicle, time)``."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One window of every vehicle.
+
+    Attributes:
+        n: usable rows, ``(vehicle,)``.
+        excited: ``(vehicle,)`` bool, by the fixed rule.
+        density: the posterior density of the vehicles named by an index, from their priors.
+    """
+
+    n: Tensor
+    excited: Tensor
+    density: Callable[[Tensor, Prior], Density]
+
+
+class Form(Protocol):
+    """A form of the log density: which columns it reads, which parameters it has, what a window of rows is to it."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def columns(self) -> tuple[str, ...]: ...
+
+    @property
+    def noise_prior(self) -> Prior: ...
+
+    def evidence(self, rows: Rows, full: float) -> Evidence:
+        """Evidence of a window; ``full`` is the number of rows of a complete one."""
+        ...
+
+
+class JerkForm:
+    """Jerk is measured: Eq. 4 of the paper from six sums."""
+
+    names = ("T_L", "K_L", "sigma")
+    columns = ("accel_cmd", "accel", "jerk")
+
+    def __init__(self, *, rule: ExcitationRule | None = None, noise_prior: Prior | None = None) -> None:
+        self.rule = ExcitationRule() if rule is None else rule
+        self.noise_prior = default_jerk_noise_prior() if noise_prior is None else noise_prior
+
+    def evidence(self, rows: Rows, full: float) -> Evidence:
+        statistics = JerkStatistics.from_samples(rows["accel"], rows["accel_cmd"], rows["jerk"], rows["usable"])
+        return Evidence(
+            n=statistics.n,
+            excited=self.rule(statistics, full),
+            density=lambda index, prior: JerkDensity(statistics.select(index), prior),
+        )

@@ -1,0 +1,50 @@
+"""Which windows can teach anything: a fixed rule on ``a``, ``u`` and the noise level, never on the posterior."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from avtorch.inference.jerk import JerkStatistics
+
+
+@dataclass(frozen=True)
+class ExcitationRule:
+    """A window is excited if it alone would resolve the accepted change at a fixed reference vehicle.
+
+    Least squares of jerk on ``(-a, u)`` predicts the standard deviations of ``1/T_L`` and ``K_L/T_L`` from the products
+    of ``a`` and ``u`` and the noise level; at the reference they become those of ``T_L`` and ``K_L``. A window whose
+    prediction is wider leaves the belief to its prior, and would only water it down.
+
+    Attributes:
+        T_ref, K_ref: reference lag [s] and gain [-], slow enough that a degraded vehicle is resolved, too.
+        sd_T, sd_K: the widest predicted SDs of ``T_L`` [s] and ``K_L`` [-]: the paper's accepted changes.
+        share: the least share of the window's rows that must be usable.
+    """
+
+    T_ref: float = 1.0
+    K_ref: float = 1.0
+    sd_T: float = 0.2
+    sd_K: float = 0.15
+    share: float = 0.5
+
+    def predicted_sd(self, statistics: JerkStatistics) -> tuple[Tensor, Tensor]:
+        """Predicted SDs of ``T_L`` [s] and ``K_L`` [-] at the reference vehicle, each ``(window,)``; infinite for no excitation."""
+        s = statistics
+        _, _, noise = s.least_squares()
+        determinant = s.aa * s.uu - s.au.square()
+        solvable = determinant > 1e-12 * s.aa * s.uu
+        inverse = noise.square() / torch.where(solvable, determinant, 1.0)
+        var_inverse_lag, var_gain, cov = inverse * s.uu, inverse * s.aa, inverse * s.au
+        # delta method: T = 1/x, K = y/x with x = 1/T_L, y = K_L/T_L
+        sd_T = self.T_ref**2 * var_inverse_lag.sqrt()
+        var_K = self.T_ref**2 * (var_gain - 2 * self.K_ref * cov + self.K_ref**2 * var_inverse_lag)
+        sd_K = var_K.clamp_min(0.0).sqrt()
+        return torch.where(solvable, sd_T, torch.inf), torch.where(solvable, sd_K, torch.inf)
+
+    def __call__(self, statistics: JerkStatistics, rows: float) -> Tensor:
+        """Excited or not, ``(window,)`` bool; ``rows`` is how many rows a full window has."""
+        sd_T, sd_K = self.predicted_sd(statistics)
+        return (sd_T <= self.sd_T) & (sd_K <= self.sd_K) & (statistics.n >= max(4.0, self.share * rows))

@@ -1,0 +1,145 @@
+"""The log density where jerk is measured (paper, Eq. 4): ``jerk_i ~ Normal(-a_i/T_L + K_L u_i/T_L, sigma^2)``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
+from avtorch.vehicle.glvd import glvd_jerk
+
+_LOG_2PI = math.log(2 * math.pi)
+
+
+def jerk_log_likelihood(T_L: Tensor, K_L: Tensor, sigma: Tensor, a: Tensor, u: Tensor, jerk: Tensor) -> Tensor:
+    """Log likelihood of a window of measured jerk (Eq. 4 with Eq. 1), differentiable in every argument.
+
+    Args:
+        T_L, K_L, sigma: lag [s], gain [-], jerk noise [m/s^3]; shape ``(...)``.
+        a, u, jerk: realised and demanded acceleration [m/s^2], jerk [m/s^3]; shape ``(..., time)``.
+
+    Returns:
+        Sum over time, shape ``(...)``.
+    """
+    residual = jerk - glvd_jerk(a, u, T_L.unsqueeze(-1), K_L.unsqueeze(-1))
+    return -0.5 * (residual / sigma.unsqueeze(-1)).square().sum(-1) - jerk.shape[-1] * (sigma.log() + 0.5 * _LOG_2PI)
+
+
+@dataclass(frozen=True)
+class JerkStatistics:
+    """Six sums over a window and its number of points: all that Eq. 4 needs, so its cost does not grow with the points.
+
+    Every field has shape ``(window,)``; ``aj`` is the sum of ``a * jerk`` and so on.
+    """
+
+    n: Tensor
+    jj: Tensor
+    aj: Tensor
+    uj: Tensor
+    aa: Tensor
+    au: Tensor
+    uu: Tensor
+
+    @classmethod
+    def from_samples(cls, a: Tensor, u: Tensor, jerk: Tensor, mask: Tensor | None = None) -> JerkStatistics:
+        """Sums over the last dimension of ``a, u, jerk``, each ``(window, time)``, where ``mask`` is true."""
+        a, u, jerk = (torch.as_tensor(x, dtype=torch.float64) for x in (a, u, jerk))
+        weight = torch.ones_like(a) if mask is None else mask.to(a)
+        # a masked row may hold anything, also NaN
+        a, u, jerk = (torch.where(weight > 0, x, 0.0) for x in (a, u, jerk))
+        pairs = ((jerk, jerk), (a, jerk), (u, jerk), (a, a), (a, u), (u, u))
+        return cls(weight.sum(-1), *((x * y).sum(-1) for x, y in pairs))
+
+    def select(self, index: Tensor) -> JerkStatistics:
+        """The windows named by ``index``."""
+        return JerkStatistics(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    def least_squares(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Least squares of jerk on ``(-a, u)``: estimates of ``1/T_L`` and ``K_L/T_L`` and the residual's SD [m/s^3].
+
+        Where ``a`` and ``u`` are collinear (or constant zero) the estimates are NaN; the SD is then that of the jerk.
+        """
+        determinant = self.aa * self.uu - self.au.square()
+        # collinear to round-off: the determinant has lost all its digits
+        solvable = determinant > 1e-12 * self.aa * self.uu
+        safe = torch.where(solvable, determinant, 1.0)
+        inverse_lag = torch.where(solvable, (-self.aj * self.uu + self.au * self.uj) / safe, torch.nan)
+        gain_over_lag = torch.where(solvable, (self.aa * self.uj - self.au * self.aj) / safe, torch.nan)
+        fitted = torch.where(solvable, -inverse_lag * self.aj + gain_over_lag * self.uj, 0.0)
+        freedom = (self.n - 2 * solvable).clamp_min(1.0)
+        return inverse_lag, gain_over_lag, ((self.jj - fitted).clamp_min(0.0) / freedom).sqrt()
+
+
+class JerkDensity:
+    """Posterior of ``(T_L [s], K_L [-], sigma [m/s^3])`` of every window, from the six sums and a prior.
+
+    It is the log density of :func:`jerk_log_likelihood` plus the prior, written in the sums.
+    """
+
+    names = ("T_L", "K_L", "sigma")
+
+    def __init__(self, statistics: JerkStatistics, prior: Prior | None = None) -> None:
+        self.statistics = statistics
+        self.prior = Joint(default_actuation_prior(), default_jerk_noise_prior()) if prior is None else prior
+        s = statistics
+        # residual sum of squares as a quadratic form in (1, 1/T, K/T), divided by two once here
+        rows = ((s.jj, s.aj, -s.uj), (s.aj, s.aa, -s.au), (-s.uj, -s.au, s.uu))
+        self._half_form = 0.5 * torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+    @property
+    def windows(self) -> int:
+        return self.statistics.n.shape[0]
+
+    def log_likelihood(self, z: Tensor) -> Tensor:
+        """Eq. 4 from the sums; ``z = log(T_L, K_L, sigma)`` with shape ``(..., window, 3)``, returns ``(..., window)``."""
+        scaled = self._scaled_coefficients(z)
+        half_chi2 = (torch.einsum("wij,...wj->...wi", self._half_form, scaled) * scaled).sum(-1)
+        return -half_chi2 - self.statistics.n * (z[..., 2] + 0.5 * _LOG_2PI)
+
+    @staticmethod
+    def _scaled_coefficients(z: Tensor) -> Tensor:
+        """``(1, 1/T, K/T) / sigma``: Eq. 1 as the regression of jerk on ``(a, u)``, in units of its noise."""
+        log_T, log_K, log_sigma = z.unbind(-1)
+        return torch.stack([-log_sigma, -log_sigma - log_T, log_K - log_T - log_sigma], -1).exp()
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        return self.log_likelihood(z) + self.prior.log_prob(z)
+
+    def score(self, z: Tensor) -> Tensor:
+        """Gradient of :meth:`log_prob` in ``z``, in closed form."""
+        scaled = self._scaled_coefficients(z)
+        # of the half chi2 by the logarithms of the three scaled coefficients
+        c = 2 * torch.einsum("wij,...wj->...wi", self._half_form, scaled) * scaled
+        lag, gain = c[..., 1] + c[..., 2], -c[..., 2]
+        return torch.stack([lag, gain, c[..., 0] + lag - self.statistics.n], -1) + self.prior.score(z)
+
+    def initial(self) -> Tensor:
+        """Least squares where it gives positive values near the plausible range, else the prior's centre."""
+        inverse_lag, gain_over_lag, residual_sd = self.statistics.least_squares()
+        center = self.prior.center().expand(self.windows, 3)
+        T, K = 1 / inverse_lag, gain_over_lag / inverse_lag
+        plausible = (T > 0.01) & (T < 20) & (K > 0.02) & (K < 20)
+        T = torch.where(plausible, T, center[:, 0].exp())
+        K = torch.where(plausible, K, center[:, 1].exp())
+        return torch.stack([T, K, residual_sd.clamp(1e-6, 1e6)], -1).log()
+
+
+class JerkPoints(JerkDensity):
+    """The same density kept point by point, so that a minibatch of it can be drawn (SGLD proper)."""
+
+    def __init__(self, a: Tensor, u: Tensor, jerk: Tensor, prior: Prior | None = None) -> None:
+        """``a, u, jerk``: shape ``(window, time)``, units as in :func:`jerk_log_likelihood`."""
+        super().__init__(JerkStatistics.from_samples(a, u, jerk), prior)
+        self._columns = torch.stack([jerk, a, u], -1).to(torch.float64)
+
+    @property
+    def points(self) -> int:
+        return self._columns.shape[1]
+
+    def log_prob_minibatch(self, z: Tensor, index: Tensor) -> Tensor:
+        jerk, a, u = self._columns[:, index].unbind(-1)
+        T, K, sigma = z.exp().unbind(-1)
+        return self.prior.log_prob(z) + self.points / len(index) * jerk_log_likelihood(T, K, sigma, a, u, jerk)

@@ -1,0 +1,89 @@
+"""Exact log likelihood of the latent form by a Kalman filter, row by row: any sampling, gaps, masked rows.
+
+The slow and general route; `latent_steady` is the fast one for even sampling, and equals it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.inference.latent_model import discretise, initial_covariance
+
+
+def _tensor(value: Tensor | float, like: Tensor) -> Tensor:
+    return torch.as_tensor(value, dtype=like.dtype, device=like.device)
+
+
+def latent_log_likelihood(
+    T_L: Tensor | float,
+    K_L: Tensor | float,
+    process_noise: Tensor | float,
+    coloured_sd: Tensor | float,
+    coloured_time: Tensor | float,
+    time: Tensor,
+    u: Tensor,
+    *,
+    accel: Tensor | None = None,
+    speed: Tensor | None = None,
+    accel_noise: Tensor | float | None = None,
+    speed_noise: Tensor | float | None = None,
+    mask: Tensor | None = None,
+) -> Tensor:
+    """Log likelihood ``(...)`` [nats] of measured acceleration and/or speed, by Kalman innovations.
+
+    Parameters of shape ``(...)`` or broadcasting to it: ``T_L`` [s], ``K_L`` [-], ``process_noise`` [m/s²/√s],
+    ``coloured_sd`` [m/s²], ``coloured_time`` [s], ``accel_noise`` [m/s²] and ``speed_noise`` [m/s] per row. Data of shape
+    ``(..., time)``: ``time`` [s] increasing, ``u`` [m/s²] held from its row to the next, ``accel`` [m/s²] = a + d + noise,
+    ``speed`` [m/s]. ``mask`` ``(..., time)``: False where a row's measurements are not used; its command still acts.
+    Typically parameters are ``(chain, window)`` and data ``(window, time)``.
+
+    Exact for uneven rows (each interval is integrated exactly) and twice differentiable in everything but time and mask.
+    The start is that of `initial_covariance`, with the first unmasked speed as the centre of the first.
+
+    Source: SPEC section 3 (latent form), DIAGNOSIS.md. Raises InputError where neither signal, or a signal without its noise,
+    is given.
+    """
+    if accel is None and speed is None:
+        raise InputError("accel, speed: neither was given; the latent form needs at least one measured signal")
+    for name, signal, noise in (("accel", accel, accel_noise), ("speed", speed, speed_noise)):
+        if signal is not None and noise is None:
+            raise InputError(f"{name}_noise: missing; it is needed where {name} is measured")
+    parameters = torch.broadcast_tensors(*(_tensor(p, u) for p in (T_L, K_L, process_noise, coloured_sd, coloured_time)))
+    rows = u.shape[-1]
+    used = torch.ones_like(u, dtype=torch.bool) if mask is None else mask
+    covariance = initial_covariance(parameters[3])
+    mean = torch.zeros(covariance.shape[:-1], dtype=u.dtype, device=u.device)
+
+    # A channel: rows of data, its variance, and the row of the measurement matrix.
+    channels: list[tuple[Tensor, Tensor, Tensor]] = []
+    if speed is not None and speed_noise is not None:
+        first = used.to(torch.uint8).argmax(-1, keepdim=True)
+        start = speed.gather(-1, first.expand(*speed.shape[:-1], 1)) if speed.shape[:-1] else speed[first]
+        # The filter runs on the deviation from the first measured speed, whose prior mean is thereby zero. The centre is
+        # not differentiated: it is part of the prior's statement.
+        channels.append((speed - start.detach(), _tensor(speed_noise, u) ** 2, u.new_tensor([1.0, 0.0, 0.0])))
+    if accel is not None and accel_noise is not None:
+        channels.append((accel, _tensor(accel_noise, u) ** 2, u.new_tensor([0.0, 1.0, 1.0])))
+
+    steps = discretise(*(p[..., None] for p in parameters), (time[..., 1:] - time[..., :-1]).to(u.dtype))
+    total = torch.zeros_like(parameters[0])
+    for k in range(rows):
+        on = used[..., k]
+        for data, variance, row in channels:
+            innovation = torch.where(on, data[..., k] - mean @ row, 0.0)
+            pointing = covariance @ row
+            spread = pointing @ row + variance
+            gain = torch.where(on[..., None], pointing / spread[..., None], 0.0)
+            mean = mean + gain * innovation[..., None]
+            covariance = covariance - gain[..., :, None] * pointing[..., None, :]
+            term = torch.log(spread) + innovation**2 / spread + math.log(2.0 * math.pi)
+            total = total - 0.5 * torch.where(on, term, 0.0)
+        if k + 1 < rows:
+            phi = steps.transition[..., k, :, :]
+            mean = (phi @ mean[..., None])[..., 0] + steps.gain[..., k, :] * u[..., k, None]
+            covariance = phi @ covariance @ phi.mT + steps.noise[..., k, :, :]
+    return total

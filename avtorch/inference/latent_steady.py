@@ -1,0 +1,190 @@
+r"""The latent log likelihood on even rows, without a loop over time: exact, and milliseconds for 64 chains.
+
+On even rows the Kalman filter is time-invariant but for its start. Two facts turn that into matrix products:
+
+- Started from the *stationary* covariance ``P`` the gain is constant from the first row, and the innovations are a linear
+  filter of the data: inside blocks of rows by their impulse response, across blocks by a scan of doubling length.
+- A start ``N(0, P0)`` is the stationary start with a random mean, ``m ~ N(0, D)``, ``D = P0 - P``. Innovations are linear in
+  that mean, ``e - E m``, so it integrates out in closed form: with ``J = EᵀE``, ``j = Eᵀe``
+
+  .. math:: \log p = \log p_P + \tfrac12 j^T (I + D J)^{-1} D j - \tfrac12 \log\det(I + D J)
+
+  which stays true where ``D`` is not positive. So nothing is truncated; there is no transient to wait for.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from avtorch.inference.latent_model import discretise, initial_covariance
+
+BLOCK = 32
+
+
+@dataclass(frozen=True)
+class EvenRows:
+    """Even runs of rows, laid out once for `steady_log_likelihood`.
+
+    ``lagged`` ``(run, block·BLOCK, BLOCK·channel)``: what each row sees of its own block, newest first; channels are the
+    measured ones, then the command. ``used`` ``(run, block·BLOCK)``; ``count`` rows in use; ``dt`` [s] ``(run,)``.
+    """
+
+    lagged: Tensor
+    used: Tensor
+    count: Tensor
+    dt: Tensor
+    has_speed: bool
+    has_accel: bool
+
+    @classmethod
+    def build(cls, dt: Tensor, u: Tensor, used: Tensor, *, accel: Tensor | None, speed: Tensor | None) -> EvenRows:
+        """From ``dt (run,)`` and rows ``(run, time)``; ``used`` is True on a leading stretch of each run."""
+        signals = [] if speed is None else [speed - speed[..., :1]]
+        signals += [] if accel is None else [accel]
+        data = torch.stack((*signals, u), -1) * used[..., None]
+        pad = -u.shape[-1] % BLOCK
+        data = torch.nn.functional.pad(data, (0, 0, 0, pad))
+        used = torch.nn.functional.pad(used, (0, pad))
+        blocks = data.unflatten(1, (-1, BLOCK))
+        age = torch.arange(BLOCK)[:, None] - torch.arange(BLOCK)
+        lagged = blocks[:, :, age.clamp(min=0)] * (age >= 0)[..., None]
+        lagged = lagged.flatten(-2).flatten(1, 2).contiguous()
+        return cls(lagged, used.to(u.dtype), used.sum(-1).to(u.dtype), dt, speed is not None, accel is not None)
+
+
+def _riccati_limit(phi: Tensor, H: Tensor, Q: Tensor, R: Tensor) -> Tensor:
+    """Stationary predicted covariance by structured doubling; no graph."""
+    A, X = phi.mT, Q
+    G = H.mT @ (H / R.diagonal(dim1=-2, dim2=-1)[..., None])
+    eye = torch.eye(Q.shape[-1], dtype=Q.dtype, device=Q.device)
+    for _ in range(40):
+        solved = torch.linalg.solve(eye + G @ X, torch.cat((A, G), -1))
+        WA, WG = solved.split(Q.shape[-1], -1)
+        X_next = X + A.mT @ X @ WA
+        G = G + A @ WG @ A.mT
+        A = A @ WA
+        X, X_next = X_next, X
+        # Stops early: the two Newton steps that follow square the error twice.
+        if bool(((X - X_next).abs().amax((-2, -1)) <= 1e-7 * X.abs().amax((-2, -1))).all()):
+            break
+    return 0.5 * (X + X.mT)
+
+
+def stationary_covariance(phi: Tensor, H: Tensor, Q: Tensor, R: Tensor) -> Tensor:
+    """Predicted covariance ``P = φ(P - P Hᵀ S⁻¹ H P)φᵀ + Q``, ``(..., n, n)``, twice differentiable.
+
+    The limit is found without a graph; two Newton steps with one follow. One step has the right first derivative, two the
+    right second and third (each step squares the distance to the solution).
+    """
+    with torch.no_grad():
+        P = _riccati_limit(phi, H, Q, R)
+    n = Q.shape[-1]
+    eye = torch.eye(n * n, dtype=Q.dtype, device=Q.device)
+    for _ in range(2):
+        K = P @ H.mT @ torch.linalg.inv(H @ P @ H.mT + R)
+        M = phi - phi @ K @ H
+        drive = phi @ K @ R @ K.mT @ phi.mT + Q
+        # Solve P = M P Mᵀ + drive, with rows of vec(P) in order.
+        kron = (M[..., :, None, :, None] * M[..., None, :, None, :]).flatten(-4, -3).flatten(-2, -1)
+        P = torch.linalg.solve(eye - kron, drive.flatten(-2)[..., None])[..., 0].unflatten(-1, (n, n))
+        P = 0.5 * (P + P.mT)
+    return P
+
+
+def _powers(M: Tensor, count: int) -> Tensor:
+    """``M^0 ... M^(count-1)`` stacked on a new dimension before the matrix: ``(..., count, n, n)``."""
+    out = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device).expand(M.shape)[..., None, :, :]
+    leap = M
+    while out.shape[-3] < count:
+        out = torch.cat((out, leap[..., None, :, :] @ out), -3)
+        leap = leap @ leap
+    return out[..., :count, :, :]
+
+
+def _scan(A: Tensor, r: Tensor) -> Tensor:
+    """States at the block starts, ``s_0 = 0``, ``s_{b+1} = A s_b + r_b``; ``r`` ``(..., block, n)``."""
+    s = torch.nn.functional.pad(r[..., :-1, :], (0, 0, 1, 0))
+    leap, hop = A, 1
+    while hop < s.shape[-2]:
+        s = s + torch.nn.functional.pad(s[..., :-hop, :] @ leap.mT, (0, 0, hop, 0))
+        leap, hop = leap @ leap, 2 * hop
+    return s
+
+
+def steady_log_likelihood(
+    T_L: Tensor,
+    K_L: Tensor,
+    process_noise: Tensor,
+    coloured_sd: Tensor,
+    coloured_time: Tensor,
+    data: EvenRows,
+    *,
+    accel_noise: Tensor | None = None,
+    speed_noise: Tensor | None = None,
+) -> Tensor:
+    """Log likelihood ``(..., run)``; parameters ``(..., run)``, float64. Equals `latent_log_likelihood` on even rows."""
+    lead = T_L.shape[:-1]
+    runs = T_L.shape[-1]
+    T_L, K_L, process_noise, coloured_sd, coloured_time = (
+        p.reshape(-1, runs) for p in (T_L, K_L, process_noise, coloured_sd, coloured_time)
+    )
+    step = discretise(T_L, K_L, process_noise, coloured_sd, coloured_time, data.dt)
+    phi, B, Q, P0 = step.transition, step.gain, step.noise, initial_covariance(coloured_sd)
+    sensors = []
+    noises = []
+    if data.has_speed and speed_noise is not None:
+        sensors.append([1.0, 0.0, 0.0])
+        noises.append(speed_noise.reshape(-1, runs) ** 2)
+    if data.has_accel and accel_noise is not None:
+        sensors.append([0.0, 1.0, 1.0])
+        noises.append(accel_noise.reshape(-1, runs) ** 2)
+    H, R = phi.new_tensor(sensors), torch.diag_embed(torch.stack(noises, -1))
+    if not data.has_speed:
+        # Nothing sees the speed then, and it has no stationary law: leave it out.
+        phi, B, Q, P0, H = phi[..., 1:, 1:], B[..., 1:], Q[..., 1:, 1:], P0[..., 1:, 1:], H[..., 1:]
+    n, m = phi.shape[-1], H.shape[0]
+
+    P = stationary_covariance(phi, H, Q, R)
+    root = torch.linalg.cholesky(H @ P @ H.mT + R)
+    white = torch.linalg.inv(root)
+    K = P @ H.mT @ white.mT @ white
+    M = phi - phi @ K @ H
+    drive = torch.cat((phi @ K, B[..., None]), -1)  # what a row's measurements and command add to the next mean
+    powers = _powers(M, BLOCK)
+    seen = (white @ H)[..., None, :, :] @ powers  # (chain, run, BLOCK, m, n)
+    pushed = powers @ drive[..., None, :, :]  # (chain, run, BLOCK, n, m + 1)
+
+    # Impulse response of the whitened innovation, newest row first.
+    now = torch.cat((white, torch.zeros_like(white[..., :1])), -1)[..., None, :, :]
+    response = torch.cat((now, -(white @ H)[..., None, :, :] @ pushed[..., :-1, :, :]), -3)
+
+    def through(kernel: Tensor, rows: Tensor) -> Tensor:
+        """Apply ``kernel (chain, run, BLOCK, out, m + 1)`` to ``rows (run, row, BLOCK·(m + 1))``: all chains in one product."""
+        out = kernel.shape[-2]
+        flat = kernel.permute(1, 2, 4, 0, 3).reshape(runs, -1, kernel.shape[0] * out)
+        return (rows @ flat).unflatten(-1, (kernel.shape[0], out)).permute(2, 0, 1, 3)
+
+    blocks = data.used.shape[-1] // BLOCK
+    leap = powers[..., -1, :, :] @ M
+    start = _scan(leap, through(pushed, data.lagged[:, BLOCK - 1 :: BLOCK]))  # (chain, run, block, n)
+    seen_flat = seen.flatten(2, 3)  # (chain, run, BLOCK·m, n)
+    local = through(response, data.lagged).reshape(-1, runs, blocks, BLOCK * m)
+    used = data.used.reshape(runs, blocks, BLOCK).repeat_interleave(m, -1)
+    e = (local - start @ seen_flat.mT) * used
+    # Innovations depend on the first mean as E = H M^t: block by block, seen · leap^block.
+    far = _powers(leap, blocks)
+    pairs = (seen[..., :, None] * seen[..., None, :]).sum(-3).flatten(-2)  # (chain, run, BLOCK, n·n)
+    in_block = (data.used.reshape(runs, blocks, BLOCK) @ pairs).unflatten(-1, (n, n))
+    J = (far.mT @ in_block @ far).sum(-3)
+    j = (far.mT @ (e @ seen_flat)[..., None]).sum(-3)
+    D = P0 - P
+    inflated = torch.eye(n, dtype=D.dtype, device=D.device) + D @ J
+    gained = (j.mT @ torch.linalg.solve(inflated, D @ j))[..., 0, 0]
+    log_det = 2.0 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    misfit = e.square().sum((-2, -1))
+    total = data.count * (log_det + m * math.log(2.0 * math.pi)) + misfit + torch.linalg.slogdet(inflated)[1] - gained
+    return -0.5 * total.reshape(*lead, runs)

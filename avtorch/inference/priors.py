@@ -1,0 +1,247 @@
+"""Priors, stated on the positive parameters and evaluated in ``z = log(parameter)`` with the Jacobian counted.
+
+Defaults (SPEC, section 3): ``T_L ~ LogNormal(log 0.3, 0.7)``, ``K_L ~ LogNormal(log 1, 0.3)``, ``sigma ~ HalfNormal(1 m/s^3)``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+
+_LOG_2PI = math.log(2 * math.pi)
+
+
+class Prior(Protocol):
+    """Log density over the last dimension of ``z``; ``select`` keeps the windows named by an index."""
+
+    def log_prob(self, z: Tensor) -> Tensor: ...
+
+    def score(self, z: Tensor) -> Tensor:
+        """Gradient of ``log_prob``, shape of ``z``."""
+        ...
+
+    def select(self, index: Tensor) -> Prior: ...
+
+    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Tensor:
+        """Draws of ``z``, shape ``(count, window, parameter)``."""
+        ...
+
+    def center(self) -> Tensor:
+        """A typical ``z``, shape broadcastable to ``(window, parameter)``."""
+        ...
+
+
+@dataclass(frozen=True)
+class LogNormalPrior:
+    """Independent log-normal parameters: ``log(parameter) ~ Normal(log median, log_sd)``; shapes ``(parameter,)``."""
+
+    median: Tensor
+    log_sd: Tensor
+
+    def __post_init__(self) -> None:
+        for name in ("median", "log_sd"):
+            value = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            if not bool((value > 0).all()):
+                raise InputError(f"{name}: {value.tolist()} is not positive")
+            object.__setattr__(self, name, value)
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        score = (z - self.median.log()) / self.log_sd
+        return -0.5 * score.square().sum(-1) - self.log_sd.log().sum() - 0.5 * len(self.median) * _LOG_2PI
+
+    def score(self, z: Tensor) -> Tensor:
+        return (self.median.log() - z) / self.log_sd.square()
+
+    def select(self, index: Tensor) -> LogNormalPrior:
+        return self
+
+    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Tensor:
+        noise = torch.randn(count, windows, len(self.median), generator=generator, dtype=torch.float64)
+        return self.median.log() + self.log_sd * noise
+
+    def center(self) -> Tensor:
+        return self.median.log()
+
+
+@dataclass(frozen=True)
+class HalfNormalPrior:
+    """Independent half-normal parameters with the given ``scale``, shape ``(parameter,)``."""
+
+    scale: Tensor
+
+    def __post_init__(self) -> None:
+        value = torch.as_tensor(self.scale, dtype=torch.float64)
+        if not bool((value > 0).all()):
+            raise InputError(f"scale: {value.tolist()} is not positive")
+        object.__setattr__(self, "scale", value)
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        log_density = -0.5 * (z.exp() / self.scale).square() + z
+        return log_density.sum(-1) + len(self.scale) * 0.5 * math.log(2 / math.pi) - self.scale.log().sum()
+
+    def score(self, z: Tensor) -> Tensor:
+        return 1 - (z.exp() / self.scale).square()
+
+    def select(self, index: Tensor) -> HalfNormalPrior:
+        return self
+
+    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Tensor:
+        noise = torch.randn(count, windows, len(self.scale), generator=generator, dtype=torch.float64)
+        return (self.scale * noise.abs()).log()
+
+    def center(self) -> Tensor:
+        return (0.5 * self.scale).log()
+
+
+@dataclass(frozen=True)
+class QuadrantNormal:
+    """Normal with variance ``variance`` around ``mean``, cut to the positive quadrant: the paper's ``N([K, T], lambda I)``.
+
+    The print (Sec. 3.2.3) does not say what happens to the mass below zero; it is cut off and the rest renormalised.
+
+    Args:
+        mean: shape ``(window, parameter)``, in the parameters' own units.
+        variance: ``lambda``, in the squared units of each parameter.
+    """
+
+    mean: Tensor
+    variance: float
+    _log_mass: Tensor = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not self.variance > 0:
+            raise InputError(f"variance (lambda): {self.variance} is not positive")
+        inside = torch.special.log_ndtr(self.mean / math.sqrt(self.variance)).sum(-1)
+        object.__setattr__(self, "_log_mass", inside + 0.5 * self.mean.shape[-1] * (_LOG_2PI + math.log(self.variance)))
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        distance = (z.exp() - self.mean).square().sum(-1)
+        return -0.5 / self.variance * distance + z.sum(-1) - self._log_mass
+
+    def score(self, z: Tensor) -> Tensor:
+        value = z.exp()
+        return 1 - value * (value - self.mean) / self.variance
+
+    def select(self, index: Tensor) -> QuadrantNormal:
+        return QuadrantNormal(self.mean[index], self.variance)
+
+    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Tensor:
+        # inverse CDF of the part above zero: exact, with a fixed number of uniforms
+        uniform = torch.rand(count, windows, self.mean.shape[-1], generator=generator, dtype=torch.float64)
+        sd = math.sqrt(self.variance)
+        below = torch.special.ndtr(-self.mean / sd)
+        cut = (below + (1 - below) * uniform).clamp(1e-300, 1 - 1e-16)
+        return (self.mean + sd * torch.special.ndtri(cut)).clamp_min(1e-12).log()
+
+    def center(self) -> Tensor:
+        return self.mean.clamp_min(1e-3).log()
+
+
+@dataclass(frozen=True)
+class LogSpaceNormal:
+    """Normal in ``z`` with full covariance: the whole posterior of a window as the prior of the next.
+
+    Args:
+        mean_z: shape ``(window, parameter)``.
+        cov_z: shape ``(window, parameter, parameter)``.
+    """
+
+    mean_z: Tensor
+    cov_z: Tensor
+    _inverse: Tensor = field(init=False, repr=False)
+    _half_log_det: Tensor = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        lower = torch.linalg.cholesky(self.cov_z)
+        eye = torch.eye(lower.shape[-1], dtype=lower.dtype).expand_as(lower)
+        object.__setattr__(self, "_inverse", torch.linalg.solve_triangular(lower, eye, upper=False))
+        object.__setattr__(self, "_half_log_det", lower.diagonal(dim1=-2, dim2=-1).log().sum(-1))
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        score = torch.einsum("wij,...wj->...wi", self._inverse, z - self.mean_z)
+        return -0.5 * score.square().sum(-1) - self._half_log_det - 0.5 * self.mean_z.shape[-1] * _LOG_2PI
+
+    def score(self, z: Tensor) -> Tensor:
+        return -torch.einsum("wji,wjk,...wk->...wi", self._inverse, self._inverse, z - self.mean_z)
+
+    def select(self, index: Tensor) -> LogSpaceNormal:
+        return LogSpaceNormal(self.mean_z[index], self.cov_z[index])
+
+    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Tensor:
+        noise = torch.randn(count, windows, self.mean_z.shape[-1], generator=generator, dtype=torch.float64)
+        return self.mean_z + torch.einsum("wij,cwj->cwi", torch.linalg.cholesky(self.cov_z), noise)
+
+    def center(self) -> Tensor:
+        return self.mean_z
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Independent blocks: ``actuation`` over ``(T_L, K_L)``, the first two parameters, and ``noise`` over the rest."""
+
+    actuation: Prior
+    noise: Prior
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        return self.actuation.log_prob(z[..., :2]) + self.noise.log_prob(z[..., 2:])
+
+    def score(self, z: Tensor) -> Tensor:
+        return torch.cat([self.actuation.score(z[..., :2]), self.noise.score(z[..., 2:])], dim=-1)
+
+    def select(self, index: Tensor) -> Joint:
+        return Joint(self.actuation.select(index), self.noise.select(index))
+
+    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Tensor:
+        parts = [part.sample(count, windows, generator=generator) for part in (self.actuation, self.noise)]
+        return torch.cat(parts, dim=-1)
+
+    def center(self) -> Tensor:
+        first, rest = self.actuation.center(), self.noise.center()
+        shape = torch.broadcast_shapes(first.shape[:-1], rest.shape[:-1])
+        return torch.cat([first.expand(*shape, -1), rest.expand(*shape, -1)], dim=-1)
+
+
+@dataclass(frozen=True)
+class Switch:
+    """Window by window one of two priors: ``later`` where ``started``, shape ``(window,)``, else ``first``."""
+
+    started: Tensor
+    first: Prior
+    later: Prior
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        return torch.where(self.started, self.later.log_prob(z), self.first.log_prob(z))
+
+    def score(self, z: Tensor) -> Tensor:
+        return torch.where(self.started[:, None], self.later.score(z), self.first.score(z))
+
+    def select(self, index: Tensor) -> Prior:
+        started = self.started[index]
+        first, later = self.first.select(index), self.later.select(index)
+        if bool(started.all()):
+            return later
+        return Switch(started, first, later) if bool(started.any()) else first
+
+    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Tensor:
+        first = self.first.sample(count, windows, generator=generator)
+        later = self.later.sample(count, windows, generator=generator)
+        return torch.where(self.started[:, None], later, first)
+
+    def center(self) -> Tensor:
+        return torch.where(self.started[:, None], self.later.center(), self.first.center())
+
+
+def default_actuation_prior() -> LogNormalPrior:
+    """The first prior of ``(T_L [s], K_L [-])`` (SPEC, section 3)."""
+    return LogNormalPrior(torch.tensor([0.3, 1.0], dtype=torch.float64), torch.tensor([0.7, 0.3], dtype=torch.float64))
+
+
+def default_jerk_noise_prior() -> HalfNormalPrior:
+    """The prior of ``sigma`` [m/s^3] for every window (SPEC, section 3)."""
+    return HalfNormalPrior(torch.tensor([1.0], dtype=torch.float64))

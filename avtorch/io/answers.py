@@ -1,0 +1,46 @@
+"""JSON answers for machines: strict JSON, finite numbers only, written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from typing import Any
+
+from avtorch.errors import InputError
+from avtorch.io.atomic import atomic
+
+
+def write_json(path: str | os.PathLike[str], obj: Any) -> None:
+    """Write ``obj`` as indented UTF-8 JSON, atomically.
+
+    Takes dicts with string keys, lists, tuples, strings, numbers, booleans and None, and whatever has ``tolist`` (NumPy
+    arrays and scalars, tensors). Raises InputError, naming the key, for NaN, infinity or a foreign type; nothing is
+    written then, and an earlier file stays.
+    """
+    text = json.dumps(_plain(obj, "$"), indent=1, ensure_ascii=False, allow_nan=False)
+    with atomic(path) as stream:
+        stream.write(text + "\n")
+
+
+def _plain(x: Any, where: str) -> Any:
+    """``x`` as strict JSON can hold it; ``where`` is its place in the answer, for the message."""
+    if x is None or isinstance(x, (bool, str)):
+        return x
+    if isinstance(x, int):
+        return int(x)
+    if isinstance(x, float):
+        if not math.isfinite(x):
+            raise InputError(f"{where}: is {x}; an answer holds finite numbers, or null where there is none")
+        return float(x)
+    if isinstance(x, Mapping):
+        for key in x:
+            if not isinstance(key, str):
+                raise InputError(f"{where}: has the key {key!r}; the keys of an answer are strings")
+        return {str(key): _plain(value, f"{where}.{key}") for key, value in x.items()}
+    if isinstance(x, (list, tuple)):
+        return [_plain(value, f"{where}[{i}]") for i, value in enumerate(x)]
+    if hasattr(x, "tolist"):
+        return _plain(x.tolist(), where)
+    raise InputError(f"{where}: is a {type(x).__name__}; an answer holds objects, lists, strings, numbers and null")

@@ -1,0 +1,154 @@
+"""Other names, units and clocks: what ``--map``, ``--unit`` and the TOML file beside the log say."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from avtorch.errors import InputError
+from avtorch.io.units import to_si
+
+SIGNALS = (
+    "time", "accel_cmd", "accel", "speed", "jerk", "engaged", "spacing", "lead_speed", "lead_accel", "grade", "segment",
+)  # fmt: skip
+
+Pairs = Mapping[str, Any] | Iterable[str] | None
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """A signal that lies in another file: ``column`` there, stamped by ``time`` in ``time_unit``."""
+
+    file: str
+    time: str = "time"
+    column: str | None = None
+    time_unit: str | None = None
+
+
+@dataclass(frozen=True)
+class SignalMap:
+    """Where each signal of a log is found. ``column``, ``unit`` and ``stamp`` are keyed by signal; ``origin`` says who
+    spoke, for the messages."""
+
+    column: dict[str, str] = field(default_factory=dict)
+    unit: dict[str, str] = field(default_factory=dict)
+    stamp: dict[str, str] = field(default_factory=dict)
+    elsewhere: dict[str, Elsewhere] = field(default_factory=dict)
+
+
+def read_mapping(path: str | os.PathLike[str], *, map: Pairs = None, unit: Pairs = None, stamp: Pairs = None) -> SignalMap:
+    """The mapping for the log at ``path``: the TOML file beside it (``lap.csv`` has ``lap.toml``), overruled by the
+    arguments, each a dict or a sequence of ``SIGNAL=VALUE``.
+
+    The TOML file has the tables ``[map]`` (signal = "column"), ``[unit]`` (signal = "km/h"), ``[stamp]`` (signal = "its
+    own time column") and ``[signals.NAME]`` (``file``, ``time``, ``column``, ``time_unit`` of a signal in another file).
+    Raises InputError for a signal, unit, table or key that is not known.
+    """
+    beside = Path(path).with_suffix(".toml")
+    # a log that is called x.toml itself has no file beside it
+    told = _read_toml(beside) if beside != Path(path) and beside.is_file() else SignalMap()
+    return SignalMap(
+        column=_distinct({**told.column, **pairs("map", map)}),
+        unit={**told.unit, **_units(pairs("unit", unit), "")},
+        stamp={**told.stamp, **_stamps(pairs("stamp", stamp), "")},
+        elsewhere=told.elsewhere,
+    )
+
+
+def pairs(option: str, given: Pairs) -> dict[str, str]:
+    """``{"accel": "CAN.ACC_X"}`` or ``["accel=CAN.ACC_X"]`` as a dict; InputError for a malformed or unknown one."""
+    if given is None:
+        return {}
+    if isinstance(given, str):
+        given = [given]
+    if isinstance(given, Mapping):
+        items = [(str(name), str(value)) for name, value in given.items()]
+    else:
+        items = []
+        for text in given:
+            name, mark, value = str(text).partition("=")
+            if not mark or not name.strip() or not value.strip():
+                raise InputError(f"{option}: {text!r} is not of the form SIGNAL=VALUE, such as {_EXAMPLE[option]}")
+            items.append((name.strip(), value.strip()))
+    answer: dict[str, str] = {}
+    for name, value in items:
+        _known(name, f"{option} {name}={value}")
+        if answer.get(name, value) != value:
+            raise InputError(f"{option} {name}: given as {answer[name]!r} and as {value!r}; once is enough")
+        answer[name] = value
+    return answer
+
+
+_EXAMPLE = {"map": "accel=CAN.ACC_X", "unit": "speed=km/h", "stamp": "speed=GPS_TIME"}
+
+
+def _known(name: str, where: str) -> None:
+    if name not in SIGNALS:
+        raise InputError(f"{where}: {name!r} is no signal; signals: {', '.join(SIGNALS)}")
+
+
+def _units(units: dict[str, str], where: str) -> dict[str, str]:
+    for signal, unit in units.items():
+        try:
+            to_si(signal, unit)
+        except InputError as fault:
+            raise InputError(f"{where}{fault}") from None
+    return units
+
+
+def _stamps(stamps: dict[str, str], where: str) -> dict[str, str]:
+    if "time" in stamps:
+        raise InputError(f"{where}stamp time={stamps['time']}: time is the clock itself; only other signals are stamped")
+    return stamps
+
+
+def _distinct(columns: dict[str, str]) -> dict[str, str]:
+    seen: dict[str, str] = {}
+    for signal, column in columns.items():
+        if column in seen:
+            raise InputError(f"map {signal}={column}: column {column!r} is already mapped to {seen[column]}")
+        seen[column] = signal
+    return columns
+
+
+def _read_toml(file: Path) -> SignalMap:
+    try:
+        told = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as fault:
+        raise InputError(f"{file}: is no readable TOML ({str(fault).splitlines()[0]})") from None
+    for name, table in told.items():
+        if name not in ("map", "unit", "stamp", "signals"):
+            raise InputError(f"{file}: table [{name}] is not known; tables: map, unit, stamp, signals")
+        if not isinstance(table, dict):
+            raise InputError(f"{file}: {name} is no table; write [{name}] and its lines below")
+    here = f"{file}: "
+    try:
+        column, unit, stamp = (pairs(name, _texts(told.get(name, {}), name)) for name in ("map", "unit", "stamp"))
+        elsewhere = {name: _elsewhere(name, table) for name, table in told.get("signals", {}).items()}
+    except InputError as fault:
+        raise InputError(f"{here}{fault}") from None
+    return SignalMap(column, _units(unit, here), _stamps(stamp, here), elsewhere)
+
+
+def _texts(table: dict[str, Any], name: str) -> dict[str, str]:
+    for key, value in table.items():
+        if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+            # the commonest cause: map.accel = ... with a dot in an unquoted key
+            raise InputError(f"[{name}] {key}: is a {type(value).__name__}; a text is needed")
+    return {key: str(value) for key, value in table.items()}
+
+
+def _elsewhere(name: str, table: Any) -> Elsewhere:
+    _known(name, f"[signals.{name}]")
+    if name == "time" or not isinstance(table, dict) or "file" not in table:
+        raise InputError(f"[signals.{name}]: needs `file` (and may have `time`, `column`, `time_unit`), for a signal")
+    for key, value in table.items():
+        if key not in ("file", "time", "column", "time_unit") or not isinstance(value, str):
+            raise InputError(f"[signals.{name}] {key}: not known, or no text; keys: file, time, column, time_unit")
+    if "time_unit" in table:
+        to_si("time", table["time_unit"])
+    return Elsewhere(**table)

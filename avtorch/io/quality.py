@@ -1,0 +1,169 @@
+"""The look at a log before anything is believed: what it holds, what is left out, what is doubtful. It notes and never guesses."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.io.consistency import scale_between
+from avtorch.io.log import Log, median_step, stretches
+from avtorch.io.validity import command_scale
+
+SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead_accel", "grade")
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A gap begins after ``row`` (of the log, from 1) at ``start_s`` on the log's time and lasts ``seconds``."""
+
+    row: int
+    start_s: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What a log is worth. ``jitter``: 95 % point of the deviation of a step from the median one, as its share [-];
+    ``late_rows``: steps over 1.5 median ones that are no gap; ``masked_rows``: rows not usable, of which ``driver_rows`` not
+    engaged and ``standstill_rows`` below 0.3 m/s; ``notes``: all of it in sentences, worth telling a person.
+    """
+
+    rows: int
+    seconds: float
+    segments: int
+    rate_hz: float
+    jitter: float
+    late_rows: int
+    gaps: tuple[Gap, ...]
+    masked_rows: int
+    driver_rows: int
+    standstill_rows: int
+    constant: tuple[str, ...]
+    missing: tuple[str, ...]
+    doubtful_units: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For a JSON answer."""
+        return asdict(self)
+
+
+def check(log: Log) -> Quality:
+    """Look a log over. Takes any valid `Log` and raises nothing."""
+    same = np.diff(log.segment) == 0
+    step = median_step(log.time, same)
+    steps = np.diff(log.time)[same]
+    jitter = float(np.quantile(np.abs(steps - step), 0.95) / step) if len(steps) else 0.0
+    late = int((steps > 1.5 * step).sum())
+    gaps = tuple(
+        Gap(int(row) + 1, float(log.time[row]), float(log.time[row + 1] - log.time[row]))
+        for row in np.flatnonzero(~same)
+        if log.time[row + 1] - log.time[row] > 1.5 * step
+    )
+    present = {name: getattr(log, name) for name in SIGNALS if getattr(log, name) is not None}
+    constant = tuple(name for name, values in present.items() if np.ptp(values) == 0)
+    missing = tuple(name for name in ("accel_cmd", "accel", "speed") if name not in present)
+    doubtful = tuple(_doubtful_units(log))
+    driver, still = int((~log.engaged).sum()), int((~log.moving).sum())
+    masked = int((~log.usable).sum())
+    segments = len(log.segments())
+
+    notes = [f"{log.rows} rows, {log.seconds:.1f} s in {segments} segment{'s' * (segments != 1)}, {log.rate_hz:.4g} Hz"]
+    if jitter > 0.1:
+        notes.append(f"time jitters: steps differ from {step:.4g} s by up to {100 * jitter:.0f} % (95 % of them by less)")
+    if late:
+        notes.append(f"{late} step{'s' * (late != 1)} longer than 1.5 median ones: rows were lost, too few for a gap")
+    for gap in gaps[:5]:
+        notes.append(f"gap of {gap.seconds:.3g} s after row {gap.row} (time {gap.start_s:.6g} s): a new segment starts")
+    if len(gaps) > 5:
+        notes.append(f"{len(gaps) - 5} more gaps, each the start of a new segment")
+    if segments - 1 > len(gaps):
+        notes.append(f"{segments - 1 - len(gaps)} new segments by the log's own segment column")
+    if driver:
+        notes.append(f"{driver} rows masked: not engaged")
+    if still:
+        notes.append(f"{still} rows masked: standstill (below 0.3 m/s)")
+    if masked == log.rows:
+        notes.append("no row is left to learn from")
+    notes.extend(f"{name} is constant ({present[name][0]:.6g}): it excites nothing" for name in constant)
+    notes.extend(_says_missing(missing))
+    notes.extend(_repeats(present, log))
+    notes.extend(doubtful)
+    notes.extend(_disagreements(log))
+    if log.ignored:
+        notes.append(f"columns ignored: {', '.join(log.ignored)}")
+    notes.extend(log.remarks)
+    return Quality(
+        rows=log.rows, seconds=log.seconds, segments=segments, rate_hz=log.rate_hz, jitter=jitter, late_rows=late, gaps=gaps,
+        masked_rows=masked, driver_rows=driver, standstill_rows=still, constant=constant, missing=missing,
+        doubtful_units=doubtful, notes=tuple(notes),
+    )  # fmt: skip
+
+
+def _says_missing(missing: tuple[str, ...]) -> list[str]:
+    said = {
+        "accel_cmd": "no accel_cmd: what is said of the actuator is conditional on an assumed controller",
+        "accel": "no accel: speed is the only witness, so sensor faults and real forces cannot be told apart",
+        "speed": "no speed: accel is the only witness, standstill cannot be masked, nor sensor faults be told from forces",
+    }
+    return [said[name] for name in missing]
+
+
+def _repeats(present: dict[str, NDArray], log: Log) -> list[str]:
+    """Signals that come more slowly than the rows and are held between."""
+    notes = []
+    for name in ("accel_cmd", "accel", "speed"):
+        if name not in present:
+            continue
+        changes = np.flatnonzero(np.diff(present[name]) != 0)
+        # a signal at rest repeats too; a slow one repeats by the same count each time
+        if len(changes) >= 20:
+            runs = np.diff(changes)
+            usual = int(np.median(runs))
+            if usual >= 2 and np.mean(runs == usual) > 0.7:
+                notes.append(f"{name} changes every {usual} rows only: it comes at {log.rate_hz / usual:.3g} Hz and is held")
+    return notes
+
+
+def _doubtful_units(log: Log) -> list[str]:
+    notes = []
+    parts = stretches(log.usable, log.segment)
+    if log.speed is not None and log.moving.any():
+        top, middle = float(log.speed.max()), float(np.median(log.speed[log.moving]))
+        if top > 60 or middle > 45:
+            notes.append(f"speed reaches {top:.3g} m/s (median {middle:.3g}): could it be km/h? `--unit speed=km/h`")
+    if log.speed is not None and log.accel is not None:
+        found = scale_between(log.time, parts, log.speed, log.accel)
+        if found is not None and found.correlation > 0.9 and not 0.8 <= found.slope <= 1.25:
+            notes.append(f"speed changes {found.slope:.3g} times what accel says: a unit or a sensor's scale is off")
+    if log.accel_cmd is not None:
+        found = command_scale(log.time, parts, log.speed, log.accel, log.accel_cmd)
+        if found is not None and found.correlation > 0.9 and not 0.2 <= found.slope <= 1.5:
+            witness = "speed" if log.speed is not None else "accel"
+            notes.append(f"{witness} answers with {found.slope:.3g} times the command: units of {witness} or accel_cmd?")
+    if log.speed is None and log.accel is not None and log.accel_cmd is not None:
+        top = max(float(np.abs(log.accel).max()), float(np.abs(log.accel_cmd).max()))
+        if 0 < top < 0.6:
+            notes.append(f"accel and accel_cmd stay below {top:.2g}: a calm drive, or g? Without speed nothing can tell")
+    if log.jerk is not None and log.accel is not None:
+        found = scale_between(log.time, parts, log.accel, log.jerk)
+        if found is not None and found.correlation > 0.9 and not 0.5 <= found.slope <= 2:
+            notes.append(f"accel changes {found.slope:.3g} times what jerk says: a unit is off")
+    if log.lead_speed is not None and log.speed is not None:
+        ratio = float(np.abs(log.lead_speed).sum() / max(np.abs(log.speed).sum(), 1e-9))
+        if not 0.5 < ratio < 2:
+            notes.append(f"the leader is {ratio:.3g} times as fast all along: units of lead_speed or speed?")
+    return notes
+
+
+def _disagreements(log: Log) -> list[str]:
+    if log.speed is None or log.accel is None:
+        return []
+    found = scale_between(log.time, stretches(log.usable, log.segment), log.speed, log.accel)
+    # 0.5 m/s in a second is well above what noise and grade do
+    if found is None or found.change < 0.5 or found.correlation >= 0.5:
+        return []
+    return [f"speed's derivative and accel disagree (correlation {found.correlation:.2f}): one of them is not this car's motion"]

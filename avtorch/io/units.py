@@ -1,0 +1,78 @@
+"""Units a recorder may use, each with its way to SI."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.errors import InputError
+
+GRAVITY = 9.80665  # m/s^2, the standard value: "g" as a unit is defined by it
+_MILE = 1609.344
+_FOOT = 0.3048
+
+_LENGTH = {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": _FOOT}
+_SPEED = {
+    "m/s": 1.0, "mps": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6, "kmph": 1 / 3.6, "mph": _MILE / 3600,
+    "ft/s": _FOOT, "cm/s": 0.01, "mm/s": 0.001, "kn": 1852 / 3600,
+}  # fmt: skip
+_ACCEL = {
+    "m/s2": 1.0, "mps2": 1.0, "g": GRAVITY, "mg": GRAVITY / 1000, "cm/s2": 0.01, "mm/s2": 0.001, "ft/s2": _FOOT,
+    "km/h/s": 1 / 3.6, "mph/s": _MILE / 3600,
+}  # fmt: skip
+_JERK = {"m/s3": 1.0, "mps3": 1.0, "g/s": GRAVITY, "cm/s3": 0.01, "mm/s3": 0.001, "ft/s3": _FOOT}
+_TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+_GRADE = {"-": 1.0, "1": 1.0, "%": 0.01, "percent": 0.01, "permille": 0.001}
+# an angle is no factor: the grade is its tangent
+_ANGLE: dict[str, Callable[[NDArray], NDArray]] = {"rad": np.tan, "deg": lambda x: np.tan(np.radians(x))}
+
+_UNITS: dict[str, dict[str, float]] = {
+    "time": _TIME,
+    "accel_cmd": _ACCEL,
+    "accel": _ACCEL,
+    "speed": _SPEED,
+    "jerk": _JERK,
+    "spacing": _LENGTH,
+    "lead_speed": _SPEED,
+    "lead_accel": _ACCEL,
+    "grade": _GRADE,
+}
+SIGNALS_WITH_UNIT = tuple(_UNITS)
+
+
+def to_si(signal: str, unit: str) -> Callable[[NDArray], NDArray]:
+    """The conversion of ``signal`` from ``unit`` to SI: a name such as ``km/h``, ``g``, ``ms`` or ``cm/s²``, or a bare
+    factor such as ``-1`` for a sensor mounted backwards.
+
+    Raises InputError for a signal that has no unit and for a unit that is not known for this signal.
+    """
+    known = _UNITS.get(signal)
+    if known is None:
+        raise InputError(f"unit {signal}={unit}: {signal} takes no unit; signals with one: {', '.join(_UNITS)}")
+    name = unit.strip().replace("²", "2").replace("³", "3").replace("^", "").replace("**", "").replace("µ", "u")
+    name = name.replace("μ", "u").replace("°", "deg")
+    if name in known:
+        return _scaled(known[name])
+    if signal == "grade" and name in _ANGLE:
+        return _ANGLE[name]
+    try:
+        factor = float(name)
+    except ValueError:
+        factor = math.nan
+    if not math.isfinite(factor) or factor == 0:
+        also = (*known, *(_ANGLE if signal == "grade" else ()))
+        raise InputError(f"unit {signal}={unit}: not known for {signal}; known: {', '.join(also)}, or a factor to SI")
+    return _scaled(factor)
+
+
+def _scaled(factor: float) -> Callable[[NDArray], NDArray]:
+    # dividing keeps 50.4 km/h = 14 m/s exact where multiplying by the rounded 1/3.6 would not
+    if factor == 1.0:
+        return lambda x: x
+    inverse = round(1 / factor, 9)
+    if abs(inverse * factor - 1) < 1e-15:
+        return lambda x: x / inverse
+    return lambda x: x * factor

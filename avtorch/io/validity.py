@@ -1,0 +1,160 @@
+"""What is certainly wrong with the values of a log: these raise. What is only doubtful is for ``quality`` to note."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.errors import InputError
+from avtorch.io.consistency import Scale, scale_between
+from avtorch.io.units import GRAVITY
+
+RATE_HZ = (10.0, 200.0)
+_RATE_SLACK = 0.05  # clocks are off by a little, and 10 Hz is the rate of most recordings
+
+# signal: lowest, highest, unit, what a value outside says
+_LIMITS: dict[str, tuple[float, float, str, str]] = {
+    "speed": (-2.0, 150.0, "m/s", "speed is forward speed"),
+    "lead_speed": (-2.0, 150.0, "m/s", "speed is forward speed"),
+    "accel_cmd": (-50.0, 50.0, "m/s2", "no car does that"),
+    "accel": (-50.0, 50.0, "m/s2", "no car does that"),
+    "lead_accel": (-50.0, 50.0, "m/s2", "no car does that"),
+    "jerk": (-5000.0, 5000.0, "m/s3", "no car does that"),
+    "spacing": (0.0, 10000.0, "m", "spacing is bumper to bumper and never negative"),
+    "grade": (-0.5, 0.5, "", "grade is rise over run"),
+}
+# units that would bring a too large value back: unit, its size in SI
+_SUSPECTS: dict[str, tuple[tuple[str, float], ...]] = {
+    "speed": (("km/h", 1 / 3.6), ("cm/s", 0.01), ("mm/s", 0.001)),
+    "lead_speed": (("km/h", 1 / 3.6), ("cm/s", 0.01), ("mm/s", 0.001)),
+    "accel_cmd": (("cm/s2", 0.01), ("mm/s2", 0.001)),
+    "accel": (("cm/s2", 0.01), ("mm/s2", 0.001)),
+    "lead_accel": (("cm/s2", 0.01), ("mm/s2", 0.001)),
+    "spacing": (("cm", 0.01), ("mm", 0.001)),
+    "grade": (("%", 0.01),),
+}
+_PLAUSIBLE = {"speed": 70.0, "lead_speed": 70.0, "accel": 12.0, "accel_cmd": 12.0, "lead_accel": 12.0, "spacing": 300.0, "grade": 0.3}
+
+
+def check_range(signal: str, values: NDArray, where: Callable[[int], str]) -> None:
+    """Raise InputError at the first value that no car gives; ``where`` tells the place of a row, counted from 0."""
+    if signal == "engaged":
+        _at_first(~np.isin(values, (0.0, 1.0)), values, where, "0 (driver) or 1 (engaged) is needed")
+    elif signal == "segment":
+        _at_first(values != np.round(values), values, where, "a whole number is needed")
+    elif signal in _LIMITS:
+        low, high, unit, why = _LIMITS[signal]
+        bad = (values < low) | (values > high)
+        if bad.any():
+            top = float(np.abs(values).max())
+            suspects = (name for name, size in _SUSPECTS.get(signal, ()) if top * size <= _PLAUSIBLE[signal])
+            guess = next(suspects, None) if top > high else None
+            hint = f"; `--unit {signal}={guess}` if that is its unit" if guess else ""
+            span = f"{low:g} to {high:g} {unit}".strip()
+            _at_first(bad, values, where, f"{span} is needed ({why}{hint})")
+
+
+def _at_first(bad: NDArray, values: NDArray, where: Callable[[int], str], need: str) -> None:
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise InputError(f"{where(row)}: is {values[row]:.10g}; {need}")
+
+
+def check_time(time: NDArray, same_drive: NDArray, where: Callable[[int], str]) -> None:
+    """Raise InputError where time repeats or goes back inside a drive; ``same_drive`` ``(time - 1,)`` is false where a new
+    value of ``segment`` lets it start anew."""
+    bad = (np.diff(time) <= 0) & same_drive
+    if bad.any():
+        row = int(np.argmax(bad)) + 1
+        what = "repeats" if time[row] == time[row - 1] else f"goes back from {time[row - 1]:.10g} s to"
+        raise InputError(f"{where(row)}: {what} {time[row]:.10g} s; time must rise from row to row")
+
+
+def check_rate(step: float, where: str) -> None:
+    """Raise InputError for a median ``step`` [s] outside 10 to 200 Hz; it says so when the step looks like ms, us or ns."""
+    rate = 1 / step
+    if not RATE_HZ[0] * (1 - _RATE_SLACK) <= rate <= RATE_HZ[1] * (1 + _RATE_SLACK):
+        hint = ""
+        for unit, ticks in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
+            if RATE_HZ[0] * (1 - _RATE_SLACK) <= rate * ticks <= RATE_HZ[1] * (1 + _RATE_SLACK):
+                hint = f"; `--unit time={unit}` if time counts {unit}"
+        raise InputError(
+            f"{where}: rows come at {rate:.4g} Hz (median step {step:.4g} s); 10 to 200 Hz is needed{hint}"
+        )
+
+
+# how far two signals of one motion may differ in scale before their units are certainly not the same. Recordings whose
+# accel is 1.8 times the derivative of speed exist; a faulty
+# accelerometer is off by a fifth; an actuator that gives 2.5 times what is demanded does not exist.
+_WITNESS = (0.45, 2.2)
+_COMMAND = (0.02, 2.5)
+_SURE = 0.9
+
+_SPEED_FACTORS = {"km/h": 3.6, "mph": 3600 / 1609.344, "ft/s": 1 / 0.3048, "cm/s": 100.0, "mm/s": 1000.0}
+_ACCEL_FACTORS = {"g": GRAVITY, "cm/s2": 0.01, "mm/s2": 0.001, "ft/s2": 0.3048, "km/h/s": 1 / 3.6}
+
+
+def command_scale(time: NDArray, parts: Sequence[slice], speed: NDArray | None, accel: NDArray | None, u: NDArray) -> Scale | None:
+    """How the motion follows the command ``u``: from speed where it is known, else from the integrated acceleration."""
+    if speed is None:
+        assert accel is not None
+        level = np.concatenate([[0.0], np.cumsum(0.5 * (accel[1:] + accel[:-1]) * np.clip(np.diff(time), 0, 1))])
+    else:
+        level = speed
+    return scale_between(time, parts, level, u, delays=tuple(np.arange(0, 1.01, 0.1)))
+
+
+def check_units(
+    source: str,
+    time: NDArray,
+    parts: Sequence[slice],
+    *,
+    accel_cmd: NDArray | None,
+    accel: NDArray | None,
+    speed: NDArray | None,
+    lead_speed: NDArray | None,
+) -> None:
+    """Raise InputError where two signals prove that one of them has another unit or sign. ``parts``: stretches without
+    standstill and without the driver's hand.
+    """
+    if speed is not None and accel is not None:
+        found = scale_between(time, parts, speed, accel)
+        options = {f"speed={u}": f for u, f in _SPEED_FACTORS.items()} | {f"accel={u}": f for u, f in _ACCEL_FACTORS.items()}
+        _refuse_scale(source, "speed", "accel", found, _WITNESS, options, "accel=-1")
+    if accel_cmd is not None:
+        found = command_scale(time, parts, speed, accel, accel_cmd)
+        options = {"accel_cmd=g": GRAVITY, "accel_cmd=cm/s2": 0.01}
+        if speed is not None:
+            options["speed=km/h"] = 3.6
+        answer = "speed" if speed is not None else "accel"
+        _refuse_scale(source, answer, "accel_cmd", found, _COMMAND, options, "accel_cmd=-1")
+    if speed is not None and lead_speed is not None:
+        ratio = float(np.abs(lead_speed).sum() / max(np.abs(speed).sum(), 1e-9))
+        for name, expected in (("lead_speed", 3.6), ("speed", 1 / 3.6)):
+            if abs(ratio / expected - 1) < 0.08 and time[-1] - time[0] > 20:
+                raise InputError(
+                    f"{source}: columns 'lead_speed' and 'speed': the leader is {ratio:.3g} times as fast all along; "
+                    f"`--unit {name}=km/h` if that is its unit"
+                )
+
+
+def _refuse_scale(
+    source: str, level: str, rate: str, found: Scale | None, limits: tuple[float, float], options: dict[str, float], sign: str
+) -> None:
+    if found is None or abs(found.correlation) < _SURE or limits[0] <= found.slope <= limits[1]:
+        return
+    place = f"{source}: columns {level!r} and {rate!r}"
+    moves = "speed changes" if level == "speed" else "accel answers with"
+    if found.slope < 0:
+        raise InputError(
+            f"{place}: {moves} {found.slope:.3g} times what {rate} says, so one has the wrong sign; "
+            f"`--unit {sign}` turns it round"
+        )
+    near = min(options, key=lambda name: abs(math.log(found.slope / options[name])))
+    raise InputError(
+        f"{place}: {moves} {found.slope:.3g} times what {rate} says, so their units differ; "
+        f"`--unit {near}` is the nearest"
+    )

@@ -1,0 +1,38 @@
+"""What moves: the GLVD, controllers, closed loop and platoons, leaders, performance; stability in its own package."""
+
+from avtorch.vehicle.block import Block, Trajectory
+from avtorch.vehicle.controllers import NOMINAL_GAINS, Controller, FollowerState, LinearController
+from avtorch.vehicle.glvd import GLVD, exact_motion, glvd_jerk, glvd_rollout, glvd_step
+from avtorch.vehicle.leader import Leader
+from avtorch.vehicle.loop import ClosedLoop, simulate
+from avtorch.vehicle.lower_level import LowerLevel
+from avtorch.vehicle.mpc import MPC
+from avtorch.vehicle.performance import Performance, equilibrium_throughput, performance
+from avtorch.vehicle.plant import GLVDPlant, Plant
+from avtorch.vehicle.time_gap import RAMP_RATE, TimeGap
+
+__all__ = [
+    "GLVD",
+    "MPC",
+    "NOMINAL_GAINS",
+    "RAMP_RATE",
+    "Block",
+    "ClosedLoop",
+    "Controller",
+    "FollowerState",
+    "GLVDPlant",
+    "Leader",
+    "LinearController",
+    "LowerLevel",
+    "Performance",
+    "Plant",
+    "TimeGap",
+    "Trajectory",
+    "equilibrium_throughput",
+    "exact_motion",
+    "glvd_jerk",
+    "glvd_rollout",
+    "glvd_step",
+    "performance",
+    "simulate",
+]

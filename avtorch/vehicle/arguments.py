@@ -1,0 +1,46 @@
+"""Numbers and tensors as the vehicle takes them: checked once, at the border, then trusted in the hot loop."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+
+Number: TypeAlias = float | int | Tensor
+
+
+def tensor(value: object, *, dtype: torch.dtype | None = None) -> Tensor:
+    """`value` as a floating tensor: tensors keep their dtype, everything else becomes float64 (or `dtype`)."""
+    if isinstance(value, Tensor):
+        return value if value.is_floating_point() else value.to(dtype or torch.float64)
+    return torch.as_tensor(value, dtype=dtype or torch.float64)
+
+
+def checked(
+    name: str,
+    value: object,
+    *,
+    unit: str = "",
+    above: float | None = None,
+    least: float | None = None,
+    dtype: torch.dtype | None = None,
+) -> Tensor:
+    """`value` as a tensor, all finite, `> above` and `>= least`; raises an `InputError` that names the argument."""
+    try:
+        out = tensor(value, dtype=dtype)
+    except (TypeError, ValueError, RuntimeError):
+        raise InputError(f"{name}: found {value!r}, needs a number or a tensor of numbers") from None
+    right = "finite" + (f" and > {above:g}" if above is not None else f" and >= {least:g}" if least is not None else "")
+    right += f" {unit}" if unit else ""
+    seen = out.detach()
+    bad = ~torch.isfinite(seen)
+    if above is not None:
+        bad |= seen <= above
+    if least is not None:
+        bad |= seen < least
+    if bool(bad.any()):
+        raise InputError(f"{name}: found {seen[bad].reshape(-1)[0].item():g}, needs {right}")
+    return out

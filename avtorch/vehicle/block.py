@@ -1,0 +1,71 @@
+"""What a run leaves behind: time series by scenario, as the car's own log would hold them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from avtorch.io import Log
+
+B = TypeVar("B", bound="Block")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A stretch of a run. `time` (time,) [s]; every other field (scenario, time), in a platoon (scenario, vehicle,
+    time), in a replay of candidates (candidate, scenario, time).
+
+    One row: the state at `time`, and the command sent then, which acts until the next row. `demanded` is the upper
+    level's wish, `accel_cmd` what the lower level sent after clipping, `clipped` where the two steps differ.
+    `accel` is kinematic (0 while standing), `jerk` the instantaneous jerk of that row with its own noise (0 while
+    standing, NaN where the plant does not tell). SI units.
+    """
+
+    time: Tensor
+    accel_cmd: Tensor
+    accel: Tensor
+    speed: Tensor
+    jerk: Tensor
+    spacing: Tensor
+    lead_speed: Tensor
+    lead_accel: Tensor
+    demanded: Tensor
+    clipped: Tensor
+
+    @classmethod
+    def concatenate(cls: type[B], blocks: Sequence[B]) -> B:
+        """Blocks that follow each other, as one."""
+        return cls(*(torch.cat([getattr(b, f.name) for b in blocks], -1) for f in fields(cls)))
+
+    def __getitem__(self: B, part: slice) -> B:
+        """The rows of a slice of time."""
+        return type(self)(*(getattr(self, f.name)[..., part] for f in fields(self)))
+
+    @property
+    def collided(self) -> Tensor:
+        """Whether the spacing was ever zero or less, (scenario,) or (scenario, vehicle)."""
+        return (self.spacing <= 0).any(-1)
+
+    def log(self, scenario: int = 0, vehicle: int = 0) -> Log:
+        """One vehicle's drive as a `Log`; ends with the row before a collision, as a real one would."""
+        from avtorch.io import Log
+
+        def row(x: Tensor) -> Tensor:
+            return x[scenario] if x.dim() == 2 else x[scenario, vehicle]
+
+        hit = torch.nonzero(row(self.spacing) <= 0)
+        end = int(hit[0]) if len(hit) else self.time.shape[-1]
+        names = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead_accel")
+        columns: dict[str, Any] = {name: row(getattr(self, name))[:end].numpy() for name in names}
+        if torch.isnan(row(self.jerk)).any():
+            del columns["jerk"]
+        return Log.from_arrays(time=self.time[:end].numpy(), **columns)
+
+
+class Trajectory(Block):
+    """A whole run of `simulate`: a `Block` with dimensions (scenario, vehicle, time); vehicle 0 follows the leader."""

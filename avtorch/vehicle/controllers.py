@@ -1,0 +1,106 @@
+"""Upper level: what acceleration is demanded, given what the follower sees.
+
+A controller is any callable `controller(state: FollowerState) -> demanded acceleration (..., scenario)`: the linear
+law here, the MPC in `mpc.py`, a policy network, a function of unknown structure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.vehicle.arguments import Number, checked
+from avtorch.vehicle.time_gap import RAMP_RATE, TimeGap
+
+NOMINAL_GAINS = (1.5, 1.5, -0.8)
+
+
+class FollowerState(NamedTuple):
+    """What a follower sees at one tick. `time` [s] is a float, the same for all; the rest are tensors (..., scenario).
+
+    `lead_accel` is what the link delivers: the leader's acceleration `link_delay` ago (see `ClosedLoop`).
+    """
+
+    time: float
+    spacing: Tensor
+    speed: Tensor
+    accel: Tensor
+    lead_speed: Tensor
+    lead_accel: Tensor
+
+
+Controller = Callable[[FollowerState], Tensor]
+
+
+@dataclass(frozen=True)
+class LinearController:
+    """Constant-time-gap law `u = k_s Δs + k_v Δv + k_a a + k_f a_lead` (SPEC section 1), demanded acceleration [m/s²].
+
+    `Δs = spacing - (time_gap speed + standstill)`, `Δv = lead_speed - speed`.
+
+    `gains` (k_s [1/s²], k_v [1/s], k_a [-]) on the last dimension, (..., 3); `time_gap` [s], `standstill` [m] and
+    `feedforward` k_f [-] floats or tensors; all broadcast with (..., scenario). `ramp`, if given, is how the gap moves
+    toward `time_gap` (made by `retargeted`). Frozen: a new setting is a new object. Raises `InputError` for non-finite
+    values, gains that are not three, or a negative time gap or standstill spacing.
+    """
+
+    gains: Sequence[float] | Tensor = NOMINAL_GAINS
+    time_gap: Number = 1.0
+    standstill: Number = 5.0
+    feedforward: Number = 0.0
+    ramp: TimeGap | None = None
+    _k: tuple[Tensor, Tensor, Tensor] = field(init=False, repr=False, compare=False)
+    _final: tuple[Tensor, Tensor] = field(init=False, repr=False, compare=False)
+    _k_f: Tensor | None = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        gains = checked("gains", self.gains)
+        if gains.dim() == 0 or gains.shape[-1] != 3:
+            raise InputError(f"gains: found shape {tuple(gains.shape)}, needs k_s, k_v, k_a on the last dimension")
+        k_s, k_v, k_a = gains.unbind(-1)
+        gap = checked("time_gap", self.time_gap, unit="s", least=0.0)
+        rest = checked("standstill", self.standstill, unit="m", least=0.0)
+        k_f = checked("feedforward", self.feedforward)
+        object.__setattr__(self, "_k", (k_s, k_v, k_a))
+        object.__setattr__(self, "_final", (-(k_s * gap + k_v), -k_s * rest))
+        object.__setattr__(self, "_k_f", k_f if bool((k_f != 0).any()) else None)
+
+    def __call__(self, state: FollowerState) -> Tensor:
+        k_s, k_v, k_a = self._k
+        on_speed, constant = self._final
+        if self.ramp is not None and state.time < self.ramp.done_at:
+            on_speed = -(k_s * self.ramp.at(state.time) + k_v)
+        u = torch.addcmul(constant, k_s, state.spacing)
+        u = torch.addcmul(u, k_v, state.lead_speed)
+        u = torch.addcmul(u, on_speed, state.speed)
+        u = torch.addcmul(u, k_a, state.accel)
+        return u if self._k_f is None else torch.addcmul(u, self._k_f, state.lead_accel)
+
+    def time_gap_at(self, time: float) -> Tensor:
+        """The time gap [s] in force at `time` [s], on its way to `time_gap`."""
+        return checked("time_gap", self.time_gap) if self.ramp is None else self.ramp.at(time)
+
+    def retargeted(
+        self,
+        *,
+        at: float,
+        time_gap: Number | None = None,
+        gains: Sequence[float] | Tensor | None = None,
+        rate: float = RAMP_RATE,
+    ) -> LinearController:
+        """The same controller with new settings from time `at` [s] on; the gap moves there at `rate` [s/s].
+
+        It starts from the gap in force at `at`, so a ramp may be retargeted midway. `at` later than the time of the
+        call is a driver's compliance delay (gains change at once).
+        """
+        changed = dataclasses.replace(self, gains=self.gains if gains is None else gains)
+        if time_gap is None:
+            return changed
+        ramp = TimeGap(target=time_gap, start=self.time_gap_at(at), since=at, rate=rate)
+        return dataclasses.replace(changed, time_gap=time_gap, ramp=ramp)

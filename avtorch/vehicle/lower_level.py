@@ -1,0 +1,86 @@
+"""The lower level: turns the demanded acceleration into the command sent, by inverting a model of the actuator.
+
+SPEC section 1: with a model `(T_hat, K_hat)` and a target `(T_d, K_d)` it sends
+
+    u_cmd = (T_hat / K_hat) [ (1/T_hat - 1/T_d) a + (K_d / T_d) u ]
+
+clipped to the vehicle's limits, so that a plant equal to the model answers `u` like a GLVD with `(T_d, K_d)`.
+Adjusting `T_hat`, `K_hat` here is Strategy 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.vehicle.arguments import Number, checked, tensor
+
+
+@dataclass(frozen=True)
+class LowerLevel:
+    """Model `(T_hat [s], K_hat [-])`, target `(T_d [s], K_d [-])`, limits [m/s²]; floats or tensors (scenario,).
+
+    Frozen: a new setting is a new object (`dataclasses.replace`). Raises `InputError` unless lags and gains are
+    > 0 and `accel_min < accel_max`.
+    """
+
+    T_hat: Number = 0.3
+    K_hat: Number = 1.0
+    T_d: Number = 0.3
+    K_d: Number = 1.0
+    accel_min: Number = -6.0
+    accel_max: Number = 4.0
+    _on_accel: Tensor = field(init=False, repr=False, compare=False)
+    _on_demand: Tensor = field(init=False, repr=False, compare=False)
+    _inverts: bool = field(init=False, repr=False, compare=False)
+    _limits: tuple = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        T_hat = checked("T_hat", self.T_hat, unit="s", above=0.0)
+        K_hat = checked("K_hat", self.K_hat, above=0.0)
+        T_d = checked("T_d", self.T_d, unit="s", above=0.0)
+        K_d = checked("K_d", self.K_d, above=0.0)
+        low, high = checked("accel_min", self.accel_min), checked("accel_max", self.accel_max)
+        if bool((low >= high).any()):
+            raise InputError(f"accel_min: found {self.accel_min} with accel_max {self.accel_max}, needs a lower value")
+        # written so that T_hat = T_d, K_hat = K_d gives exactly 0 and 1: u passes through to the bit
+        on_accel, on_demand = (1 - T_hat / T_d) / K_hat, (T_hat * K_d) / (K_hat * T_d)
+        both_floats = not isinstance(self.accel_min, Tensor) and not isinstance(self.accel_max, Tensor)
+        limits = (float(self.accel_min), float(self.accel_max)) if both_floats else (low, high)
+        object.__setattr__(self, "_on_accel", on_accel)
+        object.__setattr__(self, "_on_demand", on_demand)
+        object.__setattr__(self, "_inverts", bool((on_accel != 0).any() or (on_demand != 1).any()))
+        object.__setattr__(self, "_limits", limits)
+
+    def raw_command(self, a: Tensor, u: Tensor) -> Tensor:
+        """The command before clipping [m/s²] for measured acceleration `a` and demand `u` [m/s²], (..., scenario)."""
+        if not self._inverts:
+            return u
+        return torch.addcmul(self._on_accel * a, self._on_demand, u)
+
+    def clip(self, raw: Tensor) -> Tensor:
+        """`raw` [m/s²] within the vehicle's limits."""
+        return torch.clamp(raw, self._limits[0], self._limits[1])  # type: ignore[call-overload]
+
+    def command(self, a: Tensor, u: Tensor) -> Tensor:
+        """The command actually sent [m/s²]: `raw_command`, clipped. This is what the estimator takes as `u`."""
+        return self.clip(self.raw_command(a, u))
+
+    def amplification(self) -> Tensor:
+        """Command effort `T_hat K_d / (K_hat T_d)` [-]: how much louder a fast demand leaves than it came."""
+        return self._on_demand
+
+    def effective(self, T_L: Number, K_L: Number) -> tuple[Tensor, Tensor]:
+        """`(T_e [s], K_e [-])` the loop behaves as, unclipped, with a plant `(T_L, K_L)` (SPEC section 1); broadcasts.
+
+        `1/T_e = 1/T - r (1/T_hat - 1/T_d)`, `r = K T_hat / (T K_hat)`. Where the model promises more than the plant
+        has, `1/T_e` can be zero or negative: the inner loop is then itself unstable and `T_e` comes back infinite or
+        negative, to be judged unstable.
+        """
+        T, K = tensor(T_L), tensor(K_L)
+        r_over_T_hat = K / (T * self.K_hat)
+        rate = 1 / T - r_over_T_hat * (1 - tensor(self.T_hat) / self.T_d)
+        return 1 / rate, r_over_T_hat * self.T_hat * self.K_d / (rate * self.T_d)

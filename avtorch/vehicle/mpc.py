@@ -1,0 +1,194 @@
+r"""A linear constant-time-gap MPC with box limits on the demanded acceleration, batched over scenarios.
+
+Internal model, state `x = (Δs, Δv, a)`, leader assumed at constant speed, GLVD `(T, K)`:
+
+    Δs' = Δv - tau a,   Δv' = -a,   a' = (K u - a) / T,   u held for `step`
+
+Every tick it minimises `Σ_j q_s Δs_j² + q_v Δv_j² + q_a a_j² + r u_j²` over the horizon within `[u_min, u_max]` and
+demands the first move. The states are eliminated (condensed form), which leaves a strongly convex box problem
+`½ Uᵀ H U + (F x)ᵀ U` of `horizon / step` variables with `H` constant.
+
+Where the unconstrained optimum `-H⁻¹ F x` lies inside the box it is the answer. Elsewhere: the primal-dual active set
+method (a semismooth Newton method; Hintermüller, Ito and Kunisch 2002), which ends after a few solves at the exact
+optimum and, started afresh each tick, answers a scenario the same whatever batch it is in. It can cycle in theory;
+what has not settled after 20 rounds is handed to Nesterov's projected gradient method, whose rate `1 - 1/sqrt(cond)`
+fixes the number of iterations beforehand. Library solvers take one problem at a time.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.vehicle.arguments import checked
+from avtorch.vehicle.controllers import FollowerState
+from avtorch.vehicle.time_gap import RAMP_RATE, TimeGap
+
+_ROUNDS = 20  # of the active set method; 3 to 6 are usual
+_ACCURACY = 1e-9  # relative error of the gradient iterations, by their guaranteed rate
+
+
+class MPC:
+    """Controller `mpc(state) -> demanded acceleration (..., scenario)` [m/s²].
+
+    Args:
+        time_gap: [s]. standstill: [m]. horizon, step: [s]; 4 s at 0.2 s by default: several times the loop's slowest
+            time constant, in steps shorter than the actuator's lag.
+        T, K: internal model of the actuator. accel_min, accel_max: the box [m/s²].
+        weights: (q_s [1/m²], q_v [s²/m²], q_a [s⁴/m²], r [s⁴/m²]); the default puts a spacing error of 1 m, a speed
+            difference of 1 m/s and a demand of 1 m/s² level.
+
+    Raises `InputError` for numbers out of range or a horizon that is no whole number of steps.
+    """
+
+    def __init__(
+        self,
+        *,
+        time_gap: float = 1.0,
+        standstill: float = 5.0,
+        horizon: float = 4.0,
+        step: float = 0.2,
+        T: float = 0.3,
+        K: float = 1.0,
+        accel_min: float = -6.0,
+        accel_max: float = 4.0,
+        weights: Sequence[float] = (1.0, 1.0, 0.0, 1.0),
+    ) -> None:
+        self.time_gap = float(checked("time_gap", time_gap, unit="s", least=0.0))
+        self.standstill = float(checked("standstill", standstill, unit="m", least=0.0))
+        lag = float(checked("T", T, unit="s", above=0.0))
+        gain = float(checked("K", K, above=0.0))
+        self.step = float(checked("step", step, unit="s", above=0.0))
+        moves = round(float(checked("horizon", horizon, unit="s", above=0.0)) / self.step)
+        if moves < 1 or abs(moves * self.step - horizon) > 1e-9:
+            raise InputError(f"horizon: found {horizon!r} s with step {step!r} s, needs a whole number of steps")
+        if not -math.inf < accel_min < accel_max < math.inf:
+            raise InputError(f"accel_min: found {accel_min!r} with accel_max {accel_max!r}, needs a lower value")
+        q = checked("weights", weights, least=0.0)
+        if q.shape != (4,) or float(q[3]) <= 0:
+            raise InputError(f"weights: found {tuple(weights)!r}, needs q_s, q_v, q_a >= 0 and r > 0")
+        self.accel_min, self.accel_max = float(accel_min), float(accel_max)
+        self.T, self.K, self.horizon, self.weights = lag, gain, horizon, tuple(q.tolist())
+        self.ramp: TimeGap | None = None
+        self._condense(moves, q)
+
+    def _condense(self, moves: int, q: Tensor) -> None:
+        tau, T, K, h = self.time_gap, self.T, self.K, self.step
+        drift = torch.tensor([[0, 1, -tau, 0], [0, 0, -1, 0], [0, 0, -1 / T, K / T], [0, 0, 0, 0]], dtype=torch.float64)
+        held = torch.linalg.matrix_exp(drift * h)
+        A, B = held[:3, :3], held[:3, 3]
+        powers = [torch.eye(3, dtype=torch.float64)]
+        for _ in range(moves):
+            powers.append(A @ powers[-1])
+        # x_j = A^j x_0 + Σ_{i<j} A^{j-1-i} B u_i, j = 1…moves
+        free = torch.stack(powers[1:])  # (step, 3, 3)
+        forced = torch.zeros(moves, 3, moves, dtype=torch.float64)
+        for j in range(moves):
+            for i in range(j + 1):
+                forced[j, :, i] = powers[j - i] @ B
+        weight = q[:3, None]
+        self._H = 2 * (torch.einsum("jsi,jsk->ik", forced, weight * forced) + q[3] * torch.eye(moves, dtype=q.dtype))
+        self._F = 2 * torch.einsum("jsi,jsk->ik", forced, weight * free)  # (move, 3)
+        self._law = -torch.linalg.solve(self._H, self._F)
+        scale = self._H.diagonal().rsqrt()
+        self._scale, self._scaled_H = scale, scale[:, None] * self._H * scale
+        eigenvalues = torch.linalg.eigvalsh(self._scaled_H)
+        self._lipschitz = float(eigenvalues[-1])
+        root = math.sqrt(self._lipschitz / float(eigenvalues[0]))
+        self._momentum = (root - 1) / (root + 1)
+        # the squared error falls by 1 - 1/root an iteration
+        self._iterations = max(1, math.ceil(2 * math.log(_ACCURACY) / math.log1p(-1 / root))) if root > 1 else 1
+
+    def __call__(self, state: FollowerState) -> Tensor:
+        gap = self.time_gap
+        if self.ramp is not None and state.time < self.ramp.done_at:
+            gap = self.ramp.at(state.time)
+        error = state.spacing - (gap * state.speed + self.standstill)
+        seen = torch.broadcast_tensors(error, state.lead_speed - state.speed, state.accel)
+        return self.plan(torch.stack(seen, -1))[..., 0]
+
+    def plan(self, x: Tensor) -> Tensor:
+        """Optimal moves (..., move) [m/s²] from states `x` = (Δs [m], Δv [m/s], a [m/s²]), (..., 3)."""
+        free = x @ self._law.T
+        outside = ((free < self.accel_min) | (free > self.accel_max)).any(-1)
+        if not bool(outside.any()):
+            return free
+        out = free.clone()
+        out[outside] = self._solve(x[outside] @ self._F.T, free[outside])
+        return torch.clamp(out, self.accel_min, self.accel_max)  # rounding: a limit kept is not a command clipped
+
+    def _solve(self, linear: Tensor, guess: Tensor) -> Tensor:
+        """Minimiser in the box for `linear` = F x, (problem, move); `guess` is the unconstrained one."""
+        above, below = guess > self.accel_max, guess < self.accel_min
+        eye = torch.eye(linear.shape[-1], dtype=linear.dtype)
+        out = guess
+        for _ in range(_ROUNDS):
+            # one linear system: the free moves' gradient vanishes, the others sit on their bound
+            bound = torch.where(above, self.accel_max, self.accel_min)
+            pinned = above | below
+            rows = torch.where(pinned.unsqueeze(-1), eye, self._H)
+            out = torch.linalg.solve(rows, torch.where(pinned, bound, -linear))
+            push = -(out @ self._H + linear) / self._H.diagonal()
+            was = above, below
+            above = torch.where(above, push > 0, out > self.accel_max)
+            below = torch.where(below, push < 0, out < self.accel_min)
+            moved = ((above != was[0]) | (below != was[1])).any(-1)
+            if not bool(moved.any()):
+                return out
+        return torch.where(moved.unsqueeze(-1), self._descend(linear, guess), out)
+
+    def _descend(self, linear: Tensor, guess: Tensor) -> Tensor:
+        """The same by projected gradient with constant momentum, in variables `U / scale` of unit diagonal."""
+        low, high = self.accel_min / self._scale, self.accel_max / self._scale
+        step = 1 / self._lipschitz
+        shift = -step * linear * self._scale
+        turn = torch.eye(len(self._scale), dtype=linear.dtype) - step * self._scaled_H
+        old = ahead = torch.clamp(guess / self._scale, low, high)
+        for _ in range(self._iterations):
+            new = torch.clamp(ahead @ turn + shift, low, high)
+            ahead = new + self._momentum * (new - old)
+            old = new
+        return old * self._scale
+
+    def equivalent_gains(self) -> tuple[float, float, float]:
+        """`(k_s, k_v, k_a)` of the law away from the limits, which is linear: `u = k_s Δs + k_v Δv + k_a a`.
+
+        With these the stability analysis of the linear controller holds for the MPC (small motions).
+        """
+        k_s, k_v, k_a = self._law[0].tolist()
+        return k_s, k_v, k_a
+
+    @property
+    def gains(self) -> tuple[float, float, float]:
+        """`equivalent_gains`."""
+        return self.equivalent_gains()
+
+    def time_gap_at(self, time: float) -> Tensor:
+        """The time gap [s] in force at `time` [s]."""
+        return checked("time_gap", self.time_gap) if self.ramp is None else self.ramp.at(time)
+
+    def retargeted(self, *, at: float, time_gap: float | None = None, rate: float = RAMP_RATE) -> MPC:
+        """The same MPC with a new time gap from `at` [s] on, reached at `rate` [s/s]; see `LinearController`.
+
+        The prediction uses the new gap at once, the error `Δs` the one in force.
+        """
+        if time_gap is None:
+            return copy.copy(self)
+        new = MPC(
+            time_gap=time_gap,
+            standstill=self.standstill,
+            horizon=self.horizon,
+            step=self.step,
+            T=self.T,
+            K=self.K,
+            accel_min=self.accel_min,
+            accel_max=self.accel_max,
+            weights=self.weights,
+        )
+        new.ramp = TimeGap(target=time_gap, start=self.time_gap_at(at), since=at, rate=rate)
+        return new

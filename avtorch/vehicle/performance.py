@@ -1,0 +1,105 @@
+"""How a run went: the measures of SPEC section 4, by scenario."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from avtorch.vehicle.arguments import Number, checked, tensor
+from avtorch.vehicle.block import Block
+
+#: Bounds of comfort: 2 m/s² and, as ISO 15622 asks of adaptive cruise control, 2.5 m/s³.
+COMFORT_ACCEL, COMFORT_JERK = 2.0, 2.5
+
+#: Road load per unit mass of a mid-size car: rolling 0.01 g, and rho c_d A / (2 m) = 1.2 * 0.65 / (2 * 1500).
+ROLLING_MPS2, AERO_PER_M = 0.0981, 2.6e-4
+
+VEHICLE_LENGTH_M = 4.5
+
+
+@dataclass(frozen=True)
+class Performance:
+    """Tensors (scenario,), in a platoon (scenario, vehicle), float64.
+
+    - `speed_rms_ratio` [-]: RMS of the follower's speed about its mean over that of the leader (about the mean, or the
+      ratio would be 1 whatever happens); `accel_rms_ratio` [-]: RMS acceleration over the leader's. Above 1 the
+      follower amplifies. NaN behind a leader at constant speed. In a platoon against the vehicle in front; the
+      product over the vehicles is tail against head.
+    - `min_spacing_m`: zero or less means a collision. `min_ttc_s`: least spacing / closing speed over rows that close
+      in; infinite if none does, 0 after a collision.
+    - `jerk_rms_mps3`: of the instantaneous jerk, noise included. `clipped_share`: rows whose command hit the limits.
+    - `comfort_share`: rows within 2 m/s² and 2.5 m/s³. `energy_jpkgm`: positive traction work per kg and metre driven
+      (acceleration, rolling, air; no recuperation). `throughput_vph`: vehicles an hour at equilibrium at the mean speed
+      of the leader, NaN without a time gap.
+    """
+
+    speed_rms_ratio: Tensor
+    accel_rms_ratio: Tensor
+    min_spacing_m: Tensor
+    min_ttc_s: Tensor
+    jerk_rms_mps3: Tensor
+    clipped_share: Tensor
+    comfort_share: Tensor
+    energy_jpkgm: Tensor
+    throughput_vph: Tensor
+
+    def row(self, *index: int) -> dict[str, float | None]:
+        """One scenario's (or vehicle's) figures by name; what is not finite is None, as JSON has no other word."""
+        out: dict[str, float | None] = {}
+        for f in fields(self):
+            value = float(getattr(self, f.name)[index or (0,)].reshape(-1)[0])
+            out[f.name] = value if math.isfinite(value) else None
+        return out
+
+
+def performance(
+    run: Block, *, time_gap: Number | None = None, standstill: Number = 5.0, length: float = VEHICLE_LENGTH_M
+) -> Performance:
+    """The measures of a `Block` or `Trajectory` (..., time); `time_gap` [s] is that of the setting, for the throughput.
+
+    The peak gain belongs to a setting, not to a run: `avtorch.stability.peak_gain`.
+    """
+    v, a, lead_v, lead_a = run.speed, run.accel, run.lead_speed, run.lead_accel
+    dt = float(run.time[1] - run.time[0]) if len(run.time) > 1 else math.nan
+    closing = v - lead_v
+    ttc = torch.where(closing > 0, run.spacing / torch.where(closing > 0, closing, 1.0), math.inf)
+    traction = torch.clamp(a + ROLLING_MPS2 + AERO_PER_M * v * v, min=0.0) * v
+    mean = lead_v.mean(-1)
+    flow = torch.full_like(mean, math.nan)
+    if time_gap is not None:
+        flow = equilibrium_throughput(mean, time_gap, standstill=standstill, length=length).expand(mean.shape)
+    calm = (a.abs() <= COMFORT_ACCEL) & (run.jerk.abs() <= COMFORT_JERK)
+    return Performance(
+        speed_rms_ratio=_rms(v - v.mean(-1, keepdim=True)) / _moving(_rms(lead_v - lead_v.mean(-1, keepdim=True))),
+        accel_rms_ratio=_rms(a) / _moving(_rms(lead_a)),
+        min_spacing_m=run.spacing.amin(-1),
+        min_ttc_s=ttc.amin(-1).clamp(min=0.0),
+        jerk_rms_mps3=_rms(run.jerk),
+        clipped_share=run.clipped.to(v.dtype).mean(-1),
+        comfort_share=calm.to(v.dtype).mean(-1),
+        energy_jpkgm=(traction.sum(-1) * dt) / (v.sum(-1) * dt),
+        throughput_vph=flow,
+    )
+
+
+def equilibrium_throughput(
+    speed: Number, time_gap: Number, *, standstill: Number = 5.0, length: float = VEHICLE_LENGTH_M
+) -> Tensor:
+    """Vehicles an hour past a point when all drive at `speed` [m/s] and `time_gap` [s]; arguments broadcast.
+
+    `3600 v / (time_gap v + standstill + length)`. Raises `InputError` for negative values.
+    """
+    v, gap = checked("speed", speed, unit="m/s", least=0.0), checked("time_gap", time_gap, unit="s", least=0.0)
+    return 3600 * v / (gap * v + tensor(standstill) + length)
+
+
+def _rms(x: Tensor) -> Tensor:
+    return (x * x).mean(-1).sqrt()
+
+
+def _moving(x: Tensor) -> Tensor:
+    """NaN where the leader shows no motion to compare with (rounding apart)."""
+    return torch.where(x > 1e-9, x, math.nan)

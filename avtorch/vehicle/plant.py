@@ -1,0 +1,89 @@
+"""The plant: what the car makes of the command, over one step.
+
+A plant is an object with `step(a, v, u, dt, eps)` (or a callable of the same arguments) that returns acceleration,
+speed and displacement after `dt`; (..., scenario) tensors, no standstill logic. Two optional members: `sigma`
+[m/s³], the scale of the jerk noise the loop draws for it (none: 0), and `jerk(a, u)`, the noise-free jerk at a row,
+without which the log's jerk is unknown (NaN), never a difference of accelerations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.vehicle.arguments import Number, checked
+from avtorch.vehicle.glvd import Method, motion_coefficients
+
+Motion = tuple[Tensor, Tensor, Tensor]
+
+
+class Plant(Protocol):
+    """What the loop asks of a plant."""
+
+    def step(self, a: Tensor, v: Tensor, u: Tensor, dt: float, eps: Tensor) -> Motion:
+        """Acceleration [m/s²], speed [m/s] and displacement [m] after `dt` [s], command `u` and noise `eps` held."""
+        ...
+
+
+PlantFunction = Callable[[Tensor, Tensor, Tensor, float, Tensor], Motion]
+
+
+@dataclass(frozen=True)
+class GLVDPlant:
+    """Eq. 1 with jerk noise `eps ~ N(0, sigma²)`, one draw per step, held over it; floats or tensors (scenario,).
+
+    `"zoh"` integrates acceleration, speed and position exactly; `"euler"` is the paper's explicit step. `accel_min`
+    and `accel_max` [m/s²] bound what the vehicle can physically follow: `K_L u` is clipped to them (the car does not
+    tell; the log still shows the command sent). Frozen: another car is another object. Raises `InputError` for
+    `T_L <= 0`, `K_L < 0`, `sigma < 0`, non-finite values or crossed limits.
+    """
+
+    T_L: Number = 0.3
+    K_L: Number = 1.0
+    sigma: Number = 0.1
+    method: Method = "zoh"
+    accel_min: float | None = None
+    accel_max: float | None = None
+    _lag: Tensor = field(init=False, repr=False, compare=False)
+    _gain: Tensor = field(init=False, repr=False, compare=False)
+    _coefficients: dict = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_lag", checked("T_L", self.T_L, unit="s", above=0.0))
+        object.__setattr__(self, "_gain", checked("K_L", self.K_L, least=0.0))
+        checked("sigma", self.sigma, unit="m/s³", least=0.0)
+        if self.method not in ("zoh", "euler"):
+            raise InputError(f'method: found {self.method!r}, needs "zoh" or "euler"')
+        low = -torch.inf if self.accel_min is None else self.accel_min
+        if not low < (torch.inf if self.accel_max is None else self.accel_max):
+            raise InputError(f"accel_min: found {self.accel_min} with accel_max {self.accel_max}, needs a lower value")
+        object.__setattr__(self, "_coefficients", {})
+
+    def target(self, u: Tensor) -> Tensor:
+        """What the acceleration tends to under a held `u`, noise apart: `K_L u` within the physical limits [m/s²]."""
+        wanted = self._gain * u
+        if self.accel_min is None and self.accel_max is None:
+            return wanted
+        return torch.clamp(wanted, self.accel_min, self.accel_max)
+
+    def jerk(self, a: Tensor, u: Tensor) -> Tensor:
+        """Noise-free instantaneous jerk [m/s³]."""
+        return (self.target(u) - a) / self._lag
+
+    def step(self, a: Tensor, v: Tensor, u: Tensor, dt: float, eps: Tensor) -> Motion:
+        """See `Plant.step`."""
+        if self.method == "euler":
+            return a + dt * (self.jerk(a, u) + eps), v + dt * a, dt * v
+        if dt not in self._coefficients:  # a few operations a step saved; the object is frozen, so they stay right
+            self._coefficients[dt] = motion_coefficients(self._lag, dt)
+        alpha, m1, m2 = self._coefficients[dt]
+        a_inf = torch.addcmul(self.target(u), self._lag, eps)
+        d = a - a_inf
+        speed = torch.addcmul(torch.add(v, a_inf, alpha=dt), m1, d)
+        moved = torch.addcmul(torch.add(v * dt, a_inf, alpha=0.5 * dt * dt), m2, d)
+        return torch.addcmul(a_inf, alpha, d), speed, moved

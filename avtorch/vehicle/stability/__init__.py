@@ -1,0 +1,48 @@
+"""Stability of the car-following loop: Eq. 2, Eq. 3, the exact string condition, dead time, regions and beliefs."""
+
+from avtorch.vehicle.stability.belief import (
+    Interval,
+    StabilityBelief,
+    p_locally_stable,
+    p_string_stable,
+    stability_belief,
+)
+from avtorch.vehicle.stability.conditions import (
+    Conditions,
+    local_conditions,
+    string_conditions,
+    string_sufficient,
+)
+from avtorch.vehicle.stability.exact import string_margin, string_margins
+from avtorch.vehicle.stability.region import Region, region
+from avtorch.vehicle.stability.transfer import gain, transfer_function
+from avtorch.vehicle.stability.verdict import (
+    dead_time_margin,
+    local_stable,
+    peak_frequency,
+    peak_gain,
+    string_stable,
+)
+
+__all__ = [
+    "Conditions",
+    "Interval",
+    "Region",
+    "StabilityBelief",
+    "dead_time_margin",
+    "gain",
+    "local_conditions",
+    "local_stable",
+    "p_locally_stable",
+    "p_string_stable",
+    "peak_frequency",
+    "peak_gain",
+    "region",
+    "stability_belief",
+    "string_conditions",
+    "string_margin",
+    "string_margins",
+    "string_stable",
+    "string_sufficient",
+    "transfer_function",
+]

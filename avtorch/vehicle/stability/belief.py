@@ -1,0 +1,172 @@
+"""Stability under a belief: probabilities and intervals over draws of the actuation, for many settings at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.vehicle.stability.exact import coefficients
+from avtorch.vehicle.stability.nyquist import lost_at
+from avtorch.vehicle.stability.setting import Gains, Setting, Value, as_tensor, read_setting
+from avtorch.vehicle.stability.verdict import locally_stable, peak_gain_of, string_stable_of
+
+BLOCK = 1 << 17  # (setting, draw) pairs held at a time: the temporaries then stay in the cache
+
+
+class Interval(NamedTuple):
+    """Median and 90 % interval, each (setting,) or of the settings' shape: order statistics, so inf is no trouble."""
+
+    q05: Tensor
+    q50: Tensor
+    q95: Tensor
+
+
+@dataclass(frozen=True)
+class StabilityBelief:
+    """What a belief says of each setting; every tensor has the settings' shape.
+
+    p_locally_stable, p_string_stable: shares of the draws. error: their Monte Carlo standard error at most, as if the
+    draws were independent (Agresti-Coull, so it is no zero at a share of 0 or 1). margins: intervals of
+      local [1/s]: (1/K - k_a) g - T k_s / K, the last line of Eq. 2 (> 0 stable), without dead time;
+      B [-] and C_over_K [1/s^2]: the lines of Eq. 3, without dead time;
+      dead_time [s]: how much more dead time the loop bears before it is locally unstable, counted from the one it has;
+      peak_gain [-]: with dead time; inf where locally unstable.
+    """
+
+    p_locally_stable: Tensor
+    p_string_stable: Tensor
+    error: Tensor
+    margins: dict[str, Interval]
+
+
+def p_locally_stable(
+    T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, dead_time: Value = 0.0
+) -> Tensor:
+    """P(locally stable) of every setting under draws of the actuation, shape (setting,) or whatever the settings have.
+
+    The vehicle, T_L [s], K_L [-] and dead_time [s], has its draws on the last dimension: (draw,) for all settings
+    alike, or (setting, draw) where a setting changes it (a lower level: effective T_L and K_L). Numbers are known
+    values. The settings, time_gap (setting,) and gains (setting, 3), broadcast with each other. Draws that leave the
+    loop without a stable actuator (T_L < 0 or infinite, K_L <= 0) count as unstable. Raises InputError as
+    `local_stable`, and where there is no draw.
+    """
+    return _share(locally_stable, _Blocks(T_L, K_L, time_gap, gains, dead_time, 0.0, 0.0))
+
+
+def p_string_stable(
+    T_L: Value,
+    K_L: Value,
+    time_gap: Value,
+    gains: Gains,
+    *,
+    dead_time: Value = 0.0,
+    feedforward: Value = 0.0,
+    feedforward_delay: Value = 0.0,
+) -> Tensor:
+    """P(string stable), arguments as in `p_locally_stable`; feedforward [-] and its delay [s] belong to the setting."""
+    return _share(string_stable_of, _Blocks(T_L, K_L, time_gap, gains, dead_time, feedforward, feedforward_delay))
+
+
+def stability_belief(
+    T_L: Value,
+    K_L: Value,
+    time_gap: Value,
+    gains: Gains,
+    *,
+    dead_time: Value = 0.0,
+    feedforward: Value = 0.0,
+    feedforward_delay: Value = 0.0,
+) -> StabilityBelief:
+    """Probabilities and margins with intervals, arguments as in `p_string_stable`."""
+    blocks = _Blocks(T_L, K_L, time_gap, gains, dead_time, feedforward, feedforward_delay)
+    local, string, n = [], [], blocks.draws
+    margins: dict[str, list[Interval]] = {}
+    for s in blocks:
+        local.append(s.full(locally_stable(s)).double().mean(-1))
+        string.append(s.full(string_stable_of(s)).double().mean(-1))
+        for name, draws in _margins(s).items():
+            margins.setdefault(name, []).append(_interval(s.full(draws)))
+    p_local, p_string = blocks.join(local), blocks.join(string)
+    shrunk = (p_string * n + 2) / (n + 4)
+    return StabilityBelief(
+        p_locally_stable=p_local,
+        p_string_stable=p_string,
+        error=(shrunk * (1 - shrunk) / (n + 4)).sqrt(),
+        margins={k: Interval(*(blocks.join(list(q)) for q in zip(*v, strict=True))) for k, v in margins.items()},
+    )
+
+
+def _margins(s: Setting) -> dict[str, Tensor]:
+    B, C = coefficients(s)
+    rows = {
+        "local": (1 / s.K - s.ka) * s.g - s.T * s.ks / s.K,
+        "B": B,
+        "C_over_K": C / s.K,
+        "dead_time": lost_at(s) - s.theta,
+    }
+    rows = {name: torch.where(s.valid, row, torch.full_like(row, -torch.inf)) for name, row in rows.items()}
+    return rows | {"peak_gain": peak_gain_of(s)}
+
+
+def _interval(draws: Tensor) -> Interval:
+    ordered = draws.sort(-1).values
+    n = ordered.shape[-1]
+    return Interval(*(ordered[..., min(n - 1, int(q * n))] for q in (0.05, 0.5, 0.95)))
+
+
+def _share(verdict: Callable[[Setting], Tensor], blocks: _Blocks) -> Tensor:
+    return blocks.join([s.full(verdict(s)).double().mean(-1) for s in blocks])
+
+
+class _Blocks:
+    """Cuts (setting, draw) into row blocks that fit in memory, and puts per-setting answers back into shape."""
+
+    def __init__(
+        self,
+        T_L: Value,
+        K_L: Value,
+        time_gap: Value,
+        gains: Gains,
+        dead_time: Value,
+        feedforward: Value,
+        feedforward_delay: Value,
+    ) -> None:
+        like = [T_L, K_L, time_gap, gains, dead_time, feedforward, feedforward_delay]
+        names = ("T_L", "K_L", "dead_time")
+        plant = [as_tensor(x, like, n) for x, n in zip((T_L, K_L, dead_time), names, strict=True)]
+        # Known numbers are draws that never vary.
+        plant = [x.reshape(1) if x.ndim == 0 else x for x in plant]
+        law = [as_tensor(x, like, "setting").unsqueeze(-1) for x in (time_gap, feedforward, feedforward_delay)]
+        k = as_tensor(gains, like, "gains")
+        if k.ndim == 0 or k.shape[-1] != 3:
+            raise InputError(f"gains: expected (k_s, k_v, k_a) on the last dimension, found shape {tuple(k.shape)}")
+        self.setting = read_setting(
+            plant[0],
+            plant[1],
+            law[0],
+            k.unsqueeze(-2),
+            dead_time=plant[2],
+            feedforward=law[1],
+            feedforward_delay=law[2],
+        )
+        self.shape = self.setting.shape[:-1]
+        self.draws = self.setting.shape[-1]
+        if self.draws == 0:
+            raise InputError("T_L, K_L: expected at least one draw, found none")
+
+    def __iter__(self) -> Iterator[Setting]:
+        count = self.shape.numel()
+        s = self.setting.map(lambda x: x.detach().expand(*self.shape, x.shape[-1]).reshape(count, x.shape[-1]))
+        rows = max(1, BLOCK // self.draws)
+        for start in range(0, count, rows):
+            yield s.map(lambda x, start=start: x[start : start + rows])
+
+    def join(self, parts: list[Tensor]) -> Tensor:
+        if not parts:
+            return torch.zeros(self.shape, dtype=torch.float64)
+        return torch.cat(parts).reshape(self.shape)

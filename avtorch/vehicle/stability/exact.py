@@ -1,0 +1,94 @@
+"""The exact string condition without dead time, in closed form: B, C and the peak of |G|."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from avtorch.vehicle.stability.setting import Gains, Setting, Value, read_setting
+
+# A loop on the boundary (C = 0 on paper) must not fall off it by rounding: the sums below have some ten roundings.
+ROUNDINGS = 16
+
+
+def string_margins(
+    T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, feedforward: Value = 0.0
+) -> tuple[Tensor, Tensor]:
+    """(B, C) of SPEC section 2: |G|^2 <= 1 at omega iff T^2 omega^4 + B omega^2 + C >= 0.
+
+    B = (1 - K k_a)^2 - 2 T K g [-] is Eq. 3's first line at one point, C / K [1/s^2] its last. With a feed-forward gain
+    (no communication delay) B loses K^2 k_f^2 and C gains 2 K^2 k_s k_f. -inf where the actuation is no vehicle.
+    """
+    s = read_setting(T_L, K_L, time_gap, gains, feedforward=feedforward)
+    B, C = torch.broadcast_tensors(*coefficients(s))
+    low = torch.full_like(B, -torch.inf)
+    return s.full(torch.where(s.valid, B, low)), s.full(torch.where(s.valid, C, low))
+
+
+def string_margin(T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, feedforward: Value = 0.0) -> Tensor:
+    """The least of T^2 x^2 + B x + C over x = omega^2 >= 0: the gain condition holds iff it is >= 0.
+
+    One number for both cases of SPEC section 2: C where B >= 0, else C - B^2 / (4 T^2). No word on local stability.
+    """
+    s = read_setting(T_L, K_L, time_gap, gains, feedforward=feedforward)
+    B, C = coefficients(s)
+    dip = torch.where(B < 0, B, torch.zeros_like(B)) ** 2 / (4 * torch.where(s.T > 0, s.T, torch.ones_like(s.T)) ** 2)
+    endless = (B < 0) & (s.T == 0)
+    least = torch.where(endless, torch.full_like(dip, -torch.inf), C - dip)
+    return s.full(torch.where(s.valid, least, torch.full_like(least, -torch.inf)))
+
+
+def coefficients(s: Setting) -> tuple[Tensor, Tensor]:
+    """(B, C), the dead time and the feed-forward's delay ignored."""
+    B = s.b**2 - 2 * s.T * s.K * s.g - (s.K * s.kf) ** 2
+    C = s.K**2 * (s.g**2 - s.kv**2 + 2 * s.ks * s.kf) - 2 * s.K * s.ks * s.b
+    return B, C
+
+
+def gain_condition(s: Setting) -> Tensor:
+    """|G| <= 1 at every omega, without dead time: C >= 0 and (B >= 0 or B^2 <= 4 T^2 C), to rounding."""
+    B, C = coefficients(s)
+    eps = ROUNDINGS * torch.finfo(C.dtype).eps
+    slack = eps * (
+        s.K**2 * (s.g**2 + s.kv**2 + 2 * (s.ks * s.kf).abs()) + 2 * s.K * s.ks.abs() * (1 + (s.K * s.ka).abs())
+    )
+    B_slack = eps * ((1 + (s.K * s.ka).abs()) ** 2 + 2 * s.T * s.K * s.g.abs() + (s.K * s.kf) ** 2)
+    room = 4 * s.T**2 * (C + slack) + 2 * B.abs() * B_slack - B**2
+    return (C + slack >= 0) & ((B + B_slack >= 0) | (room >= 0))
+
+
+def peak_omega(s: Setting) -> Tensor:
+    """Frequency [rad/s] at which |G| is largest, 0 where |G| nowhere exceeds one; no dead time, no feed-forward.
+
+    With x = omega^2, |G|^2 = N / (N + P), N = K^2 (k_v^2 x + k_s^2), P = T^2 x^3 + B x^2 + C x. P / N is stationary at
+    the roots of a cubic; by the signs of its coefficients the only minimum below zero is its largest root. Newton from
+    a bound above that root falls on it monotonically (the cubic is convex there). Where no such root exists the
+    iteration ends anywhere, harmlessly: |G| there is below one.
+    """
+    B, C = coefficients(s)
+    n0, n1, T2 = s.ks**2, s.kv**2, s.T**2
+    c3, c2, c1, c0 = torch.broadcast_tensors(2 * n1 * T2, 3 * T2 * n0 + B * n1, 2 * B * n0, C * n0)
+    x = _above_roots(c3, c2, c1, c0)
+    for _ in range(24):
+        f, df = ((c3 * x + c2) * x + c1) * x + c0, (3 * c3 * x + 2 * c2) * x + c1
+        x = torch.where(df > 0, x - f / torch.where(df > 0, df, torch.ones_like(df)), x).clamp_min(0)
+    above = (T2 * x + B) * x + C < 0
+    return torch.where(above, x, torch.zeros_like(x)).sqrt()
+
+
+def _above_roots(c3: Tensor, c2: Tensor, c1: Tensor, c0: Tensor) -> Tensor:
+    """A number at or above every positive root, where some leading coefficient is positive.
+
+    Each negative term is outweighed by a third of one positive term of higher degree, the cheapest at hand.
+    """
+    bound = torch.zeros_like(c0)
+    rest = (c0, c1, c2, c3)
+    for low in range(3):
+        cheapest = torch.full_like(c0, torch.inf)
+        for high in range(low + 1, 4):
+            usable = rest[high] > 0
+            ratio = 3 * (-rest[low]).clamp_min(0) / torch.where(usable, rest[high], torch.ones_like(c0))
+            reach = torch.where(usable, ratio ** (1 / (high - low)), torch.full_like(c0, torch.inf))
+            cheapest = torch.minimum(cheapest, reach)
+        bound = torch.maximum(bound, torch.where(rest[low] < 0, cheapest, torch.zeros_like(c0)))
+    return torch.where(torch.isfinite(bound), bound, torch.ones_like(bound))

@@ -1,0 +1,106 @@
+"""Stability over a plane: any two of (k_s, k_v, k_a, tau, T, K), the rest held."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.vehicle.stability.conditions import PointOrBox, local_conditions, string_sufficient
+from avtorch.vehicle.stability.setting import Gains, Value
+from avtorch.vehicle.stability.verdict import local_stable, peak_gain, string_stable
+
+AXES = ("k_s", "k_v", "k_a", "tau", "T", "K")
+Axis = tuple[str, Sequence[float] | Tensor]
+
+
+@dataclass(frozen=True)
+class Region:
+    """Masks over a plane, each (y, x).
+
+    local: locally stable. string: string stable (form "exact"), or what Eq. 3's box form passes. peak_gain: inf where
+    locally unstable; None for the box forms, which are about every vehicle of a box at once.
+    """
+
+    x_name: str
+    x: Tensor
+    y_name: str
+    y: Tensor
+    form: str
+    local: Tensor
+    string: Tensor
+    peak_gain: Tensor | None
+
+    @property
+    def local_share(self) -> float:
+        """Share of the plane's points that is locally stable."""
+        return float(self.local.double().mean())
+
+    @property
+    def string_share(self) -> float:
+        """Share of the plane's points that is string stable."""
+        return float(self.string.double().mean())
+
+
+def region(
+    x: Axis,
+    y: Axis,
+    *,
+    T_L: PointOrBox = 0.3,
+    K_L: PointOrBox = 1.0,
+    time_gap: Value = 1.0,
+    gains: Gains = (1.5, 1.5, -0.8),
+    dead_time: float = 0.0,
+    form: Literal["exact", "print", "rigorous"] = "exact",
+) -> Region:
+    """Stability over the plane of two axes, each (name, values) with a name out of k_s, k_v, k_a, tau, T, K.
+
+    What no axis names keeps the value given. form="exact" judges points, with any dead_time [s]; "print" and
+    "rigorous" judge boxes by Eqs. 2 and 3 (`local_conditions`, `string_sufficient`), where T_L and K_L may be
+    (lower, upper) tuples and no dead time is known: the paper's stability figures are of this kind.
+
+    Raises InputError for unknown or equal axes, an axis that is not one-dimensional and finite, a tuple on an axis or
+    with form="exact", and a dead time with a box form.
+    """
+    if form not in ("exact", "print", "rigorous"):
+        raise InputError(f"form: expected 'exact', 'print' or 'rigorous', found {form!r}")
+    x_values, y_values = _axis(x, "x"), _axis(y, "y")
+    if x[0] == y[0]:
+        raise InputError(f"x, y: expected two different axes, found {x[0]!r} twice")
+    held = torch.as_tensor(gains, dtype=torch.float64)
+    if held.shape != (3,):
+        raise InputError(f"gains: expected three numbers (k_s, k_v, k_a), found shape {tuple(held.shape)}")
+    values: dict[str, PointOrBox] = {"k_s": held[0], "k_v": held[1], "k_a": held[2], "tau": time_gap}
+    values |= {"T": T_L, "K": K_L, x[0]: x_values[None, :], y[0]: y_values[:, None]}
+    T, K, tau = values["T"], values["K"], values["tau"]
+    # One gain tensor over the whole plane is cheap and spares the callee any thought of axes.
+    plane = torch.zeros(y_values.numel(), x_values.numel(), dtype=torch.float64)
+    k = torch.stack([plane + values[name] for name in ("k_s", "k_v", "k_a")], -1)
+    if isinstance(tau, tuple):
+        raise InputError("time_gap: expected one number [s], found a tuple")
+    if form == "exact":
+        if isinstance(T, tuple) or isinstance(K, tuple):
+            raise InputError("form: bounds on T_L or K_L need form='print' or form='rigorous'")
+        local = local_stable(T, K, tau, k, dead_time=dead_time)
+        string = string_stable(T, K, tau, k, dead_time=dead_time)
+        peak = peak_gain(T, K, tau, k, dead_time=dead_time)
+    else:
+        if dead_time:
+            raise InputError(f"dead_time: Eqs. 2 and 3 know none, found {dead_time:g} s; use form='exact'")
+        local = local_conditions(T, K, tau, k, form=form).holds
+        string, peak = string_sufficient(T, K, tau, k, form=form), None
+    return Region(x[0], x_values, y[0], y_values, form, local, string, peak)
+
+
+def _axis(axis: Axis, which: str) -> Tensor:
+    name, values = axis
+    if name not in AXES:
+        raise InputError(f"{which}: expected one of {', '.join(AXES)}, found {name!r}")
+    points = torch.as_tensor(values, dtype=torch.float64)
+    if points.ndim != 1 or points.numel() == 0 or not bool(torch.isfinite(points).all()):
+        raise InputError(f"{which}: expected a list of finite values of {name}, found shape {tuple(points.shape)}")
+    return points

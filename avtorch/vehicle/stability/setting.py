@@ -1,0 +1,135 @@
+"""One setting of the loop: actuation, time gap, gains and dead time, brought to one dtype and ready to broadcast."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+
+Value = float | Tensor
+Gains = Sequence[float] | Tensor
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A loop around `A (T s + 1) = K exp(-theta s) u`, every field a tensor that broadcasts with the others.
+
+    `valid` is False where the actuation is no vehicle: T_L < 0, K_L <= 0 or anything not finite. Such entries come from
+    a lower level whose inverted model makes the loop unstable (effective T_L infinite or negative, SPEC section 1) and
+    carry harmless stand-in numbers so that nothing turns into NaN, and every verdict on them is "unstable".
+    T_L = 0, the paper's ideal actuator, is valid and means the limit from above.
+    """
+
+    T: Tensor
+    K: Tensor
+    tau: Tensor
+    ks: Tensor
+    kv: Tensor
+    ka: Tensor
+    theta: Tensor
+    kf: Tensor
+    theta_f: Tensor
+    valid: Tensor
+
+    @property
+    def g(self) -> Tensor:
+        """Total speed gain g = k_s tau + k_v [1/s] (SPEC section 2)."""
+        return self.ks * self.tau + self.kv
+
+    @property
+    def b(self) -> Tensor:
+        """Coefficient of s^2 without dead time, 1 - K k_a [-]."""
+        return 1 - self.K * self.ka
+
+    @property
+    def shape(self) -> torch.Size:
+        return torch.broadcast_shapes(*(getattr(self, f.name).shape for f in fields(self)))
+
+    def full(self, x: Tensor) -> Tensor:
+        """`x` broadcast to the shape of the whole setting."""
+        return x.expand(self.shape)
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Setting:
+        """The setting with `change` done to every field."""
+        return Setting(*(change(getattr(self, f.name)) for f in fields(self)))
+
+    def pick(self, mask: Tensor) -> Setting:
+        """The entries where `mask` (of the full shape) holds, as a flat (setting,) batch."""
+        mask = mask.reshape(1) if mask.ndim == 0 else mask
+        return self.map(lambda x: x.expand(mask.shape)[mask])
+
+    def column(self) -> Setting:
+        """The same batch with a trailing axis for frequencies."""
+        return self.map(lambda x: x.unsqueeze(-1))
+
+
+def as_tensor(x: Value | Gains, like: Sequence[Value | Gains], name: str) -> Tensor:
+    """`x` as a floating tensor: the dtype and device of the floating tensors in `like`, else float64 (ints too)."""
+    given = [t for t in like if isinstance(t, Tensor)]
+    floating = [t.dtype for t in given if t.is_floating_point()]
+    dtype = floating[0] if floating else torch.float64
+    for other in floating[1:]:
+        dtype = torch.promote_types(dtype, other)
+    try:
+        return torch.as_tensor(x, dtype=dtype, device=given[0].device if given else None)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"{name}: expected a number or a tensor of numbers, found {type(x).__name__}") from error
+
+
+def read_setting(
+    T_L: Value,
+    K_L: Value,
+    time_gap: Value,
+    gains: Gains,
+    *,
+    dead_time: Value = 0.0,
+    feedforward: Value = 0.0,
+    feedforward_delay: Value = 0.0,
+) -> Setting:
+    """Check and gather the arguments that every stability function takes.
+
+    T_L [s], K_L [-], time_gap [s], dead_time [s], feedforward k_f [-] and its delay [s] broadcast with each other and
+    with the leading dimensions of gains (..., 3) = (k_s [1/s^2], k_v [1/s], k_a [-]).
+
+    Raises InputError for gains without a last dimension of 3, shapes that do not broadcast, and a dead time or delay
+    that is negative or not finite.
+    """
+    given = {
+        "T_L": T_L,
+        "K_L": K_L,
+        "time_gap": time_gap,
+        "gains": gains,
+        "dead_time": dead_time,
+        "feedforward": feedforward,
+        "feedforward_delay": feedforward_delay,
+    }
+    like = list(given.values())
+    T, K, tau, k, theta, kf, theta_f = (as_tensor(x, like, name) for name, x in given.items())
+    if k.ndim == 0 or k.shape[-1] != 3:
+        raise InputError(f"gains: expected (k_s, k_v, k_a) on the last dimension, found shape {tuple(k.shape)}")
+    for name, delay in (("dead_time", theta), ("feedforward_delay", theta_f)):
+        if not bool((torch.isfinite(delay) & (delay >= 0)).all()):
+            raise InputError(f"{name}: expected finite seconds >= 0, found {_first_bad(delay)}")
+    try:
+        torch.broadcast_shapes(T.shape, K.shape, tau.shape, k.shape[:-1], theta.shape, kf.shape, theta_f.shape)
+    except RuntimeError as error:
+        found = zip(given, (T, K, tau, k, theta, kf, theta_f), strict=True)
+        shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in found)
+        raise InputError(f"shapes do not broadcast (gains without its last dimension): {shapes}") from error
+    ks, kv, ka = k.unbind(-1)
+    actuator = torch.isfinite(T) & torch.isfinite(K) & (T >= 0) & (K > 0)
+    law = torch.isfinite(tau) & torch.isfinite(k).all(-1) & torch.isfinite(kf)
+    one = torch.ones((), dtype=T.dtype, device=T.device)
+    # Stand-ins by torch.where, on each side alone, keep values and gradients finite and the shapes small.
+    T, K = (torch.where(actuator, x, one) for x in (T, K))
+    tau, ks, kv, ka, kf = (torch.where(torch.isfinite(x), x, one) for x in (tau, ks, kv, ka, kf))
+    return Setting(T, K, tau, ks, kv, ka, theta, kf, theta_f, actuator & law)
+
+
+def _first_bad(delay: Tensor) -> float:
+    flat = delay.reshape(-1)
+    return float(flat[~(torch.isfinite(flat) & (flat >= 0))][0])

@@ -1,0 +1,93 @@
+"""The transfer function from the leader's speed to the follower's, and how far it stays below one."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from avtorch.vehicle.stability.setting import Gains, Setting, Value, as_tensor, read_setting
+
+
+def transfer_function(
+    omega: Value,
+    T_L: Value,
+    K_L: Value,
+    time_gap: Value,
+    gains: Gains,
+    *,
+    dead_time: Value = 0.0,
+    feedforward: Value = 0.0,
+    feedforward_delay: Value = 0.0,
+) -> Tensor:
+    """G(j omega) = V / V_lead, complex, of the shape that omega [rad/s] and the setting broadcast to (SPEC section 2).
+
+    With E = exp(-j omega theta): G = K E (k_f s^2 E_f + k_v s + k_s) / (T s^3 + s^2 + K E (-k_a s^2 + g s + k_s)).
+    Formal where the loop is locally unstable; 0 where the actuation is no vehicle (T_L < 0, K_L <= 0, not finite).
+    """
+    w = as_tensor(omega, [omega, T_L, K_L, time_gap, gains], "omega")
+    s = read_setting(
+        T_L, K_L, time_gap, gains, dead_time=dead_time, feedforward=feedforward, feedforward_delay=feedforward_delay
+    )
+    (nr, ni), (fr, fi) = _numerator(s, w), _denominator(s, w)
+    # The common factor exp(-j omega theta) of the numerator is left out of |G| but belongs to G.
+    turn = torch.exp(torch.complex(torch.zeros_like(w * s.theta), -w * s.theta))
+    response = turn * torch.complex(*torch.broadcast_tensors(nr, ni)) / torch.complex(*torch.broadcast_tensors(fr, fi))
+    return torch.where(s.valid, response, torch.zeros_like(response))
+
+
+def gain(
+    omega: Value,
+    T_L: Value,
+    K_L: Value,
+    time_gap: Value,
+    gains: Gains,
+    *,
+    dead_time: Value = 0.0,
+    feedforward: Value = 0.0,
+    feedforward_delay: Value = 0.0,
+) -> Tensor:
+    """|G(j omega)| [-], as `transfer_function`."""
+    w = as_tensor(omega, [omega, T_L, K_L, time_gap, gains], "omega")
+    s = read_setting(
+        T_L, K_L, time_gap, gains, dead_time=dead_time, feedforward=feedforward, feedforward_delay=feedforward_delay
+    )
+    size = magnitude(s, w)
+    return torch.where(s.valid, size, torch.zeros_like(size))
+
+
+def magnitude(s: Setting, omega: Tensor) -> Tensor:
+    """|G(j omega)| of a setting."""
+    return torch.hypot(*_numerator(s, omega)) / torch.hypot(*_denominator(s, omega))
+
+
+def excess(s: Setting, omega: Tensor) -> tuple[Tensor, Tensor]:
+    """(h, N) with |G|^2 = N / (N + omega^2 h): the gain is at most one exactly where h >= 0.
+
+    Without dead time and feed-forward h = T^2 omega^4 + B omega^2 + C. Dividing by omega^2 on paper, not in the
+    machine, keeps the sign of h right down to omega = 0, where |G| itself rounds to one.
+    """
+    x = omega * omega
+    c, d = torch.cos(omega * s.theta), torch.sin(omega * s.theta)
+    spring = s.ks + s.ka * x
+    real = -spring - s.T * s.g * x
+    imag = omega * (s.T * spring - s.g)
+    h = x * (1 + s.T**2 * x) + s.K**2 * (2 * s.ks * s.ka + s.ka**2 * x + s.g**2 - s.kv**2)
+    h = h + 2 * s.K * (real * c + imag * d)
+    # The leader's fed-forward acceleration adds to the numerator only.
+    lead = s.ks * torch.cos(omega * s.theta_f) - s.kv * omega * torch.sin(omega * s.theta_f)
+    h = h - s.K**2 * s.kf * (s.kf * x - 2 * lead)
+    n = s.K**2 * (s.ks**2 + s.kv**2 * x + s.kf * x * (s.kf * x - 2 * lead))
+    return h, n
+
+
+def _numerator(s: Setting, w: Tensor) -> tuple[Tensor, Tensor]:
+    x = w * w
+    angle = w * s.theta_f
+    return s.K * (s.ks - s.kf * x * torch.cos(angle)), s.K * (s.kv * w + s.kf * x * torch.sin(angle))
+
+
+def _denominator(s: Setting, w: Tensor) -> tuple[Tensor, Tensor]:
+    x = w * w
+    c, d = torch.cos(w * s.theta), torch.sin(w * s.theta)
+    qr, qi = s.ks + s.ka * x, s.g * w
+    return s.K * (qr * c + qi * d) - x, s.K * (qi * c - qr * d) - s.T * w * x
