@@ -1,0 +1,99 @@
+"""From a drive log to a belief about an automated vehicle's actuation, and from the belief to an action.
+
+The public face. Names are loaded when first used, so that `import avtorch` and the command line's help cost nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from avtorch import decision, inference, io, plots, vehicle
+    from avtorch.decision import Monitor, Setting, Strategist, algorithm2
+    from avtorch.decision.estimation import Estimates, estimate
+    from avtorch.errors import InputError
+    from avtorch.inference import SGLD, BeliefStream, SequentialInference
+    from avtorch.io import Log
+    from avtorch.vehicle import (
+        GLVD,
+        MPC,
+        ClosedLoop,
+        GLVDPlant,
+        Leader,
+        LinearController,
+        LowerLevel,
+        performance,
+        simulate,
+        stability,
+    )
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "avtorch": ("decision", "inference", "io", "plots", "vehicle"),
+    "avtorch.decision": ("Monitor", "Setting", "Strategist", "algorithm2"),
+    "avtorch.decision.estimation": ("Estimates", "estimate"),
+    "avtorch.errors": ("InputError",),
+    "avtorch.inference": ("SGLD", "BeliefStream", "SequentialInference"),
+    "avtorch.io": ("Log",),
+    "avtorch.vehicle": (
+        "GLVD",
+        "MPC",
+        "ClosedLoop",
+        "GLVDPlant",
+        "Leader",
+        "LinearController",
+        "LowerLevel",
+        "performance",
+        "simulate",
+        "stability",
+    ),
+}
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+
+__all__ = [
+    "GLVD",
+    "MPC",
+    "SGLD",
+    "BeliefStream",
+    "ClosedLoop",
+    "Estimates",
+    "GLVDPlant",
+    "InputError",
+    "Leader",
+    "LinearController",
+    "Log",
+    "LowerLevel",
+    "Monitor",
+    "SequentialInference",
+    "Setting",
+    "Strategist",
+    "algorithm2",
+    "decision",
+    "estimate",
+    "inference",
+    "io",
+    "performance",
+    "plots",
+    "simulate",
+    "stability",
+    "vehicle",
+]
+
+
+def __getattr__(name: str) -> Any:
+    home = _MODULE_OF.get(name)
+    if home is None:
+        raise AttributeError(f"module 'avtorch' has no attribute {name!r}")
+    module = import_module(f"avtorch.{name}" if home == "avtorch" else home)
+    if home == "avtorch":
+        return module
+    # a submodule such as stability is an attribute of its package only once imported
+    value = import_module(f"{home}.{name}") if name == "stability" else getattr(module, name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

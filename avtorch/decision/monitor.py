@@ -25,7 +25,7 @@ from torch import Tensor
 from avtorch.decision.algorithm2 import ACCEPTED_CHANGE
 from avtorch.decision.charts import CHARTS, Chart
 from avtorch.decision.divergence import DIVERGENCES, Gaussian, divergence, divergence_p_value, innovation
-from avtorch.decision.settings import Setting, p_stable
+from avtorch.decision.settings import Setting
 from avtorch.errors import InputError
 
 DETECTORS = ("stability", "accepted_change", *DIVERGENCES, *CHARTS)
@@ -156,8 +156,8 @@ class Monitor:
         T_L, K_L = T_L.to(torch.float64), K_L.to(torch.float64)
         mean = (T_L.mean(dim=-1), K_L.mean(dim=-1))
         window = Gaussian.of_draws(T_L, K_L, inflation=self.inflation)
-        p_string = p_stable(setting.string_stable(T_L, K_L, dead_time=self.dead_time))
-        p_local = p_stable(setting.local_stable(T_L, K_L, dead_time=self.dead_time))
+        p_string = setting.p_string_stable(T_L, K_L, dead_time=self.dead_time)
+        p_local = setting.p_locally_stable(T_L, K_L, dead_time=self.dead_time)
 
         alerts: dict[str, Tensor] = {}
         statistics: dict[str, Tensor] = {}
@@ -241,7 +241,7 @@ class Monitor:
         """(alarm, probability of being outside) (scenario,): for T_L or K_L, whichever of those outside is surer."""
         sure = torch.zeros_like(mean[0])
         for draws, centre, accepted, width in zip((T_L, K_L), mean, self.accepted, self.change, strict=True):
-            outside = p_stable((draws - accepted.unsqueeze(-1)).abs() > width)
+            outside = ((draws - accepted.unsqueeze(-1)).abs() > width).to(draws.dtype).mean(dim=-1)
             sure = torch.maximum(sure, torch.where((centre - accepted).abs() > width, outside, 0.0))
         return sure >= self.certainty, sure
 

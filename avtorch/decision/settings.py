@@ -97,6 +97,10 @@ class Setting:
         """Some of the scenarios, by index tensor, mask or slice."""
         return Setting(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
+    def transposed(self) -> Setting:
+        """(scenario, candidate) as (candidate, scenario), the way the closed loop takes it."""
+        return Setting(**{f.name: getattr(self, f.name).transpose(0, 1) for f in fields(self)})
+
     def lower_level(self, *, accel_min: Number = -6.0, accel_max: Number = 4.0) -> LowerLevel:
         """The lower level of this setting in a vehicle with the given limits [m/s²]."""
         return LowerLevel(self.T_hat, self.K_hat, self.T_d, self.K_d, accel_min, accel_max)
@@ -119,31 +123,36 @@ class Setting:
         """(T_e, K_e) the unclipped loop behaves as with draws of the plant (scenario, draw) (SPEC section 1)."""
         return self._over_draws().lower_level().effective(T_L, K_L)
 
-    def string_stable(self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0) -> Tensor:
-        """Exact verdicts (scenario, draw) at draws of the plant (scenario, draw), through (T_e, K_e)."""
-        T_e, K_e = self.effective(T_L, K_L)
-        theta = dead_time.unsqueeze(-1) if isinstance(dead_time, Tensor) and dead_time.ndim else dead_time
-        return stability.string_stable(T_e, K_e, self.time_gap.unsqueeze(-1), self.gains.unsqueeze(-2), dead_time=theta)
+    def p_string_stable(self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0) -> Tensor:
+        """P(string stable) (scenario,) under draws of the plant (scenario, draw), exact and through (T_e, K_e).
 
-    def local_stable(self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0) -> Tensor:
-        """As `string_stable`, whether disturbances die out at all."""
+        Fields (scenario, candidate) go with draws (scenario, 1, draw). `dead_time` [s] is a number or of the shape of
+        the fields.
+        """
         T_e, K_e = self.effective(T_L, K_L)
-        theta = dead_time.unsqueeze(-1) if isinstance(dead_time, Tensor) and dead_time.ndim else dead_time
-        return stability.local_stable(T_e, K_e, self.time_gap.unsqueeze(-1), self.gains.unsqueeze(-2), dead_time=theta)
+        return stability.p_string_stable(T_e, K_e, self.time_gap, self.gains, dead_time=_per_draw(dead_time))
+
+    def p_locally_stable(self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0) -> Tensor:
+        """As `p_string_stable`, of disturbances dying out at all."""
+        T_e, K_e = self.effective(T_L, K_L)
+        return stability.p_locally_stable(T_e, K_e, self.time_gap, self.gains, dead_time=_per_draw(dead_time))
 
     def peak_gain(self, T_L: Number, K_L: Number, *, dead_time: Number = 0.0) -> Tensor:
         """Peak gain (scenario,) at one plant for each scenario, through (T_e, K_e): the judge of a choice, at the truth."""
         T_e, K_e = self.lower_level().effective(T_L, K_L)
         return stability.peak_gain(T_e, K_e, self.time_gap, self.gains, dead_time=dead_time)
 
+    def lower_differs(self, other: Setting) -> Tensor:
+        """Whether the lower levels send different commands; shapes broadcast. A renamed model is no difference."""
+        here, there = self.lower_level(), other.lower_level()
+        one, none = torch.ones((), dtype=torch.float64), torch.zeros((), dtype=torch.float64)
+        return _differs(here.raw_command(one, none), there.raw_command(one, none)) | _differs(
+            here.raw_command(none, one), there.raw_command(none, one)
+        )
+
     def strategies(self, default: Setting) -> list[set[int]]:
         """Which strategies lead from `default` here, one set out of {1, 2, 3} per scenario (of a flat batch)."""
-        # The lower level acts through these two numbers only; a renamed model that sends the same commands is no change.
-        here, there = self.lower_level(), default.lower_level()
-        a, u = torch.ones((), dtype=torch.float64), torch.zeros((), dtype=torch.float64)
-        lower = _differs(here.raw_command(a, u), there.raw_command(a, u)) | _differs(
-            here.amplification(), there.amplification()
-        )
+        lower = self.lower_differs(default)
         gap = _differs(self.time_gap, default.time_gap)
         gains = _differs(self.gains, default.gains).any(dim=-1)
         flags = torch.stack(torch.broadcast_tensors(lower, gap, gains), dim=-1).expand(*self.shape, 3)
@@ -197,9 +206,8 @@ class DesignBounds:
         return DesignBounds(pair(T_L), pair(K_L))
 
 
-def p_stable(verdicts: Tensor) -> Tensor:
-    """Share of draws (scenario, draw) that are stable, (scenario,)."""
-    return verdicts.to(torch.float64).mean(dim=-1)
+def _per_draw(number: Number) -> Number:
+    return number.unsqueeze(-1) if isinstance(number, Tensor) and number.ndim else number
 
 
 def _differs(a: Tensor, b: Tensor) -> Tensor:

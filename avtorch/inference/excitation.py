@@ -31,7 +31,10 @@ class ExcitationRule:
     share: float = 0.5
 
     def predicted_sd(self, statistics: JerkStatistics) -> tuple[Tensor, Tensor]:
-        """Predicted SDs of ``T_L`` [s] and ``K_L`` [-] at the reference vehicle, each ``(window,)``; infinite for no excitation."""
+        """Predicted SDs of ``T_L`` [s] and ``K_L`` [-] at the reference vehicle, each ``(window,)``.
+
+        Infinite where ``a`` and ``u`` are constant zero or collinear.
+        """
         s = statistics
         _, _, noise = s.least_squares()
         determinant = s.aa * s.uu - s.au.square()

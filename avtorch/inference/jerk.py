@@ -94,7 +94,7 @@ class JerkDensity:
         return self.statistics.n.shape[0]
 
     def log_likelihood(self, z: Tensor) -> Tensor:
-        """Eq. 4 from the sums; ``z = log(T_L, K_L, sigma)`` with shape ``(..., window, 3)``, returns ``(..., window)``."""
+        """Eq. 4 from the sums; ``z = log(T_L, K_L, sigma)``, ``(..., window, 3)``; returns ``(..., window)``."""
         scaled = self._scaled_coefficients(z)
         half_chi2 = (torch.einsum("wij,...wj->...wi", self._half_form, scaled) * scaled).sum(-1)
         return -half_chi2 - self.statistics.n * (z[..., 2] + 0.5 * _LOG_2PI)

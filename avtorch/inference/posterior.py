@@ -15,7 +15,7 @@ class Posterior:
     Attributes:
         names: parameter names, in the order of the last dimension.
         draws: shape ``(chain, draw, window, parameter)``, in the parameters' own units.
-        converged: ``(window,)`` bool; false where the chains left the posterior or disagree. Such draws are not to be used.
+        converged: ``(window,)`` bool; false where the chains left the posterior or disagree: draws not to be used.
     """
 
     names: tuple[str, ...]
@@ -63,9 +63,9 @@ def sorted_quantile(ordered: Tensor, q: float) -> Tensor:
 def nested_rhat(draws: Tensor, groups: int = 8) -> Tensor:
     """Split nested R-hat (Margossian et al. 2024) over ``(chain, draw, ...)``; returns the remaining shape.
 
-    Many short chains are joined into ``groups`` superchains, cut into halves: chains of a few autocorrelation times each
-    would look apart to the plain R-hat even at stationarity. A common drift shows between the halves, a chain that went
-    elsewhere shows between the groups.
+    Many short chains are joined into ``groups`` superchains, cut into halves: chains of a few autocorrelation times
+    each would look apart to the plain R-hat even at stationarity. A common drift shows between the halves, a chain that
+    went elsewhere shows between the groups.
     """
     chains, count = draws.shape[:2]
     groups = max(1, min(groups, chains))

@@ -1,6 +1,7 @@
 """Priors, stated on the positive parameters and evaluated in ``z = log(parameter)`` with the Jacobian counted.
 
-Defaults (SPEC, section 3): ``T_L ~ LogNormal(log 0.3, 0.7)``, ``K_L ~ LogNormal(log 1, 0.3)``, ``sigma ~ HalfNormal(1 m/s^3)``.
+Defaults (SPEC, section 3): ``T_L ~ LogNormal(log 0.3, 0.7)``, ``K_L ~ LogNormal(log 1, 0.3)``,
+``sigma ~ HalfNormal(1 m/s^3)``.
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ class HalfNormalPrior:
 
 @dataclass(frozen=True)
 class QuadrantNormal:
-    """Normal with variance ``variance`` around ``mean``, cut to the positive quadrant: the paper's ``N([K, T], lambda I)``.
+    """Normal of ``variance`` around ``mean``, cut to the positive quadrant: the paper's ``N([K, T], lambda I)``.
 
     The print (Sec. 3.2.3) does not say what happens to the mass below zero; it is cut off and the rest renormalised.
 

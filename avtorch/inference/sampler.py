@@ -1,4 +1,4 @@
-"""Algorithm 1 of the paper: walk with SGLD, drop the burn-in, collect the rest; many chains and windows in one tensor."""
+"""Algorithm 1 of the paper: walk with SGLD, drop the burn-in, collect the rest; chains and windows in one tensor."""
 
 from __future__ import annotations
 
@@ -92,8 +92,9 @@ def sample(
 
 
 def stiffness(density: Density, mode: Mode, radius: float = 3.0) -> Tensor:
-    """How much steeper than its Laplace approximation the whitened potential gets ``radius`` SDs out, ``(window,)``, at least 1.
+    """How much steeper than its Laplace approximation the whitened potential gets ``radius`` SDs out.
 
+    Shape ``(window,)``, at least 1.
     A skewed posterior (a weak window) has a steep side on which the step that suits the mode overshoots; dividing the
     window's step by this keeps ``step x curvature`` what it is at the mode of a Gaussian.
     """
@@ -109,9 +110,10 @@ def stiffness(density: Density, mode: Mode, radius: float = 3.0) -> Tensor:
 def walk(
     density: Density, mode: Mode, settings: SamplerSettings, *, generator: torch.Generator | None = None
 ) -> Tensor:
-    """One run of Algorithm 1 in the whitened coordinates ``z = mode + scale w``; draws of ``z``, ``(chain, draw, window, d)``.
+    """One run of Algorithm 1 in the whitened coordinates ``z = mode + scale w``.
 
-    A step ``h`` in ``w`` is a step 1 in ``w/sqrt(h)``, so each window's own step is folded into its scale.
+    Returns draws of ``z``, ``(chain, draw, window, d)``. A step ``h`` in ``w`` is a step 1 in ``w/sqrt(h)``, so each
+    window's own step is folded into its scale.
     """
     scale = mode.scale / stiffness(density, mode).sqrt()[:, None, None]
     shape = (settings.chains, *mode.z.shape)

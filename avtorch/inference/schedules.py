@@ -18,7 +18,7 @@ def harmonic(optimizer: Optimizer) -> LambdaLR:
 
 
 def polynomial(optimizer: Optimizer, *, b: float = 100.0, gamma: float = 1 / 3) -> LambdaLR:
-    """Welling and Teh's ``eta_k = a (b + k)^-gamma``, written as ``lr (1 + k/b)^-gamma`` so that it starts at ``lr = a b^-gamma``.
+    """Welling and Teh's ``eta_k = a (b + k)^-gamma``, as ``lr (1 + k/b)^-gamma``: it starts at ``lr = a b^-gamma``.
 
     Raises:
         InputError: for ``b <= 0`` or ``gamma`` outside ``(0, 1]``.

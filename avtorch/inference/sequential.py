@@ -35,7 +35,8 @@ class Belief:
         mean, sd, q05, q95: shape ``(vehicle, parameter)``.
         draws: ``(draw, vehicle, parameter)``.
         excited: ``(vehicle,)`` bool; where false the window was not used and the rest is carried over unchanged.
-        converged: ``(vehicle,)`` bool; false where the window was excited but its chains did not settle: carried over, too.
+        converged: ``(vehicle,)`` bool; false where the window was excited but its chains did not settle: carried over,
+            too.
     """
 
     names: tuple[str, ...]
@@ -171,10 +172,10 @@ class SequentialInference:
         Raises:
             InputError: if it was saved by a loop of another mode or other parameters.
         """
-        if state["mode"] != self.mode or tuple(state["names"]) != self.belief.names:
-            raise InputError(
-                f"state: saved with mode {state['mode']!r} over {state['names']}, not {self.mode!r} over {list(self.belief.names)}"
-            )
+        saved = (state["mode"], tuple(state["names"]), len(state["mean"]))
+        own = (self.mode, self.belief.names, len(self.belief.mean))
+        if saved != own:
+            raise InputError(f"state: (mode, names, vehicles) were {saved} when it was saved, here they are {own}")
         keys = ("mean", "sd", "q05", "q95", "draws", "excited", "converged")
         self.belief = Belief(self.belief.names, **{key: state[key].clone() for key in keys})
         self._started, self._mean_z, self._cov_z = (state[key].clone() for key in ("started", "mean_z", "cov_z"))

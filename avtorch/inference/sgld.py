@@ -24,8 +24,8 @@ class SGLD(Optimizer):
     ``U`` is the potential: the negative log density **on the scale of the whole window**. A closure that works on a
     minibatch returns ``-log p(theta) - (N/n) sum_batch log p(D_i | theta)``; a mean over points would shrink the drift
     but not the noise. (The print of the paper, its Eq. for SGLD, misplaces ``N/n``, loses the sign and applies the step
-    twice; this is the law of Welling and Teh.) With ``temperature=0`` no noise is drawn and the step is that of SGD with
-    ``lr = h/2``. On a Gaussian of precision ``p`` with gradient-noise variance ``s2`` the stationary variance is
+    twice; this is the law of Welling and Teh.) With ``temperature=0`` no noise is drawn and the step is that of SGD
+    with ``lr = h/2``. On a Gaussian of precision ``p`` with gradient-noise variance ``s2`` the stationary variance is
     ``(1 + h s2/4) / (p (1 - h p/4))``.
 
     Chains and windows are leading dimensions of the parameters: one step moves all of them, and ``U`` may then be a
@@ -85,6 +85,9 @@ class SGLD(Optimizer):
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         _check({**self.defaults, **param_group})
         super().add_param_group(param_group)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "generator": self.generator}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
@@ -165,9 +168,9 @@ class SGLD(Optimizer):
                 if noises is not None:
                     noises[i] = noises[i] * scale.sqrt()
         if group["foreach"]:
-            torch._foreach_add_(params, drifts, alpha=-0.5 * h * sign)
+            torch._foreach_add_(params, drifts, alpha=-0.5 * h * sign)  # pyright: ignore[reportPrivateImportUsage]
             if noises is not None:
-                torch._foreach_add_(params, noises, alpha=amplitude)
+                torch._foreach_add_(params, noises, alpha=amplitude)  # pyright: ignore[reportPrivateImportUsage]
             return
         for i, p in enumerate(params):
             p.add_(drifts[i], alpha=-0.5 * h * sign)
@@ -187,7 +190,10 @@ class SGLD(Optimizer):
     def _precondition(
         self, p: Tensor, gradient: Tensor, curvature: Tensor, group: dict[str, Any]
     ) -> tuple[Tensor, Tensor]:
-        """``G`` and ``Gamma = dG/dtheta`` (Li et al. 2016): ``dV/dtheta = 2 (1 - alpha) g H_ii``, ``dG/dV = -G^2/(2 sqrt V)``."""
+        """``G`` and ``Gamma = dG/dtheta`` (Li et al. 2016).
+
+        ``dV/dtheta = 2 (1 - alpha) g H_ii`` and ``dG/dV = -G^2/(2 sqrt V)``.
+        """
         alpha = group["alpha"]
         state = self.state[p]
         mean_square = state.get("mean_square")
@@ -198,12 +204,16 @@ class SGLD(Optimizer):
         state["mean_square"] = mean_square
         root = mean_square.sqrt()
         scale = 1 / (group["eps"] + root)
-        gamma = -scale.square() / root.clamp_min(group["eps"]) * (1 - alpha) * gradient * curvature
+        # |gradient| sqrt(1 - alpha) <= root, so the quotient is bounded and needs no floor but against 0/0
+        quotient = gradient / root.clamp_min(torch.finfo(root.dtype).tiny)
+        gamma = -scale.square() * (1 - alpha) * quotient * curvature
         return scale, gamma
 
 
 def _hessian_diagonal(p: Tensor, gradient: Tensor, chain_dims: int) -> Tensor:
     """Diagonal of the Hessian, one derivative per entry behind the ``chain_dims`` independent leading dimensions."""
+    if not gradient.requires_grad:  # U is linear
+        return torch.zeros_like(p)
     flat = gradient.flatten(chain_dims) if p.dim() > chain_dims else gradient.unsqueeze(-1)
     columns = []
     for i in range(flat.shape[-1]):

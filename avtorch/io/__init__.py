@@ -5,7 +5,8 @@ from avtorch.io.atomic import atomic
 from avtorch.io.log import STANDSTILL_MPS, Log
 from avtorch.io.merge import held
 from avtorch.io.quality import Gap, Quality, check
-from avtorch.io.recordings import RawLeader, read_leader
+from avtorch.io.raw_leader import RawLeader
+from avtorch.io.recordings import read_leader
 
 __all__ = [
     "STANDSTILL_MPS",

@@ -30,8 +30,8 @@ def atomic(path: str | os.PathLike[str], *, binary: bool = False) -> Iterator[IO
         raise InputError(f"{target}: cannot be written ({fault.strerror or fault})") from None
     try:
         # newline="" keeps line ends as given, so that a log has the same bytes on every system
-        text = {} if binary else {"encoding": "utf-8", "newline": ""}
-        with os.fdopen(handle, "wb" if binary else "w", **text) as stream:
+        opened = os.fdopen(handle, "wb") if binary else os.fdopen(handle, "w", encoding="utf-8", newline="")
+        with opened as stream:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())

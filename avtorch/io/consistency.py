@@ -13,8 +13,8 @@ MIN_SPANS = 8
 
 
 class Scale(NamedTuple):
-    """``slope`` [-]: change of the first signal per integral of the second; ``correlation`` of the two; ``change``: standard
-    deviation of the first one's changes over SPAN_S, in its unit."""
+    """``slope`` [-]: change of the first signal per integral of the second; ``correlation`` of the two; ``change``:
+    standard deviation of the first one's changes over SPAN_S, in its unit."""
 
     slope: float
     correlation: float

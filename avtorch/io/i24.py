@@ -1,19 +1,22 @@
-"""The instrumented car on I-24 (DOI 10.5281/zenodo.6366761): speed in km/h, and no leader where the space gap is 252 m."""
+"""The instrumented car on I-24 (DOI 10.5281/zenodo.6366761): speed in km/h, no leader where the gap is 252 m."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from avtorch.io.consistency import scale_between
-from avtorch.io.recordings import RawLeader, checked
+from avtorch.io.raw_leader import RawLeader, checked
 from avtorch.io.tables import Table
 
 NO_LEADER_M = 252.0
 
 
 def read(table: Table) -> RawLeader:
-    """The instrumented car itself, as a leader for others. Its ``Acceleration`` is handed on as recorded; where it differs
-    in scale from the derivative of the speed, the note says by how much."""
+    """The instrumented car itself, as a leader for others.
+
+    Its ``Acceleration`` is handed on as recorded; where it differs in scale from the derivative of the speed, the note
+    says by how much.
+    """
     columns = {"time": "Time", "speed": "Velocity"}
     time, speed = table.numbers("Time"), table.numbers("Velocity", empty_is_nan=True) / 3.6
     accel = spacing = None

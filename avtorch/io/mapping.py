@@ -31,8 +31,7 @@ class Elsewhere:
 
 @dataclass(frozen=True)
 class SignalMap:
-    """Where each signal of a log is found. ``column``, ``unit`` and ``stamp`` are keyed by signal; ``origin`` says who
-    spoke, for the messages."""
+    """Where each signal of a log is found; every dict is keyed by signal."""
 
     column: dict[str, str] = field(default_factory=dict)
     unit: dict[str, str] = field(default_factory=dict)
@@ -40,12 +39,14 @@ class SignalMap:
     elsewhere: dict[str, Elsewhere] = field(default_factory=dict)
 
 
-def read_mapping(path: str | os.PathLike[str], *, map: Pairs = None, unit: Pairs = None, stamp: Pairs = None) -> SignalMap:
+def read_mapping(
+    path: str | os.PathLike[str], *, map: Pairs = None, unit: Pairs = None, stamp: Pairs = None
+) -> SignalMap:
     """The mapping for the log at ``path``: the TOML file beside it (``lap.csv`` has ``lap.toml``), overruled by the
     arguments, each a dict or a sequence of ``SIGNAL=VALUE``.
 
     The TOML file has the tables ``[map]`` (signal = "column"), ``[unit]`` (signal = "km/h"), ``[stamp]`` (signal = "its
-    own time column") and ``[signals.NAME]`` (``file``, ``time``, ``column``, ``time_unit`` of a signal in another file).
+    own time column") and ``[signals.NAME]`` (``file``, ``time``, ``column``, ``time_unit``: a signal in another file).
     Raises InputError for a signal, unit, table or key that is not known.
     """
     beside = Path(path).with_suffix(".toml")
@@ -102,7 +103,9 @@ def _units(units: dict[str, str], where: str) -> dict[str, str]:
 
 def _stamps(stamps: dict[str, str], where: str) -> dict[str, str]:
     if "time" in stamps:
-        raise InputError(f"{where}stamp time={stamps['time']}: time is the clock itself; only other signals are stamped")
+        raise InputError(
+            f"{where}stamp time={stamps['time']}: time is the clock itself; only other signals are stamped"
+        )
     return stamps
 
 

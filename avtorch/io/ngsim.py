@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.errors import InputError
-from avtorch.io.recordings import RawLeader, checked
+from avtorch.io.raw_leader import RawLeader, checked
 from avtorch.io.tables import Table
 
 DURATION_S = 80.0
@@ -17,21 +17,23 @@ _LOOK_S = 0.5  # the acceleration on either side of a joint is taken over this l
 
 def read_event(table: Table, event: int) -> RawLeader:
     """The leader of one event; its time starts at 0. InputError where the file has no such event."""
+    table = _parsed(table)
     return _event(table, _numbers(table), event)
 
 
 def join_events(table: Table, *, duration: float | None = None, first: int | None = None) -> RawLeader:
     """A leader of at least ``duration`` [s] (default 80) out of events joined at equal speed.
 
-    Rule. Start with the longest event, or ``first``. At its end, look at the first 5 s of every event not yet used (each
-    leaves at least 10 s to drive) for samples whose lead speed is within 0.2 m/s of the last one; take the sample whose
-    acceleration over the next 0.5 s is nearest to that of the last 0.5 s, ties to the lower event number, and go on from
-    the sample after it, speeds as recorded. ``events`` and ``note`` of the answer say what was joined. Raises InputError
-    where no event fits before ``duration`` is reached.
+    Rule. Start with the longest event, or ``first``. At its end, look at the first 5 s of every event not yet used
+    (each leaves at least 10 s to drive) for samples whose lead speed is within 0.2 m/s of the last one; take the sample
+    whose acceleration over the next 0.5 s is nearest to that of the last 0.5 s, ties to the lower event number, and go
+    on from the sample after it, speeds as recorded. ``events`` and ``note`` of the answer say what was joined. Raises
+    InputError where no event fits before ``duration`` is reached.
     """
     wanted = DURATION_S if duration is None else float(duration)
     if not 0 < wanted < np.inf:
         raise InputError(f"duration: is {duration}; a positive number of seconds is needed")
+    table = _parsed(table)
     numbers = _numbers(table)
     ids, counts = np.unique(numbers, return_counts=True)
     start = int(ids[np.argmax(counts)]) if first is None else first
@@ -76,6 +78,12 @@ def _slope(time: NDArray, speed: NDArray, start: float, end: float) -> float:
     return float(b - a) / (end - start)
 
 
+def _parsed(table: Table) -> Table:
+    """The three columns that count, read once for all events."""
+    names = ("event", "time", "lead_speed")
+    return Table(table.source, names, tuple(table.numbers(name) for name in names), table.lines)
+
+
 def _numbers(table: Table) -> NDArray[np.float64]:
     numbers = table.numbers("event")
     bad = numbers != np.round(numbers)
@@ -93,11 +101,12 @@ def _event(table: Table, numbers: NDArray, event: int) -> RawLeader:
         )
     if rows[-1] - rows[0] + 1 != len(rows):
         cut = rows[int(np.argmax(np.diff(rows) > 1)) + 1]
-        raise InputError(f"{table.where(int(cut), 'event')}: event {event} goes on after another began; rows must be together")
+        raise InputError(
+            f"{table.where(int(cut), 'event')}: event {event} goes on after another; keep its rows together"
+        )
     part = slice(int(rows[0]), int(rows[-1]) + 1)
     lines = None if table.lines is None else table.lines[part]
-    # the message must tell the row of the file, so the part keeps its lines and only row numbers count from the event
-    piece = Table(f"{table.source}, event {event}", table.names, tuple(cells[part] for cells in table.cells), lines)
+    piece = Table(table.source, table.names, tuple(cells[part] for cells in table.cells), lines, first=part.start)
     leader = checked(
         piece,
         piece.numbers("time"),

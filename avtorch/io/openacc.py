@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from avtorch.errors import InputError
-from avtorch.io.recordings import RawLeader, checked
+from avtorch.io.raw_leader import RawLeader, checked
 from avtorch.io.tables import Table, read_bytes, text_of
 
 
@@ -19,7 +19,7 @@ def numbered(stem: str, names: Iterable[str]) -> list[int]:
 
 
 def astazero(table: Table, vehicle: int | None = None) -> RawLeader:
-    """A vehicle of the AstaZero form: ``Time, X_i, SpeedDoppler_i, Accel_i, Spacing_i`` (spacing to the vehicle ahead)."""
+    """A vehicle of the AstaZero form: ``Time, X_i, SpeedDoppler_i, Accel_i, Spacing_i`` (to the vehicle ahead)."""
     number = _choose(table, "SpeedDoppler", vehicle)
     columns = {"time": "Time", "speed": f"SpeedDoppler{number}"}
     accel = spacing = None
@@ -42,8 +42,9 @@ def astazero(table: Table, vehicle: int | None = None) -> RawLeader:
 def zalazone(table: Table, vehicle: int | None = None, order: tuple[str, ...] = ()) -> RawLeader:
     """A vehicle of the ZalaZONE form: header lines, then ``Time, Speed_i, E_i, N_i, Alt_i, IVS_i``.
 
-    Vehicle numbers can skip and cells can be empty. ``IVS_i`` is the spacing between vehicles i and i + 1, so a vehicle's
-    spacing to the one ahead bears the number before its own. ``order``: the makes, by number, from the file's header.
+    Vehicle numbers can skip and cells can be empty. ``IVS_i`` is the spacing between vehicles i and i + 1, so a
+    vehicle's spacing to the one ahead bears the number before its own. ``order``: the makes, by number, from the file's
+    header.
     """
     number = _choose(table, "Speed", vehicle)
     speed = f"Speed{number}"

@@ -1,4 +1,4 @@
-"""The look at a log before anything is believed: what it holds, what is left out, what is doubtful. It notes and never guesses."""
+"""The look at a log before anything is believed: what it holds, masks and leaves in doubt. It notes, never guesses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.io.consistency import scale_between
-from avtorch.io.log import Log, median_step, stretches
+from avtorch.io.log import Log
+from avtorch.io.segments import median_step, stretches
 from avtorch.io.validity import command_scale
 
 SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead_accel", "grade")
@@ -26,9 +27,11 @@ class Gap:
 
 @dataclass(frozen=True)
 class Quality:
-    """What a log is worth. ``jitter``: 95 % point of the deviation of a step from the median one, as its share [-];
-    ``late_rows``: steps over 1.5 median ones that are no gap; ``masked_rows``: rows not usable, of which ``driver_rows`` not
-    engaged and ``standstill_rows`` below 0.3 m/s; ``notes``: all of it in sentences, worth telling a person.
+    """What a log is worth.
+
+    ``jitter``: 95 % point of the deviation of a step from the median one, as its share [-]; ``late_rows``: steps over
+    1.5 median ones that are no gap; ``masked_rows``: rows not usable, of which ``driver_rows`` not engaged and
+    ``standstill_rows`` below 0.3 m/s; ``notes``: all of it in sentences, worth telling a person.
     """
 
     rows: int
@@ -73,7 +76,9 @@ def check(log: Log) -> Quality:
 
     notes = [f"{log.rows} rows, {log.seconds:.1f} s in {segments} segment{'s' * (segments != 1)}, {log.rate_hz:.4g} Hz"]
     if jitter > 0.1:
-        notes.append(f"time jitters: steps differ from {step:.4g} s by up to {100 * jitter:.0f} % (95 % of them by less)")
+        notes.append(
+            f"time jitters: steps differ from {step:.4g} s by up to {100 * jitter:.0f} % (95 % of them by less)"
+        )
     if late:
         notes.append(f"{late} step{'s' * (late != 1)} longer than 1.5 median ones: rows were lost, too few for a gap")
     for gap in gaps[:5]:
@@ -97,8 +102,8 @@ def check(log: Log) -> Quality:
         notes.append(f"columns ignored: {', '.join(log.ignored)}")
     notes.extend(log.remarks)
     return Quality(
-        rows=log.rows, seconds=log.seconds, segments=segments, rate_hz=log.rate_hz, jitter=jitter, late_rows=late, gaps=gaps,
-        masked_rows=masked, driver_rows=driver, standstill_rows=still, constant=constant, missing=missing,
+        rows=log.rows, seconds=log.seconds, segments=segments, rate_hz=log.rate_hz, jitter=jitter, late_rows=late,
+        gaps=gaps, masked_rows=masked, driver_rows=driver, standstill_rows=still, constant=constant, missing=missing,
         doubtful_units=doubtful, notes=tuple(notes),
     )  # fmt: skip
 
@@ -107,7 +112,7 @@ def _says_missing(missing: tuple[str, ...]) -> list[str]:
     said = {
         "accel_cmd": "no accel_cmd: what is said of the actuator is conditional on an assumed controller",
         "accel": "no accel: speed is the only witness, so sensor faults and real forces cannot be told apart",
-        "speed": "no speed: accel is the only witness, standstill cannot be masked, nor sensor faults be told from forces",
+        "speed": "no speed: accel is the only witness, standstill is not masked, and sensor faults look like forces",
     }
     return [said[name] for name in missing]
 
@@ -124,7 +129,9 @@ def _repeats(present: dict[str, NDArray], log: Log) -> list[str]:
             runs = np.diff(changes)
             usual = int(np.median(runs))
             if usual >= 2 and np.mean(runs == usual) > 0.7:
-                notes.append(f"{name} changes every {usual} rows only: it comes at {log.rate_hz / usual:.3g} Hz and is held")
+                notes.append(
+                    f"{name} changes every {usual} rows only: it comes at {log.rate_hz / usual:.3g} Hz and is held"
+                )
     return notes
 
 
@@ -143,11 +150,13 @@ def _doubtful_units(log: Log) -> list[str]:
         found = command_scale(log.time, parts, log.speed, log.accel, log.accel_cmd)
         if found is not None and found.correlation > 0.9 and not 0.2 <= found.slope <= 1.5:
             witness = "speed" if log.speed is not None else "accel"
-            notes.append(f"{witness} answers with {found.slope:.3g} times the command: units of {witness} or accel_cmd?")
+            notes.append(
+                f"{witness} answers with {found.slope:.3g} times the command: units of {witness} or accel_cmd?"
+            )
     if log.speed is None and log.accel is not None and log.accel_cmd is not None:
         top = max(float(np.abs(log.accel).max()), float(np.abs(log.accel_cmd).max()))
         if 0 < top < 0.6:
-            notes.append(f"accel and accel_cmd stay below {top:.2g}: a calm drive, or g? Without speed nothing can tell")
+            notes.append(f"accel and accel_cmd stay below {top:.2g}: calm, or in g? Without speed nothing can tell")
     if log.jerk is not None and log.accel is not None:
         found = scale_between(log.time, parts, log.accel, log.jerk)
         if found is not None and found.correlation > 0.9 and not 0.5 <= found.slope <= 2:
@@ -166,4 +175,5 @@ def _disagreements(log: Log) -> list[str]:
     # 0.5 m/s in a second is well above what noise and grade do
     if found is None or found.change < 0.5 or found.correlation >= 0.5:
         return []
-    return [f"speed's derivative and accel disagree (correlation {found.correlation:.2f}): one of them is not this car's motion"]
+    r = f"{found.correlation:.2f}"
+    return [f"speed's derivative and accel disagree (correlation {r}): one of them is not this car's motion"]

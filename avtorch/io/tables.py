@@ -28,6 +28,7 @@ class Table:
     names: tuple[str, ...]
     cells: tuple[Sequence[Any] | NDArray, ...]
     lines: Sequence[int] | None = None
+    first: int = 0  # rows of the file before this part of it
 
     @property
     def rows(self) -> int:
@@ -36,10 +37,7 @@ class Table:
     def where(self, row: int, column: str) -> str:
         """The place of a cell in words; ``row`` counts from 0."""
         line = f" (line {self.lines[row]})" if self.lines is not None else ""
-        return f"{self.source}: row {row + 1}{line}, column {column!r}"
-
-    def cell(self, row: int, column: str) -> Any:
-        return self.cells[self.names.index(column)][row]
+        return f"{self.source}: row {self.first + row + 1}{line}, column {column!r}"
 
     def numbers(self, column: str, *, empty_is_nan: bool = False) -> NDArray[np.float64]:
         """A column as float64, ``(row,)``.
@@ -84,7 +82,8 @@ class Table:
                     hint = " with a decimal point"
                 text = str(cell)
                 shown = text if len(text) <= 30 else text[:27] + "..."
-                raise InputError(f"{self.where(row, column)}: {shown!r} is no number; a number{hint} is needed") from None
+                place = self.where(row, column)
+                raise InputError(f"{place}: {shown!r} is no number; a number{hint} is needed") from None
         return values, empty
 
 
@@ -92,8 +91,8 @@ def read_table(path: str | os.PathLike[str], *, header: str | None = None) -> Ta
     """Read a CSV (UTF-8, comma) or Parquet file.
 
     ``header`` names the first cell of the header line where other lines come before it. Unnamed columns get the name
-    ``(unnamed 1)`` by position. Raises InputError for what is no such file: missing, a directory, empty, binary, another
-    separator, no header, a row with too few or too many cells.
+    ``(unnamed 1)`` by position. Raises InputError for what is no such file: missing, a directory, empty, binary,
+    another separator, no header, a row with too few or too many cells.
     """
     file = Path(path)
     raw = read_bytes(file)
@@ -128,7 +127,7 @@ def text_of(file: Path, raw: bytes) -> str:
     except UnicodeDecodeError as fault:
         line = raw[: fault.start].count(b"\n") + 1
         raise InputError(
-            f"{file}: line {line}, byte {fault.start}: is not UTF-8 text; a CSV or Parquet file is needed"
+            f"{file}: line {line}, byte {fault.start + 1}: is not UTF-8 text; a CSV or Parquet file is needed"
         ) from None
     if "\0" in text:
         line = text[: text.index("\0")].count("\n") + 1
@@ -148,7 +147,8 @@ def _csv(file: Path, text: str, header: str | None) -> Table:
     except csv.Error as fault:
         raise InputError(f"{file}: line {reader.line_num}: cannot be split into cells ({fault})") from None
     while rows and not any(cell.strip() for cell in rows[-1]):  # an editor's empty lines at the end
-        rows.pop(), lines.pop()
+        rows.pop()
+        lines.pop()
     start = 0
     if header is not None:
         start = next((i for i, row in enumerate(rows) if row and row[0].strip() == header), 0)
@@ -158,7 +158,8 @@ def _csv(file: Path, text: str, header: str | None) -> Table:
     for row, line in zip(rows, lines, strict=True):
         if len(row) != len(head):
             number = lines.index(line) + 1
-            raise InputError(f"{file}: row {number} (line {line}): has {len(row)} cells where the header has {len(head)}")
+            found = f"has {len(row)} cells where the header has {len(head)}" if row else "is empty"
+            raise InputError(f"{file}: row {number} (line {line}): {found}")
     columns = tuple(zip(*rows, strict=True)) if rows else tuple(() for _ in head)
     return Table(str(file), tuple(head), columns, lines)
 

@@ -36,7 +36,15 @@ _SUSPECTS: dict[str, tuple[tuple[str, float], ...]] = {
     "spacing": (("cm", 0.01), ("mm", 0.001)),
     "grade": (("%", 0.01),),
 }
-_PLAUSIBLE = {"speed": 70.0, "lead_speed": 70.0, "accel": 12.0, "accel_cmd": 12.0, "lead_accel": 12.0, "spacing": 300.0, "grade": 0.3}
+_PLAUSIBLE = {
+    "speed": 70.0,
+    "lead_speed": 70.0,
+    "accel": 12.0,
+    "accel_cmd": 12.0,
+    "lead_accel": 12.0,
+    "spacing": 300.0,
+    "grade": 0.3,
+}
 
 
 def check_range(signal: str, values: NDArray, where: Callable[[int], str]) -> None:
@@ -64,8 +72,8 @@ def _at_first(bad: NDArray, values: NDArray, where: Callable[[int], str], need: 
 
 
 def check_time(time: NDArray, same_drive: NDArray, where: Callable[[int], str]) -> None:
-    """Raise InputError where time repeats or goes back inside a drive; ``same_drive`` ``(time - 1,)`` is false where a new
-    value of ``segment`` lets it start anew."""
+    """Raise InputError where time repeats or goes back inside a drive; ``same_drive`` ``(time - 1,)`` is false where a
+    new value of ``segment`` lets it start anew."""
     bad = (np.diff(time) <= 0) & same_drive
     if bad.any():
         row = int(np.argmax(bad)) + 1
@@ -74,7 +82,7 @@ def check_time(time: NDArray, same_drive: NDArray, where: Callable[[int], str]) 
 
 
 def check_rate(step: float, where: str) -> None:
-    """Raise InputError for a median ``step`` [s] outside 10 to 200 Hz; it says so when the step looks like ms, us or ns."""
+    """Raise InputError for a median ``step`` [s] outside 10 to 200 Hz, saying so where it looks like ms, us or ns."""
     rate = 1 / step
     if not RATE_HZ[0] * (1 - _RATE_SLACK) <= rate <= RATE_HZ[1] * (1 + _RATE_SLACK):
         hint = ""
@@ -86,9 +94,8 @@ def check_rate(step: float, where: str) -> None:
         )
 
 
-# how far two signals of one motion may differ in scale before their units are certainly not the same. Recordings whose
-# accel is 1.8 times the derivative of speed exist; a faulty
-# accelerometer is off by a fifth; an actuator that gives 2.5 times what is demanded does not exist.
+# how far two signals of one motion may differ in scale before their units are certainly not the same: recordings exist
+# whose acceleration is 1.8 times the derivative of their speed; an actuator that gives 2.5 times the demand does not
 _WITNESS = (0.45, 2.2)
 _COMMAND = (0.02, 2.5)
 _SURE = 0.9
@@ -97,7 +104,9 @@ _SPEED_FACTORS = {"km/h": 3.6, "mph": 3600 / 1609.344, "ft/s": 1 / 0.3048, "cm/s
 _ACCEL_FACTORS = {"g": GRAVITY, "cm/s2": 0.01, "mm/s2": 0.001, "ft/s2": 0.3048, "km/h/s": 1 / 3.6}
 
 
-def command_scale(time: NDArray, parts: Sequence[slice], speed: NDArray | None, accel: NDArray | None, u: NDArray) -> Scale | None:
+def command_scale(
+    time: NDArray, parts: Sequence[slice], speed: NDArray | None, accel: NDArray | None, u: NDArray
+) -> Scale | None:
     """How the motion follows the command ``u``: from speed where it is known, else from the integrated acceleration."""
     if speed is None:
         assert accel is not None
@@ -122,7 +131,8 @@ def check_units(
     """
     if speed is not None and accel is not None:
         found = scale_between(time, parts, speed, accel)
-        options = {f"speed={u}": f for u, f in _SPEED_FACTORS.items()} | {f"accel={u}": f for u, f in _ACCEL_FACTORS.items()}
+        options = {f"speed={unit}": factor for unit, factor in _SPEED_FACTORS.items()}
+        options |= {f"accel={unit}": factor for unit, factor in _ACCEL_FACTORS.items()}
         _refuse_scale(source, "speed", "accel", found, _WITNESS, options, "accel=-1")
     if accel_cmd is not None:
         found = command_scale(time, parts, speed, accel, accel_cmd)
@@ -142,7 +152,13 @@ def check_units(
 
 
 def _refuse_scale(
-    source: str, level: str, rate: str, found: Scale | None, limits: tuple[float, float], options: dict[str, float], sign: str
+    source: str,
+    level: str,
+    rate: str,
+    found: Scale | None,
+    limits: tuple[float, float],
+    options: dict[str, float],
+    sign: str,
 ) -> None:
     if found is None or abs(found.correlation) < _SURE or limits[0] <= found.slope <= limits[1]:
         return

@@ -160,8 +160,8 @@ class ClosedLoop:
             command = lower.clip(raw)
             rows.append((command, kinematic, v, spacing, lead_v, lead_a, demanded, raw, a))
             a, v_next, moved = move(a, v, command, dt, eps[i])
-            standing = float(v_next.min()) <= 0
-            if standing:
+            stood, standing = standing, float(v_next.min()) <= 0
+            if stood or standing:
                 v_next, moved = _stop(v, v_next, moved, dt)
             x, v = x + moved, v_next
         block = self._block(rows, held_rows, eps_all, first)
@@ -219,6 +219,8 @@ def _time_first(eps: Tensor, dims: int) -> Tensor:
 def _stop(v: Tensor, v_next: Tensor, moved: Tensor, dt: float) -> tuple[Tensor, Tensor]:
     """A step that would end rolling back ends at rest, after the way to the stop at that step's mean deceleration."""
     back = v_next < 0
+    # an actuator that turns positive within the step has pulled backward before, on a car that stood
+    moved = torch.clamp(moved, min=0.0)
     to_rest = 0.5 * dt * v * v / torch.where(back, v - v_next, 1.0)
     return torch.where(back, 0.0, v_next), torch.where(back, to_rest, moved)
 

@@ -133,6 +133,7 @@ class MPC:
             pinned = above | below
             rows = torch.where(pinned.unsqueeze(-1), eye, self._H)
             out = torch.linalg.solve(rows, torch.where(pinned, bound, -linear))
+            out = torch.where(pinned, bound, out)
             push = -(out @ self._H + linear) / self._H.diagonal()
             was = above, below
             above = torch.where(above, push > 0, out > self.accel_max)

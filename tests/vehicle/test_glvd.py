@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
@@ -39,12 +40,10 @@ def test_step_is_the_closed_form():
 @pytest.mark.parametrize(("T", "K", "dt"), [*EDGES, (0.3, 1.0, 0.01)])
 @pytest.mark.parametrize("steps", [1, 2, 7, 64, 65, 1000])
 def test_rollout_equals_stepping(method, T, K, dt, steps, rotating_seed):
-    if method == "euler" and dt >= 2 * T:
-        pytest.skip("Euler is unstable here: both blow up, in different last digits")
     g = torch.Generator().manual_seed(rotating_seed)
     u, a0 = torch.randn(3, steps, dtype=F64, generator=g), torch.randn(3, dtype=F64, generator=g)
     T, K = torch.tensor(T, dtype=F64), torch.tensor(K, dtype=F64)
-    # both sum at most `steps` terms of size |K u| (1 - alpha): rounding is far below 1e-11
+    # at most 1000 terms of size below 10 (|alpha| <= 1 everywhere here): rounding stays below 1e-11
     torch.testing.assert_close(
         glvd_rollout(a0, u, T, K, dt, method=method), stepped(a0, u, T, K, dt, method), rtol=0, atol=1e-11
     )
@@ -65,7 +64,9 @@ def test_dtype_is_kept_and_accurate(dtype):
     u = torch.sin(torch.arange(2000, dtype=dtype) * 0.01)
     model = GLVD(torch.tensor(3.0, dtype=dtype), torch.tensor(0.7, dtype=dtype))
     out = model.rollout(0.2, u, 0.005)
-    assert out.dtype == dtype and model.jerk(0.1, u).dtype == dtype and model.step(0.1, u, 0.01).dtype == dtype
+    assert out.dtype == dtype
+    assert model.jerk(0.1, u).dtype == dtype
+    assert model.step(0.1, u, 0.01).dtype == dtype
     exact = glvd_rollout(0.2, torch.sin(torch.arange(2000, dtype=F64) * 0.01), 3.0, 0.7, 0.005)
     # sine and sum of the float32 inputs round at 2^-24 of numbers up to 20 and 1
     assert (out.to(F64) - exact).abs().max() < (2e-5 if dtype == torch.float32 else 1e-13)
@@ -93,11 +94,13 @@ def test_gradient_at_the_edges_is_the_formula(T, K, dt):
     last = glvd_rollout(a0, torch.full((n,), u, dtype=F64), lag, gain, dt)[-1]
     on_T, on_K = torch.autograd.grad(last, (lag, gain), create_graph=True)
     decay = math.exp(-n * dt / T)
-    assert on_T.item() == pytest.approx((a0 - K * u) * decay * n * dt / T**2, rel=1e-9, abs=1e-15)
+    assert on_T.item() == pytest.approx((a0 - K * u) * decay * n * dt / T**2, rel=1e-9, abs=1e-13)
     assert on_K.item() == pytest.approx(u * (1 - decay), rel=1e-11)
     (second,) = torch.autograd.grad(on_T, lag)
     x = n * dt / T
-    assert second.item() == pytest.approx((a0 - K * u) * decay * x * (x - 2) / T**2, rel=1e-8, abs=1e-13)
+    assert second.item() == pytest.approx(
+        (a0 - K * u) * decay * x * (x - 2) / T**2, rel=1e-8, abs=1e-11
+    )  # rounding of terms K u/T²
 
 
 def test_euler_where_alpha_is_zero_has_finite_gradients():
@@ -105,7 +108,8 @@ def test_euler_where_alpha_is_zero_has_finite_gradients():
     out = glvd_rollout(0.3, torch.ones(50, dtype=F64), lag, gain, 0.05, method="euler")
     (first,) = torch.autograd.grad(out.sum(), lag, create_graph=True)
     (second,) = torch.autograd.grad(first, lag)
-    assert torch.isfinite(first) and torch.isfinite(second)
+    assert torch.isfinite(first)
+    assert torch.isfinite(second)
 
 
 def test_euler_converges_with_order_one_and_zoh_is_exact():
@@ -115,14 +119,14 @@ def test_euler_converges_with_order_one_and_zoh_is_exact():
     for n in (100, 200, 400, 800):
         u = torch.ones(n, dtype=F64)
         # the whole path, not its end: there the exponential has died out
-        path = exact_path = None
         path = glvd_rollout(0.5, u, T, K, horizon / n, method="euler")
         exact_path = glvd_rollout(0.5, u, T, K, horizon / n)
         assert abs(exact_path[-1] - exact) < 1e-13
         errors.append((path - exact_path).abs().max().item())
-    orders = [math.log2(a / b) for a, b in zip(errors, errors[1:], strict=False)]
+    orders = [math.log2(a / b) for a, b in itertools.pairwise(errors)]
     # the next term of the error is of relative size dt/T, halved each time: 0.07 at the first pair
-    assert orders[-1] == pytest.approx(1.0, abs=0.01) and abs(orders[0] - 1) < 0.1
+    assert orders[-1] == pytest.approx(1.0, abs=0.01)
+    assert abs(orders[0] - 1) < 0.1
 
 
 def test_exact_motion_does_not_cancel_for_small_steps():
@@ -168,7 +172,9 @@ def test_module_is_trained_by_torch():
     model = GLVD(0.6, 0.7)
     u = torch.sin(torch.arange(300, dtype=F64) * 0.05)
     target = glvd_rollout(0.0, u, 0.3, 1.0, 0.01)
-    optimizer = torch.optim.LBFGS(model.parameters(), max_iter=60, line_search_fn="strong_wolfe", tolerance_change=1e-16)
+    optimizer = torch.optim.LBFGS(
+        model.parameters(), max_iter=60, line_search_fn="strong_wolfe", tolerance_change=1e-16
+    )
 
     def closure():
         optimizer.zero_grad()
@@ -177,4 +183,5 @@ def test_module_is_trained_by_torch():
         return loss
 
     optimizer.step(closure)
-    assert model.T_L.item() == pytest.approx(0.3, abs=1e-4) and model.K_L.item() == pytest.approx(1.0, abs=1e-4)
+    assert model.T_L.item() == pytest.approx(0.3, abs=1e-4)
+    assert model.K_L.item() == pytest.approx(1.0, abs=1e-4)

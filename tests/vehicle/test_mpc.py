@@ -39,7 +39,14 @@ def independent(mpc: MPC, x: np.ndarray) -> np.ndarray:
     return found.x
 
 
-STATES = [[0.5, 0.2, -0.1], [-20.0, -5.0, 1.0], [30.0, 4.0, 0.0], [-8.0, 6.0, -3.0], [3.0, -9.0, 2.0], [-40.0, 2.0, 0.0]]
+STATES = [
+    [0.5, 0.2, -0.1],
+    [-20.0, -5.0, 1.0],
+    [30.0, 4.0, 0.0],
+    [-8.0, 6.0, -3.0],
+    [3.0, -9.0, 2.0],
+    [-40.0, 2.0, 0.0],
+]
 
 
 @pytest.mark.slow
@@ -54,14 +61,17 @@ def test_plan_against_an_independent_solver():
 
 def test_both_solvers_and_the_optimality_conditions_agree(rotating_seed):
     mpc = MPC()
-    x = torch.randn(400, 3, dtype=F64, generator=torch.Generator().manual_seed(rotating_seed)) * torch.tensor([20.0, 5, 2])
+    x = torch.randn(400, 3, dtype=F64, generator=torch.Generator().manual_seed(rotating_seed)) * torch.tensor(
+        [20.0, 5, 2]
+    )
     linear, free = x @ mpc._F.T, x @ mpc._law.T
     plan = mpc.plan(x)
     scale = linear.abs().amax(-1, keepdim=True)
     torch.testing.assert_close(plan, mpc._descend(linear, free).clamp(-6, 4), rtol=0, atol=1e-6)
     slope = (plan @ mpc._H + linear) / scale
     assert (slope[(plan > -6) & (plan < 4)].abs() < 1e-9).all()
-    assert (slope[plan == -6] > -1e-9).all() and (slope[plan == 4] < 1e-9).all()
+    assert (slope[plan == -6] > -1e-9).all()
+    assert (slope[plan == 4] < 1e-9).all()
     assert ((plan == -6) | (plan == 4)).any()
 
 
@@ -86,7 +96,10 @@ def test_inside_the_box_the_mpc_drives_like_its_linear_law():
     leader = Leader.from_speed([0, 5, 10, 15, 20, 30], [20, 20.5, 21, 20.2, 20, 20])
     settings = {"plant": GLVDPlant(sigma=0.05), "duration": 25.0}
     mpc = MPC()
-    run, linear = simulate(leader, mpc, **settings), simulate(leader, LinearController(mpc.equivalent_gains()), **settings)
+    run, linear = (
+        simulate(leader, mpc, **settings),
+        simulate(leader, LinearController(mpc.equivalent_gains()), **settings),
+    )
     assert run.accel_cmd.abs().max() < 4
     torch.testing.assert_close(run.accel, linear.accel, rtol=0, atol=1e-10)
 
@@ -104,17 +117,18 @@ def test_retargeted_gap_ramps():
     loop.advance(100)
     loop.controller = loop.controller.retargeted(at=loop.time, time_gap=2.0)  # type: ignore[attr-defined]
     run = loop.advance(3500)
-    assert run.accel.min() > -2.0 and run.spacing[0, -1].item() == pytest.approx(55.0, abs=0.02)
+    assert run.accel.min() > -2.0
+    assert run.spacing[0, -1].item() == pytest.approx(55.0, abs=0.02)
 
 
 def test_cost_of_a_step_is_far_below_the_tick():
-    """Loose on purpose (a shared machine): a constrained plan must fit a tick of 10 ms."""
+    """A constrained plan must fit a tick of 10 ms (processor time: the machine may be shared)."""
     mpc, x = MPC(), torch.tensor([[-20.0, -5.0, 1.0]], dtype=F64)
     times = []
     for _ in range(30):
-        start = time.perf_counter()
+        start = time.process_time()
         mpc.plan(x)
-        times.append(time.perf_counter() - start)
+        times.append(time.process_time() - start)
     assert sorted(times)[15] < 0.01
 
 

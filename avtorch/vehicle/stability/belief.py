@@ -44,9 +44,7 @@ class StabilityBelief:
     margins: dict[str, Interval]
 
 
-def p_locally_stable(
-    T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, dead_time: Value = 0.0
-) -> Tensor:
+def p_locally_stable(T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, dead_time: Value = 0.0) -> Tensor:
     """P(locally stable) of every setting under draws of the actuation, shape (setting,) or whatever the settings have.
 
     The vehicle, T_L [s], K_L [-] and dead_time [s], has its draws on the last dimension: (draw,) for all settings

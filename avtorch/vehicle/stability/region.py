@@ -64,7 +64,7 @@ def region(
     (lower, upper) tuples and no dead time is known: the paper's stability figures are of this kind.
 
     Raises InputError for unknown or equal axes, an axis that is not one-dimensional and finite, a tuple on an axis or
-    with form="exact", and a dead time with a box form.
+    with form="exact" and a dead time with a box form.
     """
     if form not in ("exact", "print", "rigorous"):
         raise InputError(f"form: expected 'exact', 'print' or 'rigorous', found {form!r}")
@@ -74,14 +74,13 @@ def region(
     held = torch.as_tensor(gains, dtype=torch.float64)
     if held.shape != (3,):
         raise InputError(f"gains: expected three numbers (k_s, k_v, k_a), found shape {tuple(held.shape)}")
-    values: dict[str, PointOrBox] = {"k_s": held[0], "k_v": held[1], "k_a": held[2], "tau": time_gap}
-    values |= {"T": T_L, "K": K_L, x[0]: x_values[None, :], y[0]: y_values[:, None]}
-    T, K, tau = values["T"], values["K"], values["tau"]
+    if isinstance(time_gap, tuple):
+        raise InputError("time_gap: expected one number [s], found a tuple")
+    axes = {x[0]: x_values[None, :], y[0]: y_values[:, None]}
+    T, K, tau = axes.get("T", T_L), axes.get("K", K_L), axes.get("tau", time_gap)
     # One gain tensor over the whole plane is cheap and spares the callee any thought of axes.
     plane = torch.zeros(y_values.numel(), x_values.numel(), dtype=torch.float64)
-    k = torch.stack([plane + values[name] for name in ("k_s", "k_v", "k_a")], -1)
-    if isinstance(tau, tuple):
-        raise InputError("time_gap: expected one number [s], found a tuple")
+    k = torch.stack([plane + axes.get(name, held[i]) for i, name in enumerate(("k_s", "k_v", "k_a"))], -1)
     if form == "exact":
         if isinstance(T, tuple) or isinstance(K, tuple):
             raise InputError("form: bounds on T_L or K_L need form='print' or form='rigorous'")

@@ -15,7 +15,7 @@ DECADES = 3.5  # below this the sweep is one bracket, down to omega = 0
 POINTS = 320  # 2.5 % apart: the skirts of a resonance are seen however sharp its tip
 MOST_POINTS = 8192
 FEW_POINTS = 80  # for a verdict that is not close
-BLOCK = 1 << 17  # numbers held at a time: the temporaries stay in the cache
+BLOCK = 1 << 18  # numbers held at a time: the temporaries stay in the cache
 GOLDEN = (math.sqrt(5) - 1) / 2
 
 
@@ -118,11 +118,13 @@ def _rounding(size: Tensor) -> Tensor:
 def _size(s: Setting, omega: Tensor) -> Tensor:
     """Sum of the absolute terms of h: what its rounding and its bending are measured by."""
     x = omega * omega
-    k2 = s.K**2
-    spring = s.ks.abs() + s.ka.abs() * x
-    size = x * (1 + s.T**2 * x) + k2 * (2 * s.ks.abs() * s.ka.abs() + s.ka**2 * x + s.g**2 + s.kv**2)
-    size = size + 2 * s.K * (spring + s.T * s.g.abs() * x + omega * (s.T * spring + s.g.abs()))
-    return size + k2 * s.kf.abs() * (s.kf.abs() * x + 2 * s.ks.abs() + 2 * s.kv.abs() * omega)
+    k2, twice = s.K**2, 2 * s.K
+    ks, kv, ka, kf, g = s.ks.abs(), s.kv.abs(), s.ka.abs(), s.kf.abs(), s.g.abs()
+    c0 = k2 * (2 * ks * ka + g**2 + kv**2 + 2 * kf * ks) + twice * ks
+    c1 = twice * (s.T * ks + g) + 2 * k2 * kf * kv
+    c2 = 1 + k2 * (ka**2 + kf**2) + twice * (ka + s.T * g)
+    even = torch.addcmul(c0, x, torch.addcmul(c2, x, s.T**2))
+    return torch.addcmul(even, omega, torch.addcmul(c1, x, twice * s.T * ka))
 
 
 def _band(s: Setting) -> Tensor:

@@ -67,16 +67,22 @@ def excess(s: Setting, omega: Tensor) -> tuple[Tensor, Tensor]:
     machine, keeps the sign of h right down to omega = 0, where |G| itself rounds to one.
     """
     x = omega * omega
-    c, d = torch.cos(omega * s.theta), torch.sin(omega * s.theta)
-    spring = s.ks + s.ka * x
-    real = -spring - s.T * s.g * x
-    imag = omega * (s.T * spring - s.g)
-    h = x * (1 + s.T**2 * x) + s.K**2 * (2 * s.ks * s.ka + s.ka**2 * x + s.g**2 - s.kv**2)
-    h = h + 2 * s.K * (real * c + imag * d)
-    # The leader's fed-forward acceleration adds to the numerator only.
-    lead = s.ks * torch.cos(omega * s.theta_f) - s.kv * omega * torch.sin(omega * s.theta_f)
-    h = h - s.K**2 * s.kf * (s.kf * x - 2 * lead)
-    n = s.K**2 * (s.ks**2 + s.kv**2 * x + s.kf * x * (s.kf * x - 2 * lead))
+    k2, twice = s.K**2, 2 * s.K
+    # Polynomials in x with coefficients a setting: few passes over the (setting, frequency) numbers.
+    steady = torch.addcmul(
+        k2 * (2 * s.ks * s.ka + s.g**2 - s.kv**2), x, torch.addcmul(1 + k2 * (s.ka**2 - s.kf**2), x, s.T**2)
+    )
+    real = torch.addcmul(-twice * s.ks, x, -twice * (s.ka + s.T * s.g))
+    imag = omega * torch.addcmul(twice * (s.T * s.ks - s.g), x, twice * s.T * s.ka)
+    turn = omega * s.theta
+    h = torch.addcmul(torch.addcmul(steady, real, turn.cos()), imag, turn.sin())
+    n = torch.addcmul(k2 * s.ks**2, x, k2 * s.kv**2)
+    if bool((s.kf != 0).any()):
+        # The leader's fed-forward acceleration adds to the numerator only.
+        turn = omega * s.theta_f
+        lead = 2 * k2 * s.kf * (s.ks * turn.cos() - s.kv * omega * turn.sin())
+        h = h + lead
+        n = n + x * (k2 * s.kf**2 * x - lead)
     return h, n
 
 

@@ -1,0 +1,40 @@
+"""The commands put together, and what happens when one is refused or interrupted.
+
+The commands import torch and matplotlib only once their arguments are read: help and a mistyped option answer at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from cyclopts import App, CycloptsError
+
+from avtorch import __version__
+from avtorch.cli.estimate import estimate
+from avtorch.cli.stability import stability
+from avtorch.errors import InputError
+
+app = App(
+    name="avtorch",
+    help="Watch an automated vehicle: from a drive log to a belief about its actuation, and from the belief to action.",
+    version=__version__,
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
+)
+app.command(estimate)
+app.command(stability)
+
+
+def main(tokens: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code: 0, 2 for bad input (one line on stderr), 130 when interrupted."""
+    try:
+        app(tokens, exit_on_error=False, print_error=False)
+    except (InputError, CycloptsError) as fault:
+        # one line, whatever the parser's own message looks like
+        print("avtorch: " + " ".join(str(fault).split()), file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("avtorch: interrupted; no answer was written", file=sys.stderr)
+        return 130
+    return 0

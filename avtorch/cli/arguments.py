@@ -1,0 +1,65 @@
+"""Arguments that commands share, and the checks that turn a bad one into one line."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Group, Parameter
+
+from avtorch.errors import InputError
+
+OUTPUT = Group("Output", sort_key=9)
+
+Out = Annotated[Path, Parameter(name="--out", group=OUTPUT, help="Folder for the answer and the pictures.")]
+Json = Annotated[bool, Parameter(name="--json", negative=(), group=OUTPUT, help="Print the answer as JSON, no tables.")]
+Quiet = Annotated[bool, Parameter(name=("--quiet", "-q"), negative=(), group=OUTPUT, help="Print nothing but errors.")]
+Seed = Annotated[int, Parameter(name="--seed", help="Seed of everything random.")]
+Gains = Annotated[str, Parameter(name="--gains", help="Gains k_s,k_v,k_a of the upper level.")]
+Lag = Annotated[float, Parameter(name="--T", help="Actuation lag T_L [s].")]
+Gain = Annotated[float, Parameter(name="--K", help="Actuation gain K_L [-].")]
+TimeGap = Annotated[float, Parameter(name="--tau", help="Time gap [s].")]
+
+
+def positive(name: str, value: float, unit: str = "") -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise InputError(f"{name}: found {value:g}, needs a finite number above 0 {unit}".rstrip())
+
+
+def not_negative(name: str, value: float, unit: str = "") -> None:
+    if not (math.isfinite(value) and value >= 0):
+        raise InputError(f"{name}: found {value:g}, needs a finite number of 0 {unit} or more".replace("  ", " "))
+
+
+def seed_number(seed: int) -> None:
+    if not 0 <= seed < 2**63:
+        raise InputError(f"--seed: found {seed}, needs a whole number from 0 to 2^63 - 1")
+
+
+def three_gains(name: str, text: str) -> tuple[float, float, float]:
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 3 or not all(map(math.isfinite, values)):
+        raise InputError(f"{name}: found {text!r}, needs three numbers k_s,k_v,k_a such as 1.5,1.5,-0.8")
+    return values[0], values[1], values[2]
+
+
+def two_axes(text: str) -> tuple[str, str]:
+    known = ("k_s", "k_v", "k_a", "tau", "T", "K")
+    names = tuple(part.strip() for part in text.split(","))
+    if len(names) != 2 or names[0] == names[1] or not set(names) <= set(known):
+        raise InputError(f"--plane: found {text!r}, needs two different names out of {', '.join(known)} such as tau,T")
+    return names[0], names[1]
+
+
+def free_folder(out: Path) -> None:
+    """Refuse a place that cannot become a folder before any work is done; nothing is made yet."""
+    for place in (out, *out.parents):
+        if place.exists():
+            if not place.is_dir():
+                what = "a file" if place == out else f"inside {place}, which is a file"
+                raise InputError(f"--out: {out} is {what}; needs a folder, or a name that is free")
+            return

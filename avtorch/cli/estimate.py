@@ -1,0 +1,101 @@
+"""`avtorch estimate`: the belief on a recorded log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from avtorch.cli.arguments import (
+    Gains,
+    Json,
+    Out,
+    Quiet,
+    Seed,
+    TimeGap,
+    free_folder,
+    not_negative,
+    positive,
+    seed_number,
+    three_gains,
+)
+from avtorch.cli.talk import Talk, write_answer
+
+
+def estimate(
+    log: Path,
+    *,
+    window: Annotated[float, Parameter(help="Length of a window [s].")] = 2.0,
+    out: Out,
+    map: Annotated[
+        list[str] | None, Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN; repeatable.")
+    ] = None,
+    unit: Annotated[list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT; repeatable.")] = None,
+    stamp: Annotated[
+        list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
+    ] = None,
+    form: Annotated[
+        Literal["auto", "jerk", "latent"],
+        Parameter(help="Likelihood: of measured jerk, or of noisy acceleration and speed."),
+    ] = "auto",
+    mode: Annotated[
+        Literal["lambda", "posterior", "forgetting"], Parameter(help="How a posterior becomes the next prior.")
+    ] = "lambda",
+    tau: TimeGap = 1.0,
+    gains: Gains = "1.5,1.5,-0.8",
+    seed: Seed = 0,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """What a recorded drive says about the vehicle's actuation, window by window.
+
+    A check of the log comes first. Then one posterior of (T_L, K_L) per window, alerts, and P(string stable) under the
+    controller named by --tau and --gains, which a log does not tell.
+
+    Parameters
+    ----------
+    log
+        CSV or Parquet: time, accel_cmd, and accel or speed. LOG.toml beside it may map names and units.
+    """
+    positive("--window", window, "s")
+    not_negative("--tau", tau, "s")
+    k = three_gains("--gains", gains)
+    free_folder(out)
+    seed_number(seed)
+
+    from avtorch.decision import Setting
+    from avtorch.decision.estimation import estimate as work
+    from avtorch.io import Log, check
+    from avtorch.results import estimates_answer
+
+    talk = Talk(json=json, quiet=quiet)
+    drive = Log.read(log, map=map, unit=unit, stamp=stamp)
+    talk.notes(f"{drive.name}", check(drive).notes)
+    setting = Setting(time_gap=tau, gains=k, scenarios=1)
+    with talk.progress("Estimating") as step:
+        found = work(drive, window, form=form, setting=setting, mode=mode, seed=seed, progress=step)
+    answer = estimates_answer(found)
+
+    from avtorch import plots
+
+    pictures = {
+        "belief.png": lambda: plots.belief_figure(answer["windows"], answer=answer, log=drive),
+        "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
+    }
+    write_answer(out, "estimates.json", answer, pictures)
+    talk.windows(answer["windows"])
+    talk.summary(answer, estimates_note(answer))
+    talk.done(out, answer)
+
+
+def estimates_note(answer: Mapping[str, Any]) -> str:
+    """One sentence on a list of windows."""
+    windows = answer["windows"]
+    used = [w for w in windows if w["excited"]]
+    if not used:
+        return f"{len(windows)} windows, none excited: the belief is still the first prior."
+    last = used[-1]
+    text = ", ".join(f"{name} {last[name]['mean']:.3f} ± {last[name]['sd']:.3f}" for name in ("T_L", "K_L"))
+    return f"{len(used)} of {len(windows)} windows excited; the last of them says {text}."

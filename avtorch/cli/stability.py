@@ -1,0 +1,90 @@
+"""`avtorch stability`: conditions, exact verdict, peak gain and a region around one setting."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from avtorch.cli.arguments import (
+    Gain,
+    Gains,
+    Json,
+    Lag,
+    Out,
+    Quiet,
+    TimeGap,
+    free_folder,
+    not_negative,
+    positive,
+    three_gains,
+    two_axes,
+)
+from avtorch.cli.talk import Talk, write_answer
+
+
+def stability(
+    *,
+    T: Lag = 0.3,
+    K: Gain = 1.0,
+    tau: TimeGap = 1.0,
+    gains: Gains = "1.5,1.5,-0.8",
+    dead_time: Annotated[float, Parameter(name="--dead-time", help="Dead time in the chain [s].")] = 0.0,
+    plane: Annotated[str, Parameter(help="Axes of the region: two out of k_s, k_v, k_a, tau, T, K.")] = "T,K",
+    out: Out = Path("out/stability"),
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Is one setting stable, and does it damp what the leader does: conditions, exact verdict, peak gain, region."""
+    positive("--T", T, "s")
+    positive("--K", K)
+    not_negative("--tau", tau, "s")
+    not_negative("--dead-time", dead_time, "s")
+    k = three_gains("--gains", gains)
+    free_folder(out)
+    axes = two_axes(plane)
+
+    import torch
+
+    from avtorch.results import stability_answer
+    from avtorch.vehicle import stability as s
+
+    talk = Talk(json=json, quiet=quiet)
+    answer = stability_answer(T, K, tau, k, dead_time=dead_time)
+    point = {"k_s": k[0], "k_v": k[1], "k_a": k[2], "tau": tau, "T": T, "K": K}
+    # the sweep that a dead time needs is dear: fewer points then
+    points = 401 if dead_time == 0 else 101
+    x, y = ((name, torch.linspace(*_around(name, point[name]), points, dtype=torch.float64)) for name in axes)
+    held = {"T_L": T, "K_L": K, "time_gap": tau, "gains": k, "dead_time": dead_time}
+    with talk.waiting("Drawing the region"):
+        region = s.region(x, y, **held)
+    omega = torch.logspace(-1.5, 1.5, 600, dtype=torch.float64)
+    curve = s.gain(omega, T, K, tau, k, dead_time=dead_time)
+
+    from avtorch import plots
+
+    peak = None if answer["peak_gain"] is None else (answer["peak_frequency_radps"], answer["peak_gain"])
+    title = f"T_L {T:g} s, K_L {K:g}, time gap {tau:g} s, gains {k[0]:g}, {k[1]:g}, {k[2]:g}, dead time {dead_time:g} s"
+
+    def picture() -> Any:
+        here = (point[axes[0]], point[axes[1]])
+        return plots.stability_figure(region, here, omega, curve, peak=peak, title=title)
+
+    write_answer(out, "stability.json", answer, {"stability.png": picture})
+    talk.stability(answer)
+    talk.done(out, answer)
+
+
+def _around(name: str, value: float) -> tuple[float, float]:
+    """A stretch of an axis that shows the setting and where it could go."""
+    usual = {
+        "T": (0.02, 2.0),
+        "K": (0.2, 1.3),
+        "tau": (0.1, 3.0),
+        "k_s": (0.05, 4.0),
+        "k_v": (0.0, 4.0),
+        "k_a": (-3.0, 0.9),
+    }
+    low, high = usual[name]
+    return min(low, value - 0.1 * abs(value)), max(high, value + 0.3 * abs(value))

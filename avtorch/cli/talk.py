@@ -1,0 +1,114 @@
+"""Everything a person sees of a command: notes, progress, tables, where the files are."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+
+class Talk:
+    """Everything a person sees. With `json` the tables give way to the answer; with `quiet` to nothing."""
+
+    def __init__(self, *, json: bool, quiet: bool) -> None:
+        self.json, self.silent = json and not quiet, quiet or json
+        self.out = Console(quiet=self.silent, highlight=False)
+        self.err = Console(stderr=True, quiet=self.silent, highlight=False)
+
+    @contextmanager
+    def progress(self, what: str) -> Iterator[Callable[[int, int], None]]:
+        """A bar on stderr where it is a terminal; yields a function of (done, of)."""
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, console=self.err, transient=True, disable=not self.err.is_terminal) as bar:
+            task = bar.add_task(what, total=None)
+            yield lambda done, of: bar.update(task, completed=done, total=of)
+
+    @contextmanager
+    def waiting(self, what: str) -> Iterator[None]:
+        if self.err.is_terminal:
+            with self.err.status(what):
+                yield
+        else:
+            yield
+
+    def notes(self, title: str, notes: Sequence[str]) -> None:
+        self.out.print(f"[bold]{title}[/bold]")
+        for note in notes:
+            self.out.print(f"  {note}", markup=False)
+        self.out.print()
+
+    def windows(self, windows: Sequence[Mapping[str, Any]], most: int = 60) -> None:
+        table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
+        for name in ("time [s]", "rows", "T_L [s]", "90 %", "K_L", "90 %", "P(string stable)", ""):
+            table.add_column(name, justify="left" if name == "" else "right")
+        for w in windows[:most]:
+            style = None if w["excited"] else "dim"
+            cells = [f"{w['start_s']:.1f}-{w['end_s']:.1f}", str(w["n"])]
+            for name in ("T_L", "K_L"):
+                cells += [f"{w[name]['mean']:.3f}", f"{w[name]['q05']:.3f}-{w[name]['q95']:.3f}"]
+            told = ", ".join(w["alerts"]) if w["alerts"] else "" if w["excited"] else "not excited"
+            table.add_row(*cells, f"{w['p_string_stable']:.2f}", told, style="bold yellow" if w["alerts"] else style)
+        self.out.print(table)
+        if len(windows) > most:
+            self.out.print(f"... and {len(windows) - most} more windows in the answer", style="dim")
+        self.out.print()
+
+    def summary(self, answer: Mapping[str, Any], sentence: str) -> None:
+        self.out.print(sentence)
+        for alert in answer["alerts"][:5]:
+            self.out.print(f"{alert['time_s']:.1f} s  {alert['detector']}: {alert['why']}", style="yellow")
+        if len(answer["alerts"]) > 5:
+            self.out.print(f"... and {len(answer['alerts']) - 5} more alerts in the answer", style="dim")
+
+    def stability(self, answer: Mapping[str, Any]) -> None:
+        table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
+        for name, side in (("condition", "left"), ("expression > 0", "left"), ("value", "right"), ("", "left")):
+            table.add_column(name, justify=side)  # type: ignore[arg-type]
+        for group, lines in answer["conditions"].items():
+            for i, (line, value) in enumerate(lines.items()):
+                mark = "[green]holds[/green]" if value > 0 else "[red]fails[/red]"
+                table.add_row(group if i == 0 else "", line, f"{value:.4g}", mark)
+        self.out.print(table)
+        self.out.print()
+        if answer["setting"]["dead_time_s"] > 0:
+            self.out.print("The conditions above know no dead time; the verdict below does.", style="dim")
+        local, string, peak = answer["locally_stable"], answer["string_stable"], answer["peak_gain"]
+        self.out.print(f"locally stable   {_yes(local)}")
+        self.out.print(f"string stable    {_yes(string)}")
+        if peak is not None:
+            where = f" at {answer['peak_frequency_radps']:.3g} rad/s" if not string else ""
+            self.out.print(f"peak gain        [bold]{peak:.4f}[/bold]{where}")
+        self.out.print(f"dead time left   {answer['dead_time_margin_s']:.3f} s until locally unstable")
+
+    def done(self, out: Path, answer: Mapping[str, Any]) -> None:
+        if self.json:
+            print(json.dumps(answer, default=lambda x: x.tolist()))
+            return
+        names = ", ".join(sorted(p.name for p in out.iterdir() if p.suffix in (".json", ".png")))
+        self.out.print(f"\nWritten to [bold]{out}[/bold]: {names}", soft_wrap=True)
+
+
+def _yes(verdict: bool) -> str:
+    return "[bold green]yes[/bold green]" if verdict else "[bold red]no[/bold red]"
+
+
+def write_answer(out: Path, name: str, answer: Mapping[str, Any], pictures: Mapping[str, Callable[[], Any]]) -> None:
+    """Write the pictures, then the answer: while `name` is missing, what lies in the folder is not whole."""
+    from avtorch.io import write_json
+    from avtorch.plots import save
+
+    (out / name).unlink(missing_ok=True)
+    for file, draw in pictures.items():
+        save(draw(), out / file)
+    write_json(out / name, answer)

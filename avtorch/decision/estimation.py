@@ -1,0 +1,104 @@
+"""A recorded log, window by window: belief, alerts and P(string stable) (the command line's `estimate`)."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+
+from avtorch.decision.monitor import Monitor
+from avtorch.decision.settings import Setting
+from avtorch.decision.watch import Watch, WatchedWindow
+from avtorch.errors import InputError
+from avtorch.inference.evidence import Form, JerkForm
+from avtorch.inference.latent_form import LatentForm
+from avtorch.inference.stream import BeliefStream
+from avtorch.io.log import Log
+from avtorch.io.quality import Quality, check
+
+FormName = Literal["auto", "jerk", "latent"]
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """What `estimate` found.
+
+    `windows` in the order of the log; `seconds_per_window` of computing; `form` "jerk" or "latent"; `quality` of the
+    log, looked at first; `setting` under which P(string stable) was asked: a log does not tell its controller.
+    """
+
+    windows: list[WatchedWindow]
+    seconds_per_window: float
+    form: str
+    quality: Quality
+    setting: Setting
+
+    @property
+    def excited_share(self) -> float:
+        """Share of the windows that were excited, and so used."""
+        excited = [bool(w.window.belief.excited[0]) for w in self.windows]
+        return sum(excited) / len(excited)
+
+
+def estimate(
+    log: Log,
+    window: float = 2.0,
+    *,
+    form: FormName = "auto",
+    setting: Setting | None = None,
+    monitor: Monitor | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    seed: int = 0,
+    **inference: Any,
+) -> Estimates:
+    """The belief in (T_L, K_L) over a log, one posterior per `window` [s], each the prior of the next.
+
+    `form`: "jerk" needs measured jerk and accel (Eq. 4); "latent" takes accel and/or speed with their noise;
+    "auto" is "jerk" where the log has both. Windows lie on a grid that starts afresh with each segment of the log; the
+    last of a segment may be short. Rows at standstill or with `engaged` 0 are masked. `progress(done, of)` is called
+    with rows. Further keywords go to `SequentialInference` (`mode`, `lam`, `settings`, ...).
+
+    Raises `InputError` for a log without accel_cmd, a form whose columns it lacks, or a window longer than the log.
+    """
+    if log.accel_cmd is None:
+        raise InputError(f"{log.name}: has no accel_cmd; without the demanded acceleration T_L and K_L are not to be told")
+    chosen = _form(log, form)
+    if not window > 0:
+        raise InputError(f"window: found {window:g} s, needs a number above 0")
+    longest = max(float(log.time[part][-1] - log.time[part][0]) for part in log.segments())
+    # a window of rows spans one step less than its length
+    if window > longest + 1.5 / log.rate_hz:
+        raise InputError(f"window: found {window:g} s, needs at most {longest:g} s, the longest segment of {log.name}")
+    quality = check(log)
+    setting = Setting() if setting is None else setting
+    watch = Watch(BeliefStream(window=window, form=chosen, gap=float("inf"), seed=seed, **inference), monitor)
+    usable = torch.from_numpy(log.usable)
+    signals = {name: torch.from_numpy(getattr(log, name)) for name in chosen.columns}
+    windows: list[WatchedWindow] = []
+    begun = clock.perf_counter()
+    for part in log.segments():
+        time = torch.from_numpy(log.time[part])
+        # block by block, so that progress can be shown and an interruption heard
+        for first in range(0, len(time), 1000):
+            block = slice(first, first + 1000)
+            rows = {name: signal[part][block] for name, signal in signals.items()}
+            windows += watch.feed(time[block], rows, setting, usable=usable[part][block])
+            if progress is not None:
+                progress(part.start + min(first + 1000, len(time)), log.rows)
+        windows += watch.flush(setting)
+    seconds = (clock.perf_counter() - begun) / max(len(windows), 1)
+    return Estimates(windows, seconds, "jerk" if isinstance(chosen, JerkForm) else "latent", quality, setting)
+
+
+def _form(log: Log, form: FormName) -> Form:
+    if form not in ("auto", "jerk", "latent"):
+        raise InputError(f"form: found {form!r}, needs 'auto', 'jerk' or 'latent'")
+    measured = log.jerk is not None and log.accel is not None
+    if form == "jerk" and not measured:
+        raise InputError(f"form: 'jerk' needs the columns jerk and accel, which {log.name} lacks; try 'latent'")
+    if form != "latent" and measured:
+        return JerkForm()
+    return LatentForm(accel=log.accel is not None, speed=log.speed is not None)

@@ -1,0 +1,160 @@
+"""The strategist's finite grid of settings, and how intrusive each one is.
+
+Grid, relative to the driver's default and to the setting in force:
+
+- lower level: keep what is in force, or update the model to the estimate with a target lag between the default's and the
+  estimate's, in equal steps of its logarithm. A slower target asks less of the actuator: it lowers the command effort
+  T_hat K_d / (K_hat T_d).
+- time gap: the driver's settings, none shorter than the default.
+- gains: the default's, and a stated list of triples, calibrated beforehand.
+
+Intrusiveness is a number without unit; one is what updating the lower level costs. What nobody in the car notices costs
+least, what the driver sees on the dashboard or the engineer has to re-approve costs more, and both together cost the sum:
+
+    lower level differs from the default    1    + 0.5 for each doubling of the command effort above 1
+    lower level kept though known wrong     2    (the paper: update at a minimum)
+    time gap longer than the default        1.5  + 3 (gap / default - 1)
+    gains differ from the default           2    + sum over gains of |log2(ratio)|, for k_a of 1 - k_a
+
+so that 1 -> 1.6 s costs 3.3, 1 -> 2.5 s costs 6, doubling k_v costs 3. The lower level alone comes first (about 1 to
+2.7), then one step of the gap or a mild change of gains, then the longest gap or a strong change of gains, then both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from avtorch.decision.algorithm2 import PAPER_GAINS
+from avtorch.decision.settings import DRIVER_TIME_GAPS, Setting
+from avtorch.errors import InputError
+
+GAINS_GRID: tuple[tuple[float, float, float], ...] = (
+    *product((1.5,), (1.5, 2.0, 3.0, 4.0, 6.0), (-0.8, -1.8, -3.0, -5.0)),
+    PAPER_GAINS,
+)
+"""Gains (k_s, k_v, k_a) on offer: k_v makes the car responsive, which a weak actuator needs; a stronger k_a holds back a
+slow one. k_s stays, as it is neutral (paper, table on gains). The paper's own triple is among them."""
+
+
+@dataclass(frozen=True)
+class Intrusiveness:
+    """Weights of the cost in this module's text; `margin` is the strategist's price of a setting that barely passes."""
+
+    update: float = 1.0
+    effort: float = 0.5
+    stale: float = 2.0
+    gap: float = 1.5
+    gap_length: float = 3.0
+    gains: float = 2.0
+    gains_change: float = 1.0
+    margin: float = 2.0
+
+    def __call__(self, setting: Setting, default: Setting, stale: Tensor) -> Tensor:
+        """Cost of settings against defaults that broadcast with them; `stale`: a model known to be wrong is kept."""
+        lower = setting.lower_differs(default)
+        effort = (setting.amplification() / default.amplification()).log2().clamp_min(0.0)
+        longer = (setting.time_gap / default.time_gap - 1.0).clamp_min(0.0)
+        k, k0 = setting.gains, default.gains
+        k = torch.cat([k[..., :2], 1.0 - k[..., 2:]], dim=-1)
+        k0 = torch.cat([k0[..., :2], 1.0 - k0[..., 2:]], dim=-1)
+        # A gain of zero or below has no ratio; the smallest stands in, so that it counts as a large change.
+        octaves = (k.clamp_min(1e-3) / k0.clamp_min(1e-3)).log2().abs().sum(dim=-1)
+        return (
+            self.update * lower
+            + self.effort * effort
+            + self.stale * stale
+            + self.gap * (longer > 1e-9)
+            + self.gap_length * longer
+            + self.gains * (octaves > 1e-9)
+            + self.gains_change * octaves
+        )
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """`setting` (scenario, candidate); `cost` (scenario, candidate), infinite where a candidate is not on offer."""
+
+    setting: Setting
+    cost: Tensor
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A finite set of settings (see the module's text).
+
+    time_gaps [s]; gains: triples; targets: positions of T_d between the default's target lag (0) and the estimated lag
+    (1); allowed: strategies out of {1, 2, 3} that may be used. gains_of_gap: for a controller whose gains follow from
+    its time gap (an MPC's equivalent gains): (time gap [s]) -> triple; Strategy 3 is then not on offer. Raises
+    `InputError` for an empty or impossible grid.
+    """
+
+    time_gaps: Sequence[float] = DRIVER_TIME_GAPS
+    gains: Sequence[Sequence[float]] = GAINS_GRID
+    targets: Sequence[float] = (0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0)
+    allowed: frozenset[int] = frozenset({1, 2, 3})
+    gains_of_gap: Callable[[float], Sequence[float]] | None = None
+    intrusiveness: Intrusiveness = field(default_factory=Intrusiveness)
+
+    def __post_init__(self) -> None:
+        if not self.allowed <= {1, 2, 3}:
+            raise InputError(f"allowed: found {sorted(self.allowed)}, need some of 1, 2, 3")
+        if any(not gap > 0.0 for gap in self.time_gaps):
+            raise InputError(f"time_gaps: found {tuple(self.time_gaps)}, need numbers above 0")
+        if any(not 0.0 <= t <= 1.0 for t in self.targets):
+            raise InputError(f"targets: found {tuple(self.targets)}, need numbers from 0 to 1")
+        if any(len(k) != 3 for k in self.gains):
+            raise InputError("gains: need triples (k_s, k_v, k_a)")
+
+    def candidates(
+        self, T_L: Tensor, K_L: Tensor, *, current: Setting, default: Setting, model_wrong: Tensor
+    ) -> Candidates:
+        """All settings on offer at the estimates T_L [s], K_L [-] (scenario,), (scenario, candidate).
+
+        `model_wrong` (scenario,) bool: a change of the vehicle was detected, so the model in force is known to be wrong.
+        """
+        scenarios = T_L.shape[0]
+        column = default[:, None]
+        # Lower level: row 0 keeps what is in force.
+        targets = torch.tensor(list(self.targets) if 1 in self.allowed else [], dtype=torch.float64)
+        reach = (T_L / default.T_d).log().clamp_min(0.0)[:, None]
+        T_d = torch.cat([current.T_d[:, None], column.T_d * (targets * reach).exp()], dim=1)
+        T_hat = torch.cat([current.T_hat[:, None], T_L[:, None].expand(-1, len(targets))], dim=1)
+        K_hat = torch.cat([current.K_hat[:, None], K_L[:, None].expand(-1, len(targets))], dim=1)
+        K_d = torch.cat([current.K_d[:, None], column.K_d.expand(-1, len(targets))], dim=1)
+        # An estimate at or below the default's target leaves one update, not several that are the same.
+        fresh = torch.cat([torch.ones(scenarios, 1, dtype=torch.bool), (targets == 0.0) | (reach > 1e-9)], dim=1)
+
+        gaps = torch.cat(
+            [column.time_gap, torch.tensor(list(self.time_gaps), dtype=torch.float64).expand(scenarios, -1)], dim=1
+        )
+        offered = gaps > column.time_gap + 1e-9
+        offered[:, 0] = True
+        if 2 not in self.allowed:
+            offered[:, 1:] = False
+
+        triples = list(self.gains) if 3 in self.allowed and self.gains_of_gap is None else []
+        listed = torch.tensor([list(k) for k in triples], dtype=torch.float64).reshape(-1, 3)
+        gains = torch.cat([default.gains[:, None], listed.expand(scenarios, -1, 3)], dim=1)
+        other = (gains - default.gains[:, None]).abs().amax(dim=-1) > 1e-9
+        other[:, 0] = True
+
+        lower, gap, gain = (
+            i.reshape(-1)
+            for i in torch.meshgrid(*(torch.arange(n) for n in (T_d.shape[1], gaps.shape[1], gains.shape[1])), indexing="ij")
+        )
+        k = gains[:, gain]
+        if self.gains_of_gap is not None:
+            k = torch.tensor(
+                [[list(self.gains_of_gap(g)) for g in row] for row in gaps.tolist()], dtype=torch.float64
+            )[:, gap]
+        setting = Setting(T_hat[:, lower], K_hat[:, lower], T_d[:, lower], K_d[:, lower], gaps[:, gap], k)
+        priced_default = column if self.gains_of_gap is None else column.replace(gains=k)
+        cost = self.intrusiveness(setting, priced_default, model_wrong[:, None] & (lower == 0))
+        on_offer = fresh[:, lower] & offered[:, gap] & other[:, gain]
+        return Candidates(setting, torch.where(on_offer, cost, torch.inf))
+

@@ -1,0 +1,170 @@
+"""What a setting would have done over the last windows: the closed loop replayed behind the leader that was seen.
+
+The replay starts from the state logged at the beginning of the stretch, follows the leader's logged speed and acceleration
+with the posterior mean as the vehicle, and moves the time gap from the one in force at the loop's own rate. It is how
+the strategist predicts clipping and cost before it touches the car.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from avtorch.decision.settings import Number, Setting
+from avtorch.errors import InputError
+from avtorch.vehicle.block import Block
+from avtorch.vehicle.leader import Leader
+from avtorch.vehicle.loop import ClosedLoop
+from avtorch.vehicle.performance import performance
+from avtorch.vehicle.plant import GLVDPlant
+from avtorch.vehicle.time_gap import RAMP_RATE
+
+_ROWS = 4096  # closed loops run side by side: more would only cost memory
+
+
+@dataclass(frozen=True)
+class History:
+    """The last seconds as logged: `lead_speed` [m/s], `lead_accel` [m/s²] (scenario, time) at steps of `dt` [s]; the
+    follower's `spacing` [m] and `speed` [m/s] (scenario,) at the beginning.
+    """
+
+    dt: float
+    lead_speed: Tensor
+    lead_accel: Tensor
+    spacing: Tensor
+    speed: Tensor
+
+    def __post_init__(self) -> None:
+        if self.lead_speed.ndim != 2 or self.lead_speed.shape != self.lead_accel.shape:
+            raise InputError(
+                f"history: found lead_speed {tuple(self.lead_speed.shape)} and lead_accel "
+                f"{tuple(self.lead_accel.shape)}, need (scenario, time) both"
+            )
+        if self.lead_speed.shape[1] < 2:
+            raise InputError(f"history: found {self.lead_speed.shape[1]} rows, need 2 or more")
+
+    @staticmethod
+    def of_blocks(blocks: Sequence[Block], *, seconds: float = 20.0) -> History:
+        """The last `seconds` of consecutive blocks of a run, (scenario, time), shortened to what there is."""
+        whole = Block.concatenate(list(blocks))
+        dt = float(whole.time[1] - whole.time[0])
+        part = whole[max(0, whole.time.shape[0] - round(seconds / dt) - 1) :]
+        return History(dt, part.lead_speed, part.lead_accel, part.spacing[..., 0], part.speed[..., 0])
+
+    @property
+    def seconds(self) -> float:
+        return (self.lead_speed.shape[1] - 1) * self.dt
+
+    def __getitem__(self, index: Tensor) -> History:
+        """Some of the scenarios."""
+        return History(
+            self.dt, self.lead_speed[index], self.lead_accel[index], self.spacing[index], self.speed[index]
+        )
+
+    def thinned(self, dt: float) -> History:
+        """Every n-th row, so that the step is at most `dt` [s] (never finer than logged)."""
+        n = max(1, int(dt / self.dt + 1e-9))
+        n = min(n, self.lead_speed.shape[1] - 1)
+        return History(
+            n * self.dt, self.lead_speed[:, ::n], self.lead_accel[:, ::n], self.spacing, self.speed
+        )
+
+    def leader(self) -> Leader:
+        """The leader seen, (scenario, time), position from 0."""
+        v = self.lead_speed
+        moved = 0.5 * self.dt * (v[:, 1:] + v[:, :-1])
+        position = torch.cat([torch.zeros_like(v[:, :1]), moved.cumsum(dim=1)], dim=1)
+        time = torch.arange(v.shape[1], dtype=torch.float64) * self.dt
+        return Leader(time, position, v, self.lead_accel, self.dt, "leader seen")
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted over the replay, every tensor of one shape, (scenario, candidate) from `replay`.
+
+    `clipped_share` of commands [-]; `throughput_vph` at equilibrium at the leader's mean speed with the setting's own
+    time gap; `jerk_rms_mps3` [m/s³] (comfort); `min_spacing_m`, `mean_spacing_m` [m]; `command_rms_mps2` [m/s²] and
+    `amplification` [-] (command effort).
+    """
+
+    clipped_share: Tensor
+    throughput_vph: Tensor
+    jerk_rms_mps3: Tensor
+    min_spacing_m: Tensor
+    mean_spacing_m: Tensor
+    command_rms_mps2: Tensor
+    amplification: Tensor
+
+    def map(self, change: object) -> Prediction:
+        """A function of a tensor applied to every field."""
+        return Prediction(**{name: change(value) for name, value in vars(self).items()})  # type: ignore[operator]
+
+    def as_dict(self, scenario: int = 0) -> dict[str, float]:
+        """One scenario's figures, for a prediction of shape (scenario,)."""
+        return {name: float(value[scenario]) for name, value in vars(self).items()}
+
+
+@torch.no_grad()
+def replay(
+    history: History,
+    setting: Setting,
+    *,
+    T_L: Tensor,
+    K_L: Tensor,
+    time_gap_now: Tensor,
+    accel_min: Number = -6.0,
+    accel_max: Number = 4.0,
+    standstill: float = 5.0,
+    ramp_rate: float = RAMP_RATE,
+    delay: float = 0.0,
+    dt: float = 0.05,
+) -> Prediction:
+    """Run `setting` (scenario, candidate) through `history` with the vehicle T_L [s], K_L [-] (scenario,).
+
+    The time gap leaves `time_gap_now` (scenario,) after `delay` [s] at `ramp_rate` [s/s]. Limits [m/s²] are numbers or
+    (scenario,). The step is the logged one or a multiple of it, at most `dt` [s] and a sixth of the lag: a command held
+    for longer would shake a fast car with a strong k_a, which the real loop does not.
+    """
+    past = history.thinned(min(dt, float(T_L.min()) / 6.0))
+    scenarios, candidates = setting.shape
+    loop = ClosedLoop(
+        past.leader(),
+        plant=GLVDPlant(T_L, K_L, 0.0),
+        scenarios=scenarios,
+        spacing0=past.spacing.clamp_min(0.1),
+        speed0=past.speed,
+    )
+    parts = []
+    each = max(1, _ROWS // scenarios)
+    for first in range(0, candidates, each):
+        some = setting[:, first : first + each]
+        some = some.transposed()
+        twin = loop.copy(candidates=some.shape[0])
+        start = Setting(time_gap=time_gap_now, gains=some.gains).controller(standstill=standstill)
+        twin.controller = some.retarget(start, at=delay, rate=ramp_rate)
+        twin.lower_level = some.lower_level(accel_min=accel_min, accel_max=accel_max)
+        parts.append(_predict(twin.advance(past.lead_speed.shape[1]), some, standstill))
+    return Prediction(*(torch.cat(column).mT for column in zip(*(vars(p).values() for p in parts), strict=True)))
+
+
+def _predict(run: Block, setting: Setting, standstill: float) -> Prediction:
+    """Of one run (candidate, scenario, time) under `setting` (candidate, scenario)."""
+    shape = setting.shape
+
+    def flat(x: Tensor) -> Tensor:
+        return x.reshape(-1, x.shape[-1])
+
+    rows = Block(run.time, *(flat(v) for name, v in vars(run).items() if name != "time"))
+    seen = performance(rows, time_gap=setting.time_gap.reshape(-1), standstill=standstill)
+    return Prediction(
+        clipped_share=seen.clipped_share.reshape(shape),
+        throughput_vph=seen.throughput_vph.reshape(shape),
+        jerk_rms_mps3=seen.jerk_rms_mps3.reshape(shape),
+        min_spacing_m=seen.min_spacing_m.reshape(shape),
+        mean_spacing_m=run.spacing.mean(dim=-1),
+        command_rms_mps2=run.accel_cmd.square().mean(dim=-1).sqrt(),
+        amplification=setting.amplification(),
+    )

@@ -1,0 +1,363 @@
+"""The strategist: the least intrusive setting that is good enough, out of a stated finite grid.
+
+A setting is *sufficient* when
+
+1. P(string stable) under the posterior draws reaches `required` (0.95), by the exact condition at the effective
+   actuation (T_e, K_e) that setting gives every draw;
+2. at most 5 % of the commands it would have sent over the last windows are clipped at the vehicle's limits, and it would
+   not have collided, both in a replay of the closed loop (`replay.py`). The inversion formula knows no limits: without
+   this, inverting a slow actuator would always win, on paper.
+
+Among the sufficient ones the least `total` is taken: the intrusiveness of `grid.py` plus `margin` times the probability of
+being string unstable when the spread of the belief is doubled, as the first posterior after a change is still pulled to
+the past by its prior. Sufficient settings are searched in order of intrusiveness, and the search ends when nothing left
+could be better; where it ends without one, every setting that reaches `required` has been replayed. The one with the
+best P(string stable) is then taken, out of those that clip at most five points more than the setting in force would have,
+and would have collided no harder (a leader who asks for more than the car has clips every setting), and `sufficient` says that it is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from avtorch.decision.grid import Candidates, Grid
+from avtorch.decision.replay import History, Prediction, replay
+from avtorch.decision.settings import Number, Setting
+from avtorch.errors import InputError
+from avtorch.vehicle.time_gap import RAMP_RATE
+
+# Candidates judged, and replayed, at a time: few scenarios leave room for more at nearly the same price.
+_JUDGED = 48
+_REPLAYED = 512
+_PAIRS = 1024
+_SCREEN = 12
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What to do in each scenario; every tensor (scenario,).
+
+    `setting`: the choice. `sufficient`: whether it meets both conditions; `p_string_stable` under the belief, and
+    `p_robust` with the spread doubled. `intrusiveness` as in `grid.py`. `predicted`: clipping and costs in the replay.
+    `strategies` lead from the default to the choice; `changes`: it differs from the setting in force. `why`: one
+    sentence each. `interim`: the setting until the driver has set the longer time gap, `p_interim` its P(string
+    stable), `driver_delay_s` the time allowed for it; where no driver is asked, 0 and the choice itself.
+    """
+
+    setting: Setting
+    sufficient: Tensor
+    p_string_stable: Tensor
+    p_robust: Tensor
+    intrusiveness: Tensor
+    predicted: Prediction
+    strategies: list[set[int]]
+    changes: Tensor
+    why: list[str]
+    interim: Setting
+    p_interim: Tensor
+    driver_delay_s: Tensor
+
+    def as_dict(self, scenario: int = 0) -> dict[str, object]:
+        """One scenario as an action of `run.json` (without its time), costs beside it."""
+        asked = float(self.driver_delay_s[scenario])
+        return {
+            "strategies": sorted(self.strategies[scenario]),
+            "settings": self.setting.as_dict(scenario),
+            "why": self.why[scenario],
+            "p_string_stable": float(self.p_string_stable[scenario]),
+            "sufficient": bool(self.sufficient[scenario]),
+            "predicted": self.predicted.as_dict(scenario),
+            "driver_delay_s": asked,
+        }
+
+
+@dataclass(frozen=True)
+class Strategist:
+    """Chooses settings; see the module's text.
+
+    grid: what is on offer. required: P(string stable) to reach. most_clipped: share of commands. draws: of the
+    posterior, used in the search (the figures reported use all that are given). dead_time [s]: of the vehicle.
+    driver_delay [s]: where above zero the time gap is not set but asked for, and the driver needs that long.
+    Raises `InputError` for numbers out of range.
+    """
+
+    grid: Grid = field(default_factory=Grid)
+    required: float = 0.95
+    most_clipped: float = 0.05
+    draws: int = 256
+    dead_time: float = 0.0
+    driver_delay: float = 0.0
+    ramp_rate: float = RAMP_RATE
+    standstill: float = 5.0
+
+    def __post_init__(self) -> None:
+        for name in ("required", "most_clipped"):
+            value = getattr(self, name)
+            if not 0.0 < value < 1.0:
+                raise InputError(f"{name}: found {value}, need a number between 0 and 1")
+        if self.draws < 20:
+            raise InputError(f"draws: found {self.draws}, need 20 or more")
+        if not self.driver_delay >= 0.0:
+            raise InputError(f"driver_delay: found {self.driver_delay} s, need 0 or more")
+
+    @torch.no_grad()
+    def decide(
+        self,
+        T_L: Tensor,
+        K_L: Tensor,
+        history: History,
+        *,
+        current: Setting,
+        default: Setting,
+        time_gap_now: Tensor | None = None,
+        model_wrong: Tensor | None = None,
+        accel_min: Number = -6.0,
+        accel_max: Number = 4.0,
+    ) -> Decision:
+        """Choose for every scenario, from posterior draws T_L [s], K_L [-] (scenario, draw) and the last seconds.
+
+        `current` is in force, `default` the driver's and engineer's choice; `time_gap_now` [s] where the gap is still
+        on its way (default: there). `model_wrong` (scenario,) bool, default all: a change of the vehicle was detected,
+        so keeping the lower level's model has its price. Limits [m/s²] are numbers or (scenario,). Raises `InputError`
+        for shapes that do not fit.
+        """
+        scenarios = T_L.shape[0]
+        if T_L.ndim != 2 or K_L.shape != T_L.shape or history.lead_speed.shape[0] != scenarios:
+            raise InputError(
+                f"T_L, K_L, history: found {tuple(T_L.shape)}, {tuple(K_L.shape)} and "
+                f"{history.lead_speed.shape[0]} scenarios, need (scenario, draw) and as many scenarios"
+            )
+        T_L, K_L = T_L.to(torch.float64), K_L.to(torch.float64)
+        wrong = torch.ones(scenarios, dtype=torch.bool) if model_wrong is None else model_wrong
+        search = _Search(
+            self,
+            T_L,
+            K_L,
+            history,
+            current=current,
+            default=default,
+            time_gap_now=current.time_gap if time_gap_now is None else time_gap_now,
+            wrong=wrong,
+            limits=(torch.as_tensor(accel_min).expand(scenarios), torch.as_tensor(accel_max).expand(scenarios)),
+        )
+        pick, sufficient = search.run()
+        rows = torch.arange(scenarios)
+        chosen = search.candidates.setting[rows, pick]
+        p = chosen.p_string_stable(T_L, K_L, dead_time=self.dead_time)
+        longer = chosen.time_gap > current.time_gap + 1e-9
+        asked = longer & (self.driver_delay > 0.0)
+        interim = chosen.replace(time_gap=torch.where(asked, current.time_gap, chosen.time_gap))
+        predicted = search.prediction(pick)
+        strategies = chosen.strategies(default)
+        return Decision(
+            setting=chosen,
+            sufficient=sufficient,
+            p_string_stable=p,
+            p_robust=chosen.p_string_stable(*_widened(T_L, K_L), dead_time=self.dead_time),
+            intrusiveness=search.candidates.cost[rows, pick],
+            predicted=predicted,
+            strategies=strategies,
+            changes=torch.tensor([bool(s) for s in chosen.strategies(current)]),
+            why=_sentences(chosen, current, default, strategies, sufficient, p, predicted, asked, self),
+            interim=interim,
+            p_interim=interim.p_string_stable(T_L, K_L, dead_time=self.dead_time),
+            driver_delay_s=asked * self.driver_delay,
+        )
+
+
+class _Search:
+    """One decision's search over (scenario, candidate)."""
+
+    def __init__(
+        self,
+        rules: Strategist,
+        T_L: Tensor,
+        K_L: Tensor,
+        history: History,
+        *,
+        current: Setting,
+        default: Setting,
+        time_gap_now: Tensor,
+        wrong: Tensor,
+        limits: tuple[Tensor, Tensor],
+    ) -> None:
+        self.rules, self.history, self.gap_now, self.limits = rules, history, time_gap_now, limits
+        self.T, self.K = T_L.mean(dim=-1), K_L.mean(dim=-1)
+        every = max(1, T_L.shape[1] // rules.draws)
+        self.belief = (T_L[:, ::every], K_L[:, ::every])
+        self.candidates: Candidates = rules.grid.candidates(
+            self.T, self.K, current=current, default=default, model_wrong=wrong
+        )
+        shape = self.candidates.cost.shape
+        self.p = torch.full(shape, torch.nan, dtype=torch.float64)
+        self.total = self.candidates.cost.clone()
+        self.predictions: Prediction | None = None
+        self.replayed = torch.zeros(shape, dtype=torch.bool)
+
+    def run(self) -> tuple[Tensor, Tensor]:
+        """(choice, whether it is sufficient), (scenario,) each."""
+        cost = self.candidates.cost
+        order = cost.argsort(dim=1, stable=True)
+        best = torch.full((cost.shape[0],), torch.inf, dtype=torch.float64)
+        pick = torch.zeros(cost.shape[0], dtype=torch.long)
+        chunk = max(_JUDGED, _REPLAYED // cost.shape[0])
+        for first in range(0, cost.shape[1], chunk):
+            column = order[:, first : first + chunk]
+            # The margin only adds: what is dearer already without it cannot win.
+            open_ = torch.nonzero(cost.gather(1, column[:, :1])[:, 0] < best)[:, 0]
+            if len(open_) == 0:
+                break
+            self._judge(open_, column[open_])
+            tries = max(4, _REPLAYED // len(open_))
+            while True:
+                worth = (self.p[open_] >= self.rules.required) & ~self.replayed[open_]
+                worth &= self.total[open_] < best[open_, None]
+                if not bool(worth.any()):
+                    break
+                # Few at first, as the least intrusive mostly is sufficient; ever more where it is not.
+                self._replay(open_, worth, self.total[open_], tries)
+                tries *= 4
+                good = torch.where(self._sufficient(), self.total, torch.inf)
+                best, pick = good.min(dim=1)
+        lost = torch.nonzero(torch.isinf(best))[:, 0]
+        if len(lost):
+            pick[lost] = self._best_of_the_rest(lost)
+        return pick, torch.isfinite(best)
+
+    def _best_of_the_rest(self, lost: Tensor) -> Tensor:
+        """Where none will do: the best P(string stable) of what clips little more than the setting in force would.
+
+        The setting in force is the first candidate. All that reach the required P have been replayed already.
+        """
+        cost = self.candidates.cost[lost]
+        in_force = torch.zeros_like(cost, dtype=torch.bool)
+        in_force[:, 0] = True
+        rest = torch.isfinite(cost) & ~self.replayed[lost]
+        self._replay(lost, rest, torch.where(in_force, -torch.inf, -self.p[lost].nan_to_num(0.0) + 1e-6 * cost), 16)
+        assert self.predictions is not None
+        clipped, nearest = self.predictions.clipped_share[lost], self.predictions.min_spacing_m[lost]
+        bearable = clipped <= clipped[:, :1] + self.rules.most_clipped
+        no_closer = nearest >= nearest[:, :1].clamp_max(1e-9)
+        judged = self.replayed[lost] & torch.isfinite(self.p[lost])
+        eligible = in_force | (judged & bearable & no_closer)
+        # Beyond the required P less clipping is worth more than a better P.
+        score = self.p[lost].clamp_max(self.rules.required) - 1e-3 * clipped - 1e-6 * cost.clamp_max(1e2)
+        return torch.where(eligible, score, -torch.inf).argmax(dim=1)
+
+    def prediction(self, pick: Tensor) -> Prediction:
+        assert self.predictions is not None
+        return self.predictions.map(lambda x: x[torch.arange(len(pick)), pick])
+
+    def _judge(self, rows: Tensor, columns: Tensor) -> None:
+        """P(string stable) and the price of the margin for some candidates (row, chunk).
+
+        Most candidates fail clearly: a few draws screen them. One that reaches the required 0.95 is string stable in
+        fewer than five of twelve draws once in 10⁸ times.
+        """
+        r, c = rows[:, None].expand_as(columns).reshape(-1), columns.reshape(-1)
+        offered = torch.isfinite(self.candidates.cost[r, c])
+        r, c = r[offered], c[offered]
+        self.p[r, c] = self._probability(r, c, self.belief, every=self.belief[0].shape[1] // _SCREEN)
+        left = self.p[r, c] > 0.4
+        r, c = r[left], c[left]
+        self.p[r, c] = self._probability(r, c, self.belief)
+        left = self.p[r, c] >= self.rules.required
+        r, c = r[left], c[left]
+        unstable = 1.0 - self._probability(r, c, _widened(*self.belief), every=2)
+        self.total[r, c] += self.rules.grid.intrusiveness.margin * unstable
+
+    def _probability(self, r: Tensor, c: Tensor, belief: tuple[Tensor, Tensor], *, every: int = 1) -> Tensor:
+        """P(string stable) of the pairs (scenario r, candidate c), from every n-th draw."""
+        T, K = (x[:, :: max(1, every)] for x in belief)
+        parts = [
+            self.candidates.setting[i, j].p_string_stable(T[i], K[i], dead_time=self.rules.dead_time)
+            for i, j in zip(r.split(_PAIRS), c.split(_PAIRS), strict=True)
+            if len(i)
+        ]
+        return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.float64)
+
+    def _replay(self, rows: Tensor, worth: Tensor, rank: Tensor, count: int) -> None:
+        """Replay, for each of `rows`, the `count` candidates of least `rank` among those `worth` it."""
+        rank = torch.where(worth, rank, torch.inf)
+        busy = worth.any(dim=1)
+        rows, rank, worth = rows[busy], rank[busy], worth[busy]
+        if len(rows) == 0:
+            return
+        count = min(count, int(worth.sum(dim=1).max()))
+        columns = rank.argsort(dim=1, stable=True)[:, :count]
+        seen = replay(
+            self.history[rows],
+            self.candidates.setting[rows[:, None], columns],
+            T_L=self.T[rows],
+            K_L=self.K[rows],
+            time_gap_now=self.gap_now[rows],
+            accel_min=self.limits[0][rows],
+            accel_max=self.limits[1][rows],
+            standstill=self.rules.standstill,
+            ramp_rate=self.rules.ramp_rate,
+            delay=self.rules.driver_delay,
+        )
+        if self.predictions is None:
+            self.predictions = seen.map(lambda x: torch.full(self.p.shape, torch.nan, dtype=torch.float64))
+        for name, value in vars(seen).items():
+            getattr(self.predictions, name)[rows[:, None], columns] = value
+        self.replayed[rows[:, None], columns] = True
+
+    def _sufficient(self) -> Tensor:
+        assert self.predictions is not None
+        return (
+            self.replayed
+            & (self.p >= self.rules.required)
+            & (self.predictions.clipped_share <= self.rules.most_clipped)
+            & (self.predictions.min_spacing_m > 0.0)
+        )
+
+
+def _widened(T_L: Tensor, K_L: Tensor) -> tuple[Tensor, Tensor]:
+    """The belief with its spread doubled about the mean, in log space, draws on the last dimension."""
+
+    def twice(draws: Tensor) -> Tensor:
+        z = draws.log()
+        return (2.0 * z - z.mean(dim=-1, keepdim=True)).exp()
+
+    return twice(T_L), twice(K_L)
+
+
+def _sentences(
+    chosen: Setting,
+    current: Setting,
+    default: Setting,
+    strategies: list[set[int]],
+    sufficient: Tensor,
+    p: Tensor,
+    predicted: Prediction,
+    asked: Tensor,
+    rules: Strategist,
+) -> list[str]:
+    """One sentence a scenario, as a person would say it."""
+    out = []
+    for i, used in enumerate(strategies):
+        now, was = chosen.as_dict(i), current.as_dict(i)
+        steps = []
+        if 1 in used:
+            steps.append(
+                f"lower level models T {now['T_hat']:.2f} s, K {now['K_hat']:.2f} and aims at {now['T_d']:.2f} s"
+            )
+        if 2 in used:
+            verb = "driver asked for a time gap of" if bool(asked[i]) else "time gap"
+            steps.append(f"{verb} {now['time_gap_s']:g} s instead of {float(default.time_gap[i]):g} s")
+        if 3 in used:
+            steps.append("gains " + ", ".join(f"{k:g}" for k in now["gains"]))
+        what = "; ".join(steps) if steps else "default setting"
+        if now == was:
+            what = f"setting in force stays ({what})"
+        clipped = 100.0 * float(predicted.clipped_share[i])
+        result = f"P(string stable) {float(p[i]):.2f}, {clipped:.1f} % of commands clipped"
+        if bool(sufficient[i]):
+            out.append(f"least intrusive sufficient setting: {what} ({result})")
+        else:
+            out.append(f"no setting of the grid is sufficient, the best is taken: {what} ({result})")
+    return out

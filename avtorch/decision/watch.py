@@ -1,0 +1,61 @@
+"""Belief and monitor on one stream of samples: what the command line's `estimate` and the supervisor both look through."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from avtorch.decision.monitor import Monitor, MonitorReport
+from avtorch.decision.settings import Setting
+from avtorch.inference.stream import BeliefStream, Window
+
+
+@dataclass(frozen=True)
+class WatchedWindow:
+    """A window's belief and what the monitor said of it under the `setting` in force."""
+
+    window: Window
+    report: MonitorReport
+    setting: Setting
+
+
+class Watch:
+    """A `stream` of beliefs about many vehicles with a `monitor` behind it, one scenario a vehicle."""
+
+    def __init__(self, stream: BeliefStream, monitor: Monitor | None = None) -> None:
+        self.stream = stream
+        self.monitor = Monitor(stream.vehicles) if monitor is None else monitor
+
+    def feed(
+        self,
+        time: Tensor,
+        columns: Mapping[str, Tensor],
+        setting: Setting,
+        *,
+        usable: Tensor | None = None,
+        until: float | None = None,
+    ) -> list[WatchedWindow]:
+        """Rows in, watched windows out; arguments as `BeliefStream.feed`, `setting` is the one in force over these rows."""
+        return [self._watch(w, setting) for w in self.stream.feed(time, columns, usable=usable, until=until)]
+
+    def flush(self, setting: Setting) -> list[WatchedWindow]:
+        """Close the open window early (the drive ends or a gap follows)."""
+        return [self._watch(w, setting) for w in self.stream.flush()]
+
+    def _watch(self, window: Window, setting: Setting) -> WatchedWindow:
+        belief = window.belief
+        T_L, K_L = (belief.draws[..., i].mT for i in range(2))
+        used = belief.excited & belief.converged
+        return WatchedWindow(window, self.monitor.update(T_L, K_L, used, setting), setting)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Belief, open window and monitor: a resumed watch goes on equal to the bit."""
+        return {"stream": self.stream.state_dict(), "monitor": self.monitor.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from `state_dict`; raises `InputError` where it is another watch's."""
+        self.stream.load_state_dict(state["stream"])
+        self.monitor.load_state_dict(state["monitor"])

@@ -1,0 +1,180 @@
+"""From a table and a mapping to the signals of a log: found, converted, checked, merged onto one clock."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.errors import InputError
+from avtorch.io.mapping import SIGNALS, SignalMap
+from avtorch.io.merge import held
+from avtorch.io.segments import gap_limit, median_step
+from avtorch.io.tables import Table, read_table
+from avtorch.io.units import to_si
+from avtorch.io.validity import check_range, check_rate, check_time
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Assembled:
+    """Signals ``(time,)`` in SI units by name, segment numbers from 0, columns not used, and what merging left out."""
+
+    signals: dict[str, Float]
+    segment: NDArray[np.int64]
+    ignored: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+
+def assemble(table: Table, mapping: SignalMap, *, folder: Path, following: bool) -> Assembled:
+    """Find, convert, check and merge the signals of a log.
+
+    ``folder`` is where other files named in the mapping lie. Rows where a signal with its own stamps had not arrived,
+    or is older than three of its own steps (0.1 s at least), are left out, which makes a gap; ``engaged`` and
+    ``segment`` are states that only tell changes and are held without end. Raises InputError for all that is certainly
+    wrong.
+    """
+    source = table.source
+    _require(table, mapping, following)
+    if table.rows < 2:
+        found = "one row" if table.rows == 1 else "a header but no rows"
+        raise InputError(f"{source}: has {found}; a log needs at least two rows")
+    signals: dict[str, Float] = {}
+    arrivals: dict[str, tuple[Float, Float]] = {}
+    for signal in SIGNALS:
+        column = mapping.column.get(signal, signal)
+        if signal in mapping.elsewhere:
+            arrivals[signal] = _from_elsewhere(signal, mapping, folder)
+        elif column in table.names:
+            if signal in mapping.stamp:
+                arrivals[signal] = _stamped(table, signal, column, mapping)
+            else:
+                signals[signal] = _signal(table, signal, column, mapping)
+    for signal in mapping.unit:
+        if signal not in signals and signal not in arrivals:
+            raise InputError(f"{source}: unit {signal}={mapping.unit[signal]}: the log has no column for {signal}")
+
+    time = signals["time"]
+    drive = signals.get("segment", np.zeros(len(time)))
+    clock = mapping.column.get("time", "time")
+    check_time(time, np.diff(drive) == 0, _place(table, "time", clock))
+    time_step = median_step(time, np.diff(drive) == 0)
+    check_rate(time_step, f"{source}: column {clock!r}")
+
+    remarks: list[str] = []
+    keep = np.ones(len(time), bool)
+    for signal, (stamps, values) in arrivals.items():
+        signals[signal], age = held(time, stamps, values)
+        # a value that is long overdue is no longer what the car does: those rows make a gap. States only tell changes.
+        limit = gap_limit(float(np.median(np.diff(stamps)))) if len(stamps) > 1 else np.inf
+        limit = np.inf if signal in ("engaged", "segment") else limit + time_step / 2
+        stale = (age > limit) | np.isinf(age)
+        if stale.any():
+            count = int(stale.sum())
+            remarks.append(f"{count} rows left out where {signal} had not arrived or was older than {limit:.3g} s")
+        keep &= ~stale
+    if keep.sum() < 2:
+        raise InputError(
+            f"{source}: the signals with time stamps of their own ({', '.join(arrivals)}) share {int(keep.sum())} rows "
+            f"with the log's clock ({time[0]:.6g} to {time[-1]:.6g} s); at least two are needed"
+        )
+    signals = {signal: values[keep] for signal, values in signals.items()}
+    time = signals["time"]
+    fresh = np.diff(time) > gap_limit(time_step)
+    if "segment" in signals:
+        fresh |= np.diff(signals["segment"]) != 0
+    segment = np.concatenate([[0], np.cumsum(fresh)]).astype(np.int64)
+    used = {mapping.column.get(signal, signal) for signal in SIGNALS if signal not in mapping.elsewhere}
+    used |= set(mapping.stamp.values())
+    ignored = tuple(name for name in table.names if name not in used)
+    return Assembled(signals, segment, ignored, tuple(remarks))
+
+
+def _require(table: Table, mapping: SignalMap, following: bool) -> None:
+    def there(signal: str) -> bool:
+        return mapping.column.get(signal, signal) in table.names or signal in mapping.elsewhere
+
+    for option in (mapping.column, mapping.stamp):
+        for signal, column in option.items():
+            if column not in table.names and signal not in mapping.elsewhere:
+                there_are = ", ".join(table.names)
+                raise InputError(f"{table.source}: column {column!r} ({signal}) is missing; columns: {there_are}")
+    needed = ("time", "spacing", "lead_speed") if following and not there("accel_cmd") else ("time", "accel_cmd")
+    for signal in needed:
+        if not there(signal):
+            raise InputError(f"{table.source}: column {signal!r} is missing; {_advice(signal, table.names)}")
+    if not there("accel") and not there("speed"):
+        advice = _advice("speed", table.names)
+        raise InputError(f"{table.source}: columns 'accel' and 'speed' are both missing; one is needed; {advice}")
+    for signal in mapping.stamp:
+        if signal in mapping.elsewhere:
+            raise InputError(f"{table.source}: {signal} is stamped and also told to lie in another file; one is enough")
+
+
+def _advice(signal: str, names: Iterable[str]) -> str:
+    plain = {name.strip().lower(): name for name in names}
+    close = difflib.get_close_matches(signal, plain, n=1, cutoff=0.6)
+    name = f"{plain[close[0]]!r}" if close else "NAME"
+    return f"columns: {', '.join(names)}; `--map {signal}={name}` if it goes by another name"
+
+
+def _place(table: Table, signal: str, column: str, rows: NDArray | None = None) -> Callable[[int], str]:
+    suffix = "" if column == signal else f" ({signal})"
+    return lambda row: table.where(row if rows is None else int(rows[row]), column) + suffix
+
+
+def _signal(table: Table, signal: str, column: str, mapping: SignalMap) -> Float:
+    values = table.numbers(column)
+    if signal in mapping.unit:
+        values = to_si(signal, mapping.unit[signal])(values)
+    check_range(signal, values, _place(table, signal, column))
+    return values
+
+
+def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tuple[Float, Float]:
+    """Arrivals of a signal with a time column of its own in the log's table; rows empty in it brought nothing."""
+    clock = mapping.stamp[signal]
+    values = table.numbers(column, empty_is_nan=True)
+    stamps = table.numbers(clock, empty_is_nan=True)
+    unit = mapping.unit.get("time")
+    own_clock = clock != mapping.column.get("time", "time")
+    half = np.isnan(values) != np.isnan(stamps) if own_clock else np.zeros(len(values), bool)
+    if half.any():
+        row = int(np.argmax(half))
+        empty, full = (column, clock) if np.isnan(values[row]) else (clock, column)
+        raise InputError(f"{table.where(row, empty)}: is empty where {full!r} is not; both or neither are needed")
+    rows = np.flatnonzero(~np.isnan(values))
+    return _arrivals(table, signal, column, clock, values, stamps, rows, unit, mapping.unit.get(signal))
+
+
+def _from_elsewhere(signal: str, mapping: SignalMap, folder: Path) -> tuple[Float, Float]:
+    """Arrivals of a signal that lies in a file of its own, beside the log."""
+    there = mapping.elsewhere[signal]
+    table = read_table(folder / there.file)
+    column = there.column or mapping.column.get(signal, signal)
+    values, stamps = table.numbers(column), table.numbers(there.time)
+    unit = there.time_unit or mapping.unit.get("time")
+    rows = np.arange(len(values))
+    return _arrivals(table, signal, column, there.time, values, stamps, rows, unit, mapping.unit.get(signal))
+
+
+def _arrivals(
+    table: Table, signal: str, column: str, clock: str, values: Float, stamps: Float, rows: NDArray,
+    time_unit: str | None, unit: str | None,
+) -> tuple[Float, Float]:  # fmt: skip
+    if len(rows) == 0:
+        raise InputError(f"{table.source}: column {column!r} ({signal}): holds no value at all")
+    values, stamps = values[rows], stamps[rows]
+    values = values if unit is None else to_si(signal, unit)(values)
+    stamps = stamps if time_unit is None else to_si("time", time_unit)(stamps)
+    check_range(signal, values, _place(table, signal, column, rows))
+    # a recorder that writes the last arrival into every row repeats stamp and value together; that is one arrival
+    again = np.concatenate([[False], (np.diff(stamps) == 0) & (np.diff(values) == 0)])
+    rows, values, stamps = rows[~again], values[~again], stamps[~again]
+    check_time(stamps, np.ones(len(stamps) - 1, bool), _place(table, f"stamp of {signal}", clock, rows))
+    return stamps, values

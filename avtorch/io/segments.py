@@ -1,0 +1,31 @@
+"""Where a drive breaks off: gaps, and runs of rows that belong together."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+GAP_STEPS = 3.0
+GAP_SECONDS = 0.1
+"""A step longer than both GAP_STEPS median steps and GAP_SECONDS is a gap: what is shorter is jitter or a lost row."""
+
+
+def stretches(mask: NDArray[np.bool_], segment: NDArray[np.int64]) -> list[slice]:
+    """Unbroken runs of rows, within one segment each, where ``mask`` holds."""
+    key = np.where(mask, segment, -1)
+    cuts = np.flatnonzero(np.diff(key)) + 1
+    edges = [0, *cuts.tolist(), len(key)]
+    return [slice(a, b) for a, b in pairwise(edges) if mask[a]]
+
+
+def median_step(time: NDArray[np.float64], same_drive: NDArray[np.bool_]) -> float:
+    """Median time between rows [s], steps across drives left out."""
+    steps = np.diff(time)
+    return float(np.median(steps[same_drive] if same_drive.any() else np.abs(steps)))
+
+
+def gap_limit(step: float) -> float:
+    """The longest time between two rows [s] that is no gap, at a median ``step`` [s]."""
+    return max(GAP_STEPS * step, GAP_SECONDS)

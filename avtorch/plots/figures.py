@@ -1,0 +1,160 @@
+"""The pictures that the commands write, each a figure put together from drawings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from avtorch.io import Log
+from avtorch.plots.over_plane import gain_curve, region, setting_region, verdict_legend
+from avtorch.plots.over_time import Steps, Windows, belief_band, data_quality, events, motion, string_probability
+from avtorch.plots.style import GREEN, GREY, styled
+from avtorch.vehicle import stability
+
+Motion = Mapping[str, Mapping[str, ArrayLike]]
+"""Traces of a run: `{"speed": {"leader": ..., "without action": ..., "with action": ...}, "accel": {...}, ...}`."""
+
+
+@styled
+def motion_figure(answer: Mapping[str, Any], time: ArrayLike, traces: Motion) -> Figure:
+    """Speeds, accelerations and spacings of a run with and without action."""
+    figure = Figure(figsize=(9, 2.3 * len(traces) + 0.6), layout="constrained")
+    axes = figure.subplots(len(traces), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, (quantity, named) in zip(axes, traces.items(), strict=True):
+        motion(_events_of(ax, answer), time, named, quantity=quantity)
+    axes[-1].set_xlabel("time [s]")
+    _legend_above(figure, axes[0])
+    return figure
+
+
+@styled
+def belief_figure(
+    windows: Windows,
+    *,
+    answer: Mapping[str, Any] | None = None,
+    truth: Mapping[str, Steps] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    log: Log | None = None,
+) -> Figure:
+    """Posterior bands of T_L and K_L over time; with a `log`, the quality of its rows below them."""
+    rows = 2 + (log is not None)
+    figure = Figure(figsize=(9, 5.8 if log is None else 6.8), layout="constrained")
+    heights = [3, 3, 1.3][:rows]
+    axes = figure.subplots(rows, 1, sharex=True, height_ratios=heights)
+    for ax, name in zip(axes, ("T_L", "K_L"), strict=False):
+        _events_of(ax, answer or {})
+        belief_band(ax, windows, name, truth=(truth or {}).get(name), bounds=(bounds or {}).get(name))
+    if log is not None:
+        data_quality(axes[-1], log, windows)
+    axes[-1].set_xlabel("time [s]")
+    _legend_above(figure, *axes[:2])
+    return figure
+
+
+@styled
+def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = None, target: float = 0.95) -> Figure:
+    """P(string stable) over time, with alerts and actions; each action says what it set."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    ax = figure.subplots()
+    string_probability(_events_of(ax, answer or {}), windows, target=target)
+    for i, action in enumerate((answer or {}).get("actions") or []):
+        names = " + ".join(str(s) for s in action["strategies"]) or "none"
+        ax.annotate(f"strategy {names}", (action["time_s"], 0.04 + 0.09 * (i % 4)), (4, 0), textcoords="offset points",
+                    color=GREEN, fontsize=9)  # fmt: skip
+    ax.set_xlabel("time [s]")
+    _legend_above(figure, ax)
+    return figure
+
+
+@styled
+def region_figure(
+    settings: Sequence[tuple[str, Mapping[str, Any]]],
+    clouds: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    *,
+    truth: tuple[float, float] | None = None,
+) -> Figure:
+    """The posterior cloud in the stability region of each named setting, side by side on the same axes."""
+    t = np.concatenate([np.asarray(c[0]) for c in clouds.values()] + [[] if truth is None else [truth[0]]])
+    k = np.concatenate([np.asarray(c[1]) for c in clouds.values()] + [[] if truth is None else [truth[1]]])
+    # a few far draws of a broad belief must not squeeze the rest into a corner
+    T_range = (0.02, max(1.0, 1.25 * float(np.quantile(t, 0.99)), 1.25 * (truth[0] if truth else 0.0)))
+    K_range = (min(0.25, 0.8 * float(np.quantile(k, 0.01))), max(1.3, 1.15 * float(np.quantile(k, 0.99))))
+    figure = Figure(figsize=(4.9 * len(settings) + 0.4, 5.2), layout="constrained")
+    axes = figure.subplots(1, len(settings), sharey=True, squeeze=False)[0]
+    for ax, (title, setting) in zip(axes, settings, strict=True):
+        setting_region(ax, setting, T_range=T_range, K_range=K_range, clouds=clouds, truth=truth)
+        ax.set_title(title)
+        ax.label_outer()
+    legend = verdict_legend(axes[0]).get_legend()
+    assert legend is not None
+    handles = legend.legend_handles
+    legend.remove()
+    figure.legend(handles=[h for h in handles if h is not None], loc="outside lower center", ncols=3, fontsize=8.5)
+    return figure
+
+
+@styled
+def overview_figure(
+    answer: Mapping[str, Any],
+    time: ArrayLike,
+    traces: Motion,
+    *,
+    truth: Mapping[str, Steps] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    target: float = 0.95,
+) -> Figure:
+    """A run at one glance: acceleration, belief about lag and gain, P(string stable)."""
+    figure = Figure(figsize=(9, 8.4), layout="constrained")
+    axes = figure.subplots(4, 1, sharex=True)
+    for ax in axes:
+        _events_of(ax, answer)
+    motion(axes[0], time, traces["accel"], quantity="accel")
+    for ax, name in zip(axes[1:3], ("T_L", "K_L"), strict=True):
+        belief_band(ax, answer["windows"], name, truth=(truth or {}).get(name), bounds=(bounds or {}).get(name))
+    string_probability(axes[3], answer["windows"], target=target)
+    axes[3].set_xlabel("time [s]")
+    _legend_above(figure, *axes)
+    return figure
+
+
+@styled
+def stability_figure(
+    plane: stability.Region,
+    point: tuple[float, float],
+    omega: ArrayLike,
+    gain: ArrayLike,
+    *,
+    peak: tuple[float, float] | None = None,
+    title: str = "",
+) -> Figure:
+    """A stability region with one setting in it, beside that setting's gain over frequency."""
+    figure = Figure(figsize=(10.4, 4.8), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[1, 1.05])
+    verdict_legend(region(left, plane, point=point), extra=False)
+    gain_curve(right, omega, gain, peak=peak)
+    left.set_title("Region")
+    right.set_title("Leader's speed to follower's")
+    if title:
+        figure.suptitle(title, fontsize=10, color=GREY)
+    return figure
+
+
+def _events_of(ax: Axes, answer: Mapping[str, Any]) -> Axes:
+    change = (answer.get("change") or {}).get("time_s")
+    return events(ax, change_s=change, alerts=answer.get("alerts") or (), actions=answer.get("actions") or ())
+
+
+def _legend_above(figure: Figure, *axes: Axes) -> None:
+    """One legend for the figure, each name once, the events last."""
+    found: dict[str, Any] = {}
+    for ax in axes:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    last = ("vehicle changes", "alert", "action")
+    names = [n for n in found if n not in last] + [n for n in last if n in found]
+    figure.legend([found[n] for n in names], names, loc="outside upper center", ncols=min(len(names), 4))

@@ -1,0 +1,147 @@
+"""Drawings over parameters and frequency: regions, clouds of belief, gain curves. Each takes an axes and returns it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import ArrayLike
+
+from avtorch.plots.style import AMPLIFIES, BLACK, BLUE, GREY, LABELS, ORANGE, STABLE, UNSTABLE, VERMILLION
+from avtorch.vehicle import LowerLevel, stability
+
+
+def verdict_map(
+    ax: Axes, x: ArrayLike, y: ArrayLike, local: ArrayLike, string: ArrayLike, peak: ArrayLike | None = None
+) -> Axes:
+    """Where a loop is string stable, where it only is locally stable and amplifies, where it is unstable; masks (y, x).
+
+    Contours inside the amplifying part give the peak gain.
+    """
+    x, y, local, string = (np.asarray(v) for v in (x, y, local, string))
+    kind = np.where(string, 2, np.where(local, 1, 0))
+    ax.pcolormesh(
+        x,
+        y,
+        kind,
+        cmap=ListedColormap([UNSTABLE, AMPLIFIES, STABLE]),
+        vmin=-0.5,
+        vmax=2.5,
+        shading="nearest",
+        rasterized=True,
+    )
+    for mask, style in ((string, "-"), (local, "--")):
+        if mask.any() and not mask.all():
+            ax.contour(x, y, mask.astype(float), levels=[0.5], colors=BLACK, linewidths=1.1, linestyles=style)
+    if peak is not None:
+        gain = np.asarray(peak, dtype=float)
+        # inf beyond the stable part would end the contours a cell early
+        gain = np.where(np.isfinite(gain), gain, np.nan)
+        levels = (
+            [level for level in (1.1, 1.25, 1.5, 2.0, 3.0) if np.nanmin(gain) < level < np.nanmax(gain)]
+            if np.isfinite(gain).any()
+            else []
+        )
+        if levels:
+            lines = ax.contour(x, y, gain, levels=levels, colors="#B07A1E", linewidths=0.7)
+            ax.clabel(lines, fmt=lambda g: f"{g:g}", fontsize=7)
+    ax.grid(False)
+    ax.set_xlim(x[0], x[-1])
+    ax.set_ylim(y[0], y[-1])
+    return ax
+
+
+def region(ax: Axes, plane: stability.Region, *, point: tuple[float, float] | None = None) -> Axes:
+    """A `stability.Region`, with the setting asked about as a point in it."""
+    verdict_map(ax, plane.x, plane.y, plane.local, plane.string, plane.peak_gain)
+    if point is not None:
+        ax.plot(
+            *point, marker="o", markersize=9, color=BLUE, markeredgecolor="white", markeredgewidth=1.5, linestyle="none"
+        )
+    ax.set_xlabel(LABELS[plane.x_name])
+    ax.set_ylabel(LABELS[plane.y_name])
+    return ax
+
+
+def setting_region(
+    ax: Axes,
+    setting: Mapping[str, Any],
+    *,
+    T_range: tuple[float, float],
+    K_range: tuple[float, float],
+    clouds: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
+    truth: tuple[float, float] | None = None,
+    points: int = 401,
+) -> Axes:
+    """Which vehicles `(T_L, K_L)` a whole setting (`T_hat`, `K_hat`, `time_gap_s`, `gains`) keeps string stable.
+
+    The lower level's inversion is taken into account: the verdict on a vehicle is that on its effective lag and gain.
+    `clouds`: draws `(T_L, K_L)` of the belief, by the name of the moment; the last one is drawn strongest.
+    """
+    T = torch.linspace(*T_range, points, dtype=torch.float64)
+    K = torch.linspace(*K_range, points, dtype=torch.float64)
+    lower = LowerLevel(T_hat=setting["T_hat"], K_hat=setting["K_hat"])
+    effective = lower.effective(T[None, :], K[:, None])
+    law = (*effective, setting["time_gap_s"], setting["gains"])
+    verdict_map(ax, T, K, stability.local_stable(*law), stability.string_stable(*law), stability.peak_gain(*law))
+    colours = [GREY, VERMILLION, BLUE]
+    named = list((clouds or {}).items())
+    for (name, (t, k)), colour in zip(named, colours[-len(named) :] if len(named) > 1 else [BLUE], strict=False):
+        ax.plot(np.asarray(t), np.asarray(k), ".", color=colour, markersize=3, alpha=0.35, label=name, zorder=3)
+    if truth is not None:
+        ax.plot(
+            *truth,
+            marker="P",
+            color=BLACK,
+            markersize=9,
+            markeredgecolor="white",
+            linestyle="none",
+            label="truth",
+            zorder=4,
+        )
+    ax.set_xlabel(LABELS["T_L"])
+    ax.set_ylabel(LABELS["K_L"])
+    return ax
+
+
+def gain_curve(ax: Axes, omega: ArrayLike, gain: ArrayLike, *, peak: tuple[float, float] | None = None) -> Axes:
+    """|G(jω)| from the leader's speed to the follower's over frequency [rad/s]; above one, disturbances grow."""
+    omega, gain = np.asarray(omega), np.asarray(gain)
+    ax.fill_between(omega, 1.0, gain, where=gain > 1, color=ORANGE, alpha=0.3, linewidth=0)
+    ax.axhline(1.0, color=GREY, linewidth=1.0, linestyle=":")
+    ax.plot(omega, gain, color=BLUE)
+    if peak is not None and np.isfinite(peak[1]) and peak[0] > 0:
+        ax.plot(*peak, marker="o", color=VERMILLION, markersize=7, markeredgecolor="white")
+        text = f"{peak[1]:.4g} at {peak[0]:.3g} rad/s"
+        ax.annotate(text, peak, (8, 4), textcoords="offset points", color=VERMILLION, fontsize=9)
+    ax.set_xscale("log")
+    ax.set_xlim(omega[0], omega[-1])
+    ax.set_ylim(0, max(1.25, 1.15 * float(gain.max())))
+    ax.set_xlabel("frequency ω [rad/s]")
+    ax.set_ylabel("|G(jω)| [-]")
+    return ax
+
+
+def verdict_legend(ax: Axes, *, extra: bool = True) -> Axes:
+    """Name the three colours of a verdict map, and whatever else the axes labels, below it."""
+    patches: list[Any] = [
+        Patch(facecolor=STABLE, edgecolor=GREY, label="string stable"),
+        Patch(facecolor=AMPLIFIES, edgecolor=GREY, label="stable, amplifies (lines: peak gain)"),
+        Patch(facecolor=UNSTABLE, edgecolor=GREY, label="unstable"),
+    ]
+    if extra:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            if isinstance(handle, Line2D):
+                proxy = Line2D(
+                    [], [], color=handle.get_color(), marker=handle.get_marker(), linestyle="none", label=label
+                )
+                proxy.set_markersize(8)
+                patches.append(proxy)
+    ax.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=8.5)
+    return ax

@@ -1,0 +1,167 @@
+"""Drawings over time: motion, beliefs, events, the quality of a log. Each takes an axes and returns it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import ArrayLike
+
+from avtorch.io import Log
+from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, LABELS, ORANGE, SKY, VERMILLION
+
+_TRACES = {
+    "leader": {"color": GREY, "linewidth": 1.2, "zorder": 2.1},
+    "without action": {"color": VERMILLION, "linewidth": 1.3, "zorder": 2.2},
+    "with action": {"color": BLUE, "linewidth": 1.6, "zorder": 2.3},
+}
+
+Windows = Sequence[Mapping[str, Any]]
+"""Windows as an answer holds them: `start_s`, `end_s`, `excited`, `T_L`, `K_L`, `p_string_stable`, ..."""
+
+Steps = Sequence[tuple[float, float]]
+"""A quantity that jumps: `(from this time on [s], value)`."""
+
+
+def motion(ax: Axes, time: ArrayLike, traces: Mapping[str, ArrayLike], *, quantity: str = "speed") -> Axes:
+    """Speeds, accelerations or spacings over time [s]; `traces` by name: leader, without action, with action."""
+    for name, values in traces.items():
+        ax.plot(np.asarray(time), np.asarray(values), label=name, **_TRACES.get(name, {}))
+    ax.set_ylabel(LABELS.get(quantity, quantity))
+    return _span(ax, np.asarray(time)[[0, -1]])
+
+
+def belief_band(
+    ax: Axes,
+    windows: Windows,
+    name: str,
+    *,
+    truth: Steps | None = None,
+    bounds: tuple[float, float] | None = None,
+) -> Axes:
+    """The belief about one parameter: 90 % interval and mean of each window, paler where the window was not excited.
+
+    `truth`: what it really was. `bounds`: the design bounds that the controller was built for.
+    """
+    if bounds is not None:
+        ax.axhspan(
+            *bounds, facecolor="none", edgecolor="#DCDCDC", hatch="////", linewidth=0, zorder=0, label="design bounds"
+        )
+    for excited, colour, label in ((True, BLUE, "90 % interval"), (False, GREY, "carried over (not excited)")):
+        x, low = _staircase(windows, name, "q05", excited)
+        _, high = _staircase(windows, name, "q95", excited)
+        _, mean = _staircase(windows, name, "mean", excited)
+        if np.isfinite(mean).any():
+            ax.fill_between(x, low, high, color=colour, alpha=0.3 if excited else 0.18, linewidth=0, label=label)
+            ax.plot(x, mean, color=colour, linewidth=1.8 if excited else 1.0, label="mean" if excited else None)
+    if truth is not None and windows:
+        end = windows[-1]["end_s"]
+        x = [t for t, _ in truth] + [end]
+        ax.step(x, [v for _, v in truth] + [truth[-1][1]], where="post", color=BLACK, linestyle="--", label="truth")
+    ax.set_ylabel(LABELS.get(name, name))
+    ax.set_ylim(*_reach(windows, name, truth, bounds))
+    return _span(ax, _ends(windows))
+
+
+def string_probability(ax: Axes, windows: Windows, *, target: float = 0.95) -> Axes:
+    """P(string stable) of the setting in force, over time."""
+    x = np.array([t for w in windows for t in (w["start_s"], w["end_s"])])
+    p = np.array([w["p_string_stable"] for w in windows for _ in range(2)])
+    ax.fill_between(x, p, color=SKY, alpha=0.25, linewidth=0)
+    ax.plot(x, p, color=BLUE)
+    ax.axhline(target, color=GREY, linestyle=":", linewidth=1.2)
+    ax.text(
+        1.0,
+        target - 0.02,
+        f"target {target:g} ",
+        transform=ax.get_yaxis_transform(),
+        ha="right",
+        va="top",
+        color=GREY,
+        fontsize=8,
+    )
+    ax.set_ylim(-0.02, 1.05)
+    ax.set_ylabel("P(string stable) [-]")
+    return _span(ax, _ends(windows))
+
+
+def events(
+    ax: Axes,
+    *,
+    change_s: float | None = None,
+    alerts: Iterable[Mapping[str, Any]] = (),
+    actions: Iterable[Mapping[str, Any]] = (),
+    label: bool = True,
+) -> Axes:
+    """Mark the change of the vehicle, the alerts and the actions on a time axis."""
+    style: dict[str, Any] = {"zorder": 1.9, "linewidth": 1.4}
+    if change_s is not None:
+        ax.axvline(change_s, color=BLACK, linestyle=":", label="vehicle changes" if label else None, **style)
+    for i, time in enumerate(sorted({a["time_s"] for a in alerts})):
+        ax.axvline(time, color=ORANGE, label="alert" if label and i == 0 else None, **style)
+    for i, action in enumerate(actions):
+        text = "action" if label and i == 0 else None
+        ax.axvline(action["time_s"], color=GREEN, linestyle="--", label=text, **style)
+    return ax
+
+
+def data_quality(ax: Axes, log: Log, windows: Windows = ()) -> Axes:
+    """Which rows of a log serve: recorded, masked (driver, standstill); and which windows were excited."""
+    step = 1 / log.rate_hz
+    recorded = [(log.time[s][0], log.time[s][-1] - log.time[s][0] + step) for s in log.segments()]
+    lanes = [
+        ("recorded", recorded, GREY),
+        ("driver in charge", _runs(log, ~log.engaged, step), VERMILLION),
+        ("standstill", _runs(log, ~log.moving, step), ORANGE),
+        ("excited windows", [(w["start_s"], w["end_s"] - w["start_s"]) for w in windows if w["excited"]], BLUE),
+    ]
+    for lane, (_, spans, colour) in enumerate(lanes):
+        ax.broken_barh(spans, (lane - 0.32, 0.64), color=colour, alpha=0.75, linewidth=0)
+    ax.set_yticks(range(len(lanes)), [name for name, _, _ in lanes])
+    ax.set_ylim(len(lanes) - 0.4, -0.6)
+    ax.grid(False, axis="y")
+    return _span(ax, log.time[[0, -1]])
+
+
+def _staircase(windows: Windows, name: str, key: str, excited: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Both ends of every window; NaN for windows of the other kind and across gaps, so that the line breaks there."""
+    x: list[float] = []
+    y: list[float] = []
+    for w in windows:
+        if x and w["start_s"] > x[-1] + 1e-6:
+            x.append(x[-1])
+            y.append(np.nan)
+        value = w[name][key] if bool(w["excited"]) == excited else np.nan
+        x += [w["start_s"], w["end_s"]]
+        y += [value, value]
+    return np.array(x), np.array(y)
+
+
+def _reach(windows: Windows, name: str, truth: Steps | None, bounds: tuple[float, float] | None) -> tuple[float, float]:
+    """Limits of the axis: excited windows, truth and bounds in full; a broad first prior may run out of the picture."""
+    used = [w for w in windows if w["excited"]] or list(windows)
+    values = [w[name][q] for w in used for q in ("q05", "q95")] + [v for _, v in truth or []] + list(bounds or ())
+    low, high = min(values, default=0.0), max(values, default=1.0)
+    pad = 0.08 * (high - low or 1.0)
+    return max(0.0, low - pad), high + pad
+
+
+def _runs(log: Log, mask: np.ndarray, step: float) -> list[tuple[float, float]]:
+    """Spans `(start, length)` [s] of the rows where `mask` holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [
+        (float(log.time[a]), float(log.time[b - 1] - log.time[a]) + step)
+        for a, b in zip(edges[::2], edges[1::2], strict=True)
+    ]
+
+
+def _ends(windows: Windows) -> np.ndarray:
+    return np.array([windows[0]["start_s"], windows[-1]["end_s"]]) if windows else np.array([0.0, 1.0])
+
+
+def _span(ax: Axes, ends: np.ndarray) -> Axes:
+    if ends[1] > ends[0]:
+        ax.set_xlim(float(ends[0]), float(ends[1]))
+    return ax

@@ -1,0 +1,86 @@
+"""The look of every picture, and how one is saved.
+
+One palette (Okabe and Ito's, safe for colour-blind readers) and one meaning a colour: blue is what avtorch believes or
+did, vermillion what happens without it, black is the truth, green an action, orange an alert.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any, ParamSpec
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+from avtorch.io import atomic
+
+BLUE, VERMILLION, GREEN, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9"
+BLACK, GREY, PALE = "#222222", "#7F7F7F", "#D9D9D9"
+UNSTABLE, AMPLIFIES, STABLE = "#DDD3D8", "#FBE6C4", "#D3E8F2"
+
+STYLE: dict[str, Any] = {
+    "figure.dpi": 100,
+    "savefig.dpi": 150,
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": GREY,
+    "axes.labelcolor": BLACK,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E6E6E6",
+    "grid.linewidth": 0.7,
+    "lines.linewidth": 1.5,
+    "lines.solid_capstyle": "round",
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "xtick.labelcolor": BLACK,
+    "ytick.labelcolor": BLACK,
+    "hatch.linewidth": 0.6,
+}
+
+LABELS = {
+    "T_L": "actuation lag $T_L$ [s]",
+    "K_L": "actuation gain $K_L$ [-]",
+    "T": "actuation lag $T_L$ [s]",
+    "K": "actuation gain $K_L$ [-]",
+    "tau": r"time gap $\tau$ [s]",
+    "k_s": "spacing gain $k_s$ [1/s²]",
+    "k_v": "speed gain $k_v$ [1/s]",
+    "k_a": "acceleration gain $k_a$ [-]",
+    "speed": "speed [m/s]",
+    "accel": "acceleration [m/s²]",
+    "spacing": "spacing [m]",
+}
+
+P = ParamSpec("P")
+
+
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Let a figure be made in the house's style without touching the caller's."""
+
+    @wraps(draw)
+    def inner(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        with mpl.rc_context(STYLE):
+            return draw(*args, **kwargs)
+
+    return inner
+
+
+def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
+    """Write a figure as PNG, whole or not at all."""
+    buffer = io.BytesIO()
+    with mpl.rc_context(STYLE):
+        figure.savefig(buffer, format="png")
+    with atomic(path, binary=True) as stream:
+        stream.write(buffer.getvalue())
+    return Path(path)

@@ -1,0 +1,91 @@
+"""Answers for machines: what a command found, as plain objects ready for JSON."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from avtorch.vehicle import stability
+
+if TYPE_CHECKING:
+    from avtorch.decision.estimation import Estimates
+    from avtorch.decision.watch import WatchedWindow
+
+
+def window_entry(watched: WatchedWindow, scenario: int = 0) -> dict[str, Any]:
+    """One window of `estimates.json` and `run.json`, for one scenario.
+
+    `excited` is the fixed rule's word; `used` is false as well where an excited window's chains did not settle, and the
+    belief was carried over. The jerk form has `sigma` [m/s³], the latent form `noise` with its own parameters.
+    """
+    window, belief = watched.window, watched.window.belief
+    excited, settled = bool(belief.excited[scenario]), bool(belief.converged[scenario])
+    stats = {name: belief.stat(name, scenario) for name in belief.names}
+    actuation = {name: stats.pop(name) for name in ("T_L", "K_L")}
+    noise = stats if "sigma" in stats else {"noise": stats}
+    return {
+        "start_s": window.start_s,
+        "end_s": window.end_s,
+        "n": int(window.n[scenario]),
+        "excited": excited,
+        "used": excited and settled,
+        **actuation,
+        **noise,
+        "alerts": watched.report.names(scenario),
+        "p_string_stable": float(watched.report.p_string_stable[scenario]),
+    }
+
+
+def alert_entries(watched: Sequence[WatchedWindow], scenario: int = 0) -> list[dict[str, Any]]:
+    """The alerts of a drive, each at the end of the window that raised it: the moment it could be known."""
+    return [
+        {"time_s": w.window.end_s, "detector": name, "why": w.report.why(name, scenario)}
+        for w in watched
+        for name in w.report.names(scenario)
+    ]
+
+
+def estimates_answer(estimates: Estimates) -> dict[str, Any]:
+    """`estimates.json`: the windows of a log, and beside them what the quality check saw and what was assumed."""
+    setting = estimates.setting
+    return {
+        "schema": "avtorch.estimates/1",
+        "windows": [window_entry(w) for w in estimates.windows],
+        "seconds_per_window": estimates.seconds_per_window,
+        "form": estimates.form,
+        "alerts": alert_entries(estimates.windows),
+        "assumed": {"time_gap_s": float(setting.time_gap[0]), "gains": setting.gains[0].tolist()},
+        "quality": estimates.quality.to_dict(),
+    }
+
+
+def stability_answer(
+    T_L: float, K_L: float, time_gap: float, gains: Sequence[float], *, dead_time: float = 0.0
+) -> dict[str, Any]:
+    """`stability.json`: Eqs. 2 and 3 at one point, the exact verdicts and the peak gain (null where unstable).
+
+    The conditions know no dead time; the verdicts, the peak and the margin do.
+    """
+    setting = (T_L, K_L, time_gap, gains)
+    peak = float(stability.peak_gain(*setting, dead_time=dead_time))
+    return {
+        "schema": "avtorch.stability/1",
+        "setting": {"T_L": T_L, "K_L": K_L, "time_gap_s": time_gap, "gains": list(gains), "dead_time_s": dead_time},
+        "conditions": {
+            "local (Eq. 2)": _at_one_point(stability.local_conditions(*setting)),
+            "string, sufficient (Eq. 3)": _at_one_point(stability.string_conditions(*setting)),
+        },
+        "locally_stable": bool(stability.local_stable(*setting, dead_time=dead_time)),
+        "string_stable": bool(stability.string_stable(*setting, dead_time=dead_time)),
+        "peak_gain": peak if math.isfinite(peak) else None,
+        "peak_frequency_radps": float(stability.peak_frequency(*setting, dead_time=dead_time)),
+        "dead_time_margin_s": max(0.0, float(stability.dead_time_margin(*setting)) - dead_time),
+    }
+
+
+def _at_one_point(conditions: stability.Conditions) -> dict[str, float]:
+    """The conditions of a box shrunk to a point: upper and lower bounds coincide, and so do some of the lines."""
+    names = [re.sub(r"\^[ul](?=\b|\s)|^min ", "", name) for name in conditions.names]
+    return dict(zip(names, conditions.values.tolist(), strict=True))
