@@ -10,8 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from avtorch import decision, inference, io, plots, vehicle
-    from avtorch.decision import Monitor, Setting, Strategist, algorithm2
+    from avtorch.decision.algorithm2 import algorithm2
     from avtorch.decision.estimation import Estimates, estimate
+    from avtorch.decision.monitor import Monitor
+    from avtorch.decision.settings import Setting
+    from avtorch.decision.strategist import Strategist
+    from avtorch.decision.supervisor import Supervisor
     from avtorch.errors import InputError
     from avtorch.inference import SGLD, BeliefStream, SequentialInference
     from avtorch.io import Log
@@ -32,8 +36,12 @@ __version__ = "0.1.0"
 
 _HOME = {
     "avtorch": ("decision", "inference", "io", "plots", "vehicle"),
-    "avtorch.decision": ("Monitor", "Setting", "Strategist", "algorithm2"),
+    "avtorch.decision.algorithm2": ("algorithm2",),
     "avtorch.decision.estimation": ("Estimates", "estimate"),
+    "avtorch.decision.monitor": ("Monitor",),
+    "avtorch.decision.settings": ("Setting",),
+    "avtorch.decision.strategist": ("Strategist",),
+    "avtorch.decision.supervisor": ("Supervisor",),
     "avtorch.errors": ("InputError",),
     "avtorch.inference": ("SGLD", "BeliefStream", "SequentialInference"),
     "avtorch.io": ("Log",),
@@ -69,6 +77,7 @@ __all__ = [
     "SequentialInference",
     "Setting",
     "Strategist",
+    "Supervisor",
     "algorithm2",
     "decision",
     "estimate",

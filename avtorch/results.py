@@ -7,11 +7,13 @@ import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from avtorch.vehicle import stability
+from avtorch.vehicle import performance, stability
 
 if TYPE_CHECKING:
     from avtorch.decision.estimation import Estimates
+    from avtorch.decision.supervisor import SupervisedRun
     from avtorch.decision.watch import WatchedWindow
+    from avtorch.vehicle import Block
 
 
 def window_entry(watched: WatchedWindow, scenario: int = 0) -> dict[str, Any]:
@@ -61,6 +63,49 @@ def estimates_answer(estimates: Estimates) -> dict[str, Any]:
     }
 
 
+def run_answer(
+    run: SupervisedRun,
+    without_action: Block,
+    *,
+    change: tuple[float, float, float],
+    time_gap: float,
+    scenario: int = 0,
+) -> dict[str, Any]:
+    """`run.json` of one scenario; `change` is (time [s], T_L [s], K_L) of the vehicle from then on.
+
+    `without_action` is the same drive under the same noise and the setting it began with, of `time_gap` [s].
+    """
+    actions = run.actions[scenario]
+    last_gap = float(actions[-1].setting.time_gap[0]) if actions else time_gap
+    return {
+        "schema": "avtorch.run/1",
+        "change": dict(zip(("time_s", "T_L", "K_L"), change, strict=True)),
+        "windows": [window_entry(w, scenario) for w in run.windows],
+        "alerts": [{"time_s": a.time_s, "detector": a.detector, "why": a.why} for a in run.alerts[scenario]],
+        "actions": [
+            {
+                "time_s": a.time_s,
+                "strategies": a.strategies,
+                "settings": a.setting.as_dict(),
+                "why": a.why,
+                "sufficient": a.sufficient,
+                "p_string_stable": a.p_string_stable,
+                "peak_gain_true": finite(a.peak_gain_true),
+            }
+            for a in actions
+        ],
+        "performance": {
+            "without_action": performance(without_action, time_gap=time_gap).row(scenario),
+            "with_action": performance(run.rows, time_gap=last_gap).row(scenario),
+        },
+    }
+
+
+def finite(value: float | None) -> float | None:
+    """Infinity (the peak gain of an unstable loop, say) has no other word in JSON than null."""
+    return value if value is not None and math.isfinite(value) else None
+
+
 def stability_answer(
     T_L: float, K_L: float, time_gap: float, gains: Sequence[float], *, dead_time: float = 0.0
 ) -> dict[str, Any]:
@@ -79,7 +124,7 @@ def stability_answer(
         },
         "locally_stable": bool(stability.local_stable(*setting, dead_time=dead_time)),
         "string_stable": bool(stability.string_stable(*setting, dead_time=dead_time)),
-        "peak_gain": peak if math.isfinite(peak) else None,
+        "peak_gain": finite(peak),
         "peak_frequency_radps": float(stability.peak_frequency(*setting, dead_time=dead_time)),
         "dead_time_margin_s": max(0.0, float(stability.dead_time_margin(*setting)) - dead_time),
     }

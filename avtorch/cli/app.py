@@ -12,6 +12,7 @@ from cyclopts import App, CycloptsError
 
 from avtorch import __version__
 from avtorch.cli.estimate import estimate
+from avtorch.cli.run import run
 from avtorch.cli.stability import stability
 from avtorch.errors import InputError
 
@@ -22,6 +23,7 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
+app.command(run)
 app.command(estimate)
 app.command(stability)
 

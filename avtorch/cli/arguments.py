@@ -63,3 +63,14 @@ def free_folder(out: Path) -> None:
                 what = "a file" if place == out else f"inside {place}, which is a file"
                 raise InputError(f"--out: {out} is {what}; needs a folder, or a name that is free")
             return
+
+
+def limits_pair(name: str, text: str) -> tuple[float, float]:
+    """Two numbers, the first below zero and the second above."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 2 or not all(map(math.isfinite, values)) or not values[0] < 0 < values[1]:
+        raise InputError(f"{name}: found {text!r}, needs MIN,MAX [m/s²] below and above 0, such as -6,4")
+    return values[0], values[1]

@@ -65,8 +65,8 @@ def estimate(
     free_folder(out)
     seed_number(seed)
 
-    from avtorch.decision import Setting
     from avtorch.decision.estimation import estimate as work
+    from avtorch.decision.settings import Setting
     from avtorch.io import Log, check
     from avtorch.results import estimates_answer
 

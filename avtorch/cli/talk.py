@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -43,23 +44,27 @@ class Talk:
             yield
 
     def notes(self, title: str, notes: Sequence[str]) -> None:
-        self.out.print(f"[bold]{title}[/bold]")
+        self.out.print(title, style="bold", markup=False)
         for note in notes:
             self.out.print(f"  {note}", markup=False)
         self.out.print()
 
     def windows(self, windows: Sequence[Mapping[str, Any]], most: int = 60) -> None:
         table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
-        for name in ("time [s]", "rows", "T_L [s]", "90 %", "K_L", "90 %", "P(string stable)", ""):
-            table.add_column(name, justify="left" if name == "" else "right")
+        for name in ("time [s]", "rows", "T_L [s]", "90 %", "K_L", "90 %", "P", ""):
+            table.add_column(escape(name), justify="left" if name == "" else "right", no_wrap=name != "")
         for w in windows[:most]:
             style = None if w["excited"] else "dim"
-            cells = [f"{w['start_s']:.1f}-{w['end_s']:.1f}", str(w["n"])]
+            cells = [
+                f"{w['start_s']:.0f}-{w['end_s']:.0f}" if _whole(w) else f"{w['start_s']:.1f}-{w['end_s']:.1f}",
+                str(w["n"]),
+            ]
             for name in ("T_L", "K_L"):
-                cells += [f"{w[name]['mean']:.3f}", f"{w[name]['q05']:.3f}-{w[name]['q95']:.3f}"]
+                cells += [f"{w[name]['mean']:.3f}", f"{w[name]['q05']:.2f}-{w[name]['q95']:.2f}"]
             told = ", ".join(w["alerts"]) if w["alerts"] else "" if w["excited"] else "not excited"
             table.add_row(*cells, f"{w['p_string_stable']:.2f}", told, style="bold yellow" if w["alerts"] else style)
         self.out.print(table)
+        self.out.print("P: probability of string stability under the setting in force", style="dim")
         if len(windows) > most:
             self.out.print(f"... and {len(windows) - most} more windows in the answer", style="dim")
         self.out.print()
@@ -67,9 +72,39 @@ class Talk:
     def summary(self, answer: Mapping[str, Any], sentence: str) -> None:
         self.out.print(sentence)
         for alert in answer["alerts"][:5]:
-            self.out.print(f"{alert['time_s']:.1f} s  {alert['detector']}: {alert['why']}", style="yellow")
+            self.out.print(
+                f"{alert['time_s']:.1f} s  {alert['detector']}: {alert['why']}", style="yellow", markup=False
+            )
         if len(answer["alerts"]) > 5:
             self.out.print(f"... and {len(answer['alerts']) - 5} more alerts in the answer", style="dim")
+
+    def story(self, answer: Mapping[str, Any]) -> None:
+        """What happened in a run, in order, and what the action was worth."""
+        change = answer["change"]
+        lines = [(change["time_s"], "", f"the vehicle changes to T_L {change['T_L']:g} s, K_L {change['K_L']:g}")]
+        lines += [(a["time_s"], "yellow", f"alert, {a['detector']}: {a['why']}") for a in answer["alerts"]]
+        for a in answer["actions"]:
+            names = " and ".join(map(str, a["strategies"])) or "none"
+            gain = "" if a["peak_gain_true"] is None else f"; true peak gain {a['peak_gain_true']:.4f}"
+            lines.append((a["time_s"], "green", f"action, strategy {names}: {a['why']}{gain}"))
+        told = Table.grid(padding=(0, 2, 0, 0))
+        told.add_column(justify="right", no_wrap=True)
+        told.add_column()
+        # the sort is stable: an action stays behind the alert of the same time that it answers
+        for time, style, text in sorted(lines, key=lambda line: line[0])[:12]:
+            told.add_row(f"{time:.1f} s", escape(text), style=style or None)
+        self.out.print(told)
+        if len(lines) > 12:
+            self.out.print(f"... and {len(lines) - 12} more in the answer", style="dim")
+        table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
+        table.add_column("")
+        for name in ("without action", "with action"):
+            table.add_column(name, justify="right")
+        both = answer["performance"]
+        for key, words in _MEASURES.items():
+            table.add_row(escape(words), *(_number(both[side][key]) for side in ("without_action", "with_action")))
+        self.out.print()
+        self.out.print(table)
 
     def stability(self, answer: Mapping[str, Any]) -> None:
         table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
@@ -97,6 +132,25 @@ class Talk:
             return
         names = ", ".join(sorted(p.name for p in out.iterdir() if p.suffix in (".json", ".png")))
         self.out.print(f"\nWritten to [bold]{out}[/bold]: {names}", soft_wrap=True)
+
+
+_MEASURES = {
+    "speed_rms_ratio": "speed RMS, follower / leader [-]",
+    "accel_rms_ratio": "acceleration RMS, follower / leader [-]",
+    "min_spacing_m": "least spacing [m]",
+    "min_ttc_s": "least time to collision [s]",
+    "jerk_rms_mps3": "jerk RMS [m/s³]",
+    "clipped_share": "share of commands clipped [-]",
+    "throughput_vph": "throughput at equilibrium [1/h]",
+}
+
+
+def _whole(window: Mapping[str, Any]) -> bool:
+    return all(abs(window[key] - round(window[key])) < 1e-6 for key in ("start_s", "end_s"))
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
 
 
 def _yes(verdict: bool) -> str:

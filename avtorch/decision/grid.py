@@ -52,7 +52,7 @@ class Intrusiveness:
     gap_length: float = 3.0
     gains: float = 2.0
     gains_change: float = 1.0
-    margin: float = 2.0
+    margin: float = 4.0
 
     def __call__(self, setting: Setting, default: Setting, stale: Tensor) -> Tensor:
         """Cost of settings against defaults that broadcast with them; `stale`: a model known to be wrong is kept."""

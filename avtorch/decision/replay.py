@@ -64,13 +64,10 @@ class History:
             self.dt, self.lead_speed[index], self.lead_accel[index], self.spacing[index], self.speed[index]
         )
 
-    def thinned(self, dt: float) -> History:
-        """Every n-th row, so that the step is at most `dt` [s] (never finer than logged)."""
-        n = max(1, int(dt / self.dt + 1e-9))
-        n = min(n, self.lead_speed.shape[1] - 1)
-        return History(
-            n * self.dt, self.lead_speed[:, ::n], self.lead_accel[:, ::n], self.spacing, self.speed
-        )
+    def thinned(self, stride: int) -> History:
+        """Every `stride`-th row."""
+        lead = (x[:, ::stride] for x in (self.lead_speed, self.lead_accel))
+        return History(stride * self.dt, *lead, self.spacing, self.speed)
 
     def leader(self) -> Leader:
         """The leader seen, (scenario, time), position from 0."""
@@ -128,26 +125,65 @@ def replay(
     (scenario,). The step is the logged one or a multiple of it, at most `dt` [s] and a sixth of the lag: a command held
     for longer would shake a fast car with a strong k_a, which the real loop does not.
     """
-    past = history.thinned(min(dt, float(T_L.min()) / 6.0))
+    strides = (torch.clamp_max(T_L / 6.0, dt) / history.dt + 1e-9).long().clamp(1, history.lead_speed.shape[1] - 1)
+    out: Prediction | None = None
+    # By its own lag, not by its company's: a scenario is predicted alike in any batch.
+    for stride in strides.unique().tolist():
+        rows = torch.nonzero(strides == stride)[:, 0]
+        seen = _replay_at(
+            history[rows].thinned(int(stride)),
+            setting[rows],
+            plant=GLVDPlant(T_L[rows], K_L[rows], 0.0),
+            time_gap_now=time_gap_now[rows],
+            limits=(_pick(accel_min, rows), _pick(accel_max, rows)),
+            standstill=standstill,
+            ramp_rate=ramp_rate,
+            delay=delay,
+        )
+        if len(rows) == setting.shape[0]:
+            return seen
+        if out is None:
+            out = seen.map(lambda x: torch.zeros(setting.shape, dtype=torch.float64))
+        for name, value in vars(seen).items():
+            getattr(out, name)[rows] = value
+    assert out is not None
+    return out
+
+
+def _replay_at(
+    past: History,
+    setting: Setting,
+    *,
+    plant: GLVDPlant,
+    time_gap_now: Tensor,
+    limits: tuple[Number, Number],
+    standstill: float,
+    ramp_rate: float,
+    delay: float,
+) -> Prediction:
+    """`replay` at the step of `past`."""
     scenarios, candidates = setting.shape
     loop = ClosedLoop(
         past.leader(),
-        plant=GLVDPlant(T_L, K_L, 0.0),
+        plant=plant,
         scenarios=scenarios,
         spacing0=past.spacing.clamp_min(0.1),
-        speed0=past.speed,
+        speed0=past.speed.clamp_min(0.0),
     )
     parts = []
     each = max(1, _ROWS // scenarios)
     for first in range(0, candidates, each):
-        some = setting[:, first : first + each]
-        some = some.transposed()
+        some = setting[:, first : first + each].transposed()
         twin = loop.copy(candidates=some.shape[0])
         start = Setting(time_gap=time_gap_now, gains=some.gains).controller(standstill=standstill)
         twin.controller = some.retarget(start, at=delay, rate=ramp_rate)
-        twin.lower_level = some.lower_level(accel_min=accel_min, accel_max=accel_max)
+        twin.lower_level = some.lower_level(accel_min=limits[0], accel_max=limits[1])
         parts.append(_predict(twin.advance(past.lead_speed.shape[1]), some, standstill))
     return Prediction(*(torch.cat(column).mT for column in zip(*(vars(p).values() for p in parts), strict=True)))
+
+
+def _pick(limit: Number, rows: Tensor) -> Number:
+    return limit[rows] if isinstance(limit, Tensor) and limit.ndim else limit
 
 
 def _predict(run: Block, setting: Setting, standstill: float) -> Prediction:

@@ -33,6 +33,7 @@ from avtorch.vehicle.time_gap import RAMP_RATE
 _JUDGED = 48
 _REPLAYED = 512
 _PAIRS = 1024
+_CLIPPING_PRICE = 10.0  # where none will do, ten points of clipped commands weigh as much as a lower-level update
 _SCREEN = 12
 
 
@@ -243,8 +244,11 @@ class _Search:
         no_closer = nearest >= nearest[:, :1].clamp_max(1e-9)
         judged = self.replayed[lost] & torch.isfinite(self.p[lost])
         eligible = in_force | (judged & bearable & no_closer)
-        # Beyond the required P less clipping is worth more than a better P.
-        score = self.p[lost].clamp_max(self.rules.required) - 1e-3 * clipped - 1e-6 * cost.clamp_max(1e2)
+        # P first, as far as it is required; among equals intrusiveness and clipping are weighed against each other.
+        # An amplified demand that is clipped most of the time is bang-bang control: clipping costs by the doubling.
+        doublings = self.candidates.setting[lost].amplification().log2().clamp_min(0.0)
+        price = self.total[lost] + _CLIPPING_PRICE * clipped * (1.0 + doublings)
+        score = self.p[lost].clamp_max(self.rules.required) - 1e-4 * price
         return torch.where(eligible, score, -torch.inf).argmax(dim=1)
 
     def prediction(self, pick: Tensor) -> Prediction:
@@ -304,7 +308,8 @@ class _Search:
             self.predictions = seen.map(lambda x: torch.full(self.p.shape, torch.nan, dtype=torch.float64))
         for name, value in vars(seen).items():
             getattr(self.predictions, name)[rows[:, None], columns] = value
-        self.replayed[rows[:, None], columns] = True
+        # Columns that only fill up the batch are not told of, so that a scenario is judged alike in any company.
+        self.replayed[rows[:, None], columns] = worth.gather(1, columns)
 
     def _sufficient(self) -> Tensor:
         assert self.predictions is not None

@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-SPAN_S = 1.0  # long enough to average sensor noise, short enough that the fall-off of a real bias does not matter
+SPANS_S = (1.0, 4.0)  # the short one sees brisk drives, the long one averages more sensor noise
 MIN_SPANS = 8
 
 
 class Scale(NamedTuple):
     """``slope`` [-]: change of the first signal per integral of the second; ``correlation`` of the two; ``change``:
-    standard deviation of the first one's changes over SPAN_S, in its unit."""
+    standard deviation of the first one's changes, in its unit per second."""
 
     slope: float
     correlation: float
@@ -24,38 +24,40 @@ class Scale(NamedTuple):
 def scale_between(
     time: NDArray, parts: Sequence[slice], level: NDArray, rate: NDArray, *, delays: Sequence[float] = (0.0,)
 ) -> Scale | None:
-    """Compare the changes of ``level`` over SPAN_S with the integral of ``rate`` over the same spans, both ``(time,)``.
+    """Compare the changes of ``level`` over a span with the integral of ``rate`` over the same span, both ``(time,)``.
 
-    ``parts`` are the stretches that may be used; of ``delays`` [s] of the response, the one of best correlation counts.
-    None where there are fewer than MIN_SPANS separate spans or one of the two does not move: then nothing can be said.
+    ``parts`` are the stretches that may be used; of ``delays`` [s] of the response and of SPANS_S, the pair of best
+    correlation counts. None where there are fewer than MIN_SPANS separate spans or one of the two signals does not
+    move: then nothing can be said.
     """
-    best: Scale | None = None
-    for delay in delays:
-        changes, integrals, spans = [], [], 0.0
-        for part in parts:
-            t, x, y = time[part], level[part], rate[part]
-            if len(t) < 3:
-                continue
-            total = np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(t))])
-            starts = np.arange(t[0] + delay, t[-1] - SPAN_S, SPAN_S / 4)
-            if len(starts) == 0:
-                continue
-            spans += (t[-1] - t[0] - delay) / SPAN_S
-            changes.append(np.interp(starts + SPAN_S, t, x) - np.interp(starts, t, x))
-            integrals.append(np.interp(starts + SPAN_S - delay, t, total) - np.interp(starts - delay, t, total))
-        if spans < MIN_SPANS:
-            continue
-        change, integral = np.concatenate(changes), np.concatenate(integrals)
-        sx, sy = float(change.std()), float(integral.std())
-        # a constant signal leaves rounding only
-        if sx <= 1e-9 * (1 + np.abs(change).max()) or sy <= 1e-9 * (1 + np.abs(integral).max()):
-            continue
-        correlation = float(np.mean((change - change.mean()) * (integral - integral.mean())) / (sx * sy))
-        # a periodic drive correlates as strongly, with the other sign, half a period off: the agreeing sign goes first
-        if best is None or _rank(correlation) > _rank(best.correlation):
-            best = Scale(correlation * sx / sy, correlation, sx)
-    return best
+    totals = []
+    for part in parts:
+        t, y = time[part], rate[part]
+        if len(t) > 2:
+            totals.append((t, level[part], np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(t))])))
+    found = (_compare(totals, span, delay) for span in SPANS_S for delay in delays)
+    return max((x for x in found if x is not None), key=_rank, default=None)
 
 
-def _rank(correlation: float) -> tuple[bool, float]:
-    return correlation > 0.5, abs(correlation)
+def _compare(totals: list[tuple[NDArray, NDArray, NDArray]], span: float, delay: float) -> Scale | None:
+    changes, integrals, spans = [], [], 0.0
+    for t, x, total in totals:
+        starts = np.arange(t[0] + delay, t[-1] - span, span / 4)
+        if len(starts):
+            spans += (t[-1] - t[0] - delay) / span
+            changes.append(np.interp(starts + span, t, x) - np.interp(starts, t, x))
+            integrals.append(np.interp(starts + span - delay, t, total) - np.interp(starts - delay, t, total))
+    if spans < MIN_SPANS:
+        return None
+    change, integral = np.concatenate(changes), np.concatenate(integrals)
+    sx, sy = float(change.std()), float(integral.std())
+    # a constant signal leaves rounding only
+    if sx <= 1e-9 * (1 + np.abs(change).max()) or sy <= 1e-9 * (1 + np.abs(integral).max()):
+        return None
+    correlation = float(np.mean((change - change.mean()) * (integral - integral.mean())) / (sx * sy))
+    return Scale(correlation * sx / sy, correlation, sx / span)
+
+
+def _rank(found: Scale) -> tuple[bool, float]:
+    # a periodic drive correlates as strongly, with the other sign, half a period off: the agreeing sign goes first
+    return found.correlation > 0.5, abs(found.correlation)

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
-from avtorch.plots.style import AMPLIFIES, BLACK, BLUE, GREY, LABELS, ORANGE, STABLE, UNSTABLE, VERMILLION
+from avtorch.plots.style import AMPLIFIES, BLACK, BLUE, GREY, LABELS, ORANGE, PURPLE, STABLE, UNSTABLE, VERMILLION
 from avtorch.vehicle import LowerLevel, stability
 
 
@@ -79,18 +79,18 @@ def setting_region(
     truth: tuple[float, float] | None = None,
     points: int = 401,
 ) -> Axes:
-    """Which vehicles `(T_L, K_L)` a whole setting (`T_hat`, `K_hat`, `time_gap_s`, `gains`) keeps string stable.
+    """Which vehicles `(T_L, K_L)` a setting, as an answer holds it, keeps string stable.
 
     The lower level's inversion is taken into account: the verdict on a vehicle is that on its effective lag and gain.
     `clouds`: draws `(T_L, K_L)` of the belief, by the name of the moment; the last one is drawn strongest.
     """
     T = torch.linspace(*T_range, points, dtype=torch.float64)
     K = torch.linspace(*K_range, points, dtype=torch.float64)
-    lower = LowerLevel(T_hat=setting["T_hat"], K_hat=setting["K_hat"])
+    lower = LowerLevel(setting["T_hat"], setting["K_hat"], setting.get("T_d", 0.3), setting.get("K_d", 1.0))
     effective = lower.effective(T[None, :], K[:, None])
     law = (*effective, setting["time_gap_s"], setting["gains"])
     verdict_map(ax, T, K, stability.local_stable(*law), stability.string_stable(*law), stability.peak_gain(*law))
-    colours = [GREY, VERMILLION, BLUE]
+    colours = [GREY, PURPLE, BLUE]
     named = list((clouds or {}).items())
     for (name, (t, k)), colour in zip(named, colours[-len(named) :] if len(named) > 1 else [BLUE], strict=False):
         ax.plot(np.asarray(t), np.asarray(k), ".", color=colour, markersize=3, alpha=0.35, label=name, zorder=3)

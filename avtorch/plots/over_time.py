@@ -96,14 +96,15 @@ def events(
     label: bool = True,
 ) -> Axes:
     """Mark the change of the vehicle, the alerts and the actions on a time axis."""
-    style: dict[str, Any] = {"zorder": 1.9, "linewidth": 1.4}
-    if change_s is not None:
-        ax.axvline(change_s, color=BLACK, linestyle=":", label="vehicle changes" if label else None, **style)
+    # an action follows its alert at once: the broad pale line leaves the thin one on top of it to be seen
     for i, time in enumerate(sorted({a["time_s"] for a in alerts})):
-        ax.axvline(time, color=ORANGE, label="alert" if label and i == 0 else None, **style)
+        ax.axvline(time, color=ORANGE, alpha=0.45, linewidth=5, zorder=1.7, label="alert" if label and i == 0 else None)
     for i, action in enumerate(actions):
         text = "action" if label and i == 0 else None
-        ax.axvline(action["time_s"], color=GREEN, linestyle="--", label=text, **style)
+        ax.axvline(action["time_s"], color=GREEN, linewidth=1.6, zorder=1.9, label=text)
+    if change_s is not None:
+        text = "vehicle changes" if label else None
+        ax.axvline(change_s, color=BLACK, linestyle=":", linewidth=1.4, zorder=1.8, label=text)
     return ax
 
 

@@ -18,11 +18,11 @@ from matplotlib.figure import Figure
 
 from avtorch.io import atomic
 
-BLUE, VERMILLION, GREEN, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9"
-BLACK, GREY, PALE = "#222222", "#7F7F7F", "#D9D9D9"
+BLUE, VERMILLION, GREEN, ORANGE, SKY, PURPLE = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#A6407E"
+BLACK, GREY = "#222222", "#7F7F7F"
 UNSTABLE, AMPLIFIES, STABLE = "#DDD3D8", "#FBE6C4", "#D3E8F2"
 
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "figure.dpi": 100,
     "savefig.dpi": 150,
     "font.size": 10,

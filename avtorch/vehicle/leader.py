@@ -19,9 +19,6 @@ from avtorch.errors import InputError
 #: width removes the steps of differenced GPS speed and keeps every manoeuvre a driver makes.
 SMOOTH_S = 0.5
 
-#: US06 stands still for its first 5 s; the default leader starts with the first motion.
-US06_START_S = 5.0
-
 
 @dataclass(frozen=True)
 class Leader:
@@ -95,11 +92,11 @@ class Leader:
         return cls(*(torch.from_numpy(x) for x in (grid, position, smooth, accel)), dt=dt, name=name)
 
     @classmethod
-    def default(cls, *, start: float = US06_START_S, duration: float | None = None, dt: float = 0.01) -> Leader:
-        """US06 from second `start` on (default: its first motion), to its end or for `duration` [s].
+    def default(cls, *, start: float = 0.0, duration: float | None = None, dt: float = 0.01) -> Leader:
+        """US06, from second `start` of the cycle on, to its end or for `duration` [s].
 
-        The first 80 s hold a pull-off to 20 m/s, a full stop of 8 s, and a second pull-off to 25 m/s. `start=48` begins
-        with the second one, whose 80 s end in the next stop.
+        The first 80 s hold a standstill of 5 s, a pull-off to 20 m/s, a full stop of 8 s, and a second pull-off.
+        `start=48` begins with that one.
         """
         from avtorch.io.us06 import US06_SPEED_MPS
 

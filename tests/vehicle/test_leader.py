@@ -24,15 +24,15 @@ def test_speed_and_position_are_the_integrals_of_acceleration():
     assert leader.time[1].item() == pytest.approx(dt)
 
 
-def test_default_is_us06_from_its_first_motion():
+def test_default_is_us06_on_the_cycles_own_clock():
     leader = Leader.default()
     assert leader.name == "US06"
     assert leader.speed.min() >= 0
-    assert leader.speed[0] < 0.1
-    assert leader.speed[600:3500].min() > 0.3
+    assert leader.speed[:400].max() < 0.01
+    assert leader.speed[1000:4000].min() > 0.3
     first = Leader.default(duration=80.0)
     assert first.duration == pytest.approx(80.0)
-    assert (first.speed > 0.3).double().mean() > 0.8
+    assert (first.speed > 0.3).double().mean() > 0.75
     torch.testing.assert_close(first.speed, leader.speed[:8001])
     # public figures of the cycle: 12.8 km, 129.2 km/h at most; 0.5 s of smoothing takes little off the peak
     assert leader.position[-1].item() == pytest.approx(12.88e3, rel=0.01)

@@ -126,7 +126,7 @@ def test_standstill_holds_and_starts_again():
     assert run.spacing[:, 2600].min() > 4.0
     rest = run.spacing[:, 2210:2600].diff()
     assert rest.max() < 1e-9
-    assert (rest[still[:, 2210:2599]].abs() < 1e-9).all(), "moves while it stands"
+    assert (rest[still[:, 2210:2599] & still[:, 2211:2600]].abs() < 1e-9).all(), "moves while it stands"
 
 
 def test_a_stop_takes_the_way_of_its_deceleration():
@@ -185,10 +185,10 @@ def test_platoon_noise_differs_by_vehicle_and_first_vehicle_is_the_single_one():
 
 
 def test_unstable_string_amplifies_along_the_platoon_and_stable_does_not():
-    leader = Leader.from_speed(np.arange(0, 90, 0.5), 20 + 0.3 * np.sin(0.8 * np.arange(0, 90, 0.5)), smooth_s=0.0)
+    leader = Leader.from_speed(np.arange(0, 60, 0.5), 20 + 0.3 * np.sin(0.8 * np.arange(0, 60, 0.5)), smooth_s=0.0)
     for plant, grows in ((QUIET, False), (GLVDPlant(1.5, 0.5, 0.0), True)):
-        run = simulate(leader, plant=plant, vehicles=5, duration=85.0)
-        swing = run.speed[0, :, 4500:].std(-1)
+        run = simulate(leader, plant=plant, vehicles=4, duration=58.0)
+        swing = run.speed[0, :, 3000:].std(-1)
         assert ((swing[1:] > swing[:-1]) == grows).all()
 
 

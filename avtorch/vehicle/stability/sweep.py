@@ -15,7 +15,7 @@ DECADES = 3.5  # below this the sweep is one bracket, down to omega = 0
 POINTS = 320  # 2.5 % apart: the skirts of a resonance are seen however sharp its tip
 MOST_POINTS = 8192
 FEW_POINTS = 80  # for a verdict that is not close
-BLOCK = 1 << 18  # numbers held at a time: the temporaries stay in the cache
+BLOCK = 1 << 17  # numbers held at a time: the temporaries stay in the cache
 GOLDEN = (math.sqrt(5) - 1) / 2
 
 

@@ -1,0 +1,90 @@
+"""The house in order: the files a newcomer meets, and rules that a reader would otherwise have to check."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "avtorch"
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+
+
+def project() -> dict:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("name", ["README.md", "CHANGELOG.md", "LICENSE", "Makefile", ".gitignore", ".ci/run"])
+def test_files_a_newcomer_meets(name: str) -> None:
+    assert (ROOT / name).read_text(encoding="utf-8").strip()
+
+
+def test_ci_script_can_be_run() -> None:
+    assert (ROOT / ".ci/run").stat().st_mode & 0o111
+
+
+def test_package_is_marked_as_typed() -> None:
+    assert (PACKAGE / "py.typed").is_file()
+
+
+def test_every_requirement_is_pinned() -> None:
+    pinned = {
+        re.sub(r"[-_.]+", "-", line.split("==")[0]).lower()
+        for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+        if "==" in line
+    }
+    extras = project()["project"]["optional-dependencies"]
+    wanted = [*project()["project"]["dependencies"], *(r for group in extras.values() for r in group)]
+    names = {re.match(r"[A-Za-z0-9._-]+", r).group().lower() for r in wanted}  # type: ignore[union-attr]
+    assert names - {"avtorch"} <= pinned
+
+
+def test_torch_is_pinned_as_in_ci() -> None:
+    assert "torch==2.13.0" in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_module_says_what_it_is(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert not text.strip() or text.lstrip().startswith(('"""', 'r"""')), "a module starts with a docstring"
+    assert len(text.splitlines()) <= 400, "a file of one idea is shorter"
+
+
+def test_no_rooms_without_a_name() -> None:
+    assert not [p for p in SOURCES if p.stem in ("utils", "helpers", "common", "misc")]
+
+
+@pytest.mark.parametrize("package", ["torch", "matplotlib", "rich", "cyclopts", "pyro", "arviz"])
+def test_logs_are_read_without(package: str) -> None:
+    found = [p for p in (PACKAGE / "io").glob("*.py") if re.search(rf"^\s*(import|from) {package}\b", p.read_text(encoding="utf-8"), re.M)]
+    assert not found
+
+
+def test_readme_names_only_what_exists() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#:]+)\)", text):
+        assert (ROOT / target).exists(), target
+    for folder in re.findall(r"^\| `([^`]+)` \|", text, re.M):
+        assert (ROOT / folder).exists(), folder
+
+
+def test_readme_example_is_python_that_runs_on_the_public_face() -> None:
+    import avtorch
+
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)
+    assert blocks
+    for block in blocks:
+        compile(block, "README.md", "exec")
+        assert len(block.strip().splitlines()) <= 12
+        for name in re.findall(r"\bavtorch\.(\w+)", block):
+            assert hasattr(avtorch, name), name
+
+
+@pytest.mark.slow
+def test_readme_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    for block in re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S):
+        exec(compile(block, "README.md", "exec"), {})
+    assert "2.24" in capsys.readouterr().out
