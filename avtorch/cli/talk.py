@@ -23,7 +23,7 @@ class Talk:
         self.err = Console(stderr=True, quiet=self.silent, highlight=False)
 
     @contextmanager
-    def progress(self, what: str) -> Iterator[Callable[[int, int], None]]:
+    def progress(self, what: str) -> Iterator[Callable[[float, float], None]]:
         """A bar on stderr where it is a terminal; yields a function of (done, of)."""
         columns = (
             TextColumn("{task.description}"),
@@ -71,12 +71,15 @@ class Talk:
 
     def summary(self, answer: Mapping[str, Any], sentence: str) -> None:
         self.out.print(sentence)
-        for alert in answer["alerts"][:5]:
-            self.out.print(
-                f"{alert['time_s']:.1f} s  {alert['detector']}: {alert['why']}", style="yellow", markup=False
-            )
-        if len(answer["alerts"]) > 5:
-            self.out.print(f"... and {len(answer['alerts']) - 5} more alerts in the answer", style="dim")
+        # an alarm that nobody answers goes on: its first window tells, the rest are counted
+        first: dict[str, Mapping[str, Any]] = {}
+        for alert in answer["alerts"]:
+            first.setdefault(alert["detector"], alert)
+        for name, alert in first.items():
+            count = sum(a["detector"] == name for a in answer["alerts"])
+            again = f" (and {count - 1} windows more)" if count > 1 else ""
+            told = f"{alert['time_s']:.1f} s  {name}: {alert['why']}{again}"
+            self.out.print(told, style="yellow", markup=False)
 
     def story(self, answer: Mapping[str, Any]) -> None:
         """What happened in a run, in order, and what the action was worth."""

@@ -65,14 +65,12 @@ def algorithm2(
 ) -> Algorithm2:
     """One pass of Algorithm 2 over point estimates T_L [s] and K_L [-] (scenario,), with `setting` in force.
 
-    The boundary is `accepted` ± `change`, both (T_L, K_L); by default around the model in the lower level, which is what
-    was accepted last. `check="print"` is Eq. 2 with the sufficient Eq. 3 at the estimate; `"exact"` the exact string
-    condition. Raises `InputError` where the new time gap is not longer or a new gain not larger in size than the one in
-    force, as the print demands, in a scenario that takes that branch.
+    The boundary is `accepted` ± `change`, both (T_L, K_L); by default around the model in the lower level, which is
+    what was accepted last. `check="print"` is Eq. 2 with the sufficient Eq. 3 at the estimate; `"exact"` the exact
+    string condition. Raises `InputError` where the new time gap is not longer or a new gain not larger in size than
+    the one in force, as the print demands, in a scenario that takes that branch.
     """
-    T, K = torch.broadcast_tensors(
-        torch.as_tensor(T_L, dtype=torch.float64), torch.as_tensor(K_L, dtype=torch.float64)
-    )
+    T, K = torch.broadcast_tensors(torch.as_tensor(T_L, dtype=torch.float64), torch.as_tensor(K_L, dtype=torch.float64))
     around = (setting.T_hat, setting.K_hat) if accepted is None else accepted
     outside = ((T - around[0]).abs() > change[0]) | ((K - around[1]).abs() > change[1])
     outside, T, K = (x.expand(setting.shape) for x in (outside, T, K))

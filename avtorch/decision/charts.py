@@ -4,11 +4,12 @@ In control the innovations are independent standard normal. One two-sided chart 
 
 - **Shewhart** when :math:`|z_t| > L`;
 - **EWMA** when :math:`|e_t| > L \sqrt{w/(2-w)}`, with :math:`e_t = (1-w) e_{t-1} + w z_t` and :math:`e_0 = 0`;
-- **CUSUM** when :math:`\max(c^+_t, c^-_t) > L`, with :math:`c^\pm_t = \max(0, c^\pm_{t-1} \pm z_t - r)` and :math:`c_0 = 0`.
+- **CUSUM** when :math:`\max(c^+_t, c^-_t) > L`, with :math:`c^\pm_t = \max(0, c^\pm_{t-1} \pm z_t - r)`, likewise.
 
-No limit is typed in. The ARL of Shewhart is exact; those of EWMA and CUSUM solve the renewal (Fredholm) equation of the
-chart's Markov chain, the continuous limit of Brook & Evans (1972), on Gauss-Legendre nodes; the limit for a wanted ARL is
-then found by bracketing. A chart starts again from zero after its alarm, so alarms in control come an ARL apart.
+No limit is typed in. The ARL of Shewhart is exact; those of EWMA and CUSUM solve the renewal (Fredholm) equation of
+the chart's Markov chain, the continuous limit of Brook & Evans (1972), on Gauss-Legendre nodes; the limit for a
+wanted ARL is then found by bracketing. A chart starts again from zero after its alarm, so alarms in control come an
+ARL apart.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def shewhart_arl(limit: float) -> float:
 
 
 def ewma_arl(limit: float, weight: float) -> float:
-    """In-control ARL [windows] of the two-sided EWMA chart from zero; `limit` counts steady-state standard deviations."""
+    """In-control ARL [windows] of the two-sided EWMA chart from zero; `limit` in steady-state standard deviations."""
     if weight == 1.0:
         return shewhart_arl(limit)
     edge = limit * math.sqrt(weight / (2.0 - weight))
@@ -93,10 +94,10 @@ def chart_limit(kind: ChartKind, arl: float, *, weight: float = 0.2, reference: 
 class Chart:
     """Two-sided charts run side by side, one per scenario and per innovation component.
 
-    Rates of alarms add, so with `components` innovations each chart is designed for `components * arl`: the scenario as a
-    whole then alarms once per `arl` windows in control (exactly for Shewhart up to 1/arl, closely for the others, whose
-    run lengths are nearly geometric). `limit` is computed, never given. `last_statistic` is what the last step compared
-    with `edge`, kept before the restart of a chart that alarmed.
+    Rates of alarms add, so with `components` innovations each chart is designed for `components * arl`: the scenario
+    as a whole then alarms once per `arl` windows in control (exactly for Shewhart up to 1/arl, closely for the
+    others, whose run lengths are nearly geometric). `limit` is computed, never given. `last_statistic` is what the
+    last step compared with `edge`, kept before the restart of a chart that alarmed.
     """
 
     kind: ChartKind
@@ -162,4 +163,5 @@ def _solve(arl_of: Any, arl: float) -> float:
         low /= 2.0
     if low <= 1e-6:
         raise InputError(f"arl: found {arl}, shorter than this chart can have")
-    return float(brentq(lambda limit: math.log(arl_of(limit) / arl), low, high, xtol=1e-10))
+    root: Any = brentq(lambda limit: math.log(arl_of(limit) / arl), low, high, xtol=1e-10)
+    return float(root)

@@ -7,10 +7,10 @@ Both are taken as Gaussians in :math:`(\log T_L, \log K_L)`, the scale on which 
     H^2(p, q) &= 1 - \frac{|P|^{1/4} |Q|^{1/4}}{|M|^{1/2}} \exp(-\tfrac18 \delta^\top M^{-1} \delta),\ M = (P+Q)/2 \\
     W_2^2(p, q) &= \delta^\top \delta + \mathrm{tr}(P + Q - 2 (Q^{1/2} P Q^{1/2})^{1/2})
 
-Each is increasing in one quadratic form :math:`\delta^\top A \delta` of the distance of the means. If nothing has changed,
-:math:`\delta \sim N(0, P + Q)`, as the baseline is uncertain too; the form is then a sum of weighted chi-squares, whose upper
-tail in two dimensions is one smooth periodic integral. The threshold on the divergence is that tail's quantile, so that
-the rate of false alarms is what was asked for, whatever the two covariances are.
+Each is increasing in one quadratic form :math:`\delta^\top A \delta` of the distance of the means. If nothing has
+changed, :math:`\delta \sim N(0, P + Q)`, as the baseline is uncertain too; the form is then a sum of weighted
+chi-squares, whose upper tail in two dimensions is one smooth periodic integral. The threshold on the divergence is
+that tail's quantile, so that the rate of false alarms is what was asked for, whatever the two covariances are.
 """
 
 from __future__ import annotations

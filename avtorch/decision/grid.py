@@ -2,14 +2,15 @@
 
 Grid, relative to the driver's default and to the setting in force:
 
-- lower level: keep what is in force, or update the model to the estimate with a target lag between the default's and the
-  estimate's, in equal steps of its logarithm. A slower target asks less of the actuator: it lowers the command effort
-  T_hat K_d / (K_hat T_d).
+- lower level: keep what is in force, or update the model to the estimate with a target lag between the default's and
+  the estimate's, in equal steps of its logarithm. A slower target asks less of the actuator: it lowers the command
+  effort T_hat K_d / (K_hat T_d).
 - time gap: the driver's settings, none shorter than the default.
 - gains: the default's, and a stated list of triples, calibrated beforehand.
 
-Intrusiveness is a number without unit; one is what updating the lower level costs. What nobody in the car notices costs
-least, what the driver sees on the dashboard or the engineer has to re-approve costs more, and both together cost the sum:
+Intrusiveness is a number without unit; one is what updating the lower level costs. What nobody in the car notices
+costs least, what the driver sees on the dashboard or the engineer has to re-approve costs more, and both together
+cost the sum:
 
     lower level differs from the default    1    + 0.5 for each doubling of the command effort above 1
     lower level kept though known wrong     2    (the paper: update at a minimum)
@@ -37,8 +38,8 @@ GAINS_GRID: tuple[tuple[float, float, float], ...] = (
     *product((1.5,), (1.5, 2.0, 3.0, 4.0, 6.0), (-0.8, -1.8, -3.0, -5.0)),
     PAPER_GAINS,
 )
-"""Gains (k_s, k_v, k_a) on offer: k_v makes the car responsive, which a weak actuator needs; a stronger k_a holds back a
-slow one. k_s stays, as it is neutral (paper, table on gains). The paper's own triple is among them."""
+"""Gains (k_s, k_v, k_a) on offer: k_v makes the car responsive, which a weak actuator needs; a stronger k_a holds
+back a slow one. k_s stays, as it is neutral (paper, table on gains). The paper's own triple is among them."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,8 @@ class Grid:
     ) -> Candidates:
         """All settings on offer at the estimates T_L [s], K_L [-] (scenario,), (scenario, candidate).
 
-        `model_wrong` (scenario,) bool: a change of the vehicle was detected, so the model in force is known to be wrong.
+        `model_wrong` (scenario,) bool: a change of the vehicle was detected, so the model in force is known to be
+        wrong.
         """
         scenarios = T_L.shape[0]
         column = default[:, None]
@@ -145,16 +147,15 @@ class Grid:
 
         lower, gap, gain = (
             i.reshape(-1)
-            for i in torch.meshgrid(*(torch.arange(n) for n in (T_d.shape[1], gaps.shape[1], gains.shape[1])), indexing="ij")
+            for i in torch.meshgrid(*(torch.arange(x.shape[1]) for x in (T_d, gaps, gains)), indexing="ij")
         )
         k = gains[:, gain]
         if self.gains_of_gap is not None:
-            k = torch.tensor(
-                [[list(self.gains_of_gap(g)) for g in row] for row in gaps.tolist()], dtype=torch.float64
-            )[:, gap]
+            k = torch.tensor([[list(self.gains_of_gap(g)) for g in row] for row in gaps.tolist()], dtype=torch.float64)[
+                :, gap
+            ]
         setting = Setting(T_hat[:, lower], K_hat[:, lower], T_d[:, lower], K_d[:, lower], gaps[:, gap], k)
         priced_default = column if self.gains_of_gap is None else column.replace(gains=k)
         cost = self.intrusiveness(setting, priced_default, model_wrong[:, None] & (lower == 0))
         on_offer = fresh[:, lower] & offered[:, gap] & other[:, gain]
         return Candidates(setting, torch.where(on_offer, cost, torch.inf))
-

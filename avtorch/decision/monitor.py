@@ -78,7 +78,8 @@ class MonitorReport:
             return f"{seen} left what was accepted ({T0:.2f} s, {K0:.2f}) with probability {sure:.3f}"
         value = float(self.statistics[name][scenario])
         if name in CHARTS:
-            return f"{name} chart at {value:.2f}, limit {float(self.statistics[name + '_limit'][scenario]):.2f} ({seen})"
+            limit = float(self.statistics[name + "_limit"][scenario])
+            return f"{name} chart at {value:.2f}, limit {limit:.2f} ({seen})"
         p = float(self.statistics[name + "_p_value"][scenario])
         return f"{name} divergence from the baseline {value:.3g}, by chance with probability {p:.1e} ({seen})"
 
@@ -133,7 +134,8 @@ class Monitor:
         self.false_alarm_rate = false_alarm_rate
         self.inflation = inflation
         self.dead_time = dead_time
-        self.accepted = tuple(torch.as_tensor(a, dtype=torch.float64).expand(scenarios).clone() for a in accepted)
+        first, second = (torch.as_tensor(a, dtype=torch.float64).expand(scenarios).clone() for a in accepted)
+        self.accepted = (first, second)
         self._charts = {name: Chart(name, scenarios, arl) for name in CHARTS if name in self.detectors}
         unit = torch.eye(2, dtype=torch.float64).expand(scenarios, 2, 2)
         self._baseline = Gaussian(torch.zeros(scenarios, 2, dtype=torch.float64), unit)
@@ -199,17 +201,18 @@ class Monitor:
         baseline becomes that window's posterior and the charts start afresh.
         """
         new = (self._mean[0] if T_L is None else T_L, self._mean[1] if K_L is None else K_L)
-        self.accepted = tuple(
+        T, K = (
             torch.where(where, torch.as_tensor(n, dtype=torch.float64), old)
             for n, old in zip(new, self.accepted, strict=True)
         )
+        self.accepted = (T, K)
         self._baseline = _choose(where, self._window, self._baseline)
         self._has_baseline = self._has_baseline | where
         for chart in self._charts.values():
             chart.restart(where)
 
     def set_baseline(self, T_L: Tensor, K_L: Tensor) -> None:
-        """A baseline posterior from elsewhere (technical knowledge, an earlier drive): draws (scenario, draw) or (draw,)."""
+        """A baseline posterior from elsewhere (an earlier drive, knowledge): draws (scenario, draw) or (draw,)."""
         given = Gaussian.of_draws(T_L.to(torch.float64), K_L.to(torch.float64), inflation=self.inflation)
         self._baseline = Gaussian(given.mean.expand(self.scenarios, 2), given.cov.expand(self.scenarios, 2, 2))
         self._has_baseline = torch.ones(self.scenarios, dtype=torch.bool)
@@ -226,11 +229,11 @@ class Monitor:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume to the bit. Raises `InputError` where the state is of other detectors or another number of scenarios."""
+        """Resume to the bit. Raises `InputError` where the state is of other charts or scenarios."""
         if set(state["charts"]) != set(self._charts) or state["has_baseline"].shape != (self.scenarios,):
             raise InputError("state: of a monitor with other charts or another number of scenarios")
-        self.accepted = tuple(a.clone() for a in state["accepted"])
-        self._mean = tuple(m.clone() for m in state["mean"])
+        self.accepted = (state["accepted"][0].clone(), state["accepted"][1].clone())
+        self._mean = (state["mean"][0].clone(), state["mean"][1].clone())
         self._baseline = Gaussian(*(t.clone() for t in state["baseline"]))
         self._window = Gaussian(*(t.clone() for t in state["window"]))
         self._has_baseline = state["has_baseline"].clone()
@@ -247,6 +250,4 @@ class Monitor:
 
 
 def _choose(where: Tensor, a: Gaussian, b: Gaussian) -> Gaussian:
-    return Gaussian(
-        torch.where(where[:, None], a.mean, b.mean), torch.where(where[:, None, None], a.cov, b.cov)
-    )
+    return Gaussian(torch.where(where[:, None], a.mean, b.mean), torch.where(where[:, None, None], a.cov, b.cov))

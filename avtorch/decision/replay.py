@@ -1,8 +1,8 @@
 """What a setting would have done over the last windows: the closed loop replayed behind the leader that was seen.
 
-The replay starts from the state logged at the beginning of the stretch, follows the leader's logged speed and acceleration
-with the posterior mean as the vehicle, and moves the time gap from the one in force at the loop's own rate. It is how
-the strategist predicts clipping and cost before it touches the car.
+The replay starts from the state logged at the beginning of the stretch, follows the leader's logged speed and
+acceleration with the posterior mean as the vehicle, and moves the time gap from the one in force at the loop's own
+rate. It is how the strategist predicts clipping and cost before it touches the car.
 """
 
 from __future__ import annotations
@@ -60,14 +60,12 @@ class History:
 
     def __getitem__(self, index: Tensor) -> History:
         """Some of the scenarios."""
-        return History(
-            self.dt, self.lead_speed[index], self.lead_accel[index], self.spacing[index], self.speed[index]
-        )
+        return History(self.dt, self.lead_speed[index], self.lead_accel[index], self.spacing[index], self.speed[index])
 
     def thinned(self, stride: int) -> History:
         """Every `stride`-th row."""
-        lead = (x[:, ::stride] for x in (self.lead_speed, self.lead_accel))
-        return History(stride * self.dt, *lead, self.spacing, self.speed)
+        v, a = self.lead_speed[:, ::stride], self.lead_accel[:, ::stride]
+        return History(stride * self.dt, v, a, self.spacing, self.speed)
 
     def leader(self) -> Leader:
         """The leader seen, (scenario, time), position from 0."""

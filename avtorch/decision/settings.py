@@ -1,7 +1,7 @@
 """The whole setting of a car-following controller, for many scenarios at once, and how it is changed.
 
-Strategy 1 changes the model in the lower level, Strategy 2 the time gap, Strategy 3 the gains of the upper level (paper,
-Section 4). Formulas live in `avtorch.vehicle`; this file only carries the numbers to them.
+Strategy 1 changes the model in the lower level, Strategy 2 the time gap, Strategy 3 the gains of the upper level
+(paper, Section 4). Formulas live in `avtorch.vehicle`; this file only carries the numbers to them.
 """
 
 from __future__ import annotations
@@ -82,16 +82,15 @@ class Setting:
 
     def where(self, condition: Tensor, other: Setting) -> Setting:
         """This setting where `condition` (scenario,) holds, `other` elsewhere."""
-        return Setting(
-            **{
-                f.name: torch.where(
-                    condition.unsqueeze(-1) if f.name == "gains" else condition,
-                    getattr(self, f.name),
-                    getattr(other, f.name),
-                )
-                for f in fields(self)
-            }
-        )
+        parts: dict[str, Any] = {
+            f.name: torch.where(
+                condition.unsqueeze(-1) if f.name == "gains" else condition,
+                getattr(self, f.name),
+                getattr(other, f.name),
+            )
+            for f in fields(self)
+        }
+        return Setting(**parts)
 
     def __getitem__(self, index: Any) -> Setting:
         """Some of the scenarios, by index tensor, mask or slice."""
@@ -138,7 +137,7 @@ class Setting:
         return stability.p_locally_stable(T_e, K_e, self.time_gap, self.gains, dead_time=_per_draw(dead_time))
 
     def peak_gain(self, T_L: Number, K_L: Number, *, dead_time: Number = 0.0) -> Tensor:
-        """Peak gain (scenario,) at one plant for each scenario, through (T_e, K_e): the judge of a choice, at the truth."""
+        """Peak gain (scenario,) at one plant a scenario, through (T_e, K_e): the judge of a choice, at the truth."""
         T_e, K_e = self.lower_level().effective(T_L, K_L)
         return stability.peak_gain(T_e, K_e, self.time_gap, self.gains, dead_time=dead_time)
 

@@ -4,16 +4,17 @@ A setting is *sufficient* when
 
 1. P(string stable) under the posterior draws reaches `required` (0.95), by the exact condition at the effective
    actuation (T_e, K_e) that setting gives every draw;
-2. at most 5 % of the commands it would have sent over the last windows are clipped at the vehicle's limits, and it would
-   not have collided, both in a replay of the closed loop (`replay.py`). The inversion formula knows no limits: without
-   this, inverting a slow actuator would always win, on paper.
+2. at most 5 % of the commands it would have sent over the last windows are clipped at the vehicle's limits, and it
+   would not have collided, both in a replay of the closed loop (`replay.py`). The inversion formula knows no limits:
+   without this, inverting a slow actuator would always win, on paper.
 
-Among the sufficient ones the least `total` is taken: the intrusiveness of `grid.py` plus `margin` times the probability of
-being string unstable when the spread of the belief is doubled, as the first posterior after a change is still pulled to
-the past by its prior. Sufficient settings are searched in order of intrusiveness, and the search ends when nothing left
-could be better; where it ends without one, every setting that reaches `required` has been replayed. The one with the
-best P(string stable) is then taken, out of those that clip at most five points more than the setting in force would have,
-and would have collided no harder (a leader who asks for more than the car has clips every setting), and `sufficient` says that it is not.
+Among the sufficient ones the least `total` is taken: the intrusiveness of `grid.py` plus `margin` times the
+probability of being string unstable when the spread of the belief is doubled, as the first posterior after a change
+is still pulled to the past by its prior. Sufficient settings are searched in order of intrusiveness, and the search
+ends when nothing left could be better; where it ends without one, every setting that reaches `required` has been
+replayed. The one with the best P(string stable) is then taken, out of those that clip at most five points more than
+the setting in force would have and would have collided no harder (a leader who asks for more than the car has clips
+every setting); among equals intrusiveness is weighed against clipping. `sufficient` says that it is not.
 """
 
 from __future__ import annotations
@@ -309,7 +310,7 @@ class _Search:
         for name, value in vars(seen).items():
             getattr(self.predictions, name)[rows[:, None], columns] = value
         # Columns that only fill up the batch are not told of, so that a scenario is judged alike in any company.
-        self.replayed[rows[:, None], columns] = worth.gather(1, columns)
+        self.replayed[rows[:, None], columns] |= worth.gather(1, columns)
 
     def _sufficient(self) -> Tensor:
         assert self.predictions is not None

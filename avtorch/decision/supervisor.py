@@ -114,6 +114,7 @@ class Supervisor:
         self.strategist = strategist
         # the model in the lower level is known to be wrong from a detected change until it is updated
         self._model_wrong = torch.zeros(n, dtype=torch.bool)
+        self._acted = torch.zeros(n, dtype=torch.bool)
 
     def run(
         self,
@@ -165,8 +166,12 @@ class Supervisor:
     def _act(self, watched: WatchedWindow, blocks: list[Block], actions: list[list[Action]]) -> None:
         assert self.strategist is not None
         report, loop = watched.report, self.loop
-        self._model_wrong |= report.actuation_changed
-        asked = torch.nonzero(report.any).squeeze(-1)
+        # a setting that was chosen and still does its work stays: the paper warns of changing the controller often
+        p = torch.minimum(report.p_string_stable, report.p_local_stable)
+        content = self._acted & (p >= self.strategist.required)
+        self.watch.monitor.accept(report.any & content)
+        self._model_wrong |= report.actuation_changed & ~content
+        asked = torch.nonzero(report.any & ~content).squeeze(-1)
         if len(asked) == 0:
             return
         T_L, K_L = (watched.window.belief.draws[:, asked, i].mT for i in range(2))
@@ -207,6 +212,7 @@ class Supervisor:
         # what was acted on is the new normal; where nothing better was found, the alarm goes on
         self.watch.monitor.accept(where)
         self._model_wrong &= ~where
+        self._acted |= where
 
     def _put_in_force(self, setting: Setting, loop: ClosedLoop) -> None:
         loop.controller = setting.retarget(loop.controller, at=loop.time)

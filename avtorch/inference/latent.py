@@ -25,6 +25,7 @@ EVEN = 0.05
 #: gear changes, gain errors; it must be free to reach them, or the posterior of T_L and K_L is several times too narrow.
 NOISE_PRIOR: dict[str, tuple[float, float]] = {
     "process_noise": (0.1, 1.0),
+    "road_noise": (0.005, 1.0),
     "speed_noise": (0.01, 1.5),
     "accel_noise": (0.05, 1.0),
     "coloured_sd": (0.15, 0.7),
@@ -146,7 +147,7 @@ def default_noise_prior(names: Sequence[str]) -> LogNormalPrior:
 
 def latent_names(*, accel: bool, speed: bool) -> tuple[str, ...]:
     """Parameters of the latent form: the actuation pair, then the noise of what is measured."""
-    sensors = (*(("speed_noise",) if speed else ()), *(("accel_noise",) if accel else ()))
+    sensors = (*(("road_noise", "speed_noise") if speed else ()), *(("accel_noise",) if accel else ()))
     return ("T_L", "K_L", "process_noise", *sensors, "coloured_sd", "coloured_time")
 
 
@@ -172,7 +173,7 @@ class LatentDensity:
         """``z`` ``(..., window, parameter)``; returns ``(..., window)`` [nats]."""
         p = dict(zip(self.names, z[..., self._owner, :].exp().unbind(-1), strict=True))
         five = (p["T_L"], p["K_L"], p["process_noise"], p["coloured_sd"], p["coloured_time"])
-        noise = {"accel_noise": p.get("accel_noise"), "speed_noise": p.get("speed_noise")}
+        noise = {name: p[name] for name in ("accel_noise", "speed_noise", "road_noise") if name in p}
         if self._even is not None:
             per_run = steady_log_likelihood(*five, self._even, **noise)
         else:

@@ -31,12 +31,13 @@ def latent_log_likelihood(
     speed: Tensor | None = None,
     accel_noise: Tensor | float | None = None,
     speed_noise: Tensor | float | None = None,
+    road_noise: Tensor | float = 0.0,
     mask: Tensor | None = None,
 ) -> Tensor:
     """Log likelihood ``(...)`` [nats] of measured acceleration and/or speed, by Kalman innovations.
 
     Parameters of shape ``(...)`` or broadcasting to it: ``T_L`` [s], ``K_L`` [-], ``process_noise`` [m/s²/√s],
-    ``coloured_sd`` [m/s²], ``coloured_time`` [s], ``accel_noise`` [m/s²] and ``speed_noise`` [m/s] per row. Data of shape
+    ``coloured_sd`` [m/s²], ``coloured_time`` [s], ``accel_noise`` [m/s²] and ``speed_noise`` [m/s] per row, ``road_noise`` [m/s/√s]. Data of shape
     ``(..., time)``: ``time`` [s] increasing, ``u`` [m/s²] held from its row to the next, ``accel`` [m/s²] = a + d + noise,
     ``speed`` [m/s]. ``mask`` ``(..., time)``: False where a row's measurements are not used; its command still acts.
     Typically parameters are ``(chain, window)`` and data ``(window, time)``.
@@ -52,10 +53,10 @@ def latent_log_likelihood(
     for name, signal, noise in (("accel", accel, accel_noise), ("speed", speed, speed_noise)):
         if signal is not None and noise is None:
             raise InputError(f"{name}_noise: missing; it is needed where {name} is measured")
-    parameters = torch.broadcast_tensors(*(_tensor(p, u) for p in (T_L, K_L, process_noise, coloured_sd, coloured_time)))
+    parameters = torch.broadcast_tensors(*(_tensor(p, u) for p in (T_L, K_L, process_noise, road_noise, coloured_sd, coloured_time)))
     rows = u.shape[-1]
     used = torch.ones_like(u, dtype=torch.bool) if mask is None else mask
-    covariance = initial_covariance(parameters[3])
+    covariance = initial_covariance(parameters[4])
     mean = torch.zeros(covariance.shape[:-1], dtype=u.dtype, device=u.device)
 
     # A channel: rows of data, its variance, and the row of the measurement matrix.

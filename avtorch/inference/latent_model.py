@@ -3,11 +3,12 @@ r"""The latent-acceleration model and its exact discretisation (SPEC section 3, 
 State ``(v, a, d)``: speed, actuator acceleration, external acceleration that the simulator does not know.
 
 .. math::
-    \dot v = a + d, \qquad \dot a = -a/T_L + (K_L/T_L)\, u + q\, w_1, \qquad
+    \dot v = a + d + g\, w_3, \qquad \dot a = -a/T_L + (K_L/T_L)\, u + q\, w_1, \qquad
     \dot d = -d/\tau_d + s \sqrt{2/\tau_d}\, w_2
 
 with ``w`` unit white noise; ``d`` is Ornstein-Uhlenbeck with stationary standard deviation ``s`` and carries the coloured
-residual. Measured are ``v`` and/or ``a + d``, each with independent noise per row. The command is held between rows.
+residual. ``g`` is road noise: vibration of the body that the wheels see and that is faster than the rows. Without it the
+mode ``T_L → 0`` with a huge ``q`` imitates it (hundreds of nats on a real lap) and drags the lag to nothing. Measured are ``v`` and/or ``a + d``, each with independent noise per row. The command is held between rows.
 ``a`` and ``d`` drive ``v`` independently, so every entry has a closed form and no matrix exponential is needed.
 """
 
@@ -68,21 +69,28 @@ def _ou(time: Tensor, density: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tens
 
 
 def discretise(
-    T_L: Tensor, K_L: Tensor, process_noise: Tensor, coloured_sd: Tensor, coloured_time: Tensor, dt: Tensor
+    T_L: Tensor,
+    K_L: Tensor,
+    process_noise: Tensor,
+    road_noise: Tensor,
+    coloured_sd: Tensor,
+    coloured_time: Tensor,
+    dt: Tensor,
 ) -> Step:
     """Exact discretisation with the command held over ``dt``; all arguments broadcast to ``(...)``.
 
-    Units: ``T_L`` [s], ``K_L`` [-], ``process_noise`` [m/s²/√s], ``coloured_sd`` [m/s²], ``coloured_time`` [s], ``dt`` [s].
+    Units: ``T_L`` [s], ``K_L`` [-], ``process_noise`` [m/s²/√s], ``road_noise`` [m/s/√s], ``coloured_sd`` [m/s²],
+    ``coloured_time`` [s], ``dt`` [s].
     """
-    T_L, K_L, process_noise, coloured_sd, coloured_time, dt = torch.broadcast_tensors(
-        T_L, K_L, process_noise, coloured_sd, coloured_time, dt
+    T_L, K_L, process_noise, road_noise, coloured_sd, coloured_time, dt = torch.broadcast_tensors(
+        T_L, K_L, process_noise, road_noise, coloured_sd, coloured_time, dt
     )
     ea, reach_a, aa, va, vv_a = _ou(T_L, process_noise**2, dt)
     ed, reach_d, dd, vd, vv_d = _ou(coloured_time, 2.0 * coloured_sd**2 / coloured_time, dt)
     one, zero = torch.ones_like(dt), torch.zeros_like(dt)
     transition = torch.stack((one, reach_a, reach_d, zero, ea, zero, zero, zero, ed), -1).unflatten(-1, (3, 3))
     gain = torch.stack((K_L * (dt - reach_a), -K_L * torch.expm1(-dt / T_L), zero), -1)
-    noise = torch.stack((vv_a + vv_d, va, vd, va, aa, zero, vd, zero, dd), -1).unflatten(-1, (3, 3))
+    noise = torch.stack((vv_a + vv_d + road_noise**2 * dt, va, vd, va, aa, zero, vd, zero, dd), -1).unflatten(-1, (3, 3))
     return Step(transition, gain, noise)
 
 

@@ -125,14 +125,16 @@ def steady_log_likelihood(
     *,
     accel_noise: Tensor | None = None,
     speed_noise: Tensor | None = None,
+    road_noise: Tensor | None = None,
 ) -> Tensor:
     """Log likelihood ``(..., run)``; parameters ``(..., run)``, float64. Equals `latent_log_likelihood` on even rows."""
     lead = T_L.shape[:-1]
     runs = T_L.shape[-1]
-    T_L, K_L, process_noise, coloured_sd, coloured_time = (
-        p.reshape(-1, runs) for p in (T_L, K_L, process_noise, coloured_sd, coloured_time)
+    road = torch.zeros_like(T_L) if road_noise is None else road_noise
+    T_L, K_L, process_noise, road, coloured_sd, coloured_time = (
+        p.reshape(-1, runs) for p in (T_L, K_L, process_noise, road, coloured_sd, coloured_time)
     )
-    step = discretise(T_L, K_L, process_noise, coloured_sd, coloured_time, data.dt)
+    step = discretise(T_L, K_L, process_noise, road, coloured_sd, coloured_time, data.dt)
     phi, B, Q, P0 = step.transition, step.gain, step.noise, initial_covariance(coloured_sd)
     sensors = []
     noises = []

@@ -77,7 +77,11 @@ def _expand(density: Density, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     z = z.detach().requires_grad_()
     potential = -density.log_prob(z)
     (gradient,) = torch.autograd.grad(potential.sum(), z, create_graph=True)
-    rows = [torch.autograd.grad(gradient[:, i].sum(), z, retain_graph=True)[0] for i in range(z.shape[-1])]
+    rows = []
+    for i in range(z.shape[-1]):
+        # a density that is linear in a parameter has no second derivative to ask for
+        row = torch.autograd.grad(gradient[:, i].sum(), z, retain_graph=True)[0] if gradient.requires_grad else None
+        rows.append(torch.zeros_like(z) if row is None else row)
     hessian = torch.stack(rows, -2)
     potential, gradient, hessian = potential.detach(), gradient.detach(), 0.5 * (hessian + hessian.mT)
     good = potential.isfinite() & gradient.isfinite().all(-1) & hessian.isfinite().flatten(1).all(-1)

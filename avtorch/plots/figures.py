@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -145,8 +146,12 @@ def stability_figure(
 
 
 def _events_of(ax: Axes, answer: Mapping[str, Any]) -> Axes:
+    """Mark an answer's events; of an alarm that goes on over many windows only the first."""
+    windows = answer.get("windows") or []
+    went_on = {b["end_s"] for a, b in pairwise(windows) if a["alerts"] and b["alerts"]}
+    alerts = [a for a in answer.get("alerts") or () if a["time_s"] not in went_on]
     change = (answer.get("change") or {}).get("time_s")
-    return events(ax, change_s=change, alerts=answer.get("alerts") or (), actions=answer.get("actions") or ())
+    return events(ax, change_s=change, alerts=alerts, actions=answer.get("actions") or ())
 
 
 def _legend_above(figure: Figure, *axes: Axes) -> None:

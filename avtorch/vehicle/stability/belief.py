@@ -15,7 +15,7 @@ from avtorch.vehicle.stability.nyquist import lost_at
 from avtorch.vehicle.stability.setting import Gains, Setting, Value, as_tensor, read_setting
 from avtorch.vehicle.stability.verdict import locally_stable, peak_gain_of, string_stable_of
 
-BLOCK = 1 << 17  # (setting, draw) pairs held at a time: the temporaries then stay in the cache
+BLOCK = 1 << 15  # (setting, draw) pairs held at a time: the temporaries then stay in the cache
 
 
 class Interval(NamedTuple):

@@ -1,0 +1,213 @@
+"""The strategist: least intrusive and sufficient by brute force, honest about clipping, and about having nothing to offer."""
+
+import time
+
+import pytest
+import torch
+
+from avtorch.decision.grid import Grid
+from avtorch.decision.replay import History, replay
+from avtorch.decision.settings import Setting
+from avtorch.decision.strategist import Strategist
+from avtorch.errors import InputError
+from avtorch.vehicle import ClosedLoop, GLVDPlant, Leader, LowerLevel
+
+SMALL = Grid(gains=((1.5, 3.0, -1.8), (1.5, 4.0, -3.0), (3.0, 3.0, -1.8)), targets=(0.0, 0.5, 1.0))
+
+
+def belief(T, K, *, sd=0.05, draws=256, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    T, K = (torch.as_tensor(x, dtype=torch.float64).reshape(-1, 1) for x in (T, K))
+    z = torch.randn(2, T.shape[0], draws, generator=generator, dtype=torch.float64)
+    return T * torch.exp(sd * z[0]), K * torch.exp(0.5 * sd * z[1])
+
+
+def history(T, K, *, accel_min=-6.0, accel_max=4.0):
+    """20 s of US06 with a healthy vehicle, then two with (T, K). The leader pulls away at up to 1.7 m/s²."""
+    T, K = (torch.as_tensor(x, dtype=torch.float64).reshape(-1) for x in (T, K))
+    loop = ClosedLoop(
+        Leader.default(start=5.0),
+        plant=GLVDPlant(0.3, 1.0, 0.0),
+        lower_level=LowerLevel(accel_min=accel_min, accel_max=accel_max),
+        scenarios=len(T),
+    )
+    before = loop.advance(2600)
+    loop.plant = GLVDPlant(T, K, 0.0)
+    return History.of_blocks([before, loop.advance(200)])
+
+
+def decide(T, K, *, strategist=None, default=None, limits=(-6.0, 4.0), sd=0.05, **how):
+    n = torch.as_tensor(T).reshape(-1).shape[0]
+    default = Setting(scenarios=n) if default is None else default
+    return (strategist or Strategist()).decide(
+        *belief(T, K, sd=sd),
+        history(T, K, accel_min=limits[0], accel_max=limits[1]),
+        current=how.pop("current", default),
+        default=default,
+        accel_min=limits[0],
+        accel_max=limits[1],
+        **how,
+    )
+
+
+def test_the_choice_is_the_least_of_all_sufficient_ones():
+    """Against every setting of the grid, judged one by one without the search's shortcuts."""
+    T, K = [0.3, 1.0, 1.5, 1.5, 2.0], [0.6, 0.6, 0.5, 0.8, 1.0]
+    strategist, default = Strategist(grid=SMALL), Setting(scenarios=5)
+    draws, past = belief(T, K), history(T, K)
+    chosen = strategist.decide(*draws, past, current=default, default=default)
+    mean = (draws[0].mean(dim=1), draws[1].mean(dim=1))
+    offer = SMALL.candidates(*mean, current=default, default=default, model_wrong=torch.ones(5, dtype=torch.bool))
+    wide = tuple((2 * x.log() - x.log().mean(dim=1, keepdim=True)).exp()[:, None, ::2] for x in draws)
+    p = offer.setting.p_string_stable(draws[0][:, None], draws[1][:, None])
+    robust = offer.setting.p_string_stable(*wide)
+    seen = replay(past, offer.setting, T_L=mean[0], K_L=mean[1], time_gap_now=default.time_gap)
+    sufficient = (p >= 0.95) & (seen.clipped_share <= 0.05) & (seen.min_spacing_m > 0.0)
+    total = torch.where(sufficient, offer.cost + 4.0 * (1.0 - robust), torch.inf)
+    best = total.min(dim=1)
+    assert torch.equal(chosen.sufficient, torch.isfinite(best.values))
+    assert bool(chosen.sufficient.any())
+    for i in torch.nonzero(chosen.sufficient)[:, 0].tolist():
+        assert chosen.setting.as_dict(i) == offer.setting[i].as_dict(int(best.indices[i]))
+        assert float(chosen.p_string_stable[i]) == float(p[i, best.indices[i]])
+        assert float(chosen.predicted.clipped_share[i]) == float(seen.clipped_share[i, best.indices[i]])
+
+
+def test_a_scenario_is_decided_alike_in_any_company():
+    T, K = [0.2, 1.0, 1.5, 2.0], [1.0, 0.6, 0.5, 0.4]
+    draws, past = belief(T, K), history(T, K)
+    strategist = Strategist(grid=SMALL)
+    default = Setting(scenarios=4)
+    together = strategist.decide(*draws, past, current=default, default=default)
+    for i in range(4):
+        one = torch.tensor([i])
+        alone = strategist.decide(draws[0][one], draws[1][one], past[one], current=default[one], default=default[one])
+        assert alone.setting.as_dict(0) == together.setting.as_dict(i)
+        assert alone.why[0] == together.why[i]
+
+
+def test_with_a_strong_actuator_the_lower_level_is_enough():
+    decision = decide([1.5, 0.6], [0.5, 0.6], limits=(-60.0, 60.0))
+    assert decision.strategies == [{1}, {1}]
+    assert decision.sufficient.tolist() == [True, True]
+    assert bool((decision.p_string_stable >= 0.95).all())
+    assert decision.changes.tolist() == [True, True]
+
+
+def test_clipping_rules_out_what_would_win_on_paper():
+    strong, weak = (decide([1.5], [0.5], limits=limits) for limits in ((-60.0, 60.0), (-6.0, 4.0)))
+    assert strong.strategies == [{1}]
+    assert weak.strategies != [{1}]
+    assert float(weak.setting.amplification()) < float(strong.setting.amplification())
+    assert float(weak.predicted.clipped_share) <= 0.05
+    assert bool(weak.sufficient[0])
+
+
+@pytest.mark.slow
+def test_all_strategies_occur_and_hold_at_the_truth():
+    T, K = torch.cartesian_prod(torch.tensor([0.1, 0.6, 1.0, 1.5, 2.0]), torch.tensor([0.4, 0.6, 0.8, 1.1])).double().T
+    used = set()
+    for limits in ((-6.0, 4.0), (-10.0, 6.0)):
+        decision = decide(T, K, limits=limits, sd=0.03)
+        used |= {frozenset(s) for s in decision.strategies}
+        enough = decision.sufficient
+        assert float(enough.double().mean()) > 0.9
+        assert bool((decision.p_string_stable[enough] >= 0.95 - 1e-9).all())
+        assert bool((decision.predicted.clipped_share[enough] <= 0.05).all())
+        assert bool((decision.predicted.min_spacing_m[enough] > 0.0).all())
+        assert bool((decision.setting.time_gap >= 1.0).all())
+        # The belief is centred at the truth: what holds for 95 % of it holds there.
+        assert bool((decision.setting.peak_gain(T, K)[enough] <= 1.001).all())
+    assert frozenset({1}) in used
+    assert set().union(*used) == {1, 2, 3}
+    assert any(2 in s and 3 not in s for s in used)
+
+
+def test_gains_are_taken_where_the_driver_leaves_no_gap_to_open():
+    decision = decide([1.5], [0.6], default=Setting(time_gap=2.5), strategist=Strategist(grid=Grid(time_gaps=(2.5,))))
+    assert 2 not in decision.strategies[0]
+    decision = decide([2.0], [0.6], strategist=Strategist(grid=Grid(allowed=frozenset({3}))), limits=(-60.0, 60.0))
+    assert decision.strategies[0] <= {3}
+    decision = decide([1.5], [0.8], strategist=Strategist(grid=Grid(allowed=frozenset({3}))), limits=(-60.0, 60.0))
+    assert decision.strategies == [{3}] and bool(decision.sufficient[0])
+
+
+def test_where_nothing_is_sufficient_it_is_said():
+    only_gaps = Strategist(grid=Grid(allowed=frozenset({2}), time_gaps=(1.0, 1.6)))
+    decision = decide([2.0], [0.4], strategist=only_gaps)
+    assert decision.sufficient.tolist() == [False]
+    assert decision.why[0].startswith("no setting of the grid is sufficient")
+    # A leader beyond the car's power clips everything: the lower level may not win by amplifying what is clipped.
+    decision = decide([1.5], [0.6], limits=(-3.0, 2.0))
+    assert decision.sufficient.tolist() == [False]
+    assert float(decision.setting.amplification()) < 2.0
+    assert float(decision.p_string_stable) >= 0.95
+
+
+def test_a_sufficient_setting_in_force_stays():
+    default = Setting()
+    inverted = Setting(T_hat=1.0, K_hat=0.8, T_d=0.3)
+    decision = decide(
+        [1.0], [0.8], default=default, current=inverted, model_wrong=torch.tensor([False]), limits=(-20.0, 20.0)
+    )
+    assert decision.changes.tolist() == [False]
+    assert decision.strategies == [{1}]
+    assert "stays" in decision.why[0]
+
+
+def test_a_vehicle_that_recovers_is_given_its_default_back():
+    drastic = Setting(T_hat=1.5, K_hat=0.5, T_d=0.9, time_gap=2.5, gains=(1.5, 4.0, -3.0))
+    decision = decide([0.3], [1.0], current=drastic, default=Setting())
+    assert float(decision.setting.time_gap) == 1.0
+    assert decision.setting.gains[0].tolist() == [1.5, 1.5, -0.8]
+    assert bool(decision.changes[0])
+
+
+def test_the_driver_is_asked_and_given_time():
+    patient = Strategist(grid=Grid(allowed=frozenset({2})), driver_delay=8.0)
+    decision = decide([1.0], [0.5], strategist=patient)
+    assert decision.strategies == [{2}]
+    assert decision.driver_delay_s.tolist() == [8.0]
+    assert decision.interim.time_gap.tolist() == [1.0]
+    assert float(decision.p_interim) < 0.5 < float(decision.p_string_stable)
+    assert "driver asked" in decision.why[0]
+    assert decision.as_dict()["driver_delay_s"] == 8.0
+    at_once = decide([1.0], [0.5], strategist=Strategist(grid=Grid(allowed=frozenset({2}))))
+    assert at_once.driver_delay_s.tolist() == [0.0]
+    assert at_once.interim.as_dict() == at_once.setting.as_dict()
+
+
+def test_a_dead_time_is_counted():
+    # Nominal vehicle: fine without a delay, string unstable with one of 0.4 s (SPEC section 2).
+    rules = {"grid": Grid(allowed=frozenset({2}), time_gaps=(1.0, 1.6, 2.5)), "draws": 20}
+    assert decide([0.3], [1.0], strategist=Strategist(**rules)).strategies == [set()]
+    delayed = decide([0.3], [1.0], strategist=Strategist(**rules, dead_time=0.4))
+    assert delayed.strategies != [set()] or not bool(delayed.sufficient[0])
+
+
+def test_an_action_as_it_is_reported():
+    report = decide([1.5], [0.8]).as_dict()
+    assert set(report) >= {"strategies", "settings", "why", "p_string_stable"}
+    assert set(report["settings"]) >= {"T_hat", "K_hat", "time_gap_s", "gains"}
+    assert set(report["predicted"]) >= {"clipped_share", "throughput_vph", "jerk_rms_mps3", "mean_spacing_m"}
+    assert "\n" not in report["why"]
+
+
+def test_a_decision_takes_well_under_a_second_of_computing():
+    draws, past = belief([1.5], [0.5]), history([1.5], [0.5])
+    Strategist().decide(*draws, past, current=Setting(), default=Setting())
+    start = time.process_time()
+    Strategist().decide(*draws, past, current=Setting(), default=Setting())
+    assert time.process_time() - start < 1.0
+
+
+@pytest.mark.parametrize("bad", [{"required": 1.0}, {"most_clipped": 0.0}, {"draws": 3}, {"driver_delay": -1.0}])
+def test_bad_rules_are_refused(bad):
+    with pytest.raises(InputError, match=next(iter(bad))):
+        Strategist(**bad)
+
+
+def test_shapes_that_do_not_fit_are_refused():
+    draws, past = belief([1.5, 1.5], [0.5, 0.5]), history([1.5], [0.5])
+    with pytest.raises(InputError, match="scenario"):
+        Strategist().decide(*draws, past, current=Setting(), default=Setting())

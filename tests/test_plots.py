@@ -1,0 +1,175 @@
+"""Drawings: they take and return axes, show what they were given, and leave the reader's style alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+
+from avtorch import plots
+from avtorch.errors import InputError
+from avtorch.io import Log
+from avtorch.vehicle import stability
+
+
+def stat(mean: float, half: float) -> dict[str, float]:
+    return {"mean": mean, "sd": half / 1.645, "q05": mean - half, "q95": mean + half}
+
+
+def window(start: float, *, lag: float = 0.3, excited: bool = True, p: float = 1.0) -> dict:
+    ends = {"start_s": start, "end_s": start + 2.0, "n": 200, "excited": excited, "alerts": []}
+    return {**ends, "T_L": stat(lag, 0.05), "K_L": stat(1.0, 0.1), "p_string_stable": p}
+
+
+WINDOWS = [window(0.0), window(2.0, excited=False), window(4.0, lag=1.5, p=0.0), window(6.0, lag=1.5, p=0.9)]
+SETTING = {"T_hat": 0.3, "K_hat": 1.0, "T_d": 0.3, "K_d": 1.0, "time_gap_s": 1.0, "gains": [1.5, 1.5, -0.8]}
+ANSWER = {
+    "change": {"time_s": 4.0, "T_L": 1.5, "K_L": 0.5},
+    "windows": WINDOWS,
+    "alerts": [{"time_s": 6.0, "detector": "stability", "why": "x"}],
+    "actions": [{"time_s": 6.0, "strategies": [1, 2], "settings": SETTING}],
+}
+TIME = np.arange(0.0, 8.0, 0.01)
+TRACES = {
+    q: {"leader": np.sin(TIME), "without action": 1.2 * np.sin(TIME), "with action": np.sin(TIME - 0.3)}
+    for q in ("speed", "accel")
+}
+TRUTH = {"T_L": [(0.0, 0.3), (4.0, 1.5)], "K_L": [(0.0, 1.0), (4.0, 0.5)]}
+
+
+def axes():
+    return Figure().subplots()
+
+
+def log() -> Log:
+    time = np.concatenate([np.arange(0, 4, 0.1), np.arange(6, 8, 0.1)])
+    speed = np.where(time < 1, 0.0, 5.0 + 0.1 * np.sin(time))
+    engaged = (time < 7).astype(float)
+    return Log.from_arrays(time=time, accel_cmd=np.sin(time), speed=speed, engaged=engaged)
+
+
+def test_every_drawing_returns_the_axes_it_was_given() -> None:
+    omega = torch.logspace(-1, 1, 50, dtype=torch.float64)
+    curve = stability.gain(omega, 1.5, 0.5, 1.0, (1.5, 1.5, -0.8))
+    plane = stability.region(("T", torch.linspace(0.1, 2, 21)), ("K", torch.linspace(0.2, 1.3, 11)))
+    draw = [
+        lambda ax: plots.motion(ax, TIME, TRACES["speed"]),
+        lambda ax: plots.belief_band(ax, WINDOWS, "T_L", truth=TRUTH["T_L"], bounds=(0.1, 0.4)),
+        lambda ax: plots.string_probability(ax, WINDOWS),
+        lambda ax: plots.events(ax, change_s=1.0, alerts=ANSWER["alerts"], actions=ANSWER["actions"]),
+        lambda ax: plots.data_quality(ax, log(), WINDOWS),
+        lambda ax: plots.region(ax, plane, point=(0.3, 1.0)),
+        lambda ax: plots.setting_region(ax, SETTING, T_range=(0.1, 2.0), K_range=(0.3, 1.3), points=11),
+        lambda ax: plots.gain_curve(ax, omega, curve, peak=(0.86, 2.24)),
+        lambda ax: plots.verdict_legend(ax),
+    ]
+    for step in draw:
+        ax = axes()
+        assert step(ax) is ax
+
+
+def test_band_shows_interval_and_breaks_where_not_excited() -> None:
+    ax = plots.belief_band(axes(), WINDOWS, "T_L")
+    mean = next(line for line in ax.lines if line.get_label() == "mean")
+    x, y = np.asarray(mean.get_xdata(), float), np.asarray(mean.get_ydata(), float)
+    assert np.isnan(y[(x > 2.0) & (x < 4.0)]).all()
+    assert set(y[~np.isnan(y)]) == {0.3, 1.5}
+    low, high = ax.get_ylim()
+    assert low < 0.25
+    assert high > 1.55
+
+
+def test_band_breaks_across_a_gap() -> None:
+    ax = plots.belief_band(axes(), [window(0.0), window(10.0)], "T_L")
+    mean = next(line for line in ax.lines if line.get_label() == "mean")
+    y = np.asarray(mean.get_ydata(), float)
+    assert np.isnan(y).sum() == 1
+
+
+def test_a_broad_first_prior_does_not_squeeze_the_rest() -> None:
+    first = {**window(0.0, excited=False), "T_L": {"mean": 5.0, "sd": 9.0, "q05": 0.1, "q95": 30.0}}
+    ax = plots.belief_band(axes(), [first, *WINDOWS], "T_L")
+    assert ax.get_ylim()[1] < 3.0
+
+
+def test_map_tells_the_three_verdicts_apart() -> None:
+    local = np.array([[False, True, True]] * 2)
+    string = np.array([[False, False, True]] * 2)
+    ax = plots.verdict_map(axes(), [0.0, 1.0, 2.0], [0.0, 1.0], local, string)
+    mesh = ax.collections[0]
+    assert np.asarray(mesh.get_array()).reshape(2, 3).tolist() == [[0, 1, 2]] * 2
+    colours = {tuple(mesh.to_rgba(k)) for k in (0, 1, 2)}
+    assert len(colours) == 3
+
+
+def test_map_of_one_verdict_only() -> None:
+    everywhere = np.ones((2, 3), bool)
+    plots.verdict_map(axes(), [0.0, 1.0, 2.0], [0.0, 1.0], everywhere, everywhere, np.ones((2, 3)))
+    nowhere = np.zeros((2, 3), bool)
+    plots.verdict_map(axes(), [0.0, 1.0, 2.0], [0.0, 1.0], nowhere, nowhere, np.full((2, 3), np.inf))
+
+
+def test_setting_region_judges_the_effective_vehicle() -> None:
+    # with the lower level's model right at (1.5, 0.5) that vehicle behaves as the target and is string stable
+    right = {**SETTING, "T_hat": 1.5, "K_hat": 0.5}
+    for setting, expected in ((SETTING, 1), (right, 2)):
+        ax = plots.setting_region(axes(), setting, T_range=(1.4, 1.6), K_range=(0.45, 0.55), points=3)
+        verdicts = np.asarray(ax.collections[0].get_array()).reshape(3, 3)
+        assert verdicts[1, 1] == expected
+
+
+def test_quality_shows_what_was_masked() -> None:
+    ax = plots.data_quality(axes(), log(), WINDOWS)
+    labels = [t.get_text() for t in ax.get_yticklabels()]
+    spans = dict(zip(labels, (len(c.get_paths()) for c in ax.collections), strict=True))
+    assert spans == {"recorded": 2, "driver in charge": 1, "standstill": 1, "excited windows": 3}
+
+
+@pytest.mark.parametrize("cloud", [1, 2, 3])
+def test_figures_are_written_whole(tmp_path: Path, cloud: int) -> None:
+    draws = (torch.rand(200) * 0.1 + 0.3, torch.rand(200) * 0.1 + 0.9)
+    clouds = {f"moment {i}": draws for i in range(cloud)}
+    figure = plots.region_figure([("as built", SETTING)] * cloud, clouds, truth=(1.5, 0.5))
+    path = plots.save(figure, tmp_path / "a.png")
+    assert path.read_bytes()[:4] == b"\x89PNG"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_other_figures() -> None:
+    figures = [
+        plots.motion_figure(ANSWER, TIME, TRACES),
+        plots.belief_figure(WINDOWS, answer=ANSWER, truth=TRUTH, bounds={"T_L": (0.1, 0.4), "K_L": (0.7, 1.0)}),
+        plots.belief_figure(WINDOWS, log=log()),
+        plots.probability_figure(WINDOWS, answer=ANSWER),
+        plots.overview_figure(ANSWER, TIME, TRACES, truth=TRUTH),
+    ]
+    for figure in figures:
+        figure.canvas.draw()
+        for legend in figure.legends:
+            box = legend.get_window_extent()
+            assert box.x0 >= -1, "the legend runs out of the picture"
+            assert box.x1 <= figure.bbox.x1 + 1, "the legend runs out of the picture"
+
+
+def test_an_alarm_that_goes_on_is_marked_once() -> None:
+    windows = [{**w, "alerts": ["stability"] if w["start_s"] >= 2.0 else []} for w in WINDOWS]
+    alerts = [{"time_s": w["end_s"], "detector": "stability", "why": "x"} for w in windows if w["alerts"]]
+    figure = plots.probability_figure(windows, answer={"windows": windows, "alerts": alerts})
+    marked = [line for line in figure.axes[0].lines if line.get_label() == "alert"]
+    assert [float(np.asarray(line.get_xdata())[0]) for line in marked] == [4.0]
+    assert sum(list(np.asarray(line.get_xdata())) == [6.0, 6.0] for line in figure.axes[0].lines) == 0
+
+
+def test_style_of_the_reader_is_left_alone() -> None:
+    before = dict(mpl.rcParams)
+    plots.probability_figure(WINDOWS)
+    assert dict(mpl.rcParams) == before
+
+
+def test_save_refuses_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is a directory"):
+        plots.save(Figure(), tmp_path)
