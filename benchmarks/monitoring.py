@@ -73,7 +73,8 @@ def score(
     due = [change_at + window * (1 + int(k)) for k in informed]
     seen, moved = torch.stack(excited), torch.stack(moving)
     coverage = torch.cat(inside).double().mean(0)
-    median = {after: torch.cat(e).median(0).values for after, e in errors.items() if e}
+    pooled = {after: torch.cat(e) for after, e in errors.items() if e}
+    median = {after: e.median(0).values for after, e in pooled.items() if len(e)}
     actions = [a for scenario in run.actions for a in scenario]
     last = [scenario[-1] for scenario in run.actions if scenario]
     return {

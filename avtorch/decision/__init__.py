@@ -1,0 +1,36 @@
+"""What is done: the monitor's detectors, Algorithm 2, the strategist, and the supervisor that closes the loop online."""
+
+from avtorch.decision.algorithm2 import Algorithm2, algorithm2
+from avtorch.decision.estimation import Estimates, estimate
+from avtorch.decision.grid import Grid, Intrusiveness
+from avtorch.decision.monitor import DEFAULT_DETECTORS, DETECTORS, Monitor, MonitorReport
+from avtorch.decision.replay import History, replay
+from avtorch.decision.settings import DesignBounds, Setting
+from avtorch.decision.strategist import Decision, Strategist
+from avtorch.decision.supervisor import Action, Alert, SupervisedRun, Supervisor
+from avtorch.decision.watch import Watch, WatchedWindow
+
+__all__ = [
+    "DEFAULT_DETECTORS",
+    "DETECTORS",
+    "Action",
+    "Alert",
+    "Algorithm2",
+    "Decision",
+    "DesignBounds",
+    "Estimates",
+    "Grid",
+    "History",
+    "Intrusiveness",
+    "Monitor",
+    "MonitorReport",
+    "Setting",
+    "Strategist",
+    "SupervisedRun",
+    "Supervisor",
+    "Watch",
+    "WatchedWindow",
+    "algorithm2",
+    "estimate",
+    "replay",
+]

@@ -5,20 +5,23 @@ Grid, relative to the driver's default and to the setting in force:
 - lower level: keep what is in force, or update the model to the estimate with a target lag between the default's and
   the estimate's, in equal steps of its logarithm. A slower target asks less of the actuator: it lowers the command
   effort T_hat K_d / (K_hat T_d).
-- time gap: the driver's settings, none shorter than the default.
-- gains: the default's, and a stated list of triples, calibrated beforehand.
+- time gap: the one in force, the default, and the driver's settings that are longer than the default.
+- gains: those in force, the default's, and a stated list of triples, calibrated beforehand.
 
 Intrusiveness is a number without unit; one is what updating the lower level costs. What nobody in the car notices
-costs least, what the driver sees on the dashboard or the engineer has to re-approve costs more, and both together
-cost the sum:
+costs least; what the driver sees on the dashboard or the engineer has to re-approve costs more; both together cost
+more than the sum:
 
     lower level differs from the default    1    + 0.5 for each doubling of the command effort above 1
-    lower level kept though known wrong     2    (the paper: update at a minimum)
+    lower level kept though known wrong     3    (the paper: update at a minimum)
     time gap longer than the default        1.5  + 3 (gap / default - 1)
     gains differ from the default           2    + sum over gains of |log2(ratio)|, for k_a of 1 - k_a
+    both time gap and gains differ          2    more
+    anything differs from what is in force  1    (do not intervene for a trifle)
 
-so that 1 -> 1.6 s costs 3.3, 1 -> 2.5 s costs 6, doubling k_v costs 3. The lower level alone comes first (about 1 to
-2.7), then one step of the gap or a mild change of gains, then the longest gap or a strong change of gains, then both.
+so that 1 -> 1.6 s costs 3.3, 1 -> 2.5 s costs 6, doubling k_v costs 3. The lower level alone comes first (about 2 to
+3.7), then with it one step of the gap or a mild change of gains, then the longest gap or a strong change of gains, then
+gap and gains. All weights are parameters.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import product
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -48,11 +52,13 @@ class Intrusiveness:
 
     update: float = 1.0
     effort: float = 0.5
-    stale: float = 2.0
+    stale: float = 3.0
     gap: float = 1.5
     gap_length: float = 3.0
     gains: float = 2.0
     gains_change: float = 1.0
+    both: float = 2.0
+    switch: float = 1.0
     margin: float = 4.0
 
     def __call__(self, setting: Setting, default: Setting, stale: Tensor) -> Tensor:
@@ -73,12 +79,16 @@ class Intrusiveness:
             + self.gap_length * longer
             + self.gains * (octaves > 1e-9)
             + self.gains_change * octaves
+            + self.both * ((longer > 1e-9) & (octaves > 1e-9))
         )
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """`setting` (scenario, candidate); `cost` (scenario, candidate), infinite where a candidate is not on offer."""
+    """`setting` (scenario, candidate); `cost` (scenario, candidate), infinite where a candidate is not on offer.
+
+    The first candidate is the setting in force.
+    """
 
     setting: Setting
     cost: Tensor
@@ -131,19 +141,20 @@ class Grid:
         # An estimate at or below the default's target leaves one update, not several that are the same.
         fresh = torch.cat([torch.ones(scenarios, 1, dtype=torch.bool), (targets == 0.0) | (reach > 1e-9)], dim=1)
 
-        gaps = torch.cat(
-            [column.time_gap, torch.tensor(list(self.time_gaps), dtype=torch.float64).expand(scenarios, -1)], dim=1
-        )
-        offered = gaps > column.time_gap + 1e-9
-        offered[:, 0] = True
+        gaps = torch.cat([current.time_gap[:, None], column.time_gap, _listed(self.time_gaps, scenarios)], dim=1)
+        offered = torch.ones_like(gaps, dtype=torch.bool)
+        offered[:, 1:] = (gaps[:, 1:] - gaps[:, :1]).abs() > 1e-9
+        offered[:, 2:] &= gaps[:, 2:] > column.time_gap + 1e-9
         if 2 not in self.allowed:
-            offered[:, 1:] = False
+            offered[:, 2:] = False
 
-        triples = list(self.gains) if 3 in self.allowed and self.gains_of_gap is None else []
-        listed = torch.tensor([list(k) for k in triples], dtype=torch.float64).reshape(-1, 3)
-        gains = torch.cat([default.gains[:, None], listed.expand(scenarios, -1, 3)], dim=1)
-        other = (gains - default.gains[:, None]).abs().amax(dim=-1) > 1e-9
-        other[:, 0] = True
+        triples = self.gains if 3 in self.allowed else ()
+        gains = torch.cat([current.gains[:, None], default.gains[:, None], _listed(triples, scenarios, 3)], dim=1)
+        other = torch.ones(gains.shape[:2], dtype=torch.bool)
+        for i in range(2):
+            other[:, i + 1 :] &= (gains[:, i + 1 :] - gains[:, i, None]).abs().amax(dim=-1) > 1e-9
+        if self.gains_of_gap is not None:
+            other[:, 1:] = False
 
         lower, gap, gain = (
             i.reshape(-1)
@@ -151,11 +162,20 @@ class Grid:
         )
         k = gains[:, gain]
         if self.gains_of_gap is not None:
-            k = torch.tensor([[list(self.gains_of_gap(g)) for g in row] for row in gaps.tolist()], dtype=torch.float64)[
-                :, gap
-            ]
+            follow = [[list(self.gains_of_gap(g)) for g in row] for row in gaps.tolist()]
+            k = torch.tensor(follow, dtype=torch.float64)[:, gap]
         setting = Setting(T_hat[:, lower], K_hat[:, lower], T_d[:, lower], K_d[:, lower], gaps[:, gap], k)
         priced_default = column if self.gains_of_gap is None else column.replace(gains=k)
         cost = self.intrusiveness(setting, priced_default, model_wrong[:, None] & (lower == 0))
+        cost = cost + self.intrusiveness.switch * setting.differs(current[:, None])
         on_offer = fresh[:, lower] & offered[:, gap] & other[:, gain]
         return Candidates(setting, torch.where(on_offer, cost, torch.inf))
+
+
+def _listed(values: Sequence[Any], scenarios: int, *shape: int) -> Tensor:
+    """A list of numbers, or of triples with `shape` 3, the same for every scenario."""
+    return (
+        torch.tensor([list(v) if shape else v for v in values], dtype=torch.float64)
+        .reshape(-1, *shape)
+        .expand(scenarios, -1, *shape)
+    )

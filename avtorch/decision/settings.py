@@ -151,11 +151,16 @@ class Setting:
 
     def strategies(self, default: Setting) -> list[set[int]]:
         """Which strategies lead from `default` here, one set out of {1, 2, 3} per scenario (of a flat batch)."""
-        lower = self.lower_differs(default)
-        gap = _differs(self.time_gap, default.time_gap)
-        gains = _differs(self.gains, default.gains).any(dim=-1)
-        flags = torch.stack(torch.broadcast_tensors(lower, gap, gains), dim=-1).expand(*self.shape, 3)
+        flags = torch.stack(self._differences(default), dim=-1).expand(*self.shape, 3)
         return [{i + 1 for i, on in enumerate(row) if on} for row in flags.tolist()]
+
+    def differs(self, other: Setting) -> Tensor:
+        """Whether anything differs, in the broadcast shape."""
+        return torch.stack(self._differences(other)).any(dim=0)
+
+    def _differences(self, other: Setting) -> list[Tensor]:
+        lower, gap = self.lower_differs(other), _differs(self.time_gap, other.time_gap)
+        return list(torch.broadcast_tensors(lower, gap, _differs(self.gains, other.gains).any(dim=-1)))
 
     def as_dict(self, scenario: int = 0) -> dict[str, Any]:
         """One scenario's setting as in `run.json`: T_hat, K_hat, time_gap_s, gains, and the lower level's target."""

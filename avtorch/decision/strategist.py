@@ -20,6 +20,7 @@ every setting); among equals intrusiveness is weighed against clipping. `suffici
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -62,7 +63,7 @@ class Decision:
     p_interim: Tensor
     driver_delay_s: Tensor
 
-    def as_dict(self, scenario: int = 0) -> dict[str, object]:
+    def as_dict(self, scenario: int = 0) -> dict[str, Any]:
         """One scenario as an action of `run.json` (without its time), costs beside it."""
         asked = float(self.driver_delay_s[scenario])
         return {
@@ -153,7 +154,9 @@ class Strategist:
         asked = longer & (self.driver_delay > 0.0)
         interim = chosen.replace(time_gap=torch.where(asked, current.time_gap, chosen.time_gap))
         predicted = search.prediction(pick)
-        strategies = chosen.strategies(default)
+        # Gains that follow from the gap are no strategy of their own.
+        follow = self.grid.gains_of_gap is not None
+        strategies = chosen.strategies(default.replace(gains=chosen.gains) if follow else default)
         return Decision(
             setting=chosen,
             sufficient=sufficient,
@@ -162,7 +165,7 @@ class Strategist:
             intrusiveness=search.candidates.cost[rows, pick],
             predicted=predicted,
             strategies=strategies,
-            changes=torch.tensor([bool(s) for s in chosen.strategies(current)]),
+            changes=chosen.differs(current),
             why=_sentences(chosen, current, default, strategies, sufficient, p, predicted, asked, self),
             interim=interim,
             p_interim=interim.p_string_stable(T_L, K_L, dead_time=self.dead_time),

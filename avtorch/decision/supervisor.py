@@ -209,8 +209,9 @@ class Supervisor:
                     gain,
                 )
             )
-        # what was acted on is the new normal; where nothing better was found, the alarm goes on
-        self.watch.monitor.accept(where)
+        # what was acted on, or found good as it is, is the new normal; where nothing is sufficient the alarm goes on
+        settled = torch.zeros_like(where).index_put((asked,), decision.sufficient)
+        self.watch.monitor.accept(where | settled)
         self._model_wrong &= ~where
         self._acted |= where
 

@@ -112,7 +112,10 @@ class JerkDensity:
         """Gradient of :meth:`log_prob` in ``z``, in closed form."""
         scaled = self._scaled_coefficients(z)
         # of the half chi2 by the logarithms of the three scaled coefficients
-        c = 2 * torch.einsum("wij,...wj->...wi", self._half_form, scaled) * scaled
+        if scaled.ndim == 3:  # one product, where einsum spends more on its bookkeeping
+            c = 2 * torch.bmm(scaled.transpose(0, 1), self._half_form).transpose(0, 1) * scaled
+        else:
+            c = 2 * torch.einsum("wij,...wj->...wi", self._half_form, scaled) * scaled
         lag, gain = c[..., 1] + c[..., 2], -c[..., 2]
         return torch.stack([lag, gain, c[..., 0] + lag - self.statistics.n], -1) + self.prior.score(z)
 

@@ -37,23 +37,25 @@ def latent_log_likelihood(
     """Log likelihood ``(...)`` [nats] of measured acceleration and/or speed, by Kalman innovations.
 
     Parameters of shape ``(...)`` or broadcasting to it: ``T_L`` [s], ``K_L`` [-], ``process_noise`` [m/s²/√s],
-    ``coloured_sd`` [m/s²], ``coloured_time`` [s], ``accel_noise`` [m/s²] and ``speed_noise`` [m/s] per row, ``road_noise`` [m/s/√s]. Data of shape
-    ``(..., time)``: ``time`` [s] increasing, ``u`` [m/s²] held from its row to the next, ``accel`` [m/s²] = a + d + noise,
-    ``speed`` [m/s]. ``mask`` ``(..., time)``: False where a row's measurements are not used; its command still acts.
-    Typically parameters are ``(chain, window)`` and data ``(window, time)``.
+    ``coloured_sd`` [m/s²], ``coloured_time`` [s], ``accel_noise`` [m/s²] and ``speed_noise`` [m/s] per row,
+    ``road_noise`` [m/s/√s]. Data of shape ``(..., time)``: ``time`` [s] increasing, ``u`` [m/s²] held from its row to the
+    next, ``accel`` [m/s²] = a + d + noise, ``speed`` [m/s]. ``mask`` ``(..., time)``: False where a row's measurements
+    are not used; its command still acts. Typically parameters are ``(chain, window)`` and data ``(window, time)``.
 
-    Exact for uneven rows (each interval is integrated exactly) and twice differentiable in everything but time and mask.
-    The start is that of `initial_covariance`, with the first unmasked speed as the centre of the first.
+    Exact for uneven rows (each interval is integrated exactly) and twice differentiable in parameters, ``u``, ``accel``
+    and ``speed``. The start is that of `initial_covariance`; the first speed's prior is centred on the first unmasked
+    measured one, and the centre moves with the data: a constant added to all speeds changes nothing.
 
-    Source: SPEC section 3 (latent form), DIAGNOSIS.md. Raises InputError where neither signal, or a signal without its noise,
-    is given.
+    Source: SPEC section 3 (latent form), DIAGNOSIS.md. Raises InputError where neither signal, or a signal without its
+    noise, is given.
     """
     if accel is None and speed is None:
         raise InputError("accel, speed: neither was given; the latent form needs at least one measured signal")
     for name, signal, noise in (("accel", accel, accel_noise), ("speed", speed, speed_noise)):
         if signal is not None and noise is None:
             raise InputError(f"{name}_noise: missing; it is needed where {name} is measured")
-    parameters = torch.broadcast_tensors(*(_tensor(p, u) for p in (T_L, K_L, process_noise, road_noise, coloured_sd, coloured_time)))
+    given = (T_L, K_L, process_noise, road_noise, coloured_sd, coloured_time)
+    parameters = torch.broadcast_tensors(*(_tensor(p, u) for p in given))
     rows = u.shape[-1]
     used = torch.ones_like(u, dtype=torch.bool) if mask is None else mask
     covariance = initial_covariance(parameters[4])
@@ -64,13 +66,12 @@ def latent_log_likelihood(
     if speed is not None and speed_noise is not None:
         first = used.to(torch.uint8).argmax(-1, keepdim=True)
         start = speed.gather(-1, first.expand(*speed.shape[:-1], 1)) if speed.shape[:-1] else speed[first]
-        # The filter runs on the deviation from the first measured speed, whose prior mean is thereby zero. The centre is
-        # not differentiated: it is part of the prior's statement.
-        channels.append((speed - start.detach(), _tensor(speed_noise, u) ** 2, u.new_tensor([1.0, 0.0, 0.0])))
+        # The filter runs on the deviation from the first measured speed, whose prior mean is thereby zero.
+        channels.append((speed - start, _tensor(speed_noise, u) ** 2, u.new_tensor([1.0, 0.0, 0.0])))
     if accel is not None and accel_noise is not None:
         channels.append((accel, _tensor(accel_noise, u) ** 2, u.new_tensor([0.0, 1.0, 1.0])))
 
-    steps = discretise(*(p[..., None] for p in parameters), (time[..., 1:] - time[..., :-1]).to(u.dtype))
+    steps = discretise(*(p[..., None] for p in parameters), dt=(time[..., 1:] - time[..., :-1]).to(u.dtype))
     total = torch.zeros_like(parameters[0])
     for k in range(rows):
         on = used[..., k]

@@ -6,10 +6,11 @@ State ``(v, a, d)``: speed, actuator acceleration, external acceleration that th
     \dot v = a + d + g\, w_3, \qquad \dot a = -a/T_L + (K_L/T_L)\, u + q\, w_1, \qquad
     \dot d = -d/\tau_d + s \sqrt{2/\tau_d}\, w_2
 
-with ``w`` unit white noise; ``d`` is Ornstein-Uhlenbeck with stationary standard deviation ``s`` and carries the coloured
-residual. ``g`` is road noise: vibration of the body that the wheels see and that is faster than the rows. Without it the
-mode ``T_L → 0`` with a huge ``q`` imitates it (hundreds of nats on a real lap) and drags the lag to nothing. Measured are ``v`` and/or ``a + d``, each with independent noise per row. The command is held between rows.
-``a`` and ``d`` drive ``v`` independently, so every entry has a closed form and no matrix exponential is needed.
+with ``w`` unit white noise. ``d`` is Ornstein-Uhlenbeck with stationary SD ``s`` and carries the coloured
+residual. ``g`` is road noise: vibration of the body that the wheels see, faster than the rows. Without it the mode
+``T_L → 0`` with a huge ``q`` imitates it, on a recorded lap by hundreds of nats, and drags the lag to nothing.
+Measured are ``v`` and/or ``a + d``, each with independent noise per row. The command is held between rows. ``a`` and ``d``
+drive ``v`` independently, so every entry has a closed form and no matrix exponential is needed.
 """
 
 from __future__ import annotations
@@ -90,15 +91,16 @@ def discretise(
     one, zero = torch.ones_like(dt), torch.zeros_like(dt)
     transition = torch.stack((one, reach_a, reach_d, zero, ea, zero, zero, zero, ed), -1).unflatten(-1, (3, 3))
     gain = torch.stack((K_L * (dt - reach_a), -K_L * torch.expm1(-dt / T_L), zero), -1)
-    noise = torch.stack((vv_a + vv_d + road_noise**2 * dt, va, vd, va, aa, zero, vd, zero, dd), -1).unflatten(-1, (3, 3))
+    vv = vv_a + vv_d + road_noise**2 * dt
+    noise = torch.stack((vv, va, vd, va, aa, zero, vd, zero, dd), -1).unflatten(-1, (3, 3))
     return Step(transition, gain, noise)
 
 
 def initial_covariance(coloured_sd: Tensor) -> Tensor:
     """Covariance ``(..., 3, 3)`` of ``(v, a, d)`` at the first row, before its measurement.
 
-    The mean is (first measured speed, 0, 0). ``v`` is nearly diffuse, so that its centre carries no information; ``a`` is
-    broad, because a window may start anywhere in a drive and the command before it is unknown; ``d`` is stationary.
+    The mean is (first measured speed, 0, 0). ``v`` is nearly diffuse, so that its centre carries no information; ``a``
+    is broad, because a window may start anywhere in a drive, after unknown commands; ``d`` is stationary.
     """
     one = torch.ones_like(coloured_sd)
     return torch.diag_embed(torch.stack((one * SPEED_SD0**2, one * ACCEL_SD0**2, coloured_sd**2), -1))

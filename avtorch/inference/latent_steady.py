@@ -2,10 +2,10 @@ r"""The latent log likelihood on even rows, without a loop over time: exact, and
 
 On even rows the Kalman filter is time-invariant but for its start. Two facts turn that into matrix products:
 
-- Started from the *stationary* covariance ``P`` the gain is constant from the first row, and the innovations are a linear
-  filter of the data: inside blocks of rows by their impulse response, across blocks by a scan of doubling length.
-- A start ``N(0, P0)`` is the stationary start with a random mean, ``m ~ N(0, D)``, ``D = P0 - P``. Innovations are linear in
-  that mean, ``e - E m``, so it integrates out in closed form: with ``J = EᵀE``, ``j = Eᵀe``
+- Started from the *stationary* covariance ``P`` the gain is constant from the first row, and the innovations are a
+  linear filter of the data: inside blocks of rows by their impulse response, across blocks by a scan.
+- A start ``N(0, P0)`` is the stationary start with a random mean, ``m ~ N(0, D)``, ``D = P0 - P``. Innovations are linear
+  in that mean, ``e - E m``, so it integrates out in closed form: with ``J = EᵀE``, ``j = Eᵀe``
 
   .. math:: \log p = \log p_P + \tfrac12 j^T (I + D J)^{-1} D j - \tfrac12 \log\det(I + D J)
 
@@ -29,8 +29,8 @@ BLOCK = 32
 class EvenRows:
     """Even runs of rows, laid out once for `steady_log_likelihood`.
 
-    ``lagged`` ``(run, block·BLOCK, BLOCK·channel)``: what each row sees of its own block, newest first; channels are the
-    measured ones, then the command. ``used`` ``(run, block·BLOCK)``; ``count`` rows in use; ``dt`` [s] ``(run,)``.
+    ``lagged`` ``(run, block·BLOCK, BLOCK·channel)``: what each row sees of its own block, newest first; channels are
+    the measured ones, then the command. ``used`` ``(run, block·BLOCK)``; ``count`` rows in use; ``dt`` [s] ``(run,)``.
     """
 
     lagged: Tensor
@@ -77,8 +77,8 @@ def _riccati_limit(phi: Tensor, H: Tensor, Q: Tensor, R: Tensor) -> Tensor:
 def stationary_covariance(phi: Tensor, H: Tensor, Q: Tensor, R: Tensor) -> Tensor:
     """Predicted covariance ``P = φ(P - P Hᵀ S⁻¹ H P)φᵀ + Q``, ``(..., n, n)``, twice differentiable.
 
-    The limit is found without a graph; two Newton steps with one follow. One step has the right first derivative, two the
-    right second and third (each step squares the distance to the solution).
+    The limit is found without a graph; two Newton steps with one follow. One step has the right first derivative, two
+    the right second and third (each step squares the distance to the solution).
     """
     with torch.no_grad():
         P = _riccati_limit(phi, H, Q, R)
@@ -127,7 +127,7 @@ def steady_log_likelihood(
     speed_noise: Tensor | None = None,
     road_noise: Tensor | None = None,
 ) -> Tensor:
-    """Log likelihood ``(..., run)``; parameters ``(..., run)``, float64. Equals `latent_log_likelihood` on even rows."""
+    """Log likelihood ``(..., run)``; parameters ``(..., run)``, float64: `latent_log_likelihood` on even rows."""
     lead = T_L.shape[:-1]
     runs = T_L.shape[-1]
     road = torch.zeros_like(T_L) if road_noise is None else road_noise
@@ -165,7 +165,7 @@ def steady_log_likelihood(
     response = torch.cat((now, -(white @ H)[..., None, :, :] @ pushed[..., :-1, :, :]), -3)
 
     def through(kernel: Tensor, rows: Tensor) -> Tensor:
-        """Apply ``kernel (chain, run, BLOCK, out, m + 1)`` to ``rows (run, row, BLOCK·(m + 1))``: all chains in one product."""
+        """``kernel (chain, run, BLOCK, out, m + 1)`` on ``rows (run, row, BLOCK·(m + 1))``, all chains in one product."""
         out = kernel.shape[-2]
         flat = kernel.permute(1, 2, 4, 0, 3).reshape(runs, -1, kernel.shape[0] * out)
         return (rows @ flat).unflatten(-1, (kernel.shape[0], out)).permute(2, 0, 1, 3)

@@ -68,8 +68,8 @@ def sample(
 ) -> Posterior:
     """Draws from the posterior of every window (Algorithm 1).
 
-    A window whose chains leave the finite numbers or end with a nested R-hat above ``rhat_max`` is sampled again, with
-    half the step and twice the steps; one that never settles comes back with ``converged`` false.
+    A window whose chains leave the finite numbers or the posterior, or end with a nested R-hat above ``rhat_max``, is
+    sampled again, with half the step and twice the steps; one that never settles comes back with ``converged`` false.
 
     Args:
         density: the target, over ``z = log(parameter)``.
@@ -77,9 +77,13 @@ def sample(
     """
     settings = SamplerSettings() if settings is None else settings
     mode = find_mode(density) if mode is None else mode
+
+    def unsettled(draws: Tensor) -> Tensor:
+        rhat = nested_rhat(draws).amax(-1)
+        return ~(rhat <= rhat_max) | _strayed(density, mode, draws)  # NaN is trouble, too
+
     draws = walk(density, mode, settings, generator=generator)
-    rhat = nested_rhat(draws).amax(-1)
-    trouble = ~(rhat <= rhat_max)  # NaN is trouble, too
+    trouble = unsettled(draws)
     slower = settings
     for _ in range(settings.attempts - 1):
         if not bool(trouble.any()):
@@ -87,8 +91,21 @@ def sample(
         slower = replace(slower, step=slower.step / 2, burn_in=2 * slower.burn_in, thinning=2 * slower.thinning)
         again = walk(density, mode, slower, generator=generator)
         draws = torch.where(trouble[:, None], again, draws)
-        trouble = trouble & ~(nested_rhat(again).amax(-1) <= rhat_max)
+        trouble = trouble & unsettled(again)
     return Posterior(density.names, draws.exp(), mode.converged & ~trouble)
+
+
+def _strayed(density: Density, mode: Mode, draws: Tensor, depth: float = 200.0) -> Tensor:
+    """Where some chain's furthest draw lies ``depth`` nats off the mode, ``(window,)`` bool.
+
+    R-hat alone overlooks the few chains that diverge: they blow up the variance within as much as that between.
+    A draw of the posterior lies ``chi^2/2`` nats deep, so 200 is out of reach even for a tenfold variance.
+    """
+    whitened = torch.einsum("wij,cnwj->cnwi", torch.linalg.inv(mode.scale), draws - mode.z)
+    furthest = whitened.square().sum(-1).nan_to_num(nan=torch.inf).argmax(1)
+    with torch.no_grad():
+        far = draws.take_along_dim(furthest[:, None, :, None], dim=1).squeeze(1)
+        return ~((mode.log_prob - density.log_prob(far)).abs() <= depth).all(0)
 
 
 def stiffness(density: Density, mode: Mode, radius: float = 3.0) -> Tensor:
@@ -136,8 +153,9 @@ def walk(
 
     def scored_potential() -> None:
         # a density that knows its own gradient saves the graph: half the time of a small window's step
-        z = mode.z + torch.einsum("wij,cwj->cwi", scale, w.detach())
-        w.grad = -torch.einsum("wij,cwi->cwj", scale, cast(ScoredDensity, density).score(z))
+        z = mode.z + torch.bmm(w.detach().transpose(0, 1), scale.mT).transpose(0, 1)
+        score = cast(ScoredDensity, density).score(z)
+        w.grad = -torch.bmm(score.transpose(0, 1), scale).transpose(0, 1)
 
     closure = scored_potential if settings.batch is None and isinstance(density, ScoredDensity) else potential
 

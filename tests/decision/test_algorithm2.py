@@ -64,6 +64,6 @@ def test_bad_choices_are_refused():
     with pytest.raises(InputError, match="new_gains"):
         algorithm2(T, K, Setting(scenarios=4), choose="gains", new_gains=(3.0, 1.0, -1.8))
     with pytest.raises(InputError, match="choose"):
-        algorithm2(T, K, Setting(scenarios=4), choose="both")
+        algorithm2(T, K, Setting(scenarios=4), choose="both")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="check"):
-        algorithm2(T, K, Setting(scenarios=4), check="guess")
+        algorithm2(T, K, Setting(scenarios=4), check="guess")  # type: ignore[arg-type]

@@ -73,7 +73,8 @@ def test_each_detector_is_opt_in_and_named():
     report = monitor.update(*cloud([1.5], [0.5], seed=9), yes(), Setting())
     assert report.names() == list(DETECTORS)
     for name in DETECTORS:
-        assert len(report.why(name)) > 10 and "\n" not in report.why(name)
+        assert len(report.why(name)) > 10
+        assert "\n" not in report.why(name)
 
 
 def test_unexcited_windows_neither_alarm_nor_move_anything():

@@ -1,4 +1,4 @@
-"""The setting: verdicts go through the lower level's effective actuation; strategies are told apart; bad values refused."""
+"""The setting: verdicts through the effective actuation, strategies told apart, bad values refused."""
 
 import pytest
 import torch
@@ -80,7 +80,10 @@ def test_design_bounds_hold_their_coverage(rotating_seed):
     T, K = 1.5 * torch.exp(0.1 * z[0]), 0.5 * torch.exp(0.05 * (z[0] * 0.9 + 0.4 * z[1]))
     box = DesignBounds.of_belief(T, K, coverage=0.9)
     inside = (
-        (T >= box.T_L[0][:, None]) & (T <= box.T_L[1][:, None]) & (K >= box.K_L[0][:, None]) & (K <= box.K_L[1][:, None])
+        (box.T_L[0][:, None] <= T)
+        & (box.T_L[1][:, None] >= T)
+        & (box.K_L[0][:, None] <= K)
+        & (box.K_L[1][:, None] >= K)
     )
     # Four tails of a quarter of a tenth each, counted on the draws themselves: only ties of a draw remain.
     assert bool((inside.double().mean(dim=1) >= 0.9 - 4 / 4000).all())

@@ -1,4 +1,4 @@
-"""The strategist: least intrusive and sufficient by brute force, honest about clipping, and about having nothing to offer."""
+"""The strategist: least intrusive and sufficient by brute force, honest about clipping and about having no answer."""
 
 import time
 
@@ -129,7 +129,8 @@ def test_gains_are_taken_where_the_driver_leaves_no_gap_to_open():
     decision = decide([2.0], [0.6], strategist=Strategist(grid=Grid(allowed=frozenset({3}))), limits=(-60.0, 60.0))
     assert decision.strategies[0] <= {3}
     decision = decide([1.5], [0.8], strategist=Strategist(grid=Grid(allowed=frozenset({3}))), limits=(-60.0, 60.0))
-    assert decision.strategies == [{3}] and bool(decision.sufficient[0])
+    assert decision.strategies == [{3}]
+    assert bool(decision.sufficient[0])
 
 
 def test_where_nothing_is_sufficient_it_is_said():

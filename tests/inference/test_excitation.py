@@ -1,4 +1,4 @@
-"""The rule of excitation: a function of a, u and the noise level, with the predicted SDs that least squares really has."""
+"""The rule of excitation: a function of a, u and the noise level, with the SDs that least squares really has."""
 
 from __future__ import annotations
 

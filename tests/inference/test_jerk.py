@@ -1,4 +1,4 @@
-"""The jerk density: values against exact rational arithmetic, gradients of both orders, sums against points, minibatches."""
+"""The jerk density: values against exact rational arithmetic, gradients of both orders, sums, points, minibatches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The mode against SciPy's optimizer, the Laplace covariance against the inverse Hessian, hard starts, no mode at all."""
+"""The mode against SciPy's optimizer, Laplace covariance against the inverse Hessian, hard starts, no mode at all."""
 
 from __future__ import annotations
 
@@ -46,11 +46,10 @@ def test_mode_is_scipys(kind, make_windows, rotating_seed):
     for w in range(density.windows):
         potential = one_window(density, w)
         # from the truth's side of the prior, with no knowledge of our start
-        best = min(
-            (minimize(potential, x0, jac=True, method="L-BFGS-B", options={"maxiter": 3000, "ftol": 1e-15, "gtol": 1e-9})
-             for x0 in (np.log([0.3, 1.0, 0.1]), np.log([1.0, 0.7, 0.5]))),
-            key=lambda r: r.fun,
-        )  # fmt: skip
+        options = {"maxiter": 3000, "ftol": 1e-15, "gtol": 1e-9}
+        starts = (np.log([0.3, 1.0, 0.1]), np.log([1.0, 0.7, 0.5]))
+        ends = [minimize(potential, x0, jac=True, method="L-BFGS-B", options=options) for x0 in starts]
+        best = min(ends, key=lambda r: r.fun)
         # neither ends more than 1e-6 above the mode: sqrt(2e-6) of an SD, twice
         assert -mode.log_prob[w].item() <= best.fun + 1e-6
         assert (mode.z[w] - torch.from_numpy(best.x)).abs().div(sd[w]).max() < 5e-3

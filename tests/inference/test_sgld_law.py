@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -43,7 +44,7 @@ def test_a_chain_at_its_stationary_law_keeps_it(h, temperature, noise, rotating_
     """Mean, covariance and lag-1 covariance of a correlated Gaussian, after 1, 2 and 10 steps.
 
     With precision P and A = I - hP/2 the law of a discrete step is S = P^-1 (I - hP/4)^-1 and cov(x', x) = A S. Averaged
-    noise keeps P^-1 itself: y = x - sqrt(h) xi/2 is the autoregression with cov P^-1 (I - hP/4), and cov(x', x) is the same.
+    noise keeps P^-1 itself: y = x - sqrt(h) xi/2 is autoregressive, of cov P^-1 (I - hP/4) like cov(x', x).
     """
     g, chains, eye = generator(rotating_seed), 50_000, torch.eye(2, dtype=F64)
     precision = torch.tensor([[2.0, -0.9], [-0.9, 1.0]], dtype=F64)
@@ -109,7 +110,7 @@ def test_stationary_variance_with_gradient_noise(rotating_seed):
 
 
 def test_minibatches_on_the_scale_of_the_whole_window(rotating_seed):
-    """A Gaussian mean with N points and batches of n: the closed form with s^2 = N^2/n Var(data) / sigma^4 and Var(data) = sigma^2.
+    """A Gaussian mean, N points, batches of n: the closed form with s^2 = N^2/n Var(data)/sigma^4, Var(data) = sigma^2.
 
     N/n is in the closure, the sum over the window is what U means; dividing by N would give a variance N times this.
     """
@@ -137,7 +138,7 @@ def test_minibatches_on_the_scale_of_the_whole_window(rotating_seed):
 def stationary_moment(
     drift: Callable[[np.ndarray], np.ndarray], scale: Callable[[np.ndarray], np.ndarray], h: float
 ) -> float:
-    """E[x^2] under the exact stationary law of ``x' = x + h drift(x)/2 + sqrt(h scale(x)) xi``, by its kernel on a grid."""
+    """E[x^2] under the exact law of ``x' = x + h drift(x)/2 + sqrt(h scale(x)) xi``, from its kernel on a grid."""
     x = np.linspace(-8, 8, 601)
     sd = np.sqrt(h * scale(x))
     kernel = np.exp(-0.5 * ((x[None, :] - (x + 0.5 * h * drift(x))[:, None]) / sd[:, None]) ** 2)
@@ -176,7 +177,7 @@ def wavy_moment() -> float:
 
 
 def test_bias_is_of_order_one_in_the_step(rotating_seed):
-    """On an anharmonic target the measured bias is that of the exact kernel, and its order lies where theory puts it."""
+    """On an anharmonic target the measured bias is the exact kernel's, and its order lies where theory puts it."""
     g, truth = generator(rotating_seed), wavy_moment()
     steps, biases, errors = (0.4, 0.2), [], []
     exact = [stationary_moment(wavy_drift, np.ones_like, h) - truth for h in (*steps, 0.1, 0.05)]
@@ -188,7 +189,7 @@ def test_bias_is_of_order_one_in_the_step(rotating_seed):
         errors.append(error)
     order = math.log2(biases[0] / biases[1])
     bar = 5 / math.log(2) * math.hypot(errors[0] / biases[0], errors[1] / biases[1])
-    theory = [math.log2(a / b) for a, b in zip(exact, exact[1:], strict=False)]
+    theory = [math.log2(a / b) for a, b in pairwise(exact)]
     assert abs(order - theory[0]) < bar < 0.5
     # towards one as the step shrinks
     assert abs(theory[2] - 1) < 0.1

@@ -1,4 +1,4 @@
-"""SGLD as a torch optimizer: SGD at zero temperature, resume to the bit, groups, schedulers, closures, bad arguments."""
+"""SGLD as a torch optimizer: SGD at zero temperature, resume to the bit, groups, schedulers, closures, bad options."""
 
 from __future__ import annotations
 
@@ -247,7 +247,7 @@ def test_the_step_and_the_noise_follow_any_scheduler(build, expected):
 @pytest.mark.parametrize(("options", "name"), [({"b": 0.0}, "b"), ({"gamma": 0.0}, "gamma"), ({"gamma": 1.1}, "gamma")])
 def test_bad_schedules_are_refused(options, name):
     optimizer = SGLD([leaf(1, 2)], 0.1)
-    with pytest.raises(InputError, match=f"^{name}: "):
+    with pytest.raises(InputError, match=rf"^{name}: "):
         polynomial(optimizer, **options)
 
 
@@ -266,16 +266,16 @@ def test_bad_schedules_are_refused(options, name):
     ],
 )
 def test_bad_options_are_refused_by_name(options, name):
-    with pytest.raises(InputError, match=f"^{name}: "):
+    with pytest.raises(InputError, match=rf"^{name}: "):
         SGLD([leaf(1, 2)], **{"lr": 0.1, **options})
-    with pytest.raises(InputError, match=f"^{name}: "):
+    with pytest.raises(InputError, match=rf"^{name}: "):
         SGLD([{"params": [leaf(1, 2)], **options}], 0.1)
 
 
 def test_the_preconditioner_says_what_it_needs():
     x = leaf(1, 2)
     optimizer = SGLD([x], 0.1, preconditioner="rmsprop")
-    with pytest.raises(InputError, match="^closure: needed"):
+    with pytest.raises(InputError, match=r"^closure: needed"):
         optimizer.step()
 
     def closure():

@@ -1,0 +1,96 @@
+"""Which windows of the latent form can teach anything about the actuator: a fixed rule, blind to the posterior."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from avtorch.inference.latent import NOISE_PRIOR, even_rows, latent_names, run_log_likelihood
+from avtorch.inference.latent_window import LatentWindow
+
+#: Reference vehicle at which the information is predicted: lag [s], gain [-].
+REFERENCE = (0.3, 1.0)
+#: Noise level at which it is predicted: the priors' medians, on a road whose slope of 1.5 % no map tells.
+REFERENCE_NOISE = {name: median for name, (median, _) in NOISE_PRIOR.items()} | {"coloured_sd": 0.15}
+#: What is known beforehand of log T_L and log K_L: the first prior's SDs (SPEC section 3).
+KNOWN = (0.7, 0.3)
+#: A window is excited from one bit on: where it promises to halve the area of the belief about (T_L, K_L).
+LEAST_BITS = 1.0
+
+
+def latent_excitation(
+    data: LatentWindow,
+    *,
+    noise: Mapping[str, float] | None = None,
+    reference: tuple[float, float] = REFERENCE,
+    least_bits: float = LEAST_BITS,
+) -> tuple[Tensor, Tensor]:
+    """Which windows are excited, ``(window,)`` bool, and the information they promise, ``(window,)`` [bit].
+
+    The figure is the expected information about ``(log T_L, log K_L)`` that the *command* brings, at a fixed reference
+    vehicle and noise level: with ``F`` the Fisher information of the predicted signal and ``C = diag(KNOWN²)``,
+    ``log2 det(I + C F) / 2``. It depends on times, commands and the mask, on which signals are measured and on ``noise``
+    (names and units of ``NOISE_PRIOR``; the default is ``REFERENCE_NOISE``), not on measured values or a posterior.
+    Each run's start and a constant force on it are taken as unknown, so a constant command says nothing.
+    """
+    runs, owner = data.runs()
+    names = latent_names(accel=data.accel is not None, speed=data.speed is not None)
+    values = dict(zip(names[:2], reference, strict=True)) | REFERENCE_NOISE | dict(noise or {})
+    p = {name: torch.full_like(owner, values[name], dtype=torch.float64) for name in names}
+
+    by_lag, by_gain = _sensitivities(runs, *reference)
+
+    def energy(accel: Tensor, speed: Tensor) -> Tensor:
+        """``sᵀ Σ⁻¹ s`` of a signal over the noise: twice what the likelihood loses to it when nothing is commanded."""
+        signal = LatentWindow(
+            runs.time,
+            torch.zeros_like(runs.u),
+            None if runs.accel is None else accel,
+            None if runs.speed is None else speed,
+            runs.mask,
+        )
+        return -2.0 * run_log_likelihood(p, signal, even_rows(signal))
+
+    # A force of unknown constant size, such as a slope: it leaves the gain to what the command changes.
+    since = runs.time - runs.time[:, :1]
+    signals = (by_lag, by_gain, (torch.ones_like(since), since))
+    zero = torch.zeros_like(since)
+    floor = energy(zero, zero)
+
+    def product(i: int, j: int) -> Tensor:
+        both = energy(signals[i][0] + signals[j][0], signals[i][1] + signals[j][1])
+        return 0.5 * (both - energies[i] - energies[j] - floor)
+
+    energies = [energy(*signal) - floor for signal in signals]
+    (tt, kk, cc), tk, tc, kc = energies, product(0, 1), product(0, 2), product(1, 2)
+    cc = cc.clamp(min=1e-12)
+    fisher = (tt - tc**2 / cc, kk - kc**2 / cc, tk - tc * kc / cc)
+    tt, kk, tk = (torch.zeros(data.windows, dtype=torch.float64).index_add(0, owner, f) for f in fisher)
+    known_T, known_K = KNOWN
+    determinant = (1.0 + known_T**2 * tt) * (1.0 + known_K**2 * kk) - (known_T * known_K * tk) ** 2
+    bits = 0.5 * determinant.clamp(min=1.0).log() / math.log(2.0)
+    return bits >= least_bits, bits
+
+
+def _sensitivities(runs: LatentWindow, T: float, K: float) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """Derivatives of (acceleration, speed) by log T_L and by log K_L, each ``(run, time)``, with the command held."""
+    h = 1e-4
+    lag = T * torch.tensor([[1.0 + h], [1.0 - h]], dtype=torch.float64)
+    dt = runs.time.diff().clamp(min=0.0)
+    decay = torch.exp(-dt[None] / lag[..., None])
+    target = K * runs.u
+    a = target[:, 0].expand(2, -1)
+    v = torch.zeros_like(a)
+    rows = [torch.stack((a, v))]
+    for k in range(dt.shape[1]):
+        fading = (a - target[:, k]) * (1.0 - decay[..., k])
+        v = v + target[:, k] * dt[:, k] + lag * fading
+        a = a - fading
+        rows.append(torch.stack((a, v)))
+    accel, speed = torch.stack(rows, -1)
+    by_lag = ((accel[0] - accel[1]) / (2.0 * h), (speed[0] - speed[1]) / (2.0 * h))
+    # The response is proportional to K_L.
+    return by_lag, (accel.mean(0), speed.mean(0))

@@ -1,0 +1,120 @@
+"""Rows for the latent form: one or many windows of command, measured acceleration and/or speed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+
+#: A step longer than this many median steps is a gap: the filter starts afresh behind it.
+GAP = 2.5
+
+
+@dataclass(frozen=True)
+class LatentWindow:
+    """Rows of one or many windows, ``(window, time)`` float64, shorter ones padded at the end with ``mask`` False.
+
+    ``time`` [s]; ``u`` [m/s²] held from its row to the next; ``accel`` [m/s²] and/or ``speed`` [m/s] as measured, or
+    None; ``mask`` True where a row may be used (engaged, moving).
+    """
+
+    time: Tensor
+    u: Tensor
+    accel: Tensor | None
+    speed: Tensor | None
+    mask: Tensor
+
+    def __post_init__(self) -> None:
+        if self.accel is None and self.speed is None:
+            raise InputError("accel, speed: neither was given; the latent form needs at least one measured signal")
+        if self.time.ndim != 2:
+            raise InputError(f"time: has {self.time.ndim} dimensions; expected 2, (window, time)")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is not None and value.shape != self.time.shape:
+                raise InputError(f"{field.name}: has shape {tuple(value.shape)}; time has {tuple(self.time.shape)}")
+        if bool(((self.time.diff() <= 0) & self.mask[:, 1:] & self.mask[:, :-1]).any()):
+            raise InputError("time: does not increase from row to row")
+        for name in ("u", "accel", "speed"):
+            value = getattr(self, name)
+            if value is not None and not bool(torch.isfinite(value[self.mask]).all()):
+                raise InputError(f"{name}: is not finite in every row that is used")
+
+    @property
+    def windows(self) -> int:
+        return self.time.shape[0]
+
+    @classmethod
+    def single(
+        cls,
+        time: Tensor,
+        u: Tensor,
+        *,
+        accel: Tensor | None = None,
+        speed: Tensor | None = None,
+        mask: Tensor | None = None,
+    ) -> LatentWindow:
+        """One window from rows ``(time,)``."""
+
+        def row(value: Tensor | None) -> Tensor | None:
+            return None if value is None else torch.as_tensor(value, dtype=torch.float64)[None]
+
+        t = torch.as_tensor(time, dtype=torch.float64)[None]
+        c = torch.as_tensor(u, dtype=torch.float64)[None]
+        used = torch.ones_like(t, dtype=torch.bool) if mask is None else torch.as_tensor(mask, dtype=torch.bool)[None]
+        return cls(t, c, row(accel), row(speed), used)
+
+    @classmethod
+    def stack(cls, windows: Sequence[LatentWindow]) -> LatentWindow:
+        """Many windows as one, padded to the longest."""
+        longest = max(w.time.shape[1] for w in windows)
+
+        def pad(value: Tensor) -> Tensor:
+            return torch.nn.functional.pad(value, (0, longest - value.shape[1]))
+
+        def measured(name: str) -> Tensor | None:
+            given = [pad(v) for w in windows if (v := getattr(w, name)) is not None]
+            if 0 < len(given) < len(windows):
+                raise InputError(f"{name}: measured in some windows only; give it for all of them or for none")
+            return torch.cat(given) if given else None
+
+        rows = (torch.cat([pad(getattr(w, name)) for w in windows]) for name in ("time", "u", "mask"))
+        time, u, mask = rows
+        return cls(time, u, measured("accel"), measured("speed"), mask)
+
+    def select(self, index: Tensor) -> LatentWindow:
+        """The windows named by ``index``."""
+        parts = {f.name: getattr(self, f.name) for f in fields(self)}
+        return LatentWindow(**{name: None if v is None else v[index] for name, v in parts.items()})
+
+    def runs(self) -> tuple[LatentWindow, Tensor]:
+        """Stretches without a gap or an unused row, one a row, and the window ``(run,)`` each comes from.
+
+        Behind a gap, a standstill or a driver's override the acceleration is anybody's, so each run starts afresh.
+        """
+        pieces: list[LatentWindow] = []
+        owner: list[int] = []
+        for w in range(self.windows):
+            rows = self.mask[w].nonzero()[:, 0]
+            if not len(rows):
+                continue
+            step = self.time[w, rows].diff()
+            usual = step.median() if len(step) else torch.tensor(0.0)
+            cut = ((rows.diff() > 1) | (step > GAP * usual)).nonzero()[:, 0] + 1
+            for piece in torch.tensor_split(rows, cut.cpu()):
+                pieces.append(
+                    LatentWindow.single(
+                        self.time[w, piece],
+                        self.u[w, piece],
+                        accel=None if self.accel is None else self.accel[w, piece],
+                        speed=None if self.speed is None else self.speed[w, piece],
+                    )
+                )
+                owner.append(w)
+        if not pieces:
+            raise InputError("mask: no row of any window may be used")
+        return LatentWindow.stack(pieces), torch.tensor(owner)

@@ -1,0 +1,1 @@
+"""Measurements that print ratios: each module runs as `python -m benchmarks.<name>`."""

@@ -1,0 +1,283 @@
+"""The latent form: one exact number by three routes (dense normal, row-by-row filter, even-rows route), and its density."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.autograd import gradcheck, gradgradcheck
+
+from avtorch.errors import InputError
+from avtorch.inference.latent import LatentDensity, LatentWindow, default_noise_prior, even_rows, latent_names
+from avtorch.inference.latent_filter import latent_log_likelihood
+from avtorch.inference.latent_model import ACCEL_SD0, SPEED_SD0, discretise
+from avtorch.inference.latent_steady import EvenRows, stationary_covariance, steady_log_likelihood
+from avtorch.inference.map import find_mode
+from avtorch.inference.priors import Joint, default_actuation_prior
+
+T, K, Q, ROAD, SD, TIME, ACCEL, SPEED = 0.3, 0.9, 0.15, 0.02, 0.2, 1.5, 0.1, 0.03
+
+
+def f64(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def record(rows: int, generator: torch.Generator, *, jitter: float = 0.0, dt: float = 0.02) -> tuple[Tensor, ...]:
+    """Times, command, acceleration and speed of no particular vehicle."""
+    steps = dt * (1 + jitter * (torch.rand(rows, generator=generator, dtype=torch.float64) - 0.5))
+    u, noise = torch.randn(2, rows, generator=generator, dtype=torch.float64)
+    a = u.cumsum(0) / 10 + noise / 10
+    return steps.cumsum(0), u, a, 8 + (a * dt).cumsum(0) + noise / 30
+
+
+def dense_log_likelihood(time: Tensor, u: Tensor, used: Tensor, accel: Tensor | None, speed: Tensor | None) -> float:
+    """The same law as one big normal, built by integrating the model with a matrix exponential, not with its closed forms.
+
+    An interval's noise covariance is the upper right block of exp([[-A, BBᵀ], [0, Aᵀ]] dt) (Van Loan).
+    """
+    A = torch.zeros(3, 3, dtype=torch.float64)
+    A[0, 1] = A[0, 2] = 1.0
+    A[1, 1], A[2, 2] = -1 / T, -1 / TIME
+    drive = torch.diag(f64(ROAD**2, Q**2, 2 * SD**2 / TIME))
+    n = len(time)
+    mean, cov = torch.zeros(n, 3, dtype=torch.float64), torch.zeros(n, 3, n, 3, dtype=torch.float64)
+    cov[0, :, 0] = torch.diag(f64(SPEED_SD0**2, ACCEL_SD0**2, SD**2))
+    for k in range(n - 1):
+        dt = float(time[k + 1] - time[k])
+        phi = torch.linalg.matrix_exp(A * dt)
+        loan = torch.linalg.matrix_exp(torch.cat((torch.cat((-A, drive), 1), torch.cat((0 * A, A.T), 1))) * dt)
+        held = torch.zeros(4, 4, dtype=torch.float64)
+        held[:3, :3], held[1, 3] = A, K / T * u[k]
+        mean[k + 1] = phi @ mean[k] + torch.linalg.matrix_exp(held * dt)[:3, 3]
+        for j in range(k + 1):
+            cov[k + 1, :, j] = phi @ cov[k, :, j]
+            cov[j, :, k + 1] = cov[k + 1, :, j].T
+        cov[k + 1, :, k + 1] = phi @ cov[k, :, k] @ phi.T + loan[3:, 3:].T @ loan[:3, 3:]
+    rows, data, noise = [], [], []
+    channels = ((speed, f64(1, 0, 0), SPEED), (accel, f64(0, 1, 1), ACCEL))
+    for signal, seen, sd in channels:
+        if signal is not None:
+            centre = float(signal[used][0]) if signal is speed else 0.0
+            rows.append(torch.einsum("nm,i->nmi", torch.eye(n, dtype=torch.float64), seen)[used])
+            data.append(signal[used] - centre)
+            noise += [sd**2] * int(used.sum())
+    H = torch.cat(rows).flatten(1)
+    spread = H @ cov.reshape(3 * n, 3 * n) @ H.T + torch.diag(f64(*noise))
+    law = torch.distributions.MultivariateNormal(H @ mean.flatten(), spread)
+    return float(law.log_prob(torch.cat(data)))
+
+
+CHANNELS = pytest.mark.parametrize("channels", ["speed", "accel", "both"])
+
+
+def pick(channels: str, accel: Tensor, speed: Tensor) -> dict[str, Tensor | None]:
+    return {"accel": None if channels == "speed" else accel, "speed": None if channels == "accel" else speed}
+
+
+@CHANNELS
+def test_filter_equals_dense_normal_with_jitter_a_gap_and_masked_rows(channels: str, rotating_seed: int) -> None:
+    generator = torch.Generator().manual_seed(rotating_seed)
+    time, u, a, v = record(40, generator, jitter=0.8)
+    time[25:] += 0.7
+    used = torch.ones(40, dtype=torch.bool)
+    used[[0, 7, 8, 30]] = False
+    measured = pick(channels, a, v)
+    ours = latent_log_likelihood(
+        T, K, Q, SD, TIME, time, u, mask=used, accel_noise=ACCEL, speed_noise=SPEED, road_noise=ROAD, **measured
+    )
+    # Round-off: the diffuse start's variance of 100 against 1e-3 costs five of sixteen digits.
+    assert float(ours) == pytest.approx(dense_log_likelihood(time, u, used, **measured), abs=1e-8)
+
+
+@CHANNELS
+@pytest.mark.parametrize("rows", [1, 2, 31, 33, 250])
+def test_even_route_equals_filter(channels: str, rows: int, rotating_seed: int) -> None:
+    generator = torch.Generator().manual_seed(rotating_seed)
+    longest = [torch.stack(x) for x in zip(*(record(250, generator) for _ in range(2)), strict=True)]
+    _, u, a, v = longest
+    used = torch.ones(2, 250, dtype=torch.bool)
+    used[1, rows:] = False
+    dt = f64(0.02, 0.1)
+    time = dt[:, None] * torch.arange(250, dtype=torch.float64)
+    typical = f64(T, K, Q, SD, TIME, ACCEL, SPEED, ROAD)
+    p = typical * torch.exp(0.5 * torch.randn(3, 2, 8, generator=generator, dtype=torch.float64))
+    five, noise = p[..., :5].unbind(-1), dict(zip(("accel_noise", "speed_noise", "road_noise"), p[..., 5:].unbind(-1), strict=True))
+    measured = pick(channels, a, v)
+    slow = latent_log_likelihood(*five, time, u, mask=used, **measured, **noise)
+    fast = steady_log_likelihood(*five, EvenRows.build(dt, u, used, **measured), **noise)
+    # The diffuse start cancels about seven digits (variance 100 against squared noise 1e-4 and its information).
+    torch.testing.assert_close(fast, slow, rtol=1e-9, atol=1e-8)
+
+
+def test_discretisation_is_exact_over_the_switch_to_the_series() -> None:
+    """Two half steps make one step, on both sides of the point where the closed form takes over from the series."""
+    for lag in (0.01, 0.19, 0.21, 5.0):
+        p = f64(lag), f64(K), f64(Q), f64(ROAD), f64(SD), f64(TIME)
+        half, full = discretise(*p, f64(0.05)), discretise(*p, f64(0.1))
+        phi = half.transition
+        torch.testing.assert_close(full.transition, phi @ phi, rtol=1e-13, atol=1e-15)
+        torch.testing.assert_close(full.gain, (phi @ half.gain[..., None])[..., 0] + half.gain, rtol=1e-12, atol=1e-15)
+        torch.testing.assert_close(full.noise, phi @ half.noise @ phi.mT + half.noise, rtol=1e-12, atol=1e-18)
+
+
+def test_stationary_covariance_solves_its_equation() -> None:
+    p = (f64(T, 0.05), f64(K, K), f64(Q, 0.01), f64(0.0, ROAD), f64(SD, 0.01), f64(TIME, 20.0))
+    step = discretise(*p, f64(0.01, 0.01))
+    H, R = f64(1, 0, 0)[None], torch.diag_embed(f64(1e-6, 1e-2)[:, None])
+    P = stationary_covariance(step.transition, H, step.noise, R)
+    filtered = P - P @ H.mT @ H @ P / (H @ P @ H.mT + R)
+    again = step.transition @ filtered @ step.transition.mT + step.noise
+    torch.testing.assert_close(again, P, rtol=1e-11, atol=1e-16)
+
+
+def _gradient_case(generator: torch.Generator) -> tuple[Tensor, tuple[Tensor, ...]]:
+    time, u, a, v = record(7, generator, jitter=0.5, dt=0.1)
+    values = [f64(x) for x in (T, K, Q, SD, TIME, ACCEL, SPEED, ROAD)]
+    return time, tuple(x.requires_grad_() for x in (*values, u, a, v))
+
+
+def test_filter_gradients(rotating_seed: int) -> None:
+    time, inputs = _gradient_case(torch.Generator().manual_seed(rotating_seed))
+
+    def f(*x: Tensor) -> Tensor:
+        noise = {"accel_noise": x[5], "speed_noise": x[6], "road_noise": x[7]}
+        return latent_log_likelihood(*x[:5], time, x[8], accel=x[9], speed=x[10], **noise)
+
+    assert gradcheck(f, inputs)
+    assert gradgradcheck(f, inputs)
+
+
+def test_even_route_gradients(rotating_seed: int) -> None:
+    """In log parameters, as the sampler and Newton's method use them; second derivatives pass through the Riccati limit."""
+    _, u, a, v = record(40, torch.Generator().manual_seed(rotating_seed), dt=0.1)
+    data = EvenRows.build(f64(0.1), u[None], torch.ones(1, 40, dtype=torch.bool), accel=a[None], speed=v[None])
+    z = f64(T, K, Q, SD, TIME, ACCEL, SPEED, ROAD).log()[:, None].requires_grad_()
+
+    def f(z: Tensor) -> Tensor:
+        x = z.exp()
+        noise = {"accel_noise": x[5], "speed_noise": x[6], "road_noise": x[7]}
+        return steady_log_likelihood(*x[:5], data, **noise)
+
+    assert gradcheck(f, (z,))
+    assert gradgradcheck(f, (z,))
+
+
+@pytest.mark.parametrize("lag", [0.003, 5.0])
+@pytest.mark.parametrize("gain", [0.05, 3.0])
+def test_gradients_are_finite_at_the_edges(lag: float, gain: float) -> None:
+    _, u, _, v = record(300, torch.Generator().manual_seed(1), dt=0.01)
+    density = LatentDensity(LatentWindow.single(0.01 * torch.arange(300, dtype=torch.float64), u, speed=v))
+    for scale in (0.1, 10.0):
+        z = density.prior.center().clone() + math.log(scale)
+        z[:2] = f64(lag, gain).log()
+        z = z[None].requires_grad_()
+        (gradient,) = torch.autograd.grad(density.log_prob(z).sum(), z)
+        assert bool(gradient.isfinite().all())
+
+
+def simulate(rows: int, generator: torch.Generator, windows: int) -> LatentWindow:
+    """Windows drawn from the model itself, at the values at the head of this file, 100 Hz."""
+    step = discretise(f64(T), f64(K), f64(Q), f64(ROAD), f64(SD), f64(TIME), f64(0.01))
+    root = torch.linalg.cholesky(step.noise[0])
+    u = 0.5 * torch.randn(windows, rows // 100 + 1, generator=generator, dtype=torch.float64).repeat_interleave(100, 1)
+    x = torch.zeros(windows, 3, dtype=torch.float64)
+    x[:, 0] = 10.0
+    x[:, 2] = SD * torch.randn(windows, generator=generator, dtype=torch.float64)
+    states = []
+    for k in range(rows):
+        states.append(x)
+        noise = torch.randn(windows, 3, generator=generator, dtype=torch.float64) @ root.T
+        x = x @ step.transition[0].T + u[:, k, None] * step.gain[0] + noise
+    v = torch.stack(states, 1)[..., 0]
+    v = v + SPEED * torch.randn(v.shape, generator=generator, dtype=torch.float64)
+    time = (0.01 * torch.arange(rows, dtype=torch.float64)).expand(windows, -1)
+    return LatentWindow(time, u[:, :rows], None, v, torch.ones_like(v, dtype=torch.bool))
+
+
+def test_mode_finds_the_truth_within_its_laplace_bars(rotating_seed: int) -> None:
+    data = simulate(3000, torch.Generator().manual_seed(rotating_seed), windows=4)
+    mode = find_mode(LatentDensity(data))
+    assert bool(mode.converged.all())
+    score = (mode.z[:, :2] - f64(T, K).log()) / mode.covariance.diagonal(dim1=-2, dim2=-1)[:, :2].sqrt()
+    assert float(score.abs().max()) < 5
+
+
+def test_score_has_mean_zero_at_the_truth(rotating_seed: int) -> None:
+    """First Bartlett identity: the likelihood's gradient at the truth averages to nothing over simulated windows."""
+    windows = 60
+    data = simulate(200, torch.Generator().manual_seed(rotating_seed), windows)
+    density = LatentDensity(data)
+    truth = {"T_L": T, "K_L": K, "process_noise": Q, "road_noise": ROAD, "speed_noise": SPEED, "coloured_sd": SD, "coloured_time": TIME}
+    z = f64(*(truth[name] for name in density.names)).log().expand(windows, -1).clone().requires_grad_()
+    (score,) = torch.autograd.grad(density.log_likelihood(z).sum(), z)
+    assert bool((score.mean(0).abs() < 5 * score.std(0) / math.sqrt(windows)).all())
+
+
+def test_density_adds_prior_and_runs_and_keeps_leading_dimensions(rotating_seed: int) -> None:
+    generator = torch.Generator().manual_seed(rotating_seed)
+    data = simulate(200, generator, windows=2)
+    time = data.time.clone()
+    time[0, 120:] += 3.0  # a gap starts a new run
+    mask = data.mask.clone()
+    mask[1, 50:60] = False  # so does a stretch that may not be used
+    density = LatentDensity(LatentWindow(time, data.u, None, data.speed, mask))
+    z = density.initial() + 0.1 * torch.randn(4, 3, 2, len(density.names), generator=generator, dtype=torch.float64)
+    p = dict(zip(density.names, z.exp().unbind(-1), strict=True))
+    assert data.speed is not None
+    pieces = ((0, slice(0, 120)), (0, slice(120, 200)), (1, slice(0, 50)), (1, slice(60, 200)))
+    expected = torch.zeros(4, 3, 2, dtype=torch.float64)
+    for w, rows in pieces:
+        one = {name: value[..., w] for name, value in p.items()}
+        five = (one["T_L"], one["K_L"], one["process_noise"], one["coloured_sd"], one["coloured_time"])
+        noise = {"speed_noise": one["speed_noise"], "road_noise": one["road_noise"]}
+        expected[..., w] += latent_log_likelihood(*five, time[w, rows], data.u[w, rows], speed=data.speed[w, rows], **noise)
+    prior = Joint(default_actuation_prior(), default_noise_prior(density.names[2:]))
+    torch.testing.assert_close(density.log_prob(z), expected + prior.log_prob(z), rtol=1e-9, atol=1e-7)
+
+
+def test_uneven_rows_take_the_filter_and_rounded_stamps_do_not() -> None:
+    data = simulate(100, torch.Generator().manual_seed(0), windows=1)
+    rounded = LatentWindow(data.time + 1e-4 * torch.sin(37 * data.time), data.u, None, data.speed, data.mask)
+    uneven = LatentWindow(data.time + 2e-3 * torch.sin(37 * data.time), data.u, None, data.speed, data.mask)
+    assert even_rows(rounded) is not None
+    assert even_rows(uneven) is None
+    density = LatentDensity(uneven)
+    exact = latent_log_likelihood(
+        *(f64(x) for x in (T, K, Q, SD, TIME)), uneven.time, uneven.u, speed=uneven.speed, speed_noise=SPEED, road_noise=ROAD
+    )
+    values = {"T_L": T, "K_L": K, "process_noise": Q, "road_noise": ROAD, "speed_noise": SPEED, "coloured_sd": SD, "coloured_time": TIME}
+    z = f64(*(values[name] for name in density.names)).log()[None]
+    torch.testing.assert_close(density.log_likelihood(z), exact, rtol=1e-12, atol=0.0)
+
+
+def test_select_and_stack_are_inverse_up_to_padding() -> None:
+    data = simulate(60, torch.Generator().manual_seed(0), windows=3)
+    again = LatentWindow.stack([data.select(torch.tensor([w])) for w in range(3)])
+    assert torch.equal(again.u, data.u)
+    assert torch.equal(again.mask, data.mask)
+
+
+def test_names_follow_the_signals() -> None:
+    assert latent_names(accel=False, speed=True)[2:5] == ("process_noise", "road_noise", "speed_noise")
+    assert "road_noise" not in latent_names(accel=True, speed=False)
+    assert "accel_noise" in latent_names(accel=True, speed=True)
+
+
+def test_bad_input_names_itself() -> None:
+    t = torch.arange(5, dtype=torch.float64)
+    with pytest.raises(InputError, match="accel, speed"):
+        LatentWindow.single(t, t)
+    with pytest.raises(InputError, match="time: does not increase"):
+        LatentWindow.single(t.flip(0), t, speed=t)
+    with pytest.raises(InputError, match="speed: is not finite"):
+        LatentWindow.single(t, t, speed=t * torch.nan)
+    with pytest.raises(InputError, match="u: has shape"):
+        LatentWindow.single(t, t[:4], speed=t)
+    with pytest.raises(InputError, match="mask: no row"):
+        LatentWindow.single(t, t, speed=t, mask=torch.zeros(5)).runs()
+    with pytest.raises(InputError, match="speed_noise: missing"):
+        latent_log_likelihood(T, K, Q, SD, TIME, t, t, speed=t)
+    with pytest.raises(InputError, match="accel: measured in some"):
+        LatentWindow.stack([LatentWindow.single(t, t, speed=t), LatentWindow.single(t, t, speed=t, accel=t)])
