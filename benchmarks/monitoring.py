@@ -1,6 +1,6 @@
 """How well the paper's change is seen and met: many seeds of the closed loop in one batch.
 
-``python -m benchmarks.monitoring [--seeds 200] [--noise 0.1] [--strategy none|auto] [--leader FILE --vehicle I --start S]``
+``python -m benchmarks.monitoring [--seeds 200] [--noise 0.1] [--strategy none|auto] [--leader FILE --start S]``
 
 Prints one row: seeds with an alert before the change, and by one window after it; share of moving windows that are
 excited; coverage of the 90 % interval over excited windows; median absolute errors before and after; with an action,

@@ -3,8 +3,8 @@
     python -m benchmarks.real_time [--repeats 5]
 
 One thread. A window has 200 rows at 100 Hz and is sampled with 64 chains (the default settings). The aim is an update
-in less than 5 % of the window's length, and a cost that grows more slowly than the number of vehicles. The share is of the
-processor's time, which a busy machine does not stretch; the clock's time stands beside it.
+in less than 5 % of the window's length, and a cost that grows more slowly than the number of vehicles. The share is
+that of the processor's time, which a busy machine does not stretch; the clock's time stands beside it.
 """
 
 from __future__ import annotations

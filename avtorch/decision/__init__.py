@@ -1,4 +1,4 @@
-"""What is done: the monitor's detectors, Algorithm 2, the strategist, and the supervisor that closes the loop online."""
+"""What is done: detectors, Algorithm 2, the strategist, and the supervisor that closes the loop online."""
 
 from avtorch.decision.algorithm2 import Algorithm2, algorithm2
 from avtorch.decision.estimation import Estimates, estimate

@@ -64,7 +64,9 @@ def estimate(
     Raises `InputError` for a log without accel_cmd, a form whose columns it lacks, or a window longer than the log.
     """
     if log.accel_cmd is None:
-        raise InputError(f"{log.name}: has no accel_cmd; without the demanded acceleration T_L and K_L are not to be told")
+        raise InputError(
+            f"{log.name}: has no accel_cmd; T_L and K_L need the demanded acceleration"
+        )
     chosen = _form(log, form)
     if not window > 0:
         raise InputError(f"window: found {window:g} s, needs a number above 0")

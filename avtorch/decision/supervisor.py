@@ -75,8 +75,8 @@ class SupervisedRun:
 class Supervisor:
     """Runs a closed `loop` window by window, watches it, and changes its setting where the monitor is alarmed.
 
-    The stability verdict asks the setting in force: the gains are those of a `LinearController`, or the equivalent gains
-    of a controller that tells them (an MPC). Another controller of unknown structure is watched with `setting` given;
+    The stability verdict asks the setting in force: the gains are those of a `LinearController`, or the equivalent
+    gains of a controller that tells them (an MPC). Another controller of unknown structure is watched with `setting` given;
     its actuation is estimated all the same, and only the lower level may be changed.
 
     Args:

@@ -1,4 +1,4 @@
-"""Belief and monitor on one stream of samples: what the command line's `estimate` and the supervisor both look through."""
+"""Belief and monitor on one stream of samples: what `estimate` and the supervisor both look through."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Watch:
         usable: Tensor | None = None,
         until: float | None = None,
     ) -> list[WatchedWindow]:
-        """Rows in, watched windows out; arguments as `BeliefStream.feed`, `setting` is the one in force over these rows."""
+        """Rows in, watched windows out; arguments as `BeliefStream.feed`, `setting` is in force over these rows."""
         return [self._watch(w, setting) for w in self.stream.feed(time, columns, usable=usable, until=until)]
 
     def flush(self, setting: Setting) -> list[WatchedWindow]:

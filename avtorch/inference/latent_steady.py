@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,7 +30,7 @@ BLOCK = 32
 class EvenRows:
     """Even runs of rows, laid out once for `steady_log_likelihood`.
 
-    ``lagged`` ``(run, block·BLOCK, BLOCK·channel)``: what each row sees of its own block, newest first; channels are
+    ``lagged`` ``(run, BLOCK·channel, block·BLOCK)``: what each row sees of its own block, newest first; channels are
     the measured ones, then the command. ``used`` ``(run, block·BLOCK)``; ``count`` rows in use; ``dt`` [s] ``(run,)``.
     """
 
@@ -52,47 +53,60 @@ class EvenRows:
         blocks = data.unflatten(1, (-1, BLOCK))
         age = torch.arange(BLOCK)[:, None] - torch.arange(BLOCK)
         lagged = blocks[:, :, age.clamp(min=0)] * (age >= 0)[..., None]
-        lagged = lagged.flatten(-2).flatten(1, 2).contiguous()
+        lagged = lagged.flatten(-2).flatten(1, 2).mT.contiguous()
         return cls(lagged, used.to(u.dtype), used.sum(-1).to(u.dtype), dt, speed is not None, accel is not None)
 
 
 def _riccati_limit(phi: Tensor, H: Tensor, Q: Tensor, R: Tensor) -> Tensor:
-    """Stationary predicted covariance by structured doubling; no graph."""
+    """The limit by structured doubling: the k-th step covers ``2^k`` rows, so a dozen reach any memory."""
     A, X = phi.mT, Q
     G = H.mT @ (H / R.diagonal(dim1=-2, dim2=-1)[..., None])
-    eye = torch.eye(Q.shape[-1], dtype=Q.dtype, device=Q.device)
+    n = Q.shape[-1]
+    eye = torch.eye(n, dtype=Q.dtype, device=Q.device)
     for _ in range(40):
-        solved = torch.linalg.solve(eye + G @ X, torch.cat((A, G), -1))
-        WA, WG = solved.split(Q.shape[-1], -1)
-        X_next = X + A.mT @ X @ WA
+        WA, WG = torch.linalg.solve(eye + G @ X, torch.cat((A, G), -1)).split(n, -1)
+        added = A.mT @ X @ WA
+        X = X + added
+        # Convergence is quadratic: what comes after this is below round-off.
+        if bool((added.abs().amax((-2, -1)) <= 1e-9 * X.abs().amax((-2, -1))).all()):
+            break
         G = G + A @ WG @ A.mT
         A = A @ WA
-        X, X_next = X_next, X
-        # Stops early: the two Newton steps that follow square the error twice.
-        if bool(((X - X_next).abs().amax((-2, -1)) <= 1e-7 * X.abs().amax((-2, -1))).all()):
-            break
     return 0.5 * (X + X.mT)
 
 
-def stationary_covariance(phi: Tensor, H: Tensor, Q: Tensor, R: Tensor) -> Tensor:
-    """Predicted covariance ``P = φ(P - P Hᵀ S⁻¹ H P)φᵀ + Q``, ``(..., n, n)``, twice differentiable.
+class _Stationary(torch.autograd.Function):
+    """Implicit derivatives of the Riccati limit; the backward pass is differentiable itself, to any order."""
 
-    The limit is found without a graph; two Newton steps with one follow. One step has the right first derivative, two
-    the right second and third (each step squares the distance to the solution).
-    """
-    with torch.no_grad():
+    @staticmethod
+    def forward(ctx: Any, phi: Tensor, H: Tensor, Q: Tensor, R: Tensor) -> Tensor:
         P = _riccati_limit(phi, H, Q, R)
-    n = Q.shape[-1]
-    eye = torch.eye(n * n, dtype=Q.dtype, device=Q.device)
-    for _ in range(2):
+        ctx.save_for_backward(phi, H, R, P)
+        return P
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, Tensor, Tensor]:
+        phi, H, R, P = ctx.saved_tensors
+        n = P.shape[-1]
         K = P @ H.mT @ torch.linalg.inv(H @ P @ H.mT + R)
-        M = phi - phi @ K @ H
-        drive = phi @ K @ R @ K.mT @ phi.mT + Q
-        # Solve P = M P Mᵀ + drive, with rows of vec(P) in order.
-        kron = (M[..., :, None, :, None] * M[..., None, :, None, :]).flatten(-4, -3).flatten(-2, -1)
-        P = torch.linalg.solve(eye - kron, drive.flatten(-2)[..., None])[..., 0].unflatten(-1, (n, n))
-        P = 0.5 * (P + P.mT)
-    return P
+        push = phi @ K
+        M = phi - push @ H
+        # dP = M dP Mᵀ + ..., so the gradient solves G = Mᵀ G M + grad, here with rows of G in order.
+        kron = (M.mT[..., :, None, :, None] * M.mT[..., None, :, None, :]).flatten(-4, -3).flatten(-2, -1)
+        eye = torch.eye(n * n, dtype=P.dtype, device=P.device)
+        grad = 0.5 * (grads[0] + grads[0].mT)
+        G = torch.linalg.solve(eye - kron, grad.flatten(-2)[..., None])[..., 0].unflatten(-1, (n, n))
+        return 2.0 * G @ phi @ (P - K @ H @ P), None, G, push.mT @ G @ push
+
+
+def stationary_covariance(phi: Tensor, H: Tensor, Q: Tensor, R: Tensor) -> Tensor:
+    """Predicted covariance ``P = φ(P - P Hᵀ S⁻¹ H P)φᵀ + Q``, ``(..., n, n)``; differentiable in ``φ, Q, R``.
+
+    ``H (m, n)`` is constant, ``R (..., m, m)`` diagonal.
+    """
+    out = _Stationary.apply(phi, H, Q, R)
+    assert isinstance(out, Tensor)
+    return out
 
 
 def _powers(M: Tensor, count: int) -> Tensor:
@@ -157,7 +171,7 @@ def steady_log_likelihood(
     M = phi - phi @ K @ H
     drive = torch.cat((phi @ K, B[..., None]), -1)  # what a row's measurements and command add to the next mean
     powers = _powers(M, BLOCK)
-    seen = (white @ H)[..., None, :, :] @ powers  # (chain, run, BLOCK, m, n)
+    seen = ((white @ H)[..., None, :, :] @ powers).transpose(-3, -2).flatten(2, 3)  # (chain, run, m·BLOCK, n)
     pushed = powers @ drive[..., None, :, :]  # (chain, run, BLOCK, n, m + 1)
 
     # Impulse response of the whitened innovation, newest row first.
@@ -165,24 +179,23 @@ def steady_log_likelihood(
     response = torch.cat((now, -(white @ H)[..., None, :, :] @ pushed[..., :-1, :, :]), -3)
 
     def through(kernel: Tensor, rows: Tensor) -> Tensor:
-        """``kernel (chain, run, BLOCK, out, m + 1)`` on ``rows (run, row, BLOCK·(m + 1))``, all chains in one product."""
-        out = kernel.shape[-2]
-        flat = kernel.permute(1, 2, 4, 0, 3).reshape(runs, -1, kernel.shape[0] * out)
-        return (rows @ flat).unflatten(-1, (kernel.shape[0], out)).permute(2, 0, 1, 3)
+        """``kernel (chain, run, BLOCK, out, m + 1)`` on ``rows (run, BLOCK·(m + 1), row)``: ``(chain, run, out, row)``."""
+        chains, out = kernel.shape[0], kernel.shape[-2]
+        flat = kernel.permute(1, 0, 3, 2, 4).reshape(runs, chains * out, -1)
+        return (flat @ rows).unflatten(1, (chains, out)).transpose(0, 1)
 
     blocks = data.used.shape[-1] // BLOCK
     leap = powers[..., -1, :, :] @ M
-    start = _scan(leap, through(pushed, data.lagged[:, BLOCK - 1 :: BLOCK]))  # (chain, run, block, n)
-    seen_flat = seen.flatten(2, 3)  # (chain, run, BLOCK·m, n)
-    local = through(response, data.lagged).reshape(-1, runs, blocks, BLOCK * m)
-    used = data.used.reshape(runs, blocks, BLOCK).repeat_interleave(m, -1)
-    e = (local - start @ seen_flat.mT) * used
+    start = _scan(leap, through(pushed, data.lagged[..., BLOCK - 1 :: BLOCK]).mT)  # (chain, run, block, n)
+    local = through(response, data.lagged).unflatten(-1, (blocks, BLOCK)).transpose(2, 3).flatten(3)
+    used = data.used.reshape(runs, blocks, BLOCK)
+    e = (local - start @ seen.mT) * used.repeat(1, 1, m)  # (chain, run, block, m·BLOCK)
     # Innovations depend on the first mean as E = H M^t: block by block, seen · leap^block.
     far = _powers(leap, blocks)
-    pairs = (seen[..., :, None] * seen[..., None, :]).sum(-3).flatten(-2)  # (chain, run, BLOCK, n·n)
-    in_block = (data.used.reshape(runs, blocks, BLOCK) @ pairs).unflatten(-1, (n, n))
+    pairs = (seen[..., :, None] * seen[..., None, :]).flatten(-2).unflatten(2, (m, BLOCK)).sum(2)
+    in_block = (used @ pairs).unflatten(-1, (n, n))
     J = (far.mT @ in_block @ far).sum(-3)
-    j = (far.mT @ (e @ seen_flat)[..., None]).sum(-3)
+    j = (far.mT @ (e @ seen)[..., None]).sum(-3)
     D = P0 - P
     inflated = torch.eye(n, dtype=D.dtype, device=D.device) + D @ J
     gained = (j.mT @ torch.linalg.solve(inflated, D @ j))[..., 0, 0]

@@ -43,7 +43,7 @@ def z_scores_of_moments(x: Tensor, y: Tensor, cov_xx: Tensor, cov_xy: Tensor) ->
 def test_a_chain_at_its_stationary_law_keeps_it(h, temperature, noise, rotating_seed):
     """Mean, covariance and lag-1 covariance of a correlated Gaussian, after 1, 2 and 10 steps.
 
-    With precision P and A = I - hP/2 the law of a discrete step is S = P^-1 (I - hP/4)^-1 and cov(x', x) = A S. Averaged
+    noise keeps P^-1 itself: y = x - sqrt(h) xi/2 is autoregressive with covariance P^-1 (I - hP/4), and cov(x', x) too.
     noise keeps P^-1 itself: y = x - sqrt(h) xi/2 is autoregressive, of cov P^-1 (I - hP/4) like cov(x', x).
     """
     g, chains, eye = generator(rotating_seed), 50_000, torch.eye(2, dtype=F64)
