@@ -7,27 +7,29 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from avtorch.errors import InputError
 from avtorch.inference.latent_filter import latent_log_likelihood
 from avtorch.inference.latent_steady import EvenRows, steady_log_likelihood
 from avtorch.inference.latent_window import LatentWindow
 from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior
 
-#: Rows count as even while their times lie this close, in steps, to an even grid. A twentieth of a step moves a speed by
-#: 0.5 mm/s per m/s² at 100 Hz, below the noise of any wheel speed; beyond it the row-by-row filter takes over.
+#: Rows count as even while their times lie this close, in steps, to an even grid. A twentieth of a step moves a speed
+#: by 0.5 mm/s per m/s² at 100 Hz, below the noise of any wheel speed; beyond it the row-by-row filter takes over.
 EVEN = 0.05
 #: Medians and log SDs of the noise parameters, for a test car and a production car alike.
-#: process_noise [m/s²/√s], the actuator's own roughness: at a lag of 0.3 s the median makes 0.06 m/s², and 95 % lie
-#: within a factor 7. road_noise [m/s/√s]: body vibration; the median makes 1 mm/s from row to row at 100 Hz.
+#: process_noise [m/s²/√s], the actuator's own roughness: at a lag of 0.3 s the median makes 0.06 m/s², and 95 %
+#: lie within a factor 7. road_noise [m/s/√s]: body vibration; the median makes 1 mm/s from row to row at 100 Hz.
 #: speed_noise [m/s]: from a good inertial unit to a coarse wheel speed. accel_noise [m/s²]: likewise.
-#: coloured_sd [m/s²] and coloured_time [s]: slow forces that GLVD lacks, such as slope (1 % is 0.1 m/s²) and wind (1 to
-#: 5 s and more). Held slower than any lag: an external force as quick as the actuator imitates it, and T_L is lost.
+#: coloured_sd [m/s²] and coloured_time [s]: slow forces that GLVD lacks, such as slope (1.5 % is 0.15 m/s²) and gusts
+#: (0.1 to 0.4 m/s², 1 to 5 s). Kept slower than a usual lag (95 %: 0.6 to 4 s): an external force as quick as the
+#: actuator imitates it, and T_L is lost.
 NOISE_PRIOR: dict[str, tuple[float, float]] = {
     "process_noise": (0.15, 1.0),
     "road_noise": (0.01, 1.0),
     "speed_noise": (0.01, 1.5),
     "accel_noise": (0.05, 1.0),
-    "coloured_sd": (0.08, 0.6),
-    "coloured_time": (3.0, 0.4),
+    "coloured_sd": (0.15, 0.7),
+    "coloured_time": (1.5, 0.5),
 }
 
 
@@ -72,9 +74,15 @@ class LatentDensity:
 
     ``names`` is ``latent_names``; the density is in ``z = log(parameter)``. Even rows take the fast route, others the
     row-by-row filter; both give the same number. Gaps and unused rows split a window into runs, whose likelihoods add.
+
+    ``temper`` in (0, 1] is a power on the likelihood, for logs whose windows still spread wider than their posteriors
+    (a gain that differs between throttle and brake, say); SDs grow about as ``temper^-1/2``. 1 is the law as written.
     """
 
-    def __init__(self, data: LatentWindow, prior: Prior | None = None) -> None:
+    def __init__(self, data: LatentWindow, prior: Prior | None = None, *, temper: float = 1.0) -> None:
+        if not 0 < temper <= 1:
+            raise InputError(f"temper: {temper} is not in (0, 1]")
+        self.temper = temper
         self.data = data
         self.names = latent_names(accel=data.accel is not None, speed=data.speed is not None)
         self.prior = Joint(default_actuation_prior(), default_noise_prior(self.names[2:])) if prior is None else prior
@@ -86,7 +94,7 @@ class LatentDensity:
         return self.data.windows
 
     def log_likelihood(self, z: Tensor) -> Tensor:
-        """``z`` ``(..., window, parameter)``; returns ``(..., window)`` [nats]."""
+        """``z`` ``(..., window, parameter)``; returns ``(..., window)`` [nats], not tempered."""
         p = dict(zip(self.names, z[..., self._owner, :].exp().unbind(-1), strict=True))
         per_run = run_log_likelihood(p, self._runs, self._even)
         if len(self._owner) == self.windows:
@@ -94,7 +102,7 @@ class LatentDensity:
         return per_run.new_zeros(*per_run.shape[:-1], self.windows).index_add(-1, self._owner, per_run)
 
     def log_prob(self, z: Tensor) -> Tensor:
-        return self.log_likelihood(z) + self.prior.log_prob(z)
+        return self.temper * self.log_likelihood(z) + self.prior.log_prob(z)
 
     def initial(self) -> Tensor:
         """The best of a coarse grid over lag, gain and process noise, the rest at the prior's centre."""

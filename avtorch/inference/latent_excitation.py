@@ -13,8 +13,8 @@ from avtorch.inference.latent_window import LatentWindow
 
 #: Reference vehicle at which the information is predicted: lag [s], gain [-].
 REFERENCE = (0.3, 1.0)
-#: Noise level at which it is predicted: the priors' medians, on a road whose slope of 1.5 % no map tells.
-REFERENCE_NOISE = {name: median for name, (median, _) in NOISE_PRIOR.items()} | {"coloured_sd": 0.15}
+#: Noise level at which it is predicted: the medians of the noise priors.
+REFERENCE_NOISE = {name: median for name, (median, _) in NOISE_PRIOR.items()}
 #: What is known beforehand of log T_L and log K_L: the first prior's SDs (SPEC section 3).
 KNOWN = (0.7, 0.3)
 #: A window is excited from one bit on: where it promises to halve the area of the belief about (T_L, K_L).
@@ -32,7 +32,7 @@ def latent_excitation(
 
     The figure is the expected information about ``(log T_L, log K_L)`` that the *command* brings, at a fixed reference
     vehicle and noise level: with ``F`` the Fisher information of the predicted signal and ``C = diag(KNOWN²)``,
-    ``log2 det(I + C F) / 2``. It depends on times, commands and the mask, on which signals are measured and on ``noise``
+    ``log2 det(I + C F) / 2``. It depends on times, commands and mask, on which signals are measured and on ``noise``
     (names and units of ``NOISE_PRIOR``; the default is ``REFERENCE_NOISE``), not on measured values or a posterior.
     Each run's start and a constant force on it are taken as unknown, so a constant command says nothing.
     """
@@ -44,7 +44,7 @@ def latent_excitation(
     by_lag, by_gain = _sensitivities(runs, *reference)
 
     def energy(accel: Tensor, speed: Tensor) -> Tensor:
-        """``sᵀ Σ⁻¹ s`` of a signal over the noise: twice what the likelihood loses to it when nothing is commanded."""
+        """``sᵀ Σ⁻¹ s`` of a signal: twice what the likelihood loses to it when nothing is commanded."""
         signal = LatentWindow(
             runs.time,
             torch.zeros_like(runs.u),

@@ -38,13 +38,14 @@ def latent_log_likelihood(
 
     Parameters of shape ``(...)`` or broadcasting to it: ``T_L`` [s], ``K_L`` [-], ``process_noise`` [m/s²/√s],
     ``coloured_sd`` [m/s²], ``coloured_time`` [s], ``accel_noise`` [m/s²] and ``speed_noise`` [m/s] per row,
-    ``road_noise`` [m/s/√s]. Data of shape ``(..., time)``: ``time`` [s] increasing, ``u`` [m/s²] held from its row to the
-    next, ``accel`` [m/s²] = a + d + noise, ``speed`` [m/s]. ``mask`` ``(..., time)``: False where a row's measurements
-    are not used; its command still acts. Typically parameters are ``(chain, window)`` and data ``(window, time)``.
+    ``road_noise`` [m/s/√s]. Data of shape ``(..., time)``: ``time`` [s] increasing, ``u`` [m/s²] held from its row to
+    the next, ``accel`` [m/s²] = a + d + noise, ``speed`` [m/s]. ``mask`` ``(..., time)``: False where a row's
+    measurements are not used; its command still acts. Typically parameters are ``(chain, window)`` and data
+    ``(window, time)``.
 
-    Exact for uneven rows (each interval is integrated exactly) and twice differentiable in parameters, ``u``, ``accel``
-    and ``speed``. The start is that of `initial_covariance`; the first speed's prior is centred on the first unmasked
-    measured one, and the centre moves with the data: a constant added to all speeds changes nothing.
+    Exact for uneven rows (each interval is integrated exactly) and twice differentiable in parameters, ``u``,
+    ``accel`` and ``speed``. The start is that of `initial_covariance`; the first speed's prior is centred on the first
+    unmasked measured one, and the centre moves with the data: a constant added to all speeds changes nothing.
 
     Source: SPEC section 3 (latent form), DIAGNOSIS.md. Raises InputError where neither signal, or a signal without its
     noise, is given.
@@ -62,30 +63,40 @@ def latent_log_likelihood(
     mean = torch.zeros(covariance.shape[:-1], dtype=u.dtype, device=u.device)
 
     # A channel: rows of data, its variance, and the row of the measurement matrix.
-    channels: list[tuple[Tensor, Tensor, Tensor]] = []
+    channels: list[tuple[tuple[Tensor, ...], Tensor, Tensor]] = []
     if speed is not None and speed_noise is not None:
         first = used.to(torch.uint8).argmax(-1, keepdim=True)
         start = speed.gather(-1, first.expand(*speed.shape[:-1], 1)) if speed.shape[:-1] else speed[first]
         # The filter runs on the deviation from the first measured speed, whose prior mean is thereby zero.
-        channels.append((speed - start, _tensor(speed_noise, u) ** 2, u.new_tensor([1.0, 0.0, 0.0])))
+        data = (speed - start).unbind(-1)
+        channels.append((data, _tensor(speed_noise, u) ** 2, u.new_tensor([1.0, 0.0, 0.0])))
     if accel is not None and accel_noise is not None:
-        channels.append((accel, _tensor(accel_noise, u) ** 2, u.new_tensor([0.0, 1.0, 1.0])))
+        channels.append((accel.unbind(-1), _tensor(accel_noise, u) ** 2, u.new_tensor([0.0, 1.0, 1.0])))
 
-    steps = discretise(*(p[..., None] for p in parameters), dt=(time[..., 1:] - time[..., :-1]).to(u.dtype))
-    total = torch.zeros_like(parameters[0])
+    steps = discretise(*(p[..., None] for p in parameters), dt=time.diff().to(u.dtype))
+    # Unbound once: the gradient of an index into a row would be as large as all rows, for every row.
+    transitions, noises = steps.transition.unbind(-3), steps.noise.unbind(-3)
+    pushes = (steps.gain * u[..., :-1, None]).unbind(-2)
+    terms: list[Tensor] = []
     for k in range(rows):
         on = used[..., k]
+        everywhere = bool(on.all())
         for data, variance, row in channels:
-            innovation = torch.where(on, data[..., k] - mean @ row, 0.0)
+            innovation = data[k] - mean @ row
+            if not everywhere:
+                # A masked row may hold anything, also NaN, and must not reach a gradient either.
+                innovation = torch.where(on, innovation, 0.0)
             pointing = covariance @ row
             spread = pointing @ row + variance
-            gain = torch.where(on[..., None], pointing / spread[..., None], 0.0)
+            gain = pointing / spread[..., None]
+            term = torch.log(spread) + innovation**2 / spread + math.log(2.0 * math.pi)
+            if not everywhere:
+                term, gain = torch.where(on, term, 0.0), torch.where(on[..., None], gain, 0.0)
+            terms.append(term)
             mean = mean + gain * innovation[..., None]
             covariance = covariance - gain[..., :, None] * pointing[..., None, :]
-            term = torch.log(spread) + innovation**2 / spread + math.log(2.0 * math.pi)
-            total = total - 0.5 * torch.where(on, term, 0.0)
         if k + 1 < rows:
-            phi = steps.transition[..., k, :, :]
-            mean = (phi @ mean[..., None])[..., 0] + steps.gain[..., k, :] * u[..., k, None]
-            covariance = phi @ covariance @ phi.mT + steps.noise[..., k, :, :]
-    return total
+            phi = transitions[k]
+            mean = (phi @ mean[..., None])[..., 0] + pushes[k]
+            covariance = phi @ covariance @ phi.mT + noises[k]
+    return -0.5 * torch.stack(torch.broadcast_tensors(*terms)).sum(0)

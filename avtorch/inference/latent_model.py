@@ -9,8 +9,8 @@ State ``(v, a, d)``: speed, actuator acceleration, external acceleration that th
 with ``w`` unit white noise. ``d`` is Ornstein-Uhlenbeck with stationary SD ``s`` and carries the coloured
 residual. ``g`` is road noise: vibration of the body that the wheels see, faster than the rows. Without it the mode
 ``T_L → 0`` with a huge ``q`` imitates it, on a recorded lap by hundreds of nats, and drags the lag to nothing.
-Measured are ``v`` and/or ``a + d``, each with independent noise per row. The command is held between rows. ``a`` and ``d``
-drive ``v`` independently, so every entry has a closed form and no matrix exponential is needed.
+Measured are ``v`` and/or ``a + d``, each with independent noise per row. The command is held between rows. ``a`` and
+``d`` drive ``v`` independently, so every entry has a closed form and no matrix exponential is needed.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ def discretise(
 ) -> Step:
     """Exact discretisation with the command held over ``dt``; all arguments broadcast to ``(...)``.
 
-    Units: ``T_L`` [s], ``K_L`` [-], ``process_noise`` [m/s²/√s], ``road_noise`` [m/s/√s], ``coloured_sd`` [m/s²],
-    ``coloured_time`` [s], ``dt`` [s].
+    Units: ``T_L`` [s], ``K_L`` [-], ``process_noise`` [m/s²/√s], ``road_noise`` [m/s/√s], ``coloured_sd``
+    [m/s²], ``coloured_time`` [s], ``dt`` [s].
     """
     T_L, K_L, process_noise, road_noise, coloured_sd, coloured_time, dt = torch.broadcast_tensors(
         T_L, K_L, process_noise, road_noise, coloured_sd, coloured_time, dt

@@ -4,8 +4,8 @@ On even rows the Kalman filter is time-invariant but for its start. Two facts tu
 
 - Started from the *stationary* covariance ``P`` the gain is constant from the first row, and the innovations are a
   linear filter of the data: inside blocks of rows by their impulse response, across blocks by a scan.
-- A start ``N(0, P0)`` is the stationary start with a random mean, ``m ~ N(0, D)``, ``D = P0 - P``. Innovations are linear
-  in that mean, ``e - E m``, so it integrates out in closed form: with ``J = EᵀE``, ``j = Eᵀe``
+- A start ``N(0, P0)`` is the stationary start with a random mean, ``m ~ N(0, D)``, ``D = P0 - P``. Innovations are
+  linear in that mean, ``e - E m``, so it integrates out in closed form: with ``J = EᵀE``, ``j = Eᵀe``
 
   .. math:: \log p = \log p_P + \tfrac12 j^T (I + D J)^{-1} D j - \tfrac12 \log\det(I + D J)
 
@@ -179,7 +179,7 @@ def steady_log_likelihood(
     response = torch.cat((now, -(white @ H)[..., None, :, :] @ pushed[..., :-1, :, :]), -3)
 
     def through(kernel: Tensor, rows: Tensor) -> Tensor:
-        """``kernel (chain, run, BLOCK, out, m + 1)`` on ``rows (run, BLOCK·(m + 1), row)``: ``(chain, run, out, row)``."""
+        """``kernel (chain, run, BLOCK, out, m + 1)`` on ``rows (run, BLOCK·(m + 1), row)``: (chain, run, out, row)."""
         chains, out = kernel.shape[0], kernel.shape[-2]
         flat = kernel.permute(1, 0, 3, 2, 4).reshape(runs, chains * out, -1)
         return (flat @ rows).unflatten(1, (chains, out)).transpose(0, 1)

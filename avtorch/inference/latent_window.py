@@ -82,14 +82,14 @@ class LatentWindow:
                 raise InputError(f"{name}: measured in some windows only; give it for all of them or for none")
             return torch.cat(given) if given else None
 
-        rows = (torch.cat([pad(getattr(w, name)) for w in windows]) for name in ("time", "u", "mask"))
-        time, u, mask = rows
+        time, u, mask = (torch.cat([pad(getattr(w, name)) for w in windows]) for name in ("time", "u", "mask"))
         return cls(time, u, measured("accel"), measured("speed"), mask)
 
     def select(self, index: Tensor) -> LatentWindow:
         """The windows named by ``index``."""
-        parts = {f.name: getattr(self, f.name) for f in fields(self)}
-        return LatentWindow(**{name: None if v is None else v[index] for name, v in parts.items()})
+        accel = None if self.accel is None else self.accel[index]
+        speed = None if self.speed is None else self.speed[index]
+        return LatentWindow(self.time[index], self.u[index], accel, speed, self.mask[index])
 
     def runs(self) -> tuple[LatentWindow, Tensor]:
         """Stretches without a gap or an unused row, one a row, and the window ``(run,)`` each comes from.

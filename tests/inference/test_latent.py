@@ -1,4 +1,4 @@
-"""The latent form: one exact number by three routes (dense normal, row-by-row filter, even-rows route), and its density."""
+"""The latent form: one number by three routes (dense normal, row-by-row filter, even-rows route), and its density."""
 
 from __future__ import annotations
 
@@ -18,6 +18,10 @@ from avtorch.inference.map import find_mode
 from avtorch.inference.priors import Joint, default_actuation_prior
 
 T, K, Q, ROAD, SD, TIME, ACCEL, SPEED = 0.3, 0.9, 0.15, 0.02, 0.2, 1.5, 0.1, 0.03
+TRUTH = {"T_L": T, "K_L": K, "process_noise": Q, "road_noise": ROAD, "coloured_sd": SD, "coloured_time": TIME} | {
+    "accel_noise": ACCEL,
+    "speed_noise": SPEED,
+}
 
 
 def f64(*values: float) -> Tensor:
@@ -33,7 +37,7 @@ def record(rows: int, generator: torch.Generator, *, jitter: float = 0.0, dt: fl
 
 
 def dense_log_likelihood(time: Tensor, u: Tensor, used: Tensor, accel: Tensor | None, speed: Tensor | None) -> float:
-    """The same law as one big normal, built by integrating the model with a matrix exponential, not with its closed forms.
+    """The same law as one big normal, built with matrix exponentials instead of the model's closed forms.
 
     An interval's noise covariance is the upper right block of exp([[-A, BBᵀ], [0, Aᵀ]] dt) (Van Loan).
     """
@@ -83,12 +87,15 @@ def test_filter_equals_dense_normal_with_jitter_a_gap_and_masked_rows(channels: 
     time[25:] += 0.7
     used = torch.ones(40, dtype=torch.bool)
     used[[0, 7, 8, 30]] = False
+    a[7], v[7] = torch.nan, torch.nan
     measured = pick(channels, a, v)
+    lag = f64(T).requires_grad_()
     ours = latent_log_likelihood(
-        T, K, Q, SD, TIME, time, u, mask=used, accel_noise=ACCEL, speed_noise=SPEED, road_noise=ROAD, **measured
+        lag, K, Q, SD, TIME, time, u, mask=used, accel_noise=ACCEL, speed_noise=SPEED, road_noise=ROAD, **measured
     )
+    assert bool(torch.autograd.grad(ours.sum(), lag, retain_graph=True)[0].isfinite())
     # Round-off: the diffuse start's variance of 100 against 1e-3 costs five of sixteen digits.
-    assert float(ours) == pytest.approx(dense_log_likelihood(time, u, used, **measured), abs=1e-8)
+    assert float(ours.detach()) == pytest.approx(dense_log_likelihood(time, u, used, **measured), abs=1e-8)
 
 
 @CHANNELS
@@ -103,10 +110,11 @@ def test_even_route_equals_filter(channels: str, rows: int, rotating_seed: int) 
     time = dt[:, None] * torch.arange(250, dtype=torch.float64)
     typical = f64(T, K, Q, SD, TIME, ACCEL, SPEED, ROAD)
     p = typical * torch.exp(0.5 * torch.randn(3, 2, 8, generator=generator, dtype=torch.float64))
-    five, noise = p[..., :5].unbind(-1), dict(zip(("accel_noise", "speed_noise", "road_noise"), p[..., 5:].unbind(-1), strict=True))
+    lag, gain, rough, sd, slow_time, accel_noise, speed_noise, road = p.unbind(-1)
+    noise = {"accel_noise": accel_noise, "speed_noise": speed_noise, "road_noise": road}
     measured = pick(channels, a, v)
-    slow = latent_log_likelihood(*five, time, u, mask=used, **measured, **noise)
-    fast = steady_log_likelihood(*five, EvenRows.build(dt, u, used, **measured), **noise)
+    slow = latent_log_likelihood(lag, gain, rough, sd, slow_time, time, u, mask=used, **measured, **noise)
+    fast = steady_log_likelihood(lag, gain, rough, sd, slow_time, EvenRows.build(dt, u, used, **measured), **noise)
     # The diffuse start cancels about seven digits (variance 100 against squared noise 1e-4 and its information).
     torch.testing.assert_close(fast, slow, rtol=1e-9, atol=1e-8)
 
@@ -114,8 +122,9 @@ def test_even_route_equals_filter(channels: str, rows: int, rotating_seed: int) 
 def test_discretisation_is_exact_over_the_switch_to_the_series() -> None:
     """Two half steps make one step, on both sides of the point where the closed form takes over from the series."""
     for lag in (0.01, 0.19, 0.21, 5.0):
-        p = f64(lag), f64(K), f64(Q), f64(ROAD), f64(SD), f64(TIME)
-        half, full = discretise(*p, f64(0.05)), discretise(*p, f64(0.1))
+        half, full = (
+            discretise(f64(lag), f64(K), f64(Q), f64(ROAD), f64(SD), f64(TIME), f64(dt)) for dt in (0.05, 0.1)
+        )
         phi = half.transition
         torch.testing.assert_close(full.transition, phi @ phi, rtol=1e-13, atol=1e-15)
         torch.testing.assert_close(full.gain, (phi @ half.gain[..., None])[..., 0] + half.gain, rtol=1e-12, atol=1e-15)
@@ -123,8 +132,9 @@ def test_discretisation_is_exact_over_the_switch_to_the_series() -> None:
 
 
 def test_stationary_covariance_solves_its_equation() -> None:
-    p = (f64(T, 0.05), f64(K, K), f64(Q, 0.01), f64(0.0, ROAD), f64(SD, 0.01), f64(TIME, 20.0))
-    step = discretise(*p, f64(0.01, 0.01))
+    step = discretise(
+        f64(T, 0.05), f64(K, K), f64(Q, 0.01), f64(0.0, ROAD), f64(SD, 0.01), f64(TIME, 20.0), f64(0.01, 0.01)
+    )
     H, R = f64(1, 0, 0)[None], torch.diag_embed(f64(1e-6, 1e-2)[:, None])
     P = stationary_covariance(step.transition, H, step.noise, R)
     filtered = P - P @ H.mT @ H @ P / (H @ P @ H.mT + R)
@@ -143,14 +153,15 @@ def test_filter_gradients(rotating_seed: int) -> None:
 
     def f(*x: Tensor) -> Tensor:
         noise = {"accel_noise": x[5], "speed_noise": x[6], "road_noise": x[7]}
-        return latent_log_likelihood(*x[:5], time, x[8], accel=x[9], speed=x[10], **noise)
+        lag, gain, rough, sd, slow_time = x[:5]
+        return latent_log_likelihood(lag, gain, rough, sd, slow_time, time, x[8], accel=x[9], speed=x[10], **noise)
 
     assert gradcheck(f, inputs)
     assert gradgradcheck(f, inputs)
 
 
 def test_even_route_gradients(rotating_seed: int) -> None:
-    """In log parameters, as the sampler and Newton's method use them; second derivatives pass through the Riccati limit."""
+    """In log parameters, as sampler and Newton's method use them; both orders pass through the Riccati limit."""
     _, u, a, v = record(40, torch.Generator().manual_seed(rotating_seed), dt=0.1)
     data = EvenRows.build(f64(0.1), u[None], torch.ones(1, 40, dtype=torch.bool), accel=a[None], speed=v[None])
     z = f64(T, K, Q, SD, TIME, ACCEL, SPEED, ROAD).log()[:, None].requires_grad_()
@@ -158,7 +169,7 @@ def test_even_route_gradients(rotating_seed: int) -> None:
     def f(z: Tensor) -> Tensor:
         x = z.exp()
         noise = {"accel_noise": x[5], "speed_noise": x[6], "road_noise": x[7]}
-        return steady_log_likelihood(*x[:5], data, **noise)
+        return steady_log_likelihood(x[0], x[1], x[2], x[3], x[4], data, **noise)
 
     assert gradcheck(f, (z,))
     assert gradgradcheck(f, (z,))
@@ -179,7 +190,7 @@ def test_gradients_are_finite_at_the_edges(lag: float, gain: float) -> None:
 
 def simulate(rows: int, generator: torch.Generator, windows: int) -> LatentWindow:
     """Windows drawn from the model itself, at the values at the head of this file, 100 Hz."""
-    step = discretise(f64(T), f64(K), f64(Q), f64(ROAD), f64(SD), f64(TIME), f64(0.01))
+    step = discretise(f64(T), f64(K), f64(Q), f64(ROAD), f64(SD), f64(TIME), dt=f64(0.01))
     root = torch.linalg.cholesky(step.noise[0])
     u = 0.5 * torch.randn(windows, rows // 100 + 1, generator=generator, dtype=torch.float64).repeat_interleave(100, 1)
     x = torch.zeros(windows, 3, dtype=torch.float64)
@@ -209,8 +220,7 @@ def test_score_has_mean_zero_at_the_truth(rotating_seed: int) -> None:
     windows = 60
     data = simulate(200, torch.Generator().manual_seed(rotating_seed), windows)
     density = LatentDensity(data)
-    truth = {"T_L": T, "K_L": K, "process_noise": Q, "road_noise": ROAD, "speed_noise": SPEED, "coloured_sd": SD, "coloured_time": TIME}
-    z = f64(*(truth[name] for name in density.names)).log().expand(windows, -1).clone().requires_grad_()
+    z = f64(*(TRUTH[name] for name in density.names)).log().expand(windows, -1).clone().requires_grad_()
     (score,) = torch.autograd.grad(density.log_likelihood(z).sum(), z)
     assert bool((score.mean(0).abs() < 5 * score.std(0) / math.sqrt(windows)).all())
 
@@ -230,9 +240,9 @@ def test_density_adds_prior_and_runs_and_keeps_leading_dimensions(rotating_seed:
     expected = torch.zeros(4, 3, 2, dtype=torch.float64)
     for w, rows in pieces:
         one = {name: value[..., w] for name, value in p.items()}
-        five = (one["T_L"], one["K_L"], one["process_noise"], one["coloured_sd"], one["coloured_time"])
-        noise = {"speed_noise": one["speed_noise"], "road_noise": one["road_noise"]}
-        expected[..., w] += latent_log_likelihood(*five, time[w, rows], data.u[w, rows], speed=data.speed[w, rows], **noise)
+        expected[..., w] += latent_log_likelihood(
+            **one, time=time[w, rows], u=data.u[w, rows], speed=data.speed[w, rows]
+        )
     prior = Joint(default_actuation_prior(), default_noise_prior(density.names[2:]))
     torch.testing.assert_close(density.log_prob(z), expected + prior.log_prob(z), rtol=1e-9, atol=1e-7)
 
@@ -245,10 +255,9 @@ def test_uneven_rows_take_the_filter_and_rounded_stamps_do_not() -> None:
     assert even_rows(uneven) is None
     density = LatentDensity(uneven)
     exact = latent_log_likelihood(
-        *(f64(x) for x in (T, K, Q, SD, TIME)), uneven.time, uneven.u, speed=uneven.speed, speed_noise=SPEED, road_noise=ROAD
+        T, K, Q, SD, TIME, uneven.time, uneven.u, speed=uneven.speed, speed_noise=SPEED, road_noise=ROAD
     )
-    values = {"T_L": T, "K_L": K, "process_noise": Q, "road_noise": ROAD, "speed_noise": SPEED, "coloured_sd": SD, "coloured_time": TIME}
-    z = f64(*(values[name] for name in density.names)).log()[None]
+    z = f64(*(TRUTH[name] for name in density.names)).log()[None]
     torch.testing.assert_close(density.log_likelihood(z), exact, rtol=1e-12, atol=0.0)
 
 
@@ -257,6 +266,16 @@ def test_select_and_stack_are_inverse_up_to_padding() -> None:
     again = LatentWindow.stack([data.select(torch.tensor([w])) for w in range(3)])
     assert torch.equal(again.u, data.u)
     assert torch.equal(again.mask, data.mask)
+
+
+def test_temper_is_a_power_on_the_likelihood() -> None:
+    data = simulate(60, torch.Generator().manual_seed(0), windows=1)
+    whole, half = LatentDensity(data), LatentDensity(data, temper=0.5)
+    z = whole.initial()
+    gone = whole.log_prob(z) - half.log_prob(z)
+    torch.testing.assert_close(gone, 0.5 * whole.log_likelihood(z))
+    with pytest.raises(InputError, match="temper"):
+        LatentDensity(data, temper=0.0)
 
 
 def test_names_follow_the_signals() -> None:

@@ -1,4 +1,4 @@
-"""The excitation rule of the latent form: silent commands are refused, steps taken, the measured values never looked at."""
+"""The excitation rule of the latent form: silent commands refused, steps taken, measured values never looked at."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ def test_masked_rows_and_noise_cost_information() -> None:
 
 
 def test_information_is_the_curvature_of_the_likelihood() -> None:
-    """On the noise-free response the likelihood's Hessian in log K_L is the Fisher information, up to the constant force.
+    """On the noise-free response the likelihood's Hessian in log K_L is the Fisher information, up to the slope.
 
-    With the slope's share taken out the rule must promise less than that, and with a command of mean zero nearly as much.
+    A command of mean zero has next to nothing in common with a constant force, so the rule must promise about as much.
     """
     u = torch.sin(2 * math.pi * TIME / 2)
     # the exact response at T_L = 0.3, K_L = 1 to the held command
@@ -70,7 +70,9 @@ def test_information_is_the_curvature_of_the_likelihood() -> None:
     def of_log_gain(x: Tensor) -> Tensor:
         return density.log_likelihood(torch.cat((z[:1], x, z[2:]))[None])[0]
 
-    curvature = -float(torch.autograd.functional.hessian(of_log_gain, z[1:2]))
+    hessian = torch.autograd.functional.hessian(of_log_gain, z[1:2])
+    assert isinstance(hessian, Tensor)
+    curvature = -float(hessian)
     _, bits = latent_excitation(data)
     _, silent = latent_excitation(data, reference=(0.3, 1e-9))
     gain_alone = 0.5 * math.log2(1 + 0.3**2 * curvature)
@@ -81,7 +83,9 @@ def test_information_is_the_curvature_of_the_likelihood() -> None:
 def test_recorded_lap_has_both_kinds(data_dir: Path) -> None:
     """Lap 1: full throttle, a quiet stretch (10 to 20 s), then braking and a sprint."""
     lines = (data_dir / "genesis" / "lap1.csv").read_text().splitlines()[1:]
-    time, u, speed = torch.tensor([[float(x) for x in line.split(",")] for line in lines], dtype=torch.float64).T
+    table = torch.tensor([[float(x) for x in line.split(",")] for line in lines], dtype=torch.float64)
+    time, u, speed = table.unbind(1)
     cut = [(time >= start) & (time < start + 10) for start in (0, 10, 20, 30, 40)]
-    excited, _ = latent_excitation(LatentWindow.stack([LatentWindow.single(time[c], u[c], speed=speed[c]) for c in cut]))
+    windows = [LatentWindow.single(time[c], u[c], speed=speed[c]) for c in cut]
+    excited, _ = latent_excitation(LatentWindow.stack(windows))
     assert excited.tolist() == [True, False, True, True, True]
