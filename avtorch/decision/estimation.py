@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -64,9 +64,7 @@ def estimate(
     Raises `InputError` for a log without accel_cmd, a form whose columns it lacks, or a window longer than the log.
     """
     if log.accel_cmd is None:
-        raise InputError(
-            f"{log.name}: has no accel_cmd; T_L and K_L need the demanded acceleration"
-        )
+        raise InputError(f"{log.name}: has no accel_cmd; T_L and K_L need the demanded acceleration")
     chosen = _form(log, form)
     if not window > 0:
         raise InputError(f"window: found {window:g} s, needs a number above 0")
@@ -81,18 +79,34 @@ def estimate(
     signals = {name: torch.from_numpy(getattr(log, name)) for name in chosen.columns}
     windows: list[WatchedWindow] = []
     begun = clock.perf_counter()
+    last, ahead = -torch.inf, 0.0
     for part in log.segments():
         time = torch.from_numpy(log.time[part])
+        # a segment's clock may start anew, the stream's must go on
+        if float(time[0]) + ahead <= last:
+            ahead = last + window - float(time[0])
+        time = time + ahead
+        last = float(time[-1])
+        seen: list[WatchedWindow] = []
         # block by block, so that progress can be shown and an interruption heard
         for first in range(0, len(time), 1000):
             block = slice(first, first + 1000)
             rows = {name: signal[part][block] for name, signal in signals.items()}
-            windows += watch.feed(time[block], rows, setting, usable=usable[part][block])
+            seen += watch.feed(time[block], rows, setting, usable=usable[part][block])
             if progress is not None:
                 progress(part.start + min(first + 1000, len(time)), log.rows)
-        windows += watch.flush(setting)
+        seen += watch.flush(setting)
+        windows += [_on_the_logs_clock(w, ahead) for w in seen]
     seconds = (clock.perf_counter() - begun) / max(len(windows), 1)
     return Estimates(windows, seconds, "jerk" if isinstance(chosen, JerkForm) else "latent", quality, setting)
+
+
+def _on_the_logs_clock(watched: WatchedWindow, ahead: float) -> WatchedWindow:
+    if ahead == 0.0:
+        return watched
+    # rounded: a nanosecond is less than any clock tells, and more than there and back costs
+    start, end = (round(t - ahead, 9) for t in (watched.window.start_s, watched.window.end_s))
+    return replace(watched, window=replace(watched.window, start_s=start, end_s=end))
 
 
 def _form(log: Log, form: FormName) -> Form:

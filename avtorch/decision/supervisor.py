@@ -21,6 +21,9 @@ from avtorch.vehicle.block import Block
 from avtorch.vehicle.controllers import LinearController
 from avtorch.vehicle.loop import ClosedLoop
 from avtorch.vehicle.plant import GLVDPlant
+from avtorch.vehicle.time_gap import RAMP_RATE
+
+_NEVER = 2**62  # steps
 
 HISTORY_S = 20.0
 """What the strategist replays [s]: ten windows, long enough to hold a manoeuvre of the leader."""
@@ -51,6 +54,7 @@ class Action:
 
     `strategies` lead to `setting` (of shape ``(1,)``) from the default; `sufficient` tells whether it meets the
     strategist's conditions. `peak_gain_true`: the exact peak gain at the true vehicle, None where there is no truth.
+    `driver_delay_s`: where a driver was asked for the time gap, how long until it begins to move; else 0.
     """
 
     time_s: float
@@ -60,6 +64,7 @@ class Action:
     sufficient: bool
     p_string_stable: float
     peak_gain_true: float | None
+    driver_delay_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -76,8 +81,11 @@ class Supervisor:
     """Runs a closed `loop` window by window, watches it, and changes its setting where the monitor is alarmed.
 
     The stability verdict asks the setting in force: the gains are those of a `LinearController`, or the equivalent
-    gains of a controller that tells them (an MPC). Another controller of unknown structure is watched with `setting` given;
-    its actuation is estimated all the same, and only the lower level may be changed.
+    gains of a controller that tells them (an MPC). Another controller of unknown structure is watched with `setting`
+    given; its actuation is estimated all the same, and only the lower level may be changed.
+
+    Where the strategist asks the driver for a longer time gap, lower level and gains change at once, the gap begins to
+    move after the driver's delay, and until then the verdicts are on the setting without it.
 
     Args:
         loop: plant and controllers; its plant may change on the way (`events` of `run`).
@@ -86,6 +94,9 @@ class Supervisor:
         monitor, stream: by default those of the paper's numbers, for the loop's scenarios.
         setting: in force at the start, by default read off the loop's controller and lower level.
         seed: of the sampler's noise.
+
+    Raises `InputError` for a platoon, for parts that do not go together, and for a strategist that may change what the
+    controller cannot.
     """
 
     def __init__(
@@ -107,14 +118,29 @@ class Supervisor:
             raise InputError(f"window: found {window:g} s, needs a multiple of the step {loop.dt:g} s")
         n = loop.scenarios
         stream = BeliefStream(window=window, vehicles=n, seed=seed) if stream is None else stream
-        self.setting = read_setting(loop) if setting is None else setting
-        accepted = (self.setting.T_hat, self.setting.K_hat)
-        self.watch = Watch(stream, Monitor(n, accepted=accepted) if monitor is None else monitor)
+        if stream.vehicles != n or abs(stream.window - window) > 1e-9:
+            raise InputError(
+                f"stream: found {stream.vehicles} vehicles and windows of {stream.window:g} s, "
+                f"needs the loop's {n} and {window:g} s"
+            )
+        if strategist is not None:
+            _check_reach(strategist, loop)
+        self.setting = read_setting(loop) if setting is None else _for_scenarios(setting, n)
+        if monitor is None:
+            dead_time = 0.0 if strategist is None else strategist.dead_time
+            monitor = Monitor(n, accepted=(self.setting.T_hat, self.setting.K_hat), dead_time=dead_time)
+        self.watch = Watch(stream, monitor)
         self.default = self.setting
         self.strategist = strategist
+        # what was decided; the setting in force lags behind it while a driver is asked, until the step `_due`
+        self._ordered = self.setting
+        self._due = torch.full((n,), _NEVER)
         # the model in the lower level is known to be wrong from a detected change until it is updated
         self._model_wrong = torch.zeros(n, dtype=torch.bool)
         self._acted = torch.zeros(n, dtype=torch.bool)
+        self._first = loop.steps_done
+        self._recent: list[Block] = []
+        self._unanswered: list[WatchedWindow] = []
 
     def run(
         self,
@@ -125,9 +151,11 @@ class Supervisor:
     ) -> SupervisedRun:
         """Advance by `duration` [s]. `events` are `(time [s], change)`: at that time `change(loop)` alters the world.
 
-        `progress(seconds done)` is called after each window.
+        `progress(seconds done)` is called after each window. Raises `InputError` for less than one step.
         """
         loop, n = self.loop, self.loop.scenarios
+        if not 0.5 * loop.dt < duration < float("inf"):
+            raise InputError(f"duration: found {duration:g} s, needs at least one step of {loop.dt:g} s")
         end = loop.steps_done + round(duration / loop.dt)
         pending = sorted(((round(t / loop.dt), change) for t, change in events), key=lambda event: event[0])
         blocks: list[Block] = []
@@ -135,18 +163,24 @@ class Supervisor:
         alerts: list[list[Alert]] = [[] for _ in range(n)]
         actions: list[list[Action]] = [[] for _ in range(n)]
         while loop.steps_done < end:
+            for watched in self._unanswered:
+                self._act(watched, actions)
+            self._unanswered = []
             while pending and pending[0][0] <= loop.steps_done:
                 pending.pop(0)[1](loop)
-            until = min(end, (loop.steps_done // self.steps + 1) * self.steps)
+            self._comply()
+            into = (loop.steps_done - self._first) % self.steps
+            until = min(end, loop.steps_done + self.steps - into, int(self._due.min()))
             if pending:
                 until = min(until, pending[0][0])
             block = loop.advance(until - loop.steps_done)
             blocks.append(block)
+            self._remember(block)
             for watched in self._feed(block):
                 windows.append(watched)
                 self._note(watched, alerts)
-                if self.strategist is not None and loop.steps_done < end:
-                    self._act(watched, blocks, actions)
+                # what ends with the run is answered when it goes on
+                self._unanswered.append(watched)
             if progress is not None:
                 progress(loop.time)
         return SupervisedRun(Block.concatenate(blocks), windows, alerts, actions)
@@ -163,12 +197,19 @@ class Supervisor:
             for name in report.names(i):
                 alerts[i].append(Alert(watched.window.end_s, name, report.why(name, i)))
 
-    def _act(self, watched: WatchedWindow, blocks: list[Block], actions: list[list[Action]]) -> None:
-        assert self.strategist is not None
+    def _remember(self, block: Block) -> None:
+        """Keep what the strategist replays, and no more."""
+        self._recent.append(block)
+        enough = round(HISTORY_S / self.loop.dt) + 1
+        while sum(len(b.time) for b in self._recent[1:]) >= enough:
+            self._recent.pop(0)
+
+    def _act(self, watched: WatchedWindow, actions: list[list[Action]]) -> None:
+        if self.strategist is None:
+            return
         report, loop = watched.report, self.loop
         # a setting that was chosen and still does its work stays: the paper warns of changing the controller often
-        p = torch.minimum(report.p_string_stable, report.p_local_stable)
-        content = self._acted & (p >= self.strategist.required)
+        content = self._acted & (self._verdict(watched) >= self.strategist.required)
         self.watch.monitor.accept(report.any & content)
         self._model_wrong |= report.actuation_changed & ~content
         asked = torch.nonzero(report.any & ~content).squeeze(-1)
@@ -180,8 +221,8 @@ class Supervisor:
         decision = self.strategist.decide(
             T_L,
             K_L,
-            History.of_blocks(blocks, seconds=HISTORY_S)[asked],
-            current=self.setting[asked],
+            History.of_blocks(self._recent, seconds=HISTORY_S)[asked],
+            current=self._ordered[asked],
             default=self.default[asked],
             time_gap_now=gap_now[asked],
             model_wrong=self._model_wrong[asked],
@@ -191,13 +232,14 @@ class Supervisor:
         changed = decision.changes
         where = torch.zeros(loop.scenarios, dtype=torch.bool).index_put((asked,), changed)
         if bool(changed.any()):
-            self._put_in_force(_scatter(self.setting, asked, decision.setting), loop)
+            self._order(_scatter(self._ordered, asked, decision.setting))
         truth = _truth(loop)
         for j, i in enumerate(asked.tolist()):
             if not bool(changed[j]):
                 continue
             chosen = decision.setting[j : j + 1]
             gain = None if truth is None else float(chosen.peak_gain(truth[0][i], truth[1][i])[0])
+            waits = int(self._due[i]) - loop.steps_done if int(self._due[i]) < _NEVER else 0
             actions[i].append(
                 Action(
                     loop.time,
@@ -207,6 +249,7 @@ class Supervisor:
                     bool(decision.sufficient[j]),
                     float(decision.p_string_stable[j]),
                     gain,
+                    waits * loop.dt,
                 )
             )
         # what was acted on, or found good as it is, is the new normal; where nothing is sufficient the alarm goes on
@@ -215,9 +258,50 @@ class Supervisor:
         self._model_wrong &= ~where
         self._acted |= where
 
-    def _put_in_force(self, setting: Setting, loop: ClosedLoop) -> None:
-        loop.controller = setting.retarget(loop.controller, at=loop.time)
-        lower = loop.lower_level
+    def _verdict(self, watched: WatchedWindow) -> Tensor:
+        """P(stable) (scenario,) of what was decided: in force, or soon, when the driver has set the time gap."""
+        report = watched.report
+        p = torch.minimum(report.p_string_stable, report.p_local_stable)
+        waiting = self._due < _NEVER
+        if not bool(waiting.any()):
+            return p
+        T_L, K_L = (watched.window.belief.draws[..., i].mT for i in range(2))
+        dead_time = self.watch.monitor.dead_time
+        soon = torch.minimum(
+            self._ordered.p_string_stable(T_L, K_L, dead_time=dead_time),
+            self._ordered.p_locally_stable(T_L, K_L, dead_time=dead_time),
+        )
+        return torch.where(waiting, soon, p)
+
+    def _order(self, setting: Setting) -> None:
+        """Put `setting` in force, but for the longer time gaps that a driver is asked for."""
+        assert self.strategist is not None
+        loop, delay = self.loop, round(self.strategist.driver_delay / self.loop.dt)
+        longer = setting.time_gap > self.setting.time_gap + 1e-9
+        # asked already for this very gap: the driver needs no telling twice
+        asked = (self._due < _NEVER) & ((setting.time_gap - self._ordered.time_gap).abs() <= 1e-9)
+        afresh = torch.full_like(self._due, loop.steps_done + delay)
+        wait = longer & (delay > 0)
+        self._due = torch.where(wait, torch.where(asked, self._due, afresh), _NEVER)
+        self._ordered = setting
+        self._put_in_force()
+
+    def _comply(self) -> None:
+        """Drivers who have had their time set the gap they were asked for."""
+        due = self._due <= self.loop.steps_done
+        if bool(due.any()):
+            self._due = self._due.masked_fill(due, _NEVER)
+            self._put_in_force()
+
+    def _put_in_force(self) -> None:
+        loop, lower = self.loop, self.loop.lower_level
+        gap = torch.where(self._due < _NEVER, self.setting.time_gap, self._ordered.time_gap)
+        setting = self._ordered.replace(time_gap=gap)
+        if hasattr(loop.controller, "retargeted"):
+            rate = RAMP_RATE if self.strategist is None else self.strategist.ramp_rate
+            loop.controller = setting.retarget(loop.controller, at=loop.time, rate=rate)
+            if not isinstance(loop.controller, LinearController):  # its gains follow from the gap
+                setting = setting.replace(gains=read_setting(loop).gains)
         loop.lower_level = setting.lower_level(accel_min=lower.accel_min, accel_max=lower.accel_max)
         self.setting = setting
 
@@ -246,9 +330,31 @@ def _truth(loop: ClosedLoop) -> tuple[Tensor, Tensor] | None:
 
 def _time_gap_now(loop: ClosedLoop, setting: Setting) -> Tensor:
     """The time gap in force [s], (scenario,), on its way to the setting's."""
-    if isinstance(loop.controller, LinearController):
-        return loop.controller.time_gap_at(loop.time).expand(loop.scenarios)
-    return setting.time_gap
+    at = getattr(loop.controller, "time_gap_at", None)
+    return setting.time_gap if at is None else at(loop.time).expand(loop.scenarios)
+
+
+def _for_scenarios(setting: Setting, n: int) -> Setting:
+    """A given setting, (scenario,)."""
+    whole = Setting(**vars(setting), scenarios=n)
+    if whole.shape != (n,):
+        raise InputError(f"setting: found shape {tuple(setting.shape)}, needs one or {n} scenarios")
+    return whole
+
+
+def _check_reach(strategist: Strategist, loop: ClosedLoop) -> None:
+    """Refuse a strategist that may choose what the controller cannot do: the choice would be reported, not made."""
+    controller, grid = loop.controller, strategist.grid
+    if isinstance(controller, LinearController) or grid.allowed <= {1}:
+        return
+    if not hasattr(controller, "retargeted"):
+        raise InputError("strategist: may change time gap or gains, which this controller does not take; allow only 1")
+    if grid.gains_of_gap is None:
+        raise InputError(
+            "strategist: the gains of this controller follow from its time gap; give the grid gains_of_gap"
+        )
+    if loop.scenarios > 1:
+        raise InputError(f"scenarios: found {loop.scenarios}, but this controller has one time gap for all of them")
 
 
 def _of(value: float | Tensor, index: Tensor) -> float | Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from avtorch.decision.monitor import Monitor, MonitorReport
 from avtorch.decision.settings import Setting
+from avtorch.errors import InputError
 from avtorch.inference.stream import BeliefStream, Window
 
 
@@ -23,11 +24,16 @@ class WatchedWindow:
 
 
 class Watch:
-    """A `stream` of beliefs about many vehicles with a `monitor` behind it, one scenario a vehicle."""
+    """A `stream` of beliefs about many vehicles with a `monitor` behind it, one scenario a vehicle.
+
+    Raises `InputError` where the two count differently.
+    """
 
     def __init__(self, stream: BeliefStream, monitor: Monitor | None = None) -> None:
         self.stream = stream
         self.monitor = Monitor(stream.vehicles) if monitor is None else monitor
+        if self.monitor.scenarios != stream.vehicles:
+            raise InputError(f"monitor: found {self.monitor.scenarios} scenarios, needs the stream's {stream.vehicles}")
 
     def feed(
         self,

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference.latent_model import discretise, initial_covariance
+from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, discretise, initial_covariance
 
 
 def _tensor(value: Tensor | float, like: Tensor) -> Tensor:
@@ -39,7 +39,7 @@ def latent_log_likelihood(
     Parameters of shape ``(...)`` or broadcasting to it: ``T_L`` [s], ``K_L`` [-], ``process_noise`` [m/s²/√s],
     ``coloured_sd`` [m/s²], ``coloured_time`` [s], ``accel_noise`` [m/s²] and ``speed_noise`` [m/s] per row,
     ``road_noise`` [m/s/√s]. Data of shape ``(..., time)``: ``time`` [s] increasing, ``u`` [m/s²] held from its row to
-    the next, ``accel`` [m/s²] = a + d + noise, ``speed`` [m/s]. ``mask`` ``(..., time)``: False where a row's
+    the next, ``accel`` [m/s²] and ``speed`` [m/s] as measured. ``mask`` ``(..., time)``: False where a row's
     measurements are not used; its command still acts. Typically parameters are ``(chain, window)`` and data
     ``(window, time)``.
 
@@ -59,7 +59,7 @@ def latent_log_likelihood(
     parameters = torch.broadcast_tensors(*(_tensor(p, u) for p in given))
     rows = u.shape[-1]
     used = torch.ones_like(u, dtype=torch.bool) if mask is None else mask
-    covariance = initial_covariance(parameters[4])
+    covariance = initial_covariance(parameters[4], parameters[5])
     mean = torch.zeros(covariance.shape[:-1], dtype=u.dtype, device=u.device)
 
     # A channel: rows of data, its variance, and the row of the measurement matrix.
@@ -69,9 +69,9 @@ def latent_log_likelihood(
         start = speed.gather(-1, first.expand(*speed.shape[:-1], 1)) if speed.shape[:-1] else speed[first]
         # The filter runs on the deviation from the first measured speed, whose prior mean is thereby zero.
         data = (speed - start).unbind(-1)
-        channels.append((data, _tensor(speed_noise, u) ** 2, u.new_tensor([1.0, 0.0, 0.0])))
+        channels.append((data, _tensor(speed_noise, u) ** 2, u.new_tensor(SPEED_ROW)))
     if accel is not None and accel_noise is not None:
-        channels.append((accel.unbind(-1), _tensor(accel_noise, u) ** 2, u.new_tensor([0.0, 1.0, 1.0])))
+        channels.append((accel.unbind(-1), _tensor(accel_noise, u) ** 2, u.new_tensor(ACCEL_ROW)))
 
     steps = discretise(*(p[..., None] for p in parameters), dt=time.diff().to(u.dtype))
     # Unbound once: the gradient of an index into a row would be as large as all rows, for every row.

@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.inference.latent_model import discretise, initial_covariance
+from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, discretise, initial_covariance
 
 BLOCK = 32
 
@@ -149,14 +149,14 @@ def steady_log_likelihood(
         p.reshape(-1, runs) for p in (T_L, K_L, process_noise, road, coloured_sd, coloured_time)
     )
     step = discretise(T_L, K_L, process_noise, road, coloured_sd, coloured_time, data.dt)
-    phi, B, Q, P0 = step.transition, step.gain, step.noise, initial_covariance(coloured_sd)
+    phi, B, Q, P0 = step.transition, step.gain, step.noise, initial_covariance(coloured_sd, coloured_time)
     sensors = []
     noises = []
     if data.has_speed and speed_noise is not None:
-        sensors.append([1.0, 0.0, 0.0])
+        sensors.append(SPEED_ROW)
         noises.append(speed_noise.reshape(-1, runs) ** 2)
     if data.has_accel and accel_noise is not None:
-        sensors.append([0.0, 1.0, 1.0])
+        sensors.append(ACCEL_ROW)
         noises.append(accel_noise.reshape(-1, runs) ** 2)
     H, R = phi.new_tensor(sensors), torch.diag_embed(torch.stack(noises, -1))
     if not data.has_speed:

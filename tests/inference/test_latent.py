@@ -41,26 +41,27 @@ def dense_log_likelihood(time: Tensor, u: Tensor, used: Tensor, accel: Tensor | 
 
     An interval's noise covariance is the upper right block of exp([[-A, BBᵀ], [0, Aᵀ]] dt) (Van Loan).
     """
-    A = torch.zeros(3, 3, dtype=torch.float64)
-    A[0, 1] = A[0, 2] = 1.0
-    A[1, 1], A[2, 2] = -1 / T, -1 / TIME
-    drive = torch.diag(f64(ROAD**2, Q**2, 2 * SD**2 / TIME))
+    A = torch.zeros(4, 4, dtype=torch.float64)
+    rate = math.sqrt(3) / TIME
+    A[0, 1] = A[2, 3] = 1.0
+    A[1, 1], A[3, 2], A[3, 3] = -1 / T, -(rate**2), -2 * rate
+    drive = torch.diag(f64(ROAD**2, Q**2, 0.0, 4 * rate * SD**2))
     n = len(time)
-    mean, cov = torch.zeros(n, 3, dtype=torch.float64), torch.zeros(n, 3, n, 3, dtype=torch.float64)
-    cov[0, :, 0] = torch.diag(f64(SPEED_SD0**2, ACCEL_SD0**2, SD**2))
+    mean, cov = torch.zeros(n, 4, dtype=torch.float64), torch.zeros(n, 4, n, 4, dtype=torch.float64)
+    cov[0, :, 0] = torch.diag(f64(SPEED_SD0**2, ACCEL_SD0**2, (SD / rate) ** 2, SD**2))
     for k in range(n - 1):
         dt = float(time[k + 1] - time[k])
         phi = torch.linalg.matrix_exp(A * dt)
         loan = torch.linalg.matrix_exp(torch.cat((torch.cat((-A, drive), 1), torch.cat((0 * A, A.T), 1))) * dt)
-        held = torch.zeros(4, 4, dtype=torch.float64)
-        held[:3, :3], held[1, 3] = A, K / T * u[k]
-        mean[k + 1] = phi @ mean[k] + torch.linalg.matrix_exp(held * dt)[:3, 3]
+        held = torch.zeros(5, 5, dtype=torch.float64)
+        held[:4, :4], held[1, 4] = A, K / T * u[k]
+        mean[k + 1] = phi @ mean[k] + torch.linalg.matrix_exp(held * dt)[:4, 4]
         for j in range(k + 1):
             cov[k + 1, :, j] = phi @ cov[k, :, j]
             cov[j, :, k + 1] = cov[k + 1, :, j].T
-        cov[k + 1, :, k + 1] = phi @ cov[k, :, k] @ phi.T + loan[3:, 3:].T @ loan[:3, 3:]
+        cov[k + 1, :, k + 1] = phi @ cov[k, :, k] @ phi.T + loan[4:, 4:].T @ loan[:4, 4:]
     rows, data, noise = [], [], []
-    channels = ((speed, f64(1, 0, 0), SPEED), (accel, f64(0, 1, 1), ACCEL))
+    channels = ((speed, f64(1, 0, 1, 0), SPEED), (accel, f64(0, 1, 0, 1), ACCEL))
     for signal, seen, sd in channels:
         if signal is not None:
             centre = float(signal[used][0]) if signal is speed else 0.0
@@ -68,7 +69,7 @@ def dense_log_likelihood(time: Tensor, u: Tensor, used: Tensor, accel: Tensor | 
             data.append(signal[used] - centre)
             noise += [sd**2] * int(used.sum())
     H = torch.cat(rows).flatten(1)
-    spread = H @ cov.reshape(3 * n, 3 * n) @ H.T + torch.diag(f64(*noise))
+    spread = H @ cov.reshape(4 * n, 4 * n) @ H.T + torch.diag(f64(*noise))
     law = torch.distributions.MultivariateNormal(H @ mean.flatten(), spread)
     return float(law.log_prob(torch.cat(data)))
 
@@ -121,9 +122,9 @@ def test_even_route_equals_filter(channels: str, rows: int, rotating_seed: int) 
 
 def test_discretisation_is_exact_over_the_switch_to_the_series() -> None:
     """Two half steps make one step, on both sides of the point where the closed form takes over from the series."""
-    for lag in (0.01, 0.19, 0.21, 5.0):
+    for lag, length in ((0.01, 0.1), (0.19, 0.34), (0.21, 0.36), (5.0, 20.0)):
         half, full = (
-            discretise(f64(lag), f64(K), f64(Q), f64(ROAD), f64(SD), f64(TIME), f64(dt)) for dt in (0.05, 0.1)
+            discretise(f64(lag), f64(K), f64(Q), f64(ROAD), f64(SD), f64(length), f64(dt)) for dt in (0.05, 0.1)
         )
         phi = half.transition
         torch.testing.assert_close(full.transition, phi @ phi, rtol=1e-13, atol=1e-15)
@@ -135,7 +136,7 @@ def test_stationary_covariance_solves_its_equation() -> None:
     step = discretise(
         f64(T, 0.05), f64(K, K), f64(Q, 0.01), f64(0.0, ROAD), f64(SD, 0.01), f64(TIME, 20.0), f64(0.01, 0.01)
     )
-    H, R = f64(1, 0, 0)[None], torch.diag_embed(f64(1e-6, 1e-2)[:, None])
+    H, R = f64(1, 0, 1, 0)[None], torch.diag_embed(f64(1e-6, 1e-2)[:, None])
     P = stationary_covariance(step.transition, H, step.noise, R)
     filtered = P - P @ H.mT @ H @ P / (H @ P @ H.mT + R)
     again = step.transition @ filtered @ step.transition.mT + step.noise
@@ -193,15 +194,15 @@ def simulate(rows: int, generator: torch.Generator, windows: int) -> LatentWindo
     step = discretise(f64(T), f64(K), f64(Q), f64(ROAD), f64(SD), f64(TIME), dt=f64(0.01))
     root = torch.linalg.cholesky(step.noise[0])
     u = 0.5 * torch.randn(windows, rows // 100 + 1, generator=generator, dtype=torch.float64).repeat_interleave(100, 1)
-    x = torch.zeros(windows, 3, dtype=torch.float64)
+    x = torch.zeros(windows, 4, dtype=torch.float64)
     x[:, 0] = 10.0
-    x[:, 2] = SD * torch.randn(windows, generator=generator, dtype=torch.float64)
+    x[:, 2:] = torch.randn(windows, 2, generator=generator, dtype=torch.float64) * f64(SD * TIME / math.sqrt(3), SD)
     states = []
     for k in range(rows):
         states.append(x)
-        noise = torch.randn(windows, 3, generator=generator, dtype=torch.float64) @ root.T
+        noise = torch.randn(windows, 4, generator=generator, dtype=torch.float64) @ root.T
         x = x @ step.transition[0].T + u[:, k, None] * step.gain[0] + noise
-    v = torch.stack(states, 1)[..., 0]
+    v = torch.stack(states, 1)[..., [0, 2]].sum(-1)
     v = v + SPEED * torch.randn(v.shape, generator=generator, dtype=torch.float64)
     time = (0.01 * torch.arange(rows, dtype=torch.float64)).expand(windows, -1)
     return LatentWindow(time, u[:, :rows], None, v, torch.ones_like(v, dtype=torch.bool))
@@ -249,8 +250,8 @@ def test_density_adds_prior_and_runs_and_keeps_leading_dimensions(rotating_seed:
 
 def test_uneven_rows_take_the_filter_and_rounded_stamps_do_not() -> None:
     data = simulate(100, torch.Generator().manual_seed(0), windows=1)
-    rounded = LatentWindow(data.time + 1e-4 * torch.sin(37 * data.time), data.u, None, data.speed, data.mask)
-    uneven = LatentWindow(data.time + 2e-3 * torch.sin(37 * data.time), data.u, None, data.speed, data.mask)
+    rounded = LatentWindow(data.time + 1e-3 * torch.sin(37 * data.time), data.u, None, data.speed, data.mask)
+    uneven = LatentWindow(data.time + 4e-3 * torch.sin(37 * data.time), data.u, None, data.speed, data.mask)
     assert even_rows(rounded) is not None
     assert even_rows(uneven) is None
     density = LatentDensity(uneven)

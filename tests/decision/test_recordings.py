@@ -1,0 +1,49 @@
+"""The latent form on a real car: a Hyundai Genesis, commanded acceleration and measured speed, three laps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avtorch.decision import Estimates, estimate
+from avtorch.io import Log
+
+
+@pytest.fixture(scope="module")
+def laps(data_dir: Path) -> list[Estimates]:
+    return [estimate(Log.read(data_dir / "genesis" / f"lap{i}.csv"), window=10.0) for i in (1, 2, 3)]
+
+
+def excited(found: Estimates, name: str) -> np.ndarray:
+    """``(window, 2)``: mean and SD of a parameter over the whole 10 s windows that were used."""
+    rows = []
+    for w in found.windows:
+        belief = w.window.belief
+        if bool(belief.excited[0] & belief.converged[0]) and int(w.window.n[0]) > 950:
+            stat = belief.stat(name)
+            rows.append((stat["mean"], stat["sd"]))
+    return np.array(rows)
+
+
+@pytest.mark.slow
+def test_lag_and_gain_of_the_genesis(laps: list[Estimates]) -> None:
+    """Lag and delay together are about 0.32 s there, the gain about 0.96, by whole-lap fits of others."""
+    T, K = (np.concatenate([excited(lap, name) for lap in laps]) for name in ("T_L", "K_L"))
+    assert len(T) >= 9
+    assert abs(np.median(T[:, 0]) - 0.32) <= 0.06
+    assert abs(np.median(K[:, 0]) - 0.96) <= 0.05
+    medians = [np.median(excited(lap, "T_L")[:, 0]) for lap in laps]
+    assert max(medians) - min(medians) <= 0.08
+
+
+@pytest.mark.slow
+def test_spread_of_windows_is_told_by_their_posteriors(laps: list[Estimates]) -> None:
+    """Spread over posterior SD: about 1 for the lag; about 2 for the gain, which differs along the lap (see README)."""
+    T, K = (np.concatenate([excited(lap, name) for lap in laps]) for name in ("T_L", "K_L"))
+    ratio_T, ratio_K = (x[:, 0].std(ddof=1) / np.median(x[:, 1]) for x in (T, K))
+    print(f"spread over posterior SD: T_L {ratio_T:.2f}, K_L {ratio_K:.2f}")
+    assert ratio_T <= 1.5
+    # 1.5 is the aim; what holds today is guarded with a tenth of room, so that it cannot get worse unseen
+    assert ratio_K <= 2.2
