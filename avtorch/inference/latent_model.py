@@ -1,7 +1,7 @@
 r"""The latent-acceleration model and its exact discretisation (SPEC section 3, latent form).
 
-State ``(v, a, c, e)``: the speed that the actuator alone would give, the actuator's acceleration, and what the simulator
-does not know: ``c``, by how much the car is faster than that, and ``e``, the external acceleration, its derivative.
+State ``(v, a, c, e)``: the speed that the actuator alone would give, the actuator's acceleration, and what the
+simulator does not know: ``c``, by how much the car is faster than that, and ``e``, the external acceleration, its derivative.
 
 .. math::
     \dot v = a + g\, w_3, \qquad \dot a = -a/T_L + (K_L/T_L)\, u + q\, w_1, \qquad
@@ -112,7 +112,7 @@ def discretise(
 
 
 def _matern(sd: Tensor, length: Tensor, dt: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor, Tensor]:
-    """Transition entries (row by row) and the three noise moments of ``(c, e)`` over ``dt``; ``sd`` is that of ``e``."""
+    """Transition entries, row by row, and the three noise moments of ``(c, e)`` over ``dt``; ``sd`` is that of ``e``."""
     rate = math.sqrt(3.0) / length
     x = rate * dt
     decay = torch.exp(-x)
@@ -138,8 +138,8 @@ def _lower_gamma(y: Tensor) -> Tensor:
 def initial_covariance(coloured_sd: Tensor, coloured_time: Tensor) -> Tensor:
     """Covariance ``(..., 4, 4)`` of ``(v, a, c, e)`` at the first row, before its measurement.
 
-    The mean is (first measured speed, 0, 0, 0). ``v`` is nearly diffuse, so that its centre carries no information; ``a``
-    is broad, because a window may start anywhere in a drive, after unknown commands; ``c`` and ``e`` are stationary.
+    The mean is (first measured speed, 0, 0, 0). ``v`` is nearly diffuse, so that its centre carries no information;
+    ``a`` is broad, because a window may start anywhere in a drive, after unknown commands; ``c`` and ``e`` are stationary.
     """
     sd, length = torch.broadcast_tensors(coloured_sd, coloured_time)
     one = torch.ones_like(sd)

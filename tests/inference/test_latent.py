@@ -145,7 +145,8 @@ def test_stationary_covariance_solves_its_equation() -> None:
 
 def _gradient_case(generator: torch.Generator) -> tuple[Tensor, tuple[Tensor, ...]]:
     time, u, a, v = record(7, generator, jitter=0.5, dt=0.1)
-    values = [f64(x) for x in (T, K, Q, SD, TIME, ACCEL, SPEED, ROAD)]
+    # sensor noise of order one: finite differences of 1/noise² at 0.03 err by more than gradcheck allows
+    values = [f64(x) for x in (T, K, Q, SD, TIME, 0.5, 0.3, 0.2)]
     return time, tuple(x.requires_grad_() for x in (*values, u, a, v))
 
 
