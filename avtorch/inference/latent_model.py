@@ -1,7 +1,8 @@
 r"""The latent-acceleration model and its exact discretisation (SPEC section 3, latent form).
 
 State ``(v, a, c, e)``: the speed that the actuator alone would give, the actuator's acceleration, and what the
-simulator does not know: ``c``, by how much the car is faster than that, and ``e``, the external acceleration, its derivative.
+simulator does not know: ``c``, by how much the car is faster than that, and its derivative ``e``, an external
+acceleration.
 
 .. math::
     \dot v = a + g\, w_3, \qquad \dot a = -a/T_L + (K_L/T_L)\, u + q\, w_1, \qquad
@@ -100,9 +101,8 @@ def discretise(
     ea, reach, aa, va, vv = _ou(T_L, process_noise**2, dt)
     coloured, cc, ce, ee = _matern(coloured_sd, coloured_time, dt)
     one, zero = torch.ones_like(dt), torch.zeros_like(dt)
-    transition = torch.stack(
-        (one, reach, zero, zero, zero, ea, zero, zero, zero, zero, *coloured[:2], zero, zero, *coloured[2:]), -1
-    ).unflatten(-1, (4, 4))
+    rows = (one, reach, zero, zero, zero, ea, zero, zero, zero, zero, *coloured[:2], zero, zero, *coloured[2:])
+    transition = torch.stack(rows, -1).unflatten(-1, (4, 4))
     gain = torch.stack((K_L * (dt - reach), -K_L * torch.expm1(-dt / T_L), zero, zero), -1)
     shaken = vv + road_noise**2 * dt
     noise = torch.stack(
@@ -112,7 +112,7 @@ def discretise(
 
 
 def _matern(sd: Tensor, length: Tensor, dt: Tensor) -> tuple[tuple[Tensor, ...], Tensor, Tensor, Tensor]:
-    """Transition entries, row by row, and the three noise moments of ``(c, e)`` over ``dt``; ``sd`` is that of ``e``."""
+    """Transition entries row by row and the three noise moments of ``(c, e)`` over ``dt``; ``sd`` is that of ``e``."""
     rate = math.sqrt(3.0) / length
     x = rate * dt
     decay = torch.exp(-x)
@@ -139,7 +139,8 @@ def initial_covariance(coloured_sd: Tensor, coloured_time: Tensor) -> Tensor:
     """Covariance ``(..., 4, 4)`` of ``(v, a, c, e)`` at the first row, before its measurement.
 
     The mean is (first measured speed, 0, 0, 0). ``v`` is nearly diffuse, so that its centre carries no information;
-    ``a`` is broad, because a window may start anywhere in a drive, after unknown commands; ``c`` and ``e`` are stationary.
+    ``a`` is broad, because a window may start anywhere in a drive, after unknown commands; ``c`` and ``e`` are
+    stationary.
     """
     sd, length = torch.broadcast_tensors(coloured_sd, coloured_time)
     one = torch.ones_like(sd)
