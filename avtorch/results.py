@@ -57,6 +57,8 @@ def estimates_answer(estimates: Estimates) -> dict[str, Any]:
         "windows": [window_entry(w) for w in estimates.windows],
         "seconds_per_window": estimates.seconds_per_window,
         "form": estimates.form,
+        "excited_share": estimates.excited_share,
+        "spread_over_sd": {name: estimates.spread_ratio(name) for name in ("T_L", "K_L")},
         "alerts": alert_entries(estimates.windows),
         "assumed": {"time_gap_s": float(setting.time_gap[0]), "gains": setting.gains[0].tolist()},
         "quality": estimates.quality.to_dict(),

@@ -98,4 +98,6 @@ def estimates_note(answer: Mapping[str, Any]) -> str:
         return f"{len(windows)} windows, none excited: the belief is still the first prior."
     last = used[-1]
     text = ", ".join(f"{name} {last[name]['mean']:.3f} ± {last[name]['sd']:.3f}" for name in ("T_L", "K_L"))
-    return f"{len(used)} of {len(windows)} windows excited; the last of them says {text}."
+    spread = [f"{name} {x:.1f}" for name, x in answer["spread_over_sd"].items() if x is not None]
+    told = f" Spread from window to window over posterior SD: {', '.join(spread)}." if spread else ""
+    return f"{len(used)} of {len(windows)} windows excited; the last of them says {text}.{told}"

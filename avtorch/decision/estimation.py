@@ -5,6 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from statistics import median, stdev
 from typing import Any, Literal
 
 import torch
@@ -42,6 +43,18 @@ class Estimates:
         excited = [bool(w.window.belief.excited[0]) for w in self.windows]
         return sum(excited) / len(excited)
 
+    def spread_ratio(self, name: str) -> float | None:
+        """Spread of a parameter from window to window over its posterior SD, None below three used windows.
+
+        About 1 where the vehicle stays as it is and the posterior is honest; above 1.5 the posterior is too narrow for
+        what the log shows, or the vehicle changed (SPEC section 3).
+        """
+        beliefs = [w.window.belief for w in self.windows]
+        stats = [b.stat(name) for b in beliefs if bool(b.excited[0] & b.converged[0])]
+        if len(stats) < 3:
+            return None
+        return stdev(s["mean"] for s in stats) / median(s["sd"] for s in stats)
+
 
 def estimate(
     log: Log,
@@ -74,6 +87,8 @@ def estimate(
         raise InputError(f"window: found {window:g} s, needs at most {longest:g} s, the longest segment of {log.name}")
     quality = check(log)
     setting = Setting() if setting is None else setting
+    if setting.shape != (1,):
+        raise InputError(f"setting: found shape {tuple(setting.shape)}, needs one, (1,), for one log")
     watch = Watch(BeliefStream(window=window, form=chosen, gap=float("inf"), seed=seed, **inference), monitor)
     usable = torch.from_numpy(log.usable)
     signals = {name: torch.from_numpy(getattr(log, name)) for name in chosen.columns}

@@ -1,0 +1,290 @@
+"""`estimate` on logs of a known vehicle: what it recovers, what it leaves out, and what it refuses."""
+
+import numpy as np
+import pytest
+import torch
+
+from avtorch.decision import Monitor, Setting, estimate
+from avtorch.errors import InputError
+from avtorch.inference.sampler import SamplerSettings
+from avtorch.io import Log
+from avtorch.results import estimates_answer
+from avtorch.vehicle import GLVDPlant, Leader, simulate
+
+COLUMNS = ("time", "accel_cmd", "accel", "speed", "jerk", "engaged", "segment")
+QUICK = SamplerSettings(chains=32, draws=30)
+
+
+def drive(T=0.5, K=0.9, *, seconds=20.0, sigma=0.1, seed=1, leader=None):
+    leader = Leader.default(start=48) if leader is None else leader
+    return simulate(leader, duration=seconds, seeds=seed, plant=GLVDPlant(T, K, sigma)).log()
+
+
+def columns(log):
+    return {name: getattr(log, name).copy() for name in COLUMNS if getattr(log, name) is not None}
+
+
+def joined(*logs, **more):
+    """Logs one after the other, each a segment of its own, on the clocks they came with."""
+    parts = [columns(log) for log in logs]
+    made = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+    made["segment"] = np.repeat(np.arange(len(logs)), [log.rows for log in logs])
+    return Log.from_arrays(**(made | more))
+
+
+def spans(estimates):
+    return [(w.window.start_s, w.window.end_s) for w in estimates.windows]
+
+
+def assert_same_belief(some, others):
+    for name in ("mean", "sd", "q05", "q95", "draws"):
+        assert torch.equal(getattr(some, name), getattr(others, name))
+
+
+@pytest.fixture(scope="module")
+def healthy():
+    return drive()
+
+
+def test_the_jerk_form_recovers_the_truth(rotating_seed):
+    truth = (1.2, 0.7, 0.2)
+    found = estimate(drive(*truth[:2], sigma=truth[2], seed=rotating_seed, seconds=24.0), mode="posterior")
+    assert found.form == "jerk"
+    assert found.excited_share >= 0.6
+    belief = found.windows[-1].window.belief
+    for i, value in enumerate(truth):
+        assert abs(float(belief.mean[0, i]) - value) < 5 * float(belief.sd[0, i])
+    # hundreds of rows: it has learned something, too
+    assert float(belief.sd[0, 0]) < 0.05
+    assert float(belief.sd[0, 1]) < 0.03
+    assert found.seconds_per_window > 0.0
+    assert len(found.windows) == 12
+
+
+def test_the_verdict_is_on_the_setting_given(healthy):
+    weak = drive(1.5, 0.5)
+    for setting in (None, Setting(T_hat=1.5, K_hat=0.5), Setting(time_gap=2.5)):
+        found = estimate(weak, setting=setting)
+        setting = Setting() if setting is None else setting
+        assert found.setting.as_dict() == setting.as_dict()
+        last = found.windows[-1]
+        T_L, K_L = (last.window.belief.draws[..., i].mT for i in range(2))
+        assert torch.equal(last.report.p_string_stable, setting.p_string_stable(T_L, K_L))
+    assert any("stability" in w.report.names() for w in estimate(weak).windows)
+    assert not any("stability" in w.report.names() for w in estimate(healthy).windows)
+
+
+def test_the_monitor_given_is_the_one_asked(healthy):
+    found = estimate(healthy, monitor=Monitor(detectors=("accepted_change",), accepted=(2.0, 0.9)))
+    assert next(w.report.names() for w in found.windows if bool(w.window.belief.excited)) == ["accepted_change"]
+
+
+def test_a_drivers_rows_and_those_at_standstill_are_masked():
+    """Rows that another hand or the brakes at rest made are rubbish here, and no rubbish reaches the belief."""
+    log = drive(seconds=16.0, leader=Leader.default(start=44))
+    given = columns(log)
+    still = log.speed < 0.3
+    assert 100 < still.sum() < 800
+    driven = (log.time >= 9.0) & (log.time < 10.5)
+    given["engaged"] = np.where(driven, 0, 1)
+    clean = estimate(Log.from_arrays(**given))
+    for name in ("accel", "jerk", "accel_cmd"):
+        given[name] = np.where(driven | still, 3.0 * np.sin(37.0 * log.time), given[name])
+    rubbish = estimate(Log.from_arrays(**given))
+    for k, (a, b) in enumerate(zip(clean.windows, rubbish.windows, strict=True)):
+        rows = slice(200 * k, 200 * k + 200)
+        assert int(a.window.n[0]) == int((~still & ~driven)[rows].sum())
+        assert_same_belief(a.window.belief, b.window.belief)
+    assert any(bool(w.window.belief.excited) for w in clean.windows)
+    # half a window or less is not used
+    assert not bool(clean.windows[4].window.belief.excited)
+
+
+@pytest.mark.parametrize("rest", ["cruise", "standstill", "constant"])
+def test_a_window_that_says_nothing_leaves_the_belief(healthy, rest):
+    n, rng = 1000, np.random.default_rng(4)
+    zero = np.zeros(n)
+    speed = np.full(n, 0.0 if rest == "standstill" else 20.0)
+    jerk = 0.1 * rng.standard_normal(n) if rest == "cruise" else zero
+    accel = {"cruise": 0.005 * rng.standard_normal(n), "standstill": zero, "constant": np.full(n, 0.45)}[rest]
+    command = {"cruise": 0.005 * rng.standard_normal(n), "standstill": zero - 0.5, "constant": np.full(n, 0.5)}[rest]
+    extra = {"time": 20.0 + 0.01 * np.arange(n), "accel": accel, "accel_cmd": command, "speed": speed, "jerk": jerk}
+    made = columns(healthy)
+    log = Log.from_arrays(**{name: np.concatenate([made[name], extra[name]]) for name in extra})
+    for mode in ("lambda", "posterior", "forgetting"):
+        windows = estimate(log, mode=mode, settings=QUICK).windows
+        assert [bool(w.window.belief.excited) for w in windows[10:]] == [False] * 5
+        assert bool(windows[2].window.belief.excited)
+        for w in windows[10:]:
+            assert_same_belief(w.window.belief, windows[9].window.belief)
+            assert w.report.names() == []
+
+
+def test_a_gap_restarts_the_grid(healthy):
+    keep = (healthy.time < 7.3) | (healthy.time >= 9.55)
+    log = Log.from_arrays(**{k: v[keep] for k, v in columns(healthy).items() if k not in ("engaged", "segment")})
+    found = estimate(log)
+    expected = [(0, 2), (2, 4), (4, 6), (6, 7.3), *((9.55 + 2 * k, 11.55 + 2 * k) for k in range(5)), (19.55, 20.01)]
+    assert np.array(spans(found)) == pytest.approx(np.array(expected), abs=0.011)
+    assert [int(w.window.n[0]) for w in found.windows[1:]] == pytest.approx([200, 200, 130, *[200] * 5, 45], abs=1)
+    assert len(found.quality.gaps) == 1
+
+
+def test_a_clock_that_starts_anew_with_a_segment(healthy):
+    """Two drives in one file, both on a clock from zero: the windows tell each drive's own time."""
+    again = drive(seed=2, seconds=12.0)
+    log = joined(healthy, again)
+    assert [float(log.time[part][0]) for part in log.segments()] == [0.0, 0.0]
+    found = estimate(log)
+    own = [span for part in (healthy, again) for span in spans(estimate(part))]
+    assert np.array(spans(found)) == pytest.approx(np.array(own))
+    assert [s for s, _ in spans(found)[10:]] == [2.0 * k for k in range(6)]
+    # the clock is only a name: told on one that goes on, the belief is the same
+    later = columns(log)
+    later["time"] = np.concatenate([healthy.time, again.time + 1000.0])
+    on = estimate(Log.from_arrays(**later))
+    for a, b in zip(found.windows, on.windows, strict=True):
+        assert int(a.window.n[0]) == int(b.window.n[0])
+        assert_same_belief(a.window.belief, b.window.belief)
+    # a drive from before the first one
+    earlier = columns(log)
+    earlier["time"] = np.concatenate([healthy.time + 500.0, again.time + 3.0])
+    assert [s for s, _ in spans(estimate(Log.from_arrays(**earlier)))[10:]] == [3.0 + 2.0 * k for k in range(6)]
+
+
+def test_segments_that_follow_at_once_are_still_two_drives(healthy):
+    made = columns(healthy)
+    made["segment"] = (healthy.time >= 5.0).astype(int)
+    found = estimate(Log.from_arrays(**made))
+    ends = [end for _, end in spans(found)]
+    assert ends[:4] == pytest.approx([2.0, 4.0, 5.0, 7.0])
+
+
+def test_progress_is_told_in_rows(healthy):
+    log, seen = joined(healthy, drive(seed=2, seconds=8.0)), []
+    estimate(log, progress=lambda done, of: seen.append((done, of)), settings=QUICK)
+    assert [of for _, of in seen] == [log.rows] * len(seen)
+    assert [done for done, _ in seen] == [1000, 2000, 2800]
+
+
+def test_the_seed_decides(healthy):
+    one, again, other = (estimate(healthy, seed=s) for s in (3, 3, 4))
+    for a, b in zip(one.windows, again.windows, strict=True):
+        assert_same_belief(a.window.belief, b.window.belief)
+    last, another = (x.windows[-1].window.belief for x in (one, other))
+    assert not torch.equal(last.draws, another.draws)
+    # but not what is believed: 64 chains of 60 draws leave far less than a tenth of an SD, the windows before add alike
+    assert bool(((last.mean - another.mean).abs() < 0.3 * last.sd).all())
+
+
+def test_further_keywords_reach_the_inference(healthy):
+    tight, loose = (estimate(healthy, mode="lambda", lam=lam).windows[-1].window.belief for lam in (1e-6, 0.25))
+    assert float(tight.sd[0, 0]) < 0.1 * float(loose.sd[0, 0]) + 1e-3
+    with pytest.raises(InputError, match="lam"):
+        estimate(healthy, lam=-1.0)
+
+
+@pytest.mark.slow
+def test_the_latent_form_as_it_is_answered(rotating_seed):
+    """Noisy acceleration and speed, no jerk: `noise` stands in place of `sigma`, and the belief covers the truth."""
+    rng = np.random.default_rng(rotating_seed)
+    full = drive(sigma=0.3, seed=rotating_seed, seconds=15.0, leader=Leader.default(start=48, dt=0.05))
+    accel, speed = (x + sd * rng.standard_normal(full.rows) for x, sd in ((full.accel, 0.05), (full.speed, 0.02)))
+    log = Log.from_arrays(time=full.time, accel_cmd=full.accel_cmd, accel=accel, speed=speed)[100:]
+    assert log.jerk is None
+    found = estimate(log, window=5.0, settings=SamplerSettings(draws=30, attempts=3), seed=rotating_seed)
+    assert found.form == "latent"
+    answer = estimates_answer(found)
+    assert answer["form"] == "latent"
+    names = {"process_noise", "road_noise", "speed_noise", "accel_noise", "coloured_sd", "coloured_time"}
+    for window in answer["windows"]:
+        assert "sigma" not in window
+        assert set(window["noise"]) == names
+        assert set(window["noise"]["speed_noise"]) == {"mean", "sd", "q05", "q95"}
+        assert isinstance(window["excited"], bool)
+    used = [w for w in answer["windows"] if w["used"]]
+    assert used
+    for name, truth in (("T_L", 0.5), ("K_L", 0.9)):
+        for window in used:
+            stat = window[name]
+            assert stat["q05"] < stat["mean"] < stat["q95"]
+            # the reverse of a 5 sigma interval, in the logarithm as the posterior is skewed
+            assert abs(np.log(stat["mean"] / truth)) < 5 * stat["sd"] / stat["mean"]
+
+
+def test_the_jerk_form_as_it_is_answered(healthy):
+    answer = estimates_answer(estimate(healthy, settings=QUICK))
+    assert answer["schema"] == "avtorch.estimates/1"
+    for window in answer["windows"]:
+        assert "noise" not in window
+        assert set(window["sigma"]) == {"mean", "sd", "q05", "q95"}
+
+
+@pytest.mark.slow
+def test_behind_a_recorded_leader_rest_and_cruise_teach_nothing(data_dir):
+    """A production car at AstaZero stands, pulls off to 19 m/s and cruises: only the pull-off tells of the actuator."""
+    path = data_dir / "openacc_astazero" / "ASta_040719_platoon7.csv"
+    leader = Leader.read(path, vehicle=1, duration=100.0)
+    log = drive(0.5, 0.9, seconds=100.0, seed=3, leader=leader)
+    windows = estimate(log).windows
+    kinds = {"standstill": 0, "cruise": 0, "excited": 0}
+    for k, (before, watched) in enumerate(zip([windows[0], *windows], windows, strict=False)):
+        rows = slice(200 * k, 200 * k + 200)
+        belief = watched.window.belief
+        if (log.speed[rows] < 0.3).all():
+            kind = "standstill"
+            assert int(watched.window.n[0]) == 0
+        elif log.speed[rows].min() > 15.0 and np.sqrt(np.mean(log.accel[rows] ** 2)) < 0.1:
+            kind = "cruise"
+        else:
+            kinds["excited"] += bool(belief.excited)
+            continue
+        kinds[kind] += 1
+        assert not bool(belief.excited)
+        assert watched.report.names() == []
+        assert_same_belief(belief, before.window.belief)
+    assert kinds["standstill"] >= 1
+    assert kinds["cruise"] >= 20
+    assert kinds["excited"] >= 1
+    last = windows[-1].window.belief
+    for i, truth in enumerate((0.5, 0.9)):
+        assert abs(float(last.mean[0, i]) - truth) < 5 * float(last.sd[0, i])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"window": 0.0}, "window"),
+        ({"window": -2.0}, "window"),
+        ({"window": float("nan")}, "window"),
+        ({"window": float("inf")}, "window"),
+        ({"window": 20.5}, "longest segment"),
+        ({"form": "best"}, "form"),
+        ({"mode": "none"}, "mode"),
+        ({"forgetting": 0.0}, "forgetting"),
+        ({"monitor": Monitor(2)}, "monitor"),
+        ({"setting": Setting(scenarios=2)}, "setting"),
+    ],
+)
+def test_what_is_refused(healthy, change, message):
+    with pytest.raises(InputError, match=message) as refused:
+        estimate(healthy, **change)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_log_that_lacks_what_a_form_needs_is_refused(healthy):
+    made = columns(healthy)
+    silent = Log.from_arrays(**{k: v for k, v in made.items() if k != "jerk"})
+    with pytest.raises(InputError, match="jerk"):
+        estimate(silent, form="jerk")
+    following = Log.from_arrays(
+        time=healthy.time, speed=healthy.speed, spacing=healthy.spacing, lead_speed=healthy.lead_speed, following=True
+    )
+    with pytest.raises(InputError, match="accel_cmd"):
+        estimate(following)
+
+
+def test_a_window_as_long_as_the_log_is_taken(healthy):
+    """Two thousand rows at 0.01 s span 19.99 s, and are 20 s of log."""
+    (only,) = estimate(healthy, window=20.0, settings=QUICK).windows
+    assert int(only.window.n[0]) == int(healthy.usable.sum())
