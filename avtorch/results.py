@@ -11,7 +11,7 @@ from avtorch.vehicle import performance, stability
 
 if TYPE_CHECKING:
     from avtorch.decision.estimation import Estimates
-    from avtorch.decision.supervisor import SupervisedRun
+    from avtorch.decision.record import SupervisedRun
     from avtorch.decision.watch import WatchedWindow
     from avtorch.vehicle import Block
 

@@ -17,8 +17,9 @@ import torch
 from torch import Tensor
 
 from avtorch.decision.grid import Grid
+from avtorch.decision.record import SupervisedRun
 from avtorch.decision.strategist import Strategist
-from avtorch.decision.supervisor import ALLOWED, SupervisedRun, Supervisor
+from avtorch.decision.supervisor import ALLOWED, Supervisor
 from avtorch.vehicle import ClosedLoop, GLVDPlant, Leader
 
 HEALTHY = (0.3, 1.0)

@@ -26,8 +26,8 @@ from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
+    from avtorch.decision.record import SupervisedRun
     from avtorch.decision.strategist import Strategist
-    from avtorch.decision.supervisor import SupervisedRun
     from avtorch.vehicle import Block, ClosedLoop, Leader
 
 DURATION_S = 80.0

@@ -92,6 +92,8 @@ class SequentialInference:
     ) -> None:
         if mode not in ("lambda", "posterior", "forgetting"):
             raise InputError(f"mode: {mode!r} is none of 'lambda', 'posterior', 'forgetting'")
+        if kept < 2 or vehicles < 1:
+            raise InputError(f"kept, vehicles: found {kept}, {vehicles}, need 2 or more draws and 1 or more vehicles")
         if not lam > 0:
             raise InputError(f"lam: {lam} is not a positive variance")
         if not 0 < forgetting <= 1:

@@ -461,6 +461,7 @@ def test_an_order_overtaken_before_the_driver_complies():
     assert float(supervisor.loop.controller.time_gap_at(9.0)) == 1.0
 
 
+@pytest.mark.slow
 def test_a_plant_that_tells_no_jerk_is_believed_by_the_latent_form():
     truth = GLVDPlant(0.3, 1.0, 0.1)
 
