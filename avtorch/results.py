@@ -28,8 +28,8 @@ def window_entry(watched: WatchedWindow, scenario: int = 0) -> dict[str, Any]:
     actuation = {name: stats.pop(name) for name in ("T_L", "K_L")}
     noise = stats if "sigma" in stats else {"noise": stats}
     return {
-        "start_s": window.start_s,
-        "end_s": window.end_s,
+        "start_s": _seconds(window.start_s),
+        "end_s": _seconds(window.end_s),
         "n": int(window.n[scenario]),
         "excited": excited,
         "used": excited and settled,
@@ -43,7 +43,7 @@ def window_entry(watched: WatchedWindow, scenario: int = 0) -> dict[str, Any]:
 def alert_entries(watched: Sequence[WatchedWindow], scenario: int = 0) -> list[dict[str, Any]]:
     """The alerts of a drive, each at the end of the window that raised it: the moment it could be known."""
     return [
-        {"time_s": w.window.end_s, "detector": name, "why": w.report.why(name, scenario)}
+        {"time_s": _seconds(w.window.end_s), "detector": name, "why": w.report.why(name, scenario)}
         for w in watched
         for name in w.report.names(scenario)
     ]
@@ -83,10 +83,10 @@ def run_answer(
         "schema": "avtorch.run/1",
         "change": dict(zip(("time_s", "T_L", "K_L"), change, strict=True)),
         "windows": [window_entry(w, scenario) for w in run.windows],
-        "alerts": [{"time_s": a.time_s, "detector": a.detector, "why": a.why} for a in run.alerts[scenario]],
+        "alerts": [{"time_s": _seconds(a.time_s), "detector": a.detector, "why": a.why} for a in run.alerts[scenario]],
         "actions": [
             {
-                "time_s": a.time_s,
+                "time_s": _seconds(a.time_s),
                 "strategies": a.strategies,
                 "settings": a.setting.as_dict(),
                 "why": a.why,
@@ -101,6 +101,11 @@ def run_answer(
             "with_action": performance(run.rows, time_gap=last_gap).row(scenario),
         },
     }
+
+
+def _seconds(time: float) -> float:
+    """A time without the round-off of the sum it came from: 35.7, not 35.699999999999996."""
+    return round(time, 9)
 
 
 def finite(value: float | None) -> float | None:

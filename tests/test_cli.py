@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from avtorch.cli import main
+from avtorch.cli.estimate import estimates_note
 from avtorch.io import Log
 from avtorch.vehicle import GLVDPlant, Leader, simulate
 
@@ -110,6 +111,24 @@ def test_quiet_is_quiet_and_a_seed_repeats(drive: Path, tmp_path: Path, capsys: 
     assert windows[0] == windows[1]
 
 
+def test_windows_that_did_not_settle_are_told_apart() -> None:
+    def window(*, excited: bool, used: bool) -> dict:
+        stat = {"mean": 0.3, "sd": 0.01, "q05": 0.28, "q95": 0.32}
+        return {"excited": excited, "used": used, "T_L": stat, "K_L": stat}
+
+    good, lost, calm = (
+        window(excited=True, used=True),
+        window(excited=True, used=False),
+        window(excited=False, used=False),
+    )
+    ratio = {"T_L": None, "K_L": None}
+    note = estimates_note({"windows": [good, lost, calm], "spread_over_sd": ratio})
+    assert note.startswith("2 of 3 windows excited, 1 of them not used")
+    note = estimates_note({"windows": [lost, calm], "spread_over_sd": ratio})
+    assert "first prior" in note
+    assert estimates_note({"windows": [good, calm], "spread_over_sd": ratio}).startswith("1 of 2 windows excited; the")
+
+
 # --- run
 
 
@@ -195,6 +214,8 @@ REFUSED = {
     "unknown unit": ["estimate", "LOG", "--unit", "speed=furlong", *OUT],
     "text in a number": ["estimate", "BROKEN", *OUT],
     "negative seed": ["estimate", "LOG", "--seed=-1", *OUT],
+    "seed no whole number": ["estimate", "LOG", "--seed", "1.5", *OUT],
+    "estimate without a gap": ["estimate", "LOG", "--tau", "0", *OUT],
     "change after the end": ["run", "--change-at", "90", *OUT],
     "change before the start": ["run", "--change-at=-1", *OUT],
     "unknown strategy": ["run", "--strategy", "4", *OUT],
@@ -212,6 +233,7 @@ REFUSED = {
     "limits of one": ["run", "--limits", "4", *OUT],
     "unknown leader": ["run", "--leader", "nobody.csv", *OUT],
     "leader of nonsense": ["run", "--leader", "BROKEN", *OUT],
+    "vehicle no whole number": ["run", "--leader", "LOG", "--vehicle", "1.5", *OUT],
     "event without a file": ["run", "--event", "3", *OUT],
     "run into a file": ["run", "--out", "FILE"],
 }

@@ -173,3 +173,26 @@ def test_style_of_the_reader_is_left_alone() -> None:
 def test_save_refuses_a_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is a directory"):
         plots.save(Figure(), tmp_path)
+
+
+def test_an_excited_window_that_did_not_settle_is_drawn_as_carried_over() -> None:
+    lost = {**window(2.0), "used": False}
+    ax = plots.belief_band(axes(), [{**window(0.0), "used": True}, lost], "T_L")
+    mean = next(line for line in ax.lines if line.get_label() == "mean")
+    x, y = np.asarray(mean.get_xdata(), float), np.asarray(mean.get_ydata(), float)
+    assert np.isnan(y[x > 2.0]).all()
+
+
+def test_an_alarm_that_goes_on_is_marked_where_it_begins_and_where_it_is_acted_upon() -> None:
+    windows = [{**window(t), "alerts": ["stability"]} for t in (0.0, 2.0, 4.0)]
+    alerts = [{"time_s": w["end_s"], "detector": "stability", "why": "x"} for w in windows]
+    actions = [{"time_s": 6.0, "strategies": [1], "settings": SETTING}]
+    figure = plots.probability_figure(windows, answer={"windows": windows, "alerts": alerts, "actions": actions})
+    wide = [line for line in figure.axes[0].lines if line.get_linewidth() == 5]
+    assert [line.get_xdata()[0] for line in wide] == [2.0, 6.0]
+
+
+def test_a_collision_is_named_in_the_spacing() -> None:
+    for spacing, told in ((np.linspace(5.0, -3.0, len(TIME)), 1), (np.full_like(TIME, 5.0), 0)):
+        ax = plots.motion(axes(), TIME, {"without action": spacing}, quantity="spacing")
+        assert [t.get_text() for t in ax.texts] == ["below 0: collision"] * told

@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from cyclopts import Group, Parameter
+from cyclopts import Group, Parameter, Token
 
 from avtorch.errors import InputError
 
 OUTPUT = Group("Output", sort_key=9)
 
+
+def whole_number(_: Any, tokens: Sequence[Token]) -> int:
+    """The parser itself would round 1.5 to a seed of its own."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"found {tokens[0].value!r}, needs a whole number") from None
+
+
 Out = Annotated[Path, Parameter(name="--out", group=OUTPUT, help="Folder for the answer and the pictures.")]
 Json = Annotated[bool, Parameter(name="--json", negative=(), group=OUTPUT, help="Print the answer as JSON, no tables.")]
 Quiet = Annotated[bool, Parameter(name=("--quiet", "-q"), negative=(), group=OUTPUT, help="Print nothing but errors.")]
-Seed = Annotated[int, Parameter(name="--seed", help="Seed of everything random.")]
+Seed = Annotated[int, Parameter(name="--seed", converter=whole_number, help="Seed of everything random.")]
 Gains = Annotated[str, Parameter(name="--gains", help="Gains k_s,k_v,k_a of the upper level.")]
 Lag = Annotated[float, Parameter(name="--T", help="Actuation lag T_L [s].")]
 Gain = Annotated[float, Parameter(name="--K", help="Actuation gain K_L [-].")]

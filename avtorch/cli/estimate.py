@@ -16,7 +16,6 @@ from avtorch.cli.arguments import (
     Seed,
     TimeGap,
     free_folder,
-    not_negative,
     positive,
     seed_number,
     three_gains,
@@ -60,7 +59,7 @@ def estimate(
         CSV or Parquet: time, accel_cmd, and accel or speed. LOG.toml beside it may map names and units.
     """
     positive("--window", window, "s")
-    not_negative("--tau", tau, "s")
+    positive("--tau", tau, "s")
     k = three_gains("--gains", gains)
     free_folder(out)
     seed_number(seed)
@@ -93,11 +92,17 @@ def estimate(
 def estimates_note(answer: Mapping[str, Any]) -> str:
     """One sentence on a list of windows."""
     windows = answer["windows"]
-    used = [w for w in windows if w["excited"]]
-    if not used:
+    excited, used = ([w for w in windows if w[key]] for key in ("excited", "used"))
+    if not excited:
         return f"{len(windows)} windows, none excited: the belief is still the first prior."
+    lost = len(excited) - len(used)
+    count = f"{len(excited)} of {len(windows)} windows excited"
+    if lost:
+        count += f", {lost} of them not used, as their chains did not settle"
+    if not used:
+        return f"{count}; the belief is still the first prior."
     last = used[-1]
     text = ", ".join(f"{name} {last[name]['mean']:.3f} ± {last[name]['sd']:.3f}" for name in ("T_L", "K_L"))
     spread = [f"{name} {x:.1f}" for name, x in answer["spread_over_sd"].items() if x is not None]
     told = f" Spread from window to window over posterior SD: {', '.join(spread)}." if spread else ""
-    return f"{len(used)} of {len(windows)} windows excited; the last of them says {text}.{told}"
+    return f"{count}; the last {'used' if lost else 'of them'} says {text}.{told}"

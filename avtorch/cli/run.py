@@ -21,6 +21,7 @@ from avtorch.cli.arguments import (
     not_negative,
     positive,
     seed_number,
+    whole_number,
 )
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
@@ -39,13 +40,17 @@ BOUNDS = {"T_L": (0.1, 0.4), "K_L": (0.7, 1.0)}
 def run(
     *,
     leader: Annotated[Path | None, Parameter(help="Recorded leader (OpenACC, NGSIM, I-24, CSV); default US06.")] = None,
-    vehicle: Annotated[int | None, Parameter(help="Which vehicle of the leader's file.")] = None,
-    event: Annotated[int | None, Parameter(help="Which event of the leader's file (NGSIM).")] = None,
+    vehicle: Annotated[
+        int | None, Parameter(converter=whole_number, help="Which vehicle of the leader's file.")
+    ] = None,
+    event: Annotated[
+        int | None, Parameter(converter=whole_number, help="Which event of the leader's file (NGSIM).")
+    ] = None,
     duration: Annotated[float | None, Parameter(help="Length of the run [s]; default 80, or the leader's.")] = None,
     window: Annotated[float, Parameter(help="Length of a window [s].")] = 2.0,
     change_at: Annotated[float, Parameter(help="When the vehicle changes [s].")] = 26.0,
-    T: Lag = 1.5,
-    K: Gain = 0.5,
+    T: Annotated[Lag, Parameter(help="Actuation lag T_L from the change on [s].")] = 1.5,
+    K: Annotated[Gain, Parameter(help="Actuation gain K_L from the change on [-].")] = 0.5,
     strategy: Annotated[
         Literal["auto", "1", "2", "3", "none"],
         Parameter(help="What may be done: 1 lower level, 2 time gap as well, 3 gains as well, auto any, none watch."),

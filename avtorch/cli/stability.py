@@ -69,7 +69,9 @@ def stability(
 
     def picture() -> Any:
         here = (point[axes[0]], point[axes[1]])
-        return plots.stability_figure(region, here, omega, curve, peak=peak, title=title)
+        return plots.stability_figure(
+            region, here, omega, curve, peak=peak, stable=answer["locally_stable"], title=title
+        )
 
     write_answer(out, "stability.json", answer, {"stability.png": picture})
     talk.stability(answer)

@@ -54,14 +54,15 @@ class Talk:
         for name in ("time [s]", "rows", "T_L [s]", "90 %", "K_L", "90 %", "P", ""):
             table.add_column(escape(name), justify="left" if name == "" else "right", no_wrap=name != "")
         for w in windows[:most]:
-            style = None if w["excited"] else "dim"
+            style = None if w["used"] else "dim"
+            unused = "not settled" if w["excited"] else "not excited"
             cells = [
                 f"{w['start_s']:.0f}-{w['end_s']:.0f}" if _whole(w) else f"{w['start_s']:.1f}-{w['end_s']:.1f}",
                 str(w["n"]),
             ]
             for name in ("T_L", "K_L"):
                 cells += [f"{w[name]['mean']:.3f}", f"{w[name]['q05']:.2f}-{w[name]['q95']:.2f}"]
-            told = ", ".join(w["alerts"]) if w["alerts"] else "" if w["excited"] else "not excited"
+            told = ", ".join(w["alerts"]) if w["alerts"] else "" if w["used"] else unused
             table.add_row(*cells, f"{w['p_string_stable']:.2f}", told, style="bold yellow" if w["alerts"] else style)
         self.out.print(table)
         self.out.print("P: probability of string stability under the setting in force", style="dim")
@@ -108,6 +109,10 @@ class Talk:
             table.add_row(escape(words), *(_number(both[side][key]) for side in ("without_action", "with_action")))
         self.out.print()
         self.out.print(table)
+        hit = [side.replace("_", " ") for side, seen in both.items() if (seen["min_spacing_m"] or 0.0) < 0]
+        if hit:
+            text = f"Collision {' and '.join(hit)}: what follows it, figures included, is no longer physical."
+            self.out.print(text, style="bold red")
 
     def stability(self, answer: Mapping[str, Any]) -> None:
         table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from avtorch.io import Log
 from avtorch.plots.over_plane import gain_curve, region, setting_region, verdict_legend
 from avtorch.plots.over_time import Steps, Windows, belief_band, data_quality, events, motion, string_probability
-from avtorch.plots.style import GREEN, GREY, styled
+from avtorch.plots.style import GREEN, GREY, VERMILLION, styled
 from avtorch.vehicle import stability
 
 Motion = Mapping[str, Mapping[str, ArrayLike]]
@@ -131,25 +131,32 @@ def stability_figure(
     gain: ArrayLike,
     *,
     peak: tuple[float, float] | None = None,
+    stable: bool = True,
     title: str = "",
 ) -> Figure:
-    """A stability region with one setting in it, beside that setting's gain over frequency."""
+    """A stability region with one setting in it, beside that setting's gain over frequency.
+
+    `stable`: the setting is locally stable; where it is not the gain is only formal, and the picture says so.
+    """
     figure = Figure(figsize=(10.4, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[1, 1.05])
     verdict_legend(region(left, plane, point=point), extra=False)
     gain_curve(right, omega, gain, peak=peak)
     left.set_title("Region")
     right.set_title("Leader's speed to follower's")
+    if not stable:
+        right.text(0.02, 0.97, "locally unstable: formal only", transform=right.transAxes, va="top", color=VERMILLION)
     if title:
         figure.suptitle(title, fontsize=10, color=GREY)
     return figure
 
 
 def _events_of(ax: Axes, answer: Mapping[str, Any]) -> Axes:
-    """Mark an answer's events; of an alarm that goes on over many windows only the first."""
+    """Mark an answer's events; of an alarm that goes on over many windows only the first and those acted upon."""
     windows = answer.get("windows") or []
     went_on = {b["end_s"] for a, b in pairwise(windows) if a["alerts"] and b["alerts"]}
-    alerts = [a for a in answer.get("alerts") or () if a["time_s"] not in went_on]
+    answered = {a["time_s"] for a in answer.get("actions") or ()}
+    alerts = [a for a in answer.get("alerts") or () if a["time_s"] not in went_on - answered]
     change = (answer.get("change") or {}).get("time_s")
     return events(ax, change_s=change, alerts=alerts, actions=answer.get("actions") or ())
 

@@ -19,7 +19,7 @@ _TRACES = {
 }
 
 Windows = Sequence[Mapping[str, Any]]
-"""Windows as an answer holds them: `start_s`, `end_s`, `excited`, `T_L`, `K_L`, `p_string_stable`, ..."""
+"""Windows as an answer holds them: `start_s`, `end_s`, `excited`, `used`, `T_L`, `K_L`, `p_string_stable`, ..."""
 
 Steps = Sequence[tuple[float, float]]
 """A quantity that jumps: `(from this time on [s], value)`."""
@@ -29,6 +29,11 @@ def motion(ax: Axes, time: ArrayLike, traces: Mapping[str, ArrayLike], *, quanti
     """Speeds, accelerations or spacings over time [s]; `traces` by name: leader, without action, with action."""
     for name, values in traces.items():
         ax.plot(np.asarray(time), np.asarray(values), label=name, **_TRACES.get(name, {}))
+    if quantity == "spacing" and any(np.nanmin(np.asarray(values)) <= 0 for values in traces.values()):
+        low, high = ax.get_ylim()
+        ax.axhspan(low, 0.0, color=GREY, alpha=0.25, linewidth=0, zorder=0)
+        ax.text(0.99, 0.03, "below 0: collision", transform=ax.transAxes, ha="right", color=BLACK, fontsize=8)
+        ax.set_ylim(low, high)
     ax.set_ylabel(LABELS.get(quantity, quantity))
     return _span(ax, np.asarray(time)[[0, -1]])
 
@@ -41,7 +46,7 @@ def belief_band(
     truth: Steps | None = None,
     bounds: tuple[float, float] | None = None,
 ) -> Axes:
-    """The belief about one parameter: 90 % interval and mean of each window, paler where the window was not excited.
+    """The belief about one parameter: 90 % interval and mean of each window, paler where the window was not used.
 
     `truth`: what it really was. `bounds`: the design bounds that the controller was built for.
     """
@@ -49,13 +54,13 @@ def belief_band(
         ax.axhspan(
             *bounds, facecolor="none", edgecolor="#DCDCDC", hatch="////", linewidth=0, zorder=0, label="design bounds"
         )
-    for excited, colour, label in ((True, BLUE, "90 % interval"), (False, GREY, "carried over (not excited)")):
-        x, low = _staircase(windows, name, "q05", excited)
-        _, high = _staircase(windows, name, "q95", excited)
-        _, mean = _staircase(windows, name, "mean", excited)
+    for used, colour, label in ((True, BLUE, "90 % interval"), (False, GREY, "carried over (window not used)")):
+        x, low = _staircase(windows, name, "q05", used)
+        _, high = _staircase(windows, name, "q95", used)
+        _, mean = _staircase(windows, name, "mean", used)
         if np.isfinite(mean).any():
-            ax.fill_between(x, low, high, color=colour, alpha=0.3 if excited else 0.18, linewidth=0, label=label)
-            ax.plot(x, mean, color=colour, linewidth=1.8 if excited else 1.0, label="mean" if excited else None)
+            ax.fill_between(x, low, high, color=colour, alpha=0.3 if used else 0.18, linewidth=0, label=label)
+            ax.plot(x, mean, color=colour, linewidth=1.8 if used else 1.0, label="mean" if used else None)
     if truth is not None and windows:
         end = windows[-1]["end_s"]
         x = [t for t, _ in truth] + [end]
@@ -126,7 +131,12 @@ def data_quality(ax: Axes, log: Log, windows: Windows = ()) -> Axes:
     return _span(ax, log.time[[0, -1]])
 
 
-def _staircase(windows: Windows, name: str, key: str, excited: bool) -> tuple[np.ndarray, np.ndarray]:
+def _used(window: Mapping[str, Any]) -> bool:
+    """Whether the belief is the window's own: an excited one whose chains did not settle is carried over, too."""
+    return bool(window.get("used", window["excited"]))
+
+
+def _staircase(windows: Windows, name: str, key: str, used: bool) -> tuple[np.ndarray, np.ndarray]:
     """Both ends of every window; NaN for windows of the other kind and across gaps, so that the line breaks there."""
     x: list[float] = []
     y: list[float] = []
@@ -134,15 +144,15 @@ def _staircase(windows: Windows, name: str, key: str, excited: bool) -> tuple[np
         if x and w["start_s"] > x[-1] + 1e-6:
             x.append(x[-1])
             y.append(np.nan)
-        value = w[name][key] if bool(w["excited"]) == excited else np.nan
+        value = w[name][key] if _used(w) == used else np.nan
         x += [w["start_s"], w["end_s"]]
         y += [value, value]
     return np.array(x), np.array(y)
 
 
 def _reach(windows: Windows, name: str, truth: Steps | None, bounds: tuple[float, float] | None) -> tuple[float, float]:
-    """Limits of the axis: excited windows, truth and bounds in full; a broad first prior may run out of the picture."""
-    used = [w for w in windows if w["excited"]] or list(windows)
+    """Limits of the axis: used windows, truth and bounds in full; a broad first prior may run out of the picture."""
+    used = [w for w in windows if _used(w)] or list(windows)
     values = [w[name][q] for w in used for q in ("q05", "q95")] + [v for _, v in truth or []] + list(bounds or ())
     low, high = min(values, default=0.0), max(values, default=1.0)
     pad = 0.08 * (high - low or 1.0)

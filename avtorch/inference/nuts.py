@@ -1,0 +1,185 @@
+"""The same posterior as a Pyro model, and full-batch NUTS over it: the reference that others wrote.
+
+Needs the extra ``nuts`` (Pyro), so import it by its path. Priors are ``pyro.sample`` statements; the jerk likelihood is
+one, too, where the rows are given, and otherwise a factor. In ``z = log(parameter)``, with Pyro's own Jacobian, the
+model's log density equals that of the density it was made from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, cast
+
+import pyro
+import pyro.distributions as dist
+import torch
+from pyro.infer import MCMC, NUTS
+from pyro.infer.mcmc.util import initialize_model
+from torch import Tensor
+from torch.distributions.constraints import Constraint
+
+from avtorch.errors import InputError
+from avtorch.inference.density import Density
+from avtorch.inference.jerk import JerkDensity
+from avtorch.inference.map import find_mode
+from avtorch.inference.posterior import Posterior, nested_rhat
+from avtorch.inference.priors import HalfNormalPrior, Joint, LogNormalPrior, LogSpaceNormal, Prior, QuadrantNormal
+from avtorch.vehicle.glvd import glvd_jerk
+
+
+class _WithPrior(Density, Protocol):
+    prior: Prior
+
+
+class PositiveNormal(dist.TorchDistribution):
+    """``Normal(loc, scale)`` cut off at zero and renormalised; Pyro has none."""
+
+    def __init__(self, loc: Tensor, scale: Tensor) -> None:
+        self.loc, self.scale = torch.broadcast_tensors(loc, scale)
+        super().__init__(self.loc.shape, validate_args=False)
+
+    @property
+    def support(self) -> Constraint:
+        return dist.constraints.positive
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        inside = torch.special.log_ndtr(self.loc / self.scale)
+        return dist.Normal(self.loc, self.scale).log_prob(value) - inside
+
+    def sample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008
+        below = torch.special.ndtr(-self.loc / self.scale)
+        uniform = torch.rand(self._extended_shape(sample_shape), dtype=self.loc.dtype)
+        cut = (below + (1 - below) * uniform).clamp(1e-300, 1 - 1e-16)
+        return (self.loc + self.scale * torch.special.ndtri(cut)).clamp_min(1e-12)
+
+
+@dataclass(frozen=True)
+class _Site:
+    """One ``pyro.sample`` of the model and the columns of ``z`` it fills; ``log_space``: the sample itself is ``z``."""
+
+    name: str
+    columns: tuple[int, ...]
+    law: dist.TorchDistribution
+    log_space: bool
+
+    def z(self, value: Tensor) -> Tensor:
+        return (value if self.log_space else value.log()).reshape(len(self.columns))
+
+    def unconstrained(self, z: Tensor) -> Tensor:
+        """What Pyro walks in: ``z`` in either case, as the positive constraint is met by ``exp``."""
+        return z[list(self.columns)].reshape(self.law.batch_shape + self.law.event_shape)
+
+
+def _sites(prior: Prior, names: tuple[str, ...], first: int = 0) -> list[_Site]:
+    """The prior of a single window as named distributions."""
+    if isinstance(prior, Joint):
+        return [*_sites(prior.actuation, names[:2], first), *_sites(prior.noise, names[2:], first + 2)]
+    if isinstance(prior, LogSpaceNormal):
+        law = dist.MultivariateNormal(prior.mean_z[0], covariance_matrix=prior.cov_z[0])
+        return [_Site("log_" + "_".join(names), tuple(range(first, first + len(names))), law, True)]
+    laws: list[dist.TorchDistribution]
+    if isinstance(prior, LogNormalPrior):
+        laws = [dist.LogNormal(m.log(), s) for m, s in zip(prior.median, prior.log_sd, strict=True)]
+    elif isinstance(prior, HalfNormalPrior):
+        laws = [dist.HalfNormal(scale) for scale in prior.scale]
+    elif isinstance(prior, QuadrantNormal):
+        sd = torch.as_tensor(prior.variance, dtype=torch.float64).sqrt()
+        laws = [PositiveNormal(mean, sd) for mean in prior.mean.reshape(-1)]
+    else:
+        raise InputError(f"prior: no Pyro distribution is known for {type(prior).__name__}")
+    return [_Site(name, (first + i,), law, False) for i, (name, law) in enumerate(zip(names, laws, strict=True))]
+
+
+class PyroModel:
+    """One window of a density as a Pyro model: call it to run its statements.
+
+    Args:
+        density: a density with a ``prior`` of `avtorch.inference.priors`.
+        window: which of its windows.
+        samples: ``(a, u, jerk)`` [m/s^2, m/s^2, m/s^3], each ``(time,)``: the rows behind a jerk density, whose
+            likelihood then is an observed statement, Eq. 4 row by row; without them it is a factor.
+
+    Raises:
+        InputError: for a window out of range, a prior unknown here, or samples with a density of another form.
+    """
+
+    def __init__(
+        self, density: _WithPrior, *, window: int = 0, samples: tuple[Tensor, Tensor, Tensor] | None = None
+    ) -> None:
+        if not 0 <= window < density.windows:
+            raise InputError(f"window: {window} is not in 0 to {density.windows - 1}")
+        if samples is not None and not isinstance(density, JerkDensity):
+            raise InputError(f"samples: the form of {type(density).__name__} is not that of measured jerk")
+        if isinstance(density, JerkDensity):  # the others evaluate all their windows to read one
+            index = torch.tensor([window])
+            density = JerkDensity(density.statistics.select(index), density.prior.select(index))
+            window = 0
+        self.density, self.window, self.samples = density, window, samples
+        self.names = density.names
+        self.sites = _sites(density.prior.select(torch.tensor([window])), density.names)
+
+    def __call__(self) -> None:
+        z = torch.cat([site.z(cast(Tensor, pyro.sample(site.name, site.law))) for site in self.sites])
+        if self.samples is None:
+            every = z.expand(self.density.windows, -1)
+            likelihood = self.density.log_prob(every) - self.density.prior.log_prob(every)
+            pyro.factor("likelihood", likelihood[self.window])
+            return
+        a, u, jerk = self.samples
+        T_L, K_L, sigma = z.exp()
+        with pyro.plate("time", len(jerk)):
+            pyro.sample("jerk", dist.Normal(glvd_jerk(a, u, T_L, K_L), sigma), obs=jerk)
+
+    def unconstrained(self, z: Tensor) -> dict[str, Tensor]:
+        """``z`` ``(parameter,)`` as Pyro's unconstrained sites."""
+        return {site.name: site.unconstrained(z) for site in self.sites}
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        """Pyro's own log density of ``z`` ``(parameter,)``, Jacobian counted: minus the potential that NUTS sees."""
+        _, potential, _, _ = initialize_model(self, initial_params=self.unconstrained(z))
+        return -potential(self.unconstrained(z))
+
+
+def nuts(
+    density: _WithPrior,
+    *,
+    window: int = 0,
+    samples: tuple[Tensor, Tensor, Tensor] | None = None,
+    chains: int = 1,
+    draws: int = 1000,
+    warmup: int = 500,
+    seed: int = 0,
+    target_accept: float = 0.8,
+    rhat_max: float = 1.1,
+) -> Posterior:
+    """Full-batch NUTS with a dense mass matrix over one window of a density, by Pyro.
+
+    Chains start from the Laplace approximation at the mode and run one after another. PyTorch's global random state is
+    left as it was.
+
+    Args:
+        density, window, samples: see :class:`PyroModel`.
+        warmup: steps of adaptation, dropped.
+
+    Returns:
+        Draws ``(chain, draw, 1, parameter)``; ``converged`` is false where R-hat exceeds ``rhat_max`` or more than 1 %
+        of the draws diverged.
+    """
+    model = PyroModel(density, window=window, samples=samples)
+    mode = find_mode(density)
+    center, scale = mode.z[window], mode.scale[window]
+    walked, diverged = [], 0
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        for _ in range(chains):
+            start = model.unconstrained(center + scale @ torch.randn_like(center))
+            kernel = NUTS(model, full_mass=True, target_accept_prob=target_accept)
+            run = MCMC(kernel, draws, warmup, initial_params=start, disable_progbar=True)
+            run.run()
+            found = run.get_samples()
+            parts = [found[s.name].reshape(draws, -1) if s.log_space else found[s.name].log() for s in model.sites]
+            walked.append(torch.cat([part.reshape(draws, -1) for part in parts], -1))
+            diverged += sum(len(v) for v in run.diagnostics()["divergences"].values())
+    z = torch.stack(walked).unsqueeze(2)
+    settled = (nested_rhat(z).amax(-1) <= rhat_max) & (diverged <= 0.01 * chains * draws)
+    return Posterior(model.names, z.exp(), settled)
