@@ -93,12 +93,13 @@ def run_answer(
                 "sufficient": a.sufficient,
                 "p_string_stable": a.p_string_stable,
                 "peak_gain_true": finite(a.peak_gain_true),
+                "driver_delay_s": a.driver_delay_s,
             }
             for a in actions
         ],
         "performance": {
-            "without_action": performance(without_action, time_gap=time_gap).row(scenario),
-            "with_action": performance(run.rows, time_gap=last_gap).row(scenario),
+            "without_action": _performance(without_action, time_gap, scenario),
+            "with_action": _performance(run.rows, last_gap, scenario),
         },
     }
 
@@ -106,6 +107,14 @@ def run_answer(
 def _seconds(time: float) -> float:
     """A time without the round-off of the sum it came from: 35.7, not 35.699999999999996."""
     return round(time, 9)
+
+
+def _performance(rows: Block, time_gap: float, scenario: int) -> dict[str, Any]:
+    """The measures of a drive, and whether it ended in a collision, after which none of them means much."""
+    return {
+        **performance(rows, time_gap=time_gap).row(scenario),
+        "collided": bool(rows.collided[scenario]),
+    }
 
 
 def finite(value: float | None) -> float | None:

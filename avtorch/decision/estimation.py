@@ -22,6 +22,9 @@ from avtorch.io.quality import Quality, check
 
 FormName = Literal["auto", "jerk", "latent"]
 
+LEAST_ROWS = 10
+"""Rows a window must span: three parameters and their noise from fewer are a guess."""
+
 
 @dataclass(frozen=True)
 class Estimates:
@@ -81,6 +84,9 @@ def estimate(
     chosen = _form(log, form)
     if not window > 0:
         raise InputError(f"window: found {window:g} s, needs a number above 0")
+    if window * log.rate_hz < LEAST_ROWS:
+        least = LEAST_ROWS / log.rate_hz
+        raise InputError(f"window: found {window:g} s, needs {least:g} s or more, {LEAST_ROWS} rows of {log.name}")
     longest = max(float(log.time[part][-1] - log.time[part][0]) for part in log.segments())
     # a window of rows spans one step less than its length
     if window > longest + 1.5 / log.rate_hz:

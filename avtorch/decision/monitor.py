@@ -9,8 +9,9 @@ Detectors, each reported by its own name:
 - `kl`, `hellinger`, `w2`: divergence from a baseline posterior beyond chance at a stated false-alarm rate.
 - `shewhart`, `ewma`, `cusum`: control charts on the standardised innovations, with a stated in-control run length.
 
-The baseline pools all excited windows since the last acceptance that raised no alarm. An unexcited window never alarms
-and moves nothing: it says nothing about the vehicle.
+The baseline pools all excited windows since the last acceptance in which no detector of change was alarmed (a
+stability alarm may be the fault of the setting). An unexcited window never alarms and moves nothing: it says nothing
+about the vehicle.
 """
 
 from __future__ import annotations

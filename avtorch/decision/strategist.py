@@ -166,7 +166,9 @@ class Strategist:
             predicted=predicted,
             strategies=strategies,
             changes=chosen.differs(current),
-            why=_sentences(chosen, current, default, strategies, sufficient, p, predicted, asked, self),
+            why=_sentences(
+                chosen, current, default, strategies, sufficient, p, predicted, asked, self, history.seconds
+            ),
             interim=interim,
             p_interim=interim.p_string_stable(T_L, K_L, dead_time=self.dead_time),
             driver_delay_s=asked * self.driver_delay,
@@ -345,6 +347,7 @@ def _sentences(
     predicted: Prediction,
     asked: Tensor,
     rules: Strategist,
+    seconds: float,
 ) -> list[str]:
     """One sentence a scenario, as a person would say it."""
     out = []
@@ -364,7 +367,8 @@ def _sentences(
         if now == was:
             what = f"setting in force stays ({what})"
         clipped = 100.0 * float(predicted.clipped_share[i])
-        result = f"P(string stable) {float(p[i]):.2f}, {clipped:.1f} % of commands clipped"
+        past = f"{clipped:.1f} % of commands clipped in a replay of the past {seconds:.0f} s"
+        result = f"P(string stable) {float(p[i]):.2f}, {past}"
         if bool(sufficient[i]):
             out.append(f"least intrusive sufficient setting: {what} ({result})")
         else:

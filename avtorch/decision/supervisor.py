@@ -15,6 +15,8 @@ from avtorch.decision.settings import Setting
 from avtorch.decision.strategist import Strategist
 from avtorch.decision.watch import Watch, WatchedWindow
 from avtorch.errors import InputError
+from avtorch.inference.evidence import JerkForm
+from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.stream import BeliefStream
 from avtorch.io.log import STANDSTILL_MPS
 from avtorch.vehicle.block import Block
@@ -79,7 +81,10 @@ class Supervisor:
         if self.steps < 2 or abs(self.steps * loop.dt - window) > 1e-9:
             raise InputError(f"window: found {window:g} s, needs a multiple of the step {loop.dt:g} s")
         n = loop.scenarios
-        stream = BeliefStream(window=window, vehicles=n, seed=seed) if stream is None else stream
+        if stream is None:
+            # a plant that tells no jerk leaves the latent form; nothing is differenced
+            form = JerkForm() if hasattr(loop.plant, "jerk") else LatentForm(accel=True, speed=True)
+            stream = BeliefStream(window=window, vehicles=n, form=form, seed=seed)
         if stream.vehicles != n or abs(stream.window - window) > 1e-9:
             raise InputError(
                 f"stream: found {stream.vehicles} vehicles and windows of {stream.window:g} s, "

@@ -1,11 +1,13 @@
 """What we believe: densities and priors, SGLD, Algorithm 1, and the sequential loop."""
 
+from avtorch.inference.conjugate import Conjugate, sample_conjugate
 from avtorch.inference.density import Density, ScoredDensity, SubsampledDensity
 from avtorch.inference.evidence import Evidence, Form, JerkForm
 from avtorch.inference.excitation import ExcitationRule
 from avtorch.inference.jerk import JerkDensity, JerkPoints, JerkStatistics, jerk_log_likelihood
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.posterior import Posterior, nested_rhat
+from avtorch.inference.quadrature import Quadrature, integrate
 from avtorch.inference.sampler import SamplerSettings, sample
 from avtorch.inference.sequential import Belief, SequentialInference
 from avtorch.inference.sgld import SGLD
@@ -15,6 +17,7 @@ __all__ = [
     "SGLD",
     "Belief",
     "BeliefStream",
+    "Conjugate",
     "Density",
     "Evidence",
     "ExcitationRule",
@@ -25,13 +28,16 @@ __all__ = [
     "JerkStatistics",
     "Mode",
     "Posterior",
+    "Quadrature",
     "SamplerSettings",
     "ScoredDensity",
     "SequentialInference",
     "SubsampledDensity",
     "Window",
     "find_mode",
+    "integrate",
     "jerk_log_likelihood",
     "nested_rhat",
     "sample",
+    "sample_conjugate",
 ]

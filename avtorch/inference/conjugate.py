@@ -43,7 +43,7 @@ class Conjugate:
     inside: Tensor
 
 
-def conjugate(
+def sample_conjugate(
     density: JerkDensity,
     *,
     draws: int = 4000,

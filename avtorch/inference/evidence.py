@@ -61,6 +61,7 @@ class JerkForm:
 
     def evidence(self, rows: Rows, full: float) -> Evidence:
         statistics = JerkStatistics.from_samples(rows["accel"], rows["accel_cmd"], rows["jerk"], rows["usable"])
+        statistics = statistics.with_least_noise()
         return Evidence(
             n=statistics.n,
             excited=self.rule(statistics, full),

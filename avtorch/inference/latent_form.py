@@ -19,7 +19,8 @@ class LatentForm:
     Args:
         accel, speed: which of the two is measured.
         noise: noise level at which excitation is predicted, by name (see :func:`latent_excitation`).
-        share: the least share of a window's rows that must be usable.
+        share: the least share of a window's rows that must be usable; the start of a run is unknown here, so that a
+            short remainder of a drive says less than its rows promise.
     """
 
     def __init__(
@@ -29,7 +30,7 @@ class LatentForm:
         speed: bool,
         noise: Mapping[str, float] | None = None,
         noise_prior: Prior | None = None,
-        share: float = 0.5,
+        share: float = 0.75,
     ) -> None:
         self.names = latent_names(accel=accel, speed=speed)
         self.measured = (*(("accel",) if accel else ()), *(("speed",) if speed else ()))

@@ -19,8 +19,11 @@ from avtorch.inference.map import Mode, find_mode
 
 #: Half width of the grid in SDs to begin with, how much a side grows that still shows mass, and how often.
 REACH, GROWTH, ROUNDS = 7.0, 1.5, 6
-#: Mass beyond a face counts as lost if the marginal there is above this share of its peak.
-FACE = 1e-9
+#: A side reaches too short if the marginal on its face is above the first share of its peak, and too far beyond the
+#: nodes that are above the second.
+FACE, NOTHING = 1e-9, 1e-11
+#: Least nodes an axis from which moments are worth moving to.
+COARSE = 21
 #: Evaluations of the density at once, over nodes and windows.
 BLOCK = 2**20
 
@@ -35,7 +38,7 @@ class Quadrature:
         log_evidence: log integral of the density, ``(window,)``; normalised if likelihood and prior are.
         error: ``(window,)``; what changes if every second node of every axis is left out: the largest of the shift of
             a mean in SDs, the relative change of an SD and the change of the log evidence. As the rule converges
-            faster than any power of the spacing, this bounds the error of the full grid with much to spare.
+            faster than any power of the spacing, a small value bounds the error of the full grid with much to spare.
         edge: ``(window,)``; the largest marginal density on a face of the grid, as a share of its peak.
         converged: ``(window,)`` bool; false where ``error`` exceeds the tolerance or mass reaches the edge.
         nodes: log parameters at the nodes of each marginal, ``(window, parameter, node)``, evenly spaced.
@@ -84,11 +87,12 @@ class Quadrature:
         return {key: float(value[window, i]) for key, value in table.items()}
 
 
-def quadrature(density: Density, *, mode: Mode | None = None, nodes: int = 49, tolerance: float = 0.01) -> Quadrature:
+def integrate(density: Density, *, mode: Mode | None = None, nodes: int = 49, tolerance: float = 0.01) -> Quadrature:
     """Integrate the posterior of every window by the trapezoid rule on a tensor grid.
 
-    The grid is re-centred and rescaled to the moments found until no face shows mass, so that a skewed posterior is
-    covered. Each parameter then gets a grid whose first axis is its own, so that its marginal falls on the nodes.
+    The grid is re-centred and rescaled to the moments found, and its sides trimmed and grown, until it lies where the
+    mass is, so that a skewed posterior is covered. Each parameter then gets a grid whose first axis is its own, so that
+    its marginal falls on the nodes.
 
     Args:
         density: over ``z = log(parameter)``, at most three parameters.
@@ -107,7 +111,7 @@ def quadrature(density: Density, *, mode: Mode | None = None, nodes: int = 49, t
     mode = find_mode(density) if mode is None else mode
     place = _Place.at(mode)
     for _ in range(ROUNDS):  # moments need fewer nodes
-        found = _integrate(density, place, nodes // 2 | 1, mode.log_prob)
+        found = _integrate(density, place, max(COARSE, nodes // 2 | 1), mode.log_prob)
         if found.settled():
             break
         place = place.moved(found)
@@ -219,8 +223,16 @@ class _Place:
         """With longer reach on the sides that showed mass."""
         return replace(self, reach=torch.where(sums.short(), GROWTH * self.reach, self.reach))
 
+    def trimmed(self, sums: _Sums) -> _Place:
+        """With each side ending one node beyond the last that shows anything: the steep side of a skewed posterior."""
+        nodes = sums.marginals.shape[-1]
+        empty = sums.marginals <= NOTHING * sums.marginals.amax(-1, keepdim=True)
+        idle = torch.stack([empty.int().cumprod(-1).sum(-1), empty.flip(-1).int().cumprod(-1).sum(-1)], -1)
+        spacing = self.reach.sum(-1, keepdim=True) / (nodes - 1)
+        return replace(self, reach=self.reach - spacing * (idle - 1).clamp_min(0))
+
     def moved(self, sums: _Sums) -> _Place:
-        """To the moments found, and grown."""
+        """To the moments found, with the sides trimmed and grown to the mass found."""
         lower = self.lower
         # a window whose grid caught a single node has no covariance; it stays, and its error will tell
         sound = torch.linalg.eigvalsh(sums.cov.nan_to_num())[:, 0] > 1e-6
@@ -228,23 +240,25 @@ class _Place:
         cov = lower @ sums.cov @ lower.mT
         center = torch.where(sound[:, None], center, self.center)
         cov = torch.where(sound[:, None, None], 0.5 * (cov + cov.mT), self.cov)
-        return replace(self.grown(sums), center=center, cov=cov)
+        return replace(self.trimmed(sums).grown(sums), center=center, cov=cov)
 
 
 def _integrate(density: Density, place: _Place, nodes: int, reference: Tensor) -> _Sums:
     """One pass, slab by slab of the first axis so that the memory stays bounded."""
     windows, d = place.center.shape
     x, lower = place.x(nodes), place.lower
-    rest = torch.cartesian_prod(*[torch.arange(nodes)] * (d - 1)).reshape(-1, d - 1)  # (node of the slab, d - 1)
-    others = torch.stack([x[:, 1 + j, rest[:, j]] for j in range(d - 1)], -1).transpose(0, 1)
+    count = nodes ** (d - 1)
+    strides = nodes ** torch.arange(d - 2, -1, -1)
+    rest = torch.arange(count)[:, None] // strides % nodes  # the other axes' nodes in a slab, (count, d - 1)
+    others = x[:, 1:].gather(-1, rest.T.expand(windows, -1, -1)).permute(2, 0, 1)  # (count, window, d - 1)
     even = (rest % 2 == 0).all(-1)
     back = [place.order.index(j) for j in range(d)]
-    slabs = max(1, min(nodes, BLOCK // (len(rest) * windows)))
+    slabs = max(1, min(nodes, BLOCK // (count * windows)))
     weights, coarse = [], []
     mean, square = torch.zeros_like(place.center), torch.zeros_like(place.cov)
-    shared = torch.zeros(nodes ** (d - 1), windows, dtype=x.dtype)
+    shared = torch.zeros(count, windows, dtype=x.dtype)
     for k in range(0, nodes, slabs):
-        first = x[:, 0, k : k + slabs].T[:, None, :, None].expand(-1, len(rest), -1, 1)
+        first = x[:, 0, k : k + slabs].T[:, None, :, None].expand(-1, count, -1, 1)
         points = torch.cat([first, others.expand(len(first), -1, -1, -1)], -1)  # (slab, node, window, d)
         z = place.center + torch.einsum("wij,snwj->snwi", lower, points)
         with torch.no_grad():

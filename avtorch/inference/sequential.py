@@ -63,6 +63,9 @@ class SequentialInference:
     - ``"posterior"``: the last posterior, as a normal with full covariance in the log parameters, noise included;
     - ``"forgetting"``: the same with the covariance divided by ``forgetting``, so that old windows fade.
 
+    ``"posterior"`` holds the vehicle for constant, and ``"forgetting"`` for slowly drifting: after a sudden change both
+    stay where they were for many windows and raise the noise instead. ``"lambda"`` follows within a window or two.
+
     Before a vehicle's first excited window its prior is ``first_prior``. Memory does not grow with the windows.
 
     Args:

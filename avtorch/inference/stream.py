@@ -22,7 +22,8 @@ class Window:
     Attributes:
         start_s, end_s: its bounds on the log's own clock [s]; a row belongs to it if ``start_s <= time < end_s``.
         n: usable rows, ``(vehicle,)``.
-        belief: see :class:`Belief`; ``belief.excited`` tells whether the window was used.
+        belief: see :class:`Belief`; the window was used where ``belief.excited`` and
+            ``belief.converged`` hold.
     """
 
     start_s: float

@@ -21,7 +21,7 @@ class Block:
     time), in a replay of candidates (candidate, scenario, time).
 
     One row: the state at `time`, and the command sent then, which acts until the next row. `demanded` is the upper
-    level's wish, `accel_cmd` what the lower level sent after clipping, `clipped` where the two steps differ.
+    level's wish, `accel_cmd` what the lower level sent after clipping, `clipped` where it sits at the limits.
     `accel` is kinematic (0 while standing), `jerk` the instantaneous jerk of that row with its own noise (0 while
     standing, NaN where the plant does not tell). SI units.
     """

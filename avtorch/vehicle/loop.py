@@ -197,7 +197,10 @@ class ClosedLoop:
             held = torch.stack([held_rows.get(i, none).expand(shape) for i in range(len(rows))], -1)
             jerk = torch.where(held, 0.0, jerk)
         time = torch.arange(first, first + len(rows), dtype=torch.float64) * self.dt
-        columns = (command, kinematic, speed, jerk, spacing, lead_v, lead_a, demanded, raw != command)
+        # time first, so that limits (scenario,) stay on the last dimension
+        limited = self.lower_level.at_limit(command.movedim(-1, 0)).movedim(0, -1)
+        clipped = (raw != command) | limited
+        columns = (command, kinematic, speed, jerk, spacing, lead_v, lead_a, demanded, clipped)
         if self.vehicles is not None:
             columns = tuple(c.movedim(-2, 0) for c in columns)
         return Block(time, *columns)

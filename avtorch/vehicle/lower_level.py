@@ -65,6 +65,12 @@ class LowerLevel:
         """`raw` [m/s²] within the vehicle's limits."""
         return torch.clamp(raw, self._limits[0], self._limits[1])  # type: ignore[call-overload]
 
+    def at_limit(self, command: Tensor) -> Tensor:
+        """Where a command sits at the vehicle's limits, whoever put it there (an MPC keeps to them by itself), bool."""
+        low, high = self._limits
+        slack = 1e-6  # [m/s²], what a solver leaves
+        return (command <= low + slack) | (command >= high - slack)
+
     def command(self, a: Tensor, u: Tensor) -> Tensor:
         """The command actually sent [m/s²]: `raw_command`, clipped. This is what the estimator takes as `u`."""
         return self.clip(self.raw_command(a, u))
