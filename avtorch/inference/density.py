@@ -9,7 +9,7 @@ from torch import Tensor
 
 @runtime_checkable
 class Density(Protocol):
-    """A posterior over positive parameters, one per window, in the unconstrained space ``z = log(parameter)``.
+    """A posterior, one per window, in an unconstrained space ``z``: for positive parameters ``z = log(parameter)``.
 
     The potential of a Langevin sampler is ``U(z) = -log_prob(z)``, on the scale of the *whole* window: no mean over the
     points is taken anywhere.
@@ -28,7 +28,7 @@ class Density(Protocol):
     def log_prob(self, z: Tensor) -> Tensor:
         """Log posterior density of ``z`` with shape ``(..., window, parameter)``; returns ``(..., window)``.
 
-        The prior and the Jacobian of ``z = log(parameter)`` are counted; constants of the likelihood are kept.
+        The prior and the Jacobian of ``z`` are counted; constants of the likelihood are kept.
         """
         ...
 
@@ -58,3 +58,26 @@ class ScoredDensity(Density, Protocol):
     def score(self, z: Tensor) -> Tensor:
         """Gradient of ``log_prob`` in ``z``, shape ``(..., window, parameter)``."""
         ...
+
+
+@runtime_checkable
+class SelectableDensity(Density, Protocol):
+    """A density whose windows can be taken apart, so that a sampler works on those that need it."""
+
+    def select(self, index: Tensor) -> Density:
+        """The windows named by ``index``, integers or bool."""
+        ...
+
+
+@runtime_checkable
+class ConstrainedDensity(Density, Protocol):
+    """A density whose parameters are not all positive, or not ``exp(z)``."""
+
+    def constrain(self, z: Tensor) -> Tensor:
+        """Parameters in their own units, each from its own entry of ``z``, shape of ``z``."""
+        ...
+
+
+def constrained(density: Density, z: Tensor) -> Tensor:
+    """Parameters of ``density`` in their own units: ``exp(z)`` unless it says otherwise."""
+    return density.constrain(z) if isinstance(density, ConstrainedDensity) else z.exp()

@@ -12,6 +12,7 @@ from avtorch.inference.density import Density
 from avtorch.inference.excitation import ExcitationRule
 from avtorch.inference.jerk import JerkDensity, JerkStatistics
 from avtorch.inference.priors import Prior, default_jerk_noise_prior
+from avtorch.inference.sampler import SamplerSettings
 
 Rows = Mapping[str, Tensor]
 """One window: ``time`` ``(time,)`` [s] and ``usable`` and the measured columns, each ``(vehicle, time)``."""
@@ -44,6 +45,11 @@ class Form(Protocol):
     @property
     def noise_prior(self) -> Prior: ...
 
+    @property
+    def sampler(self) -> SamplerSettings:
+        """How its posteriors are walked unless the user says otherwise."""
+        ...
+
     def evidence(self, rows: Rows, full: float) -> Evidence:
         """Evidence of a window; ``full`` is the number of rows of a complete one."""
         ...
@@ -54,6 +60,7 @@ class JerkForm:
 
     names = ("T_L", "K_L", "sigma")
     columns = ("accel_cmd", "accel", "jerk")
+    sampler = SamplerSettings()
 
     def __init__(self, *, rule: ExcitationRule | None = None, noise_prior: Prior | None = None) -> None:
         self.rule = ExcitationRule() if rule is None else rule

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
+from avtorch.inference.planes import as_planes
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
 from avtorch.vehicle.glvd import glvd_jerk
 
@@ -105,6 +106,10 @@ class JerkDensity:
     def windows(self) -> int:
         return self.statistics.n.shape[0]
 
+    def select(self, index: Tensor) -> JerkDensity:
+        """The windows named by ``index``."""
+        return JerkDensity(self.statistics.select(index), self.prior.select(index))
+
     def log_likelihood(self, z: Tensor) -> Tensor:
         """Eq. 4 from the sums; ``z = log(T_L, K_L, sigma)``, ``(..., window, 3)``; returns ``(..., window)``."""
         scaled = self._scaled_coefficients(z)
@@ -121,15 +126,20 @@ class JerkDensity:
         return self.log_likelihood(z) + self.prior.log_prob(z)
 
     def score(self, z: Tensor) -> Tensor:
-        """Gradient of :meth:`log_prob` in ``z``, in closed form."""
-        scaled = self._scaled_coefficients(z)
-        # of the half chi2 by the logarithms of the three scaled coefficients
-        if scaled.ndim == 3:  # one product, where einsum spends more on its bookkeeping
-            c = 2 * torch.bmm(scaled.transpose(0, 1), self._half_form).transpose(0, 1) * scaled
-        else:
-            c = 2 * torch.einsum("wij,...wj->...wi", self._half_form, scaled) * scaled
-        lag, gain = c[..., 1] + c[..., 2], -c[..., 2]
-        return torch.stack([lag, gain, c[..., 0] + lag - self.statistics.n], -1) + self.prior.score(z)
+        """Gradient of :meth:`log_prob` in ``z``, in closed form, parameter by parameter (see :func:`as_planes`)."""
+        log_T, log_K, log_sigma = z.unbind(-1)
+        s = self.statistics
+        # (1, 1/T, K/T) / sigma, then half the chi2 differentiated by their logarithms
+        one = (-log_sigma).exp()
+        lag = (-log_sigma - log_T).exp()
+        gain = (log_K - log_T - log_sigma).exp()
+        by_one = one * (s.jj * one).addcmul_(s.aj, lag).addcmul_(s.uj, gain, value=-1)
+        by_lag = lag * (s.aj * one).addcmul_(s.aa, lag).addcmul_(s.au, gain, value=-1)
+        by_gain = gain * (s.uu * gain).addcmul_(s.au, lag, value=-1).addcmul_(s.uj, one, value=-1)
+        by_lag += by_gain
+        by_one += by_lag
+        by_one -= s.n
+        return as_planes(by_lag, -by_gain, by_one).add_(self.prior.score(z))
 
     def initial(self) -> Tensor:
         """Least squares where it gives positive values near the plausible range, else the prior's centre."""
@@ -153,6 +163,11 @@ class JerkPoints(JerkDensity):
     @property
     def points(self) -> int:
         return self._columns.shape[1]
+
+    def select(self, index: Tensor) -> JerkPoints:
+        """The windows named by ``index``."""
+        jerk, a, u = self._columns[index].unbind(-1)
+        return JerkPoints(a, u, jerk, self.prior.select(index))
 
     def log_prob_minibatch(self, z: Tensor, index: Tensor) -> Tensor:
         jerk, a, u = self._columns[:, index].unbind(-1)

@@ -93,6 +93,10 @@ class LatentDensity:
     def windows(self) -> int:
         return self.data.windows
 
+    def select(self, index: Tensor) -> LatentDensity:
+        """The windows named by ``index``."""
+        return LatentDensity(self.data.select(index), self.prior.select(index), temper=self.temper)
+
     def log_likelihood(self, z: Tensor) -> Tensor:
         """``z`` ``(..., window, parameter)``; returns ``(..., window)`` [nats], not tempered."""
         p = dict(zip(self.names, z[..., self._owner, :].exp().unbind(-1), strict=True))

@@ -11,6 +11,10 @@ from avtorch.inference.latent import LatentDensity, default_noise_prior, latent_
 from avtorch.inference.latent_excitation import latent_excitation
 from avtorch.inference.latent_window import LatentWindow
 from avtorch.inference.priors import Prior
+from avtorch.inference.sampler import SamplerSettings
+
+#: A step costs a filter run over the rows for every chain here, so there are fewer chains, each walking for longer.
+SAMPLER = SamplerSettings(chains=96, draws=20, burn_in=12, step=1.5)
 
 
 class LatentForm:
@@ -22,6 +26,8 @@ class LatentForm:
         share: the least share of a window's rows that must be usable; the start of a run is unknown here, so that a
             short remainder of a drive says less than its rows promise.
     """
+
+    sampler = SAMPLER
 
     def __init__(
         self,

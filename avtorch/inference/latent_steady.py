@@ -165,7 +165,9 @@ def steady_log_likelihood(
     n, m = phi.shape[-1], H.shape[0]
 
     P = stationary_covariance(phi, H, Q, R)
-    root = torch.linalg.cholesky(H @ P @ H.mT + R)
+    # far outside the posterior the covariance may lose its digits; the log likelihood is then NaN there, no error
+    root, lost = torch.linalg.cholesky_ex(H @ P @ H.mT + R)
+    root = torch.where((lost > 0)[..., None, None], torch.nan, root)
     white = torch.linalg.inv(root)
     K = P @ H.mT @ white.mT @ white
     M = phi - phi @ K @ H

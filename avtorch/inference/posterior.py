@@ -16,11 +16,13 @@ class Posterior:
         names: parameter names, in the order of the last dimension.
         draws: shape ``(chain, draw, window, parameter)``, in the parameters' own units.
         converged: ``(window,)`` bool; false where the chains left the posterior or disagree: draws not to be used.
+        why: a reason for every window that did not converge, ``""`` for the others; empty if nobody said.
     """
 
     names: tuple[str, ...]
     draws: Tensor
     converged: Tensor
+    why: tuple[str, ...] = ()
 
     def __getitem__(self, name: str) -> Tensor:
         """Draws of one parameter, shape ``(chain, draw, window)``."""
@@ -69,9 +71,14 @@ def nested_rhat(draws: Tensor, groups: int = 8) -> Tensor:
     """
     chains, count = draws.shape[:2]
     groups = max(1, min(groups, chains))
-    chains, half = chains // groups * groups, count // 2
-    members = draws[:chains, : 2 * half].reshape(groups, chains // groups, 2, half, *draws.shape[2:])
-    members = members.transpose(1, 2).flatten(2, 3).flatten(0, 1)  # (group x half, member x draw, ...)
-    within = members.var(1).mean(0)
-    between = members.mean(1).var(0)
+    members, half = chains // groups, count // 2
+    used = draws[: groups * members, : 2 * half]
+    used = used - used[0, 0]  # near zero the sums below keep their digits
+    means, squares = [], []
+    for part in used.split(half, 1):
+        for table, x in ((means, part), (squares, part.square())):
+            table.append(x.sum(1).unflatten(0, (groups, members)).sum(1) / (members * half))
+    mean = torch.cat(means)  # (half x group, ...)
+    within = (torch.cat(squares) - mean.square()).mean(0)
+    between = mean.var(0)
     return (1 + between / within.clamp_min(torch.finfo(draws.dtype).tiny)).sqrt()

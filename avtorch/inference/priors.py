@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
+from avtorch.inference.planes import join_planes
 
 _LOG_2PI = math.log(2 * math.pi)
 
@@ -193,7 +194,7 @@ class Joint:
         return self.actuation.log_prob(z[..., :2]) + self.noise.log_prob(z[..., 2:])
 
     def score(self, z: Tensor) -> Tensor:
-        return torch.cat([self.actuation.score(z[..., :2]), self.noise.score(z[..., 2:])], dim=-1)
+        return join_planes(self.actuation.score(z[..., :2]), self.noise.score(z[..., 2:]))
 
     def select(self, index: Tensor) -> Joint:
         return Joint(self.actuation.select(index), self.noise.select(index))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import cast
 
 import torch
 from torch import Tensor
@@ -12,15 +11,33 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from avtorch.errors import InputError
-from avtorch.inference.density import Density, ScoredDensity, SubsampledDensity
+from avtorch.inference.density import Density, ScoredDensity, SelectableDensity, SubsampledDensity, constrained
 from avtorch.inference.map import Mode, find_mode
+from avtorch.inference.planes import empty_planes
 from avtorch.inference.posterior import Posterior, nested_rhat
 from avtorch.inference.sgld import SGLD, Noise
+from avtorch.inference.whitening import Coordinates, Whitening, stiffness
+
+#: Chains times windows walked at once: enough to drown the cost of a call, few enough to stay in the processor's cache.
+BLOCK = 2**15
+
+#: A window stiffer than this is whitened afresh by a pilot walk.
+UNEVEN = 4.0
+#: A window stiffer than this many times the lengthening of its walk has not mixed: its burn-in is shorter than its
+#: relaxation time.
+STUCK = 4.0
+#: Largest slope that a burn-in step follows, in whitened coordinates; within the posterior slopes are a few units.
+TAMED = 10.0
+
+MakeOptimizer = Callable[[list[Tensor], float, torch.Generator | None], Optimizer]
 
 
 @dataclass(frozen=True)
 class SamplerSettings:
     """How Algorithm 1 walks. The space is whitened by the Laplace covariance at the mode, so one step fits every car.
+
+    A window whose posterior is skewed gets a shorter step and in proportion more of them (:func:`stiffness`), so that
+    every window ends with about the same number of effective draws: there is no knob to turn for a new car.
 
     Attributes:
         chains: chains per window.
@@ -33,18 +50,22 @@ class SamplerSettings:
         spread: chains start this many posterior SDs around the mode; 0 starts them at the mode.
         schedule: makes a learning-rate scheduler from the optimizer, or ``None`` for a constant step.
         attempts: how often a window whose chains diverge or disagree is run again with half the step.
+        whitening: ``"full"``, or for comparison ``"diagonal"`` or ``"none"`` (see :class:`Coordinates`).
+        optimizer: makes another optimizer than SGLD from ``(parameters, step, generator)``.
     """
 
-    chains: int = 64
-    draws: int = 60
-    burn_in: int = 15
-    thinning: int = 1
-    step: float = 1.5
+    chains: int = 512
+    draws: int = 8
+    burn_in: int = 8
+    thinning: int = 2
+    step: float = 2.0
     noise: Noise = "averaged"
     batch: int | None = None
     spread: float = 0.0
     schedule: Callable[[Optimizer], LRScheduler] | None = None
     attempts: int = 4
+    whitening: Whitening = "full"
+    optimizer: MakeOptimizer | None = None
 
     def __post_init__(self) -> None:
         for name, least in (("chains", 1), ("draws", 4), ("burn_in", 0), ("thinning", 1), ("attempts", 1)):
@@ -52,10 +73,16 @@ class SamplerSettings:
                 raise InputError(f"{name}: {getattr(self, name)} is less than {least}")
         if not 0 < self.step < 4:
             raise InputError(f"step: {self.step} is not in (0, 4), where the whitened step is stable")
-        if self.spread < 0:
-            raise InputError(f"spread: {self.spread} is negative")
+        if not 0 <= self.spread < float("inf"):
+            raise InputError(f"spread: {self.spread} is not a finite number of posterior SDs, 0 or more")
         if self.batch is not None and self.batch < 1:
             raise InputError(f"batch: {self.batch} is less than 1")
+        if self.whitening not in ("full", "diagonal", "none"):
+            raise InputError(f"whitening: {self.whitening!r} is none of 'full', 'diagonal', 'none'")
+
+    def slower(self, times: int) -> SamplerSettings:
+        """The same walk in steps ``times`` as many, for a step that is ``times`` shorter."""
+        return replace(self, burn_in=times * self.burn_in, thinning=times * self.thinning)
 
 
 def sample(
@@ -69,97 +96,160 @@ def sample(
     """Draws from the posterior of every window (Algorithm 1).
 
     A window whose chains leave the finite numbers or the posterior, or end with a nested R-hat above ``rhat_max``, is
-    sampled again, with half the step and twice the steps; one that never settles comes back with ``converged`` false.
+    sampled again, with half the step and twice the steps; one that never settles comes back with ``converged`` false
+    and the reason in ``why``.
 
     Args:
-        density: the target, over ``z = log(parameter)``.
+        density: the target.
         mode: its mode and curvature, if known.
     """
     settings = SamplerSettings() if settings is None else settings
     mode = find_mode(density) if mode is None else mode
-
-    def unsettled(draws: Tensor) -> Tensor:
-        rhat = nested_rhat(draws).amax(-1)
-        return ~(rhat <= rhat_max) | _strayed(density, mode, draws)  # NaN is trouble, too
-
-    draws = walk(density, mode, settings, generator=generator)
-    trouble = unsettled(draws)
-    slower = settings
-    for _ in range(settings.attempts - 1):
-        if not bool(trouble.any()):
+    mode, pace = _adapted(density, mode, settings, generator)
+    # all draws of a parameter of a window behind one another, as its summaries read them
+    draws = torch.empty(*mode.z.shape, settings.chains, settings.draws, dtype=mode.z.dtype).permute(2, 3, 0, 1)
+    strayed, apart, stuck = (torch.zeros_like(mode.converged) for _ in range(3))
+    # chains that agree still differ by chance: eight groups cut into halves of this many draws each
+    members = max(1, settings.chains // 8) * (settings.draws // 2)
+    limit = (rhat_max**2 + 4 / members) ** 0.5
+    open_ = torch.arange(density.windows)
+    for _ in range(settings.attempts):
+        for index in _batches(density, open_, pace, settings.chains):
+            part, where = _select(density, index), mode.select(index)
+            times = int(_octave(pace[index]).amax())
+            coordinates, w = _walk(part, where, settings.slower(times), pace[index], generator)
+            fresh = torch.isin(index, open_)
+            new = index[fresh]
+            strayed[new] = _strayed(part, where, coordinates, w)[fresh]
+            apart[new] = ~(nested_rhat(w).amax(-1) <= limit)[fresh]  # NaN is trouble, too
+            stuck[new] = pace[new] > STUCK * times
+            values = constrained(density, coordinates.z(w))
+            draws[:, :, new] = values if len(new) == len(index) else values[:, :, fresh]
+        pace = 2 * pace
+        open_ = (strayed | apart).nonzero().squeeze(-1)
+        if not len(open_):
             break
-        slower = replace(slower, step=slower.step / 2, burn_in=2 * slower.burn_in, thinning=2 * slower.thinning)
-        again = walk(density, mode, slower, generator=generator)
-        draws = torch.where(trouble[:, None], again, draws)
-        trouble = trouble & unsettled(again)
-    return Posterior(density.names, draws.exp(), mode.converged & ~trouble)
+    flags = zip(mode.converged.tolist(), strayed.tolist(), apart.tolist(), stuck.tolist(), strict=True)
+    why = tuple(_why(*flag) for flag in flags)
+    return Posterior(density.names, draws, torch.tensor([not reason for reason in why]), why)
 
 
-def _strayed(density: Density, mode: Mode, draws: Tensor, depth: float = 200.0) -> Tensor:
+def _adapted(
+    density: Density, mode: Mode, settings: SamplerSettings, generator: torch.Generator | None
+) -> tuple[Mode, Tensor]:
+    """Whitening and stiffness of every window.
+
+    Where the Laplace covariance at the mode fits badly (one window in fifty), a pilot walk's mean and covariance take
+    its place if they are less stiff.
+    """
+    coordinates = Coordinates.of(mode, settings.whitening)
+    pace = stiffness(density, coordinates)
+    uneven = (pace > UNEVEN).nonzero().squeeze(-1)
+    if settings.whitening != "full" or not len(uneven):
+        return mode, pace
+    fitted, fitted_pace = mode, pace.clone()
+    for index in _batches(density, uneven, pace, settings.chains):
+        part, where = _select(density, index), mode.select(index)
+        times = int(_octave(pace[index]).amax())
+        coordinates, w = _walk(part, where, settings.slower(times), pace[index], generator)
+        better = where.refitted(coordinates.z(w).flatten(0, 1))
+        quicker = stiffness(part, Coordinates.of(better))
+        fitted = fitted.replaced(index, better, quicker < pace[index])
+        fitted_pace[index] = torch.minimum(quicker, pace[index])
+    return fitted, fitted_pace
+
+
+def _why(mode_found: bool, strayed: bool, apart: bool, stuck: bool) -> str:
+    if not mode_found:
+        return "the search for the posterior's mode did not end at a maximum"
+    if stuck:
+        return "the posterior is so uneven that the longest walk would not cross it"
+    if strayed:
+        return "chains left the posterior, also with the shortest step tried"
+    return "chains disagree, also with the shortest step tried" if apart else ""
+
+
+def _octave(pace: Tensor) -> Tensor:
+    """The nearest power of two, from 1 to 64."""
+    return 2.0 ** pace.log2().round().clamp(0, 6)
+
+
+def _batches(density: Density, index: Tensor, pace: Tensor, chains: int) -> list[Tensor]:
+    """Windows to walk together: of one octave of the pace, and not too many at once."""
+    if not isinstance(density, SelectableDensity):
+        return [torch.arange(density.windows)]
+    size = max(1, BLOCK // chains)
+    octaves = _octave(pace[index])
+    return [part for octave in octaves.unique() for part in index[octaves == octave].split(size)]
+
+
+def _select(density: Density, index: Tensor) -> Density:
+    if len(index) == density.windows or not isinstance(density, SelectableDensity):
+        return density
+    return density.select(index)
+
+
+def _strayed(density: Density, mode: Mode, coordinates: Coordinates, w: Tensor, depth: float = 200.0) -> Tensor:
     """Where some chain's furthest draw lies ``depth`` nats off the mode, ``(window,)`` bool.
 
     R-hat alone overlooks the few chains that diverge: they blow up the variance within as much as that between.
     A draw of the posterior lies ``chi^2/2`` nats deep, so 200 is out of reach even for a tenfold variance.
     """
-    whitened = torch.einsum("wij,cnwj->cnwi", torch.linalg.inv(mode.scale), draws - mode.z)
-    furthest = whitened.square().sum(-1).nan_to_num(nan=torch.inf).argmax(1)
+    distance = w.square().sum(-1).nan_to_num_(nan=torch.inf)
+    furthest = distance.transpose(0, 1).flatten(0, 1).argmax(0)  # in the order of memory
     with torch.no_grad():
-        far = draws.take_along_dim(furthest[:, None, :, None], dim=1).squeeze(1)
-        return ~((mode.log_prob - density.log_prob(far)).abs() <= depth).all(0)
-
-
-def stiffness(density: Density, mode: Mode, radius: float = 3.0) -> Tensor:
-    """How much steeper than its Laplace approximation the whitened potential gets ``radius`` SDs out.
-
-    Shape ``(window,)``, at least 1.
-    A skewed posterior (a weak window) has a steep side on which the step that suits the mode overshoots; dividing the
-    window's step by this keeps ``step x curvature`` what it is at the mode of a Gaussian.
-    """
-    d = mode.z.shape[-1]
-    axes = radius * torch.eye(d, dtype=mode.z.dtype)
-    probes = torch.cat([axes, -axes])[:, None, :].expand(-1, mode.z.shape[0], d).clone().requires_grad_()
-    potential = -density.log_prob(mode.z + torch.einsum("wij,cwj->cwi", mode.scale, probes))
-    (gradient,) = torch.autograd.grad(potential.sum(), probes)
-    slope = torch.einsum("cwi,cwi->cw", gradient, probes.detach()) / radius**2
-    return slope.nan_to_num(posinf=1e6).amax(0).clamp(1.0, 1e6)
+        far = coordinates.z(w.transpose(0, 1).flatten(0, 1)[furthest, torch.arange(w.shape[2])])
+        return ~((mode.log_prob - density.log_prob(far)).abs() <= depth)
 
 
 def walk(
-    density: Density, mode: Mode, settings: SamplerSettings, *, generator: torch.Generator | None = None
+    density: Density,
+    mode: Mode,
+    settings: SamplerSettings,
+    *,
+    pace: Tensor | None = None,
+    generator: torch.Generator | None = None,
 ) -> Tensor:
-    """One run of Algorithm 1 in the whitened coordinates ``z = mode + scale w``.
+    """One run of Algorithm 1 in the whitened coordinates, with step ``settings.step / pace``.
 
-    Returns draws of ``z``, ``(chain, draw, window, d)``. A step ``h`` in ``w`` is a step 1 in ``w/sqrt(h)``, so each
-    window's own step is folded into its scale.
+    ``pace``, ``(window,)``, is the :func:`stiffness` by default. Returns draws of ``z``, ``(chain, draw, window, d)``.
     """
-    scale = mode.scale / stiffness(density, mode).sqrt()[:, None, None]
+    pace = stiffness(density, Coordinates.of(mode, settings.whitening)) if pace is None else pace
+    coordinates, w = _walk(density, mode, settings, pace, generator)
+    return coordinates.z(w)
+
+
+def _walk(
+    density: Density, mode: Mode, settings: SamplerSettings, pace: Tensor, generator: torch.Generator | None
+) -> tuple[Coordinates, Tensor]:
+    """Draws ``(chain, draw, window, d)`` in the coordinates returned with them."""
+    # each window's own step is folded into its scale
+    coordinates = Coordinates.of(mode, settings.whitening).slowed(pace)
     shape = (settings.chains, *mode.z.shape)
-    start = torch.zeros(shape, dtype=mode.z.dtype)
+    w = empty_planes(*shape, dtype=mode.z.dtype).zero_()
     if settings.spread > 0:
-        start = settings.spread * torch.randn(shape, dtype=mode.z.dtype, generator=generator)
-        start = torch.einsum("wij,cwj->cwi", torch.linalg.solve(scale, mode.scale), start)
-    w = start.requires_grad_()
-    optimizer = SGLD([w], settings.step, noise=settings.noise, generator=generator)
+        start = torch.randn(shape, dtype=w.dtype, generator=generator)
+        w += settings.spread * pace.sqrt()[:, None] * start
+    w.requires_grad_()
+    if settings.optimizer is None:
+        options = {"noise": settings.noise, "noise_dtype": torch.float32}
+        optimizer: Optimizer = SGLD([w], settings.step, generator=generator, **options)
+    else:
+        optimizer = settings.optimizer([w], settings.step, generator)
     scheduler = None if settings.schedule is None else settings.schedule(optimizer)
+    gradient = _gradient(density, coordinates, w, settings.batch, generator)
+    graph = any(group.get("preconditioner") for group in optimizer.param_groups)
+    kept = empty_planes(settings.draws, *shape, dtype=w.dtype)
 
-    def potential() -> Tensor:
-        z = mode.z + torch.einsum("wij,cwj->cwi", scale, w)
-        if settings.batch is None:
-            return -density.log_prob(z).sum()
-        if not isinstance(density, SubsampledDensity):
-            raise InputError(f"batch: {type(density).__name__} has no minibatch estimate; leave batch at None")
-        index = torch.randint(density.points, (settings.batch,), generator=generator)
-        return -density.log_prob_minibatch(z, index).sum()
+    def closure() -> Tensor | None:
+        if graph:  # differentiates the potential itself, and again
+            return -_log_prob(density, coordinates.z(w), settings.batch, generator).sum()
+        w.grad = gradient()
+        if k < settings.burn_in:
+            # far out the slope may be anything, and a step along it would throw the chain further still
+            w.grad.nan_to_num_(nan=0.0).clamp_(-TAMED, TAMED)
+        return None
 
-    def scored_potential() -> None:
-        # a density that knows its own gradient saves the graph: half the time of a small window's step
-        z = mode.z + torch.bmm(w.detach().transpose(0, 1), scale.mT).transpose(0, 1)
-        score = cast(ScoredDensity, density).score(z)
-        w.grad = -torch.bmm(score.transpose(0, 1), scale).transpose(0, 1)
-
-    closure = scored_potential if settings.batch is None and isinstance(density, ScoredDensity) else potential
-
-    kept = torch.empty(settings.draws, *shape, dtype=mode.z.dtype)
     for k in range(settings.burn_in + settings.draws * settings.thinning):
         optimizer.step(closure)
         if scheduler is not None:
@@ -167,4 +257,31 @@ def walk(
         collected = k + 1 - settings.burn_in
         if collected > 0 and collected % settings.thinning == 0:
             kept[collected // settings.thinning - 1] = w.detach()
-    return mode.z + torch.einsum("wij,cnwj->cnwi", scale, kept.transpose(0, 1))
+    return coordinates, kept.transpose(0, 1)
+
+
+def _log_prob(density: Density, z: Tensor, batch: int | None, generator: torch.Generator | None) -> Tensor:
+    """The log density, or its estimate from a minibatch that all chains share."""
+    if batch is None:
+        return density.log_prob(z)
+    if not isinstance(density, SubsampledDensity):
+        raise InputError(f"batch: {type(density).__name__} has no minibatch estimate; leave batch at None")
+    return density.log_prob_minibatch(z, torch.randint(density.points, (batch,), generator=generator))
+
+
+def _gradient(
+    density: Density, coordinates: Coordinates, w: Tensor, batch: int | None, generator: torch.Generator | None
+) -> Callable[[], Tensor]:
+    """``dU/dw`` at the present ``w``; a density that knows its own score saves the graph."""
+    state = w.detach()
+    if batch is None and isinstance(density, ScoredDensity):
+        scored = density
+        return lambda: coordinates.pull_back(scored.score(coordinates.z(state))).neg_()
+
+    def differentiated() -> Tensor:
+        with torch.enable_grad():
+            z = coordinates.z(state).requires_grad_()
+            (score,) = torch.autograd.grad(_log_prob(density, z, batch, generator).sum(), z)
+        return coordinates.pull_back(score).neg_()
+
+    return differentiated

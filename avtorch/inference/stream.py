@@ -56,6 +56,7 @@ class BeliefStream:
             raise InputError(f"gap: {gap} s is not positive")
         self.window, self.gap, self.vehicles = float(window), float(gap), vehicles
         self.form: Form = JerkForm() if form is None else form
+        inference.setdefault("settings", self.form.sampler)
         self.inference = SequentialInference(
             vehicles=vehicles, names=self.form.names, noise_prior=self.form.noise_prior, **inference
         )

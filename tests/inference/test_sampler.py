@@ -19,8 +19,9 @@ from avtorch.inference import (
     sample,
 )
 from avtorch.inference.priors import Joint, QuadrantNormal, default_jerk_noise_prior
-from avtorch.inference.sampler import stiffness, walk
+from avtorch.inference.sampler import walk
 from avtorch.inference.schedules import harmonic, polynomial
+from avtorch.inference.whitening import Coordinates, stiffness
 
 F64 = torch.float64
 AMPLITUDES = [0.03, 0.1, 0.2, 0.4, 1.0, 3.0]
@@ -120,7 +121,7 @@ def test_the_independent_noise_has_the_bias_it_should(make_windows, rotating_see
     mode = find_mode(density)
     settings = SamplerSettings(chains=512, draws=150, burn_in=20, step=1.0, noise="independent")
     z = walk(density, mode, settings, generator=generator(rotating_seed))
-    step = 1.0 / stiffness(density, mode).item()
+    step = 1.0 / stiffness(density, Coordinates.of(mode)).item()
     _, _, wide, error = against(z, z.mean((0, 1)), mode.covariance.diagonal(dim1=-2, dim2=-1).sqrt())
     expected = 0.5 * (1 / (1 - step / 4) - 1)
     # 200 points: a posterior is Gaussian to about 1/200 and 2 % of variance
@@ -135,7 +136,7 @@ def test_minibatches_widen_as_they_should(make_windows, rotating_seed):
     mode = find_mode(density)
     settings = SamplerSettings(chains=256, draws=300, burn_in=60, step=0.2, noise="independent", batch=50)
     z = walk(density, mode, settings, generator=generator(rotating_seed))
-    step = 0.2 / stiffness(density, mode).item()
+    step = 0.2 / stiffness(density, Coordinates.of(mode)).item()
     # all chains share a batch, so they are not independent: the bar is that of 300 correlated steps of a common part
     _, _, wide, _ = against(z, z.mean((0, 1)), mode.covariance.diagonal(dim1=-2, dim2=-1).sqrt())
     expected = 0.5 * ((1 + step) / (1 - step / 4) - 1)
@@ -164,8 +165,8 @@ def test_the_papers_schedule_freezes(make_windows, rotating_seed):
 def test_runs_repeat_and_thinning_takes_every_other_step(make_windows):
     density = JerkDensity(make_windows(0, [1.0, 0.3]).statistics)
     mode = find_mode(density)
-    every = walk(density, mode, SamplerSettings(chains=8, draws=20, burn_in=4), generator=generator(1))
-    again = walk(density, mode, SamplerSettings(chains=8, draws=20, burn_in=4), generator=generator(1))
+    every = walk(density, mode, SamplerSettings(chains=8, draws=20, burn_in=4, thinning=1), generator=generator(1))
+    again = walk(density, mode, SamplerSettings(chains=8, draws=20, burn_in=4, thinning=1), generator=generator(1))
     second = walk(density, mode, SamplerSettings(chains=8, draws=10, burn_in=4, thinning=2), generator=generator(1))
     assert every.equal(again)
     assert second.equal(every[:, 1::2])

@@ -1,0 +1,77 @@
+"""Coordinates in which one step length suits every window: whitened at the mode, slower where a posterior is skewed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from avtorch.inference.density import Density, ScoredDensity
+from avtorch.inference.map import Mode
+from avtorch.inference.planes import lower_times, lower_transposed_times
+
+Whitening = Literal["full", "diagonal", "none"]
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """``z = mode + lower @ w``.
+
+    Attributes:
+        mode: ``(window, d)``.
+        lower: lower triangular, ``(window, d, d)``.
+    """
+
+    mode: Tensor
+    lower: Tensor
+
+    @classmethod
+    def of(cls, mode: Mode, whitening: Whitening = "full") -> Coordinates:
+        """``"full"`` makes the Laplace covariance the identity; ``"diagonal"`` only brings the curvature of each
+        parameter to one, and ``"none"`` scales all parameters alike, so that the narrowest direction has unit SD."""
+        if whitening == "full":
+            return cls(mode.z, mode.scale)
+        if whitening == "diagonal":
+            curvature = torch.linalg.inv(mode.covariance).diagonal(dim1=-2, dim2=-1)
+            return cls(mode.z, torch.diag_embed(curvature.rsqrt()))
+        narrowest = torch.linalg.eigvalsh(mode.covariance)[:, :1].clamp_min(0.0).sqrt()
+        return cls(mode.z, torch.diag_embed(narrowest.expand_as(mode.z)))
+
+    def z(self, w: Tensor) -> Tensor:
+        """``w`` ``(..., window, d)`` as log parameters (or whatever the density's unconstrained space is)."""
+        return lower_times(self.lower, w).add_(self.mode)
+
+    def pull_back(self, score: Tensor) -> Tensor:
+        """A gradient in ``z`` as one in ``w``."""
+        return lower_transposed_times(self.lower, score)
+
+    def slowed(self, pace: Tensor) -> Coordinates:
+        """A step ``h/pace`` in ``w`` is a step ``h`` in these; ``pace`` ``(window,)``."""
+        return Coordinates(self.mode, self.lower / pace.sqrt()[:, None, None])
+
+
+def stiffness(density: Density, coordinates: Coordinates, *, radius: float = 3.0) -> Tensor:
+    """How much steeper than its Laplace approximation the potential gets ``radius`` SDs out: ``(window,)``, at least 1.
+
+    A skewed posterior (a weak window) has a steep side on which the step that suits the mode overshoots; dividing the
+    window's step by this keeps ``step x curvature`` what it is at the mode of a Gaussian.
+    """
+    d = coordinates.mode.shape[-1]
+    axes = radius * torch.eye(d, dtype=coordinates.mode.dtype)
+    probes = torch.cat([axes, -axes])[:, None, :].expand(-1, len(coordinates.mode), d)
+    gradient = -coordinates.pull_back(score_of(density, coordinates.z(probes)))
+    slope = (gradient * probes).sum(-1) / radius**2
+    return slope.nan_to_num(nan=1e6, posinf=1e6).amax(0).clamp(1.0, 1e6)
+
+
+def score_of(density: Density, z: Tensor) -> Tensor:
+    """Gradient of the log density, in closed form where there is one; shape of ``z``."""
+    if isinstance(density, ScoredDensity):
+        with torch.no_grad():
+            return density.score(z)
+    z = z.detach().requires_grad_()
+    with torch.enable_grad():
+        (score,) = torch.autograd.grad(density.log_prob(z).sum(), z)
+    return score
