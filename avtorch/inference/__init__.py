@@ -1,7 +1,14 @@
 """What we believe: densities and priors, SGLD, Algorithm 1, and the sequential loop."""
 
 from avtorch.inference.conjugate import Conjugate, sample_conjugate
-from avtorch.inference.density import Density, ScoredDensity, SubsampledDensity
+from avtorch.inference.control_variates import ControlVariates
+from avtorch.inference.density import (
+    ConstrainedDensity,
+    Density,
+    ScoredDensity,
+    SelectableDensity,
+    SubsampledDensity,
+)
 from avtorch.inference.evidence import Evidence, Form, JerkForm
 from avtorch.inference.excitation import ExcitationRule
 from avtorch.inference.jerk import JerkDensity, JerkPoints, JerkStatistics, jerk_log_likelihood
@@ -10,14 +17,19 @@ from avtorch.inference.posterior import Posterior, nested_rhat
 from avtorch.inference.quadrature import Quadrature, integrate
 from avtorch.inference.sampler import SamplerSettings, sample
 from avtorch.inference.sequential import Belief, SequentialInference
+from avtorch.inference.sghmc import SGHMC
 from avtorch.inference.sgld import SGLD
 from avtorch.inference.stream import BeliefStream, Window
+from avtorch.inference.torch_density import TorchDensity
 
 __all__ = [
+    "SGHMC",
     "SGLD",
     "Belief",
     "BeliefStream",
     "Conjugate",
+    "ConstrainedDensity",
+    "ControlVariates",
     "Density",
     "Evidence",
     "ExcitationRule",
@@ -31,8 +43,10 @@ __all__ = [
     "Quadrature",
     "SamplerSettings",
     "ScoredDensity",
+    "SelectableDensity",
     "SequentialInference",
     "SubsampledDensity",
+    "TorchDensity",
     "Window",
     "find_mode",
     "integrate",
