@@ -2,7 +2,7 @@
 
     python -m benchmarks.real_time [--repeats 5]
 
-One thread. A window has 200 rows at 100 Hz and is sampled with 64 chains (the default settings). The aim is an update
+One thread. A window has 200 rows at 100 Hz and is sampled with the default settings. The aim is an update
 in less than 5 % of the window's length, and a cost that grows more slowly than the number of vehicles. The share is
 that of the processor's time, which a busy machine does not stretch; the clock's time stands beside it.
 """
@@ -15,10 +15,10 @@ import time
 
 import torch
 
-from avtorch.inference import BeliefStream
+from avtorch.inference import BeliefStream, SamplerSettings
 from avtorch.vehicle.glvd import glvd_jerk, glvd_rollout
 
-WINDOW_S, RATE_HZ, CHAINS = 2.0, 100.0, 64
+WINDOW_S, RATE_HZ = 2.0, 100.0
 AIM = 0.05
 
 
@@ -39,7 +39,6 @@ def seconds_per_window(vehicles: int, repeats: int = 5) -> tuple[list[float], li
     """Clock and processor seconds of the first window and of each of the ``repeats`` that follow; all are excited."""
     time_s, columns = drive(vehicles, repeats + 1)
     stream = BeliefStream(window=WINDOW_S, vehicles=vehicles)
-    assert stream.inference.settings.chains == CHAINS
     rows = round(WINDOW_S * RATE_HZ)
     by_clock, by_processor = [], []
     for k in range(repeats + 1):
@@ -59,7 +58,8 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="windows timed after the first")
     repeats = parser.parse_args().repeats
     torch.set_num_threads(1)
-    print(f"window {WINDOW_S:g} s at {RATE_HZ:g} Hz, {CHAINS} chains, one thread, torch {torch.__version__}")
+    chains = SamplerSettings().chains
+    print(f"window {WINDOW_S:g} s at {RATE_HZ:g} Hz, {chains} chains, one thread, torch {torch.__version__}")
     heads = ("vehicles", "first [s]", "clock [s]", "processor [s]", "of window", "per vehicle", "against one")
     print("".join(f"{head:>14}" for head in heads))
     one = None

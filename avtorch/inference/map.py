@@ -96,8 +96,11 @@ def find_mode(density: Density, *, start: Tensor | None = None, iterations: int 
 
 def _expand(density: Density, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Potential ``(window,)``, gradient ``(window, d)`` and Hessian ``(window, d, d)``; infinite where not defined."""
-    by = _from_score if isinstance(density, ScoredDensity) else _from_graph
-    potential, gradient, hessian = by(density, z.detach())
+    z = z.detach()
+    if isinstance(density, ScoredDensity):
+        potential, gradient, hessian = _from_score(density, z)
+    else:
+        potential, gradient, hessian = _from_graph(density, z)
     hessian = 0.5 * (hessian + hessian.mT)
     good = potential.isfinite() & gradient.isfinite().all(-1) & hessian.isfinite().flatten(1).all(-1)
     eye = torch.eye(z.shape[-1], dtype=z.dtype)

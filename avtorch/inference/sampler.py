@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -80,9 +81,9 @@ class SamplerSettings:
         if self.whitening not in ("full", "diagonal", "none"):
             raise InputError(f"whitening: {self.whitening!r} is none of 'full', 'diagonal', 'none'")
 
-    def slower(self, times: int) -> SamplerSettings:
-        """The same walk in steps ``times`` as many, for a step that is ``times`` shorter."""
-        return replace(self, burn_in=times * self.burn_in, thinning=times * self.thinning)
+    def slower(self, times: float) -> SamplerSettings:
+        """The same walk in ``times`` as many steps, for a step that is ``times`` shorter."""
+        return replace(self, burn_in=math.ceil(times * self.burn_in), thinning=math.ceil(times * self.thinning))
 
 
 def sample(
@@ -116,7 +117,7 @@ def sample(
     for _ in range(settings.attempts):
         for index in _batches(density, open_, pace, settings.chains):
             part, where = _select(density, index), mode.select(index)
-            times = int(_octave(pace[index]).amax())
+            times = float(_longer(pace[index]).amax())
             coordinates, w = _walk(part, where, settings.slower(times), pace[index], generator)
             fresh = torch.isin(index, open_)
             new = index[fresh]
@@ -150,7 +151,7 @@ def _adapted(
     fitted, fitted_pace = mode, pace.clone()
     for index in _batches(density, uneven, pace, settings.chains):
         part, where = _select(density, index), mode.select(index)
-        times = int(_octave(pace[index]).amax())
+        times = float(_longer(pace[index]).amax())
         coordinates, w = _walk(part, where, settings.slower(times), pace[index], generator)
         better = where.refitted(coordinates.z(w).flatten(0, 1))
         quicker = stiffness(part, Coordinates.of(better))
@@ -169,18 +170,18 @@ def _why(mode_found: bool, strayed: bool, apart: bool, stuck: bool) -> str:
     return "chains disagree, also with the shortest step tried" if apart else ""
 
 
-def _octave(pace: Tensor) -> Tensor:
-    """The nearest power of two, from 1 to 64."""
-    return 2.0 ** pace.log2().round().clamp(0, 6)
+def _longer(pace: Tensor) -> Tensor:
+    """How many times as many steps a window of this pace gets: the nearest of 1, sqrt 2, 2, ... 64."""
+    return 2.0 ** (0.5 * (2 * pace.log2()).round().clamp(0, 12))
 
 
 def _batches(density: Density, index: Tensor, pace: Tensor, chains: int) -> list[Tensor]:
-    """Windows to walk together: of one octave of the pace, and not too many at once."""
+    """Windows to walk together: as many steps each, and not too many windows at once."""
     if not isinstance(density, SelectableDensity):
         return [torch.arange(density.windows)]
     size = max(1, BLOCK // chains)
-    octaves = _octave(pace[index])
-    return [part for octave in octaves.unique() for part in index[octaves == octave].split(size)]
+    times = _longer(pace[index])
+    return [part for each in times.unique() for part in index[times == each].split(size)]
 
 
 def _select(density: Density, index: Tensor) -> Density:
@@ -251,7 +252,7 @@ def _walk(
         return None
 
     for k in range(settings.burn_in + settings.draws * settings.thinning):
-        optimizer.step(closure)
+        optimizer.step(closure)  # pyright: ignore[reportCallIssue, reportArgumentType]  (a gradient is left, no loss)
         if scheduler is not None:
             scheduler.step()
         collected = k + 1 - settings.burn_in
