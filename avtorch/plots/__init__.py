@@ -1,5 +1,6 @@
 """Pictures: drawings that take an axes and return it, and the figures that the commands write."""
 
+from avtorch.plots.calibration_figures import calibration_figure
 from avtorch.plots.figures import (
     belief_figure,
     motion_figure,
@@ -9,26 +10,40 @@ from avtorch.plots.figures import (
     stability_figure,
 )
 from avtorch.plots.over_plane import gain_curve, region, setting_region, verdict_legend, verdict_map
+from avtorch.plots.over_posteriors import agreement_scatter, exact_density, joint_cloud, marginals
+from avtorch.plots.over_ranks import ecdf_difference, ecdf_of, pooled_rank_counts, rank_band, rank_plot
 from avtorch.plots.over_time import belief_band, data_quality, events, motion, string_probability
+from avtorch.plots.posterior_figures import validation_figures
 from avtorch.plots.style import STYLE, save
 
 __all__ = [
     "STYLE",
+    "agreement_scatter",
     "belief_band",
     "belief_figure",
+    "calibration_figure",
     "data_quality",
+    "ecdf_difference",
+    "ecdf_of",
     "events",
+    "exact_density",
     "gain_curve",
+    "joint_cloud",
+    "marginals",
     "motion",
     "motion_figure",
     "overview_figure",
+    "pooled_rank_counts",
     "probability_figure",
+    "rank_band",
+    "rank_plot",
     "region",
     "region_figure",
     "save",
     "setting_region",
     "stability_figure",
     "string_probability",
+    "validation_figures",
     "verdict_legend",
     "verdict_map",
 ]

@@ -53,6 +53,13 @@ LABELS = {
     "K_L": "actuation gain $K_L$ [-]",
     "T": "actuation lag $T_L$ [s]",
     "K": "actuation gain $K_L$ [-]",
+    "sigma": r"jerk noise $\sigma$ [m/s³]",
+    "process_noise": "actuator noise [m/s²/√s]",
+    "accel_noise": "accel noise [m/s²]",
+    "speed_noise": "speed noise [m/s]",
+    "road_noise": "road noise [m/s/√s]",
+    "coloured_sd": "coloured force, SD [m/s²]",
+    "coloured_time": "coloured force, time [s]",
     "tau": r"time gap $\tau$ [s]",
     "k_s": "spacing gain $k_s$ [1/s²]",
     "k_v": "speed gain $k_v$ [1/s]",
@@ -62,7 +69,20 @@ LABELS = {
     "spacing": "spacing [m]",
 }
 
+SHORT = {
+    "T_L": "$T_L$",
+    "K_L": "$K_L$",
+    "sigma": r"$\sigma$",
+    "log_likelihood": "log likelihood",
+    "log_posterior": "log posterior",
+}
+
 P = ParamSpec("P")
+
+
+def short(name: str) -> str:
+    """A quantity's name for a heading, without its unit."""
+    return SHORT.get(name, name.replace("_", " "))
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:

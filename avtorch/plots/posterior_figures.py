@@ -1,0 +1,267 @@
+"""The pictures of a validation: SGLD held against quadrature and NUTS, window by window and all together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from avtorch.inference import Posterior, Quadrature
+from avtorch.plots.over_posteriors import agreement_reach, agreement_scatter, joint_cloud, marginals
+from avtorch.plots.over_ranks import METHODS, ecdf_difference, pooled_rank_counts, rank_plot
+from avtorch.plots.shown import Shown, place, relative_width, settled
+from avtorch.plots.style import BLACK, short, styled
+from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE
+from avtorch.validation.diagnostics import diagnose
+from avtorch.validation.uniformity import ecdf_band
+from avtorch.validation.validate import Validation
+
+#: Points of an ECDF of PIT values, and windows whose ECDF is drawn at most.
+POINTS, MOST = 100, 200
+#: Groups that SGLD's chains are joined into for the rank plots, and their bins.
+GROUPS, BINS = 4, 10
+
+METHOD = {"nuts": "NUTS", "quadrature": "quadrature"}
+Place = Literal["outside upper center", "outside lower center"]
+
+
+def validation_figures(validation: Validation) -> dict[str, Callable[[], Figure]]:
+    """The figures of a validation, by the name of the file that each is for; a figure is made when called."""
+    shown = Shown(validation)
+    figures: dict[str, Callable[[], Figure]] = {
+        "marginals.png": lambda: marginals_figure(shown),
+        "joint.png": lambda: joint_figure(shown),
+        "ranks.png": lambda: ranks_figure(shown),
+        "agreement.png": lambda: agreement_figure(validation),
+    }
+    if validation.quadrature is not None:
+        figures["ecdf.png"] = lambda: ecdf_figure(validation)
+    return figures
+
+
+@styled
+def marginals_figure(shown: Shown) -> Figure:
+    """Exact marginals with the histograms of SGLD and NUTS; a row a window, a column a parameter."""
+    found, names = shown.validation, shown.validation.names
+    figure = Figure(figsize=(_wide(names) * len(names) + 0.3, 2.3 * len(shown.windows) + 0.9), layout="constrained")
+    axes = figure.subplots(len(shown.windows), len(names), squeeze=False)
+    for row, (window, line) in enumerate(zip(shown.windows, axes, strict=True)):
+        for name, ax in zip(names, line, strict=True):
+            other = None if window.nuts is None else found.nuts[name][..., window.nuts].numpy()
+            own = found.sgld[name][..., window.number].numpy()
+            marginals(ax, name, own, other, found.quadrature, window.number, truth=shown.truth(window, name))
+            if row < len(axes) - 1:
+                ax.set_xlabel("")
+        line[0].set_title(window.title)
+        line[0].set_ylabel("density")
+    _legend(figure, axes)
+    return figure
+
+
+@styled
+def joint_figure(shown: Shown) -> Figure:
+    """Clouds of lag and gain within the 50 and 90 % regions of exact draws and of NUTS; a panel a window."""
+    found = shown.validation
+    figure = Figure(figsize=(3.9 * len(shown.windows) + 0.3, 4.6), layout="constrained")
+    axes = figure.subplots(1, len(shown.windows), squeeze=False)
+    for i, (window, ax) in enumerate(zip(shown.windows, axes[0], strict=True)):
+        references = {} if shown.exact is None else {"exact": (shown.exact, i)}
+        if window.nuts is not None:
+            references["NUTS"] = (found.nuts, window.nuts)
+        lag, gain = shown.truth(window, "T_L"), shown.truth(window, "K_L")
+        truth = None if lag is None or gain is None else (lag, gain)
+        joint_cloud(ax, found.sgld, window.number, references=references, truth=truth)
+        ax.set_title("\n".join(t for t in (window.title, ax.get_title("left")) if t))
+        if i:
+            ax.set_ylabel("")
+    _legend(figure, axes)
+    return figure
+
+
+@styled
+def ranks_figure(shown: Shown) -> Figure:
+    """Ranks of groups of SGLD's chains, of NUTS and of exact draws in their common pool; a row a window."""
+    found, names = shown.validation, shown.validation.names
+    groups = min(GROUPS, found.sgld.draws.shape[0])
+    rows = groups + 2
+    figure = Figure(
+        figsize=(_wide(names) * len(names) + 1.4, (0.33 * rows + 0.6) * len(shown.windows) + 0.9), layout="constrained"
+    )
+    axes = figure.subplots(len(shown.windows), len(names), squeeze=False)
+    reference = diagnose(found.nuts) if len(found.nuts_index) else None
+    for row, (window, line) in enumerate(zip(shown.windows, axes, strict=True)):
+        for i, (name, ax) in enumerate(zip(names, line, strict=True)):
+            drawn = _grouped(found.sgld[name][..., window.number], groups)
+            compared = place(found.compared, window.number)
+            assert compared is not None
+            worth = {label: _ess(found.agreement.ess_bulk[compared, i]) / groups for label in drawn}
+            if window.nuts is not None and reference is not None:
+                drawn["NUTS"] = found.nuts[name][..., window.nuts].numpy()
+                worth["NUTS"] = _ess(reference.ess_bulk[window.nuts, i])
+            if shown.exact is not None:
+                drawn["exact"] = shown.exact[name][..., row].numpy()
+            rank_plot(ax, pooled_rank_counts(drawn, bins=BINS), effective=worth)
+            if row == len(axes) - 1:
+                ax.set_xlabel(f"rank of {short(name)} [-]")
+            if i:
+                ax.set_yticklabels([])
+        line[0].set_title(window.title)
+    figure.suptitle(
+        "Ranks of each group in the pool of all draws, as shares: bars are relative to the count expected, grey is\n"
+        "the band that holds all bars of a panel with 95 % probability, ± its half width (by effective sample sizes)",
+        fontsize=9.5,
+        color=BLACK,
+    )
+    return figure
+
+
+@styled
+def ecdf_figure(validation: Validation) -> Figure:
+    """Exact probabilities below the draws: their ECDF less the uniform one, a line a window, for SGLD and for NUTS."""
+    exact, names = validation.quadrature, validation.names
+    assert exact is not None
+    arms = [("SGLD", validation.sgld, torch.arange(len(exact.mean)), validation.agreement.ess_bulk)]
+    if len(validation.nuts_index):
+        arms.append(("NUTS", validation.nuts, validation.nuts_index, diagnose(validation.nuts).ess_bulk))
+    figure = Figure(figsize=(_wide(names) * len(names) + 0.5, 2.7 * len(arms) + 0.8), layout="constrained")
+    axes = figure.subplots(len(arms), len(names), squeeze=False, sharex=True, sharey="row")
+    for line, (method, posterior, index, worth) in zip(axes, arms, strict=True):
+        sound = (posterior.converged & exact.converged[index]).nonzero().squeeze(-1)
+        taken = sound[torch.linspace(0, len(sound) - 1, min(MOST, len(sound))).long()]
+        curves = _pit_ecdf(posterior, exact, taken, index[taken])
+        reach = 0.0
+        for i, (name, ax) in enumerate(zip(names, line, strict=True)):
+            bands = [_band(_ess(worth[w, i])) for w in taken]
+            inside = np.array([_inside(c, band) for c, band in zip(curves[i], bands, strict=True)], dtype=bool)
+            if len(taken):
+                middle = float(worth[taken, i].nanmedian())
+                ecdf_difference(ax, {}, _band(middle), label="95 % band at the median effective sample size")
+            at = np.linspace(0, 1, POINTS + 1)
+            drawn = np.pad(curves[i], ((0, 0), (1, 0))) - at
+            for mask, look in (
+                (inside, {"linewidth": 0.7, "alpha": float(np.clip(12 / max(1, len(taken)), 0.15, 0.8))}),
+                (~inside, {"linewidth": 1.0, "linestyle": "--"}),
+            ):
+                ax.plot(at, drawn[mask].T, color=METHODS[method], zorder=2, **look)
+            reach = max([reach, ax.get_ylim()[1], 1.05 * float(np.abs(drawn).max(initial=0))])
+            ax.set_title(f"{method}, {short(name)}: {inside.sum()} of {len(taken)} inside")
+        line[0].set_ylim(-reach, reach)
+        line[0].set_ylabel("ECDF less uniform [-]")
+    for ax in axes[-1]:
+        ax.set_xlabel("exact probability below a draw [-]")
+    for ax in axes.flat:
+        ax.label_outer()
+    figure.suptitle(
+        "A line a settled window, dashed where it leaves its own 95 % band (at most 1 in 20 would by chance);"
+        " grey: the band at the median effective sample size",
+        fontsize=9.5,
+        color=BLACK,
+    )
+    return figure
+
+
+@styled
+def agreement_figure(validation: Validation) -> Figure:
+    """Differences of mean and ratios of SD of every window over the width of its posterior, with the limits."""
+    names, found, index = validation.names, validation.agreement, validation.compared
+    width, sound = relative_width(validation, index), settled(validation, index)
+    figure = Figure(figsize=(_wide(names) * len(names) + 0.4, 6.4), layout="constrained")
+    axes = figure.subplots(2, len(names), squeeze=False, sharey="row")
+    measures = [
+        ("difference of means [posterior SD]", found.mean_difference, found.mean_error, 0.0, MEAN_TOLERANCE),
+        ("ratio of SDs [-]", found.sd_ratio, found.sd_error, 1.0, SD_TOLERANCE),
+    ]
+    for line, (label, value, error, middle, tolerance) in zip(axes, measures, strict=True):
+        limits = (middle - tolerance, middle + tolerance)
+        reach = max(agreement_reach(value[:, i].numpy(), limits) for i in range(len(names)))
+        for i, (name, ax) in enumerate(zip(names, line, strict=True)):
+            agreement_scatter(
+                ax,
+                width[:, i].numpy(),
+                value[:, i].numpy(),
+                limits=limits,
+                error=error[:, i].numpy(),
+                settled=sound.numpy(),
+                reach=reach,
+            )
+            ax.set_title(f"{short(name)}: {ax.get_title('left')}")
+            ax.set_xlabel(f"SD of {short(name)} [% of its mean]" if len(names) <= 3 else "SD [% of mean]")
+        line[0].set_ylabel(label)
+    v = validation.verdict
+    figure.suptitle(
+        f"SGLD against {METHOD[validation.reference]}: {100 * v.share:.1f} % of {len(index)} windows within all limits"
+        f" (95 % interval {100 * v.low:.1f} to {100 * v.high:.1f} %;"
+        f" exact draws would be at {100 * v.share_if_exact:.1f} %)",
+        fontsize=10,
+        color=BLACK,
+    )
+    _legend(figure, axes, where="outside lower center")
+    return figure
+
+
+def _grouped(chains: Tensor, groups: int) -> dict[str, np.ndarray]:
+    """Draws ``(chain, draw)`` in groups of neighbouring chains, named by their first and last."""
+    named, first = {}, 1
+    for part in chains.tensor_split(groups):
+        last = first + len(part) - 1
+        named[f"SGLD {first}–{last}" if last > first else f"SGLD {first}"] = part.numpy()
+        first = last + 1
+    return named
+
+
+def _ess(value: Tensor) -> float:
+    """An effective sample size to count with: chains that stand still have none."""
+    return max(4.0, float(value)) if bool(value.isfinite()) else 4.0
+
+
+def _band(effective: float) -> tuple[np.ndarray, np.ndarray]:
+    """Simultaneous band of an ECDF at `POINTS` points; sizes are rounded by up to 5 %, so that few bands are made."""
+    rounded = int(np.exp(0.1 * np.round(10 * np.log(effective))))
+    low, high = ecdf_band(rounded, POINTS - 1)
+    return low.numpy(), high.numpy()
+
+
+def _inside(curve: np.ndarray, band: tuple[np.ndarray, np.ndarray]) -> bool:
+    return bool(((curve >= band[0] - 1e-12) & (curve <= band[1] + 1e-12)).all())
+
+
+def _pit_ecdf(posterior: Posterior, quadrature: Quadrature, own: Tensor, exact: Tensor) -> np.ndarray:
+    """ECDF of the exact probability below each draw, ``(parameter, window, POINTS)``.
+
+    ``own`` are the windows among those of the draws, ``exact`` the same among those of the quadrature.
+    """
+    share = torch.linspace(0, 1, 401, dtype=quadrature.nodes.dtype)
+    grid = torch.lerp(quadrature.nodes[..., :1], quadrature.nodes[..., -1:], share).exp()
+    below = quadrature.cdf(grid.movedim(-1, 0)).movedim(0, -1)[exact].clamp(0, 1).numpy()
+    levels = np.arange(1, POINTS) / POINTS
+    # between nodes a thirtieth of an SD apart a straight line is off by less than 1e-4
+    pairs = zip(below.reshape(-1, 401), grid[exact].reshape(-1, 401).numpy(), strict=True)
+    edges = torch.from_numpy(np.array([np.interp(levels, *pair) for pair in pairs]))
+    edges = edges.reshape(*below.shape[:2], POINTS - 1)
+    drawn = posterior.flat[:, own].permute(1, 2, 0).contiguous()
+    found = torch.searchsorted(drawn.sort(-1).values, edges, right=True) / drawn.shape[-1]
+    return torch.cat([found, torch.ones_like(found[..., :1])], -1).transpose(0, 1).numpy()
+
+
+def _wide(names: tuple[str, ...]) -> float:
+    """Width of a panel [inch]: many parameters share the paper."""
+    return 3.4 if len(names) <= 3 else 2.6
+
+
+def _legend(
+    figure: Figure,
+    axes: np.ndarray,
+    *,
+    where: Literal["outside upper center", "outside lower center"] = "outside upper center",
+) -> None:
+    """One legend for all axes, each name once, above or below them."""
+    found: dict = {}
+    for ax in axes.flat:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    columns = min(len(found), 6)
+    figure.legend(list(found.values()), list(found), loc=where, ncols=columns)

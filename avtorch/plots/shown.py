@@ -1,0 +1,77 @@
+"""Which windows of a validation are shown one by one, and what is known of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from avtorch.inference import Posterior
+from avtorch.validation.validate import Validation
+
+#: Exact draws a window, for contours and ranks.
+EXACT = 4000
+
+
+@dataclass(frozen=True)
+class ShownWindow:
+    """A window shown one by one: its number, its place among those NUTS was run on, what it stands for."""
+
+    number: int
+    nuts: int | None
+    title: str
+
+
+class Shown:
+    """The windows shown one by one: with the widest, a middling and the narrowest posterior of the lag.
+
+    They are of those NUTS was run on, if there are any, and settled, if any did.
+    """
+
+    def __init__(self, validation: Validation) -> None:
+        self.validation = validation
+        index = validation.nuts_index if len(validation.nuts_index) else validation.compared
+        sound = settled(validation, index)
+        index = index[sound] if bool(sound.any()) else index
+        width = relative_width(validation, index)[:, 0]
+        order = width.argsort(descending=True)
+        places = sorted({0, len(order) // 2, len(order) - 1})
+        words = {1: [""], 2: ["wide: ", "narrow: "], 3: ["wide: ", "middle: ", "narrow: "]}[len(places)]
+        self.windows = [
+            ShownWindow(
+                number := int(index[order[p]]),
+                place(validation.nuts_index, number),
+                f"{word}window {number}, SD of $T_L$ {100 * float(width[order[p]]):.2g} %",
+            )
+            for word, p in zip(words, places, strict=True)
+        ]
+
+    @cached_property
+    def exact(self) -> Posterior | None:
+        """Independent draws of the joint posterior of the windows shown, in their order."""
+        index = torch.tensor([w.number for w in self.windows])
+        return self.validation.quadrature_draws(index, chains=1, draws=EXACT)
+
+    def truth(self, window: ShownWindow, name: str) -> float | None:
+        known = self.validation.windows.truth
+        return None if known is None else float(known[window.number, self.validation.names.index(name)])
+
+
+def settled(validation: Validation, index: Tensor) -> Tensor:
+    """Windows whose chains and quadrature settled, ``(index,)`` bool."""
+    own = validation.sgld.converged[index]
+    return own if validation.quadrature is None else own & validation.quadrature.converged[index]
+
+
+def relative_width(validation: Validation, index: Tensor) -> Tensor:
+    """SD over mean by quadrature, or by SGLD where there is none, ``(index, parameter)``."""
+    known = validation.sgld if validation.quadrature is None else validation.quadrature
+    return known.sd[index] / known.mean[index]
+
+
+def place(index: Tensor, window: int) -> int | None:
+    """Where a window is in a list of windows."""
+    found = (index == window).nonzero()
+    return int(found[0]) if len(found) else None
