@@ -55,7 +55,7 @@ class SamplerSettings:
         optimizer: makes another optimizer than SGLD from ``(parameters, step, generator)``.
     """
 
-    chains: int = 512
+    chains: int = 1024
     draws: int = 8
     burn_in: int = 8
     thinning: int = 2
@@ -190,17 +190,17 @@ def _select(density: Density, index: Tensor) -> Density:
     return density.select(index)
 
 
-def _strayed(density: Density, mode: Mode, coordinates: Coordinates, w: Tensor, depth: float = 200.0) -> Tensor:
-    """Where some chain's furthest draw lies ``depth`` nats off the mode, ``(window,)`` bool.
+def _strayed(density: Density, mode: Mode, coordinates: Coordinates, w: Tensor, depth: float = 50.0) -> Tensor:
+    """Where some chain's furthest draw lies ``depth`` nats and one a parameter off the mode, ``(window,)`` bool.
 
-    R-hat alone overlooks the few chains that diverge: they blow up the variance within as much as that between.
-    A draw of the posterior lies ``chi^2/2`` nats deep, so 200 is out of reach even for a tenfold variance.
+    R-hat alone overlooks the few chains that diverge: they blow up the variance within as much as that between. A draw
+    of a normal lies ``chi^2/2`` nats deep: among ten thousand in three dimensions none beyond 20.
     """
     distance = w.square().sum(-1).nan_to_num_(nan=torch.inf)
     furthest = distance.transpose(0, 1).flatten(0, 1).argmax(0)  # in the order of memory
     with torch.no_grad():
         far = coordinates.z(w.transpose(0, 1).flatten(0, 1)[furthest, torch.arange(w.shape[2])])
-        return ~((mode.log_prob - density.log_prob(far)).abs() <= depth)
+        return ~((mode.log_prob - density.log_prob(far)).abs() <= depth + w.shape[-1])
 
 
 def walk(
