@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from avtorch.vehicle import performance, stability
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from avtorch.decision.estimation import Estimates
     from avtorch.decision.record import SupervisedRun
     from avtorch.decision.watch import WatchedWindow
+    from avtorch.inference import Posterior, Quadrature
+    from avtorch.validation import Validation
     from avtorch.vehicle import Block
 
 
@@ -150,3 +155,124 @@ def _at_one_point(conditions: stability.Conditions) -> dict[str, float]:
     """The conditions of a box shrunk to a point: upper and lower bounds coincide, and so do some of the lines."""
     names = [re.sub(r"\^[ul](?=\b|\s)|^min ", "", name) for name in conditions.names]
     return dict(zip(names, conditions.values.tolist(), strict=True))
+
+
+def validation_answer(validation: Validation) -> dict[str, Any]:
+    """`validation.json`: every window by every method, how far SGLD lies from the reference, and the verdict.
+
+    `summary` holds quantiles over the windows compared: of the absolute difference of means [SD of the reference] and
+    of the ratio of SDs. `coverage_90` is the share of windows whose 90 % interval of SGLD covers the truth, with
+    quadrature's on the same windows beside it; where the truth is unknown, the mean mass of the reference inside SGLD's
+    90 % interval. The latent form has no `sigma`: the summary's is then that of the noise parameter named by
+    `sigma_is`, the one that differs most. Seconds of a method that was not run are 0, and `not_run` names it.
+    """
+    found, windows = validation, validation.windows
+    role = {"T_L": "T_L", "K_L": "K_L", "sigma": _noise_shown(found)}
+    column = {key: found.names.index(name) for key, name in role.items()}
+    coverage = found.coverage()
+    share = found.verdict
+
+    def over_windows(values: Tensor, q: float) -> dict[str, float]:
+        return {key: float(values[:, i].nanquantile(q).nan_to_num(nan=0.0)) for key, i in column.items()}
+
+    def covered(method: str) -> dict[str, float]:
+        return {key: float(coverage[method][i]) for key, i in column.items()}
+
+    agreement = found.agreement
+    answer: dict[str, Any] = {
+        "schema": "avtorch.validation/1",
+        "windows": [
+            *_method_entries("sgld", found.sgld, range(len(windows)), found.seconds),
+            *_method_entries("quadrature", found.quadrature, range(len(windows)), found.seconds),
+            *_method_entries("nuts", found.nuts, found.nuts_index.tolist(), found.seconds),
+        ],
+        "summary": {
+            "windows": len(windows),
+            "compared": len(found.compared),
+            "excited": int(windows.excited.sum()),
+            "settled": int(found.sgld.converged.sum()),
+            "mean_difference_sd_p95": over_windows(agreement.mean_difference.abs(), 0.95),
+            "sd_ratio_p025": over_windows(agreement.sd_ratio, 0.025),
+            "sd_ratio_p975": over_windows(agreement.sd_ratio, 0.975),
+            "w1_sd_p95": over_windows(agreement.w1, 0.95),
+            "rhat_max": float(agreement.rhat.nan_to_num(nan=-math.inf).amax().clamp_min(1.0)),
+            "ess_bulk_median": over_windows(agreement.ess_bulk, 0.5),
+            "ess_tail_median": over_windows(agreement.ess_tail, 0.5),
+            "coverage_90": covered("sgld"),
+            "coverage_is": "truth" if windows.truth is not None else f"mass of {found.reference}",
+            "seconds_per_window": found.seconds,
+            "not_run": [] if found.quadrature is not None else ["quadrature"],
+            "sigma_is": role["sigma"],
+            "share_agreeing": share.share,
+            "share_interval_95": [share.low, share.high],
+            "share_if_exact": share.share_if_exact,
+            "nuts_p": share.nuts_p,
+        },
+        "verdict": "agree" if share.agree else "disagree",
+        "why": share.why,
+        "source": windows.name,
+        "form": windows.form,
+        "reference": found.reference,
+        "seed": found.seed,
+        "settings": {f.name: _setting(getattr(found.settings, f.name)) for f in fields(found.settings)},
+        "agreement": [_agreement_entry(found, row, number) for row, number in enumerate(found.compared.tolist())],
+    }
+    if "quadrature" in coverage:
+        answer["summary"]["coverage_90_quadrature"] = covered("quadrature")
+    return answer
+
+
+def _noise_shown(found: Validation) -> str:
+    """`sigma`, or in the latent form the noise parameter whose mean lies furthest from the reference's."""
+    if "sigma" in found.names:
+        return "sigma"
+    off = found.agreement.mean_difference[:, 2:].abs().nanquantile(0.95, 0)
+    return found.names[2 + int(off.nan_to_num(nan=math.inf).argmax())]
+
+
+def _method_entries(
+    method: str, found: Posterior | Quadrature | None, numbers: Sequence[int], seconds: Mapping[str, float]
+) -> list[dict[str, Any]]:
+    """One entry a window: T_L [s], K_L [-] and sigma [m/s³], or in the latent form `noise` with its parameters."""
+    if found is None:
+        return []
+    columns = {"mean": found.mean, "sd": found.sd, "q05": found.quantile(0.05), "q95": found.quantile(0.95)}
+    table = {key: value.tolist() for key, value in columns.items()}
+    entries = []
+    for row, number in enumerate(numbers):
+        stats = {name: {key: finite(table[key][row][i]) for key in table} for i, name in enumerate(found.names)}
+        actuation = {name: stats.pop(name) for name in ("T_L", "K_L")}
+        noise = stats if "sigma" in stats else {"noise": stats}
+        settled = bool(found.converged[row])
+        entries.append(
+            {"window": number, "method": method, **actuation, **noise, "seconds": seconds[method], "settled": settled}
+        )
+    return entries
+
+
+def _agreement_entry(found: Validation, row: int, number: int) -> dict[str, Any]:
+    """The measures of one window; differences in SDs of the reference."""
+    windows, table = found.windows, found.agreement
+    measures = [f.name for f in fields(table) if f.name != "names"]
+    truth = windows.truth
+    return {
+        "window": number,
+        "start_s": _seconds(float(windows.start_s[number])),
+        "end_s": _seconds(float(windows.end_s[number])),
+        "n": int(windows.n[number]),
+        "excited": bool(windows.excited[number]),
+        "settled": bool(found.sgld.converged[number]),
+        "truth": None if truth is None else dict(zip(found.names, truth[number].tolist(), strict=True)),
+        "ksd": finite(float(found.stein.value[number])),
+        "ksd_expected": finite(float(found.stein.expected[number])),
+        "ksd_p": float(found.stein.p_value[number]),
+        **{
+            name: {measure: finite(float(getattr(table, measure)[row, i])) for measure in measures}
+            for i, name in enumerate(found.names)
+        },
+    }
+
+
+def _setting(value: Any) -> Any:
+    """A setting as JSON can hold it: functions by their names."""
+    return value if value is None or isinstance(value, (bool, int, float, str)) else getattr(value, "__name__", "given")

@@ -14,6 +14,7 @@ from avtorch import __version__
 from avtorch.cli.estimate import estimate
 from avtorch.cli.run import run
 from avtorch.cli.stability import stability
+from avtorch.cli.validate import validate
 from avtorch.errors import InputError
 
 app = App(
@@ -26,6 +27,7 @@ app = App(
 app.command(run)
 app.command(estimate)
 app.command(stability)
+app.command(validate)
 
 
 def main(tokens: Sequence[str] | None = None) -> int:
