@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from avtorch import decision, inference, io, plots, vehicle
+    from avtorch import decision, inference, io, plots, validation, vehicle
     from avtorch.decision.algorithm2 import algorithm2
     from avtorch.decision.estimation import Estimates, estimate
     from avtorch.decision.monitor import Monitor
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from avtorch.errors import InputError
     from avtorch.inference import SGLD, BeliefStream, SequentialInference
     from avtorch.io import Log
+    from avtorch.validation import Validation, validate
     from avtorch.vehicle import (
         GLVD,
         MPC,
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "avtorch": ("decision", "inference", "io", "plots", "vehicle"),
+    "avtorch": ("decision", "inference", "io", "plots", "validation", "vehicle"),
     "avtorch.decision.algorithm2": ("algorithm2",),
     "avtorch.decision.estimation": ("Estimates", "estimate"),
     "avtorch.decision.monitor": ("Monitor",),
@@ -45,6 +46,7 @@ _HOME = {
     "avtorch.errors": ("InputError",),
     "avtorch.inference": ("SGLD", "BeliefStream", "SequentialInference"),
     "avtorch.io": ("Log",),
+    "avtorch.validation": ("Validation", "validate"),
     "avtorch.vehicle": (
         "GLVD",
         "MPC",
@@ -78,6 +80,7 @@ __all__ = [
     "Setting",
     "Strategist",
     "Supervisor",
+    "Validation",
     "algorithm2",
     "decision",
     "estimate",
@@ -87,6 +90,8 @@ __all__ = [
     "plots",
     "simulate",
     "stability",
+    "validate",
+    "validation",
     "vehicle",
 ]
 

@@ -1,0 +1,117 @@
+"""`avtorch validate`: SGLD held against exact quadrature and NUTS, on a log or on synthetic windows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from avtorch.cli.arguments import Json, Out, Quiet, Seed, free_folder, not_negative, positive, seed_number, whole_number
+from avtorch.cli.talk import Talk, write_answer
+from avtorch.cli.validation_table import validation_notes, validation_table
+from avtorch.errors import InputError
+
+if TYPE_CHECKING:
+    from arviz import InferenceData
+
+#: Synthetic windows if no number is given.
+SYNTHETIC = 200
+
+
+def validate(
+    log: Path | None = None,
+    *,
+    synthetic: Annotated[
+        bool, Parameter(negative=(), help="Windows of simulated vehicles, slow to quick, in place of a log.")
+    ] = False,
+    windows: Annotated[
+        int | None, Parameter(converter=whole_number, help="How many windows; 200 synthetic ones, or all of a log.")
+    ] = None,
+    window: Annotated[float, Parameter(help="Length of a log's windows [s].")] = 2.0,
+    out: Out,
+    nuts_windows: Annotated[
+        int, Parameter(converter=whole_number, help="On how many of them NUTS is run; one costs seconds.")
+    ] = 3,
+    spread: Annotated[float, Parameter(help="Posterior SDs around the mode at which chains start.")] = 0.0,
+    chains: Annotated[int | None, Parameter(converter=whole_number, help="SGLD chains per window.")] = None,
+    draws: Annotated[int | None, Parameter(converter=whole_number, help="Draws kept of each chain.")] = None,
+    map: Annotated[
+        list[str] | None, Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN; repeatable.")
+    ] = None,
+    unit: Annotated[list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT; repeatable.")] = None,
+    stamp: Annotated[
+        list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
+    ] = None,
+    seed: Seed = 0,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Do SGLD's posteriors agree with exact quadrature and with NUTS?
+
+    Each window is taken on its own, under the first prior. Needs pip install 'avtorch[validate]'.
+
+    Parameters
+    ----------
+    log
+        CSV or Parquet, as for estimate. Without measured jerk there is no quadrature, and NUTS is the reference.
+    """
+    if synthetic and log is not None:
+        raise InputError(f"--synthetic: found together with {log}; needs one of a log and --synthetic")
+    if not synthetic and log is None:
+        raise InputError("log: neither a log nor --synthetic was given; needs one of them")
+    if synthetic and (map or unit or stamp):
+        raise InputError("--map, --unit, --stamp: found with --synthetic; they name the columns of a log")
+    for name, value in (("--windows", windows), ("--nuts-windows", nuts_windows), ("--chains", chains)):
+        if value is not None and value < 1:
+            raise InputError(f"{name}: found {value}, needs 1 or more")
+    positive("--window", window, "s")
+    not_negative("--spread", spread)
+    free_folder(out)
+    seed_number(seed)
+
+    from avtorch.validation.validate import check_installed
+
+    check_installed()
+    from avtorch.io import Log, check
+    from avtorch.results import validation_answer
+    from avtorch.validation import synthetic_windows, windows_of_log
+    from avtorch.validation import validate as work
+
+    given = {name: value for name, value in (("chains", chains), ("draws", draws)) if value is not None}
+    talk = Talk(json=json, quiet=quiet)
+    if log is None:
+        source = synthetic_windows(SYNTHETIC if windows is None else windows, seed=seed)
+    else:
+        drive = Log.read(log, map=map, unit=unit, stamp=stamp)
+        talk.notes(f"{drive.name}", check(drive).notes)
+        source = windows_of_log(drive, window=window, count=windows)
+    settings = replace(source.sampler, spread=spread, **given)
+    with talk.progress("Validating") as step:
+        found = work(source, settings=settings, nuts_windows=nuts_windows, seed=seed, progress=step)
+    answer = validation_answer(found)
+
+    from avtorch import plots
+
+    (out / "validation.json").unlink(missing_ok=True)
+    written = export(out, found.to_arviz())
+    write_answer(out, "validation.json", answer, plots.validation_figures(found))
+    talk.out.print(validation_table(answer))
+    for note in validation_notes(answer):
+        talk.out.print(note, style="dim", markup=False)
+    told = f"\n{answer['verdict']}: {answer['why']}"
+    talk.out.print(told, style="bold green" if found.verdict.agree else "bold red", markup=False)
+    talk.done(out, answer)
+    talk.out.print(f"For ArviZ: {', '.join(f'{name}.nc' for name in written)}", markup=False)
+
+
+def export(out: Path, groups: Mapping[str, InferenceData]) -> list[str]:
+    """Write each as NetCDF, `NAME.nc`, and remove those of an earlier run that this one has not; returns the names."""
+    out.mkdir(parents=True, exist_ok=True)
+    for name in ("sgld", "nuts", "quadrature"):
+        (out / f"{name}.nc").unlink(missing_ok=True)
+        if name in groups:
+            groups[name].to_netcdf(str(out / f"{name}.nc"))
+    return list(groups)

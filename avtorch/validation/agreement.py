@@ -1,0 +1,160 @@
+"""How far draws lie from a reference, window by window, and how far chance alone would have put them.
+
+Every measure is per window and parameter, in the parameter's own units or in SDs of the reference. Beside each stands
+what Monte Carlo error alone accounts for, so that a difference can be told from noise. Effective sample sizes and R-hat
+are ArviZ's (extra ``validate``).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.inference.posterior import Posterior
+from avtorch.inference.quadrature import Quadrature
+from avtorch.validation.diagnostics import Diagnostics, diagnose
+
+#: The tolerance asked for: difference of means in SDs of the reference, and of the ratio of SDs from one.
+MEAN_TOLERANCE, SD_TOLERANCE = 0.1, 0.05
+#: Points of the grid that the distance of two distribution functions is integrated over; 0.03 SDs apart.
+GRID = 513
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Draws against a reference. All shapes are ``(window, parameter)``.
+
+    Attributes:
+        names: parameter names, in the order of the last dimension.
+        mean_difference: mean less the reference's, in SDs of the reference.
+        mean_error: its Monte Carlo standard error.
+        sd_ratio: SD over the reference's.
+        sd_error: its Monte Carlo standard error.
+        w1: Wasserstein-1 distance of the marginals, in SDs of the reference.
+        w1_expected: what independent exact draws of the same effective number would give in the mean.
+        z_mean, z_sd: differences of mean and of SD over their Monte Carlo standard errors.
+        rhat: rank-normalised split R-hat, over superchains (see `avtorch.validation.diagnostics`).
+        ess_bulk, ess_tail: effective sample sizes for the bulk and for the 5 % and 95 % quantiles.
+    """
+
+    names: tuple[str, ...]
+    mean_difference: Tensor
+    mean_error: Tensor
+    sd_ratio: Tensor
+    sd_error: Tensor
+    w1: Tensor
+    w1_expected: Tensor
+    z_mean: Tensor
+    z_sd: Tensor
+    rhat: Tensor
+    ess_bulk: Tensor
+    ess_tail: Tensor
+
+    def select(self, index: Tensor) -> Agreement:
+        """The windows named by ``index``."""
+        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "names"})
+
+    def within(self, *, slack: float = 0.0) -> Tensor:
+        """Windows that meet the tolerance in every parameter, ``(window,)`` bool.
+
+        ``slack`` widens it by so many Monte Carlo standard errors, for a reference that has an error of its own.
+        """
+        mean = self.mean_difference.abs() <= MEAN_TOLERANCE + slack * self.mean_error
+        sd = (self.sd_ratio - 1).abs() <= SD_TOLERANCE + slack * self.sd_error
+        return (mean & sd).all(-1)
+
+    def chance_within(self, *, slack: float = 0.0) -> Tensor:
+        """Chance that exact draws of the same effective number meet the tolerance, ``(window,)``.
+
+        Normal errors, taken as independent between mean and SD and between parameters, which errs on the low side.
+        """
+
+        def inside(tolerance: float, error: Tensor) -> Tensor:
+            return torch.special.erf((tolerance / error + slack) / math.sqrt(2))
+
+        return (inside(MEAN_TOLERANCE, self.mean_error) * inside(SD_TOLERANCE, self.sd_error)).prod(-1)
+
+
+def agreement(posterior: Posterior, quadrature: Quadrature) -> Agreement:
+    """Draws against quadrature over the same windows.
+
+    Raises:
+        InputError: if parameters or windows differ, or ArviZ is missing.
+    """
+    _same(posterior, quadrature.names, len(quadrature.mean))
+    found = diagnose(posterior)
+    nodes = quadrature.nodes
+    share = torch.linspace(0, 1, GRID, dtype=nodes.dtype)
+    grid = torch.lerp(nodes[..., :1], nodes[..., -1:], share).exp()  # (window, parameter, grid)
+    below = quadrature.cdf(grid.movedim(-1, 0)).movedim(0, -1).clamp(0, 1)
+    ordered = posterior.flat.movedim(0, -1).sort(-1).values.contiguous()
+    empirical = torch.searchsorted(ordered, grid.contiguous(), right=True) / ordered.shape[-1]
+    # beyond the grid the reference has no mass: every draw there counts with its distance
+    outside = (ordered - grid[..., -1:]).clamp_min(0).mean(-1) + (grid[..., :1] - ordered).clamp_min(0).mean(-1)
+    w1 = torch.trapezoid((empirical - below).abs(), grid) + outside
+    spread = torch.trapezoid((below * (1 - below)).sqrt(), grid)
+    exact = torch.zeros_like(quadrature.mean)
+    return _agreement(found, quadrature.mean, quadrature.sd, exact, exact, w1, spread, exact)
+
+
+def between(posterior: Posterior, other: Posterior) -> Agreement:
+    """Draws against other draws of the same windows, ``other`` being the reference; both have Monte Carlo errors.
+
+    Raises:
+        InputError: if parameters or windows differ, or ArviZ is missing.
+    """
+    _same(posterior, other.names, other.draws.shape[2])
+    found, reference = diagnose(posterior), diagnose(other)
+    first, second = posterior.flat, other.flat
+    value, order = torch.cat([first, second]).sort(0)
+    mine = (order < len(first)).to(value)
+    apart = (mine.cumsum(0) / len(first) - (1 - mine).cumsum(0) / len(second)).abs()
+    w1 = (apart[:-1] * value.diff(dim=0)).sum(0)
+    below = torch.arange(1, len(second), dtype=value.dtype)[:, None, None] / len(second)
+    spread = ((below * (1 - below)).sqrt() * second.sort(0).values.diff(dim=0)).sum(0)
+    mean_error = reference.mean_error / reference.sd
+    sd_error = reference.sd_error / reference.sd
+    return _agreement(found, reference.mean, reference.sd, mean_error, sd_error, w1, spread, 1 / reference.ess_mean)
+
+
+def _agreement(
+    found: Diagnostics,
+    mean: Tensor,
+    sd: Tensor,
+    mean_error: Tensor,
+    sd_error: Tensor,
+    w1: Tensor,
+    spread: Tensor,
+    per_draw: Tensor,
+) -> Agreement:
+    """``mean_error``, ``sd_error`` (in SDs) and ``per_draw`` (one over the draws) are the reference's own."""
+    mean_difference, ratio = (found.mean - mean) / sd, found.sd / sd
+    mean_error = torch.hypot(found.mean_error / sd, mean_error)
+    sd_error = torch.hypot(found.sd_error / sd, ratio * sd_error)
+    # E|F_n - F| of n independent draws is sqrt(2/pi F (1 - F) / n)
+    expected = math.sqrt(2 / math.pi) * spread * (1 / found.ess_mean + per_draw).sqrt() / sd
+    return Agreement(
+        names=found.names,
+        mean_difference=mean_difference,
+        mean_error=mean_error,
+        sd_ratio=ratio,
+        sd_error=sd_error,
+        w1=w1 / sd,
+        w1_expected=expected,
+        z_mean=mean_difference / mean_error,
+        z_sd=(ratio - 1) / sd_error,
+        rhat=found.rhat,
+        ess_bulk=found.ess_bulk,
+        ess_tail=found.ess_tail,
+    )
+
+
+def _same(posterior: Posterior, names: tuple[str, ...], windows: int) -> None:
+    if posterior.names != tuple(names):
+        raise InputError(f"reference: has the parameters {tuple(names)}, not {posterior.names}")
+    if posterior.draws.shape[2] != windows:
+        raise InputError(f"reference: has {windows} windows, not {posterior.draws.shape[2]}")

@@ -1,0 +1,298 @@
+"""SGLD held against quadrature and NUTS on many windows, and a verdict that knows its own Monte Carlo error."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.inference.map import find_mode
+from avtorch.inference.posterior import Posterior
+from avtorch.inference.quadrature import Quadrature
+from avtorch.inference.sampler import SamplerSettings, sample
+from avtorch.io.log import Log
+from avtorch.validation.agreement import Agreement, agreement, between
+from avtorch.validation.exact import exact_draws
+from avtorch.validation.reference import join, reference, select
+from avtorch.validation.stein import Stein, stein_discrepancy
+from avtorch.validation.verdict import Verdict, judge
+from avtorch.validation.windows import Windows, windows_of_log
+
+if TYPE_CHECKING:
+    from arviz import InferenceData
+
+Progress = Callable[[float, float], None]
+
+#: Windows at once, so that progress can be shown and the memory of the quadrature stays bounded.
+BLOCK = 50
+#: What a window of NUTS counts for in the progress, where one of SGLD and quadrature counts one.
+NUTS_SHARE = 20
+
+
+@dataclass(frozen=True)
+class NutsSettings:
+    """Chains, draws a chain and steps of adaptation of the NUTS reference."""
+
+    chains: int = 2
+    draws: int = 1000
+    warmup: int = 500
+
+    def __post_init__(self) -> None:
+        for name, least in (("chains", 1), ("draws", 16), ("warmup", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: found {getattr(self, name)}, needs {least} or more")
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Everything that `validate` found; W windows and P parameters, named by ``windows.names``.
+
+    Attributes:
+        windows: what was validated.
+        settings: of SGLD.
+        seed: of everything random.
+        reference: "quadrature", or "nuts" where quadrature cannot be (more than three parameters).
+        sgld: draws ``(chain, draw, W, P)`` in the parameters' own units.
+        quadrature: of all windows (marginals `nodes`, `mass` ``(W, P, node)``, over log parameters), or None.
+        nuts: draws ``(chain, draw, M, P)`` of the M windows named by ``nuts_index`` ``(M,)``.
+        nuts_index: see there.
+        compared: which windows ``agreement`` is over, indices ``(C,)``: all, or ``nuts_index`` where NUTS is the
+            reference.
+        agreement: SGLD against the reference, ``(C, P)`` each.
+        nuts_agreement: NUTS against quadrature, ``(M, P)`` each, or None.
+        sgld_nuts: SGLD against NUTS, ``(M, P)`` each.
+        stein: kernel Stein discrepancy of SGLD, its null and p-value, ``(W,)`` each.
+        seconds: per window, by method: "sgld", "nuts", "quadrature" (0 where it was not run).
+        verdict: see `Verdict`.
+    """
+
+    windows: Windows
+    settings: SamplerSettings
+    seed: int
+    reference: str
+    sgld: Posterior
+    quadrature: Quadrature | None
+    nuts: Posterior
+    nuts_index: Tensor
+    compared: Tensor
+    agreement: Agreement
+    nuts_agreement: Agreement | None
+    sgld_nuts: Agreement
+    stein: Stein
+    seconds: dict[str, float]
+    verdict: Verdict
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.windows.names
+
+    def coverage(self, level: float = 0.9) -> dict[str, Tensor]:
+        """How often, or how far, the central interval of SGLD holds what it promises, ``(P,)`` each.
+
+        Where the truth is known: shares of windows whose interval covers it, for "sgld" and, on the same windows,
+        "quadrature" (synthetic vehicles are not drawn from the prior, so neither need be ``level``). Otherwise "sgld"
+        is the mean mass of the reference inside SGLD's interval.
+        """
+        tail = (1 - level) / 2
+        low, high = self.sgld.quantile(tail), self.sgld.quantile(1 - tail)
+        truth = self.windows.truth
+        if truth is not None:
+            found = {"sgld": ((low <= truth) & (truth <= high)).double().mean(0)}
+            if self.quadrature is not None:
+                exact = self.quadrature.quantile(tail), self.quadrature.quantile(1 - tail)
+                found["quadrature"] = ((exact[0] <= truth) & (truth <= exact[1])).double().mean(0)
+            return found
+        if self.quadrature is not None:
+            return {"sgld": (self.quadrature.cdf(high) - self.quadrature.cdf(low)).nan_to_num(nan=0.0).mean(0)}
+        flat = self.nuts.flat
+        inside = (low[self.nuts_index] <= flat) & (flat <= high[self.nuts_index])
+        return {"sgld": inside.double().mean((0, 1))}
+
+    def quadrature_draws(self, index: Tensor | None = None, *, chains: int = 4, draws: int = 500) -> Posterior | None:
+        """Independent draws of the joint posterior (see `exact_draws`), of all windows or those named by ``index``."""
+        if self.quadrature is None:
+            return None
+        density, exact = self.windows.density, self.quadrature
+        if index is not None:
+            density, exact = self.windows.select(index).density, select(exact, index)
+        generator = torch.Generator().manual_seed(self.seed)
+        return exact_draws(density, exact, chains=chains, draws=draws, generator=generator)
+
+    def to_arviz(self) -> dict[str, InferenceData]:
+        """The draws of "sgld", "nuts" and, where it was run, "quadrature" (as independent draws) for ArviZ."""
+        from avtorch.inference.arviz_export import to_arviz
+
+        found = {"sgld": to_arviz(self.sgld), "nuts": to_arviz(self.nuts)}
+        named = {"window": self.nuts_index.numpy()}
+        found["nuts"].assign_coords(named, inplace=True)  # pyright: ignore[reportCallIssue]
+        exact = self.quadrature_draws()
+        if exact is not None:
+            found["quadrature"] = to_arviz(exact)
+        return found
+
+
+def check_installed() -> None:
+    """Raises `InputError` where ArviZ or Pyro is missing."""
+    missing = [name for name, module in (("arviz", "arviz"), ("pyro-ppl", "pyro")) if find_spec(module) is None]
+    if missing:
+        verb = "are" if len(missing) > 1 else "is"
+        raise InputError(f"{', '.join(missing)}: {verb} not installed; needs pip install 'avtorch[validate]'")
+
+
+def validate(
+    source: Log | Windows,
+    *,
+    window: float = 2.0,
+    windows: int | None = None,
+    settings: SamplerSettings | None = None,
+    nuts_windows: int = 3,
+    nuts: NutsSettings | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Validation:
+    """SGLD, quadrature and NUTS over the same windows, each under the first prior and on its own.
+
+    Args:
+        source: a log, or windows made by `synthetic_windows` and its like.
+        window: length of a log's windows [s].
+        windows: at most so many windows of a log, evenly spread; all by default.
+        settings: of SGLD; by default those that every command uses for the form.
+        nuts_windows: on how many windows, evenly spread, NUTS is run: one costs a second or more.
+        nuts: its chains and draws.
+        progress: called with (done, of).
+
+    Raises:
+        InputError: if ArviZ or Pyro is missing, for ``nuts_windows`` below 1, or for a log that cannot be used.
+    """
+    check_installed()
+    if nuts_windows < 1:
+        raise InputError(f"nuts_windows: found {nuts_windows}, needs 1 or more")
+    if isinstance(source, Log):
+        source = windows_of_log(source, window=window, count=windows)
+    settings = source.sampler if settings is None else settings
+    if settings.chains == 1 and settings.draws < 8:
+        raise InputError(f"draws: found {settings.draws} of a single chain, needs 8 or more to judge it")
+    chosen = torch.linspace(0, len(source) - 1, min(nuts_windows, len(source))).round().long()
+    told = _Told(progress, len(source) + NUTS_SHARE * len(chosen))
+    generator = torch.Generator().manual_seed(seed)
+    blocks = [_block(source.select(i), settings, generator, told) for i in torch.arange(len(source)).split(BLOCK)]
+    sgld = _joined_draws([b.sgld for b in blocks])
+    exact = [b.quadrature for b in blocks if b.quadrature is not None]
+    quadrature = join(exact) if exact else None
+    stein = Stein(
+        *(torch.cat([getattr(b.stein, name) for b in blocks]) for name in ("value", "expected", "p_value")),
+        points=blocks[0].stein.points,
+    )
+    begun = clock.perf_counter()
+    walked = _nuts(source, chosen, NutsSettings() if nuts is None else nuts, seed, told)
+    seconds = {
+        "sgld": sum(b.sgld_seconds for b in blocks) / len(source),
+        "nuts": (clock.perf_counter() - begun) / len(chosen),
+        "quadrature": sum(b.quadrature_seconds for b in blocks) / len(source),
+    }
+    sgld_nuts = between(_of_windows(sgld, chosen), walked)
+    if quadrature is None:
+        compared, found, against = chosen, sgld_nuts, None
+        settled = sgld.converged[chosen] & walked.converged
+    else:
+        compared, found = torch.arange(len(source)), agreement(sgld, quadrature)
+        against = agreement(walked, select(quadrature, chosen))
+        settled = sgld.converged & quadrature.converged
+    held_to = "nuts" if quadrature is None else "quadrature"
+    verdict = judge(found, settled, reference=held_to, numbers=compared.tolist(), nuts=against)
+    return Validation(
+        windows=source,
+        settings=settings,
+        seed=seed,
+        reference=held_to,
+        sgld=sgld,
+        quadrature=quadrature,
+        nuts=walked,
+        nuts_index=chosen,
+        compared=compared,
+        agreement=found,
+        nuts_agreement=against,
+        sgld_nuts=sgld_nuts,
+        stein=stein,
+        seconds=seconds,
+        verdict=verdict,
+    )
+
+
+@dataclass
+class _Told:
+    """Progress so far."""
+
+    progress: Progress | None
+    total: float
+    done: float = 0.0
+
+    def add(self, amount: float) -> None:
+        self.done += amount
+        if self.progress is not None:
+            self.progress(self.done, self.total)
+
+
+@dataclass(frozen=True)
+class _Block:
+    """What was found of a few windows, and the seconds it took."""
+
+    sgld: Posterior
+    quadrature: Quadrature | None
+    stein: Stein
+    sgld_seconds: float
+    quadrature_seconds: float
+
+
+def _block(windows: Windows, settings: SamplerSettings, generator: torch.Generator, told: _Told) -> _Block:
+    density = windows.density
+    begun = clock.perf_counter()
+    sgld = sample(density, settings, generator=generator)  # search for the mode included
+    sgld_seconds = clock.perf_counter() - begun
+    told.add(0.3 * len(windows))
+    begun = clock.perf_counter()
+    quadrature = reference(windows) if len(windows.names) <= 3 else None
+    seconds = clock.perf_counter() - begun if quadrature is not None else 0.0
+    told.add(0.5 * len(windows))
+    stein = stein_discrepancy(density, sgld.draws.log(), mode=find_mode(density), generator=generator)
+    told.add(0.2 * len(windows))
+    return _Block(sgld, quadrature, stein, sgld_seconds, seconds)
+
+
+def _nuts(windows: Windows, index: Tensor, settings: NutsSettings, seed: int, told: _Told) -> Posterior:
+    from avtorch.inference.nuts import nuts
+
+    found = []
+    for i in index:
+        one = windows.select(i[None])
+        found.append(
+            nuts(
+                one.density,  # pyright: ignore[reportArgumentType]
+                window=0,
+                chains=settings.chains,
+                draws=settings.draws,
+                warmup=settings.warmup,
+                seed=(seed + int(i)) % 2**63,
+            )
+        )
+        told.add(NUTS_SHARE)
+    return _joined_draws(found)
+
+
+def _joined_draws(parts: list[Posterior]) -> Posterior:
+    """Posteriors of different windows as one."""
+    draws, converged = torch.cat([p.draws for p in parts], 2), torch.cat([p.converged for p in parts])
+    why = [reason for p in parts for reason in (p.why or ("",) * len(p.converged))]
+    return Posterior(parts[0].names, draws, converged, tuple(why))
+
+
+def _of_windows(posterior: Posterior, index: Tensor) -> Posterior:
+    why = tuple(posterior.why[i] for i in index.tolist()) if posterior.why else ()
+    return Posterior(posterior.names, posterior.draws[:, :, index], posterior.converged[index], why)

@@ -1,0 +1,103 @@
+"""What a method of the comparison is: a description that costs nothing, and a runner that its own process builds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, Protocol
+
+import numpy as np
+
+from benchmarks.peers.problem import Array, Windows
+
+Settings = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a method says about some windows.
+
+    Attributes:
+        draws: ``(chain, draw, window, parameter)`` in the parameters' own units, or ``None`` without draws.
+        mean, sd: ``(window, parameter)``; NaN where the method does not estimate a parameter. Taken from the draws
+            where there are some.
+        ess: a ceiling on the effective draws of every window, ``(window,)``, for weighted draws.
+    """
+
+    draws: Array | None = None
+    mean: Array | None = None
+    sd: Array | None = None
+    ess: Array | None = None
+
+
+class Runner(Protocol):
+    """A method with its settings, built in its own process. What it compiled it keeps from call to call."""
+
+    def log_density(self, windows: Windows, z: Array) -> Array | None:
+        """Its log density of the first window at ``z = log(parameter)``, ``(point, 3)`` to ``(point,)``.
+
+        ``None`` if the method does not work on that density.
+        """
+        ...
+
+    def run(self, windows: Windows, seed: int) -> Answer:
+        """From the rows of the windows to the answer: one window, or as many as there are at once."""
+        ...
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row of the table.
+
+    Attributes:
+        name: how ``--only`` names it.
+        title: how the table names it.
+        module: under ``benchmarks.peers``; its ``build(settings)`` returns a :class:`Runner`.
+        needs: modules that must be installed, and ``pip``: what installs them.
+        candidates: settings for one window; of several the run keeps the fastest that is accurate, on windows of its
+            own. ``draws`` (a chain) is then scaled so that the worst parameter gets the effective draws wanted, unless
+            ``fixed``.
+        batch: settings for many windows at once, or ``None``; ``batch_windows``: at most so many.
+        gets: what was done for its speed, in words.
+        same_density: whether it works on the density of all; else the table says that it does not.
+        exact: the truth itself.
+        slow: the number of windows is cut, and no trial is made.
+    """
+
+    name: str
+    title: str
+    module: str
+    needs: tuple[str, ...] = ()
+    pip: str = ""
+    candidates: tuple[Settings, ...] = ({},)
+    fixed: bool = False
+    batch: Settings | None = None
+    batch_windows: int = 1000
+    gets: str = ""
+    same_density: bool = True
+    exact: bool = False
+    slow: bool = False
+
+    def missing(self) -> tuple[str, ...]:
+        """Modules it needs that are not installed."""
+        return tuple(name for name in self.needs if find_spec(name) is None)
+
+    def build(self, settings: Settings) -> Runner:
+        return import_module(f"benchmarks.peers.{self.module}").build(settings)
+
+
+def moments(answer: Answer) -> tuple[Array, Array]:
+    """Means and SDs, ``(window, parameter)``."""
+    if answer.draws is None:
+        assert answer.mean is not None
+        assert answer.sd is not None
+        return answer.mean, answer.sd
+    flat = answer.draws.reshape(-1, *answer.draws.shape[2:])
+    return flat.mean(0), flat.std(0, ddof=1)
+
+
+def as_log(windows: Windows) -> Array:
+    """Random places around the truth in ``z``, ``(point, 3)``, for comparing densities."""
+    g = np.random.default_rng(len(windows))
+    return np.log(windows.truth[0]) + 0.5 * g.standard_normal((20, 3))

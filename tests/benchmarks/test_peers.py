@@ -1,0 +1,161 @@
+"""The comparison with peers: its command runs without them, all densities are one, and what is missing is said."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.peers import __main__ as command
+from benchmarks.peers.aims import aims
+from benchmarks.peers.contract import Method, as_log
+from benchmarks.peers.problem import Windows, make_windows
+from benchmarks.peers.registry import METHODS
+from benchmarks.peers.score import WANTED, Exact, effective, seconds_to
+from benchmarks.peers.single import Row
+from benchmarks.peers.tables import markdown, one_window, text
+from benchmarks.peers.torch_rows import own_log_density
+
+#: Methods that need nothing beyond avtorch itself.
+ALONE = ("avtorch", "conjugate", "laplace", "rls", "scalar", "quadrature")
+#: Those of the others that can be imported side by side with torch in one process.
+PEERS = ("blackjax-nuts", "numpyro-nuts", "nutpie", "pyro-nuts", "posteriors", "blackjax-sgld", "ukf")
+
+
+@pytest.fixture(scope="module")
+def windows() -> Windows:
+    return make_windows(3, seed=8)
+
+
+def test_windows_keep_their_ranges(windows: Windows) -> None:
+    many = make_windows(200, points=50, seed=1)
+    low, high = many.truth.min(0), many.truth.max(0)
+    assert (low >= [0.1, 0.4, 0.05]).all()
+    assert (high <= [2.0, 1.1, 0.3]).all()
+    residual = many.jerk - (many.truth[:, 1:2] * many.u - many.a) / many.truth[:, :1]
+    assert np.allclose(residual.std(1), many.truth[:, 2], rtol=0.6)
+    assert windows.sums().shape == (3, 7)
+
+
+@pytest.mark.parametrize("name", [*ALONE, *PEERS])
+def test_every_method_works_on_the_same_density(name: str, windows: Windows) -> None:
+    method = METHODS[name]
+    if method.missing():
+        pytest.skip(f"{', '.join(method.missing())} not installed")
+    if "jax" in method.needs:
+        import_module("jax").config.update("jax_enable_x64", True)
+    z, ours = as_log(windows), own_log_density(windows, as_log(windows))
+    with warnings.catch_warnings():
+        if name in PEERS:
+            warnings.simplefilter("ignore")  # what a peer announces on import is not ours to mend
+        theirs = method.build(method.candidates[0]).log_density(windows, z)
+    assert (theirs is not None) == method.same_density
+    if theirs is not None:
+        assert (np.abs(theirs - ours) <= 1e-8 * (1 + np.abs(ours))).all()
+
+
+def test_density_check_sees_a_forgotten_jacobian(windows: Windows) -> None:
+    z, ours = as_log(windows), own_log_density(windows, as_log(windows))
+    assert (np.abs(ours - z[:, 2] - ours) > 1e-8 * (1 + np.abs(ours))).any()
+
+
+@pytest.mark.slow
+def test_quick_run_of_what_needs_no_peer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told = tmp_path / "peers.json"
+    given = ["--quick", "--windows", "1", "--only", ",".join(ALONE), "--parts", "one", "--core", "-1"]
+    assert command.main([*given, "--json", str(told)]) == 0
+    figures = json.loads(told.read_text(encoding="utf-8"))
+    rows = {row["method"]: row for row in figures["one"]}
+    assert set(rows) == set(ALONE)
+    assert not [row["why"] for row in rows.values() if row["why"]]
+    assert all(row["seconds"] > 0 and row["peak_mb"] >= 0 for row in rows.values())
+    assert rows["quadrature"]["shift"] < 1e-6
+    assert abs(rows["laplace"]["shift"]) < 1.0
+    printed = capsys.readouterr().out
+    assert "against avtorch" in printed
+    assert "recursive least squares" in printed
+
+
+@pytest.mark.slow
+def test_quick_run_of_many_windows(tmp_path: Path) -> None:
+    told = tmp_path / "peers.json"
+    given = ["--quick", "--batch", "3", "--only", "avtorch,rls,scalar", "--parts", "many", "--json", str(told)]
+    assert command.main(given) == 0
+    rows = {row["method"]: row for row in json.loads(told.read_text(encoding="utf-8"))["many"]}
+    assert set(rows) == {"avtorch", "rls"}
+    assert all(row["windows"] == 3 and row["seconds"] > 0 for row in rows.values())
+
+
+def test_missing_peer_is_a_line_with_its_pip_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    absent = Method("absent", "Absent sampler", "absent", needs=("no_such_module",), pip="pip install absent", batch={})
+    monkeypatch.setitem(METHODS, "absent", absent)
+    assert command.main(["--quick", "--windows", "1", "--only", "absent", "--parts", "one,many", "--batch", "1"]) == 0
+    assert capsys.readouterr().out.count("not installed: pip install absent") == 2
+
+
+def test_failing_method_is_a_line_not_the_end(capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    # its process looks it up in the registry, where this name is not
+    broken = Method("broken", "Broken sampler", "laplace", fixed=True)
+    monkeypatch.setitem(METHODS, "broken", broken)
+    assert command.main(["--quick", "--windows", "1", "--only", "broken", "--parts", "one"]) == 0
+    assert "its process ended" in capsys.readouterr().out
+
+
+def test_unknown_method_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        command.main(["--only", "nuts2"])
+    assert "'nuts2' is none of" in capsys.readouterr().err
+
+
+def test_effective_draws_of_many_short_chains(rotating_seed: int) -> None:
+    g = np.random.default_rng(rotating_seed)
+    chains, length = 512, 8
+    independent = np.exp(g.standard_normal((chains, length, 1, 2)))
+    bulk, _ = effective(independent)
+    # the least of two, each with a relative error of sqrt(2/512), is low by a little
+    assert abs(bulk[0] / (chains * length) - 1) < 5 * np.sqrt(2 / chains) + 0.05
+    rho = 0.9
+    walk = np.empty((chains, length, 1, 1))
+    walk[:, 0] = g.standard_normal((chains, 1, 1))
+    for k in range(1, length):
+        walk[:, k] = rho * walk[:, k - 1] + np.sqrt(1 - rho**2) * g.standard_normal((chains, 1, 1))
+    lags = np.arange(1, length)
+    expected = chains * length / (1 + 2 * ((1 - lags / length) * rho**lags).sum())
+    assert abs(effective(walk)[0][0] / expected - 1) < 5 * np.sqrt(2 / chains)
+
+
+def test_effective_draws_never_exceed_the_draws() -> None:
+    g = np.random.default_rng(0)
+    x = g.standard_normal((4, 400, 1, 1))
+    x[:, 1::2] = -x[:, ::2]  # antithetic pairs: their mean is exact, their spread is not
+    assert effective(x)[0][0] <= 1600
+
+
+def test_seconds_are_scaled_up_only() -> None:
+    assert seconds_to(WANTED, 1.0, WANTED / 2) == pytest.approx(2.0)
+    assert seconds_to(WANTED, 1.0, 2 * WANTED) == pytest.approx(1.0)
+
+
+def test_tables_and_aims_from_rows() -> None:
+    own = Row("avtorch", "avtorch SGLD", seconds=0.01, seconds_wanted=0.01, bulk=3000.0, first_s=0.1, windows=5)
+    peer = Row("blackjax-nuts", "BlackJAX NUTS", seconds=0.05, seconds_wanted=0.05, bulk=2100.0, windows=5)
+    gone = Row("nutpie", "nutpie", why="not installed: pip install nutpie")
+    shown = text(one_window([own, peer, gone]))
+    assert "5 x" in shown
+    assert "not installed: pip install nutpie" in shown
+    assert markdown(one_window([own, peer, gone])).count("\n") == 4
+    verdicts = aims([own, peer, gone], [], None)
+    assert [v for a, _, v in verdicts if "BlackJAX NUTS" in a] == ["MISSED"]
+
+
+def test_quadrature_is_the_truth_of_the_scores(windows: Windows) -> None:
+    exact = Exact.of(windows)
+    assert exact.mean.shape == exact.sd.shape == (3, 3)
+    assert torch.as_tensor(exact.sd > 0).all()
