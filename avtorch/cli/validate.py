@@ -33,8 +33,9 @@ def validate(
     window: Annotated[float, Parameter(help="Length of a log's windows [s].")] = 2.0,
     out: Out,
     nuts_windows: Annotated[
-        int, Parameter(converter=whole_number, help="On how many of them NUTS is run; one costs seconds.")
-    ] = 3,
+        int | None,
+        Parameter(converter=whole_number, help="On how many of them NUTS is run; 3, or 1 without jerk (minutes each)."),
+    ] = None,
     spread: Annotated[float, Parameter(help="Posterior SDs around the mode at which chains start.")] = 0.0,
     chains: Annotated[int | None, Parameter(converter=whole_number, help="SGLD chains per window.")] = None,
     draws: Annotated[int | None, Parameter(converter=whole_number, help="Draws kept of each chain.")] = None,

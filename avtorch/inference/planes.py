@@ -1,7 +1,8 @@
-"""The memory order in which one step of many chains is quickest: one plane ``(chain, window)`` after another.
+"""The memory order in which a step of many chains is quickest: one parameter of one window after another.
 
-Shapes stay ``(..., window, parameter)`` everywhere; only the order in memory differs, so that arithmetic on a single
-parameter runs over contiguous numbers. On 64 chains of 1000 windows a step takes a fifth of the time.
+Shapes stay ``(..., window, parameter)`` everywhere; only the order in memory differs: parameter, then window, then the
+chains. Arithmetic on a parameter then runs over contiguous numbers, and what belongs to a window is a single number
+there. For thousand chains of thirty windows a step takes a fifth of the time of the usual order.
 """
 
 from __future__ import annotations
@@ -10,23 +11,35 @@ import torch
 from torch import Tensor
 
 
+def to_planes(x: Tensor) -> Tensor:
+    """``(..., window, parameter)`` seen as ``(parameter, window, ...)``, contiguous for what this module makes."""
+    return x.permute(-1, -2, *range(x.dim() - 2))
+
+
+def from_planes(planes: Tensor) -> Tensor:
+    """The inverse of :func:`to_planes`."""
+    return planes.permute(*range(2, planes.dim()), 1, 0)
+
+
 def as_planes(*parameters: Tensor) -> Tensor:
-    """``(..., parameter)`` from one tensor ``(...)`` a parameter."""
-    return torch.stack(parameters).movedim(0, -1)
+    """``(..., window, parameter)`` from one tensor ``(..., window)`` a parameter."""
+    return from_planes(torch.stack([parameter.movedim(-1, 0) for parameter in parameters]))
 
 
 def join_planes(*blocks: Tensor) -> Tensor:
-    """Blocks ``(..., some parameters)`` side by side, ``(..., parameter)``."""
-    return torch.cat([block.movedim(-1, 0) for block in blocks]).movedim(0, -1)
+    """Blocks ``(..., window, some parameters)`` side by side, ``(..., window, parameter)``."""
+    return from_planes(torch.cat([to_planes(block) for block in blocks]))
 
 
 def empty_planes(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
-    """An uninitialised ``(..., parameter)``."""
-    return torch.empty(shape[-1], *shape[:-1], dtype=dtype).movedim(0, -1)
+    """An uninitialised ``(..., window, parameter)``."""
+    return from_planes(torch.empty(shape[-1], shape[-2], *shape[:-2], dtype=dtype))
 
 
 def lower_times(lower: Tensor, x: Tensor) -> Tensor:
     """``lower @ x`` for triangular ``lower`` ``(window, d, d)`` and ``x`` ``(..., window, d)``."""
+    if len(lower) == 1:
+        return _product(lower[0], x)
     planes, d = x.unbind(-1), x.shape[-1]
     rows = []
     for i in range(d):
@@ -39,6 +52,8 @@ def lower_times(lower: Tensor, x: Tensor) -> Tensor:
 
 def lower_transposed_times(lower: Tensor, x: Tensor) -> Tensor:
     """``lower.T @ x``, shapes as in :func:`lower_times`."""
+    if len(lower) == 1:
+        return _product(lower[0].T, x)
     planes, d = x.unbind(-1), x.shape[-1]
     rows = []
     for i in range(d):
@@ -47,3 +62,9 @@ def lower_transposed_times(lower: Tensor, x: Tensor) -> Tensor:
             row.addcmul_(lower[:, j, i], planes[j])
         rows.append(row)
     return as_planes(*rows)
+
+
+def _product(matrix: Tensor, x: Tensor) -> Tensor:
+    """The same matrix ``(d, d)`` for all: one call, where a window's few numbers are soon done with."""
+    planes = to_planes(x)
+    return from_planes((matrix @ planes.reshape(len(planes), -1)).view(planes.shape))

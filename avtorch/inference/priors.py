@@ -45,6 +45,8 @@ class LogNormalPrior:
 
     median: Tensor
     log_sd: Tensor
+    _log_median: Tensor = field(init=False, repr=False)
+    _precision: Tensor = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("median", "log_sd"):
@@ -52,13 +54,15 @@ class LogNormalPrior:
             if not bool((value > 0).all()):
                 raise InputError(f"{name}: {value.tolist()} is not positive")
             object.__setattr__(self, name, value)
+        object.__setattr__(self, "_log_median", self.median.log())
+        object.__setattr__(self, "_precision", self.log_sd.square().reciprocal())
 
     def log_prob(self, z: Tensor) -> Tensor:
         score = (z - self.median.log()) / self.log_sd
         return -0.5 * score.square().sum(-1) - self.log_sd.log().sum() - 0.5 * len(self.median) * _LOG_2PI
 
     def score(self, z: Tensor) -> Tensor:
-        return (self.median.log() - z) / self.log_sd.square()
+        return (self._log_median - z).mul_(self._precision)
 
     def select(self, index: Tensor) -> LogNormalPrior:
         return self
@@ -76,19 +80,21 @@ class HalfNormalPrior:
     """Independent half-normal parameters with the given ``scale``, shape ``(parameter,)``."""
 
     scale: Tensor
+    _minus_precision: Tensor = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         value = torch.as_tensor(self.scale, dtype=torch.float64)
         if not bool((value > 0).all()):
             raise InputError(f"scale: {value.tolist()} is not positive")
         object.__setattr__(self, "scale", value)
+        object.__setattr__(self, "_minus_precision", -value.square().reciprocal())
 
     def log_prob(self, z: Tensor) -> Tensor:
         log_density = -0.5 * (z.exp() / self.scale).square() + z
         return log_density.sum(-1) + len(self.scale) * 0.5 * math.log(2 / math.pi) - self.scale.log().sum()
 
     def score(self, z: Tensor) -> Tensor:
-        return 1 - (z.exp() / self.scale).square()
+        return (2 * z).exp_().mul_(self._minus_precision).add_(1)
 
     def select(self, index: Tensor) -> HalfNormalPrior:
         return self

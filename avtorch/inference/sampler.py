@@ -21,9 +21,13 @@ from avtorch.inference.whitening import Coordinates, Whitening, stiffness
 
 #: Chains times windows walked at once: enough to drown the cost of a call, few enough to stay in the processor's cache.
 BLOCK = 2**15
+#: Chains times windows below which a step costs what its calls cost, however few they are.
+FEW = 2**11
 
 #: A window stiffer than this is whitened afresh by a pilot walk.
-UNEVEN = 4.0
+UNEVEN = 16.0
+#: How many times as many steps the pilot gets.
+PILOT = 8.0
 #: A window stiffer than this many times the lengthening of its walk has not mixed: its burn-in is shorter than its
 #: relaxation time.
 STUCK = 4.0
@@ -82,8 +86,12 @@ class SamplerSettings:
             raise InputError(f"whitening: {self.whitening!r} is none of 'full', 'diagonal', 'none'")
 
     def slower(self, times: float) -> SamplerSettings:
-        """The same walk in ``times`` as many steps, for a step that is ``times`` shorter."""
-        return replace(self, burn_in=math.ceil(times * self.burn_in), thinning=math.ceil(times * self.thinning))
+        """The same walk in ``times`` as many steps, for a step that is ``times`` shorter.
+
+        What is steep on one side is flat on the other, where chains arrive later still: the burn-in grows once more.
+        """
+        burn_in = math.ceil(times * min(times, 5.0) * self.burn_in)
+        return replace(self, burn_in=burn_in, thinning=math.ceil(times * self.thinning))
 
 
 def sample(
@@ -108,7 +116,7 @@ def sample(
     mode = find_mode(density) if mode is None else mode
     mode, pace = _adapted(density, mode, settings, generator)
     # all draws of a parameter of a window behind one another, as its summaries read them
-    draws = torch.empty(*mode.z.shape, settings.chains, settings.draws, dtype=mode.z.dtype).permute(2, 3, 0, 1)
+    draws = torch.empty(*mode.z.shape, settings.draws, settings.chains, dtype=mode.z.dtype).permute(3, 2, 0, 1)
     strayed, apart, stuck = (torch.zeros_like(mode.converged) for _ in range(3))
     # chains that agree still differ by chance: eight groups cut into halves of this many draws each
     members = max(1, settings.chains // 8) * (settings.draws // 2)
@@ -140,8 +148,8 @@ def _adapted(
 ) -> tuple[Mode, Tensor]:
     """Whitening and stiffness of every window.
 
-    Where the Laplace covariance at the mode fits badly (one window in fifty), a pilot walk's mean and covariance take
-    its place if they are less stiff.
+    Where the Laplace covariance at the mode fits badly (one window in three hundred), a pilot walk's mean and
+    covariance take its place if they are less stiff.
     """
     coordinates = Coordinates.of(mode, settings.whitening)
     pace = stiffness(density, coordinates)
@@ -151,8 +159,8 @@ def _adapted(
     fitted, fitted_pace = mode, pace.clone()
     for index in _batches(density, uneven, pace, settings.chains):
         part, where = _select(density, index), mode.select(index)
-        times = float(_longer(pace[index]).amax())
-        coordinates, w = _walk(part, where, settings.slower(times), pace[index], generator)
+        # a rough covariance will do
+        coordinates, w = _walk(part, where, settings.slower(PILOT), pace[index], generator)
         better = where.refitted(coordinates.z(w).flatten(0, 1))
         quicker = stiffness(part, Coordinates.of(better))
         fitted = fitted.replaced(index, better, quicker < pace[index])
@@ -181,7 +189,14 @@ def _batches(density: Density, index: Tensor, pace: Tensor, chains: int) -> list
         return [torch.arange(density.windows)]
     size = max(1, BLOCK // chains)
     times = _longer(pace[index])
-    return [part for each in times.unique() for part in index[times == each].split(size)]
+    batches, few = [], index[:0]
+    for each in times.unique():
+        few = torch.cat([few, index[times == each]])
+        # a handful of windows costs less in the next batch, at its slower pace, than in one of their own
+        if len(few) * chains >= FEW or each == times.max():
+            batches += few.split(size)
+            few = index[:0]
+    return batches
 
 
 def _select(density: Density, index: Tensor) -> Density:

@@ -19,6 +19,14 @@ from avtorch.inference.sampler import SamplerSettings, sample
 from avtorch.io.log import Log
 from avtorch.validation.agreement import Agreement, agreement, between
 from avtorch.validation.exact import exact_draws
+from avtorch.validation.nuts_reference import (
+    LATENT_NUTS,
+    LATENT_NUTS_WINDOWS,
+    NUTS_WINDOWS,
+    NutsSettings,
+    join_draws,
+    walk_nuts,
+)
 from avtorch.validation.reference import join, reference, select
 from avtorch.validation.stein import Stein, stein_discrepancy
 from avtorch.validation.verdict import Verdict, judge
@@ -33,20 +41,6 @@ Progress = Callable[[float, float], None]
 BLOCK = 50
 #: What a window of NUTS counts for in the progress, where one of SGLD and quadrature counts one.
 NUTS_SHARE = 20
-
-
-@dataclass(frozen=True)
-class NutsSettings:
-    """Chains, draws a chain and steps of adaptation of the NUTS reference."""
-
-    chains: int = 2
-    draws: int = 1000
-    warmup: int = 500
-
-    def __post_init__(self) -> None:
-        for name, least in (("chains", 1), ("draws", 16), ("warmup", 1)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name}: found {getattr(self, name)}, needs {least} or more")
 
 
 @dataclass(frozen=True)
@@ -152,7 +146,7 @@ def validate(
     window: float = 2.0,
     windows: int | None = None,
     settings: SamplerSettings | None = None,
-    nuts_windows: int = 3,
+    nuts_windows: int | None = None,
     nuts: NutsSettings | None = None,
     seed: int = 0,
     progress: Progress | None = None,
@@ -164,26 +158,31 @@ def validate(
         window: length of a log's windows [s].
         windows: at most so many windows of a log, evenly spread; all by default.
         settings: of SGLD; by default those that every command uses for the form.
-        nuts_windows: on how many windows, evenly spread, NUTS is run: one costs a second or more.
-        nuts: its chains and draws.
+        nuts_windows: on how many windows, evenly spread, NUTS is run: three, or one in the latent form, where it costs
+            minutes.
+        nuts: its chains and draws; by default those of `NutsSettings`, and fewer in the latent form.
         progress: called with (done, of).
 
     Raises:
         InputError: if ArviZ or Pyro is missing, for ``nuts_windows`` below 1, or for a log that cannot be used.
     """
     check_installed()
-    if nuts_windows < 1:
+    if nuts_windows is not None and nuts_windows < 1:
         raise InputError(f"nuts_windows: found {nuts_windows}, needs 1 or more")
     if isinstance(source, Log):
         source = windows_of_log(source, window=window, count=windows)
     settings = source.sampler if settings is None else settings
     if settings.chains == 1 and settings.draws < 8:
         raise InputError(f"draws: found {settings.draws} of a single chain, needs 8 or more to judge it")
+    latent = source.form == "latent"
+    nuts = (LATENT_NUTS if latent else NutsSettings()) if nuts is None else nuts
+    if nuts_windows is None:
+        nuts_windows = LATENT_NUTS_WINDOWS if latent else NUTS_WINDOWS
     chosen = torch.linspace(0, len(source) - 1, min(nuts_windows, len(source))).round().long()
     told = _Told(progress, len(source) + NUTS_SHARE * len(chosen))
     generator = torch.Generator().manual_seed(seed)
     blocks = [_block(source.select(i), settings, generator, told) for i in torch.arange(len(source)).split(BLOCK)]
-    sgld = _joined_draws([b.sgld for b in blocks])
+    sgld = join_draws([b.sgld for b in blocks])
     exact = [b.quadrature for b in blocks if b.quadrature is not None]
     quadrature = join(exact) if exact else None
     stein = Stein(
@@ -191,7 +190,7 @@ def validate(
         points=blocks[0].stein.points,
     )
     begun = clock.perf_counter()
-    walked = _nuts(source, chosen, NutsSettings() if nuts is None else nuts, seed, told)
+    walked = walk_nuts(source, chosen, nuts, seed=seed, done=lambda: told.add(NUTS_SHARE))
     seconds = {
         "sgld": sum(b.sgld_seconds for b in blocks) / len(source),
         "nuts": (clock.perf_counter() - begun) / len(chosen),
@@ -264,33 +263,6 @@ def _block(windows: Windows, settings: SamplerSettings, generator: torch.Generat
     stein = stein_discrepancy(density, sgld.draws.log(), mode=find_mode(density), generator=generator)
     told.add(0.2 * len(windows))
     return _Block(sgld, quadrature, stein, sgld_seconds, seconds)
-
-
-def _nuts(windows: Windows, index: Tensor, settings: NutsSettings, seed: int, told: _Told) -> Posterior:
-    from avtorch.inference.nuts import nuts
-
-    found = []
-    for i in index:
-        one = windows.select(i[None])
-        found.append(
-            nuts(
-                one.density,  # pyright: ignore[reportArgumentType]
-                window=0,
-                chains=settings.chains,
-                draws=settings.draws,
-                warmup=settings.warmup,
-                seed=(seed + int(i)) % 2**63,
-            )
-        )
-        told.add(NUTS_SHARE)
-    return _joined_draws(found)
-
-
-def _joined_draws(parts: list[Posterior]) -> Posterior:
-    """Posteriors of different windows as one."""
-    draws, converged = torch.cat([p.draws for p in parts], 2), torch.cat([p.converged for p in parts])
-    why = [reason for p in parts for reason in (p.why or ("",) * len(p.converged))]
-    return Posterior(parts[0].names, draws, converged, tuple(why))
 
 
 def _of_windows(posterior: Posterior, index: Tensor) -> Posterior:

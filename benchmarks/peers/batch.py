@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.peers.problem import make_windows
 from benchmarks.peers.process import PeerFailed, Worker
 from benchmarks.peers.score import WANTED, Exact, Score, median, seconds_to
-from benchmarks.peers.single import Plan, Row, quick, say
+from benchmarks.peers.single import TRIAL_WINDOWS, Plan, Row, choose, quick, say
 
 #: Windows whose draws are scored against quadrature.
 SCORED = 100
@@ -20,10 +20,13 @@ def batch(plan: Plan, count: int) -> list[Row]:
     """Rows of the methods that take many windows at once; seconds are those of all, divided by their number."""
     methods = [m for m in plan.methods if m.batch is not None]
     windows = make_windows(2 * count, points=plan.points, seed=plan.seed + 2)
+    trial = make_windows(1 + TRIAL_WINDOWS, points=plan.points, seed=plan.seed + 1)
+    trial_exact = Exact.of(trial)
     rows = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         windows.save(folder / "many.npz")
+        trial.save(folder / "trial.npz")
         for method in methods:
             row = Row(method.name, method.title, settings=method.batch or {}, windows=min(count, method.batch_windows))
             rows.append(row)
@@ -31,9 +34,11 @@ def batch(plan: Plan, count: int) -> list[Row]:
                 row.why = f"not installed: {method.pip}"
                 continue
             say(f"{row.windows} windows at once: {method.name}")
-            settings = quick(row.settings) if plan.quick else row.settings
             worker = None
             try:
+                if method.scales != "draws" and not plan.quick:
+                    row.settings, row.trials = choose(method, plan, folder, trial_exact)
+                settings = quick(row.settings) if plan.quick else row.settings
                 worker = Worker(method, settings, folder, **plan.worker)
                 first = worker.run("many.npz", first=0, count=row.windows, seed=0).seconds[0]
                 often = 1 if plan.quick else 3

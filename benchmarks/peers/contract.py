@@ -56,9 +56,10 @@ class Method:
         module: under ``benchmarks.peers``; its ``build(settings)`` returns a :class:`Runner`.
         needs: modules that must be installed, and ``pip``: what installs them.
         candidates: settings for one window; of several the run keeps the fastest that is accurate, on windows of its
-            own. ``draws`` (a chain) is then scaled so that the worst parameter gets the effective draws wanted, unless
-            ``fixed``.
-        batch: settings for many windows at once, or ``None``; ``batch_windows``: at most so many.
+            own. ``draws`` (a chain), or what else ``scales`` names, is then scaled so that the worst parameter gets the
+            effective draws wanted, unless ``fixed``.
+        batch: settings for many windows at once, or ``None``; ``batch_windows``: at most so many. Where ``scales`` is
+            not ``draws`` the settings found for one window are taken.
         gets: what was done for its speed, in words.
         same_density: whether it works on the density of all; else the table says that it does not.
         exact: the truth itself.
@@ -72,6 +73,7 @@ class Method:
     pip: str = ""
     candidates: tuple[Settings, ...] = ({},)
     fixed: bool = False
+    scales: str = "draws"
     batch: Settings | None = None
     batch_windows: int = 1000
     gets: str = ""

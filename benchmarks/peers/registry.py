@@ -16,6 +16,15 @@ _ALL = (
         gets="`sample` with default settings, eager; sums, closed-form gradient",
     ),
     Method(
+        "avtorch-matched",
+        "avtorch SGLD, chains for 2000 ESS",
+        "avtorch_sgld",
+        candidates=({"chains": 512},),
+        scales="chains",
+        batch={"chains": 512},
+        gets="the same with as many chains as 2000 effective draws need",
+    ),
+    Method(
         "blackjax-nuts",
         "BlackJAX NUTS, tuned",
         "blackjax_nuts",

@@ -164,16 +164,16 @@ def choose(method: Method, plan: Plan, folder: Path, exact: Exact) -> tuple[Sett
             worker.close()
         score = Score.join(scores)
         least = float(score.bulk.min())
-        scaled = max(4, math.ceil(settings["draws"] * MARGIN * WANTED / least))
+        scaled = max(4, math.ceil(settings[method.scales] * MARGIN * WANTED / least))
         allowed = 0.1 + 3 / math.sqrt(least)
         ratio = score.ratio.mean(0)
         accurate = bool(np.abs(score.shift).max() <= allowed and (np.abs(ratio - 1) <= 0.05).all())
         cost = median([t * MARGIN * WANTED / e for t, e in zip(seconds, score.bulk, strict=True)])
         told = {"settings": settings, "seconds": median(seconds), "least_ess": least, "seconds_wanted": cost}
-        trials.append({**told, "accurate": accurate, "draws_scaled": scaled})
+        trials.append({**told, "accurate": accurate, "scaled": scaled})
         say(f"  {json.dumps(settings)}: {1e3 * cost:.1f} ms to {WANTED}, {'accurate' if accurate else 'not accurate'}")
     best = min(trials, key=lambda t: (not t["accurate"], t["seconds_wanted"]))
-    chosen = {**best["settings"], "draws": best["draws_scaled"]}
+    chosen = {**best["settings"], method.scales: best["scaled"]}
     if "proposals" in chosen:
         chosen["proposals"] = chosen["draws"]
     return chosen, trials
