@@ -14,7 +14,7 @@ from avtorch.inference.priors import Prior
 from avtorch.inference.sampler import SamplerSettings
 
 #: A step costs a filter run over the rows for every chain here, so there are fewer chains, each walking for longer.
-SAMPLER = SamplerSettings(chains=96, draws=20, burn_in=12, step=1.5)
+SAMPLER = SamplerSettings(chains=64, draws=20, burn_in=12, thinning=1, step=1.5, longest=3.0)
 
 
 class LatentForm:

@@ -28,9 +28,8 @@ FEW = 2**11
 UNEVEN = 16.0
 #: How many times as many steps the pilot gets.
 PILOT = 8.0
-#: A window stiffer than this many times the lengthening of its walk has not mixed: its burn-in is shorter than its
-#: relaxation time.
-STUCK = 4.0
+#: A window stiffer than this has not mixed: even the longest burn-in is shorter than its relaxation time.
+STUCK = 256.0
 #: Largest slope that a burn-in step follows, in whitened coordinates; within the posterior slopes are a few units.
 TAMED = 10.0
 
@@ -54,6 +53,7 @@ class SamplerSettings:
         batch: points per minibatch, or ``None`` for the whole window.
         spread: chains start this many posterior SDs around the mode; 0 starts them at the mode.
         schedule: makes a learning-rate scheduler from the optimizer, or ``None`` for a constant step.
+        longest: how many times as many steps a skewed window gets at most.
         attempts: how often a window whose chains diverge or disagree is run again with half the step.
         whitening: ``"full"``, or for comparison ``"diagonal"`` or ``"none"`` (see :class:`Coordinates`).
         optimizer: makes another optimizer than SGLD from ``(parameters, step, generator)``.
@@ -68,6 +68,7 @@ class SamplerSettings:
     batch: int | None = None
     spread: float = 0.0
     schedule: Callable[[Optimizer], LRScheduler] | None = None
+    longest: float = 64.0
     attempts: int = 4
     whitening: Whitening = "full"
     optimizer: MakeOptimizer | None = None
@@ -82,6 +83,8 @@ class SamplerSettings:
             raise InputError(f"spread: {self.spread} is not a finite number of posterior SDs, 0 or more")
         if self.batch is not None and self.batch < 1:
             raise InputError(f"batch: {self.batch} is less than 1")
+        if not self.longest >= 1:
+            raise InputError(f"longest: {self.longest} is not 1 or more")
         if self.whitening not in ("full", "diagonal", "none"):
             raise InputError(f"whitening: {self.whitening!r} is none of 'full', 'diagonal', 'none'")
 
@@ -90,6 +93,7 @@ class SamplerSettings:
 
         What is steep on one side is flat on the other, where chains arrive later still: the burn-in grows once more.
         """
+        times = min(times, self.longest)
         burn_in = math.ceil(times * min(times, 5.0) * self.burn_in)
         return replace(self, burn_in=burn_in, thinning=math.ceil(times * self.thinning))
 
@@ -116,7 +120,7 @@ def sample(
     mode = find_mode(density) if mode is None else mode
     mode, pace = _adapted(density, mode, settings, generator)
     # all draws of a parameter of a window behind one another, as its summaries read them
-    draws = torch.empty(*mode.z.shape, settings.draws, settings.chains, dtype=mode.z.dtype).permute(3, 2, 0, 1)
+    draws = torch.empty(*mode.z.shape, settings.chains, settings.draws, dtype=mode.z.dtype).permute(2, 3, 0, 1)
     strayed, apart, stuck = (torch.zeros_like(mode.converged) for _ in range(3))
     # chains that agree still differ by chance: eight groups cut into halves of this many draws each
     members = max(1, settings.chains // 8) * (settings.draws // 2)
@@ -131,7 +135,7 @@ def sample(
             new = index[fresh]
             strayed[new] = _strayed(part, where, coordinates, w)[fresh]
             apart[new] = ~(nested_rhat(w).amax(-1) <= limit)[fresh]  # NaN is trouble, too
-            stuck[new] = pace[new] > STUCK * times
+            stuck[new] = pace[new] > STUCK
             values = constrained(density, coordinates.z(w))
             draws[:, :, new] = values if len(new) == len(index) else values[:, :, fresh]
         pace = 2 * pace
@@ -194,7 +198,7 @@ def _batches(density: Density, index: Tensor, pace: Tensor, chains: int) -> list
         few = torch.cat([few, index[times == each]])
         # a handful of windows costs less in the next batch, at its slower pace, than in one of their own
         if len(few) * chains >= FEW or each == times.max():
-            batches += few.split(size)
+            batches += few.sort().values.split(size)
             few = index[:0]
     return batches
 

@@ -221,6 +221,7 @@ def test_divergence_is_said(wall, rotating_seed):
         {"burn_in": -1},
         {"thinning": 0},
         {"attempts": 0},
+        {"longest": 0.5},
         {"step": 0.0},
         {"step": 4.0},
         {"step": math.nan},
