@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from avtorch import decision, inference, io, plots, validation, vehicle
+    from avtorch import decision, gap, inference, io, plots, validation, vehicle
     from avtorch.decision.algorithm2 import algorithm2
     from avtorch.decision.estimation import Estimates, estimate
     from avtorch.decision.monitor import Monitor
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "avtorch": ("decision", "inference", "io", "plots", "validation", "vehicle"),
+    "avtorch": ("decision", "gap", "inference", "io", "plots", "validation", "vehicle"),
     "avtorch.decision.algorithm2": ("algorithm2",),
     "avtorch.decision.estimation": ("Estimates", "estimate"),
     "avtorch.decision.monitor": ("Monitor",),
@@ -84,6 +84,7 @@ __all__ = [
     "algorithm2",
     "decision",
     "estimate",
+    "gap",
     "inference",
     "io",
     "performance",

@@ -14,6 +14,7 @@ from avtorch.plots.over_posteriors import agreement_scatter, exact_density, join
 from avtorch.plots.over_ranks import ecdf_difference, ecdf_of, pooled_rank_counts, rank_band, rank_plot
 from avtorch.plots.over_time import belief_band, data_quality, events, motion, string_probability
 from avtorch.plots.posterior_figures import validation_figures
+from avtorch.plots.signatures import effect_signature, signature_figure
 from avtorch.plots.style import STYLE, save
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "data_quality",
     "ecdf_difference",
     "ecdf_of",
+    "effect_signature",
     "events",
     "exact_density",
     "gain_curve",
@@ -41,6 +43,7 @@ __all__ = [
     "region_figure",
     "save",
     "setting_region",
+    "signature_figure",
     "stability_figure",
     "string_probability",
     "validation_figures",

@@ -19,9 +19,9 @@ _ALL = (
         "avtorch-matched",
         "avtorch SGLD, chains for 2000 ESS",
         "avtorch_sgld",
-        candidates=({"chains": 512},),
+        candidates=({"chains": 320}, {"chains": 1280, "draws": 4, "thinning": 1}),
         scales="chains",
-        batch={"chains": 512},
+        batch={"chains": 320},
         gets="the same with as many chains as 2000 effective draws need",
     ),
     Method(

@@ -1,0 +1,40 @@
+"""The honest check: a reference vehicle that shares no code with the diagnosis, sealed cases, and their score."""
+
+from avtorch.blindtest.car import Car, draw_car
+from avtorch.blindtest.case import Case, write
+from avtorch.blindtest.cases import draw_case, draw_cases
+from avtorch.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, Family, family
+from avtorch.blindtest.deck import MIX
+from avtorch.blindtest.drives import DURATIONS_S, MANOEUVRES, RATES_HZ, Drive, Recorded, draw_drive
+from avtorch.blindtest.score import score
+from avtorch.blindtest.vehicle import Run, simulate
+from avtorch.blindtest.visibility import TIERS, Oracle, Sight, sight, tier_of
+
+__all__ = [
+    "CALIBRATION",
+    "DURATIONS_S",
+    "EFFECTS",
+    "MANOEUVRES",
+    "MIX",
+    "RATES_HZ",
+    "SEALED",
+    "TIERS",
+    "Car",
+    "Case",
+    "Drive",
+    "Family",
+    "Oracle",
+    "Recorded",
+    "Run",
+    "Sight",
+    "draw_car",
+    "draw_case",
+    "draw_cases",
+    "draw_drive",
+    "family",
+    "score",
+    "sight",
+    "simulate",
+    "tier_of",
+    "write",
+]

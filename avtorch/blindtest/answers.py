@@ -1,0 +1,118 @@
+"""One case and what a diagnosis said of it, side by side, read from plain dicts (`avtorch.diagnosis/1`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from avtorch.errors import InputError
+
+FAILED = "failed"
+"""Verdict of a diagnosis that gave no answer; it is wrong whatever the truth is."""
+
+
+def joined(names: Any) -> str:
+    """The names of a verdict, or of one candidate (`"b+a"`), in the one way to write them: `"a+b"`."""
+    parts = names.split("+") if isinstance(names, str) else list(names)
+    return "+".join(sorted(parts))
+
+
+@dataclass(frozen=True)
+class Answered:
+    """A case with its answer.
+
+    `truth`: `none`, `unknown` (a cause outside the table), an effect or two joined by `+`; `kind`, `tier` of the
+    case. `verdict` likewise; `probabilities` by candidate; `alias_set`. `closed_error`, `placebo`, `onset_error`
+    [s]: None where the case or the answer has none.
+    """
+
+    truth: str
+    kind: str
+    tier: str | None
+    verdict: str
+    probabilities: Mapping[str, float]
+    alias_set: frozenset[str]
+    closed_error: float | None
+    placebo: float | None
+    onset_error: float | None
+
+    @property
+    def right(self) -> bool:
+        return self.truth == self.verdict
+
+    @property
+    def confidence(self) -> float:
+        """Probability of the most probable candidate, 0 where there is no answer."""
+        return max(self.probabilities.values(), default=0.0)
+
+    @property
+    def favourite(self) -> str:
+        """The most probable candidate; the verdict where that is as probable."""
+        if self.probabilities.get(self.verdict, -1.0) >= self.confidence:
+            return self.verdict
+        return max(self.probabilities, key=lambda name: self.probabilities[name], default=FAILED)
+
+    @property
+    def blamed(self) -> float:
+        """The highest probability given to any effect or pair by name."""
+        return max((p for name, p in self.probabilities.items() if name not in ("none", "unknown")), default=0.0)
+
+    @property
+    def brier(self) -> float:
+        """Sum of squared errors over the candidates; a truth that was not listed counts as given 0."""
+        missed = 0.0 if self.truth in self.probabilities else 1.0
+        return missed + sum((p - (name == self.truth)) ** 2 for name, p in self.probabilities.items())
+
+
+def read(truth: Mapping[str, Any], answer: Mapping[str, Any] | None) -> Answered:
+    """A truth (`Case.truth()`) and the answer to its log (None: there was none).
+
+    Beside the schema's fields, `answer["placebo"]["closed"]` may hold what adding a wrong effect closed of the
+    held-out gap. Raises `InputError` for probabilities that do not sum to 1, or `none` and `unknown` missing.
+    """
+    of = str(truth.get("case", "answer"))
+    if answer is None:
+        return Answered(truth["verdict"], truth["kind"], truth["tier"], FAILED, {}, frozenset(), None, None, None)
+    probabilities = {joined(effect["name"]): float(effect["probability"]) for effect in answer["effects"]}
+    if abs(sum(probabilities.values()) - 1) > 1e-6 or min(probabilities.values(), default=-1) < 0:
+        raise InputError(f"{of}: probabilities sum to {sum(probabilities.values()):.8g}, need 1 and none below 0")
+    if not {"none", "unknown"} <= probabilities.keys():
+        raise InputError(f"{of}: found {', '.join(probabilities)}, needs none and unknown among the candidates")
+    verdict = joined(answer["verdict"]["names"])
+    named_right = verdict == truth["verdict"]
+    return Answered(
+        truth=truth["verdict"],
+        kind=truth["kind"],
+        tier=truth["tier"],
+        verdict=verdict,
+        probabilities=probabilities,
+        alias_set=frozenset(joined(name) for name in answer["verdict"]["alias_set"]),
+        closed_error=_closed_error(truth, answer) if named_right else None,
+        placebo=(answer.get("placebo") or {}).get("closed"),
+        onset_error=_onset_error(truth, answer) if named_right else None,
+    )
+
+
+def _closed_error(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> float | None:
+    """How far the answer's `closed` lies from the oracle's.
+
+    The oracle knows the cause, and so how much of the error before is noise: it takes the answer's own error before
+    and after, on the answer's own held-out blocks, and puts the floor where the truth has it.
+    """
+    shrinkage = answer.get("shrinkage") or {}
+    oracle = (truth.get("oracle") or {}).get(shrinkage.get("metric"))
+    said = (shrinkage.get("closed") or {}).get("mean")
+    if said is None or oracle is None or oracle["closed"] is None:
+        return None
+    before, after = float(shrinkage["before"]), float(shrinkage["after"])
+    floor = before * oracle["floor"] / oracle["before"]
+    return abs(float(said) - (before - after) / (before - floor)) if before > floor else None
+
+
+def _onset_error(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> float | None:
+    """Distance of the onset told from the true one [s]; the whole drive where the answer sees none."""
+    if truth["onset_s"] is None or not truth["onset_scored"]:
+        return None
+    said = answer.get("onset_s")
+    return float(truth["drive"]["seconds"]) if said is None else abs(float(said) - float(truth["onset_s"]))

@@ -1,0 +1,116 @@
+"""One sealed case: a log as the car would have written it, and apart from it the cause, its size and its time."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.blindtest.car import Car
+from avtorch.blindtest.catalogue import family
+from avtorch.blindtest.command import Parameters
+from avtorch.blindtest.drives import Drive
+from avtorch.blindtest.vehicle import Run
+from avtorch.blindtest.visibility import Oracle, Sight, exact_gain
+from avtorch.errors import InputError
+from avtorch.io import Log, write_json
+
+Float = NDArray[np.float64]
+Kind = Literal["none", "single", "pair", "outside"]
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One sealed case.
+
+    `kind` and `names` (alphabetical; empty for `none`) are the truth, `parameters` by name, `onset_s` the moment from
+    which the cause is there (None: from the start; for a lone `gain_change` the moment of the change). `visibility`
+    and `tier`: see `avtorch.blindtest.visibility`; `visibility_each`: of each effect of a pair alone on the same
+    drive. `oracles`: rollout errors by metric of GLVD and of one who knows the cause. `without`, `with_cause`
+    (row,) [m/s²]: noise-free measured acceleration under the log's own command of this car without the cause, and
+    with it as far as it can be foretold.
+    """
+
+    index: int
+    seed: int
+    kind: Kind
+    names: tuple[str, ...]
+    parameters: Parameters
+    onset_s: float | None
+    onset_scored: bool
+    visibility: float
+    visibility_each: Mapping[str, float]
+    tier: str | None
+    car: Car
+    drive: Drive
+    run: Run
+    refit: Sight
+    oracles: Mapping[str, Oracle]
+
+    @property
+    def name(self) -> str:
+        """Of the case, telling nothing of its cause."""
+        return f"case_{self.index:05d}"
+
+    @property
+    def truth_name(self) -> str:
+        """As a diagnosis would have to answer: `none`, `unknown`, an effect, or two joined by `+`."""
+        return {"none": "none", "outside": "unknown"}.get(self.kind, "+".join(self.names))
+
+    @property
+    def without(self) -> Float:
+        dt = 1 / self.drive.rate_hz
+        return self.car.K_L * exact_gain(self.run.command, dt, self.car.T_L)[0]
+
+    @property
+    def with_cause(self) -> Float:
+        if self.names and all(family(name).by_chance for name in self.names):
+            return self.without
+        return self.run.accel - self.run.noise_accel - self.run.chance_accel
+
+    def log(self, *, signals: Sequence[str] = ("accel", "speed")) -> Log:
+        """The log a diagnosis sees: `time`, `accel_cmd` and the witnesses in `signals`."""
+        columns = {"accel": self.run.accel, "speed": self.run.speed}
+        if not signals or set(signals) - columns.keys():
+            raise InputError(f"signals: found {tuple(signals)}, needs accel, speed or both")
+        accel, speed = (columns[name] if name in signals else None for name in columns)
+        return Log.from_arrays(name=self.name, time=self.run.time, accel_cmd=self.run.command, accel=accel, speed=speed)
+
+    def truth(self) -> dict[str, Any]:
+        """What is hidden, as plain numbers and strings: what `avtorch.blindtest.score` takes."""
+        return {
+            "schema": "avtorch.blindtest.truth/1",
+            "case": self.name,
+            "index": self.index,
+            "seed": self.seed,
+            "kind": self.kind,
+            "names": list(self.names),
+            "verdict": self.truth_name,
+            "parameters": {name: dict(values) for name, values in self.parameters.items()},
+            "onset_s": self.onset_s,
+            "onset_scored": self.onset_scored,
+            "visibility": self.visibility,
+            "visibility_each": dict(self.visibility_each),
+            "tier": self.tier,
+            "baseline": {"T_L": self.car.T_L, "K_L": self.car.K_L},
+            "refit": {"T_L": self.refit.T_L, "K_L": self.refit.K_L},
+            "noise": {k: v for k, v in asdict(self.car).items() if k not in ("T_L", "K_L")},
+            "drive": asdict(self.drive),
+            "oracle": {metric: {**asdict(o), "closed": o.closed} for metric, o in self.oracles.items()},
+        }
+
+
+def write(case: Case, folder: str | os.PathLike[str]) -> Path:
+    """Write `folder/logs/NAME.csv`, which a diagnosis may see, and `folder/truth/NAME.json`, which it may not.
+
+    Returns the path of the log. Both files appear whole or not at all, the truth first.
+    """
+    path = Path(folder) / "logs" / f"{case.name}.csv"
+    write_json(Path(folder) / "truth" / f"{case.name}.json", case.truth())
+    case.log().write(path)
+    return path

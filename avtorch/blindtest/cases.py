@@ -1,0 +1,215 @@
+"""Sealed cases, drawn so that an answer cannot be guessed from the outside.
+
+Kinds come in fixed shares in shuffled order, every effect in every tier equally often, half of the causes from a
+moment within the drive on. A case depends on `(seed, index)` and the settings alone, so a set of cases can be drawn in
+parts and in any order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from avtorch.blindtest.car import draw_car
+from avtorch.blindtest.case import Case
+from avtorch.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, Family
+from avtorch.blindtest.command import Parameters
+from avtorch.blindtest.deck import MIX, card, kind_of
+from avtorch.blindtest.drives import draw_drive
+from avtorch.blindtest.strength import excess_range, solve
+from avtorch.blindtest.vehicle import Pilot, Run, simulate
+from avtorch.blindtest.visibility import TIERS, Sight, oracles, sight, tier_of
+from avtorch.errors import InputError
+
+_ATTEMPTS = 10
+_PAIR_EXCESS = (1.25, 8.0)
+"""Each effect of a pair, alone on the drive, shows between these: plainly enough that two can be asked for."""
+_TOP_SPEED_MPS = 44.0
+
+
+def draw_cases(
+    n: int,
+    seed: int,
+    *,
+    mix: Mapping[str, float] | None = None,
+    start: int = 0,
+    tiers: Sequence[str] = tuple(TIERS),
+    effects: Sequence[str] = tuple(EFFECTS),
+    outside: Literal["sealed", "calibration"] = "sealed",
+    seconds: float | None = None,
+    manoeuvre: str | None = None,
+) -> Iterator[Case]:
+    """Cases `start` to `start + n - 1` of the set `seed`, one after another.
+
+    Args: `mix`: shares of the kinds (default 25 % none, 40 % single, 20 % pair, 15 % outside), kept in every 20
+    cases. `tiers` and `effects`: single cases run through all their combinations in random order; causes outside are
+    drawn from all `tiers`. `outside`: which of the two groups of families outside the table. `seconds`, `manoeuvre`:
+    instead of drawing them. A cause that cannot show as asked on the drive drawn gets another drive, and after ten
+    the plainest of these stands, in the tier it has.
+
+    Raises `InputError` for unknown kinds, tiers or effects.
+    """
+    for i in range(start, start + n):
+        yield draw_case(
+            i,
+            seed,
+            mix=mix,
+            tiers=tiers,
+            effects=effects,
+            outside=outside,
+            seconds=seconds,
+            manoeuvre=manoeuvre,
+        )
+
+
+def draw_case(
+    index: int,
+    seed: int,
+    *,
+    mix: Mapping[str, float] | None = None,
+    tiers: Sequence[str] = tuple(TIERS),
+    effects: Sequence[str] = tuple(EFFECTS),
+    outside: Literal["sealed", "calibration"] = "sealed",
+    seconds: float | None = None,
+    manoeuvre: str | None = None,
+) -> Case:
+    """One case; arguments as `draw_cases`."""
+    if set(tiers) - TIERS.keys() or not tiers:
+        raise InputError(f"tiers: found {tuple(tiers)}, needs some of {', '.join(TIERS)}")
+    if set(effects) - EFFECTS.keys() or not effects:
+        raise InputError(f"effects: found {tuple(effects)}, needs some of {', '.join(EFFECTS)}")
+    kind, count = kind_of(index, seed, MIX if mix is None else mix)
+    rng = np.random.default_rng([seed, index, 3])
+    group = SEALED if outside == "sealed" else CALIBRATION
+    best: Case | None = None
+    for attempt in range(5 * _ATTEMPTS):
+        if attempt % _ATTEMPTS == 0:
+            if best is not None and best.tier is not None:
+                return best
+            # at first the cause that is due; one that showed in none of ten drives gives way to any other
+            due = count if attempt == 0 else int(rng.integers(2**31))
+            families, tier = _causes(kind, due, seed, rng, effects, tiers, group)
+        case = _attempt(index, seed, kind, families, tier, rng, seconds, manoeuvre)
+        if case is None:
+            continue
+        if kind in ("none", "pair") or case.tier == tier:
+            return case
+        if best is None or case.visibility > best.visibility:
+            best = case
+    if best is None:
+        raise InputError(f"effects: {', '.join(effects)} cannot be drawn in the drives asked for")
+    return best
+
+
+def _causes(
+    kind: str,
+    count: int,
+    seed: int,
+    rng: np.random.Generator,
+    effects: Sequence[str],
+    tiers: Sequence[str],
+    group: Mapping[str, Family],
+) -> tuple[list[Family], str]:
+    """The causes of the `count`-th case of its kind, and the tier it is to show in."""
+    if kind == "single":
+        tier, effect = divmod(card(count, seed, len(effects) * len(tiers)), len(effects))
+        return [EFFECTS[effects[effect]]], tiers[tier]
+    if kind == "outside":
+        tier, which = divmod(card(count, seed, len(group) * len(tiers)), len(group))
+        return [list(group.values())[which]], tiers[tier]
+    if kind == "pair":
+        # lost messages are too faint to be one of two
+        able = sorted(set(effects) - {"command_hold"})
+        if len(able) < 2:
+            raise InputError(f"effects: found {tuple(effects)}, pairs need two that are not command_hold")
+        return [EFFECTS[str(name)] for name in sorted(rng.choice(able, 2, replace=False))], "pair"
+    return [], "none"
+
+
+def _attempt(
+    index: int,
+    seed: int,
+    kind: str,
+    families: Sequence[Family],
+    tier: str,
+    rng: np.random.Generator,
+    seconds: float | None,
+    manoeuvre: str | None,
+) -> Case | None:
+    """A case on a drive drawn anew; None where the drive is no drive, or one of a pair cannot show on it."""
+    car, drive = draw_car(rng), draw_drive(rng, seconds=seconds, manoeuvre=manoeuvre)
+    noise, late, when = int(rng.integers(2**31)), rng.random() < 0.5, float(rng.uniform(0.2, 0.7))
+    draws = {f.name: f.draw(rng, car, drive) for f in families}
+    aims = {f.name: float(rng.random()) for f in families}
+    # trials begin at no strength in particular, or the first to do would be the same in many cases
+    begins = {f.name: float(np.exp(rng.uniform(-1, 1))) for f in families}
+    if any(f.suits and drive.manoeuvre not in f.suits for f in families):
+        return None
+    changes = "gain_change" in draws
+    onset = round(when * drive.seconds * drive.rate_hz) / drive.rate_hz if late and families and not changes else 0.0
+
+    pilots: list[Pilot] = []
+
+    def made(effects: Parameters) -> tuple[Run, Sight]:
+        pilots.append(drive.pilot())
+        run = simulate(
+            car, pilots[-1], seconds=drive.seconds, rate_hz=drive.rate_hz, effects=effects, onset=onset, seed=noise
+        )
+        return run, sight(run)
+
+    def alone(f: Family) -> tuple[Parameters, Run, Sight] | None:
+        """The effect by itself, as strong as it takes."""
+        low, high = excess_range(tier) if kind != "pair" else _PAIR_EXCESS
+        aim = low * (high / low) ** (0.1 + 0.8 * aims[f.name])
+
+        def trial(strength: float) -> tuple[float, tuple[Parameters, Run, Sight]]:
+            parameters = {f.name: draws[f.name](strength)}
+            run, seen = made(parameters)
+            return seen.excess, (parameters, run, seen)
+
+        # where it cannot show as asked, its strongest stands
+        found = solve(trial, aim, low, high, begin=begins[f.name], strongest=f.strongest)
+        return found or (trial(f.strongest)[1] if kind != "pair" else None)
+
+    parameters: dict[str, Mapping[str, float]] = {}
+    each: dict[str, float] = {}
+    run: Run | None = None
+    seen: Sight | None = None
+    for f in families:
+        found = alone(f)
+        if found is None:
+            return None
+        part, run, seen = found
+        parameters |= part
+        each[f.name] = seen.most
+    if run is None or seen is None or len(families) > 1:
+        run, seen = made(parameters)
+    if not _sound(run, pilots[-1]):
+        return None
+    moment = parameters["gain_change"]["change_s"] if changes else (onset or None)
+    return Case(
+        index=index,
+        seed=seed,
+        kind=kind,  # type: ignore[arg-type]
+        names=tuple(sorted(parameters)),
+        parameters=parameters,
+        onset_s=moment,
+        onset_scored=not (changes and len(families) > 1),
+        visibility=seen.most,
+        visibility_each=each,
+        tier=tier_of(seen.most) if families else None,
+        car=car,
+        drive=drive,
+        run=run,
+        refit=seen,
+        oracles=oracles(run, seen, foretold="command_hold" not in parameters),
+    )
+
+
+def _sound(run: Run, pilot: Pilot) -> bool:
+    """Whether this is a drive: moves half of the time, stays below 44 m/s, hits nothing, does not rock to and fro."""
+    moving = np.mean(run.true_speed > 0.3) > 0.5
+    hit = getattr(pilot, "nearest", 1.0) <= 0
+    return bool(moving and not hit and run.true_speed.max() < _TOP_SPEED_MPS and np.abs(run.true_accel).max() < 9.0)

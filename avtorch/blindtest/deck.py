@@ -1,0 +1,36 @@
+"""Shuffled decks: shares are kept exactly in every round, the order is random, and any card is known by its place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from avtorch.errors import InputError
+
+MIX: dict[str, float] = {"none": 0.25, "single": 0.40, "pair": 0.20, "outside": 0.15}
+_ROUND = 20
+
+
+def kind_of(index: int, seed: int, mix: Mapping[str, float] = MIX) -> tuple[str, int]:
+    """The kind of case `index`, and how many of its kind come before it in the set `seed`.
+
+    `mix`: shares that sum to 1, kept in every 20 cases (largest remainders). Raises `InputError` for other shares.
+    """
+    if set(mix) - MIX.keys() or min(mix.values()) < 0 or abs(sum(mix.values()) - 1) > 1e-9:
+        raise InputError(f"mix: found {dict(mix)}, needs shares of {', '.join(MIX)} that sum to 1")
+    counts = {kind: int(_ROUND * share + 1e-9) for kind, share in mix.items()}
+    left = sorted(mix, key=lambda kind: counts[kind] - _ROUND * mix[kind])
+    for kind in left[: _ROUND - sum(counts.values())]:
+        counts[kind] += 1
+    deck = [kind for kind, count in counts.items() for _ in range(count)]
+    turn, place = divmod(index, _ROUND)
+    order = np.random.default_rng([seed, turn, 1]).permutation(_ROUND).tolist()
+    kind = deck[order[place]]
+    return kind, turn * counts[kind] + sum(deck[card] == kind for card in order[:place])
+
+
+def card(count: int, seed: int, size: int) -> int:
+    """The `count`-th card of a deck of `size` that is shuffled anew every round."""
+    turn, place = divmod(count, size)
+    return int(np.random.default_rng([seed, turn, 2]).permutation(size)[place])

@@ -1,0 +1,157 @@
+"""Manoeuvres and who drives them: cruise, following, stop-and-go, steps on a test track, and a recorded command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from avtorch.blindtest.trips import queue, trip, us06
+from avtorch.blindtest.vehicle import Pilot
+from avtorch.errors import InputError
+
+Manoeuvre = Literal["cruise", "following", "stop_and_go", "steps"]
+MANOEUVRES: tuple[Manoeuvre, ...] = get_args(Manoeuvre)
+DURATIONS_S = (60.0, 300.0, 900.0)
+RATES_HZ = (20, 25, 40, 50, 100)
+TYPICAL_SPEED_MPS = {"cruise": 25.0, "following": 16.0, "stop_and_go": 5.0, "steps": 17.0}
+"""Speed around which an effect that depends on speed is drawn."""
+ACCEL_MAX_MPS2, ACCEL_MIN_MPS2 = 2.0, -3.5
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive to be made: `manoeuvre`, `seconds`, `rate_hz` of the log, `seed` of what the road has in store.
+
+    Raises `InputError` for an unknown manoeuvre.
+    """
+
+    manoeuvre: Manoeuvre
+    seconds: float
+    rate_hz: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        if self.manoeuvre not in MANOEUVRES:
+            raise InputError(f"manoeuvre: found {self.manoeuvre!r}, needs one of {', '.join(MANOEUVRES)}")
+
+    def pilot(self) -> Pilot:
+        """A fresh pilot; two of the same drive do the same as long as the car does."""
+        rng = np.random.default_rng([self.seed, MANOEUVRES.index(self.manoeuvre)])
+        dt = 1 / self.rate_hz
+        if self.manoeuvre == "cruise":
+            return _Cruise(rng, self.seconds, dt)
+        if self.manoeuvre == "steps":
+            return _Steps(rng, self.seconds)
+        if self.manoeuvre == "stop_and_go":
+            return _Follow(rng, queue(rng, self.seconds, dt), dt)
+        return _Follow(rng, (us06 if rng.random() < 0.4 else trip)(rng, self.seconds, dt), dt)
+
+
+def draw_drive(rng: np.random.Generator, *, seconds: float | None = None, manoeuvre: str | None = None) -> Drive:
+    """A drive of any kind; `seconds` and `manoeuvre` narrow it."""
+    return Drive(
+        manoeuvre=MANOEUVRES[int(rng.integers(4))] if manoeuvre is None else manoeuvre,  # type: ignore[arg-type]
+        seconds=float(rng.choice(DURATIONS_S)) if seconds is None else seconds,
+        rate_hz=int(rng.choice(RATES_HZ)),
+        seed=int(rng.integers(2**31)),
+    )
+
+
+def _clip(u: float) -> float:
+    return min(max(u, ACCEL_MIN_MPS2), ACCEL_MAX_MPS2)
+
+
+class _Cruise:
+    """Holds a set speed that the driver changes now and then, by a few metres per second."""
+
+    def __init__(self, rng: np.random.Generator, seconds: float, dt: float) -> None:
+        speed, time, knots, speeds = float(rng.uniform(18, 30)), 0.0, [0.0], []
+        self.start_speed = speed
+        speeds.append(speed)
+        while time < seconds:
+            time += float(rng.uniform(6, 25))
+            change = float(rng.uniform(1.5, 6)) * (1 if rng.random() < 0.5 else -1)
+            new = speed + change if 15 < speed + change < 34 else speed - change
+            takes = abs(change) / float(rng.uniform(0.5, 1.5))
+            knots += [time, time + takes]
+            speeds += [speed, new]
+            speed, time = new, time + takes
+        self._set = np.interp(np.arange(0, seconds + 1, dt), knots, speeds).tolist()
+        self._gain, self._damping = float(rng.uniform(0.25, 0.5)), float(rng.uniform(0.0, 0.15))
+        self._ahead = round(float(rng.uniform(0.5, 1.5)) / dt)
+
+    def command(self, row: int, time: float, speed: float, accel: float, position: float) -> float:
+        ahead = self._set[min(row + self._ahead, len(self._set) - 1)]
+        return _clip(self._gain * (ahead - speed) - self._damping * accel)
+
+
+class _Follow:
+    """Keeps a time gap behind a vehicle: a linear law on spacing, speeds and its own measured acceleration."""
+
+    def __init__(self, rng: np.random.Generator, lead: np.ndarray, dt: float) -> None:
+        self._lead = lead.tolist()
+        self._gap, self._still = float(rng.uniform(1.3, 2.2)), float(rng.uniform(3, 6))
+        self._spring, self._match = float(rng.uniform(0.06, 0.16)), float(rng.uniform(0.35, 0.7))
+        self._damping = float(rng.uniform(0.0, 0.15))
+        self.start_speed = max(self._lead[0], 0.0)
+        begin = self._still + self._gap * self.start_speed + float(rng.uniform(-2, 5))
+        self._place = (begin + np.concatenate([[0.0], np.cumsum(0.5 * dt * (lead[1:] + lead[:-1]))])).tolist()
+        self._radar = (0.1 * rng.standard_normal(len(lead))).tolist()
+        self.nearest = begin  # spacing so far [m]; a collision makes it negative
+
+    def command(self, row: int, time: float, speed: float, accel: float, position: float) -> float:
+        spacing = self._place[row] - position
+        self.nearest = min(self.nearest, spacing)
+        seen, lead = spacing + self._radar[row], self._lead[row]
+        if lead < 0.2 and speed < 0.5 and seen < self._still + 2.0:
+            return -0.8  # waits, brake on
+        pull = self._spring * (seen - self._still - self._gap * speed) + self._match * (lead - speed)
+        wish = min(pull, 1.6) - self._damping * accel
+        closing = speed - lead
+        if closing > 0:
+            # what it takes to match the speed in front with 2 m to spare; a driver does not wait longer than this
+            needed = closing * closing / (2 * max(seen - 2.0, 0.3))
+            if needed > 0.7:
+                wish = min(wish, -1.3 * needed)
+        return _clip(wish)
+
+
+class _Steps:
+    """Open steps of the command, held for one to six seconds, kept between walking pace and motorway speed."""
+
+    def __init__(self, rng: np.random.Generator, seconds: float) -> None:
+        count = int(seconds) + 2
+        self._levels = (rng.choice([0.35, 1.0], count, p=[0.3, 0.7]) * rng.uniform(0.15, 1.0, count)).tolist()
+        self._signs = np.where(rng.random(count) < 0.5, 1.0, -1.0).tolist()
+        self._holds = rng.uniform(0.8, 5.0, count).tolist()
+        self._rest = (rng.random(count) < 0.2).tolist()
+        self._top = float(rng.uniform(22, 32))
+        self.start_speed = float(rng.uniform(8, 18))
+        self._next, self._at, self._until, self._value = 0, 0.0, 0.0, 0.0
+
+    def command(self, row: int, time: float, speed: float, accel: float, position: float) -> float:
+        leaving = (speed > self._top and self._value > 0) or (speed < 4.0 and self._value <= 0)
+        if time >= self._until or (leaving and time > self._at + 0.3):
+            i, self._next = self._next, min(self._next + 1, len(self._levels) - 1)
+            sign = 1.0 if speed < 6.0 else -1.0 if speed > self._top - 2.0 else self._signs[i]
+            size = self._levels[i] * (ACCEL_MAX_MPS2 if sign > 0 else -0.9 * ACCEL_MIN_MPS2)
+            self._value = 0.0 if self._rest[i] and 6.0 <= speed <= self._top - 2.0 else sign * size
+            self._at, self._until = time, time + self._holds[i]
+        return self._value
+
+
+class Recorded:
+    """Sends a recorded command row by row, whatever the car does: an open loop.
+
+    Args: `command` (row,) [m/s²]; `start_speed` [m/s].
+    """
+
+    def __init__(self, command: ArrayLike, *, start_speed: float) -> None:
+        self._command = np.asarray(command, float).tolist()
+        self.start_speed = start_speed
+
+    def command(self, row: int, time: float, speed: float, accel: float, position: float) -> float:
+        return self._command[row]

@@ -1,0 +1,175 @@
+"""What a set of answers to sealed cases is worth: every measure of `blindtest.json`, with its 90 % interval."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import rankdata
+
+from avtorch.blindtest.answers import Answered, read
+from avtorch.blindtest.intervals import Interval, bootstrap, wilson
+from avtorch.blindtest.visibility import TIERS
+from avtorch.errors import InputError
+
+Rows = Sequence[Answered]
+
+
+def score(
+    truths: Sequence[Mapping[str, Any]],
+    answers: Sequence[Mapping[str, Any] | None],
+    *,
+    seconds: Sequence[float] | None = None,
+    resamples: int = 1000,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Measures of the answers (dicts of `avtorch.diagnosis/1`, None where there is none) to the cases of `truths`.
+
+    Keys as in `blindtest.json`, and beside them `confident_errors`, `alias_set.by_tier`, `counts` (how many cases
+    stand behind a measure) and `intervals` (the same keys, `[low, high]` of 90 %). None where no case bears on a
+    measure.
+
+    - `top1` by tier, `alias_set`: single effects only. `false_alarm`: cases without a cause answered by anything but
+      `none`. `pairs_exact`, `pairs_jaccard`: pairs.
+    - `unknown_auroc`, `unknown_fpr95`: the probability of `unknown`, causes outside the table against all other
+      cases. `unknown_confidently_blamed`: share of the former that give a named effect or pair 0.5 or more.
+    - `confident_errors`, `ece` (ten bins of the probability of the most probable candidate), `brier`: all cases.
+    - `macro_f1`: over the labels that occur, an effect found within a pair counts for that effect.
+    - `closed_error`, `onset_error_s` (median): where the verdict is right. `placebo_closed`: mean over the answers
+      that tell one.
+
+    Args: `seconds` each answer took. `resamples`, `seed` of the bootstrap. Raises `InputError` for lengths that
+    differ and for answers that break the schema.
+    """
+    if len(truths) != len(answers) or (seconds is not None and len(seconds) != len(truths)):
+        raise InputError(f"answers: found {len(answers)} for {len(truths)} cases, needs one each")
+    rows = [read(truth, answer) for truth, answer in zip(truths, answers, strict=True)]
+    sheet = _Sheet(resamples, seed)
+    by_kind = {kind: [r for r in rows if r.kind == kind] for kind in ("none", "single", "pair", "outside")}
+    for tier in TIERS:
+        of_tier = [r for r in by_kind["single"] if r.tier == tier]
+        sheet.share(f"top1.{tier}", [r.right for r in of_tier])
+        sheet.share(f"alias_set.by_tier.{tier}", [r.truth in r.alias_set for r in of_tier])
+    sheet.share("alias_set.accuracy", [r.truth in r.alias_set for r in by_kind["single"]])
+    sheet.mean("alias_set.mean_size", [len(r.alias_set) for r in by_kind["single"]])
+    sheet.share("false_alarm", [not r.right for r in by_kind["none"]])
+    sheet.measure("unknown_auroc", rows, auroc)
+    sheet.measure("unknown_fpr95", rows, fpr95)
+    sheet.share("unknown_confidently_blamed", [r.blamed >= 0.5 for r in by_kind["outside"]])
+    sheet.share("confident_errors", [r.confidence > 0.9 and r.favourite != r.truth for r in rows])
+    sheet.measure("ece", rows, ece)
+    sheet.mean("brier", [r.brier for r in rows])
+    sheet.measure("macro_f1", rows, macro_f1)
+    sheet.share("pairs_exact", [r.right for r in by_kind["pair"]])
+    sheet.mean("pairs_jaccard", [_jaccard(r) for r in by_kind["pair"]])
+    sheet.mean("closed_error", [r.closed_error for r in rows if r.closed_error is not None])
+    sheet.mean("placebo_closed", [r.placebo for r in rows if r.placebo is not None])
+    late = [r for r in rows if r.onset_error is not None]
+    sheet.measure("onset_error_s", late, lambda some: float(np.median([r.onset_error or 0.0 for r in some])))
+    sheet.mean("seconds_per_case", list(seconds or ()))
+    confusion: dict[str, Counter[str]] = defaultdict(Counter)
+    for r in rows:
+        confusion[r.truth][r.verdict] += 1
+    return {
+        "cases": len(rows),
+        **sheet.values,
+        "confusion": {truth: dict(sorted(c.items())) for truth, c in sorted(confusion.items())},
+        "counts": sheet.counts,
+        "intervals": sheet.intervals,
+    }
+
+
+def auroc(rows: Rows) -> float | None:
+    """Chance that a cause outside the table is given more `unknown` than any other case is; None without both."""
+    outside = np.array([r.kind == "outside" for r in rows])
+    ins, outs = int((~outside).sum()), int(outside.sum())
+    if not ins or not outs:
+        return None
+    ranks = rankdata(_unknown(rows))
+    return float((ranks[outside].sum() - outs * (outs + 1) / 2) / (ins * outs))
+
+
+def fpr95(rows: Rows) -> float | None:
+    """Share of the other cases that a threshold on `unknown` accuses which finds 95 % of the outside ones."""
+    outside = np.array([r.kind == "outside" for r in rows])
+    if outside.all() or not outside.any():
+        return None
+    unknown = _unknown(rows)
+    found = np.sort(unknown[outside])[::-1]
+    threshold = found[int(np.ceil(0.95 * len(found))) - 1]
+    return float(np.mean(unknown[~outside] >= threshold))
+
+
+def _unknown(rows: Rows) -> NDArray[np.float64]:
+    return np.array([r.probabilities.get("unknown", 0.0) for r in rows])
+
+
+def ece(rows: Rows, bins: int = 10) -> float | None:
+    """Expected calibration error: distance of confidence from the share of right answers, over equal bins."""
+    if not rows:
+        return None
+    confidence = np.array([r.confidence for r in rows])
+    right = np.array([r.favourite == r.truth for r in rows], float)
+    which = np.minimum((confidence * bins).astype(int), bins - 1)
+    gaps = np.bincount(which, weights=confidence - right, minlength=bins)
+    return float(np.abs(gaps).sum() / len(rows))
+
+
+def macro_f1(rows: Rows) -> float | None:
+    """Mean over labels (effects, `none`, `unknown`) of the harmonic mean of precision and recall."""
+    pairs = [(set(r.truth.split("+")), set(r.verdict.split("+"))) for r in rows]
+    labels = sorted(set().union(*(truth for truth, _ in pairs))) if pairs else []
+    scores = []
+    for label in labels:
+        hit = sum(label in truth and label in said for truth, said in pairs)
+        wrong = sum((label in truth) != (label in said) for truth, said in pairs)
+        scores.append(2 * hit / (2 * hit + wrong))
+    return float(np.mean(scores)) if scores else None
+
+
+def _jaccard(r: Answered) -> float:
+    truth, said = set(r.truth.split("+")), set(r.verdict.split("+"))
+    return len(truth & said) / len(truth | said)
+
+
+class _Sheet:
+    """Measures as they are taken, with how many cases stand behind each and its interval; dots make nested dicts."""
+
+    def __init__(self, resamples: int, seed: int) -> None:
+        self.values: dict[str, Any] = {}
+        self.counts: dict[str, Any] = {}
+        self.intervals: dict[str, Any] = {}
+        self._resamples, self._seed = resamples, seed
+
+    def _put(self, key: str, value: float | None, count: int, interval: Interval | None) -> None:
+        *path, last = key.split(".")
+        for sheet, entry in (
+            (self.values, value),
+            (self.counts, count),
+            (self.intervals, None if interval is None else list(interval)),
+        ):
+            for part in path:
+                sheet = sheet.setdefault(part, {})
+            sheet[last] = entry
+
+    def share(self, key: str, hits: Sequence[bool]) -> None:
+        """A share, with Wilson's interval."""
+        self._put(key, float(np.mean(hits)) if hits else None, len(hits), wilson(sum(hits), len(hits)))
+
+    def mean(self, key: str, values: Sequence[float]) -> None:
+        """A mean, bootstrapped."""
+        known = np.asarray(values, float)
+        interval = bootstrap(
+            lambda index: float(known[index].mean()), len(known), resamples=self._resamples, seed=self._seed
+        )
+        self._put(key, float(known.mean()) if len(known) else None, len(known), interval)
+
+    def measure(self, key: str, rows: Rows, of: Callable[[Rows], float | None]) -> None:
+        """Any measure of rows, bootstrapped over them."""
+        interval = bootstrap(
+            lambda index: of([rows[i] for i in index.tolist()]), len(rows), resamples=self._resamples, seed=self._seed
+        )
+        self._put(key, of(rows) if rows else None, len(rows), interval)

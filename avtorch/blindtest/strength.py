@@ -1,0 +1,50 @@
+"""How strong a cause must be to show as plainly as asked: a search over strength, each trial a drive."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TypeVar
+
+from avtorch.blindtest.visibility import TIERS
+
+T = TypeVar("T")
+_TRIALS = 9
+_DOMINANT = 12.0  # visibility of the most dominant cases drawn
+
+
+def excess_range(tier: str) -> tuple[float, float]:
+    """The `excess` (cause over noise) of a tier, the easy one ended at visibility 12."""
+    low, high = TIERS[tier]
+    return math.sqrt(low**2 - 1), math.sqrt(min(high, _DOMINANT) ** 2 - 1)
+
+
+def solve(
+    trial: Callable[[float], tuple[float, T]], aim: float, low: float, high: float, *, begin: float, strongest: float
+) -> T | None:
+    """The trial whose excess falls in [`low`, `high`), near `aim`; None where no strength up to `strongest` gives it.
+
+    `trial(strength)` returns the excess and whatever belongs to it; `begin` is the first strength tried. The excess
+    grows about in proportion to the strength: the next guess comes by proportion, then between the nearest two trials
+    in the logarithm.
+    """
+    strength = min(begin, strongest)
+    below: tuple[float, float] | None = None
+    above: tuple[float, float] | None = None
+    for _ in range(_TRIALS):
+        excess, made = trial(strength)
+        if low <= excess < high:
+            return made
+        if excess < low:
+            if strength >= strongest:
+                return None
+            below = (strength, excess)
+        else:
+            above = (strength, excess)
+        if below and above:
+            (s0, e0), (s1, e1) = below, above
+            share = math.log(aim / max(e0, 1e-9)) / math.log(e1 / max(e0, 1e-9)) if e1 > e0 else 0.5
+            strength = s0 * (s1 / s0) ** min(max(share, 0.15), 0.85)
+        else:
+            strength = min(strongest, strength * min(max(aim / max(excess, 1e-9), 0.02), 20.0))
+    return None

@@ -1,0 +1,184 @@
+r"""How plainly a log shows that something is amiss: rollout error over noise.
+
+GLVD, refitted to the noise-free drive (`T_L`, `K_L`), answers the logged command: over the whole drive for the
+acceleration, whose start is forgotten within a few lags; for the speed, from a new true start every 10 s (and after
+every standstill). With `e` what then remains between log and rollout, noise apart, and `n` the process and sensor
+noise itself, both RMS over the rows that move (speed of 0.3 m/s or more), the visibility in one witness is
+
+    sqrt(n² + e²) / n
+
+the rollout error of the refitted GLVD over the error it would have if the cause were not there; the larger of the
+witnesses' two values counts. Drawn by chance (`gust`, `outliers`, `command_hold`), `e` is no less there, but no
+rollout of any model takes it away: for these the number says how much the predictive density loses, exp(loss of the
+mean log density of a Gaussian error whose size is refitted), which is the same ratio.
+
+Tiers: easy from 3 on, medium 1.6 to 3, hard 1.15 to 1.6, faint 1.02 to 1.15; below 1.02 there is no tier (None).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.signal import lfilter
+
+from avtorch.blindtest.vehicle import Run
+
+Float = NDArray[np.float64]
+
+TIERS = {"easy": (3.0, np.inf), "medium": (1.6, 3.0), "hard": (1.15, 1.6), "faint": (1.02, 1.15)}
+HORIZON_S = 10.0
+_MOVING_MPS = 0.3
+_LAGS_S = (0.02, 3.0)
+
+
+def tier_of(visibility: float) -> str | None:
+    """The tier a visibility falls in, None below 1.02."""
+    return next((name for name, (low, high) in TIERS.items() if low <= visibility < high), None)
+
+
+def glvd_response(command: Float, dt: float, T_L: float, K_L: float) -> Float:
+    """Acceleration (row,) of GLVD from rest under commands (row,) held for `dt` [s] each, zero-order hold, exact."""
+    alpha = np.exp(-dt / T_L)
+    answer = lfilter([0.0, -np.expm1(-dt / T_L) * K_L], [1.0, -alpha], command)
+    return np.asarray(answer)
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a drive shows. `accel`, `speed`: visibility in one witness; `T_L`, `K_L`: GLVD refitted to the drive."""
+
+    accel: float
+    speed: float
+    T_L: float
+    K_L: float
+
+    @property
+    def most(self) -> float:
+        """Visibility in the witness that shows more."""
+        return max(self.accel, self.speed)
+
+    @property
+    def excess(self) -> float:
+        """`e / n` of that witness: grows about in proportion to the strength of the cause."""
+        return float(np.sqrt(max(self.most**2 - 1.0, 0.0)))
+
+
+def chunks(run: Run) -> Iterator[slice]:
+    """Stretches of a drive from which the speed is rolled out: 2 to 10 s, moving throughout."""
+    moving = run.true_speed >= _MOVING_MPS
+    dt = float(run.time[1] - run.time[0])
+    longest, shortest = round(HORIZON_S / dt), round(2.0 / dt)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], moving.astype(int), [0]])))
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        for first in range(begin, end, longest):
+            if min(first + longest, end) - first >= shortest:
+                yield slice(first, min(first + longest, end))
+
+
+class _Witnesses:
+    """Errors of a rollout in both witnesses, from the exact start of every stretch."""
+
+    def __init__(self, run: Run) -> None:
+        self.moving = run.true_speed >= _MOVING_MPS
+        inside = np.zeros(len(run.time), bool)
+        first = np.arange(len(run.time))
+        for part in chunks(run):
+            inside[part] = True
+            first[part] = part.start
+        self.inside, self._first = inside, first
+
+    def since_start(self, speed: Float) -> Float:
+        """Change of a speed since the stretch began."""
+        return speed - speed[self._first]
+
+    def rms_accel(self, error: Float) -> float:
+        return float(np.sqrt(np.mean(error[self.moving] ** 2))) if self.moving.any() else 0.0
+
+    def rms_speed(self, error: Float) -> float:
+        return float(np.sqrt(np.mean(error[self.inside] ** 2))) if self.inside.any() else 0.0
+
+
+def exact_gain(command: Float, dt: float, T_L: float) -> tuple[Float, Float]:
+    """Acceleration and speed (row,) of GLVD with gain 1 from rest: both exact, also where the command jumps."""
+    accel = glvd_response(command, dt, T_L, 1.0)
+    # dv = u dt - T (a_next - a): the integral of GLVD's equation over a row
+    step = command * dt
+    speed = np.concatenate([[0.0], np.cumsum(step)[:-1]]) - T_L * (accel - accel[0])
+    return accel, speed
+
+
+def sight(run: Run) -> Sight:
+    """How plainly the drive differs from any GLVD; see the head of this file for what is measured."""
+    witness = _Witnesses(run)
+    dt = float(run.time[1] - run.time[0])
+    accel = run.accel - run.noise_accel
+    speed = witness.since_start(run.speed - run.noise_speed - run.drift_speed)
+    noise_a = max(witness.rms_accel(run.noise_accel), 1e-12)
+    noise_v = max(witness.rms_speed(run.noise_speed + witness.since_start(run.drift_speed)), 1e-12)
+
+    def fit(log_lag: float) -> tuple[float, float, float, float]:
+        unit_a, unit_v = exact_gain(run.command, dt, float(np.exp(log_lag)))
+        unit_v = witness.since_start(unit_v)
+        weigh_a, weigh_v = witness.moving / noise_a**2, witness.inside / noise_v**2
+        top = float(np.sum(weigh_a * unit_a * accel) + np.sum(weigh_v * unit_v * speed))
+        bottom = float(np.sum(weigh_a * unit_a**2) + np.sum(weigh_v * unit_v**2))
+        gain = max(top / bottom, 0.0) if bottom > 0 else 1.0
+        e_a = witness.rms_accel(accel - gain * unit_a) / noise_a
+        e_v = witness.rms_speed(speed - gain * unit_v) / noise_v
+        return e_a**2 + e_v**2, e_a, e_v, gain
+
+    grid = np.linspace(np.log(_LAGS_S[0]), np.log(_LAGS_S[1]), 13)
+    losses = [fit(float(x))[0] for x in grid]
+    best = int(np.argmin(losses))
+    low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+    found = minimize_scalar(lambda x: fit(float(x))[0], bounds=(low, high), method="bounded", options={"xatol": 1e-3})
+    _, e_a, e_v, gain = fit(float(found.x))
+    return Sight(float(np.hypot(1, e_a)), float(np.hypot(1, e_v)), float(np.exp(found.x)), gain)
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Rollout errors (RMS) of one witness: of the refitted GLVD, and of a model that knows cause and parameters.
+
+    `closed` is what knowing the cause closes of the gap, None where there is none to close (`before` within 10 % of
+    `floor`).
+    """
+
+    before: float
+    after: float
+    floor: float
+
+    @property
+    def closed(self) -> float | None:
+        if self.before <= 1.1 * self.floor:
+            return None
+        return (self.before - self.after) / (self.before - self.floor)
+
+
+def oracles(run: Run, fitted: Sight, *, foretold: bool) -> dict[str, Oracle]:
+    """`rollout_rmse_accel` [m/s²] and `rollout_rmse_speed` [m/s, over 10 s], by metric.
+
+    `foretold`: False where the cause decides by chance what the car does with its command (lost messages), so that
+    knowing it helps no rollout. Gusts and outliers are left to the floor, whose share of the log is known.
+    """
+    witness = _Witnesses(run)
+    dt = float(run.time[1] - run.time[0])
+    unit_a, unit_v = exact_gain(run.command, dt, fitted.T_L)
+    before_a = witness.rms_accel(run.accel - fitted.K_L * unit_a)
+    clean = run.speed - run.noise_speed
+    before_v = witness.rms_speed(run.noise_speed + witness.since_start(clean - fitted.K_L * unit_v))
+    if not foretold:
+        return {
+            "rollout_rmse_accel": Oracle(before_a, before_a, before_a),
+            "rollout_rmse_speed": Oracle(before_v, before_v, before_v),
+        }
+    floor_a = witness.rms_accel(run.noise_accel + run.chance_accel)
+    floor_v = witness.rms_speed(run.noise_speed + witness.since_start(run.drift_speed + run.chance_speed))
+    return {
+        "rollout_rmse_accel": Oracle(before_a, floor_a, floor_a),
+        "rollout_rmse_speed": Oracle(before_v, floor_v, floor_v),
+    }

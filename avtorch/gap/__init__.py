@@ -1,0 +1,73 @@
+"""What the simulator lacks: effects along the chain command, actuator, body, sensor, and plants made of them."""
+
+from avtorch.gap import effects
+from avtorch.gap.drive import Drive, Response
+from avtorch.gap.effect import EFFECTS, PLACES, Effect, NoiseChange, Row, effect_class, register
+from avtorch.gap.effects import (
+    AerodynamicDrag,
+    Backlash,
+    BrakeThrottleAsymmetry,
+    CommandHold,
+    ConstantResistance,
+    DeadBand,
+    DeadTime,
+    DrivelineOscillation,
+    GainChange,
+    GearShift,
+    Gust,
+    LowSpeedCreep,
+    Outliers,
+    RateLimit,
+    RoadGrade,
+    Saturation,
+    SecondOrderActuator,
+    SensorBias,
+    SensorLag,
+    SensorScale,
+    SpeedDependentGain,
+    SpeedDependentLag,
+)
+from avtorch.gap.parameter import Parameter
+from avtorch.gap.plant import BASELINE, GapPlant, plant
+from avtorch.gap.recursion import scan, scan_pair
+
+__all__ = [
+    "BASELINE",
+    "EFFECTS",
+    "PLACES",
+    "AerodynamicDrag",
+    "Backlash",
+    "BrakeThrottleAsymmetry",
+    "CommandHold",
+    "ConstantResistance",
+    "DeadBand",
+    "DeadTime",
+    "Drive",
+    "DrivelineOscillation",
+    "Effect",
+    "GainChange",
+    "GapPlant",
+    "GearShift",
+    "Gust",
+    "LowSpeedCreep",
+    "NoiseChange",
+    "Outliers",
+    "Parameter",
+    "RateLimit",
+    "Response",
+    "RoadGrade",
+    "Row",
+    "Saturation",
+    "SecondOrderActuator",
+    "SensorBias",
+    "SensorLag",
+    "SensorScale",
+    "SpeedDependentGain",
+    "SpeedDependentLag",
+    "effect_class",
+    "effects",
+    "plant",
+    "register",
+    "scan",
+    "scan_pair",
+]

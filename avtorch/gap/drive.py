@@ -1,0 +1,93 @@
+"""A drive as the plants take it, and what a plant answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.vehicle.arguments import Number, checked
+
+if TYPE_CHECKING:
+    from avtorch.io import Log
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Stretches without gaps: `time` (time,) [s], `command` (..., time) [m/s²] and, where measured, `speed` [m/s].
+
+    A row's command acts from its time until the next row's. `accel0` (...) [m/s²] is the car's acceleration at the
+    first row; None: the actuator has settled at the first command. Before the first row the first command acted.
+    `dt` (time,) are the steps (the last one repeats), `position` (..., time) [m] the speed integrated by trapezoids;
+    `uniform` says whether all steps are the same.
+
+    Raises `InputError` for shapes that do not fit, time that does not rise, or values that are not finite.
+    """
+
+    time: Tensor
+    command: Tensor
+    speed: Tensor | None = None
+    accel0: Number | None = None
+    dt: Tensor = field(init=False)
+    uniform: bool = field(init=False)
+    position: Tensor | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        time, command = checked("time", self.time), checked("command", self.command)
+        speed = None if self.speed is None else checked("speed", self.speed)
+        if time.dim() != 1 or time.shape[0] < 2:
+            raise InputError(f"time: found shape {tuple(time.shape)}, needs (time,) of two rows or more")
+        for name, x in (("command", command), ("speed", speed)):
+            if x is not None and (x.dim() == 0 or x.shape[-1] != time.shape[0]):
+                raise InputError(f"{name}: found shape {tuple(x.shape)}, needs (..., {time.shape[0]})")
+        steps = time.diff()
+        if not bool((steps > 0).all()):
+            raise InputError("time: does not rise from row to row; a drive has no gaps and does not repeat itself")
+        uniform = bool((steps - steps.mean()).abs().max() <= 1e-6 * steps.mean())
+        dt = (time[-1] - time[0]) / (len(time) - 1) if uniform else torch.cat([steps, steps[-1:]])
+        position = None
+        if speed is not None:
+            rows = 0.5 * (speed[..., 1:] + speed[..., :-1]) * (dt if uniform else dt[:-1])
+            position = torch.cat([torch.zeros_like(speed[..., :1]), rows.cumsum(-1)], -1)
+        values = {
+            "time": time,
+            "command": command,
+            "speed": speed,
+            "accel0": None if self.accel0 is None else checked("accel0", self.accel0, unit="m/s²"),
+            "dt": dt.expand(time.shape),
+            "uniform": uniform,
+            "position": position,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_log(cls, log: Log, segment: int = 0, *, settled: bool = False) -> Drive:
+        """One segment of a log; starts at the measured acceleration, if there is one, unless `settled`.
+
+        Raises `InputError` for a segment that is not there or a log without `accel_cmd`.
+        """
+        if log.accel_cmd is None:
+            raise InputError("accel_cmd: not in the log, needed for the response of a plant")
+        rows = log.segment == segment
+        if rows.sum() < 2:
+            raise InputError(f"segment: found {segment} with fewer than two rows, needs one of the log's")
+        speed = None if log.speed is None else torch.as_tensor(log.speed[rows])
+        accel0 = None if log.accel is None or settled else float(log.accel[rows][0])
+        return cls(torch.as_tensor(log.time[rows]), torch.as_tensor(log.accel_cmd[rows]), speed, accel0)
+
+
+@dataclass(frozen=True)
+class Response:
+    """What a plant does over a drive, (..., time): `accel` of the car and `accel_measured` [m/s²], `speed` [m/s].
+
+    `speed` is the car's acceleration integrated from the first measured speed (0 where there is none). Nothing stops
+    at standstill: such rows are masked.
+    """
+
+    accel: Tensor
+    accel_measured: Tensor
+    speed: Tensor

@@ -1,0 +1,34 @@
+"""Aerodynamic drag."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+
+@register
+@dataclass(frozen=True)
+class AerodynamicDrag(Effect):
+    """`-drag_per_m (v + wind_mps)²`, against the wind met; neutral at 0. The head wind is fitted along."""
+
+    drag_per_m: Number = 3.5e-4
+    wind_mps: Number = 0.0
+
+    name = "aerodynamic_drag"
+    place = "body"
+    needs_speed = True
+    meaning = "air resistance that the lower level does not make up for"
+    equation = "-c (v + w)²"
+    parameters = (
+        Parameter("drag_per_m", "1/m", 0.0, 2e-4, 6e-4),
+        Parameter("wind_mps", "m/s", None, -4.0, 4.0, "real", reported=False),
+    )
+
+    def apply(self, x: Tensor, row: Row) -> Tensor:
+        air = row.speed + tensor(self.wind_mps)
+        return -tensor(self.drag_per_m) * air * air.abs()

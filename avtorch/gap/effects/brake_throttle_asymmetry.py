@@ -1,0 +1,37 @@
+"""Brakes and engine answer differently."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+
+@register
+@dataclass(frozen=True)
+class BrakeThrottleAsymmetry(Effect):
+    """Gain and lag times `brake_gain_ratio`, `brake_lag_ratio` where the command is negative; neutral at 1, 1."""
+
+    brake_gain_ratio: Number = 0.7
+    brake_lag_ratio: Number = 2.0
+
+    name = "brake_throttle_asymmetry"
+    place = "actuator"
+    meaning = "gain and lag under braking differ from those under drive"
+    equation = "K_L, T_L times ratios where u < 0"
+    parameters = (
+        Parameter("brake_gain_ratio", "-", 1.0, 0.5, 0.9),
+        Parameter("brake_lag_ratio", "-", 1.0, 1.3, 3.0),
+    )
+
+    def apply(self, x: Tensor, row: Row) -> tuple[Tensor, Tensor]:
+        braking = x < 0
+        return (
+            torch.where(braking, tensor(self.brake_gain_ratio), 1.0),
+            torch.where(braking, tensor(self.brake_lag_ratio), 1.0),
+        )

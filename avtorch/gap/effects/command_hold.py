@@ -1,0 +1,63 @@
+"""Lost messages: the actuator holds the last command that arrived."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, NoiseChange, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+_ROWS_BACK = 12  # at a loss of 0.5 the older commands weigh 0.5^12
+
+
+@register
+@dataclass(frozen=True)
+class CommandHold(Effect):
+    """Each row's command is lost with probability `hold_fraction`, the last one that arrived acts on; neutral at 0.
+
+    Random: its deterministic response is none, its mark is the noise of the command, large where the command moves.
+    """
+
+    hold_fraction: Number = 0.07
+
+    name = "command_hold"
+    place = "command"
+    memory = True
+    random = True
+    meaning = "messages are lost and the last command acts on"
+    equation = "u of the last row that arrived"
+    parameters = (Parameter("hold_fraction", "-", 0.0, 0.02, 0.2, "unit"),)
+
+    def start(self, x: Tensor, row: Row) -> Tensor:
+        return x
+
+    def advance(self, x: Tensor, row: Row, state: Tensor) -> tuple[Tensor, Tensor]:
+        if row.normal is None:
+            return x, x
+        y = torch.where(self._lost(row.normal), state, x)
+        return y, y
+
+    def over(self, x: Tensor, row: Row) -> Tensor:
+        if row.normal is None:
+            return x
+        arrived = ~self._lost(row.normal)
+        rows = torch.arange(x.shape[-1])
+        last = torch.where(arrived, rows, 0).cummax(-1).values
+        shape = torch.broadcast_shapes(last.shape, x.shape)
+        return x.expand(shape).gather(-1, last.expand(shape))
+
+    def _lost(self, normal: Tensor) -> Tensor:
+        return torch.special.ndtr(normal) < tensor(self.hold_fraction)
+
+    def noise(self, u: Tensor) -> NoiseChange:
+        """Mean square of `u` acting minus `u` logged: `sum_j (1 - p) p^j (u[k-j] - u[k])²`."""
+        p = tensor(self.hold_fraction).unsqueeze(-1)
+        total = torch.zeros(torch.broadcast_shapes(u.shape, p.shape), dtype=u.dtype)
+        for j in range(1, min(_ROWS_BACK, u.shape[-1] - 1) + 1):
+            older = torch.cat([u[..., :1].expand(*u.shape[:-1], j), u[..., :-j]], -1)
+            total = total + (1 - p) * p**j * (older - u).square()
+        return NoiseChange(command_variance=total)

@@ -1,0 +1,30 @@
+"""Dead band: small commands do nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+
+@register
+@dataclass(frozen=True)
+class DeadBand(Effect):
+    """Soft threshold of `|u|` at `half_width_mps2`; neutral at 0."""
+
+    half_width_mps2: Number = 0.08
+
+    name = "dead_band"
+    place = "command"
+    order = 2
+    meaning = "commands within a band do nothing, larger ones arrive short by its half width"
+    equation = "sign(u) max(|u| - delta, 0)"
+    parameters = (Parameter("half_width_mps2", "m/s²", 0.0, 0.02, 0.3),)
+
+    def apply(self, x: Tensor, row: Row) -> Tensor:
+        width = tensor(self.half_width_mps2)
+        return (x - width).clamp_min(0.0) + (x + width).clamp_max(0.0)

@@ -1,0 +1,89 @@
+"""Dead time: the command acts late."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+
+@register
+@dataclass(frozen=True)
+class DeadTime(Effect):
+    """`u(t - delay_s)`, exact for delays of any fraction of a step; neutral at 0.
+
+    A held command that arrives late switches within a step. So the hook returns two commands and the time for which
+    the older one still acts, and the actuator integrates both parts exactly. Always last among the command's effects.
+    """
+
+    delay_s: Number = 0.16
+
+    name = "dead_time"
+    place = "command"
+    order = 9
+    memory = True
+    meaning = "the command acts after a delay"
+    equation = "u(t - tau)"
+    parameters = (Parameter("delay_s", "s", 0.0, 0.05, 0.5),)
+
+    def start(self, x: Tensor, row: Row) -> list[Tensor]:
+        return [x]
+
+    def advance(self, x: Tensor, row: Row, state: list[Tensor]) -> tuple[tuple[Tensor, Tensor, Tensor], list[Tensor]]:
+        delay = tensor(self.delay_s)
+        whole, share = self._split(delay, row.dt)
+        reach = int(whole.max()) + 2  # this row's command and those still on their way
+        kept = [*state, x][-reach:]
+        kept = [kept[0]] * (reach - len(kept)) + kept
+        if delay.dim() == 0:
+            late, early = kept[-1 - int(whole)], kept[-2 - int(whole)]
+        else:
+            shape = torch.broadcast_shapes(x.shape, delay.shape)
+            stacked = torch.stack([k.expand(shape) for k in kept])
+            index = (reach - 1 - whole.expand(shape))[None]
+            late, early = stacked.gather(0, index)[0], stacked.gather(0, index - 1)[0]
+        return (early, late, share * row.dt), kept
+
+    def over(self, x: Tensor, row: Row) -> tuple[Tensor, Tensor, Tensor]:
+        delay = tensor(self.delay_s)
+        if row.dt.dim() and bool(row.dt.min() != row.dt.max()):
+            return self._over_jitter(x, row, delay)
+        dt = row.dt if row.dt.dim() == 0 else row.dt[..., :1]
+        whole, share = self._split(delay, dt)
+        index = torch.arange(x.shape[-1]) - whole
+        late, early = _rows(x, index), _rows(x, index - 1)
+        return early, late, share * dt
+
+    def _split(self, delay: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
+        """Whole steps of delay and the remaining share of one."""
+        steps = delay / dt
+        whole = (steps + 1e-9).floor()  # 0.2 s is 20 steps of 0.01 s, whatever the division says
+        return whole.detach().long(), (steps - whole.detach()).clamp_min(0.0)
+
+    def _over_jitter(self, x: Tensor, row: Row, delay: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Uneven steps: up to three commands act in one; the last two count by their mean."""
+        time, dt = row.time, row.dt
+        ends = torch.cat([time[1:], (time[-1] + dt[-1]).reshape(1)])
+        first = torch.searchsorted(time, (time - delay).detach().contiguous(), right=True) - 1
+        last = len(time) - 1
+        until = [ends[(first + i).clamp(0, last)] + delay - time for i in range(2)]
+        first_part = torch.minimum(until[0].clamp_min(0.0), dt)
+        first_part = torch.where(first < 0, torch.minimum((time[0] + delay - time).clamp_min(0.0), dt), first_part)
+        second_part = torch.minimum(until[1].clamp_min(0.0), dt) - first_part
+        rest = dt - first_part
+        share = torch.where(rest > 0, second_part / torch.where(rest > 0, rest, 1.0), 1.0).clamp(0.0, 1.0)
+        late = share * _rows(x, first + 1) + (1 - share) * _rows(x, first + 2)
+        return _rows(x, first), late, first_part
+
+
+def _rows(x: Tensor, index: Tensor) -> Tensor:
+    index = index.clamp(0, x.shape[-1] - 1)
+    if x.dim() == 1:
+        return x[index]
+    shape = torch.broadcast_shapes(x.shape, index.shape)
+    return x.expand(shape).gather(-1, index.expand(shape))

@@ -1,0 +1,83 @@
+"""Driveline oscillation: a lightly damped mode that jerk excites."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.gap.recursion import scan_pair
+from avtorch.vehicle.arguments import Number, tensor
+
+
+@register
+@dataclass(frozen=True)
+class DrivelineOscillation(Effect):
+    """`y'' + 2 zeta omega y' + omega² y = omega j` with `j` the actuator's jerk; the car gains
+    `amplitude y + quadrature y' / omega`. Neutral at amplitude and quadrature 0.
+
+    A step of the actuator by 1 m/s² rings with `amplitude` [m/s²]. Where in the driveline the mode sits decides on
+    its phase, so a quadrature part is fitted along; the answer names the length of both. Over a step the mean jerk
+    is held, and the mode is integrated exactly.
+    """
+
+    frequency_hz: Number = 2.2
+    amplitude: Number = 0.3
+    quadrature: Number = 0.0
+    mode_damping: Number = 0.08
+
+    name = "driveline_oscillation"
+    place = "body"
+    memory = True
+    meaning = "changes of the drive make the driveline ring"
+    equation = "amplitude y,  y'' + 2 zeta omega y' + omega² y = omega da/dt"
+    parameters = (
+        Parameter("frequency_hz", "Hz", None, 1.0, 5.0),
+        Parameter("amplitude", "-", 0.0, -0.5, 0.5, "real"),
+        Parameter("quadrature", "-", 0.0, -0.5, 0.5, "real", reported=False),
+        Parameter("mode_damping", "-", None, 0.03, 0.2, reported=False),
+    )
+
+    def report(self, T_L: Tensor) -> dict[str, Tensor]:
+        amplitude = torch.hypot(tensor(self.amplitude), tensor(self.quadrature))
+        return {"frequency_hz": tensor(self.frequency_hz), "amplitude": amplitude}
+
+    def start(self, x: Tensor, row: Row) -> Any:
+        zero = torch.zeros_like(x)
+        return x, zero, zero, None
+
+    def advance(self, x: Tensor, row: Row, state: Any) -> tuple[Tensor, Any]:
+        before, y, rate, dt = state
+        if dt is not None:  # from the last row to this one
+            (m00, m01, m10, m11), (b0, b1) = self._step(dt)
+            jerk = (x - before) / dt
+            y, rate = m00 * y + m01 * rate + b0 * jerk, m10 * y + m11 * rate + b1 * jerk
+        return self._seen(y, rate), (x, y, rate, row.dt)
+
+    def over(self, x: Tensor, row: Row) -> Tensor:
+        dt = row.dt[..., :-1] if bool(row.dt.dim() and row.dt.min() != row.dt.max()) else row.dt.reshape(-1)[:1]
+        matrix, (b0, b1) = self._step(dt)
+        jerk = x.diff(dim=-1) / dt
+        zero = torch.zeros((), dtype=x.dtype)
+        y, rate = scan_pair(matrix, (b0 * jerk, b1 * jerk), (zero, zero))
+        first = torch.zeros_like(y[..., :1])
+        return self._seen(torch.cat([first, y], -1), torch.cat([first, rate], -1))
+
+    def _seen(self, y: Tensor, rate: Tensor) -> Tensor:
+        return tensor(self.amplitude) * y + tensor(self.quadrature) * rate
+
+    def _step(self, dt: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]:
+        """State `(y, y' / omega)` after `dt`, and what a constant jerk adds."""
+        omega, zeta = 2 * math.pi * tensor(self.frequency_hz), tensor(self.mode_damping)
+        damped = torch.sqrt(1 - zeta.square())
+        angle = omega * damped * dt
+        decay = torch.exp(-zeta * omega * dt)
+        c, s = decay * torch.cos(angle), decay * torch.sin(angle) / damped
+        matrix = (c + zeta * s, s, -s, c - zeta * s)
+        # a constant jerk holds the mode at jerk / omega; the state approaches it
+        return matrix, ((1 - matrix[0]) / omega, -matrix[2] / omega)

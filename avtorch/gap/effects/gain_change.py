@@ -1,0 +1,58 @@
+"""The gain changes with time: payload, brake fade, a fault."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+
+@register
+@dataclass(frozen=True)
+class GainChange(Effect):
+    """`K_L` times `gain_ratio` from `change_s` on, reached over `ramp_s` (near 0: a step); neutral at ratio 1.
+
+    A row takes the mean over its step, so the response is differentiable in the time of the change. The drive's
+    span, `earliest_s … latest_s`, is the prior of that time.
+    """
+
+    gain_ratio: Number = 0.75
+    change_s: Number = 30.0
+    ramp_s: Number = 0.0
+    earliest_s: float = 0.0
+    latest_s: float = 60.0
+
+    name = "gain_change"
+    place = "actuator"
+    meaning = "from some moment on the car gives another share of what is asked"
+    equation = "K_L (1 + (ratio - 1) clip((t - t_change) / ramp, 0, 1))"
+    parameters = (
+        Parameter("gain_ratio", "-", 1.0, 0.65, 1.4),
+        Parameter("change_s", "s", None, 0.0, 60.0, "interval"),
+        Parameter("ramp_s", "s", None, 0.5, 60.0, reported=False),
+    )
+
+    def apply(self, x: Tensor, row: Row) -> tuple[Tensor, float]:
+        ramp = tensor(self.ramp_s).clamp_min(1e-6)
+        since = row.time - tensor(self.change_s)
+        share = (_area(since + row.dt, ramp) - _area(since, ramp)) / row.dt
+        return 1 + (tensor(self.gain_ratio) - 1) * share, 1.0
+
+    def coordinates(self) -> tuple[Parameter, ...]:
+        ratio, change, ramp = self.parameters
+        return ratio, replace(change, low=self.earliest_s, high=self.latest_s), ramp
+
+    def prepared(self, time: Tensor, speed: Tensor | None, position: Tensor | None) -> Self:
+        return replace(self, earliest_s=float(time[0]), latest_s=float(time[-1]))
+
+
+def _area(since: Tensor, ramp: Tensor) -> Tensor:
+    """Integral of the ramp up to `since` [s]."""
+    within = torch.minimum(since.clamp_min(0.0), ramp)
+    return within.square() / (2 * ramp) + (since - ramp).clamp_min(0.0)

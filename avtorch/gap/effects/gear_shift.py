@@ -1,0 +1,94 @@
+"""Gear shifts: the drive is interrupted while a gear is changed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+_REARMED = 1.5  # [m/s] below a shift speed the gear counts as changed back, without interruption
+_NEVER = -1e9
+
+
+@register
+@dataclass(frozen=True)
+class GearShift(Effect):
+    """Where the speed rises through one of `speeds` [m/s], a positive command loses the share `depth` for `duration_s`.
+
+    Neutral at depth 0. `speed_scale` multiplies all shift speeds. The crossing is found between rows, and a row loses
+    by the part of its step that lies in the interruption, so the response is differentiable in duration and speeds.
+    """
+
+    depth: Number = 0.7
+    duration_s: Number = 0.25
+    speed_scale: Number = 1.0
+    speeds: tuple[float, ...] = (4.0, 8.0, 13.0, 19.0, 26.0)
+
+    name = "gear_shift"
+    place = "actuator"
+    memory = True
+    needs_speed = True
+    meaning = "shifting up at certain speeds interrupts the drive"
+    equation = "K_L (1 - depth) for duration after each upshift, where u > 0"
+    parameters = (
+        Parameter("depth", "-", 0.0, 0.3, 0.95, "unit"),
+        Parameter("duration_s", "s", None, 0.1, 0.6),
+        Parameter("speed_scale", "-", None, 0.85, 1.18, reported=False),
+    )
+
+    def start(self, x: Tensor, row: Row) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """Of each shift: speed a row ago, whether above, start of the last interruption."""
+        v = row.speed
+        return [(v, v > s, torch.full_like(v, _NEVER)) for s in self._thresholds()]
+
+    def advance(
+        self, x: Tensor, row: Row, state: list[tuple[Tensor, Tensor, Tensor]]
+    ) -> tuple[tuple[Tensor, float], list[tuple[Tensor, Tensor, Tensor]]]:
+        v, lost, after = row.speed, torch.zeros(()), []
+        for s, (v_before, above, since) in zip(self._thresholds(), state, strict=True):
+            up = ~above & (v > s)
+            since = torch.where(up, self._crossing(v_before, v, s, row), since)
+            above = (above | up) & (v > s - _REARMED)
+            lost = torch.maximum(lost, self._covered(since, row))
+            after.append((v, above, since))
+        return (self._factor(lost, x), 1.0), after
+
+    def over(self, x: Tensor, row: Row) -> tuple[Tensor, float]:
+        v, lost = row.speed, torch.zeros(())
+        before = torch.cat([v[..., :1], v[..., :-1]], -1)
+        rows = torch.arange(v.shape[-1])
+        for s in self._thresholds():
+            # a hysteresis: the last row that armed or fired decides
+            fired = torch.where(v > s, rows, -1).cummax(-1).values
+            armed = torch.where(v <= s - _REARMED, rows, -1).cummax(-1).values
+            above = fired > armed
+            was = torch.cat([v[..., :1] > s, above[..., :-1]], -1)
+            up = (v > s) & ~was
+            last = torch.where(up, rows, -1).cummax(-1).values
+            crossing = self._crossing(before, v, s, row)
+            crossing = crossing.expand(torch.broadcast_shapes(crossing.shape, last.shape))
+            since = torch.where(last < 0, _NEVER, crossing.gather(-1, last.expand_as(crossing).clamp_min(0)))
+            lost = torch.maximum(lost, self._covered(since, row))
+        return self._factor(lost, x), 1.0
+
+    def _thresholds(self) -> list[Tensor]:
+        return [tensor(self.speed_scale) * s for s in self.speeds]
+
+    def _crossing(self, before: Tensor, v: Tensor, s: Tensor, row: Row) -> Tensor:
+        """When the interruption starts: one row after the crossing, so that a step knows it when it begins."""
+        gained = v - before
+        share = ((v - s) / torch.where(gained > 0, gained, 1.0)).clamp(0.0, 1.0)
+        return row.time + (1 - share) * row.dt
+
+    def _covered(self, since: Tensor, row: Row) -> Tensor:
+        begin = torch.maximum(row.time, since)
+        end = torch.minimum(row.time + row.dt, since + tensor(self.duration_s))
+        return ((end - begin) / row.dt).clamp_min(0.0)
+
+    def _factor(self, lost: Tensor, x: Tensor) -> Tensor:
+        return torch.where(x > 0, 1 - tensor(self.depth) * lost, 1.0)

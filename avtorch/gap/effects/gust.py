@@ -1,0 +1,64 @@
+"""Gusts: a slowly coloured random acceleration of the body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, NoiseChange, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.gap.recursion import scan
+from avtorch.vehicle.arguments import Number, tensor
+
+
+@register
+@dataclass(frozen=True)
+class Gust(Effect):
+    """Ornstein-Uhlenbeck acceleration of standard deviation `sd_mps2` and `time_constant_s`, stationary; neutral at 0.
+
+    Random: its deterministic response is none; the noise model gains this force in both witnesses.
+    """
+
+    sd_mps2: Number = 0.2
+    time_constant_s: Number = 2.2
+
+    name = "gust"
+    place = "body"
+    memory = True
+    random = True
+    meaning = "wind and road push the car at random, for seconds"
+    equation = "df = -f / tau dt + sd sqrt(2 / tau) dW"
+    parameters = (
+        Parameter("sd_mps2", "m/s²", 0.0, 0.1, 0.4),
+        Parameter("time_constant_s", "s", None, 1.0, 5.0),
+    )
+
+    def start(self, x: Tensor, row: Row) -> Any:
+        return None
+
+    def advance(self, x: Tensor, row: Row, state: Any) -> tuple[Tensor, Any]:
+        if row.normal is None:
+            return torch.zeros_like(x), None
+        sd = tensor(self.sd_mps2)
+        if state is None:
+            force = sd * row.normal
+        else:
+            before, dt = state
+            keep = torch.exp(-dt / tensor(self.time_constant_s))
+            force = keep * before + sd * torch.sqrt(1 - keep.square()) * row.normal
+        return force, (force, row.dt)
+
+    def over(self, x: Tensor, row: Row) -> Tensor:
+        if row.normal is None:
+            return torch.zeros_like(x)
+        sd, dt = tensor(self.sd_mps2), row.dt.expand(row.time.shape)[..., :-1]
+        keep = torch.exp(-dt / tensor(self.time_constant_s))
+        first = sd[..., 0] * row.normal[..., 0] if sd.dim() else sd * row.normal[..., 0]
+        later = scan(keep, sd * torch.sqrt(1 - keep.square()) * row.normal[..., 1:], first)
+        return torch.cat([first.expand(later.shape[:-1])[..., None], later], -1)
+
+    def noise(self, u: Tensor) -> NoiseChange:
+        return NoiseChange(force_sd=tensor(self.sd_mps2), force_time=tensor(self.time_constant_s))

@@ -1,0 +1,33 @@
+"""Creep: an idling drive pushes the car at low speed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+_FADES_AT = 3.0  # [m/s]
+_FADES_OVER = 0.5  # [m/s]
+
+
+@register
+@dataclass(frozen=True)
+class LowSpeedCreep(Effect):
+    """`creep_mps2` below about 3 m/s, fading smoothly there; neutral at 0."""
+
+    creep_mps2: Number = 0.22
+
+    name = "low_speed_creep"
+    place = "body"
+    needs_speed = True
+    meaning = "the car is pushed forward at walking speed"
+    equation = "creep / (1 + exp((v - 3) / 0.5))"
+    parameters = (Parameter("creep_mps2", "m/s²", 0.0, 0.1, 0.5),)
+
+    def apply(self, x: Tensor, row: Row) -> Tensor:
+        return tensor(self.creep_mps2) * torch.sigmoid((_FADES_AT - row.speed) / _FADES_OVER)

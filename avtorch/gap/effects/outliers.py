@@ -1,0 +1,51 @@
+"""Outliers: now and then the accelerometer is far off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, NoiseChange, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+
+@register
+@dataclass(frozen=True)
+class Outliers(Effect):
+    """A `fraction` of samples is off by a normal error of `scale` times `noise_sd` [m/s²]; neutral at fraction 0.
+
+    Random: its deterministic response is none; the accelerometer's noise gains heavy tails, in units of its own
+    standard deviation. `noise_sd` matters to the simulator only.
+    """
+
+    fraction: Number = 0.016
+    scale: Number = 7.0
+    noise_sd: float = 0.05
+
+    name = "outliers"
+    place = "sensor"
+    order = 9
+    random = True
+    meaning = "single samples of the accelerometer are far off"
+    equation = "a + scale sigma e, with probability fraction"
+    parameters = (
+        Parameter("fraction", "-", 0.0, 0.005, 0.05, "unit"),
+        Parameter("scale", "sigma", None, 5.0, 10.0),
+    )
+
+    def apply(self, x: Tensor, row: Row) -> Tensor:
+        if row.normal is None:
+            return x
+        # one draw for both: within the hit part of its distribution it is uniform again
+        level = torch.special.ndtr(row.normal)
+        fraction = tensor(self.fraction)
+        hit = level < fraction
+        again = torch.where(hit, level / torch.where(hit, fraction, 1.0), 0.5)
+        error = torch.special.ndtri(again.clamp(1e-12, 1 - 1e-12))
+        return x + torch.where(hit, tensor(self.scale) * self.noise_sd * error, 0.0)
+
+    def noise(self, u: Tensor) -> NoiseChange:
+        return NoiseChange(tail_fraction=tensor(self.fraction), tail_scale=tensor(self.scale))

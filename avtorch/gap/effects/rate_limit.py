@@ -1,0 +1,32 @@
+"""Rate limit: the realised acceleration changes only so fast."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number
+
+
+@register
+@dataclass(frozen=True)
+class RateLimit(Effect):
+    """`|da/dt|` of the actuator at most `jerk_max_mps3`; neutral at infinity.
+
+    Behind a second-order actuator the set-point `K u` is slewed instead: what limits the one limits the other.
+    """
+
+    jerk_max_mps3: Number = 1.4
+
+    name = "rate_limit"
+    place = "actuator"
+    order = 2
+    meaning = "the actuator's jerk is bounded"
+    equation = "da/dt = (K u - a) / T_L within ± jerk_max"
+    parameters = (Parameter("jerk_max_mps3", "m/s³", float("inf"), 0.5, 4.0),)
+
+    def apply(self, x: Tensor, row: Row) -> tuple[float, float]:
+        return 1.0, 1.0  # the bound is the actuator's own affair, see `actuator.py`

@@ -1,0 +1,100 @@
+"""Road grade: an unknown, smooth slope along the road."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+_GRAVITY = 9.80665
+_SMOOTH_M = 250.0  # correlation length of the slope (Matern 3/2) [m]
+
+
+@register
+@dataclass(frozen=True)
+class RoadGrade(Effect):
+    """`-g sin(slope(position))`; the slope is a Gaussian process over position of size `grade_rms`; neutral at 0.
+
+    Cubic B-splines every `knot_m` [m] carry it; `profile` (..., knots) holds their coefficients, a priori independent
+    standard normals (the correlation is put in here), linear in the response as far as the sine is: a likelihood may
+    integrate them out by the `columns`. Where `profile` is None the slope is 0, or drawn, where drives are sampled.
+    """
+
+    grade_rms: Number = 0.03
+    profile: Tensor | None = None
+    knots: int = 256
+    knot_m: float = 120.0
+
+    name = "road_grade"
+    place = "body"
+    needs_speed = True
+    meaning = "hills that the log does not know of"
+    equation = "-g sin(slope(x)), slope a smooth random function of position"
+    parameters = (Parameter("grade_rms", "-", 0.0, 0.02, 0.06),)
+
+    def apply(self, x: Tensor, row: Row) -> Tensor:
+        position = row.position
+        if self.profile is None:
+            return torch.zeros_like(position)
+        slope = tensor(self.grade_rms) * _spline(position, self._coefficients(), self.knot_m, row.whole)
+        return -_GRAVITY * torch.sin(torch.atan(slope))
+
+    def coordinates(self) -> tuple[Parameter, ...]:
+        return *self.parameters, Parameter("profile", "-", None, -1.2816, 1.2816, "real", False, self.knots)
+
+    def prepared(self, time: Tensor, speed: Tensor | None, position: Tensor | None) -> Self:
+        if position is None:
+            return self
+        return replace(self, knots=int(float(position.max()) / self.knot_m) + 4, profile=None)
+
+    def drawn(self, generator: torch.Generator | None) -> Self:
+        if self.profile is not None:
+            return self
+        return replace(self, profile=torch.randn(self.knots, generator=generator, dtype=torch.float64))
+
+    def columns(self, position: Tensor) -> Tensor:
+        """Acceleration (time, knot) per unit of each coefficient at `grade_rms` 1, `position` (time,) [m]."""
+        lower = _lower(self.knots, self.knot_m)
+        return -_GRAVITY * _spline(position, lower.T, self.knot_m, True).movedim(0, -1)
+
+    def _coefficients(self) -> Tensor:
+        profile = tensor(self.profile)
+        return profile @ _lower(profile.shape[-1], self.knot_m).T
+
+
+def _spline(position: Tensor, coefficients: Tensor, knot: float, whole: bool) -> Tensor:
+    """Cubic B-spline with `coefficients` (..., knot) at `position`: (..., time), or (...) where not `whole`."""
+    at = position / knot
+    cell = at.detach().floor().clamp(0, coefficients.shape[-1] - 4)
+    t = at - cell
+    weights = ((1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3)
+    total = torch.zeros((), dtype=position.dtype)
+    for j, weight in enumerate(weights):
+        index = cell.long() + j
+        if coefficients.dim() == 1:
+            value = coefficients[index]
+        else:
+            index = index if whole else index[..., None]
+            shape = torch.broadcast_shapes(index.shape[:-1], coefficients.shape[:-1])
+            value = coefficients.expand(*shape, -1).gather(-1, index.expand(*shape, -1))
+            value = value if whole else value[..., 0]
+        total = total + weight / 6 * value
+    return total
+
+
+@lru_cache(maxsize=16)
+def _lower(knots: int, knot: float) -> Tensor:
+    """Cholesky factor of the coefficients' prior, scaled so that the slope has standard deviation 1 at a mid-cell."""
+    away = math.sqrt(3) * knot / _SMOOTH_M * (torch.arange(knots)[:, None] - torch.arange(knots)).abs().double()
+    covariance = (1 + away) * torch.exp(-away)
+    middle = torch.tensor([1.0, 23.0, 23.0, 1.0], dtype=torch.float64) / 48
+    size = middle @ covariance[:4, :4] @ middle
+    return torch.linalg.cholesky(covariance / size)

@@ -1,0 +1,37 @@
+"""Saturation: the car can give only so much."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+
+@register
+@dataclass(frozen=True)
+class Saturation(Effect):
+    """`K u` clipped to `accel_min_mps2 … accel_max_mps2`; neutral at -inf and inf."""
+
+    accel_max_mps2: Number = 1.25
+    accel_min_mps2: Number = -2.5
+
+    name = "saturation"
+    place = "command"
+    order = 1
+    meaning = "demands beyond what drive or brakes can give are cut"
+    equation = "K u within [a_min, a_max]"
+    parameters = (
+        Parameter("accel_max_mps2", "m/s²", float("inf"), 0.8, 2.0),
+        Parameter("accel_min_mps2", "m/s²", float("-inf"), -4.0, -1.5, "negative"),
+    )
+
+    def apply(self, x: Tensor, row: Row) -> Tensor:
+        # clipped before the gain: limits divided by it, so that an inner command passes to the bit
+        gain = row.K_L.clamp_min(1e-9)
+        high, low = tensor(self.accel_max_mps2) / gain, tensor(self.accel_min_mps2) / gain
+        return torch.maximum(torch.minimum(x, high), low)

@@ -1,0 +1,60 @@
+"""Second-order actuator: it can overshoot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+
+@register
+@dataclass(frozen=True)
+class SecondOrderActuator(Effect):
+    """`a'' / omega² + 2 zeta a' / omega + a = K u` in place of the one pole.
+
+    Fitted as `tau² a'' + T_L a' + a = K u` with `tau = inverse_frequency_s`: neutral at 0, where the GLVD comes out
+    exactly, and `T_L` keeps its meaning, the slope of the phase. The answer names `natural_frequency_radps = 1 / tau`
+    and `damping_ratio = T_L / (2 tau)`. With `damping_ratio` given, the plant's `T_L` is set to `2 zeta tau`.
+    """
+
+    inverse_frequency_s: Number = 1 / 6
+    damping_ratio: Number | None = None
+
+    name = "second_order_actuator"
+    place = "actuator"
+    order = 1
+    meaning = "the actuator has inertia and may overshoot"
+    equation = "a'' = omega² (K u - a) - 2 zeta omega a'"
+    parameters = (Parameter("inverse_frequency_s", "s", 0.0, 1 / 12, 1 / 3, reported=False),)
+
+    def apply(self, x: Tensor, row: Row) -> tuple[float, float]:
+        return 1.0, 1.0  # the second derivative is the actuator's own affair, see `actuator.py`
+
+    def report(self, T_L: Tensor) -> dict[str, Tensor]:
+        tau = tensor(self.inverse_frequency_s)
+        return {"natural_frequency_radps": 1 / tau, "damping_ratio": T_L / (2 * tau)}
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Self:
+        """From `natural_frequency_radps` and `damping_ratio` (without it the plant keeps its `T_L`)."""
+        given = dict(values)
+        if "natural_frequency_radps" in given:
+            frequency = given.pop("natural_frequency_radps")
+            if not bool(torch.all(tensor(frequency) > 0)):
+                raise InputError(f"natural_frequency_radps: found {frequency!r}, needs > 0 rad/s")
+            given["inverse_frequency_s"] = 1 / frequency
+        return super().of(given)
+
+    def implied_lag(self) -> Tensor | None:
+        """The plant's `T_L` [s] that a given `damping_ratio` means."""
+        if self.damping_ratio is None:
+            return None
+        return 2 * tensor(self.damping_ratio) * tensor(self.inverse_frequency_s)

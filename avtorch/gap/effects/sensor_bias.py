@@ -1,0 +1,29 @@
+"""Sensor bias: the accelerometer is off by a constant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+
+@register
+@dataclass(frozen=True)
+class SensorBias(Effect):
+    """`bias_mps2` on top of the measured acceleration; neutral at 0."""
+
+    bias_mps2: Number = 0.12
+
+    name = "sensor_bias"
+    place = "sensor"
+    order = 2
+    meaning = "the accelerometer shows a constant offset"
+    equation = "a + b"
+    parameters = (Parameter("bias_mps2", "m/s²", 0.0, -0.25, 0.25, "real"),)
+
+    def apply(self, x: Tensor, row: Row) -> Tensor:
+        return x + tensor(self.bias_mps2)

@@ -1,0 +1,55 @@
+"""Sensor lag: the accelerometer is filtered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.gap.recursion import scan
+from avtorch.vehicle.arguments import Number, tensor
+
+
+@register
+@dataclass(frozen=True)
+class SensorLag(Effect):
+    """First-order filter of time constant `lag_s` on the measured acceleration; neutral at 0.
+
+    Exact for an acceleration that is linear between rows.
+    """
+
+    lag_s: Number = 0.16
+
+    name = "sensor_lag"
+    place = "sensor"
+    memory = True
+    meaning = "the accelerometer shows what happened a little earlier"
+    equation = "s' = (a - s) / lag"
+    parameters = (Parameter("lag_s", "s", 0.0, 0.05, 0.5),)
+
+    def start(self, x: Tensor, row: Row) -> Any:
+        return x, x, None
+
+    def advance(self, x: Tensor, row: Row, state: Any) -> tuple[Tensor, Any]:
+        shown, before, dt = state
+        if dt is not None:
+            keep, old, new = self._weights(dt)
+            shown = keep * shown + old * before + new * x
+        return shown, (shown, x, row.dt)
+
+    def over(self, x: Tensor, row: Row) -> Tensor:
+        dt = row.dt[..., :-1] if bool(row.dt.dim() and row.dt.min() != row.dt.max()) else row.dt.reshape(-1)[:1]
+        keep, old, new = self._weights(dt)
+        later = scan(keep, old * x[..., :-1] + new * x[..., 1:], x[..., 0])
+        return torch.cat([x[..., :1].expand(*later.shape[:-1], 1), later], -1)
+
+    def _weights(self, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        lag = tensor(self.lag_s)
+        ratio = dt / lag.clamp_min(1e-7 * dt)  # at a lag of 0 the filter forgets at once, and has a derivative
+        keep = torch.exp(-ratio)
+        held = lag / dt * -torch.expm1(-ratio)
+        return keep, held - keep, 1 - held

@@ -1,0 +1,29 @@
+"""Sensor scale: the accelerometer's gain is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+
+@register
+@dataclass(frozen=True)
+class SensorScale(Effect):
+    """The measured acceleration times `scale`; neutral at 1."""
+
+    scale: Number = 1.12
+
+    name = "sensor_scale"
+    place = "sensor"
+    order = 1
+    meaning = "the accelerometer shows too much or too little"
+    equation = "scale a"
+    parameters = (Parameter("scale", "-", 1.0, 0.83, 1.2),)
+
+    def apply(self, x: Tensor, row: Row) -> Tensor:
+        return tensor(self.scale) * x

@@ -1,0 +1,41 @@
+"""The gain changes with speed: a pedal or brake map that is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+_LEAST = 0.0  # the factor's least value, out of a drive's range of speeds
+
+
+@register
+@dataclass(frozen=True)
+class SpeedDependentGain(Effect):
+    """`K_L (1 + gain_slope (v - v_mean) / v_mean)`; neutral at 0. `mean_speed` [m/s] is taken from a drive."""
+
+    gain_slope: Number = 0.3
+    mean_speed: Number = 15.0
+
+    name = "speed_dependent_gain"
+    place = "actuator"
+    needs_speed = True
+    meaning = "the realised share of the command depends on speed"
+    equation = "K_L (1 + slope (v - v_mean) / v_mean)"
+    parameters = (Parameter("gain_slope", "-", 0.0, -0.4, 0.4, "real"),)
+
+    def apply(self, x: Tensor, row: Row) -> tuple[Tensor, float]:
+        away = row.speed / tensor(self.mean_speed) - 1
+        factor = (1 + tensor(self.gain_slope) * away).clamp_min(_LEAST)
+        return factor, 1.0
+
+    def prepared(self, time: Tensor, speed: Tensor | None, position: Tensor | None) -> Self:
+        if speed is None:
+            return self
+        moving = speed[speed > 0.3]
+        return replace(self, mean_speed=float(moving.mean())) if len(moving) else self

@@ -1,0 +1,41 @@
+"""The lag changes with speed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+from torch import Tensor
+
+from avtorch.gap.effect import Effect, Row, register
+from avtorch.gap.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+_LEAST = 0.05  # the factor's least value, out of a drive's range of speeds
+
+
+@register
+@dataclass(frozen=True)
+class SpeedDependentLag(Effect):
+    """`T_L (1 + lag_slope (v - v_mean) / v_mean)`; neutral at 0. `mean_speed` [m/s] is taken from a drive."""
+
+    lag_slope: Number = 0.5
+    mean_speed: Number = 15.0
+
+    name = "speed_dependent_lag"
+    place = "actuator"
+    needs_speed = True
+    meaning = "the actuator is slower at some speeds"
+    equation = "T_L (1 + slope (v - v_mean) / v_mean)"
+    parameters = (Parameter("lag_slope", "-", 0.0, -0.7, 0.7, "real"),)
+
+    def apply(self, x: Tensor, row: Row) -> tuple[float, Tensor]:
+        away = row.speed / tensor(self.mean_speed) - 1
+        factor = (1 + tensor(self.lag_slope) * away).clamp_min(_LEAST)
+        return 1.0, factor
+
+    def prepared(self, time: Tensor, speed: Tensor | None, position: Tensor | None) -> Self:
+        if speed is None:
+            return self
+        moving = speed[speed > 0.3]
+        return replace(self, mean_speed=float(moving.mean())) if len(moving) else self

@@ -1,0 +1,109 @@
+"""A parameter of an effect: its unit, what is typical, its prior, and the real line it is fitted on.
+
+Every prior is a standard normal `z` seen through a link, `value = link(location + spread z)`, so that the prior of
+`z` needs no Jacobian and every coordinate of a fit has scale one. The typical range holds the prior's central 80 %.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+
+Constraint = Literal["real", "positive", "negative", "unit", "interval"]
+
+_CENTRAL_80 = 1.2815515655446004  # normal quantile of 0.9
+_LOG_2PI = math.log(2 * math.pi)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """`name` (the key in an answer), `unit`, `neutral` value (None: any, once the others are neutral), typical range.
+
+    `constraint` is the link: `"real"` the value itself, `"positive"` its log, `"negative"` the log of its opposite,
+    `"unit"` (0 to 1) its logit, `"interval"` uniform from `low` to `high`, by the normal distribution function.
+    `reported` False: a coordinate that the table of effects does not name, fitted and kept out of the answer.
+    `size`: 1, or the length of a vector-valued coordinate, then on its last dimension.
+
+    Raises `InputError` for a range that is empty or outside the constraint.
+    """
+
+    name: str
+    unit: str
+    neutral: float | None
+    low: float
+    high: float
+    constraint: Constraint = "positive"
+    reported: bool = True
+    size: int = 1
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise InputError(f"{self.name}: found the range {self.low:g} to {self.high:g}, needs low < high")
+        ends = [self._link(torch.tensor(x, dtype=torch.float64)) for x in (self.low, self.high)]
+        if self.constraint != "interval" and not all(math.isfinite(x) for x in ends):
+            raise InputError(f"{self.name}: {self.low:g} to {self.high:g} is not within {self.constraint!r}")
+
+    @property
+    def location(self) -> float:
+        """Centre of the prior on the link's scale."""
+        return 0.0 if self.constraint == "interval" else 0.5 * sum(self._ends())
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the prior on the link's scale."""
+        if self.constraint == "interval":
+            return 1.0
+        low, high = self._ends()
+        return abs(high - low) / (2 * _CENTRAL_80)
+
+    def _ends(self) -> tuple[float, float]:
+        low, high = (float(self._link(torch.tensor(x, dtype=torch.float64))) for x in (self.low, self.high))
+        return low, high
+
+    def _link(self, value: Tensor) -> Tensor:
+        if self.constraint == "positive":
+            return value.log()
+        if self.constraint == "negative":
+            return (-value).log()
+        if self.constraint == "unit":
+            return torch.logit(value)
+        if self.constraint == "interval":
+            return torch.special.ndtri((value - self.low) / (self.high - self.low))
+        return value
+
+    def constrain(self, z: Tensor) -> Tensor:
+        """The value for `z`, elementwise."""
+        x = self.location + self.spread * z
+        if self.constraint == "positive":
+            return x.exp()
+        if self.constraint == "negative":
+            return -x.exp()
+        if self.constraint == "unit":
+            return torch.sigmoid(x)
+        if self.constraint == "interval":
+            return self.low + (self.high - self.low) * torch.special.ndtr(x)
+        return x
+
+    def unconstrain(self, value: Tensor) -> Tensor:
+        """`z` for a value, elementwise; infinite for a neutral value at the edge of the constraint."""
+        return (self._link(value) - self.location) / self.spread
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        """Log density of `z` under the prior, elementwise: the standard normal's."""
+        return -0.5 * z.square() - 0.5 * _LOG_2PI
+
+    def typical(self) -> Tensor:
+        """The prior's median."""
+        shape = () if self.size == 1 else (self.size,)
+        return self.constrain(torch.zeros(shape, dtype=torch.float64))
+
+    def sample(self, *shape: int, generator: torch.Generator | None = None) -> Tensor:
+        """Draws from the prior, of the given shape (and the parameter's size last, where it has one)."""
+        full = shape if self.size == 1 else (*shape, self.size)
+        return self.constrain(torch.randn(full, generator=generator, dtype=torch.float64))

@@ -1,0 +1,97 @@
+"""What each effect does to one and the same command: its signature, with and without it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import matplotlib.pyplot as plt
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from avtorch.gap import EFFECTS, PLACES, Drive, Effect, GainChange, Response, plant
+from avtorch.plots.style import BLACK, BLUE, GREY, VERMILLION, styled
+
+_DT = 0.02
+_SEED = 3  # of the random effects' picture
+_FROM_MPS = {"low_speed_creep": 1.0, "aerodynamic_drag": 25.0}
+_FROM_ELSE_MPS = 12.0
+_FACTORS = (1, 2, 5, 10, 20, 50)
+_GAP_AT = -3.6  # [m/s²], where the gap's zero is drawn
+
+
+def standard_command() -> tuple[Tensor, Tensor]:
+    """Time (time,) [s] and command (time,) [m/s²]: step up, hold, step down, back to zero, sine."""
+    time = torch.arange(round(24.0 / _DT), dtype=torch.float64) * _DT
+    command = torch.zeros_like(time)
+    for start, end, value in ((1.0, 5.0, 1.5), (5.0, 7.0, 0.3), (7.0, 11.0, -2.0)):
+        command[(time >= start) & (time < end)] = value
+    sine = time >= 14.0
+    command[sine] = torch.sin(2 * math.pi * 0.4 * (time[sine] - 14.0))
+    return time, command
+
+
+def standard_response(effect: Effect | None, *, seed: int = _SEED) -> Response:
+    """Response of GLVD (0.3 s, 1), with `effect` if one is given, to the standard command; random ones are drawn.
+
+    The speed that an effect looks at is that of the very response, found by repeating.
+    """
+    time, command = standard_command()
+    first = _FROM_ELSE_MPS if effect is None else _FROM_MPS.get(effect.name, _FROM_ELSE_MPS)
+    drive = Drive(
+        time, command, torch.full_like(time, first), 0.0 if effect is None or effect.place != "body" else None
+    )
+    car = plant([] if effect is None else [effect])
+    response = car.response(drive, generator=torch.Generator().manual_seed(seed))
+    for _ in range(4):
+        drive = replace(drive, speed=response.speed.clamp_min(0.0))
+        response = car.response(drive, generator=torch.Generator().manual_seed(seed))
+    return response
+
+
+def effect_signature(ax: Axes, effect: Effect, *, seed: int = _SEED) -> Axes:
+    """The measured acceleration [m/s²] with `effect` and without, over the standard command; below, the gap, magnified
+    by the factor that is written there."""
+    time, command = standard_command()
+    with_it = standard_response(effect, seed=seed).accel_measured
+    without = standard_response(None).accel_measured
+    gap = with_it - without
+    factor = next((f for f in _FACTORS if f * float(gap.abs().max()) >= 0.45), _FACTORS[-1])
+    ax.step(time, command, where="post", color=GREY, linewidth=0.8, alpha=0.7, label="command")
+    ax.plot(time, without, color=BLACK, linewidth=1.0, linestyle="--", label="simulator (GLVD)")
+    ax.plot(time, with_it, color=BLUE, linewidth=1.3, label="with the effect")
+    ax.axhline(_GAP_AT, color=GREY, linewidth=0.6)
+    shown = (factor * gap).clamp(-1.1, 1.1) + _GAP_AT
+    ax.fill_between(time, shown, _GAP_AT, color=VERMILLION, alpha=0.6, linewidth=0, label="gap, magnified")
+    ax.plot(time, shown, color=VERMILLION, linewidth=0.8)
+    ax.text(0.995, 0.02, f"gap × {factor}", transform=ax.transAxes, color=VERMILLION, fontsize=7, ha="right")
+    ax.set_title(effect.name.replace("_", " "), fontsize=9)
+    ax.set_xlim(0.0, float(time[-1]))
+    ax.set_ylim(_GAP_AT - 1.5, 2.0)
+    ax.set_yticks([-2, -1, 0, 1])
+    return ax
+
+
+@styled
+def signature_figure() -> Figure:
+    """All registered effects at typical strength, in the order of the chain."""
+    typical = [GainChange(change_s=9.0) if cls is GainChange else cls() for cls in EFFECTS.values()]
+    effects = sorted(typical, key=lambda e: (PLACES.index(e.place), e.order, e.name))
+    columns = 4
+    rows = -(-(len(effects) + 1) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(13, 2.1 * rows), sharex=True, sharey=True, layout="constrained")
+    for ax, effect in zip(axes.flat, effects, strict=False):
+        effect_signature(ax, effect)
+        ax.set_title(effect.place, loc="right", fontsize=8, color=GREY, fontweight="normal")
+    for ax in axes.flat[len(effects) :]:
+        ax.set_axis_off()
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    axes.flat[len(effects)].legend(handles, labels, loc="center left")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("accel. [m/s²]")
+    for ax in axes.flat[max(0, len(effects) - columns) : len(effects)]:
+        ax.set_xlabel("time [s]")
+        ax.tick_params(labelbottom=True)
+    return figure
