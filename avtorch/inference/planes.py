@@ -2,7 +2,7 @@
 
 Shapes stay ``(..., window, parameter)`` everywhere; only the order in memory differs: parameter, then window, then the
 chains. Arithmetic on a parameter then runs over contiguous numbers, and what belongs to a window is a single number
-there. For thousand chains of thirty windows a step takes a fifth of the time of the usual order.
+there.
 """
 
 from __future__ import annotations

@@ -53,7 +53,8 @@ class SamplerSettings:
         batch: points per minibatch, or ``None`` for the whole window.
         spread: chains start this many posterior SDs around the mode; 0 starts them at the mode.
         schedule: makes a learning-rate scheduler from the optimizer, or ``None`` for a constant step.
-        longest: how many times as many steps a skewed window gets at most.
+        longest: how many times as many steps a skewed window gets at most; a low value saves time where a step is dear,
+            and leaves the most skewed windows short of mixing.
         attempts: how often a window whose chains diverge or disagree is run again with half the step.
         whitening: ``"full"``, or for comparison ``"diagonal"`` or ``"none"`` (see :class:`Coordinates`).
         optimizer: makes another optimizer than SGLD from ``(parameters, step, generator)``.
@@ -109,8 +110,8 @@ def sample(
     """Draws from the posterior of every window (Algorithm 1).
 
     A window whose chains leave the finite numbers or the posterior, or end with a nested R-hat above ``rhat_max``, is
-    sampled again, with half the step and twice the steps; one that never settles comes back with ``converged`` false
-    and the reason in ``why``.
+    sampled again, with half the step and, up to ``longest``, twice the steps; one that never settles comes back with
+    ``converged`` false and the reason in ``why``.
 
     Args:
         density: the target.
@@ -198,6 +199,7 @@ def _batches(density: Density, index: Tensor, pace: Tensor, chains: int) -> list
         few = torch.cat([few, index[times == each]])
         # a handful of windows costs less in the next batch, at its slower pace, than in one of their own
         if len(few) * chains >= FEW or each == times.max():
+            # in their own order: all windows of a density are walked without being picked out
             batches += few.sort().values.split(size)
             few = index[:0]
     return batches

@@ -172,6 +172,20 @@ def test_runs_repeat_and_thinning_takes_every_other_step(make_windows):
     assert second.equal(every[:, 1::2])
 
 
+def test_windows_keep_their_places_when_walked_at_several_paces(make_windows, rotating_seed):
+    """Skewed windows before and between others, in every order: each ends where it ends alone, far from the rest."""
+    w = make_windows(rotating_seed, [0.03, 3.0, 0.1, 3.0], T=[0.3, 0.1, 1.5, 1.0], K=[1.0, 1.0, 0.5, 0.6])
+    for order in ([0, 1, 2, 3], [3, 2, 1, 0], [2, 0, 3, 1]):
+        density = JerkDensity(w.statistics.select(torch.tensor(order)))
+        mode = find_mode(density)
+        # few chains, so that all four walk as one batch
+        posterior = sample(density, SamplerSettings(chains=64), generator=generator(rotating_seed), mode=mode)
+        z = posterior.draws.log()
+        away = (z.mean((0, 1)) - mode.z).abs() / z.std((0, 1))
+        # a skewed posterior's mean lies about one SD off its mode; a window in another's place would lie many
+        assert away.max() < 3
+
+
 class Valley:
     """``U = z^2/2`` in each of two windows, steeper by ``walls`` beyond 3.2, or not a number there."""
 
