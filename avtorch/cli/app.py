@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from cyclopts import App, CycloptsError
 
 from avtorch import __version__
+from avtorch.cli.diagnose import diagnose
 from avtorch.cli.estimate import estimate
 from avtorch.cli.run import run
 from avtorch.cli.stability import stability
@@ -26,6 +27,7 @@ app = App(
 )
 app.command(run)
 app.command(estimate)
+app.command(diagnose)
 app.command(stability)
 app.command(validate)
 
@@ -38,7 +40,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
         # one line, whatever the parser's own message looks like
         print("avtorch: " + " ".join(str(fault).split()), file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("avtorch: interrupted; no answer was written", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"avtorch: interrupted; {str(stop) or 'no answer was written'}", file=sys.stderr)
         return 130
     return 0

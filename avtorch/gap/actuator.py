@@ -6,7 +6,7 @@
 
 A step has one part, or two where a late command switches within it. Each part is integrated exactly, for the
 acceleration, its integral and its double integral. The same formulas serve one step (...) and whole drives
-(..., time): first and second order by scans, the rate limit by Newton's method over scans.
+(..., time): first and second order by scans, the rate limit row by row.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from avtorch.gap.limited import by_rows, limited_row, slewed_row
 from avtorch.gap.newton import solve
 from avtorch.gap.recursion import scan, scan_pair
 from avtorch.vehicle.glvd import motion_coefficients
@@ -86,8 +87,8 @@ class Actuator:
                 slope = slope * own
             return before, slope
 
-        guess, _ = _first_over(accel0.detach(), parts)
-        a = _joined(accel0, solve(step, accel0, guess[..., 1:].detach()))
+        # row by row without derivatives, which a round of Newton's method then gives
+        a = _joined(accel0, solve(step, accel0, by_rows(limited_row, accel0, parts, jerk)))
         at, gained = a[..., :-1], torch.zeros_like(a[..., 1:])
         for part in parts:
             at, _, speed, _ = _limited(at, part, jerk)
@@ -195,29 +196,14 @@ def _slewed(r: Tensor, part: Part, jerk: Tensor) -> tuple[Tensor, Tensor, Tensor
 
 
 def _slewed_over(accel0: Tensor, parts: list[Part], jerk: Tensor) -> list[Part]:
-    def step(before: Tensor, rows: slice, lag: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def step(before: Tensor, rows: slice) -> tuple[Tensor, Tensor]:
         slope = torch.ones_like(before)
         for part in parts:
-            part = part.rows(rows)
-            if lag is None:
-                before, own, _ = _slewed(before, part, jerk)
-            else:
-                before, own, *_ = _limited(before, Part(part.target, lag, part.length), jerk)
+            before, own, _ = _slewed(before, part.rows(rows), jerk)
             slope = slope * own
         return before, slope
 
-    # a pure slew has slopes of 0 and 1 and gives Newton no hint: come to it from slews with ever less lag
-    free = guess = parts[-1].target.detach()
-    whole = torch.stack([part.length.detach().max() for part in parts]).sum()
-    with torch.no_grad():
-        for steps in (32.0, 8.0, 2.0, 0.5):
-            guess = solve(
-                lambda before, rows, lag=steps * whole: step(before, rows, lag), accel0, guess, rounds=15, settle=False
-            )
-        # where the limit is never met, the target itself is the answer
-        free, guess = torch.broadcast_tensors(free, guess)
-        met = (step(_joined(accel0, free[..., :-1]), slice(0, free.shape[-1]))[0] - free).abs().amax(-1) > 1e-9
-        guess = torch.where(met[..., None], guess, free)
+    guess = by_rows(slewed_row, accel0, parts, jerk)
     ends = _joined(accel0, solve(step, accel0, guess))
     at, out = ends[..., :-1], []
     for part in parts:

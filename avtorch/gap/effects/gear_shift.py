@@ -13,6 +13,7 @@ from avtorch.vehicle.arguments import Number, tensor
 
 _REARMED = 1.5  # [m/s] below a shift speed the gear counts as changed back, without interruption
 _NEVER = -1e9
+_SHIFTS = 6
 
 
 @register
@@ -20,14 +21,16 @@ _NEVER = -1e9
 class GearShift(Effect):
     """Where the speed rises through one of `speeds` [m/s], a positive command loses the share `depth` for `duration_s`.
 
-    Neutral at depth 0. `speed_scale` multiplies all shift speeds. The crossing is found between rows, and a row loses
+    Neutral at depth 0. Without `speeds` they are those of a gearbox of even steps: `first_mps`, each next one
+    `gear_ratio` times the last. The crossing is found between rows, and a row loses
     by the part of its step that lies in the interruption, so the response is differentiable in duration and speeds.
     """
 
     depth: Number = 0.7
     duration_s: Number = 0.25
-    speed_scale: Number = 1.0
-    speeds: tuple[float, ...] = (4.0, 8.0, 13.0, 19.0, 26.0)
+    first_mps: Number = 4.5
+    gear_ratio: Number = 1.5
+    speeds: tuple[float, ...] | None = None
 
     name = "gear_shift"
     place = "actuator"
@@ -38,7 +41,8 @@ class GearShift(Effect):
     parameters = (
         Parameter("depth", "-", 0.0, 0.3, 0.95, "unit"),
         Parameter("duration_s", "s", None, 0.1, 0.6),
-        Parameter("speed_scale", "-", None, 0.85, 1.18, reported=False),
+        Parameter("first_mps", "m/s", None, 3.0, 7.0, reported=False),
+        Parameter("gear_ratio", "-", None, 1.3, 1.8, reported=False),
     )
 
     def start(self, x: Tensor, row: Row) -> list[tuple[Tensor, Tensor, Tensor]]:
@@ -77,7 +81,9 @@ class GearShift(Effect):
         return self._factor(lost, x), 1.0
 
     def _thresholds(self) -> list[Tensor]:
-        return [tensor(self.speed_scale) * s for s in self.speeds]
+        if self.speeds is not None:
+            return [tensor(s) for s in self.speeds]
+        return [tensor(self.first_mps) * tensor(self.gear_ratio) ** i for i in range(_SHIFTS)]
 
     def _crossing(self, before: Tensor, v: Tensor, s: Tensor, row: Row) -> Tensor:
         """When the interruption starts: one row after the crossing, so that a step knows it when it begins."""

@@ -1,0 +1,220 @@
+"""`avtorch diagnose`: which effect the simulator lacks, by one or more logs of a car."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from avtorch.cli.arguments import Json, Out, Quiet, Seed, free_folder, positive, seed_number
+from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes, diagnosis_table
+from avtorch.cli.resume import FITS, same_work
+from avtorch.cli.talk import Talk
+from avtorch.errors import InputError
+
+if TYPE_CHECKING:
+    from avtorch.gap import GapPlant
+    from avtorch.io import Log
+
+CAUSES = ("none", "unknown", "pair")
+"""What a prior may weigh beside the effects; `pair`: all pairs together."""
+
+
+def diagnose(
+    logs: list[Path],
+    /,
+    *,
+    out: Out,
+    map: Annotated[
+        list[str] | None, Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN; repeatable.")
+    ] = None,
+    unit: Annotated[list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT; repeatable.")] = None,
+    stamp: Annotated[
+        list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
+    ] = None,
+    baseline: Annotated[
+        str, Parameter(help="Your simulator: glvd, effects such as dead_time=0.2, or a TOML file.")
+    ] = "glvd",
+    prior: Annotated[
+        list[str] | None,
+        Parameter(negative=(), help="Prior weight of a cause, NAME=WEIGHT (effect, none, unknown, pair); repeatable."),
+    ] = None,
+    accel_kind: Annotated[
+        Literal["kinematic", "specific-force"],
+        Parameter(help="What accel is: dv/dt, or an accelerometer's reading with gravity's share in it."),
+    ] = "kinematic",
+    budget: Annotated[float | None, Parameter(help="Stop the search after this time [s]; default: none.")] = None,
+    effects: Annotated[str | None, Parameter(help="Only these effects, NAME,NAME,...; default: all.")] = None,
+    pairs: Annotated[bool, Parameter(help="Look for two effects at once.")] = True,
+    posterior: Annotated[
+        Literal["laplace", "sgld"], Parameter(help="Of the winner's parameters: normal approximation, or SGLD.")
+    ] = "sgld",
+    resume: Annotated[bool, Parameter(help="Go on from an interrupted run in --out, or begin anew.")] = True,
+    seed: Seed = 0,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """What does the simulator lack? Names the effect, its parameters, and what cannot be told apart.
+
+    Writes diagnosis.json and plant.toml, the simulator with the effect in. A run that was interrupted, or ended by its
+    --budget, goes on where it stood when the command is given again.
+
+    Parameters
+    ----------
+    logs
+        CSV or Parquet: time, accel_cmd, and accel or speed. Several are drives of one car. LOG.toml beside a log may
+        map names and units.
+    """
+    if budget is not None:
+        positive("--budget", budget, "s")
+    seed_number(seed)
+    free_folder(out)
+
+    chosen = _effects(effects)
+    weights = _prior(prior or ())
+    simulator = _baseline(baseline)
+
+    from avtorch.io import Log, check
+
+    talk = Talk(json=json, quiet=quiet)
+    drives = [Log.read(path, map=map, unit=unit, stamp=stamp) for path in logs]
+    for path, drive in zip(logs, drives, strict=True):
+        _usable(path, drive, accel_kind)
+    settings = {
+        "--baseline": "glvd" if simulator is None else simulator.to_toml(),
+        "--accel-kind": accel_kind,
+        "--effects": chosen,
+        "--pairs": pairs,
+        "--posterior": posterior,
+        "--seed": seed,
+    }
+    same_work(out, drives, settings, resume=resume)
+    for drive in drives:
+        talk.notes(f"{drive.name}", check(drive).notes)
+
+    from avtorch.gap.diagnose import diagnose as work
+
+    try:
+        with _progress(talk, budget) as step:
+            found = work(
+                drives,
+                baseline=simulator,
+                prior=weights or None,
+                accel_kind=accel_kind,
+                effects=chosen,
+                pairs=pairs,
+                posterior=posterior,
+                budget_s=budget,
+                seed=seed,
+                progress=step,
+                checkpoint=out / FITS,
+            )
+    except KeyboardInterrupt:
+        if (out / FITS).exists():
+            told = f"no answer was written; what is done is kept in {out / FITS}: the same command goes on from there"
+            raise KeyboardInterrupt(told) from None
+        raise
+    written = found.write(out)
+    if talk.json:
+        talk.done(out, found.to_dict())
+        return
+    talk.out.print(*diagnosis_headline(found), sep="\n")
+    talk.out.print()
+    talk.out.print(diagnosis_table(found))
+    talk.out.print()
+    for note in diagnosis_notes(found):
+        talk.out.print(note)
+    names = [p.name + (" (the repaired simulator)" if p.suffix == ".toml" else "") for p in written]
+    talk.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {', '.join(names)}", soft_wrap=True)
+
+
+def _known(option: str, name: str, more: Sequence[str] = ()) -> str:
+    from avtorch.gap import EFFECTS
+
+    if name not in EFFECTS and name not in more:
+        near = get_close_matches(name, [*EFFECTS, *more], n=1)
+        hint = f"; perhaps {near[0]}" if near else f", such as {', '.join(sorted(EFFECTS)[:3])}"
+        needs = "".join(f"{x}, " for x in more) + ("or " if more else "")
+        raise InputError(f"{option}: found {name!r}, needs {needs}an effect's name{hint}")
+    return name
+
+
+def _effects(text: str | None) -> list[str] | None:
+    if text is None:
+        return None
+    names = [_known("--effects", part.strip()) for part in text.split(",")]
+    if len(set(names)) < len(names):
+        raise InputError(f"--effects: found {text!r}, needs each name once")
+    return names
+
+
+def _prior(given: Sequence[str]) -> dict[str, float]:
+    weights: dict[str, float] = {}
+    for item in given:
+        name, equals, value = (x.strip() for x in item.partition("="))
+        try:
+            weight = float(value)
+        except ValueError:
+            weight = math.nan
+        if not equals or not (math.isfinite(weight) and weight >= 0):
+            raise InputError(f"--prior: found {item!r}, needs NAME=WEIGHT with a number of 0 or more, such as none=5")
+        if _known("--prior", name, CAUSES) in weights:
+            raise InputError(f"--prior: found {name} twice, needs each name once")
+        weights[name] = weight
+    return weights
+
+
+def _baseline(text: str) -> GapPlant | None:
+    """None for the bare GLVD, whose answer says as well what remains once a delay is in."""
+    from avtorch.gap import plant
+
+    if text.strip().lower() == "glvd":
+        return None
+    try:
+        simulator = plant(baseline=Path(text) if text.endswith(".toml") or Path(text).is_file() else text)
+    except InputError as fault:
+        raise InputError(f"--baseline {text!r}: {fault}") from None
+    known = simulator.parameters()
+    for name, value in simulator.values().items():
+        # the ends of an interval are a drive's, which is not known yet
+        if known[name].constraint != "interval" and known[name].unconstrain(value).isnan().any():
+            raise InputError(
+                f"--baseline {text!r}: {name} is {value.tolist():g}, needs a {known[name].constraint} number"
+            )
+    return simulator
+
+
+def _usable(path: Path, drive: Log, accel_kind: str) -> None:
+    if not drive.usable.any():
+        raise InputError(f"{path}: has no row to use; all are driven by hand (engaged 0) or at standstill")
+    if accel_kind == "specific-force" and drive.accel is None:
+        raise InputError(f"--accel-kind: found specific-force, but {path} has no accel")
+
+
+@contextmanager
+def _progress(talk: Talk, budget: float | None) -> Iterator[Callable[[str, int, int], None]]:
+    """A bar for each stage of the search on stderr where it is a terminal; takes (what, done, of)."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("" if budget is None else f"of {budget:g} s at most"),
+    )
+    begun = time.monotonic()
+    with Progress(*columns, console=talk.err, transient=True, disable=not talk.err.is_terminal) as bar:
+        task = bar.add_task("Diagnosing", total=None)
+        bar.tasks[0].start_time = begun
+
+        def step(what: str, done: int, of: int) -> None:
+            bar.update(task, description=what, completed=done, total=of)
+
+        yield step

@@ -1,0 +1,150 @@
+"""A diagnosis that reads in ten seconds: one sentence, one table, a few lines below it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from math import floor, log10
+from typing import TYPE_CHECKING
+
+from rich.markup import escape
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from avtorch.gap.diagnosis import Candidate, Diagnosis, Quantity
+
+ROWS = 8
+BAR = 8
+_EIGHTHS = " ▏▎▍▌▋▊▉█"
+
+
+def diagnosis_headline(found: Diagnosis) -> list[str]:
+    """The verdict as one sentence, and below it the diagnosis' own reason."""
+    from avtorch.gap.verdict import meanings
+
+    verdict, p = found.verdict, _share(found.winner.probability)
+    if verdict.abstained:
+        style, text = "bold yellow", f"The cause is none of the effects known here ({p}): nothing is blamed."
+    elif verdict.name == "none":
+        style, text = "bold green", f"The simulator lacks nothing that this log shows ({p})."
+    else:
+        told = meanings(verdict.name)
+        told = f": {told}." if told else "."
+        style, text = "bold cyan", f"The simulator lacks {' and '.join(verdict.names)} ({p}){told}"
+    return [f"[{style}]{escape(text)}[/]", f"[dim]{escape(verdict.why)}[/]"]
+
+
+def diagnosis_table(found: Diagnosis) -> Table:
+    """A row a candidate: probability, log evidence, parameters, and how the baseline moves with it in."""
+    table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column("candidate", no_wrap=True)
+    table.add_column("probability", no_wrap=True)
+    table.add_column("nats", justify="right", no_wrap=True)
+    table.add_column("parameters (90 %)")
+    shown, left = _shown(found.candidates)
+    for c in shown:
+        first = c.name == found.verdict.name
+        style = "bold" if first else None if c.name in found.verdict.alias_set else "dim"
+        nats = "" if c.log_evidence is None else f"{c.log_evidence:+.0f}" if c.log_evidence else "0"
+        lines = [_parameter(name, c, q) for name, q in c.parameters.items()] + _moved(found.baseline, c.moved)
+        name = c.name.replace("+", " +\n")
+        table.add_row(
+            escape(name), f"{_number(c.probability)} {bar(c.probability)}", nats, "\n".join(lines), style=style
+        )
+    if left:
+        rest = sum(c.probability for c in left)
+        table.add_row(f"{len(left)} others", _number(rest), "", "", style="dim")
+    return table
+
+
+def diagnosis_notes(found: Diagnosis) -> list[str]:
+    """What else there is to say, as lines with markup: alias set, onset, size of the gap, what remains, budget."""
+    lines = [escape(_aliases(found))]
+    if found.onset_s is not None:
+        lines.append(f"Onset: at {found.onset_s:.1f} s of the log's time.")
+    elif found.winner.effects:
+        lines.append("Onset: there from the start.")
+    lines += _gap(found)
+    if found.remaining:
+        best = sorted(found.remaining, key=lambda c: -c.probability)[:3]
+        told = ", ".join(f"{c.name} {_number(c.probability)}" for c in best if c.probability >= 0.005)
+        lines.append(escape(f"Once dead_time is in, what remains: {told}."))
+    if not found.complete:
+        text = "The budget ended the search: the answer is provisional; the same command with more goes on from here."
+        lines.append(f"[yellow]{text}[/]")
+    lines += [f"[dim]{escape(note)}[/]" for note in found.notes]
+    return lines
+
+
+def bar(share: float) -> str:
+    """`share` of `BAR` cells, in eighths of a cell."""
+    eighths = round(8 * BAR * min(max(share, 0.0), 1.0))
+    full, part = divmod(eighths, 8)
+    return ("█" * full + (_EIGHTHS[part] if part else "")).ljust(BAR)
+
+
+def _shown(candidates: Iterable[Candidate]) -> tuple[list[Candidate], list[Candidate]]:
+    """The first rows, `none` and `unknown` always among them; and those left out."""
+    ranked = list(candidates)
+    always = [c for c in ranked if c.name in ("none", "unknown")]
+    best = [c for c in ranked if c.name not in ("none", "unknown")][: ROWS - len(always)]
+    shown = [c for c in ranked if c in best or c in always]
+    return shown, [c for c in ranked if c not in shown]
+
+
+def _parameter(key: str, candidate: Candidate, q: Quantity) -> str:
+    from avtorch.gap.quantity import unit_of, words_of
+
+    effect, _, own = key.rpartition(".")
+    # a pair's parameters need the effect's name only where both have one of that name
+    twice = sum(k.rpartition(".")[2] == own for k in candidate.parameters) > 1
+    unit = unit_of(own)
+    words = f"{effect}: {words_of(own)}" if twice else words_of(own)
+    return escape(f"{words} {_interval(q, '' if unit == '-' else ' ' + unit)}")
+
+
+def _interval(q: Quantity, unit: str) -> str:
+    """Mean and 90 %, to the digit that the interval supports."""
+    width = q.q95 - q.q05
+    digits = min(max(1 - floor(log10(width)), 0), 7) if width > 0 else 3
+    return f"{q.mean:.{digits}f}{unit} ({q.q05:.{digits}f} to {q.q95:.{digits}f})"
+
+
+def _moved(baseline: Mapping[str, Quantity], moved: Mapping[str, Quantity]) -> list[str]:
+    told = []
+    for name in ("T_L", "K_L"):
+        if name in moved and name in baseline:
+            unit = " s" if name == "T_L" else ""
+            told.append(f"{name} {baseline[name].mean:.2f} → {moved[name].mean:.2f}{unit}")
+    return [", ".join(told)] if told else []
+
+
+def _aliases(found: Diagnosis) -> str:
+    from_words = {"none": "no effect at all", "unknown": "a cause outside the table"}
+    others = [from_words.get(n, n.replace("+", " with ")) for n in found.verdict.alias_set if n != found.verdict.name]
+    if not others:
+        return "Told apart from every other candidate on this log."
+    listing = others[0] if len(others) == 1 else f"{', '.join(others[:-1])} or {others[-1]}"
+    name = from_words.get(found.verdict.name, found.verdict.name.replace("+", " with "))
+    return f"Not told apart on this log: {name}, or {listing}."
+
+
+def _gap(found: Diagnosis) -> list[str]:
+    gap = found.gap
+    parts = []
+    if gap.rollout_rmse_accel is not None:
+        floor = "" if gap.rollout_floor_accel is None else f" (noise alone {gap.rollout_floor_accel:.2g})"
+        parts.append(f"acceleration off by {gap.rollout_rmse_accel:.2g} m/s²{floor}")
+    if gap.rollout_rmse_speed is not None:
+        parts.append(f"speed by {gap.rollout_rmse_speed:.2g} m/s")
+    if not parts:
+        return []
+    over = "" if gap.horizon_s is None else f", over {gap.horizon_s:g} s"
+    return [f"Gap of the simulator as it is{over}: {', '.join(parts)}."]
+
+
+def _number(p: float) -> str:
+    return "<.001" if 0 < p < 0.0005 else ">.999" if 0.9995 <= p < 1 else f"{p:.3f}"
+
+
+def _share(p: float) -> str:
+    return f"probability {p:.2f}" if p < 0.995 else "probability over 0.99"

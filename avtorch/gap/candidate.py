@@ -1,0 +1,168 @@
+"""A candidate cause: a plant with some effects, its coordinates, and what it leaves over of a record.
+
+Coordinates `z` are standard normal a priori. An effect whose size can go to its neutral value may be far fainter than
+what is typical, so the prior of sizes is twice as wide here as the table's range.
+
+With an `onset`, a row number, the effects act from there on: the responses with and without them are spliced, the
+speed going on from where it is. What lags behind the splice is forgotten within some lags.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from avtorch.gap.effect import Effect, effect_class
+from avtorch.gap.effects.road_grade import RoadGrade
+from avtorch.gap.parameter import Parameter
+from avtorch.gap.plant import GapPlant, plant
+from avtorch.gap.record import Record
+
+Float = NDArray[np.float64]
+
+_WIDER = 2.0
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One coordinate of a fit: the parameter's key in the plant, and how much wider than typical its prior is."""
+
+    key: str
+    parameter: Parameter
+    wider: float
+
+    def value(self, z: Float) -> torch.Tensor:
+        return self.parameter.constrain(torch.as_tensor(self.wider * z))
+
+    def z_of(self, value: float) -> float:
+        z = float(self.parameter.unconstrain(torch.tensor(value, dtype=torch.float64))) / self.wider
+        return float(np.clip(z, -4.0, 4.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Effects on top of a baseline, over a record."""
+
+    record: Record
+    effects: tuple[type[Effect], ...]
+    baseline: GapPlant
+
+    @classmethod
+    def named(cls, record: Record, name: str, baseline: GapPlant, more: Sequence[type[Effect]] = ()) -> Candidate:
+        """From `none`, an effect's name, or two joined by `+`."""
+        parts = () if name == "none" else tuple(name.split("+"))
+        return cls(record, tuple(effect_class(part, more) for part in parts), baseline)
+
+    @property
+    def name(self) -> str:
+        return "+".join(sorted(e.name for e in self.effects)) or "none"
+
+    @cached_property
+    def plant(self) -> GapPlant:
+        return plant(list(self.effects), baseline=self.baseline).prepared(self.record.drives[0])
+
+    @cached_property
+    def _without(self) -> GapPlant:
+        return plant([], baseline=self.baseline).prepared(self.record.drives[0])
+
+    @cached_property
+    def coordinates(self) -> tuple[Coordinate, ...]:
+        """`T_L`, `K_L`, then the effects'; vectors (a slope's profile) and baseline effects are left out."""
+        own = {e.name for e in self.effects}
+        found = []
+        for key, p in self.plant.parameters().items():
+            effect = key.partition(".")[0]
+            if p.size > 1 or ("." in key and effect not in own):
+                continue
+            if effect == "road_grade":
+                continue
+            sized = "." in key and p.neutral is not None and p.constraint != "interval"
+            found.append(Coordinate(key, p, _WIDER if sized else 1.0))
+        return tuple(found)
+
+    @property
+    def size(self) -> int:
+        return len(self.coordinates)
+
+    def values(self, z: Float) -> dict[str, torch.Tensor]:
+        """Parameters by key, (column,), for `z` (column, coordinate)."""
+        return {c.key: c.value(z[:, i]) for i, c in enumerate(self.coordinates)}
+
+    def z_of(self, values: Mapping[str, float]) -> Float:
+        """Coordinates for values by key; what is missing gets its prior's centre."""
+        return np.array([c.z_of(values[c.key]) if c.key in values else 0.0 for c in self.coordinates])
+
+    def rollouts(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
+        """Responses for `z` (column, coordinate): (column, witness, counted)."""
+        values = self.values(z)
+        full = self._rollouts(self.plant, values, coarse)
+        if onset is None:
+            return full
+        base = {k: v for k, v in values.items() if k in ("T_L", "K_L")}
+        without = self._rollouts(self._without, base, coarse)
+        return splice(self.record, full, without, onset)
+
+    def baseline_rollout(self, z: Float) -> Float:
+        """What the baseline alone does with the `T_L` and `K_L` of `z` (coordinate,): (witness, counted)."""
+        values = {k: v for k, v in self.values(z[None]).items() if k in ("T_L", "K_L")}
+        return self._rollouts(self._without, values)[0]
+
+    def _rollouts(self, of: GapPlant, values: Mapping[str, torch.Tensor], coarse: bool = False) -> Float:
+        record = self.record
+        with torch.no_grad():
+            responses = [of.response(drive, values) for drive in (record.coarse if coarse else record.drives)]
+        parts = []
+        if record.accel is not None:
+            parts.append(record.seen([r.accel_measured for r in responses], coarse=coarse))
+        if record.speed is not None:
+            parts.append(record.seen([r.speed for r in responses], coarse=coarse))
+        columns = max(len(v) for v in values.values())
+        return np.stack([np.broadcast_to(p, (columns, record.rows)) for p in parts], 1)
+
+    @cached_property
+    def measured(self) -> Float:
+        """(witness, counted)."""
+        return measured(self.record)
+
+    def errors(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
+        """Measured less rolled out, (column, witness, counted)."""
+        return self.measured - self.rollouts(z, onset, coarse=coarse)
+
+    @cached_property
+    def grade_columns(self) -> Float | None:
+        """Rollouts (knot, witness, counted) per unit of each coefficient of the slope at `grade_rms` 1."""
+        grade = next((e for e in self.plant.effects if isinstance(e, RoadGrade)), None)
+        if grade is None or RoadGrade not in self.effects:
+            return None
+        record = self.record
+        drive = record.drives[0]
+        if drive.position is None:
+            return None
+        force = grade.columns(drive.position).T
+        parts = []
+        if record.accel is not None:
+            parts.append(record.seen([force]))
+        if record.speed is not None:
+            dt = drive.dt[:-1]
+            gained = torch.cumsum(0.5 * dt * (force[:, 1:] + force[:, :-1]), -1)
+            parts.append(record.seen([torch.cat([torch.zeros_like(force[:, :1]), gained], -1)]))
+        return np.stack(parts, 1)
+
+
+def measured(record: Record) -> Float:
+    """What the witnesses saw, (witness, counted)."""
+    return np.stack([x[record.source] for x in (record.accel, record.speed) if x is not None])
+
+
+def splice(record: Record, full: Float, without: Float, onset: int) -> Float:
+    """Rollouts (column, witness, counted) that are `without` before counted row `onset` and go on as `full` does."""
+    apart = full - without
+    if record.speed is not None and onset < record.rows:
+        apart[:, -1] -= apart[:, -1, onset][:, None]
+    apart[:, :, :onset] = 0.0
+    return without + apart

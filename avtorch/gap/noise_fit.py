@@ -1,0 +1,128 @@
+"""The noise model fitted to what a rollout leaves over: scoring steps on the innovations' likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.innovations import NAMES, NoiseModel, Whitener
+from avtorch.gap.record import Record
+
+Float = NDArray[np.float64]
+
+Prior = tuple[float, float, float]
+
+PRIORS: dict[str, Prior] = {
+    "process_sd": (np.log(0.05), 1.2, 4.0),
+    "process_time": (0.0, 0.15, 2.0),
+    "force_sd": (np.log(0.005), 0.5, 1.5),
+    "force_time": (np.log(3.0), 0.3, 1.0),
+    "accel_sd": (np.log(0.05), 1.2, 4.0),
+    "speed_sd": (np.log(0.02), 1.2, 4.0),
+}
+"""Log-normal priors: mean and sd of the logarithm, and beyond how many sds they end.
+
+White jerk noise passes the actuator's lag, so `process_time` is told in units of `T_L`. The nuisance force is small and
+slow by decree: free, it would swallow whatever the car does that no candidate foretells, and every cause with it.
+"""
+
+GUST: dict[str, Prior] = {
+    **PRIORS,
+    "force_sd": (np.log(0.1), 1.0, 4.0),
+    "force_time": (np.log(2.2), 0.63, 2.5),
+}
+"""Priors where the coloured force is the cause."""
+
+CALM = 0.005
+"""Size of the nuisance force before a gust's onset [m/s²]."""
+
+_STEP = 1e-3
+_LONGEST = 1.5  # of a step, in prior standard deviations
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseFit:
+    """`noise` at its mode; `log_prior` there with Laplace's term: what it adds to a log evidence.
+
+    `rows` (counted,): log likelihood of each row; `sds` of the logarithms, by name.
+    """
+
+    noise: NoiseModel
+    log_prior: float
+    rows: Float = field(repr=False)
+    sds: Mapping[str, float] = field(repr=False)
+
+
+def row_likelihoods(record: Record, errors: Float, noise: NoiseModel, onset: int | None = None) -> Float:
+    """Log likelihood (counted,) of each row of errors (witness, counted); sums to the whole.
+
+    With `onset`, the coloured force has its size from that row on only.
+    """
+    white = Whitener(record, noise)
+    rows = white.constant / record.rows - 0.5 * (white(errors) ** 2).sum(0)
+    if onset:
+        calm = row_likelihoods(record, errors, noise.replaced(force_sd=min(CALM, noise.force_sd)))
+        rows = np.concatenate([calm[:onset], rows[onset:]])
+    return rows
+
+
+def fit_noise(
+    record: Record,
+    errors: Float,
+    start: NoiseModel,
+    *,
+    T_L: float,
+    priors: Mapping[str, Prior] = PRIORS,
+    onset: int | None = None,
+    iterations: int = 6,
+) -> NoiseFit:
+    """Mode of the noise's parameters given the errors (witness, counted) of a rollout; `T_L` [s] of the plant."""
+    means = np.array([priors[n][0] for n in NAMES])
+    means[NAMES.index("process_time")] += np.log(T_L)
+    sds, ends = (np.array([priors[n][k] for n in NAMES]) for k in (1, 2))
+
+    def model(z: Float) -> NoiseModel:
+        return NoiseModel(**{n: float(x) for n, x in zip(NAMES, np.exp(means + sds * z), strict=True)})
+
+    def likelihoods(z: Float) -> Float:
+        return row_likelihoods(record, errors, model(z), onset)
+
+    begin = np.log([getattr(start, n) for n in NAMES])
+    z = np.clip((begin - means) / sds, -ends, ends)
+    rows = likelihoods(z)
+    value = float(rows.sum()) - 0.5 * float(z @ z)
+    damping, information = 1e-2, np.eye(len(z))
+    for _ in range(iterations):
+        ahead = z + _STEP * np.eye(len(z))
+        slopes = np.stack([(likelihoods(x) - rows) / _STEP for x in ahead])
+        information = slopes @ slopes.T + np.eye(len(z))
+        gradient = slopes.sum(1) - z
+        # what an end holds back does not move
+        held = ((z >= ends) & (gradient > 0)) | ((z <= -ends) & (gradient < 0))
+        free = np.flatnonzero(~held)
+        part = information[np.ix_(free, free)]
+        better = False
+        for _ in range(4):
+            step = np.linalg.solve(part + damping * np.diag(np.diag(part)), gradient[free])
+            step *= min(1.0, _LONGEST / max(float(np.abs(step).max(initial=0)), 1e-12))
+            new = z.copy()
+            new[free] += step
+            new = np.clip(new, -ends, ends)
+            new_rows = likelihoods(new)
+            new_value = float(new_rows.sum()) - 0.5 * float(new @ new)
+            if new_value >= value:
+                better = True
+                break
+            damping = max(damping * 8, 1e-2)
+        if not better:
+            break
+        gained, z, rows, value = new_value - value, new, new_rows, new_value
+        damping *= 0.2
+        if gained < 0.02:
+            break
+    log_prior = -0.5 * float(z @ z) - 0.5 * float(np.linalg.slogdet(information)[1])
+    spread = np.sqrt(np.diag(np.linalg.inv(information))) * sds
+    return NoiseFit(model(z), log_prior, rows, dict(zip(NAMES, spread.tolist(), strict=True)))

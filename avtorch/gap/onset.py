@@ -1,0 +1,67 @@
+"""From when on: the row at which a cause sets in, found by running sums of likelihoods with and without it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.candidate import Candidate, splice
+from avtorch.gap.innovations import Whitener
+
+Float = NDArray[np.float64]
+
+_NEAREST_S = 4.0  # an onset this close to the start or the end is none
+
+
+def profile(without: Float, with_cause: Float) -> Float:
+    """Log likelihood (row,) if the cause sets in at each row, from those of single rows (row,)."""
+    before = np.concatenate([[0.0], np.cumsum(without)[:-1]])
+    after = np.cumsum(with_cause[::-1])[::-1]
+    return before + after
+
+
+def allowed(rows: int, dt: float) -> slice:
+    """Rows at which a cause can be said to set in."""
+    edge = min(round(_NEAREST_S / dt), rows // 4)
+    return slice(edge, rows - edge)
+
+
+def rough(white: Whitener, candidate: Candidate, z: Float) -> tuple[int, float]:
+    """Best onset row for parameters `z` of a fit over the whole drive, and what it gains [nats] over none."""
+    full = candidate.errors(z[None])[0]
+    silent = candidate.measured - candidate.baseline_rollout(z)
+    rows = profile(-0.5 * (white(silent) ** 2).sum(0), -0.5 * (white(full) ** 2).sum(0))
+    within = allowed(len(rows), white.record.dt)
+    best = within.start + int(np.argmax(rows[within]))
+    return best, float(rows[best] - rows[0])
+
+
+def refined(white: Whitener, candidate: Candidate, z: Float, onset: int) -> tuple[int, Float]:
+    """Best onset row near `onset`, and the log likelihood over all rows tried, (row,), -inf elsewhere."""
+    record = white.record
+    full, silent = candidate.rollouts(z[None])[0], candidate.baseline_rollout(z)
+    measured = candidate.measured
+    within = allowed(record.rows, record.dt)
+    found = np.full(record.rows, -np.inf)
+    for reach in (8.0, 1.5):
+        steps = np.unique(np.round(np.linspace(-reach, reach, 17) / record.dt).astype(int))
+        tries = np.unique(np.clip(onset + steps, within.start, within.stop - 1))
+        tries = tries[np.isneginf(found[tries])]
+        if not len(tries):
+            continue
+        errors = np.stack([measured - splice(record, full[None], silent[None], int(t))[0] for t in tries])
+        found[tries] = white.log_likelihood(errors)
+        onset = int(np.argmax(found))
+    return onset, found
+
+
+def averaged(found: Float, dt: float) -> float:
+    """What not knowing the onset costs [nats]: mean over a uniform prior against the best row."""
+    tried = np.flatnonzero(np.isfinite(found))
+    if len(tried) < 2:
+        return -float(np.log(len(found)))
+    best = found[tried].max()
+    # between rows tried the likelihood is taken to run straight
+    rows = np.arange(tried[0], tried[-1] + 1)
+    inside = np.interp(rows, tried, np.exp(found[tried] - best))
+    return float(np.log(max(inside.sum(), 1.0) / len(found)))

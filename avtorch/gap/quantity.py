@@ -1,0 +1,89 @@
+"""A number with its uncertainty, as an answer holds it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+
+_NORMAL_Q95 = 1.6448536269514722
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(61)
+
+_UNITS = {
+    "_mps2": "m/s²",
+    "_mps3": "m/s³",
+    "_mps": "m/s",
+    "_radps": "rad/s",
+    "_hz": "Hz",
+    "_per_m": "1/m",
+    "_s": "s",
+}
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Mean, standard deviation and the central 90 % of a posterior. Raises `InputError` unless finite and in order."""
+
+    mean: float
+    sd: float
+    q05: float
+    q95: float
+
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, (self.mean, self.sd, self.q05, self.q95))):
+            raise InputError(f"quantity: found {self}, needs finite numbers")
+        if self.sd < 0 or self.q05 > self.q95:
+            raise InputError(f"quantity: found {self}, needs sd >= 0 and q05 <= q95")
+
+    @classmethod
+    def of_draws(cls, draws: Any) -> Quantity:
+        """From draws of any shape (NumPy array, tensor or list)."""
+        x = np.asarray(draws.detach() if isinstance(draws, Tensor) else draws, dtype=float).reshape(-1)
+        if not len(x):
+            raise InputError("draws: found none, needs 1 or more")
+        q05, q95 = np.quantile(x, (0.05, 0.95))
+        return cls(float(x.mean()), float(x.std(ddof=1)) if len(x) > 1 else 0.0, float(q05), float(q95))
+
+    @classmethod
+    def of_normal(cls, mean: float, sd: float, link: Callable[[Tensor], Tensor] | None = None) -> Quantity:
+        """Of `link(z)`, z normal with `mean` and `sd`; `link` is elementwise and monotone (None: z itself).
+
+        Quantiles are exact; mean and SD are by Gauss-Hermite quadrature, good to many digits for the links of
+        `Parameter`. `Parameter.constrain` is such a link.
+        """
+        if link is None:
+            return cls(float(mean), float(sd), mean - _NORMAL_Q95 * sd, mean + _NORMAL_Q95 * sd)
+        z = np.concatenate((_NODES, (-_NORMAL_Q95, _NORMAL_Q95)))
+        with torch.no_grad():
+            values = link(torch.as_tensor(mean + sd * z, dtype=torch.float64)).numpy()
+        weights = _WEIGHTS / _WEIGHTS.sum()
+        average = float(weights @ values[:-2])
+        variance = float(weights @ (values[:-2] - average) ** 2)
+        q05, q95 = sorted(map(float, values[-2:]))
+        return cls(average, math.sqrt(variance), q05, q95)
+
+    def to_dict(self) -> dict[str, float]:
+        """For a JSON answer: mean, sd, q05, q95."""
+        return asdict(self)
+
+
+def unit_of(key: str) -> str:
+    """The unit a parameter's key ends in: `"delay_s"` has `"s"`; `"-"` for none."""
+    if key == "T_L":
+        return "s"
+    return next((unit for end, unit in _UNITS.items() if key.endswith(end)), "-")
+
+
+def words_of(key: str) -> str:
+    """A parameter's key as words, its unit left out: `"half_width_mps2"` is "half width"."""
+    if key in ("T_L", "K_L"):
+        return key
+    end = next((end for end in _UNITS if key.endswith(end)), "")
+    return key.removesuffix(end).replace("_", " ")

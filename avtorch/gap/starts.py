@@ -1,0 +1,82 @@
+"""Where a search begins: a few values of each effect's parameters, for what has more than one hill to climb."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.candidate import Candidate
+
+Float = NDArray[np.float64]
+
+GRIDS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
+    "dead_time": {"delay_s": (0.03, 0.12, 0.3, 0.6)},
+    "dead_band": {"half_width_mps2": (0.03, 0.12, 0.35)},
+    "backlash": {"half_width_mps2": (0.03, 0.12, 0.35)},
+    "saturation": {"accel_max_mps2": (0.4, 0.8, 1.4, 5.0), "accel_min_mps2": (-0.7, -1.4, -2.4, -8.0)},
+    "brake_throttle_asymmetry": {"brake_gain_ratio": (0.6, 0.95, 1.2), "brake_lag_ratio": (1.0, 2.5)},
+    "second_order_actuator": {"inverse_frequency_s": (0.05, 0.15, 0.4)},
+    "rate_limit": {"jerk_max_mps3": (0.4, 1.0, 2.2, 4.5)},
+    "speed_dependent_lag": {"lag_slope": (-0.4, 0.4)},
+    "speed_dependent_gain": {"gain_slope": (-0.15, 0.15)},
+    "gear_shift": {
+        "depth": (0.5,),
+        "duration_s": (0.25,),
+        "first_mps": tuple(np.arange(3.2, 6.9, 0.18)),
+        "gear_ratio": tuple(np.arange(1.35, 1.77, 0.025)),
+    },
+    "driveline_oscillation": {"frequency_hz": tuple(np.geomspace(0.9, 5.5, 14)), "amplitude": (0.1,), "quadrature": (0.05,)},
+    "aerodynamic_drag": {"drag_per_m": (5e-5, 4e-4)},
+    "constant_resistance": {"resistance_mps2": (0.02, 0.15)},
+    "low_speed_creep": {"creep_mps2": (0.05, 0.3)},
+    "sensor_lag": {"lag_s": (0.03, 0.12, 0.35)},
+    "sensor_bias": {"bias_mps2": (0.02, -0.02)},
+    "sensor_scale": {"scale": (0.95, 1.05)},
+}  # fmt: skip
+"""Values by effect and parameter; all combinations are tried. A change of gain starts at shares of the drive."""
+
+_CHANGES = 12
+
+
+def of_effect(candidate: Candidate, name: str) -> list[dict[str, float]]:
+    """Starts of one effect, by key in the plant."""
+    if name == "gain_change":
+        first, last = float(candidate.record.drives[0].time[0]), float(candidate.record.drives[0].time[-1])
+        times = first + (last - first) * (np.arange(_CHANGES) + 0.5) / _CHANGES
+        grid: Mapping[str, tuple[float, ...]] = {
+            "gain_ratio": (0.85, 1.15),
+            "change_s": tuple(times.tolist()),
+            "ramp_s": (1.0, 0.12 * (last - first)),
+        }
+    else:
+        grid = GRIDS.get(name, {})
+    if not grid:  # an effect of the user's: typical, and fainter
+        sized = [c for c in candidate.coordinates if c.key.startswith(f"{name}.")]
+        return [
+            {c.key: float(c.value(np.array(at))) for c in sized if c.parameter.neutral is not None} for at in (-1.0, 0.0)
+        ]
+    keys = [f"{name}.{key}" for key in grid]
+    return [dict(zip(keys, values, strict=True)) for values in product(*grid.values())]
+
+
+def starts(candidate: Candidate, base: Mapping[str, float]) -> Float:
+    """(start, coordinate): `base` (T_L, K_L and what is known of some effects) with every effect's own starts."""
+    sets: list[dict[str, float]] = [dict(base)]
+    for effect in candidate.effects:
+        known = any(key.startswith(f"{effect.name}.") for key in base)
+        if known or effect.random or effect.name == "road_grade":
+            continue
+        sets = [{**a, **b} for a in sets for b in of_effect(candidate, effect.name)]
+    return np.stack([candidate.z_of(s) for s in _unique(sets)])
+
+
+def _unique(sets: list[dict[str, float]]) -> Iterator[dict[str, float]]:
+    seen = set()
+    for s in sets:
+        mark = tuple(sorted(s.items()))
+        if mark not in seen:
+            seen.add(mark)
+            yield s

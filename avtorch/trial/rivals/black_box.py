@@ -1,0 +1,100 @@
+"""A black box: what a flexible regression foretells of the residual on blocks held out, beyond the noise's own memory.
+
+It can say that something is amiss, not what: its answers are `none` and `unknown`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from avtorch.io import Log
+from avtorch.trial.reply import reply
+from avtorch.trial.rivals.maximum_likelihood import Fitter
+from avtorch.trial.rivals.residuals import Residuals
+
+Float = NDArray[np.float64]
+_BLOCKS = 20
+_ORDER = 8
+_LAGS_S = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
+_RIDGE = 1e-3
+
+
+def black_box(log: Log) -> dict[str, Any]:
+    """The gain in held-out log likelihood over blocks of the drive, by a t-test.
+
+    Its p-value is turned into odds by the bound of Sellke, Bayarri and Berger (2001), -e p log p, prior odds even.
+    """
+    fitter = Fitter(Residuals.of(log, rate_hz=log.rate_hz))
+    none = fitter.fit()
+    gains = held_out_gains(fitter, none.transformed)
+    spread = gains.std(ddof=1) / math.sqrt(len(gains))
+    p_value = float(student.sf(gains.mean() / max(spread, 1e-12), len(gains) - 1))
+    p_value = min(max(p_value, 1e-12), 1.0)
+    for_none = -math.e * p_value * math.log(p_value) if p_value < 1 / math.e else 1.001
+    return reply(
+        log,
+        {"none": for_none / (1 + for_none), "unknown": 1 / (1 + for_none)},
+        why=f"a flexible residual gains {gains.sum():.1f} nats on held-out blocks, p = {p_value:.2g}",
+        baseline={name: none.values()[name] for name in ("T_L", "K_L")},
+        p_value=p_value,
+    )
+
+
+def held_out_gains(fitter: Fitter, transformed: NDArray[np.complex128]) -> Float:
+    """Gain in log likelihood (block,) of the flexible regression over autoregression, each block held out in turn."""
+    drive = fitter.drive
+    valid = drive.valid
+    residual = np.fft.irfft(transformed, fitter.spectrum.length, 0)[: len(valid)]
+    reach = max(_ORDER, round(_LAGS_S[-1] / drive.step) + 2)
+    at = np.arange(len(valid))
+    run = at - np.maximum.accumulate(np.where(valid, -1, at))
+    rows = np.flatnonzero(run > _ORDER)
+    rows = rows[rows >= reach]
+    memory = np.concatenate([residual[rows - i] for i in range(1, _ORDER + 1)], 1)
+    features = np.concatenate([memory, _features(drive, rows)], 1)
+    block = np.minimum(np.arange(len(rows)) * _BLOCKS // len(rows), _BLOCKS - 1)
+    target = residual[rows]
+    gains = np.zeros(_BLOCKS)
+    plain, flexible = (_held_out(x, target, block) for x in (memory, features))
+    for channel in range(target.shape[1]):
+        for b in range(_BLOCKS):
+            mine = block == b
+            before, after = (np.mean(e[mine, channel] ** 2) for e in (plain, flexible))
+            gains[b] += 0.5 * mine.sum() * math.log(before / after)
+    return gains
+
+
+def _features(drive: Residuals, rows: NDArray[np.intp]) -> Float:
+    """Lagged commands and accelerations, bent and times speed; nothing that the row's own noise has touched."""
+    command = np.concatenate([one.command.numpy() for one in drive.drives])
+    speed = np.concatenate([np.zeros(len(one.time)) if one.speed is None else one.speed.numpy() for one in drive.drives])
+    moved = (command, drive.seen[drive.channels.index("accel")] if "accel" in drive.channels else command)
+    v = speed[rows - 1]
+    columns = [np.ones(len(rows)), v, v**2, np.exp(-v / 2)]
+    for x in moved:
+        for lag in _LAGS_S:
+            seen = x[rows - 1 - round(lag / drive.step)]
+            columns += [seen, np.maximum(seen, 0.0), np.tanh(seen / 0.1), seen * v, np.abs(seen) * seen]
+    late = rows / rows[-1]
+    columns += [command[rows - 1] * late, late, command[rows - 1] * (late > 0.5)]
+    return np.stack(columns, 1)
+
+
+def _held_out(features: Float, target: Float, block: NDArray[np.intp]) -> Float:
+    """Errors of ridge regressions that have not seen the block."""
+    scaled = features / np.maximum(np.sqrt(np.mean(features**2, 0)), 1e-9)
+    edges = np.searchsorted(block, np.arange(_BLOCKS + 1))
+    parts = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    grams = [scaled[p].T @ scaled[p] for p in parts]
+    crosses = [scaled[p].T @ target[p] for p in parts]
+    gram, cross = sum(grams), sum(crosses)
+    price = _RIDGE * len(scaled) * np.eye(scaled.shape[1])
+    errors = np.empty_like(target)
+    for part, own, mine in zip(parts, grams, crosses, strict=True):
+        errors[part] = target[part] - scaled[part] @ np.linalg.solve(gram - own + price, cross - mine)
+    return errors

@@ -1,0 +1,166 @@
+"""Maximum likelihood of one plant: the deterministic effects by Gauss and Newton, the noise refitted at every step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from avtorch.gap import EFFECTS, GapPlant, plant
+from avtorch.trial.rivals.residuals import Residuals
+from avtorch.trial.rivals.spectrum import Complex, Spectrum
+
+Float = NDArray[np.float64]
+_STEPS = 12
+_WIDE = 0.05  # half of the width of differences, in the prior's SDs
+_REACH = 6.0  # how far from its prior's middle a coordinate may go, in the prior's SDs
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted candidate. `z`: coordinates by name, each on the scale of its prior; `sd` likewise; `loss` = -log L.
+
+    `transformed` residual; `bands` of it; `sizes`, `gust_time` of the noise; `inverse` its spectrum's; `lag` T_L [s].
+    """
+
+    effects: tuple[str, ...]
+    plant: GapPlant
+    z: Mapping[str, float]
+    sd: Mapping[str, float]
+    loss: float
+    transformed: Complex
+    slope: Complex
+    bands: Complex
+    sizes: Float
+    gust_time: float | None
+    inverse: Complex
+    lag: float
+
+    def values(self) -> dict[str, tuple[float, float]]:
+        """Mean and standard deviation of each coordinate in its own unit."""
+        own = self.plant.parameters()
+        out = {}
+        for name, z in self.z.items():
+            at = torch.tensor([z, z - 0.5 * self.sd[name], z + 0.5 * self.sd[name]], dtype=torch.float64)
+            mean, low, high = own[name].constrain(at).tolist()
+            out[name] = (mean, abs(high - low))
+        return out
+
+
+class Fitter:
+    """Fits candidates to one drive."""
+
+    def __init__(self, drive: Residuals) -> None:
+        self.drive = drive
+        self.spectrum = Spectrum(drive.valid, drive.step, drive.channels)
+
+    def fit(
+        self, effects: Sequence[str] = (), *, near: Fit | None = None, gust: bool = False, steps: int = _STEPS
+    ) -> Fit:
+        """The most likely plant with `effects`.
+
+        `near`: a fit to begin from (T_L, K_L and the effects it shares); the first coordinate of those that are new is
+        tried at a few typical values.
+        """
+        made = plant([EFFECTS[name] for name in effects]).prepared(self.drive.drives[0])
+        names = list(made.parameters())
+        begin = np.array([dict(near.z).get(name, 0.0) if near else 0.0 for name in names])
+        known = near.z if near else {}
+        starts = self._starts(names, begin, known)
+        misses = self._misses(made, names, starts)
+        sizes, gust_time = (near.sizes, near.gust_time) if near else (None, None)
+        best, state = 0, None
+        if len(starts) > 1 and near is not None:
+            losses = self._quadratic(misses, near.inverse)
+            best = int(np.argmin(losses))
+        z = starts[best]
+        state = self._state(made, names, z, misses[best], sizes, gust)
+        damping = 1e-3
+        for _ in range(steps):
+            loss, transformed, bands, sizes, gust_time, inverse, lag = state
+            slope = self._slope(made, names, z)
+            hessian, downhill = _normal(slope, inverse, transformed)
+            moved = False
+            for _ in range(4):
+                scaled = hessian + np.diag(damping * np.diag(hessian) + 1e-3)
+                step = np.clip(np.linalg.solve(scaled, downhill), -1.5, 1.5)
+                tried = np.clip(z + step, -_REACH, _REACH)
+                after = self._state(made, names, tried, self._misses(made, names, tried[None])[0], sizes, gust)
+                if after[0] < loss:
+                    z, state, moved, damping = tried, after, True, damping / 5
+                    break
+                damping = max(10 * damping, 1e-2)
+            if not moved or loss - state[0] < 0.05:
+                break
+        loss, transformed, bands, sizes, gust_time, inverse, lag = state
+        slope = self._slope(made, names, z)
+        hessian, _ = _normal(slope, inverse, transformed)
+        sd = np.sqrt(np.diag(np.linalg.inv(hessian + np.eye(len(names)))))
+        return Fit(
+            tuple(effects),
+            made,
+            dict(zip(names, z.tolist(), strict=True)),
+            dict(zip(names, sd.tolist(), strict=True)),
+            loss,
+            transformed,
+            slope,
+            bands,
+            sizes,
+            gust_time,
+            inverse,
+            lag,
+        )
+
+    def _starts(self, names: Sequence[str], begin: Float, known: Mapping[str, float]) -> Float:
+        """Coordinates (start, coordinate) at which to begin."""
+        new = [i for i, name in enumerate(names) if name not in known and "." in name]
+        if not new:
+            return begin[None]
+        starts = []
+        times = [i for i in new if names[i] == "gain_change.change_s"]
+        # a limit far below what the drive asks for is slow to work out, and was never the best start
+        for first in (0.0, 1.5, 3.0) if names[new[0]].startswith("rate_limit.") else (-1.5, 0.0, 1.5):
+            for when in np.linspace(-1.2, 1.2, 7) if times else (0.0,):
+                z = begin.copy()
+                z[new[0]] = first
+                if times:
+                    z[times[0]] = when
+                starts.append(z)
+        return np.stack(starts)
+
+    def _misses(self, made: GapPlant, names: Sequence[str], z: Float) -> Float:
+        own = made.parameters()
+        values = {name: own[name].constrain(torch.as_tensor(z[:, i].copy())) for i, name in enumerate(names)}
+        return self.drive.misses(made, values)
+
+    def _quadratic(self, misses: Float, inverse: Complex) -> Float:
+        transformed = self.spectrum.transform(misses)
+        return np.einsum("skc,kcd,skd->s", transformed.conj(), inverse, transformed, optimize=True).real
+
+    def _state(self, made: GapPlant, names: Sequence[str], z: Float, missed: Float, sizes: Float | None, gust: bool):
+        lag = float(made.parameters()["T_L"].constrain(torch.tensor(z[0], dtype=torch.float64)))
+        transformed = self.spectrum.transform(missed)
+        bands = self.spectrum.bands(transformed)
+        if not np.isfinite(bands).all():  # beyond where the effect is defined
+            return np.inf, transformed, bands, sizes, None, None, lag
+        loss, sizes, gust_time = self.spectrum.fit_noise(bands, lag, sizes, gust)
+        return loss, transformed, bands, sizes, gust_time, self.spectrum.inverse(lag, sizes, gust_time), lag
+
+    def _slope(self, made: GapPlant, names: Sequence[str], z: Float) -> Complex:
+        """Derivative of the transformed response, (coordinate, frequency, channel), by central differences.
+
+        They are wide, for a response that has kinks (a delay of whole rows) draws a narrower one into the kink.
+        """
+        away = _WIDE * np.eye(len(names))
+        missed = np.nan_to_num(self._misses(made, names, np.concatenate([z - away, z + away])))
+        return self.spectrum.transform((missed[: len(names)] - missed[len(names) :]) / (2 * _WIDE))
+
+
+def _normal(slope: Complex, inverse: Complex, transformed: Complex) -> tuple[Float, Float]:
+    """Gauss and Newton's matrix, and the direction downhill."""
+    weighed = np.einsum("kcd,pkd->pkc", inverse, slope)
+    flat = weighed.reshape(len(slope), -1).conj()
+    return 2 * (flat @ slope.reshape(len(slope), -1).T).real, 2 * (flat @ transformed.ravel()).real

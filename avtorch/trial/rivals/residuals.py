@@ -1,0 +1,99 @@
+"""A drive at the log's rate or thinned, and how a plant's response misses it.
+
+Thinned rows are for a first look alone. The controller has acted on the rows left out, so the command knows of noise
+that the thinned log does not, and a fit to it takes that for a second pole or a delay of the car.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.gap import Drive, GapPlant
+from avtorch.io import Log
+
+Float = NDArray[np.float64]
+_SETTLE_S = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Every few rows of a log; the command is the mean over the rows left out, which the actuator integrates.
+
+    `seen` (channel, row): acceleration [m/s²] and gain in speed until the next row [m/s], as far as the log has them,
+    named by `channels`. `valid` (row,): moving, engaged, not the last of a stretch, and past the first second of it.
+    `push` (row,) [(m/s²)²]: squared steps of the command within the row. `step` [s].
+    """
+
+    drives: tuple[Drive, ...]
+    channels: tuple[str, ...]
+    seen: Float
+    valid: NDArray[np.bool_]
+    push: Float
+    step: float
+
+    @classmethod
+    def of(cls, log: Log, *, rate_hz: float) -> Residuals:
+        """At about `rate_hz`, or the log's rate if that is lower. Raises `InputError` for too little to look at."""
+        if log.accel_cmd is None:
+            raise InputError(f"{log.name}: has no accel_cmd, needed to hold a plant against it")
+        every = max(1, round(log.rate_hz / rate_hz))
+        channels = tuple(name for name in ("accel", "speed") if getattr(log, name) is not None)
+        drives, seen, valid, push = [], [], [], []
+        for part in log.segments():
+            count = (part.stop - part.start) // every
+            if count < 3:
+                continue
+            rows = slice(part.start, part.start + count * every)
+            command = log.accel_cmd[rows].reshape(count, every)
+            time = np.ascontiguousarray(log.time[rows][::every])
+            accel, speed = (None if x is None else x[rows][::every].copy() for x in (log.accel, log.speed))
+            fit = log.usable[rows].reshape(count, every).all(1)
+            valid.append(fit & np.append(fit[1:], False) & _after(fit, round(_SETTLE_S * log.rate_hz / every)))
+            push.append((np.diff(command.ravel(), prepend=command[0, 0]) ** 2).reshape(count, every).sum(1))
+            gained = None if speed is None else np.append(np.diff(speed), 0.0)
+            seen.append(np.stack([x for x in (accel, gained) if x is not None]))
+            drives.append(
+                Drive(
+                    torch.as_tensor(time),
+                    torch.as_tensor(command.mean(1)),
+                    None if speed is None else torch.as_tensor(speed),
+                    None if accel is None else float(accel[0]),
+                )
+            )
+        if not valid or np.concatenate(valid).sum() < 100:
+            raise InputError(f"{log.name}: fewer than 100 rows in motion, needs more to tell anything")
+        step = every / log.rate_hz
+        return cls(tuple(drives), channels, np.concatenate(seen, 1), np.concatenate(valid), np.concatenate(push), step)
+
+    @torch.no_grad()
+    def misses(self, plant: GapPlant, values: Mapping[str, Tensor]) -> Float:
+        """Residuals (batch, channel, row), 0 where not valid; `values` as of `GapPlant.response`, batch first."""
+        parts = []
+        for drive in self.drives:
+            answer = plant.response(drive, values)
+            gained = answer.speed.diff(dim=-1, append=answer.speed[..., -1:])
+            told = {"accel": answer.accel_measured, "speed": gained}
+            batch = np.broadcast_shapes(*(told[name].shape for name in self.channels))
+            parts.append(torch.stack([told[name].expand(batch) for name in self.channels], -2).numpy())
+        missed = self.seen - np.concatenate(parts, -1)
+        return np.where(self.valid, missed, 0.0)
+
+    def forced(self, columns: Float) -> Float:
+        """What accelerations (column, row) [m/s²] of the body put into the channels: (column, channel, row)."""
+        gained = np.zeros_like(columns)
+        gained[:, :-1] = 0.5 * self.step * (columns[:, 1:] + columns[:, :-1])
+        told = {"accel": columns, "speed": gained}
+        return np.where(self.valid, np.stack([told[name] for name in self.channels], 1), 0.0)
+
+
+def _after(fit: NDArray[np.bool_], wait: int) -> NDArray[np.bool_]:
+    """Rows with `wait` fit rows before them."""
+    at = np.arange(len(fit))
+    return at - np.maximum.accumulate(np.where(fit, -1, at)) > wait

@@ -1,0 +1,141 @@
+"""A trial: sealed cases, those who answer them, and the score. What was answered stays, a rerun does the rest."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+from avtorch.blindtest import MIX
+from avtorch.errors import InputError
+from avtorch.io import write_json
+from avtorch.trial.folder import TrialFolder
+from avtorch.trial.tally import tally
+from avtorch.trial.work import Answerer, Task, begin_worker, work
+
+SIGNALS = ("accel", "speed")
+
+
+def run_trial(
+    n: int,
+    seed: int,
+    out: str | os.PathLike[str],
+    *,
+    answerers: Mapping[str, Answerer],
+    workers: int = 1,
+    mix: Mapping[str, float] | None = None,
+    signals: Sequence[str] = SIGNALS,
+    outside: Literal["sealed", "calibration"] = "sealed",
+    keep_logs: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+    **draw_options: Any,
+) -> dict[str, Any]:
+    """Let `answerers` answer cases 0 to `n - 1` of the set `seed`; write and return `out/blindtest.json`.
+
+    The first answerer is judged, the others stand under `baselines` with the same keys. Answers and truths are kept in
+    `out` as they come (`avtorch.trial.folder`); a rerun, also with more cases or another answerer, answers only what is
+    missing. Who raises, or answers outside the schema, has not answered: the message is kept, and the case counts as
+    wrong. Delete an answerer's folder in `out/answers` to hear it again, as one must once its code has changed.
+
+    Args:
+        answerers: by name (letters, digits, `_`, `-`): `Log` to a dict of `avtorch.diagnosis/1`.
+        workers: processes, each with one thread; more than one needs answerers that can be pickled, and a script that
+            begins work under `if __name__ == "__main__"`.
+        mix, outside, draw_options: as `avtorch.blindtest.draw_cases`. signals: the witnesses in the logs.
+        keep_logs: keep `out/logs/NAME.csv`, so that a rerun need not draw the cases again.
+        progress: is told (cases done, of).
+
+    Raises `InputError` for a folder with another trial's settings and for arguments out of range.
+    """
+    names = list(answerers)
+    _check(n, seed, names, workers, signals)
+    shares = dict(MIX if mix is None else mix)
+    settings = {"seed": seed, "signals": [s for s in SIGNALS if s in signals], "outside": outside}
+    settings |= {"mix": shares, "draw": {key: draw_options[key] for key in sorted(draw_options)}}
+    folder = TrialFolder(Path(out))
+    folder.settle(settings)
+    tasks = [
+        Task(
+            root=folder.root,
+            index=i,
+            seed=seed,
+            missing=missing,
+            answerers={name: answerers[name] for name in missing},
+            signals=tuple(settings["signals"]),
+            options={"mix": shares, "outside": outside, **draw_options},
+            keep_logs=keep_logs,
+        )
+        for i in range(n)
+        if (missing := folder.missing(i, names))
+    ]
+    # what lies there is not the whole of it while cases are missing
+    (folder.root / "blindtest.json").unlink(missing_ok=True)
+    done = n - len(tasks)
+    if progress:
+        progress(done, n)
+    for _ in _worked(tasks, workers):
+        done += 1
+        if progress:
+            progress(done, n)
+    found = tally(folder, n, names, settings)
+    write_json(folder.root / "blindtest.json", found)
+    return found
+
+
+def _check(n: int, seed: int, names: Sequence[str], workers: int, signals: Sequence[str]) -> None:
+    if n < 1:
+        raise InputError(f"n: found {n}, needs 1 case or more")
+    if not 0 <= seed < 2**63:
+        raise InputError(f"seed: found {seed}, needs a whole number from 0 to 2^63 - 1")
+    if workers < 1:
+        raise InputError(f"workers: found {workers}, needs 1 or more")
+    if not names:
+        raise InputError("answerers: found none, needs one to judge")
+    for name in names:
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+            raise InputError(f"answerers: found the name {name!r}, needs letters, digits, _ and -")
+    if not signals or set(signals) - set(SIGNALS):
+        raise InputError(f"signals: found {tuple(signals)}, needs accel, speed or both")
+
+
+def _worked(tasks: Sequence[Task], workers: int) -> Iterator[int]:
+    """Cases as they are done."""
+    if workers == 1 or len(tasks) < 2:
+        yield from map(work, tasks)
+        return
+    # spawned, since a fork of a process whose torch has threads may hang
+    context = multiprocessing.get_context("spawn")
+    with _one_thread(), ProcessPoolExecutor(workers, mp_context=context, initializer=begin_worker) as pool:
+        waiting = [pool.submit(work, task) for task in tasks]
+        try:
+            for one in as_completed(waiting):
+                yield one.result()
+        except BrokenProcessPool:
+            raise InputError(
+                "workers: one was ended from outside, perhaps for want of memory; what was answered is kept, "
+                "needs fewer workers"
+            ) from None
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Children begun within use one thread each; it must be told before their libraries are loaded."""
+    names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value

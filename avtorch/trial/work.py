@@ -1,0 +1,90 @@
+"""One case of a trial: drawn, shown to those who have not answered it yet, and their answers kept."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from multiprocessing import parent_process
+from pathlib import Path
+from typing import Any
+
+from avtorch.blindtest import draw_case
+from avtorch.blindtest.answers import read
+from avtorch.errors import InputError
+from avtorch.io import Log, write_json
+from avtorch.trial.folder import TrialFolder
+
+Answerer = Callable[[Log], dict[str, Any]]
+"""Takes a log, returns an answer of `avtorch.diagnosis/1`."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A case to answer: `index` in the set `seed`, the names of those who are `missing`, and how it is drawn.
+
+    With more than one process the `answerers` are pickled: functions of a module, not lambdas.
+    """
+
+    root: Path
+    index: int
+    seed: int
+    missing: tuple[str, ...]
+    answerers: Mapping[str, Answerer]
+    signals: tuple[str, ...]
+    options: Mapping[str, Any]
+    keep_logs: bool
+
+
+def work(task: Task) -> int:
+    """Answer a case and keep what was said; returns its index."""
+    folder = TrialFolder(task.root)
+    log = folder.kept_log(task.index, task.signals)
+    if log is None:
+        case = draw_case(task.index, task.seed, **task.options)
+        if task.keep_logs:
+            case.log().write(folder.log_path(task.index))
+        folder.keep_truth(case)
+        log = case.log(signals=task.signals)
+    truth = folder.truth(task.index)
+    for name in task.missing:
+        _answer(folder, name, task, log, truth)
+    return task.index
+
+
+def _answer(folder: TrialFolder, name: str, task: Task, log: Log, truth: Mapping[str, Any]) -> None:
+    """One answer, with what it cost; a failure is an answer too, and its message is kept."""
+    path = folder.answer_path(name, task.index)
+    answer: dict[str, Any] | None = None
+    fault = ""
+    wall, cpu = time.perf_counter(), time.process_time()
+    try:
+        answer = task.answerers[name](log)
+    except Exception as error:
+        fault = f"{type(error).__name__}: {error}"
+    spent = {"seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
+    if answer is not None:
+        try:
+            read(truth, answer)  # the scorer must be able to read it
+            write_json(path, {"answer": answer, "error": None, **spent})
+            return
+        except (InputError, KeyError, TypeError, ValueError) as error:
+            fault = f"the answer is not of avtorch.diagnosis/1: {type(error).__name__}: {error}"
+    write_json(path, {"answer": None, "error": fault, **spent})
+
+
+def begin_worker() -> None:
+    """Settings of a worker process: one thread each, and no life without the process that started it."""
+    import torch
+
+    torch.set_num_threads(1)
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: Any) -> None:
+    parent.join()
+    os._exit(1)

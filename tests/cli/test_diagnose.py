@@ -1,0 +1,437 @@
+"""`avtorch diagnose`: what it hands on, shows and writes, how it goes on, and one line for what it cannot use.
+
+The search itself is tested where it lives; here a stand-in answers in its place.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from avtorch.cli import main
+from avtorch.cli.diagnosis_table import bar, diagnosis_headline, diagnosis_notes, diagnosis_table
+from avtorch.gap import DeadTime, GapPlant, plant
+from avtorch.gap.diagnosis import Candidate, Diagnosis, GapFacts, LogFacts, Quantity, verdict_of
+from avtorch.io import Log
+
+ROWS = 600
+
+
+def around(mean: float, sd: float) -> Quantity:
+    return Quantity.of_normal(mean, sd)
+
+
+BASELINE = {"T_L": around(0.52, 0.01), "K_L": around(1.02, 0.01)}
+MOVED = {"T_L": around(0.31, 0.01), "K_L": around(0.99, 0.01)}
+CANDIDATES = (
+    Candidate("dead_time", 0.93, 1234.2, {"delay_s": around(0.182, 0.004)}, MOVED),
+    Candidate("second_order_actuator", 0.04, 1230.1, {"natural_frequency_radps": around(6.1, 0.3)}, MOVED),
+    Candidate(
+        "backlash+dead_band",
+        0.02,
+        1200.0,
+        {"backlash.half_width_mps2": around(0.1, 0.01), "dead_band.half_width_mps2": around(-0.2, 0.02)},
+        MOVED,
+    ),
+    Candidate("none", 1e-5, 0.0),
+    Candidate("unknown", 0.01),
+)
+
+
+def answer(logs: Sequence[Log], candidates: tuple[Candidate, ...] = CANDIDATES, **more: Any) -> Diagnosis:
+    gap = GapFacts(True, 1e-9, 0.08, 0.05, 0.21, 0.05, 0.9, 5.0)
+    given = {"verdict": verdict_of(candidates), "plant": plant([DeadTime(0.182)]), **more}
+    return Diagnosis(LogFacts.of(logs), BASELINE, gap, candidates, **given)
+
+
+class Search:
+    """Stands in for `avtorch.gap.diagnose`: remembers what it was given, keeps a fit, answers."""
+
+    def __init__(self) -> None:
+        self.calls: list[dict[str, Any]] = []
+        self.interrupted_after: int | None = None
+        self.more: dict[str, Any] = {}
+
+    def diagnose(self, logs: list[Log], *, checkpoint: Path, progress: Callable, **given: Any) -> Diagnosis:
+        before = json.loads(checkpoint.read_text(encoding="utf-8")) if checkpoint.exists() else []
+        self.calls.append({"logs": logs, "fits_before": len(before), **given})
+        for k in range(len(before), 4):
+            if k == self.interrupted_after:
+                raise KeyboardInterrupt
+            progress("single effects", k, 4)
+            checkpoint.parent.mkdir(parents=True, exist_ok=True)
+            checkpoint.write_text(json.dumps([*range(k + 1)]), encoding="utf-8")
+        return answer(logs, **self.more)
+
+
+@pytest.fixture
+def search(monkeypatch: pytest.MonkeyPatch) -> Search:
+    stand_in = Search()
+    module = ModuleType("avtorch.gap.diagnose")
+    module.diagnose = stand_in.diagnose  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "avtorch.gap.diagnose", module)
+    return stand_in
+
+
+def columns(phase: float = 0.0) -> dict[str, np.ndarray]:
+    time = np.arange(ROWS) * 0.02
+    return {
+        "time": time,
+        "accel_cmd": np.sin(time + phase),
+        "accel": np.sin(time + phase - 0.3),
+        "speed": 15 - np.cos(time + phase - 0.3),
+    }
+
+
+def write(path: Path, **signals: np.ndarray | None) -> str:
+    given = {name: values for name, values in signals.items() if values is not None}
+    lines = [
+        ",".join(given),
+        *(",".join(map(repr, row)) for row in zip(*(x.tolist() for x in given.values()), strict=True)),
+    ]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return str(path)
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> str:
+    return write(tmp_path / "drive.csv", **columns())
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> str:
+    return write(tmp_path / "other.csv", **columns(phase=1.0))
+
+
+# --- what it hands on and writes
+
+
+def test_files_and_words(
+    search: Search, drive: str, other: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "deep" / "er"
+    assert main(["diagnose", drive, other, "--out", str(out)]) == 0
+    told = capsys.readouterr()
+    assert told.err == ""
+    assert "drive.csv" in told.out
+    assert "other.csv" in told.out
+    assert "The simulator lacks dead_time (probability 0.93): the command acts after a" in told.out
+    assert "T_L 0.52 → 0.31 s, K_L 1.02 → 0.99" in told.out
+    assert "diagnosis.json, plant.toml (the repaired simulator)" in told.out
+    written = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
+    assert written["schema"] == "avtorch.diagnosis/1"
+    assert written["log"]["rows"] == 2 * ROWS
+    repaired = GapPlant.from_toml((out / "plant.toml").read_text(encoding="utf-8"))
+    assert float(repaired.values()["dead_time.delay_s"]) == 0.182
+    (call,) = search.calls
+    assert [log.name for log in call.pop("logs")] == [drive, other]
+    assert call == {
+        "fits_before": 0,
+        "baseline": None,
+        "prior": None,
+        "accel_kind": "kinematic",
+        "effects": None,
+        "pairs": True,
+        "posterior": "sgld",
+        "budget_s": None,
+        "seed": 0,
+    }
+
+
+def test_every_option_is_handed_on(search: Search, drive: str, tmp_path: Path) -> None:
+    options = ["--effects", "dead_time, gust", "--no-pairs", "--posterior", "laplace", "--budget", "20", "--seed", "7"]
+    priors = ["--prior", "none=3", "--prior", "dead_time=0.5", "--prior", "pair=0"]
+    more = ["--baseline", "dead_time=0.1,T_L=0.4", "--accel-kind", "specific-force"]
+    assert main(["diagnose", drive, *options, *priors, *more, "--out", str(tmp_path / "o")]) == 0
+    (call,) = search.calls
+    simulator = call["baseline"]
+    assert isinstance(simulator, GapPlant)
+    assert {name: float(x) for name, x in simulator.values().items()} == {
+        "T_L": 0.4,
+        "K_L": 1.0,
+        "dead_time.delay_s": 0.1,
+    }
+    assert call["effects"] == ["dead_time", "gust"]
+    assert call["prior"] == {"none": 3.0, "dead_time": 0.5, "pair": 0.0}
+    assert (call["pairs"], call["posterior"], call["budget_s"], call["seed"]) == (False, "laplace", 20.0, 7)
+    assert call["accel_kind"] == "specific-force"
+
+
+def test_the_repaired_simulator_is_the_next_baseline(search: Search, drive: str, tmp_path: Path) -> None:
+    assert main(["diagnose", drive, "--quiet", "--out", str(tmp_path / "a")]) == 0
+    repaired = str(tmp_path / "a" / "plant.toml")
+    assert main(["diagnose", drive, "--quiet", "--baseline", repaired, "--out", str(tmp_path / "b")]) == 0
+    assert [e.name for e in search.calls[1]["baseline"].effects] == ["dead_time"]
+
+
+def test_names_and_units_of_columns(search: Search, tmp_path: Path) -> None:
+    given = columns()
+    signals = {"time": given["time"], "CMD": given["accel_cmd"], "V": 3.6 * given["speed"]}
+    log = write(tmp_path / "raw.csv", **signals)
+    options = ["--map", "accel_cmd=CMD", "--map", "speed=V", "--unit", "speed=km/h"]
+    assert main(["diagnose", log, *options, "--quiet", "--out", str(tmp_path / "o")]) == 0
+    (read,) = search.calls[0]["logs"]
+    assert read.accel is None
+    assert np.allclose(read.speed, given["speed"])
+
+
+def test_json_and_quiet(search: Search, drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["diagnose", drive, "--json", "--out", str(tmp_path / "o")]) == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    assert json.loads(said.out) == json.loads((tmp_path / "o" / "diagnosis.json").read_text(encoding="utf-8"))
+    assert main(["diagnose", drive, "--quiet", "--out", str(tmp_path / "o")]) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+# --- interrupted, and on again
+
+
+def test_interrupted_then_on_again(
+    search: Search, drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "o"
+    search.interrupted_after = 2
+    assert main(["diagnose", drive, "--quiet", "--out", str(out)]) == 130
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert f"interrupted; no answer was written; what is done is kept in {out / 'fits.json'}" in told
+    assert "the same command goes on from there" in told
+    assert not (out / "diagnosis.json").exists()
+    search.interrupted_after = None
+    # neither the budget nor the prior over causes belongs to the fits
+    assert main(["diagnose", drive, "--budget", "9", "--prior", "none=2", "--quiet", "--out", str(out)]) == 0
+    assert [call["fits_before"] for call in search.calls] == [0, 2]
+    assert (out / "diagnosis.json").exists()
+
+
+def test_interrupted_before_anything_was_kept(
+    search: Search, drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    search.interrupted_after = 0
+    assert main(["diagnose", drive, "--quiet", "--out", str(tmp_path / "o")]) == 130
+    assert capsys.readouterr().err == "avtorch: interrupted; no answer was written\n"
+
+
+@pytest.mark.parametrize(
+    ("options", "fault"),
+    [
+        (["--seed", "3"], "begun with --seed 0;"),
+        (["--accel-kind", "specific-force"], "begun with --accel-kind kinematic;"),
+        (["--baseline", "dead_time=0.1"], "begun with --baseline glvd;"),
+        (["--effects", "gust"], "begun with --effects at its default;"),
+        (["--no-pairs"], "begun with --pairs;"),
+    ],
+)
+def test_fits_of_other_settings_are_not_taken(
+    search: Search,
+    drive: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    fault: str,
+) -> None:
+    out = str(tmp_path / "o")
+    assert main(["diagnose", drive, "--quiet", "--out", out]) == 0
+    assert main(["diagnose", drive, *options, "--quiet", "--out", out]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert fault in told
+    assert "--no-resume to begin anew" in told
+    assert main(["diagnose", drive, *options, "--quiet", "--no-resume", "--out", out]) == 0
+    assert [call["fits_before"] for call in search.calls] == [0, 0]
+
+
+def test_fits_of_other_logs_are_not_taken(
+    search: Search, drive: str, other: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "o"
+    assert main(["diagnose", drive, "--quiet", "--out", str(out)]) == 0
+    answer_before = (out / "diagnosis.json").read_bytes()
+    for logs in ([other], [drive, other]):
+        assert main(["diagnose", *logs, "--resume", "--quiet", "--out", str(out)]) == 2
+        assert f"begun with other logs ({drive}, {ROWS} rows);" in capsys.readouterr().err
+    assert (out / "diagnosis.json").read_bytes() == answer_before
+    # the same rows under another name are the same work
+    renamed = Path(drive).rename(tmp_path / "renamed.csv")
+    assert main(["diagnose", str(renamed), "--quiet", "--out", str(out)]) == 0
+    assert search.calls[-1]["fits_before"] == 4
+
+
+def test_a_note_that_cannot_be_read(
+    search: Search, drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "o"
+    assert main(["diagnose", drive, "--quiet", "--out", str(out)]) == 0
+    (out / "fits_of.json").write_text('{"logs": 3}', encoding="utf-8")
+    assert main(["diagnose", drive, "--quiet", "--out", str(out)]) == 2
+    assert "fits_of.json, which cannot be read" in capsys.readouterr().err
+
+
+# --- bad input
+
+
+@pytest.mark.parametrize(
+    ("options", "fault"),
+    [
+        (["--effects", "dead_tim"], "--effects: found 'dead_tim', needs an effect's name; perhaps dead_time"),
+        (["--effects", "gust,gust"], "--effects: found 'gust,gust', needs each name once"),
+        (["--effects", ""], "--effects: found ''"),
+        (["--effects", "none"], "--effects: found 'none'"),
+        (["--prior", "deadtime=1"], "--prior: found 'deadtime', needs none, unknown, pair, or an effect's name"),
+        (["--prior", "none"], "--prior: found 'none', needs NAME=WEIGHT"),
+        (["--prior", "none=-1"], "--prior: found 'none=-1', needs NAME=WEIGHT"),
+        (["--prior", "none=nan"], "--prior: found 'none=nan', needs NAME=WEIGHT"),
+        (["--prior", "none=1", "--prior", "none=2"], "--prior: found none twice"),
+        (["--baseline", "nonsense"], "--baseline 'nonsense': effect: found 'nonsense'"),
+        (["--baseline", "dead_time=x"], "needs a number after '='"),
+        (["--baseline", "dead_time=-0.1"], "dead_time.delay_s is -0.1, needs a positive number"),
+        (["--baseline", "T_L=0"], "--baseline 'T_L=0': T_L"),
+        (["--baseline", "missing.toml"], "--baseline 'missing.toml': plant: missing.toml cannot be read"),
+        (["--budget", "0"], "--budget: found 0, needs a finite number above 0 s"),
+        (["--budget", "nan"], "--budget: found nan"),
+        (["--seed", "1.5"], "needs a whole number"),
+        (["--accel-kind", "gravity"], "--accel-kind"),
+        (["--posterior", "nuts"], "--posterior"),
+        (["--unit", "speed=furlong"], "furlong"),
+        (["--map", "speed=NOPE"], "NOPE"),
+    ],
+)
+def test_bad_arguments(
+    search: Search, drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], fault: str
+) -> None:
+    refused(["diagnose", drive, *options], fault, tmp_path, capsys)
+    assert not search.calls
+
+
+@pytest.mark.parametrize(
+    ("missing", "fault"),
+    [
+        (("accel_cmd",), "accel_cmd"),
+        (("accel", "speed"), "columns 'accel' and 'speed' are both missing"),
+        (("time",), "time"),
+    ],
+)
+def test_logs_that_lack_a_signal(
+    search: Search, tmp_path: Path, capsys: pytest.CaptureFixture[str], missing: tuple[str, ...], fault: str
+) -> None:
+    log = write(tmp_path / "poor.csv", **(columns() | dict.fromkeys(missing)))
+    refused(["diagnose", log], fault, tmp_path, capsys)
+    assert not search.calls
+
+
+def test_logs_that_cannot_be_used(search: Search, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    by_hand = write(tmp_path / "by_hand.csv", **columns(), engaged=np.zeros(ROWS, int))
+    refused(["diagnose", by_hand], "by_hand.csv: has no row to use", tmp_path, capsys)
+    given = columns() | {"accel": None}
+    speed_only = write(tmp_path / "speed.csv", **given)
+    specific = ["--accel-kind", "specific-force"]
+    refused(["diagnose", speed_only, *specific], "speed.csv has no accel", tmp_path, capsys)
+    refused(["diagnose", str(tmp_path / "missing.csv")], "missing.csv", tmp_path, capsys)
+    refused(["diagnose"], "LOGS requires an argument", tmp_path, capsys)
+    assert main(["diagnose", speed_only, "--out", str(tmp_path / "speed.csv")]) == 2
+    assert "is a file" in capsys.readouterr().err
+
+
+def refused(arguments: list[str], fault: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*arguments, "--out", str(tmp_path / "out")]) == 2
+    told = capsys.readouterr().err
+    assert fault in told
+    assert told.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+# --- what a person reads
+
+
+@pytest.fixture
+def logs() -> list[Log]:
+    return [Log.from_arrays(**columns())]
+
+
+def lines(shown: object, width: int = 80) -> list[str]:
+    console = Console(width=width, highlight=False, no_color=True)
+    with console.capture() as seen:
+        console.print(shown)
+    return [line.rstrip() for line in seen.get().splitlines()]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_table(logs: list[Log], width: int) -> None:
+    told = lines(diagnosis_table(answer(logs)), width)
+    assert max(map(len, told)) <= width
+    assert told[0].split() == ["candidate", "probability", "nats", "parameters", "(90", "%)"]
+    assert told[1].startswith("dead_time ")
+    assert "0.930 ███████▌" in told[1]
+    assert "+1234  delay 0.182 s (0.175 to 0.189)" in told[1]
+    assert told[2].strip() == "T_L 0.52 → 0.31 s, K_L 1.02 → 0.99"
+    whole = "\n".join(told)
+    # both of the pair have a half width: there the effect is named
+    assert "backlash: half width 0.100 m/s²" in whole
+    assert "dead_band: half width -0.200 m/s²" in whole
+    assert [line.split()[:2] for line in told[-2:]] == [["unknown", "0.010"], ["none", "<.001"]]
+
+
+def test_table_of_many_candidates_stays_short(logs: list[Log]) -> None:
+    from avtorch.gap import EFFECTS
+
+    names = [name for name in EFFECTS if name != "dead_time"]
+    weak = tuple(Candidate(name, 0.02, 1.0) for name in names)
+    found = answer(
+        logs, (Candidate("dead_time", 0.5, 9.0), *weak, Candidate("none", 0.04, 0.0), Candidate("unknown", 0.04))
+    )
+    told = lines(diagnosis_table(found))
+    assert len(told) == 1 + 8 + 1
+    assert told[-1].split()[:3] == [str(len(names) - 5), "others", f"{0.02 * (len(names) - 5):.3f}"]
+    assert {"none", "unknown"} <= {line.split()[0] for line in told}
+
+
+def test_headline_for_each_kind_of_verdict(logs: list[Log]) -> None:
+    def said(name: str, p: float = 0.9) -> str:
+        others = tuple(Candidate(n, 0.0) for n in ("none", "unknown") if n != name)
+        return lines("\n".join(diagnosis_headline(answer(logs, (Candidate(name, p), *others)))), 200)[0]
+
+    assert said("none") == "The simulator lacks nothing that this log shows (probability over 0.99)."
+    assert said("unknown").startswith("The cause is none of the effects known here")
+    assert said("dead_time+gust") == (
+        "The simulator lacks dead_time and gust (probability over 0.99): "
+        "the command acts after a delay, and wind and road push the car at random, for seconds."
+    )
+
+
+def test_notes(logs: list[Log]) -> None:
+    remaining = (Candidate("none", 0.1, 0.0), Candidate("aerodynamic_drag", 0.897, 40.0), Candidate("gust", 0.003))
+    notes = diagnosis_notes(answer(logs, onset_s=132.42, remaining=remaining, complete=False, notes=("speed [only]",)))
+    told = lines("\n".join(notes), 200)
+    assert told[0] == "Not told apart on this log: dead_time, or second_order_actuator."
+    assert told[1] == "Onset: at 132.4 s of the log's time."
+    assert told[2] == (
+        "Gap of the simulator as it is, over 5 s: acceleration off by 0.21 m/s² (noise alone 0.05), speed by 0.9 m/s."
+    )
+    assert told[3] == "Once dead_time is in, what remains: aerodynamic_drag 0.897, none 0.100."
+    assert told[4].startswith("The budget ended the search")
+    assert told[5] == "speed [only]"
+
+    sure = verdict_of(CANDIDATES, aliases=lambda ranked: ())
+    told = lines("\n".join(diagnosis_notes(answer(logs, verdict=sure))), 200)
+    assert told[:2] == ["Told apart from every other candidate on this log.", "Onset: there from the start."]
+    wide = verdict_of(CANDIDATES, aliases=lambda ranked: ["none", "unknown", "backlash+dead_band"])
+    told = lines("\n".join(diagnosis_notes(answer(logs, verdict=wide))), 200)
+    assert told[0] == (
+        "Not told apart on this log: dead_time, or no effect at all, a cause outside the table or "
+        "backlash with dead_band."
+    )
+
+
+def test_bar() -> None:
+    assert [bar(p) for p in (0.0, 1.0, 0.5)] == [" " * 8, "█" * 8, "████    "]
+    assert bar(1 / 64) == "▏       "
+    assert len({len(bar(p / 100)) for p in range(101)}) == 1
