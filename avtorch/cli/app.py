@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from cyclopts import App, CycloptsError
 
 from avtorch import __version__
+from avtorch.cli.blindtest import blindtest
 from avtorch.cli.diagnose import diagnose
 from avtorch.cli.estimate import estimate
 from avtorch.cli.run import run
@@ -30,6 +31,7 @@ app.command(estimate)
 app.command(diagnose)
 app.command(stability)
 app.command(validate)
+app.command(blindtest)
 
 
 def main(tokens: Sequence[str] | None = None) -> int:

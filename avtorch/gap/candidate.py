@@ -98,7 +98,7 @@ class Candidate:
         return np.array([c.z_of(values[c.key]) if c.key in values else 0.0 for c in self.coordinates])
 
     def rollouts(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
-        """Responses for `z` (column, coordinate): (column, witness, counted)."""
+        """Responses for `z` (column, coordinate): (column, witness, counted, group)."""
         values = self.values(z)
         full = self._rollouts(self.plant, values, coarse)
         if onset is None:
@@ -107,10 +107,10 @@ class Candidate:
         without = self._rollouts(self._without, base, coarse)
         return splice(self.record, full, without, onset)
 
-    def baseline_rollout(self, z: Float) -> Float:
-        """What the baseline alone does with the `T_L` and `K_L` of `z` (coordinate,): (witness, counted)."""
+    def baseline_rollout(self, z: Float, *, coarse: bool = False) -> Float:
+        """What the baseline alone does with the `T_L` and `K_L` of `z` (coordinate,): (witness, counted, group)."""
         values = {k: v for k, v in self.values(z[None]).items() if k in ("T_L", "K_L")}
-        return self._rollouts(self._without, values)[0]
+        return self._rollouts(self._without, values, coarse)[0]
 
     def _rollouts(self, of: GapPlant, values: Mapping[str, torch.Tensor], coarse: bool = False) -> Float:
         record = self.record
@@ -122,20 +122,16 @@ class Candidate:
         if record.speed is not None:
             parts.append(record.seen([r.speed for r in responses], coarse=coarse))
         columns = max(len(v) for v in values.values())
-        return np.stack([np.broadcast_to(p, (columns, record.rows)) for p in parts], 1)
-
-    @cached_property
-    def measured(self) -> Float:
-        """(witness, counted)."""
-        return measured(self.record)
+        return np.stack([np.broadcast_to(p, (columns, *p.shape[-2:])) for p in parts], 1)
 
     def errors(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
-        """Measured less rolled out, (column, witness, counted)."""
-        return self.measured - self.rollouts(z, onset, coarse=coarse)
+        """Measured less rolled out, (column, witness, counted, group)."""
+        measured = self.record.measured
+        return (measured.mean(-1, keepdims=True) if coarse else measured) - self.rollouts(z, onset, coarse=coarse)
 
     @cached_property
     def grade_columns(self) -> Float | None:
-        """Rollouts (knot, witness, counted) per unit of each coefficient of the slope at `grade_rms` 1."""
+        """Rollouts (knot, witness, counted, group) per unit of each coefficient of the slope at `grade_rms` 1."""
         grade = next((e for e in self.plant.effects if isinstance(e, RoadGrade)), None)
         if grade is None or RoadGrade not in self.effects:
             return None
@@ -154,15 +150,10 @@ class Candidate:
         return np.stack(parts, 1)
 
 
-def measured(record: Record) -> Float:
-    """What the witnesses saw, (witness, counted)."""
-    return np.stack([x[record.source] for x in (record.accel, record.speed) if x is not None])
-
-
 def splice(record: Record, full: Float, without: Float, onset: int) -> Float:
-    """Rollouts (column, witness, counted) that are `without` before counted row `onset` and go on as `full` does."""
+    """Rollouts (column, witness, counted, group) that are `without` before counted row `onset` and go on as `full` does."""
     apart = full - without
     if record.speed is not None and onset < record.rows:
-        apart[:, -1] -= apart[:, -1, onset][:, None]
+        apart[:, -1] -= apart[:, -1, onset, :1][:, :, None]
     apart[:, :, :onset] = 0.0
     return without + apart

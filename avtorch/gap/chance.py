@@ -46,13 +46,11 @@ def tails(errors: Float, dt: float) -> Tails:
     x = np.pad(errors, 2, mode="edge")
     beside = np.median(np.stack([x[:-4], x[1:-3], x[3:-1], x[4:]]), 0)
     away = errors - beside
-    # local size: a jump of the car shows in all rows of its moment, a glitch in one
+    # a jump of the car shows in all rows of its moment, a glitch in one
     sd = max(1.4826 * float(np.median(np.abs(away - np.median(away)))), 1e-9)
-    near = np.maximum(np.abs(x[1:-3] - x[:-4]), np.abs(x[4:] - x[3:-1]))
     spread = np.abs(np.stack([x[:-4], x[1:-3], x[3:-1], x[4:]]) - beside)
     rough = np.sort(spread, 0)[1]  # of four neighbours, those nearest to their median
     away = away / np.maximum(sd, rough)
-    del near
 
     def ratios(z: Float) -> Float:
         fraction, scale = np.exp(_TAIL_PRIOR[0][0] + _TAIL_PRIOR[0][1] * z[0]), np.exp(_TAIL_PRIOR[1][0] + _TAIL_PRIOR[1][1] * z[1])
@@ -77,7 +75,7 @@ def tails(errors: Float, dt: float) -> Tails:
     hit = np.log(fraction) - np.log1p(-fraction) - 0.5 * np.log(wide) + 0.5 * away**2 * (1 - 1 / wide) > 0
     onset, gained = _onset(per_row, dt)
     return Tails(
-        evidence=max(evidence, evidence + gained) if gained > 0 else evidence,
+        evidence=evidence + float(np.logaddexp(0.0, gained)) - float(np.log(2.0)),
         fraction=fraction,
         scale=scale,
         sds=(float(sds[0] * _TAIL_PRIOR[0][1]), float(sds[1] * _TAIL_PRIOR[1][1])),
@@ -129,7 +127,7 @@ def losses(white: Whitener, errors: Float, command: Float, T_L: float, K_L: floa
     summed over.
     """
     record = white.record
-    e = white(errors)
+    e = white(errors)[..., 0]
     dt = record.dt
     length = min(record.rows - 1, max(8, round(6 * T_L / dt) + 8))
     decay = np.exp(-dt / T_L)
@@ -160,9 +158,7 @@ def losses(white: Whitener, errors: Float, command: Float, T_L: float, K_L: floa
     with np.errstate(divide="ignore"):
         weights = np.log1p(-grid)[:, None] + holds * np.log(grid)[:, None]
     gains = np.minimum(gains, 200.0)
-    rows = np.log((1 - grid)[:, None] + np.exp(weights[1:, None] + gains[None]).sum(-1)) if False else np.stack(
-        [np.log((1 - p) + np.exp(w + gains).sum(-1)) for p, w in zip(grid[1:], weights[1:], strict=True)]
-    )
+    rows = np.stack([np.log((1 - p) + np.exp(w + gains).sum(-1)) for p, w in zip(grid[1:], weights[1:], strict=True)])
     total = rows.sum(1)
     p = grid[1:]
     logit = np.log(p / (1 - p))
@@ -178,7 +174,7 @@ def losses(white: Whitener, errors: Float, command: Float, T_L: float, K_L: floa
     whole[strong] = rows[best]
     onset, more = _onset(whole, dt)
     sd = float(np.sqrt(share @ (logit - share @ logit) ** 2))
-    return Losses(evidence + max(more, 0.0), mean, max(sd, 1e-3), onset if more > 1 else None)
+    return Losses(evidence + float(np.logaddexp(0.0, more) - np.log(2.0)), mean, max(sd, 1e-3), onset if more > 1 else None)
 
 
 def _late(image: Float, rows: int, length: int) -> Float:

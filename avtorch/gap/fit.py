@@ -22,7 +22,7 @@ _LONGEST = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """`z` (coordinate,) at the mode, its posterior covariance, errors (witness, counted) left over.
+    """`z` (coordinate,) at the mode, its posterior covariance, errors (witness, counted, group) left over.
 
     `log_joint`: log likelihood plus log prior at the mode; `log_evidence`: by Laplace, the noise as given.
     `grade_rms`, `profile`: of a road's slope.
@@ -38,9 +38,18 @@ class Fit:
 
 
 def modes(
-    candidate: Candidate, white: Whitener, starts: Float, *, onset: int | None = None, iterations: int = 8
+    candidate: Candidate,
+    white: Whitener,
+    starts: Float,
+    *,
+    onset: int | None = None,
+    iterations: int = 8,
+    coarse: bool = False,
 ) -> tuple[Float, Float]:
-    """Modes (start, coordinate) and their log joint densities (start,), from `starts` (start, coordinate)."""
+    """Modes (start, coordinate) and their log joint densities (start,), from `starts` (start, coordinate).
+
+    `coarse`: on rollouts of averaged commands, several times as fast, good for a first look.
+    """
     z = np.array(starts)
     count, size = z.shape
     damping = np.full(count, 1e-3)
@@ -50,7 +59,7 @@ def modes(
     trial = z
     live = np.ones(count, bool)
     for _ in range(iterations):
-        g, h, v = _quadratic(candidate, white, trial[live], onset)
+        g, h, v = _quadratic(candidate, white, trial[live], onset, coarse)
         where = np.flatnonzero(live)
         good = v < value[where]
         gain = value[where] - v
@@ -68,12 +77,14 @@ def modes(
     return best, white.constant - value
 
 
-def _quadratic(candidate: Candidate, white: Whitener, z: Float, onset: int | None) -> tuple[Float, Float, Float]:
+def _quadratic(
+    candidate: Candidate, white: Whitener, z: Float, onset: int | None, coarse: bool = False
+) -> tuple[Float, Float, Float]:
     """Gradient, Gauss-Newton matrix and value of the negative log joint density (less its constant) at `z`."""
     count, size = z.shape
     moved = np.repeat(z[:, None], size + 1, 1)
     moved[:, 1:] += _STEP * np.eye(size)
-    errors = candidate.errors(moved.reshape(-1, size), onset)
+    errors = candidate.errors(moved.reshape(-1, size), onset, coarse=coarse)
     e = white(errors).reshape(count, size + 1, -1)
     columns = (e[:, 1:] - e[:, :1]) / _STEP
     base = e[:, 0]
@@ -82,6 +93,7 @@ def _quadratic(candidate: Candidate, white: Whitener, z: Float, onset: int | Non
     value = 0.5 * np.einsum("cr,cr->c", base, base)
     grade = candidate.grade_columns
     if grade is not None:
+        grade = grade.mean(-1, keepdims=True) if coarse else grade
         square, cross, value, _ = _integrated(white, grade, onset, columns, base, square, cross, value)
     return cross + z, square + np.eye(size), value + 0.5 * (z**2).sum(1)
 
@@ -120,25 +132,26 @@ def _integrated(
     return square, cross, value - peak - spread, (_RMS[at], (w * b) @ vectors.T)
 
 
-_CACHE: dict[int, tuple[object, int | None, tuple[Float, Float, Float]]] = {}
+_CACHE: dict[tuple[int, int], tuple[object, int | None, tuple[Float, Float, Float]]] = {}
 
 
 def _spectrum(white: Whitener, grade: Float, onset: int | None) -> tuple[Float, Float, Float]:
     """Eigenvectors and eigenvalues of the slope's Gram matrix, and the white image of its columns (knot, row)."""
-    kept = _CACHE.get(id(grade))
+    key = (id(white), grade.shape[-1])
+    kept = _CACHE.get(key)
     if kept is not None and kept[0] is white and kept[1] == onset:
         return kept[2]
     columns = grade
     if onset is not None:
         columns = grade.copy()
         if white.record.speed is not None:
-            columns[:, -1] -= columns[:, -1, onset][:, None]
+            columns[:, -1] -= columns[:, -1, onset, :1][:, :, None]
         columns[:, :, :onset] = 0.0
     image = white(columns).reshape(len(grade), -1)
     sizes, vectors = np.linalg.eigh(image @ image.T)
     made = (vectors, np.maximum(sizes, 0.0), image)
     _CACHE.clear()
-    _CACHE[id(grade)] = (white, onset, made)
+    _CACHE[key] = (white, onset, made)
     return made
 
 
@@ -160,7 +173,7 @@ def finish(candidate: Candidate, white: Whitener, z: Float, onset: int | None = 
         part = np.tensordot(profile, grade, 1)
         if onset is not None:
             if candidate.record.speed is not None:
-                part[-1] -= part[-1, onset]
+                part[-1] -= part[-1, onset, 0]
             part[:, :onset] = 0.0
         errors = errors - part
     log_joint = white.constant - float(value)

@@ -9,7 +9,8 @@ The error of a rollout is what no deterministic response foretells,
 
 with the interval between rows integrated exactly. The Kalman gain settles within some rows, so errors (row,) of both
 witnesses pass one recursive filter to become white, thousands of columns at once. The speed's offset at the start of
-each stretch is unknown and projected out.
+each stretch is unknown and projected out. Where rows come in groups, their means pass the filter, and what rows of a
+group differ by is white already.
 """
 
 from __future__ import annotations
@@ -31,7 +32,10 @@ NAMES = ("process_sd", "process_time", "force_sd", "force_time", "accel_sd", "sp
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """`process_sd`, `force_sd`, `accel_sd` [m/s²], `speed_sd` [m/s] (white ones of an averaged row), times [s]."""
+    """`process_sd`, `force_sd`, `accel_sd` [m/s²], `speed_sd` [m/s] (white ones of a group's mean), times [s].
+
+    `within`: standard deviations by witness of the rows within a group; None where no rows are grouped.
+    """
 
     process_sd: float = 0.05
     process_time: float = 0.35
@@ -39,6 +43,7 @@ class NoiseModel:
     force_time: float = 3.0
     accel_sd: float = 0.05
     speed_sd: float = 0.02
+    within: tuple[float, ...] | None = None
 
     def replaced(self, **values: float) -> NoiseModel:
         return replace(self, **values)
@@ -118,17 +123,25 @@ class Whitener:
         return image, np.add.reduceat((image**2).sum(0), self.record.starts)
 
     def __call__(self, errors: Float) -> Float:
-        """Errors (..., witness, counted) made white, of unit variance, (..., witness, counted)."""
-        if "speed" not in self.record.witnesses:
-            return self._filtered(errors)
-        errors = errors.copy()
-        starts = self.record.starts
-        errors[..., -1, :] -= errors[..., -1, starts][..., self.record.stretch]
-        e = self._filtered(errors)
-        image, square = self._offset
-        part = np.add.reduceat((e * image).sum(-2), starts, -1) / square
-        e -= image * part[..., None, self.record.stretch]
-        return e
+        """Errors (..., witness, counted, group) made white, of unit variance: (..., witness, counted, 1 + group).
+
+        First the groups' means, then what their rows differ by; without the latter where `errors` come with group 1.
+        """
+        mean = errors.mean(-1) if errors.shape[-1] > 1 else errors[..., 0].copy()
+        if "speed" in self.record.witnesses:
+            starts = self.record.starts
+            mean[..., -1, :] -= mean[..., -1, starts][..., self.record.stretch]
+            e = self._filtered(mean)
+            image, square = self._offset
+            part = np.add.reduceat((e * image).sum(-2), starts, -1) / square
+            e -= image * part[..., None, self.record.stretch]
+        else:
+            e = self._filtered(mean)
+        if errors.shape[-1] == 1 or self.noise.within is None:
+            return e[..., None]
+        apart = errors - errors.mean(-1, keepdims=True)
+        apart /= np.array(self.noise.within)[:, None, None]
+        return np.concatenate([e[..., None], apart], -1)
 
     @property
     def constant(self) -> float:
@@ -137,9 +150,12 @@ class Whitener:
         value = -0.5 * rows * (self._filter[3] + count * np.log(2 * np.pi))
         if "speed" in self.record.witnesses:
             value -= 0.5 * float(np.log(self._offset[1]).sum())
+        if self.noise.within is not None:
+            more = rows * (self.record.group - 1)
+            value -= more * sum(float(np.log(sd)) + 0.5 * np.log(2 * np.pi) for sd in self.noise.within)
         return value
 
     def log_likelihood(self, errors: Float) -> Float:
-        """Of errors (..., witness, counted): (...)."""
+        """Of errors (..., witness, counted, group): (...)."""
         e = self(errors)
-        return self.constant - 0.5 * (e**2).sum((-1, -2))
+        return self.constant - 0.5 * (e**2).sum((-1, -2, -3))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,12 +57,12 @@ class NoiseFit:
 
 
 def row_likelihoods(record: Record, errors: Float, noise: NoiseModel, onset: int | None = None) -> Float:
-    """Log likelihood (counted,) of each row of errors (witness, counted); sums to the whole.
+    """Log likelihood (counted,) of each row of errors (witness, counted, group); sums to the whole.
 
     With `onset`, the coloured force has its size from that row on only.
     """
     white = Whitener(record, noise)
-    rows = white.constant / record.rows - 0.5 * (white(errors) ** 2).sum(0)
+    rows = white.constant / record.rows - 0.5 * (white(errors) ** 2).sum((0, 2))
     if onset:
         calm = row_likelihoods(record, errors, noise.replaced(force_sd=min(CALM, noise.force_sd)))
         rows = np.concatenate([calm[:onset], rows[onset:]])
@@ -79,16 +79,29 @@ def fit_noise(
     onset: int | None = None,
     iterations: int = 6,
 ) -> NoiseFit:
-    """Mode of the noise's parameters given the errors (witness, counted) of a rollout; `T_L` [s] of the plant."""
+    """Mode of the noise's parameters given the errors (witness, counted, group) of a rollout; `T_L` [s] of the plant."""
     means = np.array([priors[n][0] for n in NAMES])
     means[NAMES.index("process_time")] += np.log(T_L)
     sds, ends = (np.array([priors[n][k] for n in NAMES]) for k in (1, 2))
 
+    within = None
+    if record.group > 1:
+        apart = errors - errors.mean(-1, keepdims=True)
+        share = record.group / (record.group - 1)
+        within = tuple(float(x) for x in np.sqrt(share * (apart**2).mean((1, 2))).clip(1e-9))
+
     def model(z: Float) -> NoiseModel:
-        return NoiseModel(**{n: float(x) for n, x in zip(NAMES, np.exp(means + sds * z), strict=True)})
+        return NoiseModel(**{n: float(x) for n, x in zip(NAMES, np.exp(means + sds * z), strict=True)}, within=within)
+
+    # what rows of a group differ by does not depend on what is sought
+    mean, fixed = errors.mean(-1, keepdims=True), 0.0
+    if within is not None:
+        apart = ((errors - mean) / np.array(within)[:, None, None]) ** 2
+        size = (record.group - 1) * sum(np.log(sd) + 0.5 * np.log(2 * np.pi) for sd in within)
+        fixed = -0.5 * apart.sum((0, 2)) - size
 
     def likelihoods(z: Float) -> Float:
-        return row_likelihoods(record, errors, model(z), onset)
+        return row_likelihoods(record, mean, replace(model(z), within=None), onset) + fixed
 
     begin = np.log([getattr(start, n) for n in NAMES])
     z = np.clip((begin - means) / sds, -ends, ends)
@@ -98,7 +111,9 @@ def fit_noise(
     for _ in range(iterations):
         ahead = z + _STEP * np.eye(len(z))
         slopes = np.stack([(likelihoods(x) - rows) / _STEP for x in ahead])
-        information = slopes @ slopes.T + np.eye(len(z))
+        # squared scores tell the information where the model fits; far from it they are too large by the square of this
+        excess = max(1.0, float((Whitener(record, replace(model(z), within=None))(mean) ** 2).mean()))
+        information = slopes @ slopes.T / excess**2 + np.eye(len(z))
         gradient = slopes.sum(1) - z
         # what an end holds back does not move
         held = ((z >= ends) & (gradient > 0)) | ((z <= -ends) & (gradient < 0))

@@ -1,14 +1,16 @@
 """What a diagnosis looks at: drives at one rate, their witnesses, and the stretches that count.
 
-Rows above some 20 Hz are averaged in groups: what an actuator of a tenth of a second does is slower, and the mean of
-a group loses nothing about it. Rollouts are made at the log's own rate and averaged alike; a search may begin with
-`coarse` ones, of averaged commands. Rows at standstill or with a driver's foot in (`engaged` 0) do not count.
+Rows above some 20 Hz come in groups of which only the means pass the innovations filter; within a group the rows
+differ by sensor noise, which is white. Both parts count: a controller feeds the noise of a row back into the command
+of the next, and means alone would take that for a lag. Rollouts are made at the log's own rate; a search may begin
+with `coarse` ones, of averaged commands, whose groups have one row. Rows at standstill or with a driver's foot in (`engaged` 0) do not count.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -32,8 +34,8 @@ _GAP_S = 5.0  # zeros between stretches, over which a filter forgets
 class Record:
     """Drives at the log's own rate, and where in one long array of rows averaged to `dt` [s] those stand that count.
 
-    `accel`, `speed` (row,): measured, over all drives' rows one after another; None: not in the log. `time` (row,)
-    [s], the log's own. `source`, `target`: of every counted row its index in these arrays and in the padded one of
+    `accel`, `speed` (row, group): measured, over all drives' rows one after another; None: not in the log. `time`
+    (row,) [s], the log's own; `command` (row,), mean of a group. `source`, `target`: of every counted row its index in these arrays and in the padded one of
     `length` rows that is filtered; `stretch` (counted,) numbers the stretches. `group`: rows averaged into one.
     """
 
@@ -107,7 +109,7 @@ class Record:
                 columns["use"].append((use & settled).astype(float))
                 for name, x in (("accel", log.accel), ("speed", log.speed)):
                     if x is not None:
-                        columns[name].append(mean(x))
+                        columns[name].append(x[cut].reshape(rows, group))
         if not drives:
             raise InputError(f"{', '.join(names)}: no drive of two seconds or more, nothing to diagnose")
         dt = float(np.median(steps))
@@ -144,17 +146,20 @@ class Record:
         return out
 
     def seen(self, responses: Sequence[Tensor], *, coarse: bool = False) -> Float:
-        """Responses by drive, (..., time) each, as means of the averaged rows, at the counted rows (..., counted)."""
+        """Responses by drive, (..., time) each, at the rows that count: (..., counted, group), `coarse` with group 1."""
         parts = []
         for x in responses:
             if self.group > 1 and coarse:
                 later = torch.cat([x[..., 1:], x[..., -1:]], -1)
                 x = torch.lerp(x, later, (self.group - 1) / (2 * self.group))
-            elif self.group > 1:
-                x = x.unflatten(-1, (-1, self.group)).mean(-1)
-            parts.append(x)
-        whole = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
-        return whole.numpy()[..., self.source]
+            parts.append(x.unflatten(-1, (-1, 1 if coarse else self.group)))
+        whole = parts[0] if len(parts) == 1 else torch.cat(parts, -2)
+        return whole.numpy()[..., self.source, :]
+
+    @cached_property
+    def measured(self) -> Float:
+        """What the witnesses saw, (witness, counted, group)."""
+        return np.stack([x[self.source] for x in (self.accel, self.speed) if x is not None])
 
 
 def _drive(time: Float, command: Float, speed: Float | None, accel0: float | None) -> Drive:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.gap.candidate import Candidate, measured, splice
+from avtorch.gap.candidate import Candidate
 from avtorch.gap.chance import Losses, Tails, losses, tails
 from avtorch.gap.effect import EFFECTS, Effect
 from avtorch.gap.fit import finish, modes
@@ -144,31 +144,31 @@ class Search:
     def _none(self, record: Record) -> Found:
         """The bare baseline, with its noise."""
         candidate = Candidate(record, (), self.baseline)
-        white = Whitener(record, NoiseModel())
+        noise = _white_first(record)
+        white = Whitener(record, noise)
         z = np.stack([candidate.z_of({"T_L": t, "K_L": 1.0}) for t in (0.12, 0.3, 0.8)])
         found, values = modes(candidate, white, z, iterations=6)
-        return self._settled(candidate, found[values.argmax()], NoiseModel(), rounds=3)
+        return self._settled(candidate, found[values.argmax()], noise, rounds=6)
 
     def _settled(
         self, candidate: Candidate, z: Float, noise: NoiseModel, *, onset: int | None = None, rounds: int = 2
     ) -> Found:
         """Parameters and noise in turn until both rest."""
         record = candidate.record
-        fitted: NoiseFit | None = None
+        white = Whitener(record, noise)
+        if record.group > 1:
+            z = modes(candidate, white, z[None], onset=onset, iterations=4, coarse=True)[0][0]
         value = -np.inf
-        for _ in range(rounds + 2):
-            white = Whitener(record, noise)
-            z = modes(candidate, white, z[None], onset=onset, iterations=5)[0][0]
+        for turn in range(rounds + 1):
+            z = modes(candidate, white, z[None], onset=onset, iterations=4)[0][0]
             fit = finish(candidate, white, z, onset)
             fitted = fit_noise(record, fit.errors, noise, T_L=self._lag(candidate, z), iterations=3)
             noise = fitted.noise
+            white = Whitener(record, noise)
             new = float(fitted.rows.sum())
-            if new < value + 0.3:
+            if new < value + 0.3 or turn == rounds:
                 break
             value = new
-        assert fitted is not None
-        white = Whitener(record, noise)
-        z = modes(candidate, white, z[None], onset=onset, iterations=3)[0][0]
         fit = finish(candidate, white, z, onset)
         return Found(
             name=candidate.name,
@@ -210,7 +210,9 @@ class Search:
             best[candidate.name] = max(best.get(candidate.name, -np.inf), value)
         order = sorted(best, key=lambda n: -best[n])
         # whatever is left behind keeps the evidence of its screening
-        lead = order[:_SINGLES]
+        floor = none.log_likelihood
+        top = best[order[0]] - floor if order else 0.0
+        lead = [n for n in order[:_SINGLES] if best[n] - floor > min(0.25 * top, top - 30)]
         found = [none]
         gust = self._gust(none) if self._has("gust") else None
         if gust is not None:
@@ -221,7 +223,7 @@ class Search:
                 break
             forms = [s for s in screened if s[1].name == name]
             found.append(self._single(forms, found))
-        for name in order[_SINGLES:]:
+        for name in [n for n in order if n not in lead]:
             _, candidate, z, _ = next(s for s in screened if s[1].name == name)
             fit = finish(candidate, white, z)
             found.append(self._as_found(candidate, fit, none))
@@ -256,7 +258,7 @@ class Search:
         if len(z) > 2:
             values = np.concatenate([white.log_likelihood(candidate.errors(z[i : i + 32], coarse=True)) for i in range(0, len(z), 32)])
             z = z[np.argsort(-(values - 0.5 * (z**2).sum(1)))[:2]]
-        found, values = modes(candidate, white, z, iterations=6)
+        found, values = modes(candidate, white, z, iterations=6, coarse=True)
         return found[values.argmax()], float(values.max())
 
     def _single(self, forms: list[tuple[float, Candidate, Float, int | None]], found: list[Found]) -> Found:
@@ -351,7 +353,7 @@ class Search:
         if not single or single[0].log_evidence < none.log_evidence + 3:
             return []
         top = single[0].log_evidence
-        bases = [f for i, f in enumerate(single[:_BASES]) if i == 0 or f.log_evidence > none.log_evidence + 0.1 * (top - none.log_evidence)]
+        bases = [f for i, f in enumerate(single[:_BASES]) if i == 0 or f.log_evidence > none.log_evidence + 0.3 * (top - none.log_evidence)]
         made: dict[str, Found] = {}
         for number, base in enumerate(bases):
             if base.gust:
@@ -379,14 +381,15 @@ class Search:
     def _score(self, candidate: Candidate, base: Found, white: Whitener) -> tuple[float, Candidate, Float]:
         """What a second effect could gain on top of `base`, by one linear step from each of its starts."""
         z = starts(candidate, base.values)
-        e = white(base.errors).ravel()
+        e = white(base.errors.mean(-1, keepdims=True)).ravel()
         own = self._own_columns(base, white)
         best, at = -np.inf, z[0]
         grade = candidate.grade_columns if "road_grade" not in base.name else None
         if grade is not None:
             # GP columns: gain by their best size
-            step, value = modes(candidate, white, z[:1], onset=base.onset, iterations=2)
-            return float(value[0]) - base.log_likelihood, candidate, step[0]
+            step, value = modes(candidate, white, z[:1], onset=base.onset, iterations=2, coarse=True)
+            flat = base.errors.mean(-1, keepdims=True)
+            return float(value[0] - white.log_likelihood(flat)), candidate, step[0]
         silent = base.candidate.rollouts(base.z[None], base.onset, coarse=True)[0]
         for i in range(0, len(z), 32):
             apart = white(candidate.rollouts(z[i : i + 32], base.onset, coarse=True) - silent).reshape(len(z[i : i + 32]), -1)
@@ -406,7 +409,7 @@ class Search:
         size = len(base.z)
         moved = np.repeat(base.z[None], size + 1, 0)
         moved[1:] += 1e-4 * np.eye(size)
-        e = white(base.candidate.rollouts(moved, base.onset)).reshape(size + 1, -1)
+        e = white(base.candidate.rollouts(moved, base.onset, coarse=True)).reshape(size + 1, -1)
         columns = e[1:] - e[:1]
         norms = np.linalg.norm(columns, axis=1)
         columns = columns[norms > 1e-9]
@@ -423,7 +426,7 @@ class Search:
     # chance --------------------------------------------------------------------------------------------------------
     def _tails(self, raw: Record, of: Found) -> Tails:
         errors = self._raw_errors(raw, of)
-        return tails(errors[0], raw.dt)
+        return tails(errors[0, :, 0], raw.dt)
 
     def _raw_errors(self, raw: Record, of: Found) -> Float:
         """Errors of a candidate's rollout at the log's own rate, (witness, counted)."""
@@ -460,6 +463,15 @@ class Search:
             white, self._raw_errors(raw, none), raw.command[raw.source], none.values["T_L"], none.values["K_L"]
         )
         return [replace(none, name="command_hold", log_evidence=none.log_evidence + lost.evidence, losses=lost)]
+
+
+def _white_first(record: Record) -> NoiseModel:
+    """Sensor noise from what rows beside each other differ by, as a first guess."""
+    same = np.diff(record.stretch) == 0
+    sds = [
+        1.4826 / np.sqrt(2) * float(np.median(np.abs(np.diff(x.mean(-1))[same]))) + 1e-4 for x in record.measured
+    ]
+    return NoiseModel(**{f"{name}_sd": sd for name, sd in zip(record.witnesses, sds, strict=True)})
 
 
 def _merged(forms: Sequence[Found]) -> Found:

@@ -13,6 +13,7 @@ from avtorch.plots.over_plane import gain_curve, region, setting_region, verdict
 from avtorch.plots.over_posteriors import agreement_scatter, exact_density, joint_cloud, marginals
 from avtorch.plots.over_ranks import ecdf_difference, ecdf_of, pooled_rank_counts, rank_band, rank_plot
 from avtorch.plots.over_time import belief_band, data_quality, events, motion, string_probability
+from avtorch.plots.over_verdicts import confusion, confusion_figure
 from avtorch.plots.posterior_figures import validation_figures
 from avtorch.plots.signatures import effect_signature, signature_figure
 from avtorch.plots.style import STYLE, save
@@ -23,6 +24,8 @@ __all__ = [
     "belief_band",
     "belief_figure",
     "calibration_figure",
+    "confusion",
+    "confusion_figure",
     "data_quality",
     "ecdf_difference",
     "ecdf_of",

@@ -24,8 +24,8 @@ class TrialFolder:
     def __init__(self, root: Path) -> None:
         self.root = root
 
-    def settle(self, settings: Mapping[str, Any]) -> None:
-        """Remember the settings, or hold them against those that are there.
+    def settle(self, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Remember the settings, or hold them against those that are there; returns them as JSON has them.
 
         Raises `InputError` where the folder is of another trial, naming what differs.
         """
@@ -33,7 +33,7 @@ class TrialFolder:
         wanted = {"schema": SCHEMA, **json.loads(json.dumps(settings))}
         if not path.exists():
             write_json(path, wanted)
-            return
+            return wanted
         found = _read(path)
         for key in sorted(wanted.keys() | found.keys()):
             if found.get(key) != wanted.get(key):
@@ -41,6 +41,7 @@ class TrialFolder:
                     f"{self.root}: holds a trial with {key} {found.get(key)!r}; found {wanted.get(key)!r}, "
                     "needs the same, or another folder"
                 )
+        return wanted
 
     def truth_path(self, index: int) -> Path:
         return self.root / "truth" / f"{case_name(index)}.json"

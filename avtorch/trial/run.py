@@ -59,7 +59,7 @@ def run_trial(
     settings = {"seed": seed, "signals": [s for s in SIGNALS if s in signals], "outside": outside}
     settings |= {"mix": shares, "draw": {key: draw_options[key] for key in sorted(draw_options)}}
     folder = TrialFolder(Path(out))
-    folder.settle(settings)
+    settings = folder.settle(settings)
     tasks = [
         Task(
             root=folder.root,

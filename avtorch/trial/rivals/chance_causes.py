@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft, rfft
 
 from avtorch.gap import RoadGrade
 from avtorch.trial.rivals.maximum_likelihood import Fit, Fitter
@@ -53,15 +52,15 @@ def road_grade(fitter: Fitter, fit: Fit) -> float | None:
     the noise is refitted. None where the drive is in pieces.
     """
     drive, spectrum = fitter.drive, fitter.spectrum
-    if len(drive.drives) > 1:
+    only, *more = drive.drives
+    if more:
         return None
-    only = drive.drives[0]
     assert only.position is not None
     road = RoadGrade().prepared(only.time, only.speed, only.position)
     columns = road.columns(only.position).T.numpy()
     kept = int(np.searchsorted(spectrum.frequency, 2 * np.pi * _ROAD_HZ * drive.step))
     force = np.stack(
-        [np.moveaxis(rfft(drive.forced(one[None])[0], spectrum.length)[:, :kept], 0, -1) for one in columns]
+        [np.moveaxis(np.fft.rfft(drive.forced(one[None])[0], spectrum.length)[:, :kept], 0, -1) for one in columns]
     )
     residual, lag, sizes, gust_time = fit.transformed, fit.lag, fit.sizes, fit.gust_time
     best = fit.loss
@@ -101,7 +100,7 @@ def _innovations(fitter: Fitter, fit: Fit, order: int = 8) -> tuple[Float, NDArr
     command for the noise's cause.
     """
     valid = fitter.drive.valid
-    residual = irfft(fit.transformed, fitter.spectrum.length, 0)[: len(valid)]
+    residual = np.fft.irfft(fit.transformed, fitter.spectrum.length, 0)[: len(valid)]
     run = np.arange(len(valid)) - np.maximum.accumulate(np.where(valid, -1, np.arange(len(valid))))
     rows = np.flatnonzero(run > order)
     past = np.concatenate([residual[rows - i] for i in range(1, order + 1)], 1)

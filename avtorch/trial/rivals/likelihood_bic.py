@@ -22,7 +22,7 @@ from avtorch.trial.rivals.residuals import Residuals
 
 CHANCE = ("command_hold", "gust", "outliers", "road_grade")
 """Causes that are told by the noise, not by the response."""
-_SINGLES, _PAIRS = 6, 3  # that are fitted at the full rate
+_SINGLES, _PAIRS = 5, 3  # that are fitted at the full rate
 _THIN_HZ = 20.0
 
 
@@ -52,7 +52,11 @@ def likelihood_bic(log: Log) -> dict[str, Any]:
         near = thin.score(best.names).fit
         pairs = [thin.score(_joined(best.names, name), near, steps=1) for name in known if name not in best.names]
         pairs = sorted(pairs, key=lambda one: -one.score)[:_PAIRS]
-        scored += [search.score(one.names, one.fit) for one in pairs] if search is not thin else pairs
+        scored += [search.score(one.names, one.fit) for one in pairs]
+        # and back: an effect that came in second may do without the first
+        best = max(scored, key=lambda one: one.score)
+        if len(best.names) == 2:
+            scored = _with(scored, [search.again((name,), best.fit) for name in best.names if name not in CHANCE])
     return _answer(log, scored, none)
 
 
@@ -72,13 +76,18 @@ class _Search:
     def __init__(self, fitter: Fitter) -> None:
         self.fitter = fitter
         self._price = 0.5 * math.log(fitter.spectrum.rows)
-        self._fits: dict[tuple[tuple[str, ...], bool], Fit] = {}
+        self._fits: dict[tuple[tuple[str, ...], bool, int], Fit] = {}
+
+    def again(self, names: tuple[str, ...], near: Fit) -> Scored:
+        """Score of a deterministic candidate fitted anew from another fit."""
+        fit = self.fitter.fit(names, near=near)
+        return Scored(names, -fit.loss - len(fit.z) * self._price, fit)
 
     def score(self, names: tuple[str, ...], near: Fit | None = None, *, steps: int = 12) -> Scored:
         """`near`: a fit to begin from; `steps` at most."""
         plain = tuple(name for name in names if name not in CHANCE)
         chance = [name for name in names if name in CHANCE]
-        key = (plain, "gust" in chance)
+        key = (plain, "gust" in chance, steps)
         if key not in self._fits:
             self._fits[key] = self.fitter.fit(plain, near=near, gust="gust" in chance, steps=steps)
         fit = self._fits[key]
@@ -90,6 +99,15 @@ class _Search:
                 after = getattr(chance_causes, name)(self.fitter, fit)
                 gained += fit.loss - (math.inf if after is None else after)
         return Scored(names, gained - loss - count * self._price, fit)
+
+
+def _with(scored: list[Scored], more: list[Scored]) -> list[Scored]:
+    """The better of those of a name."""
+    best = {one.names: one for one in scored}
+    for one in more:
+        if one.names not in best or one.score > best[one.names].score:
+            best[one.names] = one
+    return list(best.values())
 
 
 def _joined(names: tuple[str, ...], name: str) -> tuple[str, ...]:

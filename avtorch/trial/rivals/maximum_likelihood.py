@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -62,7 +63,7 @@ class Fitter:
     ) -> Fit:
         """The most likely plant with `effects`.
 
-        `near`: a fit to begin from (T_L, K_L and the effects it shares); the first coordinate of those that are new is
+        `near`: a fit to begin from (T_L, K_L and the effects it shares); the first two coordinates that are new are
         tried at a few typical values.
         """
         made = plant([EFFECTS[name] for name in effects]).prepared(self.drive.drives[0])
@@ -119,15 +120,17 @@ class Fitter:
         new = [i for i, name in enumerate(names) if name not in known and "." in name]
         if not new:
             return begin[None]
-        starts = []
-        times = [i for i in new if names[i] == "gain_change.change_s"]
         # a limit far below what the drive asks for is slow to work out, and was never the best start
-        for first in (0.0, 1.5, 3.0) if names[new[0]].startswith("rate_limit.") else (-1.5, 0.0, 1.5):
-            for when in np.linspace(-1.2, 1.2, 7) if times else (0.0,):
+        firsts = (0.0, 1.5, 3.0) if names[new[0]].startswith("rate_limit.") else (-1.5, 0.0, 1.5)
+        if names[new[-1]].startswith("gain_change."):
+            seconds = np.linspace(-1.2, 1.2, 7).tolist()
+        else:
+            seconds = [-1.5, 0.0, 1.5] if len(new) == 2 else [0.0]
+        starts = []
+        for first in firsts:
+            for second in seconds:
                 z = begin.copy()
-                z[new[0]] = first
-                if times:
-                    z[times[0]] = when
+                z[new[: 2 if len(new) > 1 else 1]] = [first, second][: len(new)]
                 starts.append(z)
         return np.stack(starts)
 
@@ -140,7 +143,9 @@ class Fitter:
         transformed = self.spectrum.transform(misses)
         return np.einsum("skc,kcd,skd->s", transformed.conj(), inverse, transformed, optimize=True).real
 
-    def _state(self, made: GapPlant, names: Sequence[str], z: Float, missed: Float, sizes: Float | None, gust: bool):
+    def _state(
+        self, made: GapPlant, names: Sequence[str], z: Float, missed: Float, sizes: Float | None, gust: bool
+    ) -> Any:
         lag = float(made.parameters()["T_L"].constrain(torch.tensor(z[0], dtype=torch.float64)))
         transformed = self.spectrum.transform(missed)
         bands = self.spectrum.bands(transformed)

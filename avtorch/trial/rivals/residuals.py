@@ -54,7 +54,7 @@ class Residuals:
             command = log.accel_cmd[rows].reshape(count, every)
             time = np.ascontiguousarray(log.time[rows][::every])
             accel, speed = (None if x is None else x[rows][::every].copy() for x in (log.accel, log.speed))
-            fit = log.usable[rows].reshape(count, every).all(1)
+            fit = np.asarray(log.usable[rows].reshape(count, every).all(1))
             valid.append(fit & np.append(fit[1:], False) & _after(fit, round(_SETTLE_S * log.rate_hz / every)))
             push.append((np.diff(command.ravel(), prepend=command[0, 0]) ** 2).reshape(count, every).sum(1))
             gained = None if speed is None else np.append(np.diff(speed), 0.0)

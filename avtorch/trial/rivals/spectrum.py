@@ -12,14 +12,15 @@ which is the Gaussian likelihood up to edges and gaps (Whittle 1953), and costs 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import next_fast_len, rfft
+from scipy.fft import next_fast_len
 from scipy.optimize import minimize
 
 Float = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+Complex = NDArray[Any]  # complex, or real where it happens to be
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,7 @@ class Spectrum:
 
     def __init__(self, valid: NDArray[np.bool_], step: float, channels: tuple[str, ...]) -> None:
         self.rows, self.step, self.channels = int(valid.sum()), step, channels
-        self.length = next_fast_len(len(valid), real=True)
+        self.length = int(next_fast_len(len(valid), real=True) or len(valid))
         count = self.length // 2 + 1
         self.frequency = 2 * np.pi * np.arange(count) / self.length  # per row
         self.weight = np.ones(count)
@@ -53,7 +54,7 @@ class Spectrum:
 
     def transform(self, residual: Float) -> Complex:
         """(..., channel, row) to (..., frequency, channel)."""
-        return np.moveaxis(rfft(residual, self.length), -1, -2)
+        return np.moveaxis(np.fft.rfft(residual, self.length), -1, -2)
 
     def bands(self, transformed: Complex) -> Complex:
         """Mean of `R R*` / rows by band: (band, channel, channel)."""
@@ -132,8 +133,8 @@ def _coloured(turn: Complex, ratio: float) -> Float:
 def _inverse(matrix: Complex) -> tuple[Complex, Float]:
     """Inverse and log determinant of Hermitian matrices (..., n, n), n at most 2."""
     if matrix.shape[-1] == 1:
-        return 1 / matrix, np.log(matrix[..., 0, 0].real)
-    a, b, d = matrix[..., 0, 0].real, matrix[..., 0, 1], matrix[..., 1, 1].real
+        return 1 / matrix, np.log(np.real(matrix[..., 0, 0]))
+    a, b, d = np.real(matrix[..., 0, 0]), matrix[..., 0, 1], np.real(matrix[..., 1, 1])
     det = np.maximum(a * d - np.abs(b) ** 2, 1e-30)
     inverse = np.empty_like(matrix)
     inverse[..., 0, 0], inverse[..., 1, 1] = d / det, a / det

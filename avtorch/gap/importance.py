@@ -1,0 +1,79 @@
+"""Draws of a posterior with cliffs, on which no gradient leads: importance sampling whose proposals adapt.
+
+Rounds of proposals, the first from Laplace's approximation with heavy tails, each next one from kernels about the
+places that weigh most so far; all rounds count together, each place held against the mixture of all proposals
+(Cornuet et al. 2012). A round's weights are tempered as far as they would else rest on a handful of places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln, logsumexp
+
+Float = NDArray[np.float64]
+
+_DEGREES = 5.0  # of the t distributions proposed from
+_KERNELS = 60
+_CARRIED = 20.0  # effective places that shape the next round
+
+
+def importance(
+    log_prob: Callable[[Float], Float], centre: Float, scale: Float, *, rounds: int, size: int, seed: int
+) -> tuple[Float, Float]:
+    """Places (place, coordinate) and their weights (place,), which sum to one.
+
+    `log_prob`: of (place, coordinate), (place,). `scale`: a triangular root of Laplace's covariance at `centre`.
+    """
+    rng = np.random.default_rng(seed)
+    dim = len(centre)
+    proposals = [(centre[None], 1.2 * scale)]
+    places, values = np.zeros((0, dim)), np.zeros(0)
+    weights = np.zeros(0)
+    for turn in range(rounds):
+        centres, root = proposals[-1]
+        tails = np.sqrt(_DEGREES / rng.chisquare(_DEGREES, size))[:, None]
+        fresh = centres[rng.integers(len(centres), size=size)] + tails * (rng.standard_normal((size, dim)) @ root.T)
+        found = log_prob(fresh)
+        places = np.concatenate([places, fresh])
+        values = np.concatenate([values, np.where(np.isfinite(found), found, -np.inf)])
+        proposed = np.stack([_density(places, *p) for p in proposals])
+        ratios = values - logsumexp(proposed, axis=0) + np.log(len(proposals))
+        weights = np.exp(ratios - logsumexp(ratios))
+        if turn + 1 < rounds:
+            shape = _tempered(ratios)
+            mean = shape @ places
+            apart = places - mean
+            covariance = (apart * shape[:, None]).T @ apart + 1e-4 * scale @ scale.T
+            width = (4 / (dim + 2) / effective(shape)) ** (1 / (dim + 4))
+            kernels = places[rng.choice(len(places), _KERNELS, p=shape)]
+            proposals.append((kernels, width * np.linalg.cholesky(covariance)))
+    return places, weights
+
+
+def effective(weights: Float) -> float:
+    """How many equal draws the weights are worth."""
+    return float(1 / np.sum(weights**2))
+
+
+def _tempered(ratios: Float) -> Float:
+    power = 1.0
+    for _ in range(40):
+        weights = np.exp(power * (ratios - ratios.max()))
+        weights /= weights.sum()
+        if effective(weights) >= _CARRIED:
+            break
+        power *= 0.8
+    return weights
+
+
+def _density(places: Float, centres: Float, root: Float) -> Float:
+    """Log density (place,) of an equal mixture of t distributions about `centres` (kernel, coordinate)."""
+    dim = places.shape[1]
+    turned = np.linalg.solve(root, places.T).T[:, None] - np.linalg.solve(root, centres.T).T
+    square = (turned**2).sum(-1)
+    inside = -0.5 * (_DEGREES + dim) * np.log1p(square / _DEGREES)
+    norm = gammaln(0.5 * (_DEGREES + dim)) - gammaln(0.5 * _DEGREES) - 0.5 * dim * np.log(_DEGREES * np.pi)
+    return logsumexp(inside, axis=1) - np.log(len(centres)) + norm - np.log(np.abs(np.diag(root))).sum()

@@ -1,0 +1,242 @@
+"""The posterior density of a found candidate's parameters, exact and with its gradient.
+
+Rollouts are torch and differentiable; making errors white is one fixed linear map `W` of long columns, so the gradient
+of `-|W e|² / 2` is `Wᵀ W e` sent back through the rollout, with `Wᵀ` the same filter run backward in time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from avtorch.gap.adjoint import adjoint
+from avtorch.gap.candidate import Candidate
+from avtorch.gap.innovations import Whitener
+from avtorch.gap.noise_fit import CALM
+from avtorch.gap.plant import GapPlant, plant
+from avtorch.gap.slope import Slope
+from avtorch.inference.priors import LogSpaceNormal
+
+if TYPE_CHECKING:
+    from avtorch.gap.search import Found
+
+Float = NDArray[np.float64]
+
+_FURTHEST = 10.0
+"""Beyond so many standard deviations of the prior the likelihood stays what it is there: no rollout of infinities."""
+_BLOCK = 2**18
+"""Columns times rows of one rollout: few enough to stay in the processor's cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class RolloutDensity:
+    """Log joint density of errors and coordinates `z`: an `avtorch.inference.Density` of a single window.
+
+    A priori `z` is standard normal. The noise model is held, and so is the row `onset` from which the effects act
+    (None: from the start). `parts`: the whiteners and which of the counted rows each of them judges. The coefficients
+    of a road's slope and its size are integrated out.
+    """
+
+    candidate: Candidate
+    parts: tuple[tuple[Whitener, slice], ...]
+    centre: Float
+    onset: int | None = None
+
+    windows = 1
+
+    @classmethod
+    def of(cls, found: Found) -> RolloutDensity:
+        """With noise and onset as found. Before a gust's onset the force is calm."""
+        record, noise = found.candidate.record, found.noise.noise
+        acting = acting_onset(found)
+        strong = Whitener(record, noise)
+        parts: tuple[tuple[Whitener, slice], ...] = ((strong, slice(0, record.rows)),)
+        if found.gust and found.onset is not None and acting is None:
+            calm = Whitener(record, noise.replaced(force_sd=min(CALM, noise.force_sd)))
+            parts = ((calm, slice(0, found.onset)), (strong, slice(found.onset, record.rows)))
+        return cls(found.candidate, parts, np.asarray(found.z, float), acting)
+
+    # the Density -----------------------------------------------------------------------------------------------------
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(c.key for c in self.candidate.coordinates)
+
+    @cached_property
+    def prior(self) -> LogSpaceNormal:
+        size = self.candidate.size
+        return LogSpaceNormal(
+            torch.zeros(1, size, dtype=torch.float64), torch.eye(size, dtype=torch.float64)[None]
+        )
+
+    def select(self, index: Tensor) -> RolloutDensity:
+        """Itself, its only window."""
+        return self
+
+    def initial(self) -> Tensor:
+        return torch.as_tensor(self.centre)[None]
+
+    def constrain(self, z: Tensor) -> Tensor:
+        """Values of the plant's parameters, each in its unit."""
+        each = zip(self.candidate.coordinates, z.unbind(-1), strict=True)
+        return torch.stack([c.parameter.constrain(c.wider * x) for c, x in each], -1)
+
+    def unconstrain(self, values: Tensor) -> Tensor:
+        """`z` for values."""
+        each = zip(self.candidate.coordinates, values.unbind(-1), strict=True)
+        return torch.stack([c.parameter.unconstrain(x) / c.wider for c, x in each], -1)
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        """Of `z` (..., 1, coordinate): (..., 1). Differentiable once."""
+        return cast(Tensor, _Exact.apply(z, self))
+
+    def score(self, z: Tensor) -> Tensor:
+        """Gradient of `log_prob`, the shape of `z`."""
+        return self.expand(z)[1]
+
+    def expand(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Log density (..., 1) and its gradient (..., 1, coordinate)."""
+        values, scores = [], []
+        for some in self._blocks(z):
+            place = some.requires_grad_()
+            with torch.enable_grad():
+                rolled = self._rolled(place)
+                value, cotangent = self._judged(rolled.detach().numpy(), slope=True)
+                (score,) = torch.autograd.grad(rolled, place, torch.as_tensor(cotangent))
+            place = place.detach()  # NaN where a chain is lost, which its sampler has to see
+            values.append(torch.as_tensor(value))
+            scores.append(score - place)
+        return torch.cat(values).reshape(z.shape[:-1]) + self._prior(z), torch.cat(scores).reshape(z.shape)
+
+    def value(self, z: Tensor) -> Tensor:
+        """`log_prob` without a graph."""
+        with torch.no_grad():
+            values = [torch.as_tensor(self._judged(self._rolled(b).numpy())[0]) for b in self._blocks(z)]
+        return torch.cat(values).reshape(z.shape[:-1]) + self._prior(z)
+
+    # what it is made of ----------------------------------------------------------------------------------------------
+    def images(self, z: Tensor) -> Float:
+        """White errors (column, row) for `z` (column, coordinate)."""
+        with torch.no_grad():
+            return np.concatenate([self._image(self._errors(self._rolled(b).numpy())) for b in self._blocks(z)])
+
+    @cached_property
+    def constant(self) -> float:
+        """Of the log likelihood, what does not depend on the errors."""
+        rows = self.candidate.record.rows
+        return sum(white.constant * (part.stop - part.start) / rows for white, part in self.parts)
+
+    @cached_property
+    def slope(self) -> Slope | None:
+        """The slope that is integrated out; None where it is none of the candidate's effects."""
+        columns = self.candidate.grade_columns
+        if columns is None:
+            return None
+        if self.onset is not None:
+            columns = spliced(self.candidate, torch.as_tensor(columns), self.onset).numpy()
+        return Slope.of(self._image(columns))
+
+    def _prior(self, z: Tensor) -> Tensor:
+        return -0.5 * z.square().sum(-1)
+
+    def _blocks(self, z: Tensor) -> tuple[Tensor, ...]:
+        size = max(1, _BLOCK // sum(len(d.time) for d in self.candidate.record.drives))
+        return z.detach().reshape(-1, z.shape[-1]).split(size)
+
+    @cached_property
+    def _without(self) -> GapPlant:
+        return plant([], baseline=self.candidate.baseline).prepared(self.candidate.record.drives[0])
+
+    def _rolled(self, z: Tensor) -> Tensor:
+        """What the witnesses would have seen, (column, witness, counted, group)."""
+        keys = self.names
+        near = z.nan_to_num(0.0).clamp(-_FURTHEST, _FURTHEST)
+        values = dict(zip(keys, self.constrain(near).unbind(-1), strict=True))
+        full = self._responses(self.candidate.plant, values)
+        if self.onset is None:
+            return full
+        without = self._responses(self._without, {k: values[k] for k in ("T_L", "K_L")})
+        return without + spliced(self.candidate, full - without, self.onset)
+
+    def _responses(self, of: GapPlant, values: dict[str, Tensor]) -> Tensor:
+        record = self.candidate.record
+        responses = [of.response(drive, values) for drive in record.drives]
+        seen = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
+        source, columns = torch.as_tensor(record.source), len(values["T_L"])
+        parts = []
+        for name in record.witnesses:
+            whole = torch.cat([x.unflatten(-1, (-1, record.group)) for x in seen[name]], -2)
+            part = whole if len(source) == whole.shape[-2] else whole.index_select(-2, source)
+            parts.append(part.expand(columns, *part.shape[-2:]))
+        return torch.stack(parts, 1)
+
+    def _errors(self, rolled: Float) -> Float:
+        return self.candidate.record.measured - rolled
+
+    def _image(self, errors: Float) -> Float:
+        """White errors, every row once: (column, row)."""
+        return np.concatenate([w(errors)[:, :, part].reshape(len(errors), -1) for w, part in self.parts], 1)
+
+    def _judged(self, rolled: Float, *, slope: bool = False) -> tuple[Float, Float | None]:
+        """Log likelihood (column,) of rollouts and, if asked for its `slope`, the derivative in them."""
+        errors = self._errors(rolled)
+        whites = [w(errors) for w, _ in self.parts]
+        cut = [e[:, :, part] for e, (_, part) in zip(whites, self.parts, strict=True)]
+        flat = np.concatenate([e.reshape(len(errors), -1) for e in cut], 1)
+        value = self.constant - 0.5 * np.einsum("cr,cr->c", flat, flat)
+        if self.slope is not None:
+            gained, less = self.slope.gained(flat)
+            value, flat = value + gained, flat - less
+        if not slope:
+            return value, None
+        total, place = np.zeros_like(errors), 0
+        for (white, part), e, own in zip(self.parts, whites, cut, strict=True):
+            count = own[0].size
+            back = np.zeros_like(e)
+            back[:, :, part] = flat[:, place : place + count].reshape(own.shape)
+            place += count
+            total += adjoint(white, back)
+        return value, total
+
+
+class _Exact(torch.autograd.Function):
+    """The log density, its gradient kept from the forward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, z: Tensor, density: RolloutDensity) -> Tensor:
+        if not ctx.needs_input_grad[0]:
+            return density.value(z)
+        value, score = density.expand(z)
+        ctx.save_for_backward(score)
+        return value
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (score,) = ctx.saved_tensors
+        return gradient[..., None] * score, None
+
+
+def spliced(candidate: Candidate, apart: Tensor, onset: int) -> Tensor:
+    """What the effects do (column, witness, counted, group), put to nothing before `onset`; see `candidate.splice`."""
+    record = candidate.record
+    if "speed" in record.witnesses and onset < record.rows:
+        first = torch.zeros(apart.shape[1], 1, 1, dtype=apart.dtype)
+        first[-1] = 1.0
+        apart = apart - first * apart[:, -1:, onset : onset + 1, :1]
+    return apart * (torch.arange(record.rows) >= onset)[:, None]
+
+
+def acting_onset(found: Found) -> int | None:
+    """Row from which the deterministic effects of a find act; its `onset` may be that of a gust alone."""
+    if found.onset is None or not found.candidate.effects:
+        return None
+    if not found.gust:
+        return found.onset
+    late, whole = (found.candidate.errors(found.z[None], onset)[0] for onset in (found.onset, None))
+    distances = [float(np.abs(found.errors - e).max()) for e in (late, whole)]
+    return found.onset if distances[0] < distances[1] else None

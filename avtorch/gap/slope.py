@@ -1,0 +1,61 @@
+"""A road's slope integrated out: its coefficients exactly, its size over a grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+Float = NDArray[np.float64]
+
+SIZES = np.exp(np.linspace(np.log(2e-4), np.log(0.1), 97))
+"""Values of `grade_rms` over which is integrated."""
+_CENTRE, _SPREAD = 0.012, 1.2  # log-normal prior of `grade_rms`, the same as in `fit.py`
+
+
+@dataclass(frozen=True, eq=False)
+class Slope:
+    """White `image` (knot, row) of the slope's columns turned to principal axes, with their squares (knot,)."""
+
+    image: Float = field(repr=False)
+    squares: Float
+
+    @classmethod
+    def of(cls, image: Float) -> Slope:
+        """From the white image (knot, row) of each coefficient at `grade_rms` 1."""
+        squares, axes = np.linalg.eigh(image @ image.T)
+        return cls(axes.T @ image, np.maximum(squares, 0.0))
+
+    @property
+    def shrinkage(self) -> Float:
+        """(size, knot): how much of each axis' match is taken for slope."""
+        square = SIZES[:, None] ** 2
+        return square / (1 + square * self.squares)
+
+    @property
+    def prior(self) -> Float:
+        """(size,): log prior mass of each size, with what its coefficients' spread costs."""
+        away = (np.log(SIZES) - np.log(_CENTRE)) / _SPREAD
+        mass = np.log(np.log(SIZES[1] / SIZES[0]) / (_SPREAD * np.sqrt(2 * np.pi)))
+        return mass - 0.5 * away**2 - 0.5 * np.log1p(SIZES[:, None] ** 2 * self.squares).sum(1)
+
+    def by_size(self, match: Float) -> Float:
+        """Log likelihood gained (column, size) by errors whose `match` with the axes is (column, knot)."""
+        return self.prior + 0.5 * match**2 @ self.shrinkage.T
+
+    def gained(self, errors: Float) -> tuple[Float, Float]:
+        """Log likelihood gained (column,) by white errors (column, row), and what part of them is taken for slope."""
+        match = errors @ self.image.T
+        gains = self.by_size(match)
+        total = logsumexp(gains, axis=1)
+        shares = np.exp(gains - total[:, None])
+        return total, ((shares @ self.shrinkage) * match) @ self.image
+
+    def sampled(self, match: Float, rng: np.random.Generator) -> Float:
+        """`grade_rms` (column,) drawn given what errors have in common with the axes, (column, knot)."""
+        gains = self.by_size(match)
+        chosen = (gains + rng.gumbel(size=gains.shape)).argmax(1)
+        within = (rng.random(len(chosen)) - 0.5) * np.log(SIZES[1] / SIZES[0])
+        return SIZES[chosen] * np.exp(within)

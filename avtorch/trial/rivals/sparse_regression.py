@@ -1,0 +1,148 @@
+"""Sparse identification of nonlinear dynamics (Brunton et al. 2016) by PySINDy: which term do the equations want?
+
+da/dt is regressed on the command, on its response and on one effect's terms at a time, at about 20 Hz, by sequentially
+thresholded least squares, and so is what dv/dt has more than the measured acceleration. The effect whose terms gain
+most on held-out blocks is named, `none` where nothing gains. The slopes come from smoothing, as the method has it,
+which looks ahead: where a controller feeds noise back, that looks like a delay.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from avtorch.errors import InputError
+from avtorch.io import Log
+from avtorch.trial.reply import reply, softmax
+from avtorch.trial.rivals.terms import lagged, terms
+
+Float = NDArray[np.float64]
+_RATE_HZ = 20.0
+_BLOCKS = 10
+_SMOOTH_S = 0.1
+
+
+def pysindy() -> ModuleType:
+    """The package. Raises `InputError` that names the extra where it is missing."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import pysindy as package
+    except ImportError:
+        raise InputError("sparse_regression: needs PySINDy, pip install 'avtorch[bench]'") from None
+    return package
+
+
+def sparse_regression(log: Log) -> dict[str, Any]:
+    """Probabilities are in proportion to the exponential of the held-out gain [nats] less its parameters' price."""
+    package = pysindy()
+    every = max(1, round(log.rate_hz / _RATE_HZ))
+    step = every / log.rate_hz
+    if log.accel_cmd is None or log.rows < 10 * every * _BLOCKS:
+        raise InputError(f"{log.name}: found {log.rows} rows, needs {10 * every * _BLOCKS} and accel_cmd")
+    u, a, v = (None if x is None else _thin(x, every) for x in (log.accel_cmd, log.accel, log.speed))
+    assert u is not None
+    moving = _thin(log.usable.astype(float), every) == 1
+    wide = _SMOOTH_S / step
+    lag = _best_lag(u, a, v, moving, step)
+    response = lagged(u, lag, step)
+    # of the two slopes the acceleration's tells more of the actuator, the speed's is all there is without it
+    if a is not None:
+        target = {"motion": gaussian_filter1d(a, wide, order=1) / step}
+        base = {"motion": [u, response], "difference": []}
+        if v is not None:
+            target["difference"] = gaussian_filter1d(v, wide, order=1) / step - gaussian_filter1d(a, wide)
+    else:
+        assert v is not None
+        target, base = {"motion": gaussian_filter1d(v, wide, order=1) / step}, {"motion": [response]}
+    # the smoothing of the slopes would be taken for a second pole, were the columns not smoothed as well
+    base = {name: [gaussian_filter1d(x, wide) for x in columns] for name, columns in base.items()}
+    block = np.arange(len(u)) * _BLOCKS // len(u)
+    plain = {name: _held_out(package, target[name], base[name], block, moving, step) for name in target}
+    found: dict[str, float] = {"none": 0.0}
+    speed = None if v is None else gaussian_filter1d(v, wide)
+    for name, equation, columns in terms(u, response, speed, step, (a is not None) + (v is not None)):
+        columns = [gaussian_filter1d(x, wide) for x in columns]
+        errors = _held_out(package, target[equation], [*base[equation], *columns], block, moving, step)
+        worth = _worth(plain[equation])
+        ratio = float(np.mean(plain[equation] ** 2) / np.mean(errors**2))
+        found[name] = 0.5 * worth * math.log(ratio) - 0.5 * len(columns) * math.log(worth)
+    best = max(found, key=lambda one: found[one])
+    weights = softmax(list(found.values()))
+    return reply(
+        log,
+        dict(zip(found, weights.tolist(), strict=True)),
+        why="no term gains on held-out blocks" if best == "none" else f"its terms gain most, {found[best]:.1f} nats",
+        log_evidence=found,
+    )
+
+
+def _thin(x: Float, every: int) -> Float:
+    return x[: len(x) // every * every].reshape(-1, every).mean(1)
+
+
+def _best_lag(u: Float, a: Float | None, v: Float | None, moving: NDArray[np.bool_], step: float) -> float:
+    """The lag [s] whose response to the command is nearest to the acceleration, up to a gain."""
+    assert a is not None or v is not None
+    seen = gaussian_filter1d(v, _SMOOTH_S / step, order=1) / step if a is None and v is not None else a
+
+    def miss(lag: float) -> float:
+        x = lagged(u, lag, step)[moving]
+        y = np.asarray(seen)[moving]
+        return float(y @ y - (x @ y) ** 2 / max(x @ x, 1e-12))
+
+    return min(np.geomspace(0.05, 2.0, 30).tolist(), key=miss)
+
+
+def _held_out(
+    package: ModuleType,
+    slope: Float,
+    columns: list[Float],
+    block: NDArray[np.intp],
+    moving: NDArray[np.bool_],
+    step: float,
+) -> Float:
+    """Errors of the sparse model at rows that it was not fitted to."""
+    if not columns:
+        return slope[moving]
+    x = np.stack(columns, 1)
+    scale = np.maximum(np.sqrt(np.mean(x[moving] ** 2, 0)), 1e-9)
+    x = x / scale
+    size = float(slope[moving].std())
+    errors = []
+    for half in range(2):
+        held = moving & (block % 2 == half)
+        seen = moving & ~held
+        if held.sum() < 20 or seen.sum() < 20:
+            continue
+        model = package.SINDy(
+            optimizer=package.STLSQ(threshold=0.005 * size, alpha=1e-6),
+            feature_library=package.IdentityLibrary(),
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            # all columns but the first go in as inputs: the equation sought is that of the slope alone
+            model.fit(x[seen, :1], t=step, x_dot=slope[seen, None], u=x[seen, 1:] if x.shape[1] > 1 else None)
+            told = model.predict(x[held, :1], u=x[held, 1:] if x.shape[1] > 1 else None)
+        errors.append(slope[held] - np.asarray(told)[:, 0])
+    if not errors:
+        raise InputError("sparse_regression: too little motion in the log, needs 40 rows at 20 Hz")
+    return np.concatenate(errors)
+
+
+def _worth(errors: Float) -> float:
+    """How many independent rows they are worth, by their first autocorrelations."""
+    e = errors - errors.mean()
+    lags = [float(e[i:] @ e[: len(e) - i] / (e @ e)) for i in range(1, 20)]
+    total = 0.0
+    for r in lags:
+        if r < 0.05:
+            break
+        total += r
+    return max(len(e) / (1 + 2 * total), 10.0)

@@ -1,0 +1,52 @@
+"""The confusion matrix shows every case once, in the right cell."""
+
+from __future__ import annotations
+
+import pytest
+from matplotlib.figure import Figure
+
+from avtorch import plots
+from avtorch.errors import InputError
+
+COUNTS = {
+    "none": {"none": 9, "gust": 1},
+    "unknown": {"unknown": 3, "aerodynamic_drag": 2},
+    "sensor_lag": {"sensor_lag": 4, "dead_time+sensor_lag": 1},
+    "dead_time+gust": {"dead_time+gust": 5, "dead_time+sensor_lag": 2, "failed": 1},
+    "aerodynamic_drag+gust": {"aerodynamic_drag": 2},
+}
+
+
+def cells(ax) -> dict[tuple[str, str], int]:
+    rows = [t.get_text().rsplit("  (", 1)[0] for t in ax.get_yticklabels()]
+    columns = [t.get_text() for t in ax.get_xticklabels()]
+    return {
+        (rows[round(t.get_position()[1])], columns[round(t.get_position()[0])]): int(t.get_text()) for t in ax.texts
+    }
+
+
+def test_every_case_is_drawn_once_and_pairs_are_put_together() -> None:
+    ax = Figure().subplots()
+    assert plots.confusion(ax, COUNTS) is ax
+    assert cells(ax) == {
+        ("none", "none"): 9,
+        ("none", "gust"): 1,
+        ("outside the table", "outside the table"): 3,
+        ("outside the table", "aerodynamic drag"): 2,
+        ("sensor lag", "sensor lag"): 4,
+        ("sensor lag", "another pair"): 1,
+        ("a pair", "a pair"): 5,
+        ("a pair", "another pair"): 2,
+        ("a pair", "no answer"): 1,
+        ("a pair", "aerodynamic drag"): 2,
+    }
+    assert [t.get_text() for t in ax.get_yticklabels()] == [
+        "none  (10)", "sensor lag  (5)", "a pair  (10)", "outside the table  (5)"
+    ]  # fmt: skip
+
+
+def test_figure_and_nothing_to_draw() -> None:
+    figure = plots.confusion_figure({"confusion": COUNTS, "cases": 30, "answerer": "avtorch", "signals": ["accel"]})
+    assert "21 of 30" in figure.axes[0].get_title(loc="left")
+    with pytest.raises(InputError, match="counts: found no case"):
+        plots.confusion(Figure().subplots(), {})

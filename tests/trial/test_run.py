@@ -1,0 +1,119 @@
+"""A trial keeps what was answered, does only what is missing, and scores all who answered alike."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from avtorch.errors import InputError
+from avtorch.io import Log
+from avtorch.trial import reply, run_trial
+from avtorch.trial.rivals import random_guess
+
+SHORT = {"seconds": 60.0, "tiers": ("easy",)}
+KEYS = {
+    *("cases", "seed", "top1", "alias_set", "false_alarm", "unknown_auroc", "unknown_fpr95"),
+    *("unknown_confidently_blamed", "ece", "brier", "macro_f1", "pairs_exact", "pairs_jaccard", "closed_error"),
+    *("placebo_closed", "onset_error_s", "seconds_per_case", "baselines", "confusion"),
+}
+
+
+class Asked:
+    """Says `none`, and remembers which logs it was shown."""
+
+    def __init__(self) -> None:
+        self.logs: list[Log] = []
+
+    def __call__(self, log: Log) -> dict[str, Any]:
+        self.logs.append(log)
+        return reply(log, {"none": 1.0}, why="always")
+
+
+def test_answers_are_kept_and_only_missing_ones_are_asked_for(tmp_path: Path) -> None:
+    first, steps = Asked(), []
+    found = run_trial(6, 4, tmp_path, answerers={"says_none": first}, progress=lambda *s: steps.append(s), **SHORT)
+    assert [log.name for log in first.logs] == [f"case_{i:05d}" for i in range(6)]
+    assert steps == [(i, 6) for i in range(7)]
+    assert json.loads((tmp_path / "blindtest.json").read_text(encoding="utf-8")) == found
+    assert found["schema"] == "avtorch.blindtest/1"
+    assert found.keys() >= KEYS
+    assert found["false_alarm"] in (0.0, None)
+    assert found["baselines"] == {}
+
+    again, guess = Asked(), {"random_guess": random_guess}
+    (tmp_path / "answers" / "says_none" / "case_00003.json").unlink()
+    more = run_trial(7, 4, tmp_path, answerers={"says_none": again, **guess}, **SHORT)
+    assert [log.name for log in again.logs] == ["case_00003", "case_00006"]
+    assert set(more["baselines"]) == {"random_guess"}
+    assert KEYS - {"cases", "seed", "baselines"} <= more["baselines"]["random_guess"].keys()
+    assert sum(sum(row.values()) for row in more["confusion"].values()) == 7
+    # truths lie apart from what an answerer is shown
+    assert not {"truth", "logs"} & {p.name for p in (tmp_path / "answers").rglob("*")}
+
+
+def test_other_settings_need_another_folder(tmp_path: Path) -> None:
+    run_trial(1, 4, tmp_path, answerers={"says_none": Asked()}, **SHORT)
+    with pytest.raises(InputError, match="trial with seed 4; found 5"):
+        run_trial(1, 5, tmp_path, answerers={"says_none": Asked()}, **SHORT)
+    with pytest.raises(InputError, match="signals"):
+        run_trial(1, 4, tmp_path, answerers={"says_none": Asked()}, signals=("speed",), **SHORT)
+    # a vehicle that has changed makes another case of the same number
+    truth = tmp_path / "truth" / "case_00000.json"
+    told = json.loads(truth.read_text(encoding="utf-8"))
+    truth.write_text(json.dumps(told | {"visibility": 1.0}), encoding="utf-8")
+    with pytest.raises(InputError, match="comes out otherwise"):
+        run_trial(1, 4, tmp_path, answerers={"other": Asked()}, **SHORT)
+
+
+def test_who_fails_or_breaks_the_schema_has_not_answered(tmp_path: Path) -> None:
+    def fails(log: Log) -> dict[str, Any]:
+        raise ValueError("out of ideas")
+
+    def breaks(log: Log) -> dict[str, Any]:
+        answer = reply(log, {"none": 1.0}, why="half")
+        answer["effects"][0]["probability"] = 0.5
+        return answer
+
+    def not_finite(log: Log) -> dict[str, Any]:
+        return reply(log, {"none": 1.0}, why="nan") | {"onset_s": float("nan")}
+
+    every = {"fails": fails, "breaks": breaks, "not_finite": not_finite}
+    found = run_trial(2, 4, tmp_path, answerers=every, **SHORT)
+    assert found["failed"] == 2
+    assert found["failures"] == ["ValueError: out of ideas"]
+    assert {v for row in found["confusion"].values() for v in row} == {"failed"}
+    assert "probabilities sum to 0.5" in found["baselines"]["breaks"]["failures"][0]
+    assert found["baselines"]["not_finite"]["failed"] == 2
+
+
+@pytest.mark.slow
+def test_two_processes_and_kept_logs_say_the_same_as_one(tmp_path: Path) -> None:
+    guess = {"random_guess": random_guess}
+    one = run_trial(4, 4, tmp_path / "one", answerers=guess, keep_logs=True, signals=("accel",), **SHORT)
+    two = run_trial(4, 4, tmp_path / "two", answerers=guess, workers=2, signals=("accel",), **SHORT)
+    for folder in (tmp_path / "one" / "answers").rglob("*.json"):
+        folder.unlink()
+    kept = run_trial(4, 4, tmp_path / "one", answerers=guess, signals=("accel",), **SHORT)
+    times = ("seconds_per_case", "cpu_seconds_per_case", "intervals")
+    for other in (two, kept):
+        assert {k: v for k, v in other.items() if k not in times} == {k: v for k, v in one.items() if k not in times}
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"n": 0}, "n: found 0"),
+        ({"workers": 0}, "workers: found 0"),
+        ({"answerers": {}}, "answerers: found none"),
+        ({"answerers": {"../up": random_guess}}, "answerers: found the name"),
+        ({"signals": ("jerk",)}, "signals: found"),
+    ],
+)
+def test_bad_arguments_are_refused(change: dict, told: str, tmp_path: Path) -> None:
+    given = {"n": 1, "seed": 0, "out": tmp_path / "out", "answerers": {"guess": random_guess}} | change
+    with pytest.raises(InputError, match=told):
+        run_trial(**given)
+    assert not (tmp_path / "out").exists()
