@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from avtorch.decision.strategist import Strategist
     from avtorch.decision.supervisor import Supervisor
     from avtorch.errors import InputError
+    from avtorch.gap.diagnose import diagnose
+    from avtorch.gap.diagnosis import Diagnosis
     from avtorch.inference import SGLD, BeliefStream, SequentialInference
     from avtorch.io import Log
     from avtorch.validation import Validation, validate
@@ -44,6 +46,8 @@ _HOME = {
     "avtorch.decision.strategist": ("Strategist",),
     "avtorch.decision.supervisor": ("Supervisor",),
     "avtorch.errors": ("InputError",),
+    "avtorch.gap.diagnose": ("diagnose",),
+    "avtorch.gap.diagnosis": ("Diagnosis",),
     "avtorch.inference": ("SGLD", "BeliefStream", "SequentialInference"),
     "avtorch.io": ("Log",),
     "avtorch.validation": ("Validation", "validate"),
@@ -68,6 +72,7 @@ __all__ = [
     "SGLD",
     "BeliefStream",
     "ClosedLoop",
+    "Diagnosis",
     "Estimates",
     "GLVDPlant",
     "InputError",
@@ -83,6 +88,7 @@ __all__ = [
     "Validation",
     "algorithm2",
     "decision",
+    "diagnose",
     "estimate",
     "gap",
     "inference",

@@ -151,7 +151,7 @@ class Candidate:
 
 
 def splice(record: Record, full: Float, without: Float, onset: int) -> Float:
-    """Rollouts (column, witness, counted, group) that are `without` before counted row `onset` and go on as `full` does."""
+    """Rollouts (column, witness, counted, group) `without` before counted row `onset`, going on as `full` does."""
     apart = full - without
     if record.speed is not None and onset < record.rows:
         apart[:, -1] -= apart[:, -1, onset, :1][:, :, None]

@@ -53,7 +53,10 @@ def tails(errors: Float, dt: float) -> Tails:
     away = away / np.maximum(sd, rough)
 
     def ratios(z: Float) -> Float:
-        fraction, scale = np.exp(_TAIL_PRIOR[0][0] + _TAIL_PRIOR[0][1] * z[0]), np.exp(_TAIL_PRIOR[1][0] + _TAIL_PRIOR[1][1] * z[1])
+        fraction, scale = (
+            np.exp(_TAIL_PRIOR[0][0] + _TAIL_PRIOR[0][1] * z[0]),
+            np.exp(_TAIL_PRIOR[1][0] + _TAIL_PRIOR[1][1] * z[1]),
+        )
         fraction = min(fraction, 0.5)
         # in units of the distances' own sd, which is some 1.15 of the noise's
         wide = 1 + (scale / 1.15) ** 2
@@ -174,7 +177,9 @@ def losses(white: Whitener, errors: Float, command: Float, T_L: float, K_L: floa
     whole[strong] = rows[best]
     onset, more = _onset(whole, dt)
     sd = float(np.sqrt(share @ (logit - share @ logit) ** 2))
-    return Losses(evidence + float(np.logaddexp(0.0, more) - np.log(2.0)), mean, max(sd, 1e-3), onset if more > 1 else None)
+    return Losses(
+        evidence + float(np.logaddexp(0.0, more) - np.log(2.0)), mean, max(sd, 1e-3), onset if more > 1 else None
+    )
 
 
 def _late(image: Float, rows: int, length: int) -> Float:

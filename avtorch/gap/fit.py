@@ -177,12 +177,16 @@ def finish(candidate: Candidate, white: Whitener, z: Float, onset: int | None = 
             part[:, :onset] = 0.0
         errors = errors - part
     log_joint = white.constant - float(value)
-    return Fit(
-        z=z,
-        covariance=np.linalg.inv(square),
-        errors=errors,
-        log_joint=log_joint,
-        log_evidence=log_joint - 0.5 * float(np.linalg.slogdet(square)[1]),
-        grade_rms=rms,
-        profile=profile,
-    ) if size else Fit(z, np.zeros((0, 0)), errors, log_joint, log_joint)
+    return (
+        Fit(
+            z=z,
+            covariance=np.linalg.inv(square),
+            errors=errors,
+            log_joint=log_joint,
+            log_evidence=log_joint - 0.5 * float(np.linalg.slogdet(square)[1]),
+            grade_rms=rms,
+            profile=profile,
+        )
+        if size
+        else Fit(z, np.zeros((0, 0)), errors, log_joint, log_joint)
+    )

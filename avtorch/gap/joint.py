@@ -24,7 +24,7 @@ from avtorch.gap.slope import Slope
 from avtorch.inference.priors import LogSpaceNormal
 
 if TYPE_CHECKING:
-    from avtorch.gap.search import Found
+    from avtorch.gap.found import Found
 
 Float = NDArray[np.float64]
 
@@ -70,9 +70,7 @@ class RolloutDensity:
     @cached_property
     def prior(self) -> LogSpaceNormal:
         size = self.candidate.size
-        return LogSpaceNormal(
-            torch.zeros(1, size, dtype=torch.float64), torch.eye(size, dtype=torch.float64)[None]
-        )
+        return LogSpaceNormal(torch.zeros(1, size, dtype=torch.float64), torch.eye(size, dtype=torch.float64)[None])
 
     def select(self, index: Tensor) -> RolloutDensity:
         """Itself, its only window."""
@@ -237,6 +235,14 @@ def acting_onset(found: Found) -> int | None:
         return None
     if not found.gust:
         return found.onset
-    late, whole = (found.candidate.errors(found.z[None], onset)[0] for onset in (found.onset, None))
-    distances = [float(np.abs(found.errors - e).max()) for e in (late, whole)]
-    return found.onset if distances[0] < distances[1] else None
+    # if they set in with the gust, errors before it are those of the bare baseline
+    late = found.candidate.errors(found.z[None], found.onset)[0][:, : found.onset]
+    return found.onset if np.allclose(late, found.errors[:, : found.onset], rtol=0, atol=1e-9) else None
+
+
+def root(covariance: Float) -> Tensor:
+    """A lower triangular root of a covariance, sound also where rounding left it without one."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    half = vectors * np.sqrt(np.maximum(values, 1e-14))
+    lower = torch.linalg.qr(torch.as_tensor(half.T.copy())).R.mT
+    return lower * torch.sign(lower.diagonal())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +80,7 @@ def fit_noise(
     onset: int | None = None,
     iterations: int = 6,
 ) -> NoiseFit:
-    """Mode of the noise's parameters given the errors (witness, counted, group) of a rollout; `T_L` [s] of the plant."""
+    """Mode of the noise's parameters given the errors (witness, counted, group) of a rollout; `T_L` [s]."""
     means = np.array([priors[n][0] for n in NAMES])
     means[NAMES.index("process_time")] += np.log(T_L)
     sds, ends = (np.array([priors[n][k] for n in NAMES]) for k in (1, 2))
@@ -107,6 +108,16 @@ def fit_noise(
     z = np.clip((begin - means) / sds, -ends, ends)
     rows = likelihoods(z)
     value = float(rows.sum()) - 0.5 * float(z @ z)
+    if not 0.5 < float((Whitener(record, replace(model(z), within=None))(mean) ** 2).mean()) < 2.0:
+        # far off: scores mislead, so begin at the best of a coarse grid of sizes
+        for shifts in product((-1.4, 0.0, 1.4), repeat=3):
+            other = z.copy()
+            for name, shift in zip(("process_sd", "accel_sd", "speed_sd"), shifts, strict=True):
+                other[NAMES.index(name)] = shift
+            tried = likelihoods(other)
+            worth = float(tried.sum()) - 0.5 * float(other @ other)
+            if worth > value:
+                z, rows, value = other, tried, worth
     damping, information = 1e-2, np.eye(len(z))
     for _ in range(iterations):
         ahead = z + _STEP * np.eye(len(z))

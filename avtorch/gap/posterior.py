@@ -16,21 +16,27 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from avtorch.errors import InputError
+from avtorch.gap.found import Found
 from avtorch.gap.importance import effective, importance
-from avtorch.gap.joint import RolloutDensity
-from avtorch.gap.search import Found
+from avtorch.gap.joint import RolloutDensity, root
+from avtorch.gap.reported import drawn, moved, repaired, reported
 from avtorch.gap.surrogate import Corrected, Surrogate, trusted_square
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.sampler import SamplerSettings, sample
 from avtorch.inference.whitening import Coordinates, stiffness
+
+__all__ = ["Draws", "drawn", "exact_one_in", "fitted", "moved", "posterior", "repaired", "reported"]
 
 Float = NDArray[np.float64]
 
 STEP = 2.0
 """SGLD's step in whitened coordinates; see `SamplerSettings`."""
 _INFLATED = 0.02  # of a variance, by the noise of gradients
+_THROWN = 3.0  # [posterior standard deviations] by one correction
+_RAREST = 16.0
+_CLIFF = 9.0  # mean square of what the surrogate's whitened gradient lacks, where no step suits the posterior
 _STEPS = 500.0  # SGLD steps affordable
-_ROWS = 3e7  # rows of exact gradients affordable, some ten seconds of one core
+_ROWS = 2.5e7  # rows of exact gradients affordable, some ten seconds of one core
 _FEWEST = 30.0  # effective draws, fewer than which are none
 
 
@@ -64,16 +70,17 @@ def posterior(found: Found, *, chains: int = 16, draws: int = 50, seed: int = 0)
     surrogate, mode = fitted(density, found.covariance)
     generator = torch.Generator().manual_seed(seed)
     points = exact_one_in(density, surrogate, mode, generator)
-    z, why = _walked(Corrected(density, surrogate, mode, points), chains, draws, generator)
-    method, share, worth = "sgld", 1 / points, 0.0
-    if z is None:
+    z, why = None, "gradients jump within a posterior standard deviation"
+    if points:
+        z, why = _walked(Corrected(density, surrogate, mode, points), chains, draws, generator)
+    if z is not None:
+        method, share, worth = "sgld", 1 / points, _worth(z)
+    else:
         z, worth = _weighted(density, mode, chains, draws, seed)
         method, share = "importance" if worth >= _FEWEST else "laplace", 1.0
         if method == "laplace":
             noise = torch.randn(chains, draws, density.candidate.size, dtype=torch.float64, generator=generator)
             z = torch.as_tensor(found.z) + noise @ root(found.covariance).mT
-    else:
-        worth = _worth(z)
     values = density.constrain(z)
     return Draws(
         names=density.names,
@@ -91,7 +98,7 @@ def _walked(target: Corrected, chains: int, draws: int, generator: torch.Generat
     """SGLD's draws of `z` (chain, draw, coordinate), or None and why not; no more gradients than are affordable."""
     density, mode = target.exact, target.mode
     pace = float(stiffness(density, Coordinates.of(mode)))
-    exact = max(1.0, chains / target.points)  # gradients a step
+    exact = chains / target.points  # gradients a step
     rows = sum(len(d.time) for d in density.candidate.record.drives)
     steps = min(_STEPS, _ROWS / rows / exact)
     thinning = 2 if draws * 2 + 4 <= steps else 1
@@ -163,28 +170,27 @@ def fitted(density: RolloutDensity, covariance: Float) -> tuple[Surrogate, Mode]
     return surrogate, Mode(mode.z, mode.scale, exact, mode.converged)
 
 
-def root(covariance: Float) -> Tensor:
-    """A lower triangular root of a covariance, sound also where rounding left it without one."""
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    half = vectors * np.sqrt(np.maximum(values, 1e-14))
-    lower = torch.linalg.qr(torch.as_tensor(half.T.copy())).R.mT
-    return lower * torch.sign(lower.diagonal())
-
-
 def exact_one_in(density: RolloutDensity, surrogate: Surrogate, mode: Mode, generator: torch.Generator) -> int:
     """One gradient in how many has to be exact, so that their noise widens the posterior by no more than told.
 
     A noise of variance s² in whitened gradients widens a variance by `step s² / 4`; correcting one in n leaves
-    `(n - 1)` times the square of what the surrogate lacks, measured at some draws from Laplace's approximation, a little widened.
+    `(n - 1)` times the square of what the surrogate lacks, measured at draws from Laplace's approximation, a little
+    widened. 0 where it lacks so much that the posterior has cliffs. Where the surrogate is trusted at the farthest,
+    one correction must not throw a chain far either.
     """
-    size = mode.z.shape[-1]
-    w = 1.2 * torch.randn(16, 1, size, dtype=mode.z.dtype, generator=generator)
-    w = w * (trusted_square(size) ** 0.5 / w.norm(dim=-1, keepdim=True)).clamp_max(1.0)
+    size, count = mode.z.shape[-1], 16
+    w = torch.randn(count + size, 1, size, dtype=mode.z.dtype, generator=generator)
+    edge, length = trusted_square(size) ** 0.5, w.norm(dim=-1, keepdim=True)
+    w = torch.cat([1.2 * w[:count] * (edge / (1.2 * length[:count])).clamp_max(1.0), w[count:] * edge / length[count:]])
     z = mode.z + w @ mode.scale[0].mT
-    lacking = ((density.score(z) - surrogate.score(z)) @ mode.scale[0]).square().mean(0).max()
-    if not bool(lacking.isfinite()):
-        return 1
-    return int(min(16.0, 1 + 4 * _INFLATED / (STEP * max(float(lacking), 1e-12))))
+    lacking = (density.score(z) - surrogate.score(z)) @ mode.scale[0]
+    if not bool(lacking.isfinite().all()):
+        return 0
+    typical = float(lacking[:count].square().mean(0).max().clamp_min(1e-12))
+    if typical > _CLIFF:
+        return 0
+    farthest = float(lacking[count:].abs().max().clamp_min(1e-12))
+    return int(min(_RAREST, 1 + 4 * _INFLATED / (STEP * typical), 1 + _THROWN / farthest))
 
 
 def _grade(density: RolloutDensity, z: Tensor, seed: int) -> Float | None:

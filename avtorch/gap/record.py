@@ -3,7 +3,8 @@
 Rows above some 20 Hz come in groups of which only the means pass the innovations filter; within a group the rows
 differ by sensor noise, which is white. Both parts count: a controller feeds the noise of a row back into the command
 of the next, and means alone would take that for a lag. Rollouts are made at the log's own rate; a search may begin
-with `coarse` ones, of averaged commands, whose groups have one row. Rows at standstill or with a driver's foot in (`engaged` 0) do not count.
+with `coarse` ones, of averaged commands, whose groups have one row. Rows at standstill or with a driver's foot in
+(`engaged` 0) do not count.
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ class Record:
     """Drives at the log's own rate, and where in one long array of rows averaged to `dt` [s] those stand that count.
 
     `accel`, `speed` (row, group): measured, over all drives' rows one after another; None: not in the log. `time`
-    (row,) [s], the log's own; `command` (row,), mean of a group. `source`, `target`: of every counted row its index in these arrays and in the padded one of
-    `length` rows that is filtered; `stretch` (counted,) numbers the stretches. `group`: rows averaged into one.
+    (row,) [s], the log's own; `command` (row,), mean of a group. `source`, `target`: of every counted row its index in
+    these arrays and in the padded one of `length` rows that is filtered; `stretch` (counted,) numbers the stretches.
+    `group`: rows averaged into one.
     """
 
     drives: tuple[Drive, ...]
@@ -75,9 +77,13 @@ class Record:
         drives: list[Drive] = []
         coarse: list[Drive] = []
         columns: dict[str, list[Float]] = {"time": [], "accel": [], "speed": [], "command": [], "use": []}
-        names = {log.name: (log.accel is not None, log.speed is not None) for log in each}
-        if len(set(names.values())) > 1:
+        names = list(dict.fromkeys(log.name for log in each))
+        if len({(log.accel is not None, log.speed is not None) for log in each}) > 1:
             raise InputError(f"logs: {', '.join(names)} have different witnesses; needs accel, speed or both in all")
+        rates = [log.rate_hz for log in each]
+        if max(rates) > 1.02 * min(rates):
+            told = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in each)
+            raise InputError(f"logs: found rates of {told}; needs one rate in all, or one diagnosis each")
         group = max(1, int(min(log.rate_hz for log in each) / rate_hz + 1e-6))
         steps = []
         for log in each:
@@ -123,7 +129,8 @@ class Record:
             return np.concatenate(columns[name]) if columns[name] else None
 
         time, command = whole("time"), whole("command")
-        assert time is not None and command is not None
+        assert time is not None
+        assert command is not None
         return cls(
             drives=tuple(drives),
             coarse=tuple(coarse or drives),
@@ -146,7 +153,7 @@ class Record:
         return out
 
     def seen(self, responses: Sequence[Tensor], *, coarse: bool = False) -> Float:
-        """Responses by drive, (..., time) each, at the rows that count: (..., counted, group), `coarse` with group 1."""
+        """Responses by drive, (..., time) each, at rows that count: (..., counted, group), `coarse` with group 1."""
         parts = []
         for x in responses:
             if self.group > 1 and coarse:

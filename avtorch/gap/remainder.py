@@ -70,10 +70,7 @@ def _columns(white: Whitener, rollout: Float) -> Float:
     witnesses = record.witnesses
     a = rollout[0] if "accel" in witnesses else lfilter([dt / 0.4], [1, dt / 0.4 - 1], u)
     moved = np.diff(a, prepend=a[0]) / dt
-    if "speed" in witnesses:
-        v = gaussian_filter1d(record.measured[-1].mean(-1), 0.5 / dt)
-    else:
-        v = np.zeros_like(a)
+    v = gaussian_filter1d(record.measured[-1].mean(-1), 0.5 / dt) if "speed" in witnesses else np.zeros_like(a)
     fast = max(float(np.quantile(v, 0.95)), 1.0)
     x, t = v / fast, np.linspace(-1, 1, len(a))
     back = {s: _late(a, round(s / dt)) for s in (0.3, 0.8, 2.0)}
@@ -137,7 +134,7 @@ def _line(e: Float) -> float:
 
 def _memory(e: Float, fold: NDArray[np.int64], order: int = 12) -> float:
     """Nats an autoregression of each witness on both gains on blocks it has not seen."""
-    count, rows = e.shape
+    _, rows = e.shape
     lagged = np.concatenate([[_late(x, k) for k in range(1, order + 1)] for x in e])
     lagged[:, :order] = 0.0
     scale = np.sqrt(rows)

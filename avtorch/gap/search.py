@@ -8,19 +8,22 @@ chance decides (gusts, outliers, lost messages) are judged on the errors that th
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.gap.candidate import Candidate
-from avtorch.gap.chance import Losses, Tails, losses, tails
+from avtorch.gap.chance import Tails, losses, tails
+from avtorch.gap.checkpoint import Checkpoint, Kept
 from avtorch.gap.effect import EFFECTS, Effect
 from avtorch.gap.fit import finish, modes
+from avtorch.gap.found import Found, Race, cleaned, merged, white_first
+from avtorch.gap.gusts import gust
 from avtorch.gap.innovations import NoiseModel, Whitener
-from avtorch.gap.noise_fit import GUST, PRIORS, NoiseFit, fit_noise, row_likelihoods
-from avtorch.gap.onset import allowed, averaged, profile, refined, rough
+from avtorch.gap.noise_fit import fit_noise
+from avtorch.gap.onset import averaged, refined, rough
 from avtorch.gap.plant import GapPlant
 from avtorch.gap.record import Record
 from avtorch.gap.starts import starts
@@ -35,50 +38,6 @@ _SECONDS = 3  # tried on each
 _CLOSE = 12.0  # nats within which a single effect stays in the race for a partner
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """A candidate fitted: `name`, `z` and parameter `values` at the mode, `log_evidence` [nats], `errors`.
-
-    `onset`: counted row from which it acts, None: from the start. `gain`: log likelihood over the baseline's.
-    `chance`: what random effects among its names found.
-    """
-
-    name: str
-    candidate: Candidate
-    z: Float = field(repr=False)
-    covariance: Float = field(repr=False)
-    values: Mapping[str, float]
-    noise: NoiseFit = field(repr=False)
-    log_evidence: float
-    log_likelihood: float
-    errors: Float = field(repr=False)
-    onset: int | None = None
-    grade_rms: float | None = None
-    profile: Float | None = field(default=None, repr=False)
-    tails: Tails | None = field(default=None, repr=False)
-    losses: Losses | None = field(default=None, repr=False)
-    gust: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Race:
-    """All candidates found, most evidence first, and what they were found on."""
-
-    record: Record
-    raw: Record
-    logs: tuple[Log, ...]
-    found: tuple[Found, ...]
-    complete: bool
-
-    @property
-    def none(self) -> Found:
-        return next(f for f in self.found if f.name == "none")
-
-    @property
-    def best(self) -> Found:
-        return self.found[0]
-
-
 class Search:
     """One search over one or several logs of a car."""
 
@@ -91,6 +50,7 @@ class Search:
         pairs: bool = True,
         budget_s: float | None = None,
         progress: Progress | None = None,
+        checkpoint: Checkpoint | None = None,
     ) -> None:
         self.logs, self.baseline, self.pairs = tuple(logs), baseline, pairs
         own = {e.name for e in baseline.effects}
@@ -99,6 +59,7 @@ class Search:
         self.until = None if budget_s is None else time.monotonic() + budget_s
         self.progress = progress or (lambda what, done, of: None)
         self.complete = True
+        self.checkpoint = checkpoint or Checkpoint(None)
 
     # the whole ---------------------------------------------------------------------------------------------------
     def run(self) -> Race:
@@ -110,7 +71,7 @@ class Search:
         if self._has("outliers") and record.accel is not None:
             glitches = self._tails(raw, none)
             if glitches.hit.any() and glitches.evidence > 2:
-                logs = _cleaned(logs, raw, glitches)
+                logs = cleaned(logs, raw, glitches)
                 record = Record.of(logs)
                 none = self._none(record)
         found = self._deterministic(record, none)
@@ -118,8 +79,10 @@ class Search:
             again = self._tails(raw, max(found, key=lambda f: f.log_evidence))
             was = glitches is not None and glitches.evidence > 2 and bool(glitches.hit.any())
             now = again.evidence > 2 and bool(again.hit.any())
-            if was != now or (was and now and abs(int(glitches.hit.sum()) - int(again.hit.sum())) > 0.3 * glitches.hit.sum() + 3):  # type: ignore[union-attr]
-                logs = _cleaned(self.logs, raw, again) if now else self.logs
+            if was != now or (
+                was and now and abs(int(glitches.hit.sum()) - int(again.hit.sum())) > 0.3 * glitches.hit.sum() + 3
+            ):  # type: ignore[union-attr]
+                logs = cleaned(self.logs, raw, again) if now else self.logs
                 record = Record.of(logs)
                 none = self._none(record)
                 found = self._deterministic(record, none)
@@ -144,7 +107,7 @@ class Search:
     def _none(self, record: Record) -> Found:
         """The bare baseline, with its noise."""
         candidate = Candidate(record, (), self.baseline)
-        noise = _white_first(record)
+        noise = white_first(record)
         white = Whitener(record, noise)
         z = np.stack([candidate.z_of({"T_L": t, "K_L": 1.0}) for t in (0.12, 0.3, 0.8)])
         found, values = modes(candidate, white, z, iterations=6)
@@ -155,6 +118,9 @@ class Search:
     ) -> Found:
         """Parameters and noise in turn until both rest."""
         record = candidate.record
+        known = self.checkpoint.next(candidate.name, onset)
+        if known is not None:
+            return known.found(candidate, onset)
         white = Whitener(record, noise)
         if record.group > 1:
             z = modes(candidate, white, z[None], onset=onset, iterations=4, coarse=True)[0][0]
@@ -169,21 +135,8 @@ class Search:
             if new < value + 0.3 or turn == rounds:
                 break
             value = new
-        fit = finish(candidate, white, z, onset)
-        return Found(
-            name=candidate.name,
-            candidate=candidate,
-            z=z,
-            covariance=fit.covariance,
-            values={k: float(v) for k, v in candidate.values(z[None]).items()},
-            noise=fitted,
-            log_evidence=fit.log_evidence + fitted.log_prior,
-            log_likelihood=float(white.log_likelihood(fit.errors)),
-            errors=fit.errors,
-            onset=onset,
-            grade_rms=fit.grade_rms,
-            profile=fit.profile,
-        )
+        self.checkpoint.keep(candidate.name, onset, Kept(z, noise, fitted.log_prior))
+        return Kept(z, noise, fitted.log_prior).found(candidate, onset)
 
     @staticmethod
     def _lag(candidate: Candidate, z: Float) -> float:
@@ -214,9 +167,9 @@ class Search:
         top = best[order[0]] - floor if order else 0.0
         lead = [n for n in order[:_SINGLES] if best[n] - floor > min(0.25 * top, top - 30)]
         found = [none]
-        gust = self._gust(none) if self._has("gust") else None
-        if gust is not None:
-            found.append(gust)
+        blown = gust(none) if self._has("gust") else None
+        if blown is not None:
+            found.append(blown)
         for i, name in enumerate(lead):
             self.progress("the best of them", i, len(lead))
             if self._late():
@@ -256,7 +209,9 @@ class Search:
         """The best of all starts under noise that is not its own."""
         z = starts(candidate, base.values)
         if len(z) > 2:
-            values = np.concatenate([white.log_likelihood(candidate.errors(z[i : i + 32], coarse=True)) for i in range(0, len(z), 32)])
+            values = np.concatenate(
+                [white.log_likelihood(candidate.errors(z[i : i + 32], coarse=True)) for i in range(0, len(z), 32)]
+            )
             z = z[np.argsort(-(values - 0.5 * (z**2).sum(1)))[:2]]
         found, values = modes(candidate, white, z, iterations=6, coarse=True)
         return found[values.argmax()], float(values.max())
@@ -267,7 +222,7 @@ class Search:
         made = []
         for _, candidate, z, onset in forms:
             made.append(self._from_onset(candidate, z, noise, onset))
-        return _merged(made)
+        return merged(made)
 
     def _from_onset(self, candidate: Candidate, z: Float, noise: NoiseModel, onset: int | None) -> Found:
         if onset is None:
@@ -289,71 +244,17 @@ class Search:
             _, tried = refined(white, candidate, settled.z, moved)
         return replace(settled, log_evidence=settled.log_evidence + averaged(tried, record.dt))
 
-    # gusts ---------------------------------------------------------------------------------------------------------
-    def _gust(self, base: Found) -> Found:
-        """A coloured force on top of `base`, over the whole drive and from an onset on."""
-        record = base.candidate.record
-        forms = []
-        lag = base.values["T_L"]
-        start = base.noise.noise.replaced(force_sd=0.08, force_time=2.0)
-        whole = self._blown(base, start, lag, None)
-        forms.append(whole)
-        rows = row_likelihoods(record, whole.errors, whole.noise.noise)
-        calm = base.noise.rows
-        along = profile(calm, rows)
-        within = allowed(record.rows, record.dt)
-        onset = within.start + int(np.argmax(along[within]))
-        if along[onset] - along[0] > 3:
-            late = self._blown(base, whole.noise.noise, lag, onset)
-            strong = row_likelihoods(record, late.errors, late.noise.noise)
-            quiet = row_likelihoods(record, late.errors, late.noise.noise.replaced(force_sd=0.005))
-            along = profile(quiet, strong)
-            moved = within.start + int(np.argmax(along[within]))
-            if abs(moved - onset) * record.dt > 1:
-                late = self._blown(base, late.noise.noise, lag, moved)
-            mass = float(np.log(np.exp(along[within] - along[moved]).sum() / record.rows))
-            forms.append(replace(late, log_evidence=late.log_evidence + mass))
-        return _merged(forms)
-
-    def _blown(self, base: Found, start: NoiseModel, lag: float, onset: int | None) -> Found:
-        record, candidate = base.candidate.record, base.candidate
-        z, errors, fitted = base.z, base.errors, None
-        evidence = 0.0
-        for _ in range(2):
-            fitted = fit_noise(record, errors, start, T_L=lag, priors=GUST, onset=onset, iterations=6)
-            start = fitted.noise
-            white = Whitener(record, start)
-            if onset is None or base.onset is not None:
-                z = modes(candidate, white, z[None], onset=base.onset, iterations=3)[0][0]
-            fit = finish(candidate, white, z, base.onset)
-            errors = fit.errors
-            evidence = fit.log_evidence - fit.log_joint + float(fitted.rows.sum()) - 0.5 * float(z @ z)
-        assert fitted is not None
-        rows = row_likelihoods(record, errors, fitted.noise, onset)
-        prior = evidence - float(fitted.rows.sum())
-        name = "+".join(sorted([*([] if base.name == "none" else base.name.split("+")), "gust"]))
-        return replace(
-            base,
-            name=name,
-            z=z,
-            values={k: float(v) for k, v in candidate.values(z[None]).items()},
-            noise=fitted,
-            errors=errors,
-            log_evidence=prior + float(rows.sum()) + fitted.log_prior,
-            log_likelihood=float(rows.sum()),
-            onset=onset if base.onset is None else base.onset,
-            gust=True,
-        )
-
     # pairs ---------------------------------------------------------------------------------------------------------
-    def _pairs(
-        self, record: Record, kinds: Sequence[type[Effect]], found: list[Found], none: Found
-    ) -> list[Found]:
+    def _pairs(self, record: Record, kinds: Sequence[type[Effect]], found: list[Found], none: Found) -> list[Found]:
         single = sorted((f for f in found if f.name != "none"), key=lambda f: -f.log_evidence)
         if not single or single[0].log_evidence < none.log_evidence + 3:
             return []
         top = single[0].log_evidence
-        bases = [f for i, f in enumerate(single[:_BASES]) if i == 0 or f.log_evidence > none.log_evidence + 0.3 * (top - none.log_evidence)]
+        bases = [
+            f
+            for i, f in enumerate(single[:_BASES])
+            if i == 0 or f.log_evidence > none.log_evidence + 0.3 * (top - none.log_evidence)
+        ]
         made: dict[str, Found] = {}
         for number, base in enumerate(bases):
             if base.gust:
@@ -374,7 +275,7 @@ class Search:
                     break
                 made[candidate.name] = self._pair(candidate, z, base)
             if self._has("gust"):
-                gusty = self._gust(base)
+                gusty = gust(base)
                 made[gusty.name] = gusty
         return list(made.values())
 
@@ -392,7 +293,9 @@ class Search:
             return float(value[0] - white.log_likelihood(flat)), candidate, step[0]
         silent = base.candidate.rollouts(base.z[None], base.onset, coarse=True)[0]
         for i in range(0, len(z), 32):
-            apart = white(candidate.rollouts(z[i : i + 32], base.onset, coarse=True) - silent).reshape(len(z[i : i + 32]), -1)
+            apart = white(candidate.rollouts(z[i : i + 32], base.onset, coarse=True) - silent).reshape(
+                len(z[i : i + 32]), -1
+            )
             apart = apart - (apart @ own.T) @ own
             square = np.einsum("cr,cr->c", apart, apart)
             cross = apart @ e
@@ -451,56 +354,15 @@ class Search:
             onset = f.onset
             if f.name == "none" and glitches.onset is not None:
                 onset = None
-            out.append(replace(f, name=name, log_evidence=f.log_evidence + glitches.evidence, tails=glitches, onset=onset))
+            out.append(
+                replace(f, name=name, log_evidence=f.log_evidence + glitches.evidence, tails=glitches, onset=onset)
+            )
         return out
 
     def _held(self, raw: Record, found: list[Found], none: Found) -> list[Found]:
-        noise = fit_noise(
-            raw, self._raw_errors(raw, none), none.noise.noise, T_L=none.values["T_L"], iterations=6
-        )
+        noise = fit_noise(raw, self._raw_errors(raw, none), none.noise.noise, T_L=none.values["T_L"], iterations=6)
         white = Whitener(raw, noise.noise)
         lost = losses(
             white, self._raw_errors(raw, none), raw.command[raw.source], none.values["T_L"], none.values["K_L"]
         )
         return [replace(none, name="command_hold", log_evidence=none.log_evidence + lost.evidence, losses=lost)]
-
-
-def _white_first(record: Record) -> NoiseModel:
-    """Sensor noise from what rows beside each other differ by, as a first guess."""
-    same = np.diff(record.stretch) == 0
-    sds = [
-        1.4826 / np.sqrt(2) * float(np.median(np.abs(np.diff(x.mean(-1))[same]))) + 1e-4 for x in record.measured
-    ]
-    return NoiseModel(**{f"{name}_sd": sd for name, sd in zip(record.witnesses, sds, strict=True)})
-
-
-def _merged(forms: Sequence[Found]) -> Found:
-    """One cause in several forms (over the whole drive, from an onset on), equally likely a priori."""
-    best = max(forms, key=lambda f: f.log_evidence)
-    total = np.logaddexp.reduce([f.log_evidence for f in forms]) - np.log(2.0)
-    return replace(best, log_evidence=float(total))
-
-
-def _cleaned(logs: Sequence[Log], raw: Record, glitches: Tails) -> list[Log]:
-    """The logs with glitches of the accelerometer put to the middle of the rows beside them."""
-    hit = raw.source[glitches.hit]
-    out, offset = [], 0
-    for log in logs:
-        assert log.accel is not None
-        accel = log.accel.copy()
-        rows = []
-        for part in log.segments():
-            size = part.stop - part.start
-            if size < 2 * 20:
-                continue
-            inside = hit[(hit >= offset) & (hit < offset + size)] - offset + part.start
-            rows.extend(inside.tolist())
-            offset += size
-        bad = np.zeros(len(accel), bool)
-        bad[rows] = True
-        for r in rows:
-            near = [k for k in range(max(r - 3, 0), min(r + 4, len(accel))) if not bad[k]]
-            if near:
-                accel[r] = np.median(log.accel[near])
-        out.append(replace(log, accel=accel))
-    return out

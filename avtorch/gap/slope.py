@@ -49,7 +49,7 @@ class Slope:
         """Log likelihood gained (column,) by white errors (column, row), and what part of them is taken for slope."""
         match = errors @ self.image.T
         gains = self.by_size(match)
-        total = logsumexp(gains, axis=1)
+        total = np.asarray(logsumexp(gains, axis=1))
         shares = np.exp(gains - total[:, None])
         return total, ((shares @ self.shrinkage) * match) @ self.image
 

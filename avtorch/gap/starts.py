@@ -28,7 +28,11 @@ GRIDS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
         "first_mps": tuple(np.arange(3.2, 6.9, 0.18)),
         "gear_ratio": tuple(np.arange(1.35, 1.77, 0.025)),
     },
-    "driveline_oscillation": {"frequency_hz": tuple(np.geomspace(0.9, 5.5, 14)), "amplitude": (0.1,), "quadrature": (0.05,)},
+    "driveline_oscillation": {
+        "frequency_hz": tuple(np.geomspace(0.9, 5.5, 14)),
+        "amplitude": (0.1,),
+        "quadrature": (0.05,),
+    },
     "aerodynamic_drag": {"drag_per_m": (5e-5, 4e-4)},
     "constant_resistance": {"resistance_mps2": (0.02, 0.15)},
     "low_speed_creep": {"creep_mps2": (0.05, 0.3)},
@@ -56,7 +60,8 @@ def of_effect(candidate: Candidate, name: str) -> list[dict[str, float]]:
     if not grid:  # an effect of the user's: typical, and fainter
         sized = [c for c in candidate.coordinates if c.key.startswith(f"{name}.")]
         return [
-            {c.key: float(c.value(np.array(at))) for c in sized if c.parameter.neutral is not None} for at in (-1.0, 0.0)
+            {c.key: float(c.value(np.array(at))) for c in sized if c.parameter.neutral is not None}
+            for at in (-1.0, 0.0)
         ]
     keys = [f"{name}.{key}" for key in grid]
     return [dict(zip(keys, values, strict=True)) for values in product(*grid.values())]

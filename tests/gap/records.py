@@ -59,9 +59,7 @@ def drawn_errors(noise: NoiseModel, rows: int, dt: float, rng: np.random.Generat
     for sd, lag in ((noise.process_sd, noise.process_time), (noise.force_sd, noise.force_time)):
         moved, gained = ornstein(sd, lag, rows, dt, rng)
         p, w = p + moved, w + gained
-    return np.stack(
-        [p + noise.accel_sd * rng.standard_normal(rows), w + noise.speed_sd * rng.standard_normal(rows)]
-    )
+    return np.stack([p + noise.accel_sd * rng.standard_normal(rows), w + noise.speed_sd * rng.standard_normal(rows)])
 
 
 def errors_of(noise: NoiseModel, record: Record, rng: np.random.Generator) -> Float:

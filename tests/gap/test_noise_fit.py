@@ -53,7 +53,10 @@ def test_the_mode_is_found_from_afar(rotating_seed: int) -> None:
     for seed in [13, 60, 82, *rng.integers(2**31, size=12).tolist()]:
         own = np.random.default_rng(seed)
         T_L = float(np.exp(own.normal(np.log(0.3), 0.5)))
-        values = {n: float(np.exp(m + s * x)) for (n, (m, s, _)), x in zip(PRIORS.items(), own.uniform(-1.2, 1.2, 6), strict=True)}
+        values = {
+            n: float(np.exp(m + s * x))
+            for (n, (m, s, _)), x in zip(PRIORS.items(), own.uniform(-1.2, 1.2, 6), strict=True)
+        }
         truth = NoiseModel(**values).replaced(process_time=values["process_time"] * T_L)
         errors = errors_of(truth, record, own)
         near = fit_noise(record, errors, truth, T_L=T_L, iterations=12).rows.sum()

@@ -200,5 +200,3 @@ def test_logs_of_different_rates_are_refused_or_each_at_its_own() -> None:
         return
     steps = np.diff(record.time[record.source])[np.diff(record.stretch) == 0]
     np.testing.assert_allclose(steps, record.dt, rtol=1e-6)
-
-

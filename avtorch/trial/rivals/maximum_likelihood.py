@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -22,23 +23,33 @@ _REACH = 6.0  # how far from its prior's middle a coordinate may go, in the prio
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A fitted candidate. `z`: coordinates by name, each on the scale of its prior; `sd` likewise; `loss` = -log L.
+    """A fitted candidate. `z`: coordinates by name, each on the scale of its prior; `loss` = -log L.
 
-    `transformed` residual; `bands` of it; `sizes`, `gust_time` of the noise; `inverse` its spectrum's; `lag` T_L [s].
+    `transformed` residual; `sizes`, `gust_time` of the noise; `inverse` its spectrum's; `lag` T_L [s]. `slope` of the
+    response and `sd`, as `z`, are worked out when asked for.
     """
 
     effects: tuple[str, ...]
     plant: GapPlant
     z: Mapping[str, float]
-    sd: Mapping[str, float]
     loss: float
     transformed: Complex
-    slope: Complex
-    bands: Complex
     sizes: Float
     gust_time: float | None
     inverse: Complex
     lag: float
+    slope_at: Callable[[], Complex]
+
+    @cached_property
+    def slope(self) -> Complex:
+        """(coordinate, frequency, channel)."""
+        return self.slope_at()
+
+    @cached_property
+    def sd(self) -> dict[str, float]:
+        hessian, _ = _normal(self.slope, self.inverse, self.transformed)
+        spread = np.sqrt(np.diag(np.linalg.inv(hessian + np.eye(len(hessian)))))
+        return dict(zip(self.z, spread.tolist(), strict=True))
 
     def values(self) -> dict[str, tuple[float, float]]:
         """Mean and standard deviation of each coordinate in its own unit."""
@@ -72,16 +83,16 @@ class Fitter:
         known = near.z if near else {}
         starts = self._starts(names, begin, known)
         misses = self._misses(made, names, starts)
-        sizes, gust_time = (near.sizes, near.gust_time) if near else (None, None)
-        best, state = 0, None
+        sizes = near.sizes if near else None
+        best = 0
         if len(starts) > 1 and near is not None:
             losses = self._quadratic(misses, near.inverse)
-            best = int(np.argmin(losses))
+            best = int(np.argmin(np.where(np.isfinite(losses), losses, np.inf)))
         z = starts[best]
         state = self._state(made, names, z, misses[best], sizes, gust)
         damping = 1e-3
         for _ in range(steps):
-            loss, transformed, bands, sizes, gust_time, inverse, lag = state
+            loss, transformed, sizes, _, inverse, _ = state
             slope = self._slope(made, names, z)
             hessian, downhill = _normal(slope, inverse, transformed)
             moved = False
@@ -96,24 +107,10 @@ class Fitter:
                 damping = max(10 * damping, 1e-2)
             if not moved or loss - state[0] < 0.05:
                 break
-        loss, transformed, bands, sizes, gust_time, inverse, lag = state
-        slope = self._slope(made, names, z)
-        hessian, _ = _normal(slope, inverse, transformed)
-        sd = np.sqrt(np.diag(np.linalg.inv(hessian + np.eye(len(names)))))
-        return Fit(
-            tuple(effects),
-            made,
-            dict(zip(names, z.tolist(), strict=True)),
-            dict(zip(names, sd.tolist(), strict=True)),
-            loss,
-            transformed,
-            slope,
-            bands,
-            sizes,
-            gust_time,
-            inverse,
-            lag,
-        )
+        loss, transformed, sizes, gust_time, inverse, lag = state
+        named = dict(zip(names, z.tolist(), strict=True))
+        slope_at = partial(self._slope, made, names, z)
+        return Fit(tuple(effects), made, named, loss, transformed, sizes, gust_time, inverse, lag, slope_at)
 
     def _starts(self, names: Sequence[str], begin: Float, known: Mapping[str, float]) -> Float:
         """Coordinates (start, coordinate) at which to begin."""
@@ -150,9 +147,9 @@ class Fitter:
         transformed = self.spectrum.transform(missed)
         bands = self.spectrum.bands(transformed)
         if not np.isfinite(bands).all():  # beyond where the effect is defined
-            return np.inf, transformed, bands, sizes, None, None, lag
+            return np.inf, transformed, sizes, None, None, lag
         loss, sizes, gust_time = self.spectrum.fit_noise(bands, lag, sizes, gust)
-        return loss, transformed, bands, sizes, gust_time, self.spectrum.inverse(lag, sizes, gust_time), lag
+        return loss, transformed, sizes, gust_time, self.spectrum.inverse(lag, sizes, gust_time), lag
 
     def _slope(self, made: GapPlant, names: Sequence[str], z: Float) -> Complex:
         """Derivative of the transformed response, (coordinate, frequency, channel), by central differences.

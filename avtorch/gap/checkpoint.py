@@ -1,0 +1,92 @@
+"""Fits that are done, kept in a file, so that a search that was cut off goes on where it was."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.errors import InputError
+from avtorch.gap.candidate import Candidate
+from avtorch.gap.fit import finish
+from avtorch.gap.found import Found
+from avtorch.gap.innovations import NoiseModel, Whitener
+from avtorch.gap.noise_fit import NoiseFit, row_likelihoods
+from avtorch.io import write_json
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """A fit that has come to rest: the mode `z` (coordinate,), its `noise`, and the noise's `log_prior`."""
+
+    z: Float
+    noise: NoiseModel
+    log_prior: float
+
+    def found(self, candidate: Candidate, onset: int | None) -> Found:
+        """All that follows from it."""
+        record = candidate.record
+        white = Whitener(record, self.noise)
+        fit = finish(candidate, white, self.z, onset)
+        rows = row_likelihoods(record, fit.errors, self.noise)
+        return Found(
+            name=candidate.name,
+            candidate=candidate,
+            z=self.z,
+            covariance=fit.covariance,
+            values={k: float(v) for k, v in candidate.values(self.z[None]).items()},
+            noise=NoiseFit(self.noise, self.log_prior, rows, {}),
+            log_evidence=fit.log_evidence + self.log_prior,
+            log_likelihood=float(white.log_likelihood(fit.errors)),
+            errors=fit.errors,
+            onset=onset,
+            grade_rms=fit.grade_rms,
+            profile=fit.profile,
+        )
+
+
+class Checkpoint:
+    """Fits in the order of a search, which is the same every time; `path` None: nothing is kept.
+
+    Raises `InputError` for a file that is not one of its own.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self.path = path
+        self._done: list[dict[str, Any]] = []
+        self._turn = 0
+        if path is None or not path.exists():
+            return
+        try:
+            self._done = json.loads(path.read_text(encoding="utf-8"))["fits"]
+        except (ValueError, KeyError, TypeError):
+            raise InputError(f"{path}: is not a file of fits; remove it to begin anew") from None
+
+    def next(self, name: str, onset: int | None) -> Kept | None:
+        """The next fit, if the file has it."""
+        if self._turn >= len(self._done):
+            return None
+        entry = self._done[self._turn]
+        if (entry.get("name"), entry.get("onset")) != (name, onset):
+            # the search took another way (a budget that ended earlier): what follows is made anew
+            self._done = self._done[: self._turn]
+            return None
+        self._turn += 1
+        noise = dict(entry["noise"])
+        if noise.get("within") is not None:
+            noise["within"] = tuple(noise["within"])
+        return Kept(np.array(entry["z"]), NoiseModel(**noise), float(entry["log_prior"]))
+
+    def keep(self, name: str, onset: int | None, fit: Kept) -> None:
+        """One more fit is done."""
+        entry = {"name": name, "onset": onset, "z": fit.z.tolist(), "noise": asdict(fit.noise)}
+        self._done.append(entry | {"log_prior": fit.log_prior})
+        self._turn = len(self._done)
+        if self.path is not None:
+            write_json(self.path, {"fits": self._done})

@@ -1,0 +1,142 @@
+"""The diagnosis: which effect the simulator lacks, with what probability, or that none of the table's does it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from avtorch.errors import InputError
+from avtorch.gap import posterior as posteriors
+from avtorch.gap.checkpoint import Checkpoint
+from avtorch.gap.diagnosis import Diagnosis, GapFacts, LogFacts
+from avtorch.gap.effect import EFFECTS, Effect, effect_class
+from avtorch.gap.found import Found, Race
+from avtorch.gap.innovations import Whitener
+from avtorch.gap.odds import favourite, probabilities
+from avtorch.gap.plant import GapPlant, plant
+from avtorch.gap.posterior import Draws
+from avtorch.gap.remainder import remainder
+from avtorch.gap.reported import drawn, moved, repaired, reported
+from avtorch.gap.search import Search
+from avtorch.gap.verdict import Candidate, verdict_of
+from avtorch.io import Log
+
+
+def diagnose(
+    logs: Log | Sequence[Log],
+    *,
+    baseline: GapPlant | str | PathLike[str] | None = None,
+    prior: Mapping[str, float] | None = None,
+    accel_kind: Literal["kinematic", "specific-force"] = "kinematic",
+    effects: Sequence[str | type[Effect]] | None = None,
+    pairs: bool = True,
+    posterior: Literal["laplace", "sgld"] = "laplace",
+    budget_s: float | None = None,
+    seed: int = 0,
+    progress: Callable[[str, int, int], None] | None = None,
+    checkpoint: Path | None = None,
+) -> Diagnosis:
+    """Name the effect, or the two, that `baseline` lacks on these drives of one car.
+
+    Args: `baseline`: the user's simulator (default: bare GLVD); its effects keep their values, `T_L` and `K_L` are
+    fitted. `prior`: weights over causes, see `odds.probabilities`. `effects`: candidates, by name or class (default:
+    all registered). `pairs`: also try two at once. `posterior` of the verdict's parameters: by SGLD, or Laplace's
+    approximation. `budget_s`: after so many seconds no new candidate is begun, and `complete` is False.
+    `progress(what, done, of)` is told of each step. `checkpoint`: a file in which fits are kept, and from which a
+    search of the same logs and settings goes on.
+
+    Raises `InputError` for a log without `accel_cmd`, without 10 s of usable driving, or for wrong arguments.
+    """
+    each = [logs] if isinstance(logs, Log) else list(logs)
+    if accel_kind != "kinematic":
+        raise InputError(
+            f"accel_kind: found {accel_kind!r}; so far only 'kinematic' (dv/dt, as on a vehicle bus) can be diagnosed"
+        )
+    if posterior not in ("laplace", "sgld"):
+        raise InputError(f"posterior: found {posterior!r}, needs 'laplace' or 'sgld'")
+    base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
+    kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
+    race = Search(
+        each, base, effects=kinds, pairs=pairs, budget_s=budget_s, progress=progress, checkpoint=Checkpoint(checkpoint)
+    ).run()
+    top = favourite(race.found)
+    left = remainder(
+        Whitener(race.record, top.noise.noise), top.errors, race.record.measured - top.errors
+    )  # fmt: skip
+    chances = probabilities(race.found, left, race.record.rows, prior)
+    candidates = [_told(f, race, chances[f.name]) for f in _first_of_each(race.found)]
+    candidates.append(Candidate("unknown", chances["unknown"], None, {}, {}, None))
+    verdict = verdict_of(candidates)
+    winner = next((f for f in race.found if f.name == verdict.name), None)
+    draws = None
+    if winner is not None and winner.candidate.size and winner.name != "none" and posterior == "sgld":
+        draws = _draws(winner, seed)
+        told = _told(winner, race, chances[winner.name], draws)
+        candidates = [told if c.name == winner.name else c for c in candidates]
+    noted = () if race.complete else ("The budget ended the search before all candidates were tried.",)
+    if draws is not None and draws.method != "sgld":
+        noted += (f"The parameters' posterior is by {draws.method}: {draws.why}.",)
+    named = winner is not None and winner.name != "none"
+    return Diagnosis(
+        log=LogFacts.of(each),
+        baseline=moved(race.none),
+        gap=_gap(race, chances),
+        candidates=tuple(candidates),
+        verdict=verdict,
+        onset_s=_onset(winner, race) if named and winner is not None else None,
+        plant=repaired(winner, base, draws) if named and winner is not None else None,
+        draws=drawn(winner, draws) if draws is not None and winner is not None else None,
+        complete=race.complete,
+        notes=noted,
+    )
+
+
+def _draws(found: Found, seed: int) -> Draws:
+    return posteriors.posterior(found, seed=seed)
+
+
+def _first_of_each(found: Sequence[Found]) -> list[Found]:
+    return list({f.name: f for f in reversed(found)}.values())[::-1]
+
+
+def _told(found: Found, race: Race, probability: float, draws: Draws | None = None) -> Candidate:
+    """A candidate as the answer lists it; parameters only where they bear on anything."""
+    gain = float(found.log_evidence - race.none.log_evidence)
+    if found.name == "none" or probability < 1e-4:
+        return Candidate(found.name, probability, gain, {}, {}, None)
+    return Candidate(
+        found.name, probability, gain, reported(found, draws), moved(found, draws), _onset(found, race)
+    )  # fmt: skip
+
+
+def _onset(found: Found | None, race: Race) -> float | None:
+    """On the log's own time axis [s]; of a change of gain the moment of the change."""
+    if found is None:
+        return None
+    if found.name == "gain_change":
+        return float(found.values["gain_change.change_s"])
+    if found.name == "outliers" and found.tails is not None and found.tails.onset is not None:
+        return float(race.raw.time[race.raw.source[found.tails.onset]])
+    if found.name == "command_hold" and found.losses is not None and found.losses.onset is not None:
+        return float(race.raw.time[race.raw.source[found.losses.onset]])
+    return None if found.onset is None else float(race.record.time[race.record.source[found.onset]])
+
+
+def _gap(race: Race, chances: Mapping[str, float]) -> GapFacts:
+    """Errors of the fitted baseline's rollout; the floor is what the favourite leaves."""
+    best = favourite(race.found)
+    names = race.record.witnesses
+    sizes = {name: float(np.sqrt((x**2).mean())) for name, x in zip(names, race.none.errors, strict=True)}
+    floor = {name: float(np.sqrt((x**2).mean())) for name, x in zip(names, best.errors, strict=True)}
+    return GapFacts(
+        detected=chances["none"] < 0.5,
+        p_value=None,
+        rollout_rmse_accel=sizes.get("accel"),
+        rollout_floor_accel=floor.get("accel"),
+        rollout_rmse_speed=None,
+        horizon_s=float(race.record.time[-1] - race.record.time[0]) if len(race.record.drives) == 1 else None,
+    )

@@ -1,0 +1,101 @@
+"""A candidate once it is fitted, all of them after a search, and what a search begins from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.candidate import Candidate
+from avtorch.gap.chance import Losses, Tails
+from avtorch.gap.innovations import NoiseModel
+from avtorch.gap.noise_fit import NoiseFit
+from avtorch.gap.record import Record
+from avtorch.io import Log
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A candidate fitted: `name`, `z` and parameter `values` at the mode, `log_evidence` [nats], `errors`.
+
+    `onset`: counted row from which it acts, None: from the start. `gain`: log likelihood over the baseline's.
+    `chance`: what random effects among its names found.
+    """
+
+    name: str
+    candidate: Candidate
+    z: Float = field(repr=False)
+    covariance: Float = field(repr=False)
+    values: Mapping[str, float]
+    noise: NoiseFit = field(repr=False)
+    log_evidence: float
+    log_likelihood: float
+    errors: Float = field(repr=False)
+    onset: int | None = None
+    grade_rms: float | None = None
+    profile: Float | None = field(default=None, repr=False)
+    tails: Tails | None = field(default=None, repr=False)
+    losses: Losses | None = field(default=None, repr=False)
+    gust: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Race:
+    """All candidates found, most evidence first, and what they were found on."""
+
+    record: Record
+    raw: Record
+    logs: tuple[Log, ...]
+    found: tuple[Found, ...]
+    complete: bool
+
+    @property
+    def none(self) -> Found:
+        return next(f for f in self.found if f.name == "none")
+
+    @property
+    def best(self) -> Found:
+        return self.found[0]
+
+
+def white_first(record: Record) -> NoiseModel:
+    """Sensor noise from what rows beside each other differ by, as a first guess."""
+    same = np.diff(record.stretch) == 0
+    sds = [1.4826 / np.sqrt(2) * float(np.median(np.abs(np.diff(x.mean(-1))[same]))) + 1e-4 for x in record.measured]
+    return NoiseModel(**{f"{name}_sd": sd for name, sd in zip(record.witnesses, sds, strict=True)})
+
+
+def merged(forms: Sequence[Found]) -> Found:
+    """One cause in several forms (over the whole drive, from an onset on), equally likely a priori."""
+    best = max(forms, key=lambda f: f.log_evidence)
+    total = np.logaddexp.reduce([f.log_evidence for f in forms]) - np.log(2.0)
+    return replace(best, log_evidence=float(total))
+
+
+def cleaned(logs: Sequence[Log], raw: Record, glitches: Tails) -> list[Log]:
+    """The logs with glitches of the accelerometer put to the middle of the rows beside them."""
+    hit = raw.source[glitches.hit]
+    out, offset = [], 0
+    for log in logs:
+        assert log.accel is not None
+        accel = log.accel.copy()
+        rows = []
+        for part in log.segments():
+            size = part.stop - part.start
+            if size < 2 * 20:
+                continue
+            inside = hit[(hit >= offset) & (hit < offset + size)] - offset + part.start
+            rows.extend(inside.tolist())
+            offset += size
+        bad = np.zeros(len(accel), bool)
+        bad[rows] = True
+        for r in rows:
+            near = [k for k in range(max(r - 3, 0), min(r + 4, len(accel))) if not bad[k]]
+            if near:
+                accel[r] = np.median(log.accel[near])
+        out.append(replace(log, accel=accel))
+    return out
