@@ -26,7 +26,7 @@ def adjoint(white: Whitener, images: Float) -> Float:
     back = np.empty_like(mean)
     count = mean.shape[-2]
     for i in range(count):
-        total = np.asarray(sum(lfilter(tops[o][i], bottom, turned[..., o, :], axis=-1) for o in range(count)))
+        total = np.sum([np.asarray(lfilter(tops[o][i], bottom, turned[..., o, :], axis=-1)) for o in range(count)], 0)
         back[..., i, :] = total[..., ::-1][..., record.target]
     if offset:  # each stretch's first speed was taken off all of its rows
         back[..., -1, starts] -= np.add.reduceat(back[..., -1, :], starts, -1)

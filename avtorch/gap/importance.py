@@ -40,7 +40,7 @@ def importance(
         places = np.concatenate([places, fresh])
         values = np.concatenate([values, np.where(np.isfinite(found), found, -np.inf)])
         proposed = np.stack([_density(places, *p) for p in proposals])
-        ratios = values - logsumexp(proposed, axis=0) + np.log(len(proposals))
+        ratios = values - np.asarray(logsumexp(proposed, axis=0)) + np.log(len(proposals))
         weights = np.exp(ratios - logsumexp(ratios))
         if turn + 1 < rounds:
             shape = _tempered(ratios)

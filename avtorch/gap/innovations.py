@@ -97,14 +97,16 @@ class Whitener:
             [np.sum([lower_inverse[o, i] * tops[i][j] for i in range(len(use))], 0) for j in range(len(use))]
             for o in range(len(use))
         ]
-        return mixed, bottom, lower_inverse, float(np.linalg.slogdet(s)[1])
+        return mixed, np.asarray(bottom, float), np.asarray(lower_inverse, float), float(np.linalg.slogdet(s)[1])
 
     def _filtered(self, errors: Float) -> Float:
         tops, bottom, _, _ = self._filter
         padded = self.record.padded(errors)
         out = np.empty((*errors.shape[:-1], errors.shape[-1]))
         for o in range(errors.shape[-2]):
-            total = sum(lfilter(tops[o][i], bottom, padded[..., i, :], axis=-1) for i in range(errors.shape[-2]))
+            total = sum(
+                np.asarray(lfilter(tops[o][i], bottom, padded[..., i, :], axis=-1)) for i in range(errors.shape[-2])
+            )
             out[..., o, :] = total[..., self.record.target]  # type: ignore[index]
         return out
 
@@ -112,7 +114,9 @@ class Whitener:
         """White image of errors (witness, time) at consecutive rows that begin with the first, offset and all."""
         tops, bottom, _, _ = self._filter
         count = len(errors)
-        return np.stack([sum(lfilter(tops[o][i], bottom, errors[i]) for i in range(count)) for o in range(count)])
+        return np.stack(
+            [sum(np.asarray(lfilter(tops[o][i], bottom, errors[i])) for i in range(count)) for o in range(count)]
+        )
 
     @cached_property
     def _offset(self) -> tuple[Float, Float]:

@@ -68,7 +68,7 @@ def _columns(white: Whitener, rollout: Float) -> Float:
     dt = record.dt
     u = record.command[record.source]
     witnesses = record.witnesses
-    a = rollout[0] if "accel" in witnesses else lfilter([dt / 0.4], [1, dt / 0.4 - 1], u)
+    a = rollout[0] if "accel" in witnesses else np.asarray(lfilter([dt / 0.4], [1, dt / 0.4 - 1], u))
     moved = np.diff(a, prepend=a[0]) / dt
     v = gaussian_filter1d(record.measured[-1].mean(-1), 0.5 / dt) if "speed" in witnesses else np.zeros_like(a)
     fast = max(float(np.quantile(v, 0.95)), 1.0)

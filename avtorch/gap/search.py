@@ -79,9 +79,8 @@ class Search:
             again = self._tails(raw, max(found, key=lambda f: f.log_evidence))
             was = glitches is not None and glitches.evidence > 2 and bool(glitches.hit.any())
             now = again.evidence > 2 and bool(again.hit.any())
-            if was != now or (
-                was and now and abs(int(glitches.hit.sum()) - int(again.hit.sum())) > 0.3 * glitches.hit.sum() + 3
-            ):  # type: ignore[union-attr]
+            before = 0 if glitches is None else int(glitches.hit.sum())
+            if was != now or (now and abs(before - int(again.hit.sum())) > 0.3 * before + 3):
                 logs = cleaned(self.logs, raw, again) if now else self.logs
                 record = Record.of(logs)
                 none = self._none(record)

@@ -48,8 +48,8 @@ class Slope:
     def gained(self, errors: Float) -> tuple[Float, Float]:
         """Log likelihood gained (column,) by white errors (column, row), and what part of them is taken for slope."""
         match = errors @ self.image.T
-        gains = self.by_size(match)
-        total = np.asarray(logsumexp(gains, axis=1))
+        gains = np.asarray(self.by_size(match))
+        total: Float = np.asarray(logsumexp(gains, axis=1))
         shares = np.exp(gains - total[:, None])
         return total, ((shares @ self.shrinkage) * match) @ self.image
 

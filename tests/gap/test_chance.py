@@ -33,9 +33,11 @@ def test_outliers_are_found_with_their_size(fraction: float, scale: float, rotat
     # distances from neighbours are no independent draws: bars of 5 sds, of which each is up to 1.3 times too small
     assert abs(np.log(found.fraction / fraction)) < 6.5 * found.sds[0]
     assert abs(np.log(found.scale / scale)) < 6.5 * found.sds[1]
-    assert found.fraction == pytest.approx(fraction, rel=0.75) and found.scale == pytest.approx(scale, rel=0.6)
+    assert found.fraction == pytest.approx(fraction, rel=0.75)
+    assert found.scale == pytest.approx(scale, rel=0.6)
     # a glitch may be small, and what is called one hardly ever is none
-    assert found.hit.sum() > 0.25 * hit.sum() and (found.hit & ~hit).sum() <= 0.15 * found.hit.sum() + 12
+    assert found.hit.sum() > 0.25 * hit.sum()
+    assert (found.hit & ~hit).sum() <= 0.15 * found.hit.sum() + 12
     large = np.abs(errors) > 0.05 * 10
     assert found.hit[large].mean() > 0.8
     assert found.ratios.shape == (ROWS,)
@@ -50,7 +52,8 @@ def test_normal_noise_has_no_outliers(rotating_seed: int) -> None:
             errors = drawn_errors(NoiseModel(process_sd=0.1, accel_sd=0.03), ROWS, 0.05, rng)[0]
             errors += 0.8 * np.sign(np.sin(np.arange(ROWS) / 200))
         found = tails(errors, 0.05)
-        assert found.evidence < 2.0 and found.hit.sum() <= 6
+        assert found.evidence < 2.0
+        assert found.hit.sum() <= 6
 
 
 def test_outliers_from_a_moment_on(rotating_seed: int) -> None:
@@ -91,7 +94,8 @@ def _steps(rng: np.random.Generator, rate_hz: int, seconds: float = 100.0) -> Fl
 def test_lost_messages_are_found_where_the_command_steps(rate_hz: int, least: float, rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     found = [_lost(_steps(rng, rate_hz), 0.15, rng, rate_hz) for _ in range(4)]
-    assert min(f.evidence for f in found) > least / 6 and np.mean([f.evidence for f in found]) > least
+    assert min(f.evidence for f in found) > least / 6
+    assert np.mean([f.evidence for f in found]) > least
     away = [(np.log(f.fraction / (1 - f.fraction)) - np.log(0.15 / 0.85)) / f.sd for f in found]
     assert np.abs(away).max() < 6
 
@@ -119,4 +123,6 @@ def test_a_command_that_also_drifts_hides_no_losses(rotating_seed: int) -> None:
 def test_a_command_that_never_moves_tells_nothing() -> None:
     rng = np.random.default_rng(0)
     found = _lost(np.full(800, 0.3), 0.2, rng, 20)
-    assert found.evidence < 0 and found.fraction == 0.0 and found.onset is None
+    assert found.evidence < 0
+    assert found.fraction == 0.0
+    assert found.onset is None

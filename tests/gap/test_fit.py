@@ -200,7 +200,8 @@ def test_the_slope_told_is_the_posterior_mean(onset: int | None, rotating_seed: 
     candidate, white = _case(_hills(rng), "road_grade", rng, speed0=30.0, seconds=14.0)
     z = candidate.z_of({"T_L": 0.3, "K_L": 1.0})
     fit = finish(candidate, white, z, onset)
-    assert fit.profile is not None and fit.grade_rms is not None
+    assert fit.profile is not None
+    assert fit.grade_rms is not None
     e = white(candidate.errors(z[None], onset))[0].ravel()
     columns = _white_columns(candidate, white, onset)
     precision = columns @ columns.T + np.eye(len(columns)) / fit.grade_rms**2
@@ -220,14 +221,16 @@ def test_the_slope_told_is_the_roads(rotating_seed: int) -> None:
     record = candidate.record
     z, _ = modes(candidate, white, candidate.z_of({"T_L": 0.3, "K_L": 1.0})[None])
     fit = finish(candidate, white, z[0])
-    assert fit.profile is not None and fit.grade_rms is not None
+    assert fit.profile is not None
+    assert fit.grade_rms is not None
     values = {k: float(v) for k, v in candidate.values(z).items()}
     found = plant([RoadGrade(fit.grade_rms, profile=torch.as_tensor(fit.profile / fit.grade_rms))], **values)
     response = found.response(record.drives[0])
     shown = np.stack([record.seen([response.accel_measured]), record.seen([response.speed])])
     # after the start, at which the actuator makes up for the slope; what that adds to the speed is its offset
     apart = (record.measured - shown - fit.errors)[:, 80:]
-    assert np.abs(apart[0]).max() < 1e-3 and np.ptp(apart[1]) < 0.02
+    assert np.abs(apart[0]).max() < 1e-3
+    assert np.ptp(apart[1]) < 0.02
     left = float((white(fit.errors) ** 2).mean())
     assert left == pytest.approx(1.0, abs=0.25)
 

@@ -9,7 +9,6 @@ import pytest
 
 from avtorch.gap.innovations import NoiseModel, Whitener
 from avtorch.gap.record import Record
-from avtorch.io import Log
 from tests.gap.records import BOTH, Float, dense_covariance, errors_of, log_normal_density, log_of, record_of
 
 NOISES = {
@@ -126,7 +125,8 @@ def test_rows_in_groups_count_by_their_mean_and_by_what_they_differ(rotating_see
     rng = np.random.default_rng(rotating_seed)
     group, within = 5, (0.07, 0.03)
     grouped = Record.of(log_of(seconds=16.0, rate_hz=100))
-    assert grouped.group == group and grouped.dt == pytest.approx(0.05)
+    assert grouped.group == group
+    assert grouped.dt == pytest.approx(0.05)
     noise = replace(NOISES["usual"], within=within)
     means = errors_of(noise, grouped, rng)
     apart = rng.standard_normal((2, grouped.rows, group)) * np.array(within)[:, None, None]

@@ -91,7 +91,8 @@ def test_shapes_broadcast_and_nothing_is_differentiated() -> None:
     part = Part(target, lag, torch.tensor(0.05, dtype=D))
     jerk = torch.tensor([[1.0], [4.0]], dtype=D)
     got = by_rows(limited_row, torch.zeros((), dtype=D), [part], jerk)
-    assert got.shape == (2, ROWS) and not got.requires_grad
+    assert got.shape == (2, ROWS)
+    assert not got.requires_grad
     for i in range(2):
         own = Part(target, lag[i].detach(), torch.tensor(0.05, dtype=D))
         alone = by_rows(limited_row, torch.zeros((), dtype=D), [own], jerk[i])

@@ -69,7 +69,9 @@ def test_what_is_seen_well_is_told_well(rotating_seed: int) -> None:
     record = record_of(120.0, noise=None)
     truth = NoiseModel(process_sd=0.08, process_time=0.4, force_sd=0.005, accel_sd=0.06, speed_sd=0.03)
     fit = fit_noise(record, errors_of(truth, record, rng), NoiseModel(), T_L=0.4, iterations=12)
-    assert fit.sds["accel_sd"] < 0.04 and fit.sds["speed_sd"] < 0.04 and fit.sds["process_sd"] < 0.15
+    assert fit.sds["accel_sd"] < 0.04
+    assert fit.sds["speed_sd"] < 0.04
+    assert fit.sds["process_sd"] < 0.15
     # the prior alone tells the nuisance's size, and what it cannot tell it does not claim to
     assert 0.2 < fit.sds["force_sd"] < 0.6
     assert np.abs(_away(fit, truth)).max() < 7

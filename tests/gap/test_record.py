@@ -29,8 +29,11 @@ def _cut(log: Log, *parts: slice) -> Log:
 def test_rows_are_averaged_down_to_some_twenty_a_second(rate_hz: int, group: int, dt: float) -> None:
     log = log_of(seconds=20.0, rate_hz=rate_hz)
     record = Record.of(log)
-    assert record.group == group and record.dt == pytest.approx(dt)
-    assert record.accel is not None and record.speed is not None and log.accel is not None
+    assert record.group == group
+    assert record.dt == pytest.approx(dt)
+    assert record.accel is not None
+    assert record.speed is not None
+    assert log.accel is not None
     assert record.accel.shape == record.speed.shape == (log.rows // group, group)
     np.testing.assert_array_equal(record.accel.ravel(), log.accel)
     np.testing.assert_array_equal(record.time, log.time[::group])
@@ -45,8 +48,10 @@ def test_drives_are_rolled_out_at_the_logs_rate_coarse_ones_at_the_groups() -> N
     log = log_of(seconds=20.0, rate_hz=100)
     record = Record.of(log)
     (fine,), (coarse,) = record.drives, record.coarse
-    assert len(fine.time) == log.rows and len(coarse.time) == log.rows // 5
-    assert fine.uniform and coarse.uniform
+    assert len(fine.time) == log.rows
+    assert len(coarse.time) == log.rows // 5
+    assert fine.uniform
+    assert coarse.uniform
     np.testing.assert_array_equal(fine.command.numpy(), log.accel_cmd)
     single = Record.of(log_of(seconds=20.0, rate_hz=20))
     assert single.coarse[0] is single.drives[0]
@@ -60,7 +65,8 @@ def test_the_truth_leaves_nothing_over(rate_hz: int) -> None:
     z = candidate.z_of({"T_L": 0.4, "K_L": 0.9})[None]
     errors = candidate.errors(z)[0]
     # the first acceleration, taken from 0.3 s, is forgotten within some lags; what it added to the speed is not
-    assert np.abs(errors[0]).max() < 2e-2 and np.abs(np.diff(errors[1], axis=0)).max() < 2e-3
+    assert np.abs(errors[0]).max() < 2e-2
+    assert np.abs(np.diff(errors[1], axis=0)).max() < 2e-3
     assert np.abs(errors[:, errors.shape[1] // 2 :] - errors[:, -1:, -1:]).max() < 1e-6
 
 
@@ -103,7 +109,8 @@ def test_standstill_and_a_drivers_foot_do_not_count() -> None:
     assert (steps[np.diff(record.stretch) == 1] >= 4 / record.dt).all()
     assert record.length > record.target.max()
     padded = record.padded(np.ones((2, record.rows)))
-    assert padded.shape == (2, record.length) and padded.sum() == 2 * record.rows
+    assert padded.shape == (2, record.length)
+    assert padded.sum() == 2 * record.rows
     # the whole drive is rolled out all the same: one drive
     assert len(record.drives) == 1
 
@@ -113,7 +120,8 @@ def test_a_group_with_one_row_that_does_not_count_does_not_count() -> None:
     engaged = np.ones(log.rows, bool)
     engaged[1503] = False
     record = Record.of(replace(log, engaged=engaged))
-    assert 300 not in record.source and {299, 301} <= set(record.source.tolist())
+    assert 300 not in record.source
+    assert {299, 301} <= set(record.source.tolist())
 
 
 def test_short_stretches_are_left_out() -> None:
@@ -154,7 +162,8 @@ def test_several_logs_are_one_after_another() -> None:
 @pytest.mark.parametrize("witness", ["accel", "speed"])
 def test_one_witness_is_enough(witness: str) -> None:
     record = Record.of(log_of(seconds=20.0, witnesses=(witness,)))
-    assert record.witnesses == (witness,) and record.measured.shape == (1, record.rows, 1)
+    assert record.witnesses == (witness,)
+    assert record.measured.shape == (1, record.rows, 1)
     assert (record.drives[0].speed is None) == (witness == "accel")
 
 
@@ -190,13 +199,8 @@ def test_logs_of_one_name_with_other_witnesses_are_refused() -> None:
     _refused([log_of(seconds=30.0), log_of(seconds=30.0, witnesses=("speed",))], "witnesses")
 
 
-def test_logs_of_different_rates_are_refused_or_each_at_its_own() -> None:
-    """Rows of 20 and 40 Hz do not pass one filter as if they were 30 ms apart."""
+def test_logs_of_different_rates_are_refused() -> None:
+    """Rows of 25 and 40 Hz do not pass one filter as if they were 30 ms apart."""
     logs = [log_of(seconds=30.0, rate_hz=r, name=f"at {r} Hz") for r in (25, 40)]
-    try:
-        record = Record.of(logs)
-    except InputError as error:
-        assert "rate" in str(error) or "Hz" in str(error)
-        return
-    steps = np.diff(record.time[record.source])[np.diff(record.stretch) == 0]
-    np.testing.assert_allclose(steps, record.dt, rtol=1e-6)
+    with pytest.raises(InputError, match="rates"):
+        Record.of(logs)
