@@ -131,23 +131,28 @@ class Candidate:
 
     @cached_property
     def grade_columns(self) -> Float | None:
-        """Rollouts (knot, witness, counted, group) per unit of each coefficient of the slope at `grade_rms` 1."""
+        """Rollouts (knot, witness, counted, group) per unit of each coefficient of the slope at `grade_rms` 1.
+
+        Every drive has coefficients of its own: where one began on the other's road is not known.
+        """
         grade = next((e for e in self.plant.effects if isinstance(e, RoadGrade)), None)
-        if grade is None or RoadGrade not in self.effects:
-            return None
         record = self.record
-        drive = record.drives[0]
-        if drive.position is None:
+        if grade is None or RoadGrade not in self.effects or record.speed is None:
             return None
-        force = grade.columns(drive.position).T
-        parts = []
-        if record.accel is not None:
-            parts.append(record.seen([force]))
-        if record.speed is not None:
-            dt = drive.dt[:-1]
-            gained = torch.cumsum(0.5 * dt * (force[:, 1:] + force[:, :-1]), -1)
-            parts.append(record.seen([torch.cat([torch.zeros_like(force[:, :1]), gained], -1)]))
-        return np.stack(parts, 1)
+        forces = []
+        for drive in record.drives:
+            assert drive.position is not None
+            own = grade.prepared(drive.time, drive.speed, drive.position)
+            forces.append(own.columns(drive.position).T)
+        knots = [len(force) for force in forces]
+        accel, speed = [], []
+        for i, (drive, force) in enumerate(zip(record.drives, forces, strict=True)):
+            whole = torch.nn.functional.pad(force, (0, 0, sum(knots[:i]), sum(knots[i + 1 :])))
+            gained = torch.cumsum(0.5 * drive.dt[:-1] * (whole[:, 1:] + whole[:, :-1]), -1)
+            accel.append(whole)
+            speed.append(torch.cat([torch.zeros_like(whole[:, :1]), gained], -1))
+        seen = {"accel": accel, "speed": speed}
+        return np.stack([record.seen(seen[name]) for name in record.witnesses], 1)
 
 
 def splice(record: Record, full: Float, without: Float, onset: int) -> Float:

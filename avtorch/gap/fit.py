@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from avtorch.gap.candidate import Candidate
 from avtorch.gap.innovations import Whitener
+from avtorch.gap.slope import Slope
 
 Float = NDArray[np.float64]
 
@@ -94,65 +95,45 @@ def _quadratic(
     grade = candidate.grade_columns
     if grade is not None:
         grade = grade.mean(-1, keepdims=True) if coarse else grade
-        square, cross, value, _ = _integrated(white, grade, onset, columns, base, square, cross, value)
+        square, cross, value = _integrated(_slope(white, grade, onset), columns, base, square, cross, value)
     return cross + z, square + np.eye(size), value + 0.5 * (z**2).sum(1)
 
 
-_RMS = np.exp(np.linspace(np.log(2e-4), np.log(0.1), 25))
-
-
 def _integrated(
-    white: Whitener,
-    grade: Float,
-    onset: int | None,
-    columns: Float,
-    base: Float,
-    square: Float,
-    cross: Float,
-    value: Float,
-) -> tuple[Float, Float, Float, tuple[Float, Float]]:
-    """The quadratic with the slope's coefficients integrated out, each start at its best `grade_rms`."""
-    vectors, sizes, image = _spectrum(white, grade, onset)
-    b = -base @ image.T @ vectors  # (start, knot): slope explains -e
-    a = columns @ image.T @ vectors
-    # log N of the coefficients' data, by eigenvalue, for every rms
-    r2 = _RMS[:, None] ** 2
-    shrink = r2 / (1 + r2 * sizes)
-    gains = 0.5 * (b**2) @ shrink.T - 0.5 * np.log1p(r2 * sizes).sum(1)
-    # the prior of the rms: log-normal about 1.2 %, wide towards faint
-    gains = gains - 0.5 * ((np.log(_RMS) - np.log(0.012)) / 1.2) ** 2
-    at = gains.argmax(1)
-    w = shrink[at]
-    square = square - np.einsum("cpk,ck,cqk->cpq", a, w, a)
-    cross = cross + np.einsum("cpk,ck->cp", a, w * b)
-    # Laplace over the rms: what the grid's curvature says
-    peak = gains[np.arange(len(at)), at]
-    spacing = np.log(_RMS[1] / _RMS[0])
-    spread = np.log(np.exp(gains - peak[:, None]).sum(1) * spacing / (1.2 * np.sqrt(2 * np.pi)))
-    return square, cross, value - peak - spread, (_RMS[at], (w * b) @ vectors.T)
+    slope: Slope, columns: Float, base: Float, square: Float, cross: Float, value: Float
+) -> tuple[Float, Float, Float]:
+    """The quadratic with the slope's coefficients and size integrated out, (start, ...)."""
+    match = base @ slope.image.T
+    towards = columns @ slope.image.T
+    total, taken = slope.weighed(match)
+    square = square - np.einsum("cpk,ck,cqk->cpq", towards, taken, towards)
+    cross = cross - np.einsum("cpk,ck->cp", towards, taken * match)
+    return square, cross, value - total
 
 
-_CACHE: dict[tuple[int, int], tuple[object, int | None, tuple[Float, Float, Float]]] = {}
+_CACHE: dict[int, tuple[object, int | None, Slope]] = {}
 
 
-def _spectrum(white: Whitener, grade: Float, onset: int | None) -> tuple[Float, Float, Float]:
-    """Eigenvectors and eigenvalues of the slope's Gram matrix, and the white image of its columns (knot, row)."""
-    key = (id(white), grade.shape[-1])
-    kept = _CACHE.get(key)
+def _slope(white: Whitener, grade: Float, onset: int | None) -> Slope:
+    """Of columns `grade` (knot, witness, counted, group) under this noise; the last one is kept."""
+    kept = _CACHE.get(grade.shape[-1])
     if kept is not None and kept[0] is white and kept[1] == onset:
         return kept[2]
-    columns = grade
-    if onset is not None:
-        columns = grade.copy()
-        if white.record.speed is not None:
-            columns[:, -1] -= columns[:, -1, onset, :1][:, :, None]
-        columns[:, :, :onset] = 0.0
-    image = white(columns).reshape(len(grade), -1)
-    sizes, vectors = np.linalg.eigh(image @ image.T)
-    made = (vectors, np.maximum(sizes, 0.0), image)
+    made = Slope.of(white(_acting(white, grade, onset)).reshape(len(grade), -1))
     _CACHE.clear()
-    _CACHE[key] = (white, onset, made)
+    _CACHE[grade.shape[-1]] = (white, onset, made)
     return made
+
+
+def _acting(white: Whitener, force: Float, onset: int | None) -> Float:
+    """What a slope does (..., witness, counted, group), if only from `onset` on."""
+    if onset is None:
+        return force
+    force = force.copy()
+    if white.record.speed is not None:
+        force[..., -1, :, :] -= force[..., -1, onset, :1][..., None, :]
+    force[..., :onset, :] = 0.0
+    return force
 
 
 def finish(candidate: Candidate, white: Whitener, z: Float, onset: int | None = None) -> Fit:
@@ -164,18 +145,8 @@ def finish(candidate: Candidate, white: Whitener, z: Float, onset: int | None = 
     rms, profile = None, None
     grade = candidate.grade_columns
     if grade is not None:
-        base = white(errors).reshape(1, -1)
-        empty = np.zeros((1, 0, base.shape[1]))
-        _, _, _, (found, coefficients) = _integrated(
-            white, grade, onset, empty, base, np.zeros((1, 0, 0)), np.zeros((1, 0)), np.zeros(1)
-        )
-        rms, profile = float(found[0]), coefficients[0]
-        part = np.tensordot(profile, grade, 1)
-        if onset is not None:
-            if candidate.record.speed is not None:
-                part[-1] -= part[-1, onset, 0]
-            part[:, :onset] = 0.0
-        errors = errors - part
+        rms, profile = _slope(white, grade, onset).told(white(errors).ravel())
+        errors = errors - _acting(white, np.tensordot(profile, grade, 1), onset)
     log_joint = white.constant - float(value)
     return (
         Fit(

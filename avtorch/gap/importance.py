@@ -21,11 +21,12 @@ _CARRIED = 20.0  # effective places that shape the next round
 
 
 def importance(
-    log_prob: Callable[[Float], Float], centre: Float, scale: Float, *, rounds: int, size: int, seed: int
+    log_prob: Callable[[Float], Float], centre: Float, scale: Float, *, rounds: int, size: int, enough: float, seed: int
 ) -> tuple[Float, Float]:
     """Places (place, coordinate) and their weights (place,), which sum to one.
 
     `log_prob`: of (place, coordinate), (place,). `scale`: a triangular root of Laplace's covariance at `centre`.
+    At most so many `rounds` of `size` places, until they are worth `enough` equal draws.
     """
     rng = np.random.default_rng(seed)
     dim = len(centre)
@@ -42,6 +43,8 @@ def importance(
         proposed = np.stack([_density(places, *p) for p in proposals])
         ratios = values - np.asarray(logsumexp(proposed, axis=0)) + np.log(len(proposals))
         weights = np.exp(ratios - logsumexp(ratios))
+        if turn and effective(weights) >= enough:
+            break
         if turn + 1 < rounds:
             shape = _tempered(ratios)
             mean = shape @ places

@@ -37,6 +37,10 @@ _RAREST = 16.0
 _CLIFF = 9.0  # mean square of what the surrogate's whitened gradient lacks, where no step suits the posterior
 _STEPS = 500.0  # SGLD steps affordable
 _ROWS = 2.5e7  # rows of exact gradients affordable, some ten seconds of one core
+_CHECKED = 160  # of the draws
+_LET_PASS = 0.15  # relative error of a variance
+_ROUNDS = 12
+_ENOUGH = 250.0  # effective draws by importance
 _FEWEST = 30.0  # effective draws, fewer than which are none
 
 
@@ -119,19 +123,39 @@ def _walked(target: Corrected, chains: int, draws: int, generator: torch.Generat
     walked = sample(target, settings, generator=generator, mode=mode)
     if not bool(walked.converged[0]):
         return None, walked.why[0]
-    return density.unconstrain(walked.draws[:, :, 0]), ""
+    z = density.unconstrain(walked.draws[:, :, 0])
+    off = misfit(density, mode, z, generator)
+    if off > 0:
+        return None, f"by Stein's identity its draws are {off:.2g} off in a variance, on a posterior with kinks"
+    return z, ""
+
+
+def misfit(density: RolloutDensity, mode: Mode, z: Tensor, generator: torch.Generator) -> float:
+    """How far draws `z` (chain, draw, coordinate) are from having the density's gradients; 0 where chance explains it.
+
+    Over a posterior the mean of `(w - mean) dU/dw` is 1 for each coordinate. A share of the variance is let pass, and
+    three standard errors.
+    """
+    flat = z.flatten(0, 1)
+    some = flat[torch.randperm(len(flat), generator=generator)[:_CHECKED]][:, None]
+    slope = -(density.score(some) @ mode.scale[0])[:, 0]
+    away = torch.linalg.solve_triangular(mode.scale[0], (some[:, 0] - flat.mean(0)).mT, upper=False).mT
+    products = away * slope
+    off = (products.mean(0) - 1).abs()
+    excess = off - _LET_PASS - 3 * products.std(0) / len(products) ** 0.5
+    return float(off.max()) if bool((excess > 0).any()) else 0.0
 
 
 def _weighted(density: RolloutDensity, mode: Mode, chains: int, draws: int, seed: int) -> tuple[Tensor, float]:
     """Draws resampled by importance, and how many they are worth."""
     rows = sum(len(d.time) for d in density.candidate.record.drives)
-    size = int(min(200, max(60, _ROWS / rows / 5)))
+    size = int(min(400, max(80, 2 * _ROWS / rows / _ROUNDS)))  # no gradients, half as dear
 
     def log_prob(z: Float) -> Float:
         return density.value(torch.as_tensor(z)[:, None])[:, 0].numpy()
 
     centre, scale = mode.z[0].numpy(), mode.scale[0].numpy()
-    places, weights = importance(log_prob, centre, scale, rounds=5, size=size, seed=seed)
+    places, weights = importance(log_prob, centre, scale, rounds=_ROUNDS, size=size, enough=_ENOUGH, seed=seed)
     rng = np.random.default_rng(seed)
     # systematic: each place comes as often as it weighs, but for one
     at = (rng.random() + np.arange(chains * draws)) / (chains * draws)

@@ -60,7 +60,7 @@ def repaired(found: Found, baseline: GapPlant | None = None, draws: Draws | None
     """The simulator with the find's effects in, at the posterior mean of each parameter, with the jerk noise found.
 
     `baseline`: whose effects it keeps; the find's own by default. Effects act from the start of a drive, also those
-    that were found to set in later. A slope is the one found along the road driven.
+    that were found to set in later. A slope is the one found along the road of the first drive.
     """
     means = {key: float(x.mean()) for key, x in _values(found, draws).items()}
     noise = found.noise.noise
@@ -71,7 +71,7 @@ def repaired(found: Found, baseline: GapPlant | None = None, draws: Draws | None
         if isinstance(effect, RoadGrade) and found.profile is not None:
             rms = _deterministic(found, draws).get("road_grade.grade_rms")
             size = float(rms.mean()) if rms is not None else float(found.grade_rms or 1.0)
-            profile = torch.as_tensor(np.asarray(found.profile) / size)
+            profile = torch.as_tensor(np.asarray(found.profile[: effect.knots]) / size)
             effects[i] = replace(effect, grade_rms=size, profile=profile, knots=len(profile))
     told = {name: float(Quantity.of_normal(*law).mean) for name, law in _random(found).items()}
     if "gust.sd_mps2" in told:

@@ -12,21 +12,22 @@ Float = NDArray[np.float64]
 
 SIZES = np.exp(np.linspace(np.log(2e-4), np.log(0.1), 97))
 """Values of `grade_rms` over which is integrated."""
-_CENTRE, _SPREAD = 0.012, 1.2  # log-normal prior of `grade_rms`, the same as in `fit.py`
+_CENTRE, _SPREAD = 0.012, 1.2  # log-normal prior of `grade_rms`: about 1.2 %, wide towards faint
 
 
 @dataclass(frozen=True, eq=False)
 class Slope:
-    """White `image` (knot, row) of the slope's columns turned to principal axes, with their squares (knot,)."""
+    """White `image` (knot, row) of the slope's columns turned to principal `axes` (knot, axis), and their squares."""
 
     image: Float = field(repr=False)
     squares: Float
+    axes: Float = field(repr=False)
 
     @classmethod
     def of(cls, image: Float) -> Slope:
         """From the white image (knot, row) of each coefficient at `grade_rms` 1."""
         squares, axes = np.linalg.eigh(image @ image.T)
-        return cls(axes.T @ image, np.maximum(squares, 0.0))
+        return cls(axes.T @ image, np.maximum(squares, 0.0), axes)
 
     @property
     def shrinkage(self) -> Float:
@@ -45,13 +46,23 @@ class Slope:
         """Log likelihood gained (column, size) by errors whose `match` with the axes is (column, knot)."""
         return self.prior + 0.5 * match**2 @ self.shrinkage.T
 
+    def weighed(self, match: Float) -> tuple[Float, Float]:
+        """Log likelihood gained (column,) for a `match` (column, knot), and the share of each axis' taken for slope."""
+        gains = self.by_size(match)
+        total: Float = np.asarray(logsumexp(gains, axis=1))
+        return total, np.exp(gains - total[:, None]) @ self.shrinkage
+
+    def told(self, errors: Float) -> tuple[float, Float]:
+        """The best `grade_rms`, and the posterior mean of the coefficients (knot,), given white errors (row,)."""
+        match = (errors @ self.image.T)[None]
+        _, taken = self.weighed(match)
+        return float(SIZES[self.by_size(match)[0].argmax()]), (taken * match)[0] @ self.axes.T
+
     def gained(self, errors: Float) -> tuple[Float, Float]:
         """Log likelihood gained (column,) by white errors (column, row), and what part of them is taken for slope."""
         match = errors @ self.image.T
-        gains = np.asarray(self.by_size(match))
-        total: Float = np.asarray(logsumexp(gains, axis=1))
-        shares = np.exp(gains - total[:, None])
-        return total, ((shares @ self.shrinkage) * match) @ self.image
+        total, taken = self.weighed(match)
+        return total, (taken * match) @ self.image
 
     def sampled(self, match: Float, rng: np.random.Generator) -> Float:
         """`grade_rms` (column,) drawn given what errors have in common with the axes, (column, knot)."""

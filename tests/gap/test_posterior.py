@@ -34,7 +34,7 @@ from avtorch.gap.found import Found
 from avtorch.gap.importance import effective, importance
 from avtorch.gap.innovations import Whitener
 from avtorch.gap.joint import RolloutDensity, acting_onset, root
-from avtorch.gap.posterior import drawn, exact_one_in, fitted, moved, posterior, repaired, reported
+from avtorch.gap.posterior import drawn, exact_one_in, fitted, misfit, moved, posterior, repaired, reported
 from avtorch.gap.surrogate import Corrected
 from avtorch.inference.density import Density, ScoredDensity, SubsampledDensity
 from tests.gap.finds import found_of
@@ -223,7 +223,7 @@ def test_sgld_against_nuts(effect: Effect, rotating_seed: int) -> None:
     z = draws.z.reshape(-1, 3)
     mean, mean_error, sd, sd_error = moments(z, len(z) / 2)
     density: Any = RolloutDensity.of(found)
-    walked = nuts(density, draws=150, warmup=60, seed=rotating_seed % 2**31)
+    walked = nuts(density, draws=120, warmup=50, seed=rotating_seed % 2**31)
     reference = walked.draws[0, :, 0].log().numpy()  # NUTS takes every density for one of logarithms
     # autocorrelation: NUTS' draws here are worth a half of their number, or more
     near_mean, near_mean_error, near_sd, near_sd_error = moments(reference, len(reference) / 2)
@@ -248,13 +248,24 @@ def test_where_gradients_lead_nowhere_places_are_weighed() -> None:
     assert (draws.method == "importance") == (draws.effective >= 30)
 
 
+def test_draws_that_are_too_wide_are_noticed() -> None:
+    found = found_of([DeadTime(0.163)], seconds=60)
+    density = RolloutDensity.of(found)
+    _, mode = fitted(density, found.covariance)
+    noise = torch.randn(16, 50, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    drawn_right = mode.z[0] + noise @ mode.scale[0].mT
+    assert misfit(density, mode, drawn_right, torch.Generator().manual_seed(0)) == 0
+    too_wide = mode.z[0] + 1.6 * noise @ mode.scale[0].mT
+    assert misfit(density, mode, too_wide, torch.Generator().manual_seed(0)) > 0.5
+
+
 def test_importance_on_a_cliff(rotating_seed: int) -> None:
     """A normal cut off at its centre: mean sqrt(2/pi), variance 1 - 2/pi, times a normal five times as wide."""
 
     def log_prob(z: np.ndarray) -> np.ndarray:
         return np.where(z[:, 0] > 0, -0.5 * z[:, 0] ** 2, -np.inf) - 0.5 * (z[:, 1] / 5) ** 2
 
-    places, weights = importance(log_prob, np.zeros(2), np.eye(2), rounds=5, size=400, seed=rotating_seed)
+    places, weights = importance(log_prob, np.zeros(2), np.eye(2), rounds=5, size=400, enough=1e9, seed=rotating_seed)
     worth = effective(weights)
     assert worth > 300
     assert weights.sum() == pytest.approx(1)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from importlib import import_module
 from types import ModuleType
 from typing import Any
 
@@ -33,7 +34,7 @@ def pysindy() -> ModuleType:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            import pysindy as package
+            package = import_module("pysindy")
     except ImportError:
         raise InputError("sparse_regression: needs PySINDy, pip install 'avtorch[bench]'") from None
     return package
