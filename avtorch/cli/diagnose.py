@@ -14,7 +14,7 @@ from cyclopts import Parameter
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from avtorch.cli.arguments import Json, Out, Quiet, Seed, free_folder, positive, seed_number
+from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, positive, seed_number
 from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.cli.resume import FITS, same_work
 from avtorch.cli.talk import Talk
@@ -32,7 +32,9 @@ def diagnose(
     logs: list[Path],
     /,
     *,
-    out: Out,
+    out: Annotated[
+        Path, Parameter(name="--out", group=OUTPUT, help="Folder for the answer and the repaired simulator.")
+    ],
     map: Annotated[
         list[str] | None, Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN; repeatable.")
     ] = None,
@@ -88,6 +90,7 @@ def diagnose(
     drives = [Log.read(path, map=map, unit=unit, stamp=stamp) for path in logs]
     for path, drive in zip(logs, drives, strict=True):
         _usable(path, drive, accel_kind)
+        _judged(chosen or (), path, drive)
     settings = {
         "--baseline": "glvd" if simulator is None else simulator.to_toml(),
         "--accel-kind": accel_kind,
@@ -140,7 +143,7 @@ def _known(option: str, name: str, more: Sequence[str] = ()) -> str:
     from avtorch.gap import EFFECTS
 
     if name not in EFFECTS and name not in more:
-        near = get_close_matches(name, [*EFFECTS, *more], n=1)
+        near = get_close_matches(name, [*EFFECTS, *more], n=1) or [x for x in EFFECTS if name and name in x]
         hint = f"; perhaps {near[0]}" if near else f", such as {', '.join(sorted(EFFECTS)[:3])}"
         needs = "".join(f"{x}, " for x in more) + ("or " if more else "")
         raise InputError(f"{option}: found {name!r}, needs {needs}an effect's name{hint}")
@@ -178,6 +181,8 @@ def _baseline(text: str) -> GapPlant | None:
 
     if text.strip().lower() == "glvd":
         return None
+    if text.endswith(".toml") and not Path(text).is_file():
+        raise InputError(f"--baseline {text!r}: no such file; needs a TOML file, or effects such as dead_time=0.2")
     try:
         simulator = plant(baseline=Path(text) if text.endswith(".toml") or Path(text).is_file() else text)
     except InputError as fault:
@@ -197,6 +202,16 @@ def _usable(path: Path, drive: Log, accel_kind: str) -> None:
         raise InputError(f"{path}: has no row to use; all are driven by hand (engaged 0) or at standstill")
     if accel_kind == "specific-force" and drive.accel is None:
         raise InputError(f"--accel-kind: found specific-force, but {path} has no accel")
+
+
+def _judged(names: Sequence[str], path: Path, drive: Log) -> None:
+    """Whoever asks for an effect by name is told where a log cannot show it."""
+    from avtorch.gap import EFFECTS
+
+    for name in names:
+        for signal, needed in (("accel", EFFECTS[name].place == "sensor"), ("speed", EFFECTS[name].needs_speed)):
+            if needed and getattr(drive, signal) is None:
+                raise InputError(f"--effects: found {name}, which no log without {signal} can show, such as {path}")
 
 
 @contextmanager

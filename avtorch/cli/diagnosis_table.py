@@ -14,6 +14,11 @@ if TYPE_CHECKING:
 
 ROWS = 8
 BAR = 8
+SURE = 0.9
+"""What a headline says without a perhaps."""
+_FAINT = 0.01  # candidates less probable than this are only counted
+_ALIASES = 4  # told by name beside the verdict
+_WIDE = 30  # cells that a terminal of 80 leaves for parameters
 _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 
@@ -25,16 +30,19 @@ def diagnosis_headline(found: Diagnosis) -> list[str]:
     if verdict.abstained:
         style, text = "bold yellow", f"The cause is none of the effects known here ({p}): nothing is blamed."
     elif verdict.name == "none":
-        style, text = "bold green", f"The simulator lacks nothing that this log shows ({p})."
+        first = "The" if found.winner.probability >= SURE else "No effect stands out: probably the"
+        style, text = "bold green", f"{first} simulator lacks nothing that this log shows ({p})."
     else:
         told = meanings(verdict.name)
         told = f": {told}." if told else "."
-        style, text = "bold cyan", f"The simulator lacks {' and '.join(verdict.names)} ({p}){told}"
+        share = found.winner.probability
+        who = "The" if share >= SURE else "Probably the" if share >= 0.5 else "Perhaps the"
+        style, text = "bold cyan", f"{who} simulator lacks {' and '.join(verdict.names)} ({p}){told}"
     return [f"[{style}]{escape(text)}[/]", f"[dim]{escape(verdict.why)}[/]"]
 
 
 def diagnosis_table(found: Diagnosis) -> Table:
-    """A row a candidate: probability, log evidence, parameters, and how the baseline moves with it in."""
+    """A row a candidate: probability, log evidence, parameters."""
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("candidate", no_wrap=True)
     table.add_column("probability", no_wrap=True)
@@ -44,15 +52,16 @@ def diagnosis_table(found: Diagnosis) -> Table:
     for c in shown:
         first = c.name == found.verdict.name
         style = "bold" if first else None if c.name in found.verdict.alias_set else "dim"
-        nats = "" if c.log_evidence is None else f"{c.log_evidence:+.0f}" if c.log_evidence else "0"
-        lines = [_parameter(name, c, q) for name, q in c.parameters.items()] + _moved(found.baseline, c.moved)
+        gain = round(c.log_evidence or 0.0)
+        nats = "" if c.log_evidence is None else f"{gain:+d}" if gain else "0"
+        lines = [_parameter(name, c, q) for name, q in c.parameters.items()]
         name = c.name.replace("+", " +\n")
         table.add_row(
             escape(name), f"{_number(c.probability)} {bar(c.probability)}", nats, "\n".join(lines), style=style
         )
     if left:
         rest = sum(c.probability for c in left)
-        table.add_row(f"{len(left)} others", _number(rest), "", "", style="dim")
+        table.add_row(f"{len(left)} {'others' if len(left) > 1 else 'other'}", _number(rest), "", "", style="dim")
     return table
 
 
@@ -63,7 +72,7 @@ def diagnosis_notes(found: Diagnosis) -> list[str]:
         lines.append(f"Onset: at {found.onset_s:.1f} s of the log's time.")
     elif found.winner.effects:
         lines.append("Onset: there from the start.")
-    lines += _gap(found)
+    lines += _moved(found.baseline, found.winner.moved) + _gap(found)
     if found.remaining:
         best = sorted(found.remaining, key=lambda c: -c.probability)[:3]
         told = ", ".join(f"{c.name} {_number(c.probability)}" for c in best if c.probability >= 0.005)
@@ -83,10 +92,11 @@ def bar(share: float) -> str:
 
 
 def _shown(candidates: Iterable[Candidate]) -> tuple[list[Candidate], list[Candidate]]:
-    """The first rows, `none` and `unknown` always among them; and those left out."""
+    """The first rows that are not faint, the verdict's, `none` and `unknown` always among them; and those left out."""
     ranked = list(candidates)
     always = [c for c in ranked if c.name in ("none", "unknown")]
-    best = [c for c in ranked if c.name not in ("none", "unknown")][: ROWS - len(always)]
+    best = [c for c in ranked if c not in always and (c is ranked[0] or c.probability >= _FAINT)]
+    best = best[: ROWS - len(always)]
     shown = [c for c in ranked if c in best or c in always]
     return shown, [c for c in ranked if c not in shown]
 
@@ -99,14 +109,16 @@ def _parameter(key: str, candidate: Candidate, q: Quantity) -> str:
     twice = sum(k.rpartition(".")[2] == own for k in candidate.parameters) > 1
     unit = unit_of(own)
     words = f"{effect}: {words_of(own)}" if twice else words_of(own)
-    return escape(f"{words} {_interval(q, '' if unit == '-' else ' ' + unit)}")
+    mean, interval = _interval(q, "" if unit == "-" else " " + unit)
+    between = " " if len(words) + len(mean) + len(interval) + 2 <= _WIDE else "\n  "
+    return escape(f"{words} {mean}{between}{interval}")
 
 
-def _interval(q: Quantity, unit: str) -> str:
+def _interval(q: Quantity, unit: str) -> tuple[str, str]:
     """Mean and 90 %, to the digit that the interval supports."""
     width = q.q95 - q.q05
     digits = min(max(1 - floor(log10(width)), 0), 7) if width > 0 else 3
-    return f"{q.mean:.{digits}f}{unit} ({q.q05:.{digits}f} to {q.q95:.{digits}f})"
+    return f"{q.mean:.{digits}f}{unit}", f"({q.q05:.{digits}f} to {q.q95:.{digits}f})"
 
 
 def _moved(baseline: Mapping[str, Quantity], moved: Mapping[str, Quantity]) -> list[str]:
@@ -115,7 +127,7 @@ def _moved(baseline: Mapping[str, Quantity], moved: Mapping[str, Quantity]) -> l
         if name in moved and name in baseline:
             unit = " s" if name == "T_L" else ""
             told.append(f"{name} {baseline[name].mean:.2f} → {moved[name].mean:.2f}{unit}")
-    return [", ".join(told)] if told else []
+    return [f"The baseline, fitted without and with it: {', '.join(told)}."] if told else []
 
 
 def _aliases(found: Diagnosis) -> str:
@@ -123,6 +135,8 @@ def _aliases(found: Diagnosis) -> str:
     others = [from_words.get(n, n.replace("+", " with ")) for n in found.verdict.alias_set if n != found.verdict.name]
     if not others:
         return "Told apart from every other candidate on this log."
+    if len(others) > _ALIASES + 1:
+        others = [*others[:_ALIASES], f"any of {len(others) - _ALIASES} that are less probable"]
     listing = others[0] if len(others) == 1 else f"{', '.join(others[:-1])} or {others[-1]}"
     name = from_words.get(found.verdict.name, found.verdict.name.replace("+", " with "))
     return f"Not told apart on this log: {name}, or {listing}."
@@ -132,13 +146,15 @@ def _gap(found: Diagnosis) -> list[str]:
     gap = found.gap
     parts = []
     if gap.rollout_rmse_accel is not None:
-        floor = "" if gap.rollout_floor_accel is None else f" (noise alone {gap.rollout_floor_accel:.2g})"
+        floor = "" if gap.rollout_floor_accel is None else f" ({gap.rollout_floor_accel:.2g} is left at best)"
+        if gap.rollout_floor_accel is not None and gap.rollout_floor_accel > 0.97 * gap.rollout_rmse_accel:
+            floor = " (no less with the best candidate in)"
         parts.append(f"acceleration off by {gap.rollout_rmse_accel:.2g} m/s²{floor}")
     if gap.rollout_rmse_speed is not None:
         parts.append(f"speed by {gap.rollout_rmse_speed:.2g} m/s")
     if not parts:
         return []
-    over = "" if gap.horizon_s is None else f", over {gap.horizon_s:g} s"
+    over = "" if gap.horizon_s is None else f", over {gap.horizon_s:.3g} s"
     return [f"Gap of the simulator as it is{over}: {', '.join(parts)}."]
 
 

@@ -109,7 +109,7 @@ class Actuator:
         if self.jerk is not None:
             assert slewed is not None
             slewed, _, g = _slewed(slewed, part, self.jerk)
-        m00, m01, m10, m11 = _modes(self.tau, T, h)
+        m00, m01, m10, m11 = modes_over(self.tau, T, h)
         d, w = state.accel - g, state.swing
         accel, swing = g + m00 * d + m01 * w, m10 * d + m11 * w
         speed = g * h - T * (accel - state.accel) - (swing - w)
@@ -123,7 +123,7 @@ class Actuator:
             parts = _slewed_over(accel0, parts, self.jerk)
         maps = []
         for part in parts:
-            m = _modes(self.tau, part.lag, part.length)
+            m = modes_over(self.tau, part.lag, part.length)
             maps.append((m, ((1 - m[0]) * part.target, -m[2] * part.target)))
         (m, b), *more = maps
         for n, c in more:
@@ -212,7 +212,7 @@ def _slewed_over(accel0: Tensor, parts: list[Part], jerk: Tensor) -> list[Part]:
     return out
 
 
-def _modes(tau: Tensor, T: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def modes_over(tau: Tensor, T: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Matrix over `h` on `(a - g, tau² a')`; regular at tau = 0 and at critical damping, as are its derivatives."""
     square = tau * tau
     bend = T * T - 4 * square

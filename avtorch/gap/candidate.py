@@ -107,14 +107,17 @@ class Candidate:
         without = self._rollouts(self._without, base, coarse)
         return splice(self.record, full, without, onset)
 
-    def baseline_rollout(self, z: Float, *, coarse: bool = False) -> Float:
-        """What the baseline alone does with the `T_L` and `K_L` of `z` (coordinate,): (witness, counted, group)."""
-        values = {k: v for k, v in self.values(z[None]).items() if k in ("T_L", "K_L")}
-        return self._rollouts(self._without, values, coarse)[0]
+    def baseline_rollouts(self, z: Float, *, coarse: bool = False) -> Float:
+        """What the baseline alone does with the `T_L` and `K_L` of `z` (column, coordinate); one column if all
+        agree."""
+        lags = z[:, [c.key in ("T_L", "K_L") for c in self.coordinates]]
+        z = z[:1] if bool((lags == lags[0]).all()) else z
+        values = {k: v for k, v in self.values(z).items() if k in ("T_L", "K_L")}
+        return self._rollouts(self._without, values, coarse)
 
     def _rollouts(self, of: GapPlant, values: Mapping[str, torch.Tensor], coarse: bool = False) -> Float:
         record = self.record
-        with torch.no_grad():
+        with torch.inference_mode():  # no derivatives: faster recursions
             responses = [of.response(drive, values) for drive in (record.coarse if coarse else record.drives)]
         parts = []
         if record.accel is not None:
@@ -149,7 +152,8 @@ class Candidate:
         for i, (drive, force) in enumerate(zip(record.drives, forces, strict=True)):
             whole = torch.nn.functional.pad(force, (0, 0, sum(knots[:i]), sum(knots[i + 1 :])))
             gained = torch.cumsum(0.5 * drive.dt[:-1] * (whole[:, 1:] + whole[:, :-1]), -1)
-            accel.append(whole)
+            # an accelerometer does not feel gravity
+            accel.append(torch.zeros_like(whole) if drive.specific_force else whole)
             speed.append(torch.cat([torch.zeros_like(whole[:, :1]), gained], -1))
         seen = {"accel": accel, "speed": speed}
         return np.stack([record.seen(seen[name]) for name in record.witnesses], 1)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Literal
-
-import numpy as np
 
 from avtorch.errors import InputError
 from avtorch.gap import posterior as posteriors
@@ -16,10 +15,12 @@ from avtorch.gap.diagnosis import Diagnosis, GapFacts, LogFacts
 from avtorch.gap.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.found import Found, Race
 from avtorch.gap.innovations import Whitener
+from avtorch.gap.misfit import gap_facts
 from avtorch.gap.odds import favourite, probabilities
 from avtorch.gap.plant import GapPlant, plant
 from avtorch.gap.posterior import Draws
 from avtorch.gap.remainder import remainder
+from avtorch.gap.remaining import remaining
 from avtorch.gap.reported import drawn, moved, repaired, reported
 from avtorch.gap.search import Search
 from avtorch.gap.verdict import Candidate, verdict_of
@@ -31,7 +32,7 @@ def diagnose(
     *,
     baseline: GapPlant | str | PathLike[str] | None = None,
     prior: Mapping[str, float] | None = None,
-    accel_kind: Literal["kinematic", "specific-force"] = "kinematic",
+    accel_kind: Literal["kinematic", "specific-force"] | None = None,
     effects: Sequence[str | type[Effect]] | None = None,
     pairs: bool = True,
     posterior: Literal["laplace", "sgld"] = "laplace",
@@ -46,16 +47,17 @@ def diagnose(
     fitted. `prior`: weights over causes, see `odds.probabilities`. `effects`: candidates, by name or class (default:
     all registered). `pairs`: also try two at once. `posterior` of the verdict's parameters: by SGLD, or Laplace's
     approximation. `budget_s`: after so many seconds no new candidate is begun, and `complete` is False.
+    `accel_kind`: whether `accel` is dv/dt or an accelerometer's reading (default: as the logs say).
     `progress(what, done, of)` is told of each step. `checkpoint`: a file in which fits are kept, and from which a
     search of the same logs and settings goes on.
 
     Raises `InputError` for a log without `accel_cmd`, without 10 s of usable driving, or for wrong arguments.
     """
     each = [logs] if isinstance(logs, Log) else list(logs)
-    if accel_kind != "kinematic":
-        raise InputError(
-            f"accel_kind: found {accel_kind!r}; so far only 'kinematic' (dv/dt, as on a vehicle bus) can be diagnosed"
-        )
+    if accel_kind is not None:
+        if accel_kind not in ("kinematic", "specific-force"):
+            raise InputError(f"accel_kind: found {accel_kind!r}, needs 'kinematic' or 'specific-force'")
+        each = [replace(log, accel_kind=accel_kind) for log in each]
     if posterior not in ("laplace", "sgld"):
         raise InputError(f"posterior: found {posterior!r}, needs 'laplace' or 'sgld'")
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
@@ -90,6 +92,7 @@ def diagnose(
         onset_s=_onset(winner, race) if named and winner is not None else None,
         plant=repaired(winner, base, draws) if named and winner is not None else None,
         draws=drawn(winner, draws) if draws is not None and winner is not None else None,
+        remaining=remaining(candidates, verdict, base),
         complete=race.complete,
         notes=noted,
     )
@@ -128,15 +131,4 @@ def _onset(found: Found | None, race: Race) -> float | None:
 
 def _gap(race: Race, chances: Mapping[str, float]) -> GapFacts:
     """Errors of the fitted baseline's rollout; the floor is what the favourite leaves."""
-    best = favourite(race.found)
-    names = race.record.witnesses
-    sizes = {name: float(np.sqrt((x**2).mean())) for name, x in zip(names, race.none.errors, strict=True)}
-    floor = {name: float(np.sqrt((x**2).mean())) for name, x in zip(names, best.errors, strict=True)}
-    return GapFacts(
-        detected=chances["none"] < 0.5,
-        p_value=None,
-        rollout_rmse_accel=sizes.get("accel"),
-        rollout_floor_accel=floor.get("accel"),
-        rollout_rmse_speed=None,
-        horizon_s=float(race.record.time[-1] - race.record.time[0]) if len(race.record.drives) == 1 else None,
-    )
+    return gap_facts(race, favourite(race.found), detected=chances["none"] < 0.5)

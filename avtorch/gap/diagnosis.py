@@ -40,7 +40,10 @@ SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead
 
 @dataclass(frozen=True)
 class LogFacts:
-    """What was looked at: usable or not, all `rows`; `seconds` without gaps; `signals` in any of the logs."""
+    """What was looked at: usable or not, all `rows`; `seconds` without gaps; `signals` in any of the logs.
+
+    `name`: the logs' own, files without their folders, which are nobody's business where an answer is read.
+    """
 
     rows: int
     segments: int
@@ -60,7 +63,7 @@ class LogFacts:
             seconds=seconds,
             rate_hz=math.fsum(log.rate_hz * log.seconds for log in all_) / seconds,
             signals=tuple(name for name in SIGNALS if any(getattr(log, name) is not None for log in all_)),
-            name=", ".join(log.name for log in all_),
+            name=", ".join(Path(log.name).name or log.name for log in all_),
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -22,7 +22,8 @@ class Drive:
     A row's command acts from its time until the next row's. `accel0` (...) [m/s²] is the car's acceleration at the
     first row; None: the actuator has settled at the first command. Before the first row the first command acted.
     `dt` (time,) are the steps (the last one repeats), `position` (..., time) [m] the speed integrated by trapezoids;
-    `uniform` says whether all steps are the same.
+    `uniform` says whether all steps are the same. `specific_force`: what is measured as acceleration, `accel0` too, is
+    an accelerometer's reading, which feels every force but gravity: a slope's pull is in the speed alone.
 
     Raises `InputError` for shapes that do not fit, time that does not rise, or values that are not finite.
     """
@@ -31,6 +32,7 @@ class Drive:
     command: Tensor
     speed: Tensor | None = None
     accel0: Number | None = None
+    specific_force: bool = False
     dt: Tensor = field(init=False)
     uniform: bool = field(init=False)
     position: Tensor | None = field(init=False)
@@ -77,7 +79,8 @@ class Drive:
             raise InputError(f"segment: found {segment} with fewer than two rows, needs one of the log's")
         speed = None if log.speed is None else torch.as_tensor(log.speed[rows])
         accel0 = None if log.accel is None or settled else float(log.accel[rows][0])
-        return cls(torch.as_tensor(log.time[rows]), torch.as_tensor(log.accel_cmd[rows]), speed, accel0)
+        time, command = torch.as_tensor(log.time[rows]), torch.as_tensor(log.accel_cmd[rows])
+        return cls(time, command, speed, accel0, log.accel_kind == "specific-force")
 
 
 @dataclass(frozen=True)

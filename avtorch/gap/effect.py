@@ -83,7 +83,10 @@ class NoiseChange:
 
 @dataclass(frozen=True)
 class Effect:
-    """Base of all effects; see the module for the hooks. `order` sorts effects at the same place."""
+    """Base of all effects; see the module for the hooks. `order` sorts effects at the same place.
+
+    `gravity`: a force of the body that an accelerometer does not feel (see `Drive.specific_force`).
+    """
 
     name: ClassVar[str]
     place: ClassVar[Place]
@@ -94,6 +97,7 @@ class Effect:
     memory: ClassVar[bool] = False
     random: ClassVar[bool] = False
     needs_speed: ClassVar[bool] = False
+    gravity: ClassVar[bool] = False
 
     # the hook ------------------------------------------------------------------------------------------------------
     def apply(self, x: Tensor, row: Row) -> Any:
@@ -136,6 +140,10 @@ class Effect:
     def drawn(self, generator: torch.Generator | None) -> Self:
         """This effect with whatever is drawn once a drive, drawn."""
         return self
+
+    def lag_apart(self) -> tuple[Self, Tensor | None]:
+        """This effect without what it says about the plant's `T_L` [s], and that `T_L`; None where it says nothing."""
+        return self, None
 
     def report(self, T_L: Tensor) -> dict[str, Tensor]:
         """The parameters as the answer names them, given the plant's lag."""

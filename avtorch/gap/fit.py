@@ -136,6 +136,22 @@ def _acting(white: Whitener, force: Float, onset: int | None) -> Float:
     return force
 
 
+def left_over(candidate: Candidate, white: Whitener, z: Float, onset: int | None = None, *, coarse: bool) -> Float:
+    """Errors (witness, counted, group) at `z` (coordinate,), less what a road's slope explains of them."""
+    errors = candidate.errors(z[None], onset, coarse=coarse)[0]
+    return errors if candidate.grade_columns is None else errors - _sloped(candidate, white, errors, onset)[2]
+
+
+def _sloped(candidate: Candidate, white: Whitener, errors: Float, onset: int | None) -> tuple[float, Float, Float]:
+    """`grade_rms`, coefficients (knot,), and what they do to the errors."""
+    grade = candidate.grade_columns
+    assert grade is not None
+    if errors.shape[-1] == 1:
+        grade = grade.mean(-1, keepdims=True)
+    rms, profile = _slope(white, grade, onset).told(white(errors).ravel())
+    return rms, profile, _acting(white, np.tensordot(profile, grade, 1), onset)
+
+
 def finish(candidate: Candidate, white: Whitener, z: Float, onset: int | None = None) -> Fit:
     """Covariance, errors and Laplace evidence at a mode `z` (coordinate,)."""
     size = len(z)
@@ -143,10 +159,9 @@ def finish(candidate: Candidate, white: Whitener, z: Float, onset: int | None = 
     del gradient
     errors = candidate.errors(z[None], onset)[0]
     rms, profile = None, None
-    grade = candidate.grade_columns
-    if grade is not None:
-        rms, profile = _slope(white, grade, onset).told(white(errors).ravel())
-        errors = errors - _acting(white, np.tensordot(profile, grade, 1), onset)
+    if candidate.grade_columns is not None:
+        rms, profile, part = _sloped(candidate, white, errors, onset)
+        errors = errors - part
     log_joint = white.constant - float(value)
     return (
         Fit(

@@ -15,12 +15,12 @@ group differ by is white already.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm, solve_discrete_are
 from scipy.signal import lfilter
 
 from avtorch.gap.record import Record
@@ -56,51 +56,20 @@ class Whitener:
     record: Record
     noise: NoiseModel
 
+    @classmethod
+    def each(cls, record: Record, noises: Sequence[NoiseModel]) -> list[Whitener]:
+        """Of several noise models, their filters designed together: some ten times as fast as one by one."""
+        made = [cls(record, noise) for noise in noises]
+        for white, filter_ in zip(made, _designed(noises, record.dt, record.witnesses), strict=True):
+            white.__dict__["_filter"] = filter_
+        return made
+
     @cached_property
-    def _filter(self) -> tuple[list[list[Float]], Float, Float, float]:
-        """Numerators by (out, in), the denominator, the inverse Cholesky factor of S, log det S."""
-        n, dt = self.noise, self.record.dt
-        drift = np.array([[0, 1, 1], [0, -1 / n.process_time, 0], [0, 0, -1 / n.force_time]], float)
-        spectrum = np.diag([0.0, 2 * n.process_sd**2 / n.process_time, 2 * n.force_sd**2 / n.force_time])
-        # a hair of speed noise, or the error of the speed is known exactly
-        spectrum[0, 0] = 1e-12
-        van_loan = expm(np.block([[-drift, spectrum], [np.zeros((3, 3)), drift.T]]) * dt)
-        move = van_loan[3:, 3:].T
-        driven = move @ van_loan[:3, 3:]
-        see = np.array([[0, 1, 1], [1, 0, 0]], float)
-        white = np.array([n.accel_sd**2, n.speed_sd**2])
-        use = [i for i, name in enumerate(("accel", "speed")) if name in self.record.witnesses]
-        see, white = see[use], np.diag(white[use])
-        keep = slice(0, 3) if 1 in use else slice(1, 3)
-        move, driven, see = move[keep, keep], driven[keep, keep], see[:, keep]
-        ahead = solve_discrete_are(move.T, see.T, 0.5 * (driven + driven.T), white)
-        s = see @ ahead @ see.T + white
-        gain = move @ ahead @ see.T @ np.linalg.inv(s)
-        lower_inverse = np.linalg.inv(np.linalg.cholesky(s))
-        inner = move - gain @ see
-        size = len(move)
-        bottom = np.real(np.poly(inner))
-        # adj(zI - A) by the Faddeev-LeVerrier recursion
-        m, terms = np.eye(size), [np.eye(size)]
-        for k in range(1, size):
-            m = inner @ m + bottom[k] * np.eye(size)
-            terms.append(m)
-        tops = []
-        for i in range(len(use)):
-            row = []
-            for j in range(len(use)):
-                lead = [0.0, *(-(see[i] @ t @ gain[:, j]) for t in terms)]
-                row.append(np.array(lead) + (bottom if i == j else 0.0))
-            tops.append(row)
-        # white at once: mix the outputs
-        mixed = [
-            [np.sum([lower_inverse[o, i] * tops[i][j] for i in range(len(use))], 0) for j in range(len(use))]
-            for o in range(len(use))
-        ]
-        return mixed, np.asarray(bottom, float), np.asarray(lower_inverse, float), float(np.linalg.slogdet(s)[1])
+    def _filter(self) -> Filter:
+        return _designed([self.noise], self.record.dt, self.record.witnesses)[0]
 
     def _filtered(self, errors: Float) -> Float:
-        tops, bottom, _, _ = self._filter
+        tops, bottom, _ = self._filter
         padded = self.record.padded(errors)
         out = np.empty((*errors.shape[:-1], errors.shape[-1]))
         for o in range(errors.shape[-2]):
@@ -112,7 +81,7 @@ class Whitener:
 
     def response(self, errors: Float) -> Float:
         """White image of errors (witness, time) at consecutive rows that begin with the first, offset and all."""
-        tops, bottom, _, _ = self._filter
+        tops, bottom, _ = self._filter
         count = len(errors)
         return np.stack(
             [sum(np.asarray(lfilter(tops[o][i], bottom, errors[i])) for i in range(count)) for o in range(count)]
@@ -151,7 +120,7 @@ class Whitener:
     def constant(self) -> float:
         """The log likelihood's part that does not depend on the errors."""
         rows, count = self.record.rows, len(self.record.witnesses)
-        value = -0.5 * rows * (self._filter[3] + count * np.log(2 * np.pi))
+        value = -0.5 * rows * (self._filter[2] + count * np.log(2 * np.pi))
         if "speed" in self.record.witnesses:
             value -= 0.5 * float(np.log(self._offset[1]).sum())
         if self.noise.within is not None:
@@ -163,3 +132,82 @@ class Whitener:
         """Of errors (..., witness, counted, group): (...)."""
         e = self(errors)
         return self.constant - 0.5 * (e**2).sum((-1, -2, -3))
+
+
+Filter = tuple[list[list[Float]], Float, float]
+"""Numerators by (out, in), the denominator, log det of the innovations' covariance."""
+
+
+def _designed(noises: Sequence[NoiseModel], dt: float, witnesses: tuple[str, ...]) -> list[Filter]:
+    """The steady Kalman filter from errors to innovations of unit covariance, for each noise model."""
+    pairs = [_motion(n, dt) for n in noises]
+    move, driven = np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])
+    use = [i for i, name in enumerate(("accel", "speed")) if name in witnesses]
+    keep = slice(0, 3) if 1 in use else slice(1, 3)
+    see = np.array([[0, 1, 1], [1, 0, 0]], float)[use][:, keep]
+    white = np.stack([np.diag(np.array([n.accel_sd**2, n.speed_sd**2])[use]) for n in noises])
+    move, driven = move[:, keep, keep], driven[:, keep, keep]
+    ahead = _steady(move, see, driven, white)
+    s = see @ ahead @ see.T + white
+    gain = move @ ahead @ see.T @ np.linalg.inv(s)
+    mix = np.linalg.inv(np.linalg.cholesky(s))
+    inner = move - gain @ see
+    # adj(z - inner) and det(z - inner) by the Faddeev-LeVerrier recursion
+    size, count = inner.shape[-1], len(use)
+    m, terms = np.broadcast_to(np.eye(size), inner.shape), []
+    bottom = np.ones((len(noises), size + 1))
+    for k in range(1, size + 1):
+        terms.append(m)
+        m = inner @ m
+        bottom[:, k] = -np.trace(m, axis1=-2, axis2=-1) / k
+        m = m + bottom[:, k, None, None] * np.eye(size)
+    # innovations: errors less what the filter expects, 1 - see adj gain / det
+    tops = np.zeros((len(noises), count, count, size + 1))
+    for k, term in enumerate(terms):
+        tops[..., k + 1] = -(see @ term @ gain)
+    tops += np.eye(count)[:, :, None] * bottom[:, None, None, :]
+    mixed = np.einsum("noi,nijk->nojk", mix, tops)
+    sizes = np.linalg.slogdet(s)[1]
+    return [([list(row) for row in mixed[i]], bottom[i], float(sizes[i])) for i in range(len(noises))]
+
+
+def _motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
+    """State (error of the speed, p, d) over `dt`: its transition and the covariance that is added, both exact.
+
+    Two Ornstein-Uhlenbeck processes and the integral of their sum.
+    """
+    move, driven = np.eye(3), np.zeros((3, 3))
+    # a hair of speed noise, or the error of the speed is known exactly
+    driven[0, 0] = 1e-12 * dt
+    for i, sd, time in ((1, n.process_sd, n.process_time), (2, n.force_sd, n.force_time)):
+        lost = -np.expm1(-dt / time)
+        move[i, i], move[0, i] = 1 - lost, time * lost
+        driven[i, i] = sd**2 * lost * (2 - lost)
+        driven[0, i] = driven[i, 0] = sd**2 * time * lost**2
+        driven[0, 0] += sd**2 * time**2 * _integral(dt / time)
+    return move, driven
+
+
+def _integral(x: float) -> float:
+    """Variance of the integral of a unit process over `x` of its times: 2 x - 3 + 4 exp(-x) - exp(-2 x)."""
+    if x < 0.02:  # the series, where the terms above cancel
+        return x**3 * (2 / 3 - x / 2 + 7 * x**2 / 30 - x**3 / 12)
+    return 2 * x - 3 + 4 * float(np.exp(-x)) - float(np.exp(-2 * x))
+
+
+def _steady(move: Float, see: Float, driven: Float, white: Float) -> Float:
+    """Covariances (model, state, state) ahead of a reading, once they have settled: the Riccati equation by doubling.
+
+    Structure-preserving doubling (Anderson 1978): each round covers twice as many rows as the last.
+    """
+    a, g, h = move.mT, see.T @ np.linalg.solve(white, np.broadcast_to(see, (len(white), *see.shape))), driven
+    one = np.eye(move.shape[-1])
+    for _ in range(60):
+        inside = np.linalg.inv(one + g @ h)
+        left, more = a @ inside, a.mT @ h @ inside @ a
+        g = g + left @ g @ a.mT
+        a = left @ a
+        h = h + more
+        if bool((np.abs(more).max((-1, -2)) <= 1e-14 * np.abs(h).max((-1, -2))).all()):
+            break
+    return 0.5 * (h + h.mT)

@@ -57,12 +57,14 @@ class NoiseFit:
     sds: Mapping[str, float] = field(repr=False)
 
 
-def row_likelihoods(record: Record, errors: Float, noise: NoiseModel, onset: int | None = None) -> Float:
+def row_likelihoods(
+    record: Record, errors: Float, noise: NoiseModel, onset: int | None = None, *, white: Whitener | None = None
+) -> Float:
     """Log likelihood (counted,) of each row of errors (witness, counted, group); sums to the whole.
 
-    With `onset`, the coloured force has its size from that row on only.
+    With `onset`, the coloured force has its size from that row on only. `white`: of this noise, where it is at hand.
     """
-    white = Whitener(record, noise)
+    white = Whitener(record, noise) if white is None else white
     rows = white.constant / record.rows - 0.5 * (white(errors) ** 2).sum((0, 2))
     if onset:
         calm = row_likelihoods(record, errors, noise.replaced(force_sd=min(CALM, noise.force_sd)))
@@ -80,13 +82,16 @@ def fit_noise(
     onset: int | None = None,
     iterations: int = 6,
 ) -> NoiseFit:
-    """Mode of the noise's parameters given the errors (witness, counted, group) of a rollout; `T_L` [s]."""
+    """Mode of the noise's parameters given the errors (witness, counted, group) of a rollout; `T_L` [s].
+
+    Errors of means only, with group 1, leave what rows of a group differ by as it was.
+    """
     means = np.array([priors[n][0] for n in NAMES])
     means[NAMES.index("process_time")] += np.log(T_L)
     sds, ends = (np.array([priors[n][k] for n in NAMES]) for k in (1, 2))
 
-    within = None
-    if record.group > 1:
+    within = start.within
+    if errors.shape[-1] > 1:
         apart = errors - errors.mean(-1, keepdims=True)
         share = record.group / (record.group - 1)
         within = tuple(float(x) for x in np.sqrt(share * (apart**2).mean((1, 2))).clip(1e-9))
@@ -96,7 +101,7 @@ def fit_noise(
 
     # what rows of a group differ by does not depend on what is sought
     mean, fixed = errors.mean(-1, keepdims=True), 0.0
-    if within is not None:
+    if within is not None and errors.shape[-1] > 1:
         apart = ((errors - mean) / np.array(within)[:, None, None]) ** 2
         size = (record.group - 1) * sum(np.log(sd) + 0.5 * np.log(2 * np.pi) for sd in within)
         fixed = -0.5 * apart.sum((0, 2)) - size
@@ -120,8 +125,14 @@ def fit_noise(
                 z, rows, value = other, tried, worth
     damping, information = 1e-2, np.eye(len(z))
     for _ in range(iterations):
-        ahead = z + _STEP * np.eye(len(z))
-        slopes = np.stack([(likelihoods(x) - rows) / _STEP for x in ahead])
+        ahead = [replace(model(x), within=None) for x in z + _STEP * np.eye(len(z))]
+        whites = [None] * len(z) if onset else Whitener.each(record, ahead)
+        slopes = np.stack(
+            [
+                (row_likelihoods(record, mean, n, onset, white=w) + fixed - rows) / _STEP
+                for n, w in zip(ahead, whites, strict=True)
+            ]
+        )
         # squared scores tell the information where the model fits; far from it they are too large by the square of this
         excess = max(1.0, float((Whitener(record, replace(model(z), within=None))(mean) ** 2).mean()))
         information = slopes @ slopes.T / excess**2 + np.eye(len(z))

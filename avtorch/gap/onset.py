@@ -29,7 +29,7 @@ def allowed(rows: int, dt: float) -> slice:
 def rough(white: Whitener, candidate: Candidate, z: Float) -> tuple[int, float]:
     """Best onset row for parameters `z` of a fit over the whole drive, and what it gains [nats] over none."""
     full = candidate.errors(z[None], coarse=True)[0]
-    silent = candidate.record.measured.mean(-1, keepdims=True) - candidate.baseline_rollout(z, coarse=True)
+    silent = candidate.record.measured.mean(-1, keepdims=True) - candidate.baseline_rollouts(z[None], coarse=True)[0]
     rows = profile(-0.5 * (white(silent) ** 2).sum((0, 2)), -0.5 * (white(full) ** 2).sum((0, 2)))
     within = allowed(len(rows), white.record.dt)
     best = within.start + int(np.argmax(rows[within]))
@@ -39,7 +39,7 @@ def rough(white: Whitener, candidate: Candidate, z: Float) -> tuple[int, float]:
 def refined(white: Whitener, candidate: Candidate, z: Float, onset: int) -> tuple[int, Float]:
     """Best onset row near `onset`, and the log likelihood over all rows tried, (row,), -inf elsewhere."""
     record = white.record
-    full, silent = candidate.rollouts(z[None])[0], candidate.baseline_rollout(z)
+    full, silent = candidate.rollouts(z[None])[0], candidate.baseline_rollouts(z[None])[0]
     measured = record.measured
     within = allowed(record.rows, record.dt)
     found = np.full(record.rows, -np.inf)

@@ -166,8 +166,8 @@ def plant(
         base = _from(read_file(baseline))
     own = [e() if isinstance(e, type) else e for e in effects]
     kept = [e for e in base.effects if e.name not in {x.name for x in own}]
-    for e in own:
-        implied = getattr(e, "implied_lag", lambda: None)()
+    for i, e in enumerate(own):
+        own[i], implied = e.lag_apart()
         if implied is not None:
             if T_L is not None:
                 raise InputError(f"T_L: given beside a {e.name} that sets it; needs one of the two")

@@ -21,6 +21,7 @@ from torch import Tensor
 from avtorch.errors import InputError
 from avtorch.gap.drive import Drive
 from avtorch.io import Log
+from avtorch.io.log import AccelKind
 
 Float = NDArray[np.float64]
 
@@ -60,6 +61,11 @@ class Record:
         return len(self.source)
 
     @property
+    def accel_kind(self) -> AccelKind:
+        """What `accel` is, as the logs say."""
+        return "specific-force" if self.drives[0].specific_force else "kinematic"
+
+    @property
     def witnesses(self) -> tuple[str, ...]:
         return tuple(name for name in ("accel", "speed") if getattr(self, name) is not None)
 
@@ -80,6 +86,10 @@ class Record:
         names = list(dict.fromkeys(log.name for log in each))
         if len({(log.accel is not None, log.speed is not None) for log in each}) > 1:
             raise InputError(f"logs: {', '.join(names)} have different witnesses; needs accel, speed or both in all")
+        kinds = {log.accel_kind for log in each}
+        if len(kinds) > 1:
+            raise InputError(f"logs: {', '.join(names)} have different kinds of accel; needs one in all")
+        specific = "specific-force" in kinds
         rates = [log.rate_hz for log in each]
         if max(rates) > 1.02 * min(rates):
             told = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in each)
@@ -107,9 +117,9 @@ class Record:
                 first = max(1, round(0.3 / step))
                 accel0 = None if log.accel is None else float(mean(log.accel)[:first].mean())
                 raw = log.speed if log.speed is None else log.speed[cut]
-                drives.append(_drive(log.time[cut], log.accel_cmd[cut], raw, accel0))
+                drives.append(_drive(log.time[cut], log.accel_cmd[cut], raw, accel0, specific))
                 if group > 1:
-                    coarse.append(_drive(time, mean(log.accel_cmd), speed, accel0))
+                    coarse.append(_drive(time, mean(log.accel_cmd), speed, accel0, specific))
                 columns["time"].append(time)
                 columns["command"].append(mean(log.accel_cmd))
                 columns["use"].append((use & settled).astype(float))
@@ -169,9 +179,9 @@ class Record:
         return np.stack([x[self.source] for x in (self.accel, self.speed) if x is not None])
 
 
-def _drive(time: Float, command: Float, speed: Float | None, accel0: float | None) -> Drive:
+def _drive(time: Float, command: Float, speed: Float | None, accel0: float | None, specific: bool) -> Drive:
     quiet = None if speed is None else torch.as_tensor(_quiet(speed, float(np.median(np.diff(time)))))
-    return Drive(torch.as_tensor(_even(time)), torch.as_tensor(command), quiet, accel0)
+    return Drive(torch.as_tensor(_even(time)), torch.as_tensor(command), quiet, accel0, specific)
 
 
 def _even(time: Float) -> Float:

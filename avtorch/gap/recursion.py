@@ -7,7 +7,8 @@ blocks' ends are joined, and what each block inherits is added. 2 sqrt(N) small 
 truncation and products only, so nothing overflows where alpha is zero. The derivative of a linear recursion is a
 linear recursion (backward in time for the gradient, forward for a tangent), hence derivatives of any order.
 
-`scan` takes a scalar state, `scan_pair` a state of two components with 2 x 2 matrices.
+`scan` takes a scalar state, `scan_pair` a state of two components with 2 x 2 matrices. In `torch.inference_mode`,
+where nobody will ask for a derivative, constant recursions pass SciPy's filter, a dozen times as fast.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import math
 from typing import Any
 
 import torch
+from scipy.signal import lfilter
 from torch import Tensor
 
 _Components = list[Tensor]
@@ -26,7 +28,11 @@ def scan(alpha: Tensor, beta: Tensor, start: Tensor) -> Tensor:
 
     Args: `alpha` (..., time), or (..., 1) where it is constant, `beta` (..., time), `start` (...). All broadcast.
     """
-    return _Scan.apply(*_aligned(1, [alpha], [beta], [start]))[0]
+    aligned = _aligned(1, [alpha], [beta], [start])
+    if torch.is_inference_mode_enabled() and alpha.shape[-1] == 1:
+        a, b, x = aligned[1:]
+        return _filtered([-a], [(torch.ones_like(a), torch.cat([b[..., :1] + a * x, b[..., 1:]], -1))])
+    return _Scan.apply(*aligned)[0]
 
 
 def scan_pair(
@@ -36,8 +42,29 @@ def scan_pair(
 
     Args: `matrix` four of (..., time) or (..., 1), `beta` two of (..., time), `start` two of (...). All broadcast.
     """
-    first, second = _Scan.apply(*_aligned(2, list(matrix), list(beta), list(start)))
+    aligned = _aligned(2, list(matrix), list(beta), list(start))
+    if torch.is_inference_mode_enabled() and all(m.shape[-1] == 1 for m in matrix):
+        m0, m1, m2, m3, b0, b1, x0, x1 = aligned[1:]
+        b0 = torch.cat([b0[..., :1] + m0 * x0 + m1 * x1, b0[..., 1:]], -1)
+        b1 = torch.cat([b1[..., :1] + m2 * x0 + m3 * x1, b1[..., 1:]], -1)
+        bottom, one = [-(m0 + m3), m0 * m3 - m1 * m2], torch.ones_like(m0)
+        first = _filtered(bottom, [(torch.cat([one, -m3], -1), b0), (torch.cat([0 * one, m1], -1), b1)])
+        second = _filtered(bottom, [(torch.cat([0 * one, m2], -1), b0), (torch.cat([one, -m0], -1), b1)])
+        return first, second
+    first, second = _Scan.apply(*aligned)
     return first, second
+
+
+def _filtered(bottom: _Components, tops: list[tuple[Tensor, Tensor]]) -> Tensor:
+    """The sum of inputs (..., time), each through `top / (1 + bottom[0] / z + ...)`, every column its own filter."""
+    shape = tops[0][1].shape
+    below = torch.stack([torch.ones_like(bottom[0]), *bottom], -1).reshape(-1, len(bottom) + 1).numpy()
+    total = torch.zeros(shape, dtype=torch.float64).reshape(-1, shape[-1])
+    for top, x in tops:
+        above, rows = top.reshape(len(total), -1).numpy(), x.reshape(total.shape).numpy()
+        for i in range(len(total)):
+            total[i] += torch.from_numpy(lfilter(above[i], below[i], rows[i]))
+    return total.reshape(shape)
 
 
 def _aligned(n: int, alpha: _Components, beta: _Components, start: _Components) -> list[Any]:

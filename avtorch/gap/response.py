@@ -38,6 +38,8 @@ def respond(
         accel0 = start = torch.as_tensor(drive.accel0).expand(shape[:-1])
         # the actuator gives what the car does beyond the other forces
         for e in at_place(single, "body"):
+            if e.gravity and drive.specific_force:
+                continue
             at = row_at(rows[e.name], 0)
             accel0 = accel0 - e.advance(start, at, e.start(start, at))[0]
     a, gained = actuator_of(whole).over(accel0.expand(shape[:-1]), parts)
@@ -49,6 +51,9 @@ def respond(
         accel = a + force
         gained = gained + 0.5 * (dt if drive.uniform else dt[:-1]) * (force[..., 1:] + force[..., :-1])
     measured = accel
+    if drive.specific_force:
+        for e, force in zip(at_place(whole, "body"), forces, strict=True):
+            measured = measured - force if e.gravity else measured
     for e in at_place(whole, "sensor"):
         measured = e.over(measured, rows[e.name])
     v0 = torch.zeros((), dtype=a.dtype) if drive.speed is None else drive.speed[..., 0]

@@ -8,7 +8,7 @@ chance decides (gusts, outliers, lost messages) are judged on the errors that th
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,14 +18,16 @@ from avtorch.gap.candidate import Candidate
 from avtorch.gap.chance import Tails, losses, tails
 from avtorch.gap.checkpoint import Checkpoint, Kept
 from avtorch.gap.effect import EFFECTS, Effect
-from avtorch.gap.fit import finish, modes
+from avtorch.gap.fit import finish, left_over, modes
 from avtorch.gap.found import Found, Race, cleaned, merged, white_first
 from avtorch.gap.gusts import gust
 from avtorch.gap.innovations import NoiseModel, Whitener
 from avtorch.gap.noise_fit import fit_noise
-from avtorch.gap.onset import averaged, refined, rough
+from avtorch.gap.onset import averaged, refined
+from avtorch.gap.pairing import joint, score, swapped
 from avtorch.gap.plant import GapPlant
 from avtorch.gap.record import Record
+from avtorch.gap.screening import Look, looks
 from avtorch.gap.starts import starts
 from avtorch.io import Log
 
@@ -34,8 +36,12 @@ Progress = Callable[[str, int, int], None]
 
 _SINGLES = 6  # fitted with noise of their own
 _BASES = 3  # joined with a second effect
-_SECONDS = 3  # tried on each
-_CLOSE = 12.0  # nats within which a single effect stays in the race for a partner
+_SECONDS = 4  # tried on each
+_PAIRS = 4  # fitted with noise of their own
+_SWAPS = 2  # times that either half of the best pair is exchanged for another effect
+_SECOND = 8.0  # nats a pair must be ahead of the best single effect for that
+_HELD = 2  # single effects on top of which lost messages are looked for
+_CLOSE = 12.0  # nats by which a pair may be behind at first sight
 
 
 class Search:
@@ -120,20 +126,19 @@ class Search:
         known = self.checkpoint.next(candidate.name, onset)
         if known is not None:
             return known.found(candidate, onset)
-        white = Whitener(record, noise)
-        if record.group > 1:
-            z = modes(candidate, white, z[None], onset=onset, iterations=4, coarse=True)[0][0]
-        value = -np.inf
-        for turn in range(rounds + 1):
-            z = modes(candidate, white, z[None], onset=onset, iterations=4)[0][0]
-            fit = finish(candidate, white, z, onset)
-            fitted = fit_noise(record, fit.errors, noise, T_L=self._lag(candidate, z), iterations=3)
-            noise = fitted.noise
-            white = Whitener(record, noise)
-            new = float(fitted.rows.sum())
-            if new < value + 0.3 or turn == rounds:
-                break
-            value = new
+        # on averaged commands first, which is several times as fast and ends close by
+        for coarse in (True, False) if record.group > 1 else (False,):
+            value = -np.inf
+            for turn in range(rounds + 1):
+                white = Whitener(record, noise)
+                z = modes(candidate, white, z[None], onset=onset, iterations=4, coarse=coarse)[0][0]
+                errors = left_over(candidate, white, z, onset, coarse=coarse)
+                fitted = fit_noise(record, errors, noise, T_L=self._lag(candidate, z), iterations=3)
+                noise = fitted.noise
+                new = float(fitted.rows.sum())
+                if new < value + 0.3 or turn == rounds:
+                    break
+                value = new
         self.checkpoint.keep(candidate.name, onset, Kept(z, noise, fitted.log_prior))
         return Kept(z, noise, fitted.log_prior).found(candidate, onset)
 
@@ -144,41 +149,34 @@ class Search:
     def _deterministic(self, record: Record, none: Found) -> list[Found]:
         kinds = [e for e in self.effects if not e.random and self._possible(e, record)]
         white = Whitener(record, none.noise.noise)
-        screened: list[tuple[float, Candidate, Float, int | None]] = []
+        seen: list[Look] = []
+        floor = float(white.log_likelihood(none.errors.mean(-1, keepdims=True)[None])[0])
         for i, kind in enumerate(kinds):
             self.progress("single effects", i, len(kinds))
             if self._late():
                 break
             candidate = Candidate(record, (kind,), self.baseline)
-            z, value = self._screen(candidate, white, none)
-            onset, more = (None, 0.0)
-            if kind.name != "gain_change" and value > none.log_likelihood - 200:
-                onset, more = rough(white, candidate, z)
-            screened.append((value, candidate, z, None))
-            if onset is not None and more > 3:
-                screened.append((value + more - 6, candidate, z, onset))
+            begin = starts(candidate, none.values)
+            seen += looks(candidate, white, begin, onsets=kind.name != "gain_change", floor=floor)
         best: dict[str, float] = {}
-        for value, candidate, _, _ in screened:
-            best[candidate.name] = max(best.get(candidate.name, -np.inf), value)
+        for look in seen:
+            best[look.candidate.name] = max(best.get(look.candidate.name, -np.inf), look.value)
         order = sorted(best, key=lambda n: -best[n])
-        # whatever is left behind keeps the evidence of its screening
-        floor = none.log_likelihood
         top = best[order[0]] - floor if order else 0.0
         lead = [n for n in order[:_SINGLES] if best[n] - floor > min(0.25 * top, top - 30)]
         found = [none]
-        blown = gust(none) if self._has("gust") else None
-        if blown is not None:
-            found.append(blown)
+        if self._has("gust"):
+            found.append(gust(none))
         for i, name in enumerate(lead):
             self.progress("the best of them", i, len(lead))
             if self._late():
                 break
-            forms = [s for s in screened if s[1].name == name]
-            found.append(self._single(forms, found))
-        for name in [n for n in order if n not in lead]:
-            _, candidate, z, _ = next(s for s in screened if s[1].name == name)
-            fit = finish(candidate, white, z)
-            found.append(self._as_found(candidate, fit, none))
+            noise = max(found, key=lambda f: f.log_evidence).noise.noise
+            found.append(self._refined([look for look in seen if look.candidate.name == name], noise))
+        # whatever is left behind keeps the evidence of its screening
+        for look in seen:
+            if look.candidate.name not in lead and look.onset is None:
+                found.append(self._as_found(look.candidate, finish(look.candidate, white, look.z), none))
         if self.pairs:
             found += self._pairs(record, kinds, found, none)
         return found
@@ -204,24 +202,9 @@ class Search:
             return False
         return not (kind.needs_speed and record.speed is None)
 
-    def _screen(self, candidate: Candidate, white: Whitener, base: Found) -> tuple[Float, float]:
-        """The best of all starts under noise that is not its own."""
-        z = starts(candidate, base.values)
-        if len(z) > 2:
-            values = np.concatenate(
-                [white.log_likelihood(candidate.errors(z[i : i + 32], coarse=True)) for i in range(0, len(z), 32)]
-            )
-            z = z[np.argsort(-(values - 0.5 * (z**2).sum(1)))[:2]]
-        found, values = modes(candidate, white, z, iterations=6, coarse=True)
-        return found[values.argmax()], float(values.max())
-
-    def _single(self, forms: list[tuple[float, Candidate, Float, int | None]], found: list[Found]) -> Found:
+    def _refined(self, forms: Sequence[Look], noise: NoiseModel) -> Found:
         """One cause over the whole drive and from an onset on; both weigh the same a priori."""
-        noise = max(found, key=lambda f: f.log_evidence).noise.noise
-        made = []
-        for _, candidate, z, onset in forms:
-            made.append(self._from_onset(candidate, z, noise, onset))
-        return merged(made)
+        return merged([self._from_onset(f.candidate, f.z, noise, f.onset) for f in forms])
 
     def _from_onset(self, candidate: Candidate, z: Float, noise: NoiseModel, onset: int | None) -> Found:
         if onset is None:
@@ -248,82 +231,68 @@ class Search:
         single = sorted((f for f in found if f.name != "none"), key=lambda f: -f.log_evidence)
         if not single or single[0].log_evidence < none.log_evidence + 3:
             return []
-        top = single[0].log_evidence
-        bases = [
-            f
-            for i, f in enumerate(single[:_BASES])
-            if i == 0 or f.log_evidence > none.log_evidence + 0.3 * (top - none.log_evidence)
-        ]
-        made: dict[str, Found] = {}
-        for number, base in enumerate(bases):
-            if base.gust:
-                continue
-            white = Whitener(record, base.noise.noise)
-            scored = []
-            for kind in kinds:
-                if kind.name in base.name.split("+") or self._late():
-                    continue
-                candidate = Candidate(record, (*base.candidate.effects, kind), self.baseline)
-                if candidate.name in made:
-                    continue
-                scored.append(self._score(candidate, base, white))
-            scored.sort(key=lambda s: -s[0])
-            for i, (gain, candidate, z) in enumerate(scored[:_SECONDS]):
-                self.progress("pairs", number * _SECONDS + i, len(bases) * _SECONDS)
-                if gain < 4 or self._late():
-                    break
-                made[candidate.name] = self._pair(candidate, z, base)
-            if self._has("gust"):
-                gusty = gust(base)
-                made[gusty.name] = gusty
+        top = single[0].log_evidence - none.log_evidence
+        bases = [f for f in single if not f.gust and f.log_evidence - none.log_evidence > 0.2 * top][:_BASES]
+        made = {f.name: f for f in map(gust, bases[:2])} if self._has("gust") else {}
+        white = Whitener(record, single[0].noise.noise)
+        alone = {f.name: f.values for f in single if not f.gust}
+        seen: dict[str, Look] = {}
+        for i, base in enumerate(bases):
+            self.progress("pairs", i, len(bases))
+            if self._late():
+                break
+            for look in self._joined(base, kinds, white, alone):
+                known = seen.get(look.candidate.name)
+                if known is None or look.value > known.value:
+                    seen[look.candidate.name] = look
+        done = self._settle_pairs(list(seen.values()), _PAIRS, single[0].noise.noise, made)
+        for _ in range(_SWAPS):
+            if done is None or done.log_evidence < single[0].log_evidence + _SECOND or self._late():
+                break
+            # a better partner for either half, now that the noise is what the best pair leaves over
+            white = Whitener(record, done.noise.noise)
+            here = Look(done.candidate, done.z, float(white.log_likelihood(done.errors[None])[0]), done.onset)
+            near = here.value - 0.5 * float(here.z @ here.z) - _CLOSE
+            others = [k for k in swapped(here, kinds, white, alone, tries=_SECONDS) if k.candidate.name not in made]
+            better = self._settle_pairs([k for k in others if k.value > near], 2, done.noise.noise, made)
+            if better is None or better.log_evidence < done.log_evidence + 1:
+                break
+            done = better
         return list(made.values())
 
-    def _score(self, candidate: Candidate, base: Found, white: Whitener) -> tuple[float, Candidate, Float]:
-        """What a second effect could gain on top of `base`, by one linear step from each of its starts."""
-        z = starts(candidate, base.values)
-        e = white(base.errors.mean(-1, keepdims=True)).ravel()
-        own = self._own_columns(base, white)
-        best, at = -np.inf, z[0]
-        grade = candidate.grade_columns if "road_grade" not in base.name else None
-        if grade is not None:
-            # GP columns: gain by their best size
-            step, value = modes(candidate, white, z[:1], onset=base.onset, iterations=2, coarse=True)
-            flat = base.errors.mean(-1, keepdims=True)
-            return float(value[0] - white.log_likelihood(flat)), candidate, step[0]
-        silent = base.candidate.rollouts(base.z[None], base.onset, coarse=True)[0]
-        for i in range(0, len(z), 32):
-            apart = white(candidate.rollouts(z[i : i + 32], base.onset, coarse=True) - silent).reshape(
-                len(z[i : i + 32]), -1
-            )
-            apart = apart - (apart @ own.T) @ own
-            square = np.einsum("cr,cr->c", apart, apart)
-            cross = apart @ e
-            ok = square > 1e-6
-            gains = np.where(ok, 0.5 * np.maximum(cross, 0) ** 2 / np.maximum(square, 1e-6), 0.0)
-            # a start that overshoots still tells the direction
-            k = int(gains.argmax())
-            if gains[k] > best:
-                best, at = float(gains[k]), z[i + k]
-        return best, candidate, at
+    def _joined(
+        self,
+        base: Found,
+        kinds: Sequence[type[Effect]],
+        white: Whitener,
+        alone: Mapping[str, Mapping[str, float]],
+    ) -> list[Look]:
+        """The effects that promise most on top of `base`, each fitted with it."""
+        scored = []
+        for kind in kinds:
+            if kind in base.candidate.effects:
+                continue
+            candidate = Candidate(white.record, (*base.candidate.effects, kind), self.baseline)
+            scored.append((*score(candidate, base.candidate, base.z, base.values, base.onset, white, alone), candidate))
+        scored.sort(key=lambda s: -s[0])
+        return [
+            joint(candidate, base.candidate.effects[0], z, base.onset, white, onsets=True)
+            for gain, z, candidate in scored[:_SECONDS]
+            if gain > 4 and not self._late()
+        ]
 
-    def _own_columns(self, base: Found, white: Whitener) -> Float:
-        """Orthonormal white directions (direction, row) along which the base's own parameters move its rollout."""
-        size = len(base.z)
-        moved = np.repeat(base.z[None], size + 1, 0)
-        moved[1:] += 1e-4 * np.eye(size)
-        e = white(base.candidate.rollouts(moved, base.onset, coarse=True)).reshape(size + 1, -1)
-        columns = e[1:] - e[:1]
-        norms = np.linalg.norm(columns, axis=1)
-        columns = columns[norms > 1e-9]
-        if not len(columns):
-            return np.zeros((0, e.shape[1]))
-        q, _ = np.linalg.qr((columns / np.linalg.norm(columns, axis=1)[:, None]).T)
-        return q.T
-
-    def _pair(self, candidate: Candidate, z: Float, base: Found) -> Found:
-        if base.onset is None:
-            return self._settled(candidate, z, base.noise.noise)
-        return self._from_onset(candidate, z, base.noise.noise, base.onset)
+    def _settle_pairs(self, pairs: list[Look], most: int, noise: NoiseModel, made: dict[str, Found]) -> Found | None:
+        """The best `most` of them with noise of their own, added to `made`; the best of these."""
+        best: Found | None = None
+        for look in sorted(pairs, key=lambda k: -k.value)[:most]:
+            if self._late():
+                break
+            pair = self._refined([look], noise)
+            made[pair.name] = pair
+            if best is None or pair.log_evidence > best.log_evidence:
+                best = pair
+                noise = pair.noise.noise
+        return best
 
     # chance --------------------------------------------------------------------------------------------------------
     def _tails(self, raw: Record, of: Found) -> Tails:
@@ -359,9 +328,16 @@ class Search:
         return out
 
     def _held(self, raw: Record, found: list[Found], none: Found) -> list[Found]:
-        noise = fit_noise(raw, self._raw_errors(raw, none), none.noise.noise, T_L=none.values["T_L"], iterations=6)
-        white = Whitener(raw, noise.noise)
-        lost = losses(
-            white, self._raw_errors(raw, none), raw.command[raw.source], none.values["T_L"], none.values["K_L"]
-        )
-        return [replace(none, name="command_hold", log_evidence=none.log_evidence + lost.evidence, losses=lost)]
+        """Lost messages alone and on top of the best single effects."""
+        known = [f for f in found if f.name != "none" and "+" not in f.name and not f.gust and f.tails is None]
+        out = []
+        for f in [none, *sorted(known, key=lambda f: -f.log_evidence)[:_HELD]]:
+            if f is not none and f.log_evidence < none.log_evidence + 3:
+                continue
+            errors = self._raw_errors(raw, f)
+            noise = fit_noise(raw, errors, f.noise.noise, T_L=f.values["T_L"], iterations=6)
+            white = Whitener(raw, noise.noise)
+            lost = losses(white, errors, raw.command[raw.source], f.values["T_L"], f.values["K_L"])
+            name = "+".join(sorted([*([] if f is none else [f.name]), "command_hold"]))
+            out.append(replace(f, name=name, log_evidence=f.log_evidence + lost.evidence, losses=lost))
+        return out

@@ -13,13 +13,16 @@ from avtorch.gap.candidate import Candidate
 Float = NDArray[np.float64]
 
 GRIDS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
-    "dead_time": {"delay_s": (0.03, 0.12, 0.3, 0.6)},
-    "dead_band": {"half_width_mps2": (0.03, 0.12, 0.35)},
-    "backlash": {"half_width_mps2": (0.03, 0.12, 0.35)},
-    "saturation": {"accel_max_mps2": (0.4, 0.8, 1.4, 5.0), "accel_min_mps2": (-0.7, -1.4, -2.4, -8.0)},
+    "dead_time": {"delay_s": (0.03, 0.07, 0.13, 0.22, 0.35, 0.55)},
+    "dead_band": {"half_width_mps2": (0.03, 0.07, 0.13, 0.22, 0.35)},
+    "backlash": {"half_width_mps2": (0.03, 0.07, 0.13, 0.22, 0.35)},
+    "saturation": {
+        "accel_max_mps2": (0.5, 0.75, 1.0, 1.25, 1.6, 2.1, 5.0),
+        "accel_min_mps2": (-0.8, -1.2, -1.6, -2.1, -2.8, -8.0),
+    },
     "brake_throttle_asymmetry": {"brake_gain_ratio": (0.6, 0.95, 1.2), "brake_lag_ratio": (1.0, 2.5)},
     "second_order_actuator": {"inverse_frequency_s": (0.05, 0.15, 0.4)},
-    "rate_limit": {"jerk_max_mps3": (0.4, 1.0, 2.2, 4.5)},
+    "rate_limit": {"jerk_max_mps3": (0.4, 0.7, 1.1, 1.8, 3.0, 5.0)},
     "speed_dependent_lag": {"lag_slope": (-0.4, 0.4)},
     "speed_dependent_gain": {"gain_slope": (-0.15, 0.15)},
     "gear_shift": {
@@ -36,7 +39,7 @@ GRIDS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
     "aerodynamic_drag": {"drag_per_m": (5e-5, 4e-4)},
     "constant_resistance": {"resistance_mps2": (0.02, 0.15)},
     "low_speed_creep": {"creep_mps2": (0.05, 0.3)},
-    "sensor_lag": {"lag_s": (0.03, 0.12, 0.35)},
+    "sensor_lag": {"lag_s": (0.03, 0.1, 0.2, 0.4)},
     "sensor_bias": {"bias_mps2": (0.02, -0.02)},
     "sensor_scale": {"scale": (0.95, 1.05)},
 }  # fmt: skip

@@ -70,7 +70,8 @@ def read_file(path: str | PathLike[str], more: Iterable[type[Effect]] = ()) -> D
 def to_toml(effects: Iterable[Effect], baseline: Mapping[str, Any]) -> str:
     """TOML that `described` reads back to the same numbers."""
     lines = [f"{name} = {_number(name, value)}" for name, value in baseline.items()]
-    for effect in effects:
+    for given in effects:
+        effect, _ = given.lag_apart()  # T_L stands there already
         lines += ["", f"[{effect.name}]"]
         for f in fields(effect):
             value = getattr(effect, f.name)

@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ STANDSTILL_MPS = 0.3
 """Below this speed GLVD does not hold; such rows are masked."""
 
 Float = NDArray[np.float64]
+AccelKind = Literal["kinematic", "specific-force"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +35,9 @@ class Log:
     ``accel`` [m/s^2] and ``speed`` [m/s], at least one of them; ``jerk`` [m/s^3]; ``engaged`` (bool, all true where the
     log does not tell); ``spacing`` [m, bumper to bumper]; ``lead_speed`` [m/s]; ``lead_accel`` [m/s^2]; ``grade`` [-];
     ``segment`` (int from 0; rises at each gap and each new value of the log's own column, where time may start anew).
-    ``name`` of the source; ``ignored``: its further columns; ``remarks``: what merging left out.
+    ``name`` of the source; ``ignored``: its further columns; ``remarks``: what merging left out. ``accel_kind`` is not
+    in a file: ``accel`` is dv/dt, as on a vehicle bus, or what an accelerometer fixed to the car reads along it, dv/dt
+    plus gravity's share on a slope; ``dataclasses.replace`` sets it.
     """
 
     time: Float
@@ -51,6 +54,7 @@ class Log:
     name: str = "log"
     ignored: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    accel_kind: AccelKind = "kinematic"
 
     @classmethod
     def read(
@@ -108,6 +112,7 @@ class Log:
             name=table.source,
             ignored=made.ignored,
             remarks=made.remarks,
+            accel_kind="kinematic",
         )
         motion = {name: getattr(log, name) for name in ("accel_cmd", "accel", "speed", "lead_speed")}
         check_units(table.source, time, stretches(log.usable, log.segment), **motion)

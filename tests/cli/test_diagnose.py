@@ -18,7 +18,7 @@ from rich.console import Console
 
 from avtorch.cli import main
 from avtorch.cli.diagnosis_table import bar, diagnosis_headline, diagnosis_notes, diagnosis_table
-from avtorch.gap import DeadTime, GapPlant, plant
+from avtorch.gap import EFFECTS, DeadTime, GapPlant, plant
 from avtorch.gap.diagnosis import Candidate, Diagnosis, GapFacts, LogFacts, Quantity, verdict_of
 from avtorch.io import Log
 
@@ -283,6 +283,7 @@ def test_a_note_that_cannot_be_read(
     ("options", "fault"),
     [
         (["--effects", "dead_tim"], "--effects: found 'dead_tim', needs an effect's name; perhaps dead_time"),
+        (["--effects", "drag"], "--effects: found 'drag', needs an effect's name; perhaps aerodynamic_drag"),
         (["--effects", "gust,gust"], "--effects: found 'gust,gust', needs each name once"),
         (["--effects", ""], "--effects: found ''"),
         (["--effects", "none"], "--effects: found 'none'"),
@@ -295,7 +296,7 @@ def test_a_note_that_cannot_be_read(
         (["--baseline", "dead_time=x"], "needs a number after '='"),
         (["--baseline", "dead_time=-0.1"], "dead_time.delay_s is -0.1, needs a positive number"),
         (["--baseline", "T_L=0"], "--baseline 'T_L=0': T_L"),
-        (["--baseline", "missing.toml"], "--baseline 'missing.toml': plant: missing.toml cannot be read"),
+        (["--baseline", "missing.toml"], "--baseline 'missing.toml': no such file"),
         (["--budget", "0"], "--budget: found 0, needs a finite number above 0 s"),
         (["--budget", "nan"], "--budget: found nan"),
         (["--seed", "1.5"], "needs a whole number"),
@@ -335,6 +336,8 @@ def test_logs_that_cannot_be_used(search: Search, tmp_path: Path, capsys: pytest
     speed_only = write(tmp_path / "speed.csv", **given)
     specific = ["--accel-kind", "specific-force"]
     refused(["diagnose", speed_only, *specific], "speed.csv has no accel", tmp_path, capsys)
+    asked = ["--effects", "gust,sensor_lag"]
+    refused(["diagnose", speed_only, *asked], "found sensor_lag, which no log without accel can show", tmp_path, capsys)
     refused(["diagnose", str(tmp_path / "missing.csv")], "missing.csv", tmp_path, capsys)
     refused(["diagnose"], "LOGS requires an argument", tmp_path, capsys)
     assert main(["diagnose", speed_only, "--out", str(tmp_path / "speed.csv")]) == 2
@@ -372,7 +375,6 @@ def test_table(logs: list[Log], width: int) -> None:
     assert told[1].startswith("dead_time ")
     assert "0.930 ███████▌" in told[1]
     assert "+1234  delay 0.182 s (0.175 to 0.189)" in told[1]
-    assert told[2].strip() == "T_L 0.52 → 0.31 s, K_L 1.02 → 0.99"
     whole = "\n".join(told)
     # both of the pair have a half width: there the effect is named
     assert "backlash: half width 0.100 m/s²" in whole
@@ -381,8 +383,6 @@ def test_table(logs: list[Log], width: int) -> None:
 
 
 def test_table_of_many_candidates_stays_short(logs: list[Log]) -> None:
-    from avtorch.gap import EFFECTS
-
     names = [name for name in EFFECTS if name != "dead_time"]
     weak = tuple(Candidate(name, 0.02, 1.0) for name in names)
     found = answer(
@@ -400,6 +400,9 @@ def test_headline_for_each_kind_of_verdict(logs: list[Log]) -> None:
         return lines("\n".join(diagnosis_headline(answer(logs, (Candidate(name, p), *others)))), 200)[0]
 
     assert said("none") == "The simulator lacks nothing that this log shows (probability over 0.99)."
+    assert said("dead_time", 0.9).startswith("The simulator lacks dead_time (")
+    unsure = (Candidate("dead_time", 0.6), Candidate("gust", 0.4), Candidate("none", 0.0), Candidate("unknown", 0.0))
+    assert diagnosis_headline(answer(logs, unsure))[0].startswith("[bold cyan]Probably the simulator lacks dead_time")
     assert said("unknown").startswith("The cause is none of the effects known here")
     assert said("dead_time+gust") == (
         "The simulator lacks dead_time and gust (probability over 0.99): "
@@ -413,12 +416,14 @@ def test_notes(logs: list[Log]) -> None:
     told = lines("\n".join(notes), 200)
     assert told[0] == "Not told apart on this log: dead_time, or second_order_actuator."
     assert told[1] == "Onset: at 132.4 s of the log's time."
-    assert told[2] == (
-        "Gap of the simulator as it is, over 5 s: acceleration off by 0.21 m/s² (noise alone 0.05), speed by 0.9 m/s."
+    assert told[2] == "The baseline, fitted without and with it: T_L 0.52 → 0.31 s, K_L 1.02 → 0.99."
+    assert told[3] == (
+        "Gap of the simulator as it is, over 5 s: acceleration off by 0.21 m/s² (0.05 is left at best), "
+        "speed by 0.9 m/s."
     )
-    assert told[3] == "Once dead_time is in, what remains: aerodynamic_drag 0.897, none 0.100."
-    assert told[4].startswith("The budget ended the search")
-    assert told[5] == "speed [only]"
+    assert told[4] == "Once dead_time is in, what remains: aerodynamic_drag 0.897, none 0.100."
+    assert told[5].startswith("The budget ended the search")
+    assert told[6] == "speed [only]"
 
     sure = verdict_of(CANDIDATES, aliases=lambda ranked: ())
     told = lines("\n".join(diagnosis_notes(answer(logs, verdict=sure))), 200)
@@ -429,6 +434,9 @@ def test_notes(logs: list[Log]) -> None:
         "Not told apart on this log: dead_time, or no effect at all, a cause outside the table or "
         "backlash with dead_band."
     )
+    many = Candidate("dead_time", 0.3, 9.0), *(Candidate(n, 0.05, 1.0) for n in sorted(EFFECTS) if n != "dead_time")
+    told = lines("\n".join(diagnosis_notes(answer(logs, (*many, *CANDIDATES[-2:])))), 200)
+    assert told[0].endswith("command_hold or any of 16 that are less probable.")
 
 
 def test_bar() -> None:

@@ -54,7 +54,7 @@ def test_wrong_arguments_are_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="posterior"):
         avtorch.diagnose(log, posterior="guess")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="accel_kind"):
-        avtorch.diagnose(log, accel_kind="specific-force")
+        avtorch.diagnose(log, accel_kind="gravity")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="no_such"):
         avtorch.diagnose(log, effects=["no_such"])
     bad = tmp_path / "fits.json"

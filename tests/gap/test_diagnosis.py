@@ -7,6 +7,7 @@ import json
 import math
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -284,6 +285,9 @@ def test_several_logs_are_counted_together() -> None:
 
     facts = LogFacts.of([log(101, 0.1), log(201, 0.05, accel=True)])
     assert (facts.rows, facts.segments, facts.name) == (302, 2, "101, 201")
+    # where a log lay is not told
+    named = [replace(log(101, 0.1), name=name) for name in ("somebody/at home/a.csv", "b.csv", "arrays")]
+    assert LogFacts.of(named).name == "a.csv, b.csv, arrays"
     assert facts.seconds == pytest.approx(20.0)
     assert facts.rate_hz == pytest.approx(15.0)
     assert facts.signals == ("accel_cmd", "accel", "speed")

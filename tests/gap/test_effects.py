@@ -131,6 +131,31 @@ def test_the_step_does_not_matter(effect: Effect, late: bool) -> None:
     torch.testing.assert_close(one.speed, two.speed[::50], rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("damping", [0.05, 0.999, 1.0, 1.001, 1.5, 4.0])
+def test_driveline_at_any_damping_against_an_ode_solver(damping: float) -> None:
+    from scipy.integrate import solve_ivp
+
+    omega, T = 2 * math.pi * 2.2, 0.3
+    effect = gap.DrivelineOscillation(2.2, 1.0, 0.5, torch.tensor(damping, dtype=D, requires_grad=True))
+    time = torch.arange(200, dtype=D) * 0.01
+    lagged = 1 - torch.exp(-time / T)
+    got = effect.over(
+        lagged, gap.Row(time, torch.tensor(0.01, dtype=D), None, None, torch.tensor(T), torch.tensor(1.0))
+    )
+    assert bool(torch.autograd.grad(got.square().sum(), effect.mode_damping)[0].isfinite())  # type: ignore[arg-type]
+    # the effect holds the mean jerk of a step, and so does the reference
+    jerk = (lagged.diff() / 0.01).tolist()
+    state, exact = [0.0, 0.0], [0.0]
+    for j in jerk:
+        state = solve_ivp(
+            lambda _, y, j=j: [y[1], omega * (j - omega * y[0]) - 2 * damping * omega * y[1]],
+            (0, 0.01), state, rtol=1e-10, atol=1e-12,
+        ).y[:, -1].tolist()  # fmt: skip
+        exact.append(state[0] + 0.5 * state[1] / omega)
+    # 200 steps of the reference at 1e-10 of a size of about 1 each
+    torch.testing.assert_close(got.detach(), torch.tensor(exact, dtype=D), rtol=0, atol=1e-7)
+
+
 def test_second_order_against_an_ode_solver() -> None:
     from scipy.integrate import solve_ivp
 

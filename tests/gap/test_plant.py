@@ -14,7 +14,7 @@ from avtorch.gap import EFFECTS, Drive, GapPlant, plant
 from avtorch.gap.effect import Effect
 from avtorch.gap.parameter import Parameter
 from avtorch.vehicle import ClosedLoop, GLVDPlant, Leader
-from tests.gap.drives import DT, driven
+from tests.gap.drives import DT, driven, smooth_drive
 
 D = torch.float64
 
@@ -114,6 +114,52 @@ def test_text_round_trip(cls: type[Effect]) -> None:
         assert (again.T_L, again.K_L, again.sigma) == (0.41, 0.93, 0.2)
 
 
+# values that neither the typical nor the neutral effect has, as a fit, a drive or a user may give them
+VARIANTS = {
+    "gear_shift": [{"speeds": (4.0, 7.5)}, {"speeds": torch.tensor([4.0, 7.5], dtype=D)}],
+    "road_grade": [{"profile": torch.linspace(-1, 1, 5, dtype=D), "knots": 5}],
+    "saturation": [{"accel_min_mps2": -float("inf")}],
+    "second_order_actuator": [{"damping_ratio": 0.4}, {"inverse_frequency_s": 0.0, "damping_ratio": None}],
+    "driveline_oscillation": [{"mode_damping": 1.4, "quadrature": -0.2}],
+    "gain_change": [{"ramp_s": 3.0, "latest_s": 90.0}],
+}
+
+
+@pytest.mark.parametrize(
+    "cls", [c for n, c in EFFECTS.items() if c.__module__.startswith("avtorch")], ids=lambda c: c.name
+)
+def test_text_round_trip_of_every_way_to_make_an_effect(cls: type[Effect]) -> None:
+    made = [cls(**given) for given in VARIANTS.get(cls.name, [])]
+    made.append(cls(**{name: torch.tensor(float(x), dtype=D) for name, x in cls().values().items()}))
+    # by the answer's own names, as a baseline in a file has them
+    made.append(cls.of({name: float(x) for name, x in cls().report(torch.tensor(0.3, dtype=D)).items()}))
+    drive = smooth_drive()
+    made.append(plant([cls]).prepared(drive).effects[0])
+    for effect in made:
+        car = plant([effect])
+        again = GapPlant.from_toml(car.to_toml())
+        assert again.to_toml() == car.to_toml()
+        for name, value in car.values().items():
+            assert torch.equal(again.values()[name], value), name
+        if not effect.random:
+            assert torch.equal(again.response(drive).accel_measured, car.response(drive).accel_measured)
+
+
+def test_a_damping_ratio_sets_the_lag_once() -> None:
+    given = gap.SecondOrderActuator(1 / 6, damping_ratio=0.4)
+    car = plant([given])
+    assert float(car.T_L) == pytest.approx(2 * 0.4 / 6)
+    # with another lag the damping is another: nothing stale is left in the effect
+    slower = plant(baseline=car, T_L=0.5)
+    told = GapPlant.from_toml(slower.to_toml()).report()["second_order_actuator"]
+    assert float(told["damping_ratio"]) == pytest.approx(0.5 * 6 / 2)
+    # made past `plant`, its text still reads back to the same lag
+    direct = GapPlant([given], T_L=0.7, K_L=1.0, sigma=0.1)
+    assert GapPlant.from_toml(direct.to_toml()).T_L == 0.7
+    with pytest.raises(InputError, match="T_L: given beside"):
+        plant([given], T_L=0.3)
+
+
 def test_short_strings() -> None:
     car = GapPlant.from_toml("dead_time=0.2, T_L = 0.4, saturation.accel_min_mps2=-2, gust")
     assert car.T_L == 0.4
@@ -166,7 +212,7 @@ def test_wrong_arguments_are_told(tmp_path: Path) -> None:
     time = torch.arange(5, dtype=D)
     for bad in ({"time": -time}, {"command": time[:3]}, {"speed": time[:2]}, {"command": time / 0}):
         with pytest.raises(InputError, match=next(iter(bad))):
-            Drive(**{"time": time, "command": time, **bad})
+            Drive(**{"time": time, "command": time, **bad})  # type: ignore[arg-type]
 
 
 def test_drives_of_logs() -> None:

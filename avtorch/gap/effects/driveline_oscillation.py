@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from avtorch.gap.actuator import modes_over
 from avtorch.gap.effect import Effect, Row, register
 from avtorch.gap.parameter import Parameter
 from avtorch.gap.recursion import scan_pair
@@ -23,7 +24,7 @@ class DrivelineOscillation(Effect):
 
     A step of the actuator by 1 m/s² rings with `amplitude` [m/s²]. Where in the driveline the mode sits decides on
     its phase, so a quadrature part is fitted along; the answer names the length of both. Over a step the mean jerk
-    is held, and the mode is integrated exactly.
+    is held, and the mode is integrated exactly, at any damping (above 1 it creeps back and does not ring).
     """
 
     frequency_hz: Number = 2.2
@@ -74,10 +75,8 @@ class DrivelineOscillation(Effect):
     def _step(self, dt: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]:
         """State `(y, y' / omega)` after `dt`, and what a constant jerk adds."""
         omega, zeta = 2 * math.pi * tensor(self.frequency_hz), tensor(self.mode_damping)
-        damped = torch.sqrt(1 - zeta.square())
-        angle = omega * damped * dt
-        decay = torch.exp(-zeta * omega * dt)
-        c, s = decay * torch.cos(angle), decay * torch.sin(angle) / damped
-        matrix = (c + zeta * s, s, -s, c - zeta * s)
+        # the actuator's formulas, which hold at any damping: their second component is y' / omega²
+        m00, m01, m10, m11 = modes_over(1 / omega, 2 * zeta / omega, dt)
+        matrix = (m00, m01 / omega, omega * m10, m11)
         # a constant jerk holds the mode at jerk / omega; the state approaches it
         return matrix, ((1 - matrix[0]) / omega, -matrix[2] / omega)

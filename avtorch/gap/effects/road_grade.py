@@ -36,6 +36,7 @@ class RoadGrade(Effect):
     name = "road_grade"
     place = "body"
     needs_speed = True
+    gravity = True
     meaning = "hills that the log does not know of"
     equation = "-g sin(slope(x)), slope a smooth random function of position"
     parameters = (Parameter("grade_rms", "-", 0.0, 0.02, 0.06),)

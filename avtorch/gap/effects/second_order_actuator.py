@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import torch
@@ -22,7 +22,8 @@ class SecondOrderActuator(Effect):
 
     Fitted as `tau² a'' + T_L a' + a = K u` with `tau = inverse_frequency_s`: neutral at 0, where the GLVD comes out
     exactly, and `T_L` keeps its meaning, the slope of the phase. The answer names `natural_frequency_radps = 1 / tau`
-    and `damping_ratio = T_L / (2 tau)`. With `damping_ratio` given, the plant's `T_L` is set to `2 zeta tau`.
+    and `damping_ratio = T_L / (2 tau)`. With `damping_ratio` given, `plant` sets `T_L` to `2 zeta tau`; from then on
+    `T_L` tells the damping, and the effect in the plant has no `damping_ratio` of its own.
     """
 
     inverse_frequency_s: Number = 1 / 6
@@ -53,8 +54,8 @@ class SecondOrderActuator(Effect):
             given["inverse_frequency_s"] = 1 / frequency
         return super().of(given)
 
-    def implied_lag(self) -> Tensor | None:
-        """The plant's `T_L` [s] that a given `damping_ratio` means."""
+    def lag_apart(self) -> tuple[Self, Tensor | None]:
         if self.damping_ratio is None:
-            return None
-        return 2 * tensor(self.damping_ratio) * tensor(self.inverse_frequency_s)
+            return self, None
+        lag = 2 * tensor(self.damping_ratio) * tensor(self.inverse_frequency_s)
+        return replace(self, damping_ratio=None), lag
