@@ -80,7 +80,7 @@ def diagnosis_notes(found: Diagnosis) -> list[str]:
     if not found.complete:
         text = "The budget ended the search: the answer is provisional; the same command with more goes on from here."
         lines.append(f"[yellow]{text}[/]")
-    lines += [f"[dim]{escape(note)}[/]" for note in found.notes]
+    lines += [f"[dim]{escape(note)}[/]" for note in found.notes if found.complete or "budget" not in note]
     return lines
 
 

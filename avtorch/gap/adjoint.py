@@ -21,7 +21,7 @@ def adjoint(white: Whitener, images: Float) -> Float:
         image, square = white._offset
         part = np.add.reduceat((mean * image).sum(-2), starts, -1) / square
         mean -= image * part[..., None, stretch]
-    tops, bottom, _, _ = white._filter
+    tops, bottom, _ = white._filter
     turned = record.padded(mean)[..., ::-1]
     back = np.empty_like(mean)
     count = mean.shape[-2]

@@ -12,13 +12,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from avtorch.gap.effect import Effect, effect_class
-from avtorch.gap.effects.road_grade import RoadGrade
+from avtorch.gap.effects.road_grade import GRAVITY, RoadGrade
 from avtorch.gap.parameter import Parameter
 from avtorch.gap.plant import GapPlant, plant
 from avtorch.gap.record import Record
@@ -42,6 +43,9 @@ class Coordinate:
     def z_of(self, value: float) -> float:
         z = float(self.parameter.unconstrain(torch.tensor(value, dtype=torch.float64))) / self.wider
         return float(np.clip(z, -4.0, 4.0))
+
+
+_MEANS: WeakKeyDictionary[Record, Float] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,25 +142,68 @@ class Candidate:
 
         Every drive has coefficients of its own: where one began on the other's road is not known.
         """
+        forces = self._grade_forces
+        if forces is None:
+            return None
+        knots = [len(force) for force in forces]
+        apart = [(0, 0, sum(knots[:i]), sum(knots[i + 1 :])) for i in range(len(knots))]
+        return self._seen_forces([torch.nn.functional.pad(f, a) for f, a in zip(forces, apart, strict=True)])
+
+    @cached_property
+    def grade_means(self) -> Float | None:
+        """The same of each group's mean, (knot, witness, counted, 1): within a group no slope changes."""
+        if self._grade_forces is None:
+            return None
+        if self.record not in _MEANS:
+            columns = self.grade_columns
+            assert columns is not None
+            _MEANS[self.record] = columns.mean(-1, keepdims=True)
+        return _MEANS[self.record]
+
+    def grade_response(self, coefficients: Float) -> Float:
+        """What a slope of `coefficients` (knot,) does, (witness, counted, group)."""
+        assert self._grade_forces is not None
+        forces, first = [], 0
+        for force in self._grade_forces:
+            own = torch.as_tensor(coefficients[first : first + len(force)])
+            forces.append((own @ force)[None])
+            first += len(force)
+        return self._seen_forces(forces)[0]
+
+    def _seen_forces(self, forces: Sequence[torch.Tensor]) -> Float:
+        """Forces (column, time) of each drive as both witnesses see them, (column, witness, counted, group)."""
+        accel, speed = [], []
+        for drive, force in zip(self.record.drives, forces, strict=True):
+            gained = torch.cumsum(0.5 * drive.dt[:-1] * (force[:, 1:] + force[:, :-1]), -1)
+            # an accelerometer does not feel gravity
+            accel.append(torch.zeros_like(force) if drive.specific_force else force)
+            speed.append(torch.cat([torch.zeros_like(force[:, :1]), gained], -1))
+        seen = {"accel": accel, "speed": speed}
+        return np.stack([self.record.seen(seen[name]) for name in self.record.witnesses], 1)
+
+    @cached_property
+    def _grade_forces(self) -> list[torch.Tensor] | None:
+        """Acceleration (knot, time) of each drive per unit of each coefficient."""
         grade = next((e for e in self.plant.effects if isinstance(e, RoadGrade)), None)
-        record = self.record
-        if grade is None or RoadGrade not in self.effects or record.speed is None:
+        if grade is None or RoadGrade not in self.effects or self.record.speed is None:
             return None
         forces = []
-        for drive in record.drives:
+        for drive in self.record.drives:
             assert drive.position is not None
             own = grade.prepared(drive.time, drive.speed, drive.position)
             forces.append(own.columns(drive.position).T)
-        knots = [len(force) for force in forces]
-        accel, speed = [], []
-        for i, (drive, force) in enumerate(zip(record.drives, forces, strict=True)):
-            whole = torch.nn.functional.pad(force, (0, 0, sum(knots[:i]), sum(knots[i + 1 :])))
-            gained = torch.cumsum(0.5 * drive.dt[:-1] * (whole[:, 1:] + whole[:, :-1]), -1)
-            # an accelerometer does not feel gravity
-            accel.append(torch.zeros_like(whole) if drive.specific_force else whole)
-            speed.append(torch.cat([torch.zeros_like(whole[:, :1]), gained], -1))
-        seen = {"accel": accel, "speed": speed}
-        return np.stack([record.seen(seen[name]) for name in record.witnesses], 1)
+        return forces
+
+    def grade_along(self, coefficients: Float) -> Float:
+        """Root mean square of the slope along all drives, (column,), for coefficients (column, knot)."""
+        assert self._grade_forces is not None
+        total, rows, first = np.zeros(len(coefficients)), 0, 0
+        for force in self._grade_forces:
+            part = coefficients[:, first : first + len(force)]
+            gram = (force @ force.T).numpy() / GRAVITY**2
+            total += np.einsum("ck,kl,cl->c", part, gram, part)
+            rows, first = rows + force.shape[1], first + len(force)
+        return np.sqrt(np.maximum(total, 0.0) / rows)
 
 
 def splice(record: Record, full: Float, without: Float, onset: int) -> Float:

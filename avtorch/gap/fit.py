@@ -46,10 +46,12 @@ def modes(
     onset: int | None = None,
     iterations: int = 8,
     coarse: bool = False,
+    enough: float = 0.01,
 ) -> tuple[Float, Float]:
     """Modes (start, coordinate) and their log joint densities (start,), from `starts` (start, coordinate).
 
-    `coarse`: on rollouts of averaged commands, several times as fast, good for a first look.
+    `coarse`: on rollouts of averaged commands, several times as fast, good for a first look. A start has arrived once
+    a step gains less than `enough` nats.
     """
     z = np.array(starts)
     count, size = z.shape
@@ -67,7 +69,7 @@ def modes(
         up = where[good]
         best[up], value[up], gradient[up], square[up] = trial[up], v[good], g[good], h[good]
         damping[where] = np.where(good, damping[where] * 0.2, np.maximum(damping[where] * 8, 1e-2))
-        live[where] = ~(good & (gain < 0.01)) & (damping[where] < 1e4)
+        live[where] = ~(good & (gain < enough)) & (damping[where] < 1e4)
         if not live.any():
             break
         diagonal = np.einsum("cii->ci", square)
@@ -86,16 +88,17 @@ def _quadratic(
     moved = np.repeat(z[:, None], size + 1, 1)
     moved[:, 1:] += _STEP * np.eye(size)
     errors = candidate.errors(moved.reshape(-1, size), onset, coarse=coarse)
-    e = white(errors).reshape(count, size + 1, -1)
-    columns = (e[:, 1:] - e[:, :1]) / _STEP
-    base = e[:, 0]
+    e = white(errors)
+    flat = e.reshape(count, size + 1, -1)
+    columns = (flat[:, 1:] - flat[:, :1]) / _STEP
+    base = flat[:, 0]
     square = columns @ columns.transpose(0, 2, 1)
     cross = np.einsum("cpr,cr->cp", columns, base)
     value = 0.5 * np.einsum("cr,cr->c", base, base)
-    grade = candidate.grade_columns
-    if grade is not None:
-        grade = grade.mean(-1, keepdims=True) if coarse else grade
-        square, cross, value = _integrated(_slope(white, grade, onset), columns, base, square, cross, value)
+    if candidate.grade_means is not None:
+        means = e.reshape(count, size + 1, -1, e.shape[-1])[..., 0]
+        columns, base = (means[:, 1:] - means[:, :1]) / _STEP, means[:, 0]
+        square, cross, value = _integrated(_slope(white, candidate, onset), columns, base, square, cross, value)
     return cross + z, square + np.eye(size), value + 0.5 * (z**2).sum(1)
 
 
@@ -111,17 +114,18 @@ def _integrated(
     return square, cross, value - total
 
 
-_CACHE: dict[int, tuple[object, int | None, Slope]] = {}
+_LAST: list[tuple[Whitener, Float, int | None, Slope]] = []
 
 
-def _slope(white: Whitener, grade: Float, onset: int | None) -> Slope:
-    """Of columns `grade` (knot, witness, counted, group) under this noise; the last one is kept."""
-    kept = _CACHE.get(grade.shape[-1])
-    if kept is not None and kept[0] is white and kept[1] == onset:
-        return kept[2]
-    made = Slope.of(white(_acting(white, grade, onset)).reshape(len(grade), -1))
-    _CACHE.clear()
-    _CACHE[grade.shape[-1]] = (white, onset, made)
+def _slope(white: Whitener, candidate: Candidate, onset: int | None) -> Slope:
+    """Of the candidate's slope under this noise; the last one is kept. Within a group of rows no slope changes."""
+    grade = candidate.grade_means
+    assert grade is not None
+    for kept, columns, row, slope in _LAST:
+        if kept is white and columns is grade and row == onset:
+            return slope
+    made = Slope.of(white(_acting(white, grade, onset))[..., 0].reshape(len(grade), -1))
+    _LAST[:] = [(white, grade, onset, made)]
     return made
 
 
@@ -139,27 +143,25 @@ def _acting(white: Whitener, force: Float, onset: int | None) -> Float:
 def left_over(candidate: Candidate, white: Whitener, z: Float, onset: int | None = None, *, coarse: bool) -> Float:
     """Errors (witness, counted, group) at `z` (coordinate,), less what a road's slope explains of them."""
     errors = candidate.errors(z[None], onset, coarse=coarse)[0]
-    return errors if candidate.grade_columns is None else errors - _sloped(candidate, white, errors, onset)[2]
+    return errors if candidate.grade_means is None else errors - _sloped(candidate, white, errors, onset)[2]
 
 
 def _sloped(candidate: Candidate, white: Whitener, errors: Float, onset: int | None) -> tuple[float, Float, Float]:
     """`grade_rms`, coefficients (knot,), and what they do to the errors."""
-    grade = candidate.grade_columns
-    assert grade is not None
-    if errors.shape[-1] == 1:
-        grade = grade.mean(-1, keepdims=True)
-    rms, profile = _slope(white, grade, onset).told(white(errors).ravel())
-    return rms, profile, _acting(white, np.tensordot(profile, grade, 1), onset)
+    rms, profile = _slope(white, candidate, onset).told(white(errors)[..., 0].ravel())
+    part = candidate.grade_response(profile)
+    part = part.mean(-1, keepdims=True) if errors.shape[-1] == 1 else part
+    return rms, profile, _acting(white, part, onset)
 
 
-def finish(candidate: Candidate, white: Whitener, z: Float, onset: int | None = None) -> Fit:
-    """Covariance, errors and Laplace evidence at a mode `z` (coordinate,)."""
+def finish(candidate: Candidate, white: Whitener, z: Float, onset: int | None = None, *, coarse: bool = False) -> Fit:
+    """Covariance, errors and Laplace evidence at a mode `z` (coordinate,); `coarse`: of the groups' means only."""
     size = len(z)
-    gradient, square, value = (x[0] for x in _quadratic(candidate, white, z[None], onset))
+    gradient, square, value = (x[0] for x in _quadratic(candidate, white, z[None], onset, coarse))
     del gradient
-    errors = candidate.errors(z[None], onset)[0]
+    errors = candidate.errors(z[None], onset, coarse=coarse)[0]
     rms, profile = None, None
-    if candidate.grade_columns is not None:
+    if candidate.grade_means is not None:
         rms, profile, part = _sloped(candidate, white, errors, onset)
         errors = errors - part
     log_joint = white.constant - float(value)

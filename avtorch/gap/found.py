@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.gap.candidate import Candidate
-from avtorch.gap.chance import Losses, Tails
+from avtorch.gap.chance import Tails
 from avtorch.gap.innovations import NoiseModel
+from avtorch.gap.losses import Losses
 from avtorch.gap.noise_fit import NoiseFit
 from avtorch.gap.record import Record
 from avtorch.io import Log

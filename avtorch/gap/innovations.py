@@ -15,17 +15,20 @@ group differ by is white already.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 from scipy.signal import lfilter
 
 from avtorch.gap.record import Record
 
 Float = NDArray[np.float64]
+
+_NO_LAG = 2e-3  # [s], of which no log tells
 
 NAMES = ("process_sd", "process_time", "force_sd", "force_time", "accel_sd", "speed_sd")
 
@@ -34,7 +37,8 @@ NAMES = ("process_sd", "process_time", "force_sd", "force_time", "accel_sd", "sp
 class NoiseModel:
     """`process_sd`, `force_sd`, `accel_sd` [m/s²], `speed_sd` [m/s] (white ones of a group's mean), times [s].
 
-    `within`: standard deviations by witness of the rows within a group; None where no rows are grouped.
+    `within`: standard deviations by witness of the rows within a group; None where no rows are grouped. What the
+    accelerometer makes of the car's random motion: `sensor_scale` [-] times it, late by a first-order `sensor_lag` [s].
     """
 
     process_sd: float = 0.05
@@ -44,9 +48,27 @@ class NoiseModel:
     accel_sd: float = 0.05
     speed_sd: float = 0.02
     within: tuple[float, ...] | None = None
+    sensor_scale: float = 1.0
+    sensor_lag: float = 0.0
 
     def replaced(self, **values: float) -> NoiseModel:
         return replace(self, **values)
+
+    def seen_through(self, values: Mapping[str, float]) -> NoiseModel:
+        """With the accelerometer that a candidate's parameter `values`, by key, speak of."""
+        lag = values.get("sensor_lag.lag_s", 0.0)
+        return replace(
+            self,
+            sensor_scale=values.get("sensor_scale.scale", 1.0),
+            sensor_lag=lag if lag > _NO_LAG else 0.0,
+        )
+
+    def by_rows(self, witnesses: tuple[str, ...]) -> NoiseModel:
+        """Of single rows instead of groups: what rows within a group differ by is the sensors' white noise."""
+        if self.within is None:
+            return self
+        own = {f"{name}_sd": sd for name, sd in zip(witnesses, self.within, strict=True)}
+        return replace(self, within=None, **own)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,17 +161,23 @@ Filter = tuple[list[list[Float]], Float, float]
 
 
 def _designed(noises: Sequence[NoiseModel], dt: float, witnesses: tuple[str, ...]) -> list[Filter]:
-    """The steady Kalman filter from errors to innovations of unit covariance, for each noise model."""
+    """The steady Kalman filter from errors to innovations of unit covariance, for each noise model.
+
+    The models have a sensor's lag all of them, or none.
+    """
     pairs = [_motion(n, dt) for n in noises]
     move, driven = np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])
     use = [i for i, name in enumerate(("accel", "speed")) if name in witnesses]
-    keep = slice(0, 3) if 1 in use else slice(1, 3)
-    see = np.array([[0, 1, 1], [1, 0, 0]], float)[use][:, keep]
+    keep = slice(0 if 1 in use else 1, move.shape[-1])
+    felt = [0, 0, 0, 1] if move.shape[-1] == 4 else [0, 1, 1]
+    seen = np.array([[felt, [1, *[0] * (len(felt) - 1)]]] * len(noises), float)
+    seen[:, 0] *= np.array([n.sensor_scale for n in noises])[:, None]
+    see = seen[:, use][..., keep]
     white = np.stack([np.diag(np.array([n.accel_sd**2, n.speed_sd**2])[use]) for n in noises])
     move, driven = move[:, keep, keep], driven[:, keep, keep]
     ahead = _steady(move, see, driven, white)
-    s = see @ ahead @ see.T + white
-    gain = move @ ahead @ see.T @ np.linalg.inv(s)
+    s = see @ ahead @ see.mT + white
+    gain = move @ ahead @ see.mT @ np.linalg.inv(s)
     mix = np.linalg.inv(np.linalg.cholesky(s))
     inner = move - gain @ see
     # adj(z - inner) and det(z - inner) by the Faddeev-LeVerrier recursion
@@ -174,8 +202,10 @@ def _designed(noises: Sequence[NoiseModel], dt: float, witnesses: tuple[str, ...
 def _motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
     """State (error of the speed, p, d) over `dt`: its transition and the covariance that is added, both exact.
 
-    Two Ornstein-Uhlenbeck processes and the integral of their sum.
+    Two Ornstein-Uhlenbeck processes and the integral of their sum. Behind a late sensor its reading is a fourth state.
     """
+    if n.sensor_lag > 0:
+        return _late_motion(n, dt)
     move, driven = np.eye(3), np.zeros((3, 3))
     # a hair of speed noise, or the error of the speed is known exactly
     driven[0, 0] = 1e-12 * dt
@@ -186,6 +216,22 @@ def _motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
         driven[0, i] = driven[i, 0] = sd**2 * time * lost**2
         driven[0, 0] += sd**2 * time**2 * _integral(dt / time)
     return move, driven
+
+
+def _late_motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
+    """By van Loan's matrix exponential."""
+    drift = np.diag([0.0, -1 / n.process_time, -1 / n.force_time, -1 / n.sensor_lag])
+    drift[0, 1:3], drift[3, 1:3] = 1.0, 1 / n.sensor_lag
+    spectrum = np.diag([1e-12, 2 * n.process_sd**2 / n.process_time, 2 * n.force_sd**2 / n.force_time, 0.0])
+    # in halves of a step short enough for the growing half of the matrix, then doubled
+    halves = max(0, int(np.ceil(np.log2(dt / n.sensor_lag))) + 1)
+    step = expm(np.block([[-drift, spectrum], [np.zeros((4, 4)), drift.T]]) * dt / 2**halves)
+    move = step[4:, 4:].T
+    driven = move @ step[:4, 4:]
+    for _ in range(halves):
+        driven = driven + move @ driven @ move.T
+        move = move @ move
+    return move, 0.5 * (driven + driven.T)
 
 
 def _integral(x: float) -> float:
@@ -200,7 +246,7 @@ def _steady(move: Float, see: Float, driven: Float, white: Float) -> Float:
 
     Structure-preserving doubling (Anderson 1978): each round covers twice as many rows as the last.
     """
-    a, g, h = move.mT, see.T @ np.linalg.solve(white, np.broadcast_to(see, (len(white), *see.shape))), driven
+    a, g, h = move.mT, see.mT @ np.linalg.solve(white, see), driven
     one = np.eye(move.shape[-1])
     for _ in range(60):
         inside = np.linalg.inv(one + g @ h)
@@ -210,4 +256,4 @@ def _steady(move: Float, see: Float, driven: Float, white: Float) -> Float:
         h = h + more
         if bool((np.abs(more).max((-1, -2)) <= 1e-14 * np.abs(h).max((-1, -2))).all()):
             break
-    return 0.5 * (h + h.mT)
+    return np.asarray(0.5 * (h + h.mT), float)

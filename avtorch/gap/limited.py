@@ -45,7 +45,7 @@ def slewed_row(r: Float, g: Float, T: Float, h: Float, J: Float) -> Float:
 def by_rows(step: RowStep, start: Tensor, parts: Sequence[Held], jerk: Tensor) -> Tensor:
     """States (..., time) after each row, from `start` (...); no derivatives."""
     limit = jerk.detach().clamp_max(1e9)
-    shape = torch.broadcast_shapes(
+    shape = np.broadcast_shapes(
         (*start.shape, 1), (*limit.shape[:-1], 1) if limit.dim() else (), *(x.shape for p in parts for x in _tensors(p))
     )
     rows = shape[-1]
@@ -64,7 +64,7 @@ def _tensors(part: Held) -> tuple[Tensor, Tensor, Tensor]:
     return part.target.detach(), part.lag.detach(), part.length.detach()
 
 
-def _by_time(x: Tensor, shape: torch.Size) -> Any:
+def _by_time(x: Tensor, shape: tuple[int, ...]) -> Any:
     """`at(k)`: values (batch,) at row `k`; what does not change over time is laid out once."""
     if x.dim() == 0 or x.shape[-1] == 1:
         once = x.expand(*shape[:-1], 1).reshape(-1).numpy() if x.dim() else np.asarray(float(x))

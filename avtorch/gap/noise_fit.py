@@ -18,7 +18,7 @@ Prior = tuple[float, float, float]
 
 PRIORS: dict[str, Prior] = {
     "process_sd": (np.log(0.05), 1.2, 4.0),
-    "process_time": (0.0, 0.15, 2.0),
+    "process_time": (0.0, 0.3, 2.0),
     "force_sd": (np.log(0.005), 0.5, 1.5),
     "force_time": (np.log(3.0), 0.3, 1.0),
     "accel_sd": (np.log(0.05), 1.2, 4.0),
@@ -97,7 +97,8 @@ def fit_noise(
         within = tuple(float(x) for x in np.sqrt(share * (apart**2).mean((1, 2))).clip(1e-9))
 
     def model(z: Float) -> NoiseModel:
-        return NoiseModel(**{n: float(x) for n, x in zip(NAMES, np.exp(means + sds * z), strict=True)}, within=within)
+        own = {n: float(x) for n, x in zip(NAMES, np.exp(means + sds * z), strict=True)}
+        return replace(start, within=within, **own)
 
     # what rows of a group differ by does not depend on what is sought
     mean, fixed = errors.mean(-1, keepdims=True), 0.0

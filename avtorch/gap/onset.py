@@ -39,8 +39,9 @@ def rough(white: Whitener, candidate: Candidate, z: Float) -> tuple[int, float]:
 def refined(white: Whitener, candidate: Candidate, z: Float, onset: int) -> tuple[int, Float]:
     """Best onset row near `onset`, and the log likelihood over all rows tried, (row,), -inf elsewhere."""
     record = white.record
-    full, silent = candidate.rollouts(z[None])[0], candidate.baseline_rollouts(z[None])[0]
-    measured = record.measured
+    full = candidate.rollouts(z[None], coarse=True)[0]
+    silent = candidate.baseline_rollouts(z[None], coarse=True)[0]
+    measured = record.measured.mean(-1, keepdims=True)
     within = allowed(record.rows, record.dt)
     found = np.full(record.rows, -np.inf)
     for reach in (8.0, 1.5):

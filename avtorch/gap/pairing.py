@@ -11,7 +11,7 @@ from avtorch.gap.candidate import Candidate
 from avtorch.gap.effect import Effect
 from avtorch.gap.fit import modes
 from avtorch.gap.innovations import Whitener
-from avtorch.gap.screening import Look, looks
+from avtorch.gap.screening import ENOUGH, Look, looks
 from avtorch.gap.starts import of_effect, starts
 
 Float = NDArray[np.float64]
@@ -41,7 +41,7 @@ def score(
         begin = candidate.z_of({**values, **known})[None]
     if not known or len(of_effect(candidate, more.name)) <= _MANY:
         begin = np.concatenate([begin, starts(candidate, values)])
-    if candidate.grade_columns is not None and base.grade_columns is None:
+    if candidate.grade_means is not None and base.grade_means is None:
         flat = white.log_likelihood(base.errors(z[None], onset, coarse=True))[0]
         step, value = modes(candidate, white, begin[:1], onset=onset, iterations=2, coarse=True)
         return float(value[0] - flat), step[0]
@@ -77,8 +77,7 @@ def joint(
         begin += [candidate.z_of({**values, **own, "K_L": k}) for own in anew for k in (values["K_L"], 1.0)]
     found = looks(candidate, white, np.stack(begin), onsets=onsets and onset is None, keep=2)
     if onset is not None or len(begin) > 1:
-        near, value = modes(candidate, white, z[None], onset=onset, iterations=6, coarse=True)
-        found.append(Look(candidate, near[0], float(value[0]), onset))
+        found.append(_rest(candidate, white, z, onset))
     return max(found, key=lambda look: look.value)
 
 
@@ -109,9 +108,16 @@ def swapped(
         for gain, candidate, start in scored[:tries]:
             if gain < 2:
                 break
-            near, value = modes(candidate, white, start[None], onset=pair.onset, iterations=6, coarse=True)
+            near, value = modes(
+                candidate, white, start[None], onset=pair.onset, iterations=6, coarse=True, enough=ENOUGH
+            )
             out.append(Look(candidate, near[0], float(value[0]), pair.onset))
     return sorted(out, key=lambda look: -look.value)
+
+
+def _rest(candidate: Candidate, white: Whitener, z: Float, onset: int | None) -> Look:
+    near, value = modes(candidate, white, z[None], onset=onset, iterations=6, coarse=True, enough=ENOUGH)
+    return Look(candidate, near[0], float(value[0]), onset)
 
 
 def _own_directions(base: Candidate, z: Float, onset: int | None, white: Whitener) -> Float:
@@ -121,9 +127,9 @@ def _own_directions(base: Candidate, z: Float, onset: int | None, white: Whitene
     moved[1:] += 1e-4 * np.eye(size)
     e = white(base.rollouts(moved, onset, coarse=True)).reshape(size + 1, -1)
     columns = e[1:] - e[:1]
-    grade = base.grade_columns
+    grade = base.grade_means
     if grade is not None:
-        columns = np.concatenate([columns, white(grade.mean(-1, keepdims=True)).reshape(len(grade), -1)])
+        columns = np.concatenate([columns, white(grade).reshape(len(grade), -1)])
     norms = np.linalg.norm(columns, axis=1)
     columns = columns[norms > 1e-9] / norms[norms > 1e-9][:, None]
     if not len(columns):

@@ -218,9 +218,10 @@ def exact_one_in(density: RolloutDensity, surrogate: Surrogate, mode: Mode, gene
 
 
 def _grade(density: RolloutDensity, z: Tensor, seed: int) -> Float | None:
-    """`grade_rms` (chain, draw) for draws of `z` (chain, draw, coordinate)."""
+    """Root mean square of the slope found, (chain, draw), for draws of `z` (chain, draw, coordinate)."""
     slope = density.slope
     if slope is None:
         return None
     match = density.images(z.reshape(-1, z.shape[-1])) @ slope.image.T
-    return slope.sampled(match, np.random.default_rng(seed)).reshape(z.shape[:-1])
+    road = slope.sampled(match, np.random.default_rng(seed))
+    return density.candidate.grade_along(road).reshape(z.shape[:-1])

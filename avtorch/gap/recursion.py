@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from scipy.signal import lfilter
 from torch import Tensor
@@ -70,7 +71,7 @@ def _filtered(bottom: _Components, tops: list[tuple[Tensor, Tensor]]) -> Tensor:
 def _aligned(n: int, alpha: _Components, beta: _Components, start: _Components) -> list[Any]:
     """One batch shape for all, one length of time for each kind."""
     start = [s.unsqueeze(-1) for s in start]
-    shape = torch.broadcast_shapes(*(x.shape[:-1] for x in (*alpha, *beta, *start)))
+    shape = np.broadcast_shapes(*(x.shape[:-1] for x in (*alpha, *beta, *start)))
     steps = max(x.shape[-1] for x in (*alpha, *beta))
     constant = all(a.shape[-1] == 1 for a in alpha)
     alpha = [a.expand(*shape, 1 if constant else steps) for a in alpha]

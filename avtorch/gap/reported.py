@@ -120,13 +120,13 @@ def _deterministic(found: Found, draws: Draws | None) -> dict[str, Float]:
 
 
 def _grade_rms(found: Found) -> Float | None:
-    """Draws of the slope's size at the mode of the other parameters."""
+    """Draws of the slope's root mean square along the road, at the mode of the other parameters."""
     density = RolloutDensity.of(found)
     slope = density.slope
     if slope is None:
         return None
     match = density.images(torch.as_tensor(found.z)[None]) @ slope.image.T
-    return slope.sampled(np.repeat(match, _LAPLACE, 0), np.random.default_rng(0))
+    return found.candidate.grade_along(slope.sampled(np.repeat(match, _LAPLACE, 0), np.random.default_rng(0)))
 
 
 def _random(found: Found) -> dict[str, tuple[float, float, Link]]:

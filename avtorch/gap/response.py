@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -69,4 +70,4 @@ def _shape(effects: list[Effect], row: Row, drive: Drive) -> torch.Size:
     for e in effects:
         long = {p.name for p in e.coordinates() if p.size > 1}
         shapes += [(*(v.shape[:-1] if k in long else v.shape), 1) for k, v in e.values().items()]
-    return torch.broadcast_shapes(*shapes)
+    return torch.Size(np.broadcast_shapes(*shapes))

@@ -15,6 +15,8 @@ from avtorch.gap.onset import allowed, profile, rough
 
 Float = NDArray[np.float64]
 
+ENOUGH = 0.3
+"""Nats a step gains at least, or the look is over."""
 _AT_ONCE = 32
 _WORTH = 4.0  # nats an onset must gain to be looked at
 _FAINT = 0.3  # the same where the effect shows over the whole drive: fitted to all of it, it is diluted
@@ -75,7 +77,7 @@ def _from(candidate: Candidate, white: Whitener, z: Float, onset: int) -> Look:
 
 
 def _best(candidate: Candidate, white: Whitener, z: Float, onset: int | None, iterations: int) -> tuple[Float, float]:
-    found, values = modes(candidate, white, z, onset=onset, iterations=iterations, coarse=True)
+    found, values = modes(candidate, white, z, onset=onset, iterations=iterations, coarse=True, enough=ENOUGH)
     return found[values.argmax()], float(values.max())
 
 

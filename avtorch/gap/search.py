@@ -15,19 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.gap.candidate import Candidate
-from avtorch.gap.chance import Tails, losses, tails
+from avtorch.gap.chance import Tails, tails
 from avtorch.gap.checkpoint import Checkpoint, Kept
 from avtorch.gap.effect import EFFECTS, Effect
-from avtorch.gap.fit import finish, left_over, modes
+from avtorch.gap.effects.road_grade import RoadGrade
+from avtorch.gap.fit import Fit, finish, left_over, modes
 from avtorch.gap.found import Found, Race, cleaned, merged, white_first
 from avtorch.gap.gusts import gust
 from avtorch.gap.innovations import NoiseModel, Whitener
-from avtorch.gap.noise_fit import fit_noise
+from avtorch.gap.losses import losses
+from avtorch.gap.noise_fit import CALM, fit_noise
 from avtorch.gap.onset import averaged, refined
 from avtorch.gap.pairing import joint, score, swapped
 from avtorch.gap.plant import GapPlant
 from avtorch.gap.record import Record
-from avtorch.gap.screening import Look, looks
+from avtorch.gap.screening import ENOUGH, Look, looks
 from avtorch.gap.starts import starts
 from avtorch.io import Log
 
@@ -35,12 +37,14 @@ Float = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
 _SINGLES = 6  # fitted with noise of their own
+_LEAST = 1.5  # nats at first sight, for less of which no noise of its own would help
 _BASES = 3  # joined with a second effect
 _SECONDS = 4  # tried on each
 _PAIRS = 4  # fitted with noise of their own
 _SWAPS = 2  # times that either half of the best pair is exchanged for another effect
 _SECOND = 8.0  # nats a pair must be ahead of the best single effect for that
-_HELD = 2  # single effects on top of which lost messages are looked for
+_HELD = 3  # of none and the single effects, on top of which lost messages are looked for
+_FAR = 30.0  # nats behind the best of these, from where they are not
 _CLOSE = 12.0  # nats by which a pair may be behind at first sight
 
 
@@ -96,8 +100,10 @@ class Search:
             found += self._held(Record.of(logs, rate_hz=1e9), found, none)
         if glitches is not None:
             found += self._glitched(found, glitches)
-        found.sort(key=lambda f: -f.log_evidence)
-        return Race(record, raw, tuple(logs), tuple(found), self.complete)
+        best: dict[str, Found] = {}
+        for f in sorted(found, key=lambda f: -f.log_evidence):
+            best.setdefault(f.name, f)
+        return Race(record, raw, tuple(logs), tuple(best.values()), self.complete)
 
     def _has(self, name: str) -> bool:
         return any(e.name == name for e in self.effects)
@@ -128,23 +134,28 @@ class Search:
             return known.found(candidate, onset)
         # on averaged commands first, which is several times as fast and ends close by
         for coarse in (True, False) if record.group > 1 else (False,):
-            value = -np.inf
-            for turn in range(rounds + 1):
+            value, best = -np.inf, (z, noise)
+            for _ in range(rounds + 1):
+                noise = noise.seen_through(self._values(candidate, z))
                 white = Whitener(record, noise)
-                z = modes(candidate, white, z[None], onset=onset, iterations=4, coarse=coarse)[0][0]
+                enough = ENOUGH if coarse else 0.05
+                z = modes(candidate, white, z[None], onset=onset, iterations=4, coarse=coarse, enough=enough)[0][0]
                 errors = left_over(candidate, white, z, onset, coarse=coarse)
-                fitted = fit_noise(record, errors, noise, T_L=self._lag(candidate, z), iterations=3)
+                fitted = fit_noise(record, errors, noise, T_L=self._values(candidate, z)["T_L"], iterations=3)
                 noise = fitted.noise
-                new = float(fitted.rows.sum())
-                if new < value + 0.3 or turn == rounds:
+                new = float(fitted.rows.sum()) + fitted.log_prior - 0.5 * float(z @ z)
+                if new > value:
+                    best, log_prior = (z, noise), fitted.log_prior
+                if new < value + 0.3:
                     break
                 value = new
-        self.checkpoint.keep(candidate.name, onset, Kept(z, noise, fitted.log_prior))
-        return Kept(z, noise, fitted.log_prior).found(candidate, onset)
+            z, noise = best
+        self.checkpoint.keep(candidate.name, onset, Kept(z, noise, log_prior))
+        return Kept(z, noise, log_prior).found(candidate, onset)
 
     @staticmethod
-    def _lag(candidate: Candidate, z: Float) -> float:
-        return float(candidate.values(z[None])["T_L"])
+    def _values(candidate: Candidate, z: Float) -> dict[str, float]:
+        return {key: float(x[0]) for key, x in candidate.values(z[None]).items()}
 
     def _deterministic(self, record: Record, none: Found) -> list[Found]:
         kinds = [e for e in self.effects if not e.random and self._possible(e, record)]
@@ -163,7 +174,7 @@ class Search:
             best[look.candidate.name] = max(best.get(look.candidate.name, -np.inf), look.value)
         order = sorted(best, key=lambda n: -best[n])
         top = best[order[0]] - floor if order else 0.0
-        lead = [n for n in order[:_SINGLES] if best[n] - floor > min(0.25 * top, top - 30)]
+        lead = [n for n in order[:_SINGLES] if best[n] - floor > max(min(0.25 * top, top - 30), _LEAST)]
         found = [none]
         if self._has("gust"):
             found.append(gust(none))
@@ -174,14 +185,17 @@ class Search:
             noise = max(found, key=lambda f: f.log_evidence).noise.noise
             found.append(self._refined([look for look in seen if look.candidate.name == name], noise))
         # whatever is left behind keeps the evidence of its screening
+        flat = finish(none.candidate, white, none.z, coarse=True).log_evidence
         for look in seen:
             if look.candidate.name not in lead and look.onset is None:
-                found.append(self._as_found(look.candidate, finish(look.candidate, white, look.z), none))
+                found.append(
+                    self._as_found(look.candidate, finish(look.candidate, white, look.z, coarse=True), none, flat)
+                )
         if self.pairs:
             found += self._pairs(record, kinds, found, none)
         return found
 
-    def _as_found(self, candidate: Candidate, fit, none: Found) -> Found:  # type: ignore[no-untyped-def]
+    def _as_found(self, candidate: Candidate, fit: Fit, none: Found, flat: float) -> Found:
         return Found(
             name=candidate.name,
             candidate=candidate,
@@ -189,7 +203,7 @@ class Search:
             covariance=fit.covariance,
             values={k: float(v) for k, v in candidate.values(fit.z[None]).items()},
             noise=none.noise,
-            log_evidence=fit.log_evidence + none.noise.log_prior,
+            log_evidence=none.log_evidence + fit.log_evidence - flat,
             log_likelihood=fit.log_joint,
             errors=fit.errors,
             grade_rms=fit.grade_rms,
@@ -234,6 +248,16 @@ class Search:
         top = single[0].log_evidence - none.log_evidence
         bases = [f for f in single if not f.gust and f.log_evidence - none.log_evidence > 0.2 * top][:_BASES]
         made = {f.name: f for f in map(gust, bases[:2])} if self._has("gust") else {}
+        for base in bases[:2]:
+            # what drifts slowly is a gust or a road, and the noise that was fitted without either hides the road
+            name = "+".join(sorted([base.name, "gust"]))
+            gusty = made.get(name)
+            if gusty is None or RoadGrade not in kinds or RoadGrade in base.candidate.effects:
+                continue
+            if gusty.log_evidence > base.log_evidence + _SECOND:
+                candidate = Candidate(record, (*base.candidate.effects, RoadGrade), self.baseline)
+                look = Look(candidate, candidate.z_of(base.values), 0.0, base.onset)
+                self._settle_pairs([look], 1, gusty.noise.noise.replaced(force_sd=CALM), made)
         white = Whitener(record, single[0].noise.noise)
         alone = {f.name: f.values for f in single if not f.gust}
         seen: dict[str, Look] = {}
@@ -306,9 +330,8 @@ class Search:
         if of.onset is not None and not of.gust:
             onset = int(np.searchsorted(raw.source, of.candidate.record.source[of.onset] * of.candidate.record.group))
         errors = candidate.errors(of.z[None], onset)[0]
-        grade = candidate.grade_columns if of.profile is not None else None
-        if grade is not None and of.profile is not None and len(grade) == len(of.profile):
-            errors = errors - np.tensordot(of.profile, grade, 1)
+        if of.profile is not None:
+            errors = errors - candidate.grade_response(of.profile)
         return errors
 
     def _glitched(self, found: list[Found], glitches: Tails) -> list[Found]:
@@ -329,14 +352,14 @@ class Search:
 
     def _held(self, raw: Record, found: list[Found], none: Found) -> list[Found]:
         """Lost messages alone and on top of the best single effects."""
-        known = [f for f in found if f.name != "none" and "+" not in f.name and not f.gust and f.tails is None]
+        alone = [f for f in found if "+" not in f.name and not f.gust and f.tails is None]
+        alone = sorted(alone, key=lambda f: -f.log_evidence)[:_HELD]
         out = []
-        for f in [none, *sorted(known, key=lambda f: -f.log_evidence)[:_HELD]]:
-            if f is not none and f.log_evidence < none.log_evidence + 3:
+        for f in alone:
+            if f.log_evidence < alone[0].log_evidence - _FAR:
                 continue
             errors = self._raw_errors(raw, f)
-            noise = fit_noise(raw, errors, f.noise.noise, T_L=f.values["T_L"], iterations=6)
-            white = Whitener(raw, noise.noise)
+            white = Whitener(raw, f.noise.noise.by_rows(raw.witnesses))
             lost = losses(white, errors, raw.command[raw.source], f.values["T_L"], f.values["K_L"])
             name = "+".join(sorted([*([] if f is none else [f.name]), "command_hold"]))
             out.append(replace(f, name=name, log_evidence=f.log_evidence + lost.evidence, losses=lost))

@@ -10,6 +10,7 @@ import zlib
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -62,7 +63,7 @@ def begin(
         e.drawn(torch.Generator().manual_seed(_stream(e.name, seed)) if e.place == "body" else None) for e in effects
     )
     noise = {e.name: _noise(e.name, seed, a) for e in effects if e.random}
-    shape = torch.broadcast_shapes(a.shape, v.shape, u.shape)
+    shape = np.broadcast_shapes(a.shape, v.shape, u.shape)
     a, v, u = (x.expand(shape) for x in (a, v, u))
     zero = torch.zeros_like(v)
     past = Past(effects, T_L, K_L, noise, 0, 0.0, dt, a, v, zero, State(a), zero, {})

@@ -65,8 +65,7 @@ class Slope:
         return total, (taken * match) @ self.image
 
     def sampled(self, match: Float, rng: np.random.Generator) -> Float:
-        """`grade_rms` (column,) drawn given what errors have in common with the axes, (column, knot)."""
+        """Coefficients (column, knot) drawn given what errors have in common with the axes, (column, knot)."""
         gains = self.by_size(match)
-        chosen = (gains + rng.gumbel(size=gains.shape)).argmax(1)
-        within = (rng.random(len(chosen)) - 0.5) * np.log(SIZES[1] / SIZES[0])
-        return SIZES[chosen] * np.exp(within)
+        taken = self.shrinkage[(gains + rng.gumbel(size=gains.shape)).argmax(1)]
+        return (taken * match + np.sqrt(taken) * rng.standard_normal(match.shape)) @ self.axes.T

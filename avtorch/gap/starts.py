@@ -28,8 +28,8 @@ GRIDS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
     "gear_shift": {
         "depth": (0.5,),
         "duration_s": (0.25,),
-        "first_mps": tuple(np.arange(3.2, 6.9, 0.18)),
-        "gear_ratio": tuple(np.arange(1.35, 1.77, 0.025)),
+        "first_mps": tuple(np.arange(3.2, 6.9, 0.2)),
+        "gear_ratio": tuple(np.arange(1.35, 1.77, 0.035)),
     },
     "driveline_oscillation": {
         "frequency_hz": tuple(np.geomspace(0.9, 5.5, 14)),

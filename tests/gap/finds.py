@@ -9,10 +9,11 @@ import torch
 
 from avtorch.gap import Effect, GapPlant, plant
 from avtorch.gap.candidate import Candidate
-from avtorch.gap.chance import Losses, Tails
+from avtorch.gap.chance import Tails
 from avtorch.gap.fit import finish, modes
 from avtorch.gap.found import Found
 from avtorch.gap.innovations import NoiseModel, Whitener
+from avtorch.gap.losses import Losses
 from avtorch.gap.noise_fit import GUST, PRIORS, fit_noise
 from avtorch.gap.record import Record
 from tests.gap.records import QUIET, log_of

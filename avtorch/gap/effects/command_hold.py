@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -47,7 +48,7 @@ class CommandHold(Effect):
         arrived = ~self._lost(row.normal)
         rows = torch.arange(x.shape[-1])
         last = torch.where(arrived, rows, 0).cummax(-1).values
-        shape = torch.broadcast_shapes(last.shape, x.shape)
+        shape = np.broadcast_shapes(last.shape, x.shape)
         return x.expand(shape).gather(-1, last.expand(shape))
 
     def _lost(self, normal: Tensor) -> Tensor:
@@ -56,7 +57,7 @@ class CommandHold(Effect):
     def noise(self, u: Tensor) -> NoiseChange:
         """Mean square of `u` acting minus `u` logged: `sum_j (1 - p) p^j (u[k-j] - u[k])²`."""
         p = tensor(self.hold_fraction).unsqueeze(-1)
-        total = torch.zeros(torch.broadcast_shapes(u.shape, p.shape), dtype=u.dtype)
+        total = torch.zeros(np.broadcast_shapes(u.shape, p.shape), dtype=u.dtype)
         for j in range(1, min(_ROWS_BACK, u.shape[-1] - 1) + 1):
             older = torch.cat([u[..., :1].expand(*u.shape[:-1], j), u[..., :-j]], -1)
             total = total + (1 - p) * p**j * (older - u).square()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -43,7 +44,7 @@ class DeadTime(Effect):
         if delay.dim() == 0:
             late, early = kept[-1 - int(whole)], kept[-2 - int(whole)]
         else:
-            shape = torch.broadcast_shapes(x.shape, delay.shape)
+            shape = np.broadcast_shapes(x.shape, delay.shape)
             stacked = torch.stack([k.expand(shape) for k in kept])
             index = (reach - 1 - whole.expand(shape))[None]
             late, early = stacked.gather(0, index)[0], stacked.gather(0, index - 1)[0]
@@ -85,5 +86,5 @@ def _rows(x: Tensor, index: Tensor) -> Tensor:
     index = index.clamp(0, x.shape[-1] - 1)
     if x.dim() == 1:
         return x[index]
-    shape = torch.broadcast_shapes(x.shape, index.shape)
+    shape = np.broadcast_shapes(x.shape, index.shape)
     return x.expand(shape).gather(-1, index.expand(shape))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -75,7 +76,7 @@ class GearShift(Effect):
             up = (v > s) & ~was
             last = torch.where(up, rows, -1).cummax(-1).values
             crossing = self._crossing(before, v, s, row)
-            crossing = crossing.expand(torch.broadcast_shapes(crossing.shape, last.shape))
+            crossing = crossing.expand(np.broadcast_shapes(crossing.shape, last.shape))
             since = torch.where(last < 0, _NEVER, crossing.gather(-1, last.expand_as(crossing).clamp_min(0)))
             lost = torch.maximum(lost, self._covered(since, row))
         return self._factor(lost, x), 1.0

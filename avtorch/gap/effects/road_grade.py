@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,8 +15,9 @@ from avtorch.gap.effect import Effect, Row, register
 from avtorch.gap.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
-_GRAVITY = 9.80665
-_SMOOTH_M = 250.0  # correlation length of the slope (Matern 3/2) [m]
+GRAVITY = 9.80665
+"""[m/s²]"""
+_SMOOTH_M = 180.0  # correlation length of the slope (Matern 3/2) [m]
 
 
 @register
@@ -31,7 +33,7 @@ class RoadGrade(Effect):
     grade_rms: Number = 0.03
     profile: Tensor | None = None
     knots: int = 256
-    knot_m: float = 120.0
+    knot_m: float = 80.0
 
     name = "road_grade"
     place = "body"
@@ -46,7 +48,7 @@ class RoadGrade(Effect):
         if self.profile is None:
             return torch.zeros_like(position)
         slope = tensor(self.grade_rms) * _spline(position, self._coefficients(), self.knot_m, row.whole)
-        return -_GRAVITY * torch.sin(torch.atan(slope))
+        return -GRAVITY * torch.sin(torch.atan(slope))
 
     def coordinates(self) -> tuple[Parameter, ...]:
         return *self.parameters, Parameter("profile", "-", None, -1.2816, 1.2816, "real", False, self.knots)
@@ -64,7 +66,7 @@ class RoadGrade(Effect):
     def columns(self, position: Tensor) -> Tensor:
         """Acceleration (time, knot) per unit of each coefficient at `grade_rms` 1, `position` (time,) [m]."""
         lower = _lower(self.knots, self.knot_m)
-        return -_GRAVITY * _spline(position, lower.T, self.knot_m, True).movedim(0, -1)
+        return -GRAVITY * _spline(position, lower.T, self.knot_m, True).movedim(0, -1)
 
     def _coefficients(self) -> Tensor:
         profile = tensor(self.profile)
@@ -84,7 +86,7 @@ def _spline(position: Tensor, coefficients: Tensor, knot: float, whole: bool) ->
             value = coefficients[index]
         else:
             index = index if whole else index[..., None]
-            shape = torch.broadcast_shapes(index.shape[:-1], coefficients.shape[:-1])
+            shape = np.broadcast_shapes(index.shape[:-1], coefficients.shape[:-1])
             value = coefficients.expand(*shape, -1).gather(-1, index.expand(*shape, -1))
             value = value if whole else value[..., 0]
         total = total + weight / 6 * value
