@@ -9,7 +9,7 @@ speed going on from where it is. What lags behind the splice is forgotten within
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from weakref import WeakKeyDictionary
@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from avtorch.gap.drive import Drive
 from avtorch.gap.effect import Effect, effect_class
 from avtorch.gap.effects.road_grade import GRAVITY, RoadGrade
 from avtorch.gap.parameter import Parameter
@@ -142,68 +143,73 @@ class Candidate:
 
         Every drive has coefficients of its own: where one began on the other's road is not known.
         """
-        forces = self._grade_forces
-        if forces is None:
+        if not self._roads:
             return None
-        knots = [len(force) for force in forces]
-        apart = [(0, 0, sum(knots[:i]), sum(knots[i + 1 :])) for i in range(len(knots))]
-        return self._seen_forces([torch.nn.functional.pad(f, a) for f, a in zip(forces, apart, strict=True)])
+        return self._columns(self.record.drives, coarse=False)
 
     @cached_property
     def grade_means(self) -> Float | None:
         """The same of each group's mean, (knot, witness, counted, 1): within a group no slope changes."""
-        if self._grade_forces is None:
+        if not self._roads:
             return None
         if self.record not in _MEANS:
-            columns = self.grade_columns
-            assert columns is not None
-            _MEANS[self.record] = columns.mean(-1, keepdims=True)
+            _MEANS[self.record] = self._columns(self.record.coarse, coarse=True)
         return _MEANS[self.record]
+
+    def _columns(self, drives: Sequence[Drive], *, coarse: bool) -> Float:
+        forces = [road.columns(_position(drive)).T for road, drive in zip(self._roads, drives, strict=True)]
+        knots = [len(force) for force in forces]
+        apart = [(0, 0, sum(knots[:i]), sum(knots[i + 1 :])) for i in range(len(knots))]
+        padded = [torch.nn.functional.pad(f, a) for f, a in zip(forces, apart, strict=True)]
+        return self._seen_forces(drives, padded, coarse=coarse)
 
     def grade_response(self, coefficients: Float) -> Float:
         """What a slope of `coefficients` (knot,) does, (witness, counted, group)."""
-        assert self._grade_forces is not None
-        forces, first = [], 0
-        for force in self._grade_forces:
-            own = torch.as_tensor(coefficients[first : first + len(force)])
-            forces.append((own @ force)[None])
-            first += len(force)
-        return self._seen_forces(forces)[0]
+        drives = self.record.drives
+        forces = [road.force(_position(d), own)[None] for road, d, own in self._each_road(drives, coefficients)]
+        return self._seen_forces(drives, forces, coarse=False)[0]
 
-    def _seen_forces(self, forces: Sequence[torch.Tensor]) -> Float:
+    def _each_road(
+        self, drives: Sequence[Drive], coefficients: Float
+    ) -> Iterator[tuple[RoadGrade, Drive, torch.Tensor]]:
+        """Each drive with its road and its part of `coefficients` (..., knot)."""
+        first = 0
+        for road, drive in zip(self._roads, drives, strict=True):
+            yield road, drive, torch.as_tensor(coefficients[..., first : first + road.knots])
+            first += road.knots
+
+    def _seen_forces(self, drives: Sequence[Drive], forces: Sequence[torch.Tensor], *, coarse: bool) -> Float:
         """Forces (column, time) of each drive as both witnesses see them, (column, witness, counted, group)."""
         accel, speed = [], []
-        for drive, force in zip(self.record.drives, forces, strict=True):
+        for drive, force in zip(drives, forces, strict=True):
             gained = torch.cumsum(0.5 * drive.dt[:-1] * (force[:, 1:] + force[:, :-1]), -1)
             # an accelerometer does not feel gravity
             accel.append(torch.zeros_like(force) if drive.specific_force else force)
             speed.append(torch.cat([torch.zeros_like(force[:, :1]), gained], -1))
         seen = {"accel": accel, "speed": speed}
-        return np.stack([self.record.seen(seen[name]) for name in self.record.witnesses], 1)
+        return np.stack([self.record.seen(seen[name], coarse=coarse) for name in self.record.witnesses], 1)
 
     @cached_property
-    def _grade_forces(self) -> list[torch.Tensor] | None:
-        """Acceleration (knot, time) of each drive per unit of each coefficient."""
+    def _roads(self) -> list[RoadGrade]:
+        """The slope with as many knots as each drive's road needs; empty where it is none of the effects."""
         grade = next((e for e in self.plant.effects if isinstance(e, RoadGrade)), None)
         if grade is None or RoadGrade not in self.effects or self.record.speed is None:
-            return None
-        forces = []
-        for drive in self.record.drives:
-            assert drive.position is not None
-            own = grade.prepared(drive.time, drive.speed, drive.position)
-            forces.append(own.columns(drive.position).T)
-        return forces
+            return []
+        return [grade.prepared(drive.time, drive.speed, _position(drive)) for drive in self.record.drives]
 
     def grade_along(self, coefficients: Float) -> Float:
         """Root mean square of the slope along all drives, (column,), for coefficients (column, knot)."""
-        assert self._grade_forces is not None
-        total, rows, first = np.zeros(len(coefficients)), 0, 0
-        for force in self._grade_forces:
-            part = coefficients[:, first : first + len(force)]
-            gram = (force @ force.T).numpy() / GRAVITY**2
-            total += np.einsum("ck,kl,cl->c", part, gram, part)
-            rows, first = rows + force.shape[1], first + len(force)
-        return np.sqrt(np.maximum(total, 0.0) / rows)
+        drives = self.record.coarse
+        squares = [
+            (road.force(_position(drive), own) / GRAVITY).square().mean(-1) * len(drive.time)
+            for road, drive, own in self._each_road(drives, coefficients)
+        ]
+        return torch.stack(squares).sum(0).div(sum(len(d.time) for d in drives)).sqrt().numpy()
+
+
+def _position(drive: Drive) -> torch.Tensor:
+    assert drive.position is not None
+    return drive.position
 
 
 def splice(record: Record, full: Float, without: Float, onset: int) -> Float:

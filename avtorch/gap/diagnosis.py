@@ -168,11 +168,13 @@ class Diagnosis:
     def write(self, folder: str | PathLike[str]) -> list[Path]:
         """Write `plant.toml` (where there is a plant), then `diagnosis.json`; returns the files.
 
+        The plant's effects act from the start, also where the log shows them from an onset on; a comment in
+        `plant.toml` then says so (a `gain_change` has its moment among its parameters).
         An earlier answer in the folder goes first: while `diagnosis.json` is missing, what lies there is not whole.
         Raises `InputError` where the folder cannot be written or a number is not finite.
         """
         answer, repaired = Path(folder) / "diagnosis.json", Path(folder) / "plant.toml"
-        text = None if self.plant is None else self.plant.to_toml()
+        text = None if self.plant is None else self._late() + self.plant.to_toml()
         for path in (answer, repaired):
             path.unlink(missing_ok=True)
         if text is not None:
@@ -180,6 +182,13 @@ class Diagnosis:
                 stream.write(text)
         write_json(answer, self.to_dict())
         return [answer] if text is None else [answer, repaired]
+
+    def _late(self) -> str:
+        """A comment for `plant.toml` where the effects set in within the log."""
+        late = " and ".join(name for name in self.verdict.names if name != "gain_change")
+        if self.onset_s is None or not late:
+            return ""
+        return f"# In the log {late} from {self.onset_s:.6g} s on (the log's own time); in this plant from the start.\n"
 
     def to_arviz(self) -> InferenceData:
         """The winner's draws as `arviz.InferenceData`, one variable (chain, draw) a parameter, its unit in `attrs`.

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
+from difflib import get_close_matches
 from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import torch
@@ -211,5 +212,7 @@ def effect_class(name: str, more: Iterable[type[Effect]] = ()) -> type[Effect]:
     """The effect called `name`, among those registered and `more`. Raises `InputError` if there is none."""
     known = {**EFFECTS, **{cls.name: cls for cls in more}}
     if name not in known:
-        raise InputError(f"effect: found {name!r}, needs one of {', '.join(sorted(known))}")
+        close = get_close_matches(name, known, n=1)
+        need = f"an effect's name; perhaps {close[0]}" if close else f"one of {', '.join(sorted(known))}"
+        raise InputError(f"effect: found {name!r}, needs {need}")
     return known[name]

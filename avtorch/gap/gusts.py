@@ -9,7 +9,7 @@ import numpy as np
 from avtorch.gap.fit import finish, modes
 from avtorch.gap.found import Found, merged
 from avtorch.gap.innovations import NoiseModel, Whitener
-from avtorch.gap.noise_fit import GUST, fit_noise, row_likelihoods
+from avtorch.gap.noise_fit import CALM, GUST, fit_noise, row_likelihoods
 from avtorch.gap.onset import allowed, profile
 
 
@@ -22,14 +22,15 @@ def gust(base: Found) -> Found:
     whole = _blown(base, start, lag, None)
     forms.append(whole)
     rows = row_likelihoods(record, whole.errors, whole.noise.noise)
-    calm = base.noise.rows
+    # against the same noise without the gust; the base's own noise has made room for it
+    calm = row_likelihoods(record, whole.errors, whole.noise.noise.replaced(force_sd=CALM))
     along = profile(calm, rows)
     within = allowed(record.rows, record.dt)
     onset = within.start + int(np.argmax(along[within]))
     if along[onset] - along[0] > 3:
         late = _blown(base, whole.noise.noise, lag, onset)
         strong = row_likelihoods(record, late.errors, late.noise.noise)
-        quiet = row_likelihoods(record, late.errors, late.noise.noise.replaced(force_sd=0.005))
+        quiet = row_likelihoods(record, late.errors, late.noise.noise.replaced(force_sd=CALM))
         along = profile(quiet, strong)
         moved = within.start + int(np.argmax(along[within]))
         if abs(moved - onset) * record.dt > 1:

@@ -21,7 +21,7 @@ from avtorch.gap.effect import Effect, NoiseChange
 from avtorch.gap.parameter import Parameter
 from avtorch.gap.response import respond
 from avtorch.gap.simulation import Past, begin, goes_on, move
-from avtorch.gap.text import Described, described, read_file, to_toml
+from avtorch.gap.text import Described, described, names_a_file, read_file, to_toml
 from avtorch.vehicle.arguments import Number, checked, tensor
 from avtorch.vehicle.plant import Motion
 
@@ -155,10 +155,11 @@ def plant(
     """A plant with `effects` (a class stands for its typical values) on top of a `baseline`.
 
     `baseline`: the user's own simulator, as a plant, as a string such as `"dead_time=0.2"` (`"glvd"`: none), or a
-    TOML file; an effect given here takes the place of the baseline's of that name. `T_L` [s], `K_L` [-] and the jerk
-    noise `sigma` [m/s³] default to the baseline's, or 0.3, 1 and 0.1. Raises `InputError` for bad values.
+    TOML file (a string that ends in `.toml` or names a file is one); an effect given here takes the place of the
+    baseline's of that name. `T_L` [s], `K_L` [-] and the jerk noise `sigma` [m/s³] default to the baseline's, or 0.3,
+    1 and 0.1. Raises `InputError` for bad values or a file that is not there.
     """
-    if isinstance(baseline, str):
+    if isinstance(baseline, str) and not names_a_file(baseline):
         base = GapPlant.from_toml(baseline)
     elif isinstance(baseline, GapPlant) or baseline is None:
         base = baseline or GapPlant((), T_L=0.3, K_L=1.0, sigma=0.1)

@@ -108,7 +108,7 @@ def _walked(target: Corrected, chains: int, draws: int, generator: torch.Generat
     thinning = 2 if draws * 2 + 4 <= steps else 1
     longest = max([1.0, *(t for t in (1.5, 2.0, 3.0, 4.0) if (4 * t + thinning * draws) * t <= steps)])
     if pace > 2 * longest:
-        return None, f"{pace:.0f} times as steep as Laplace's approximation, too uneven for the steps affordable"
+        return None, f"its shape is far from normal (in places {pace:.0f} times as steep), and SGLD would take too long"
     settings = SamplerSettings(
         chains=chains,
         draws=draws,

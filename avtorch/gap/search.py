@@ -37,14 +37,14 @@ Float = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
 _SINGLES = 6  # fitted with noise of their own
-_LEAST = 1.5  # nats at first sight, for less of which no noise of its own would help
+_LEAST = 3.0  # nats at first sight, for less of which no noise of its own would help
 _BASES = 3  # joined with a second effect
 _SECONDS = 4  # tried on each
 _PAIRS = 4  # fitted with noise of their own
 _SWAPS = 2  # times that either half of the best pair is exchanged for another effect
 _SECOND = 8.0  # nats a pair must be ahead of the best single effect for that
-_HELD = 3  # of none and the single effects, on top of which lost messages are looked for
-_FAR = 30.0  # nats behind the best of these, from where they are not
+_HELD = 2  # of none and the single effects, on top of which lost messages are looked for
+_FAR = 12.0  # nats behind the best of these, from where they are not
 _CLOSE = 12.0  # nats by which a pair may be behind at first sight
 
 
@@ -135,7 +135,7 @@ class Search:
         # on averaged commands first, which is several times as fast and ends close by
         for coarse in (True, False) if record.group > 1 else (False,):
             value, best = -np.inf, (z, noise)
-            for _ in range(rounds + 1):
+            for _ in range(1 if record.group > 1 and not coarse else rounds + 1):
                 noise = noise.seen_through(self._values(candidate, z))
                 white = Whitener(record, noise)
                 enough = ENOUGH if coarse else 0.05
@@ -243,7 +243,7 @@ class Search:
     # pairs ---------------------------------------------------------------------------------------------------------
     def _pairs(self, record: Record, kinds: Sequence[type[Effect]], found: list[Found], none: Found) -> list[Found]:
         single = sorted((f for f in found if f.name != "none"), key=lambda f: -f.log_evidence)
-        if not single or single[0].log_evidence < none.log_evidence + 3:
+        if not single or single[0].log_evidence < none.log_evidence + _LEAST:
             return []
         top = single[0].log_evidence - none.log_evidence
         bases = [f for f in single if not f.gust and f.log_evidence - none.log_evidence > 0.2 * top][:_BASES]

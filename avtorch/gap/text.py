@@ -58,10 +58,22 @@ def described(text: str, more: Iterable[type[Effect]] = ()) -> Described:
     return _of(tables, more)
 
 
+def names_a_file(text: str) -> bool:
+    """Whether a string is a file's name, there or missing, and not a plant in words."""
+    if "\n" in text or text.strip().lower() in ("", "glvd"):
+        return False
+    try:
+        return text.strip().lower().endswith(".toml") or Path(text).is_file()
+    except (OSError, ValueError):  # too long for a name, or with a zero byte in it
+        return False
+
+
 def read_file(path: str | PathLike[str], more: Iterable[type[Effect]] = ()) -> Described:
     """From a TOML file. Raises `InputError` where it cannot be read."""
     try:
         text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"plant: {path}: no such file; needs a TOML file, or effects such as dead_time=0.2") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"plant: {path} cannot be read ({error})") from None
     return described(text + "\n", more)

@@ -117,7 +117,8 @@ def _require(table: Table, mapping: SignalMap, following: bool) -> None:
 
 
 def _advice(signal: str, names: Iterable[str]) -> str:
-    plain = {name.strip().lower(): name for name in names}
+    # a column that is a signal already goes by its own name: a measured `accel` is no command
+    plain = {name.strip().lower(): name for name in names if name not in SIGNALS}
     close = difflib.get_close_matches(signal, plain, n=1, cutoff=0.6)
     name = f"{plain[close[0]]!r}" if close else "NAME"
     return f"columns: {', '.join(names)}; `--map {signal}={name}` if it goes by another name"

@@ -252,6 +252,24 @@ def test_written_files_read_back(tmp_path: Path) -> None:
     assert [p.name for p in folder.iterdir()] == ["diagnosis.json"]
 
 
+def test_a_plant_says_that_what_set_in_late_is_in_from_the_start(tmp_path: Path) -> None:
+    def written(onset_s: float | None, **chances: float) -> str:
+        given = candidates(**chances, none=0.15, unknown=0.05)
+        diagnosis(given, plant=plant([DeadTime(0.2)]), onset_s=onset_s).write(tmp_path)
+        return (tmp_path / "plant.toml").read_text(encoding="utf-8")
+
+    late = written(132.4, aerodynamic_drag_and_dead_time=0.8)
+    first, rest = late.split("\n", 1)
+    assert first == (
+        "# In the log aerodynamic_drag and dead_time from 132.4 s on (the log's own time); in this plant from the start."
+    )
+    assert rest == plant([DeadTime(0.2)]).to_toml()
+    assert GapPlant.from_toml(late).effects == (DeadTime(0.2),)
+    assert "#" not in written(None, dead_time=0.8)
+    # its moment is a parameter, which the plant has
+    assert "#" not in written(132.4, gain_change=0.8)
+
+
 @pytest.mark.parametrize(
     "effect", [Saturation(1.2, -math.inf), RoadGrade(0.03, torch.linspace(-1, 1, 5, dtype=torch.float64), 5)]
 )

@@ -173,7 +173,7 @@ def test_baselines(tmp_path: Path) -> None:
     mine = plant([gap.DeadTime(0.2), gap.SensorBias(0.1)], T_L=0.5)
     path = tmp_path / "car.toml"
     path.write_text(mine.to_toml(), encoding="utf-8")
-    for baseline in (mine, path):
+    for baseline in (mine, path, str(path)):
         car = plant([gap.AerodynamicDrag(), gap.SensorBias(0.3)], baseline=baseline)
         assert car.T_L == 0.5
         assert [e.name for e in car.effects] == ["dead_time", "aerodynamic_drag", "sensor_bias"]
@@ -181,10 +181,26 @@ def test_baselines(tmp_path: Path) -> None:
     assert plant([gap.Gust()], baseline="dead_time=0.2").effects[0] == gap.DeadTime(0.2)
 
 
+def test_a_string_that_names_a_file_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("my car", "car.toml", "dead_time=0.1", "glvd"):
+        Path(name).write_text("[dead_time]\ndelay_s = 0.2\n", encoding="utf-8")
+    for name in ("my car", "car.toml", "dead_time=0.1"):
+        assert plant(baseline=name).effects == (gap.DeadTime(0.2),)
+    assert plant(baseline="glvd").effects == ()
+    assert plant(baseline="dead_time=0.3," + 5000 * " ").effects == (gap.DeadTime(0.3),)  # too long for a name
+    for missing in ("other.toml", "no/Such.TOML"):
+        with pytest.raises(InputError, match=f"{missing}: no such file"):
+            plant(baseline=missing)
+    with pytest.raises(InputError, match=r"other\.toml: no such file"):
+        plant(baseline=Path("other.toml"))
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("dead_tim=0.2", "dead_tim"),
+        ("dead_tim=0.2", "found 'dead_tim', needs an effect's name; perhaps dead_time"),
+        ("zzz=0.2", "found 'zzz', needs one of aerodynamic_drag, "),
         ("dead_time=fast", "number"),
         ("dead_time.lag=0.2", "lag"),
         ("T_L=-1", "T_L"),

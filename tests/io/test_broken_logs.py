@@ -81,9 +81,16 @@ def test_a_missing_column_is_named_with_a_way_out(tmp_path, column):
     refused(write(tmp_path / "lap.csv", columns), f"column '{column}' is missing", f"--map {column}='{near}'")
 
 
+def test_no_signal_is_advised_in_place_of_another(tmp_path):
+    """`accel` is what the car did; taken for the command it would make every car a perfect one."""
+    columns = {k: v for k, v in SPACED.items() if k != "accel_cmd"}
+    refused(write(tmp_path / "lap.csv", columns), "'accel_cmd' is missing", "--map accel_cmd=NAME")
+    refused(write(tmp_path / "lap.csv", columns | {"accel_comd": columns["speed"]}), "--map accel_cmd='accel_comd'")
+
+
 def test_both_witnesses_missing(tmp_path):
-    columns = {k: GOOD[k] for k in ("time", "accel_cmd")}
-    refused(write(tmp_path / "lap.csv", columns), "'accel' and 'speed' are both missing")
+    columns = {k: SPACED[k] for k in ("time", "accel_cmd", "lead_speed")}
+    refused(write(tmp_path / "lap.csv", columns), "'accel' and 'speed' are both missing", "--map speed=NAME")
 
 
 def test_a_following_log_may_lack_the_command_but_not_the_leader(tmp_path):

@@ -15,16 +15,18 @@ from avtorch.vehicle.arguments import Number, tensor
 @register
 @dataclass(frozen=True)
 class ConstantResistance(Effect):
-    """`-resistance_mps2` while the car moves; neutral at 0."""
+    """`-resistance_mps2` while the car moves, which it does wherever no speed was measured; neutral at 0."""
 
     resistance_mps2: Number = 0.12
 
     name = "constant_resistance"
     place = "body"
-    needs_speed = True
     meaning = "the same deceleration at every speed"
     equation = "-r while moving"
     parameters = (Parameter("resistance_mps2", "m/s²", 0.0, 0.05, 0.3),)
 
     def apply(self, x: Tensor, row: Row) -> Tensor:
-        return torch.where(row.speed > 0, -tensor(self.resistance_mps2), 0.0)
+        force = -tensor(self.resistance_mps2)
+        if row.measured_speed is None:
+            return force * torch.ones_like(x)
+        return torch.where(row.speed > 0, force, 0.0)

@@ -68,6 +68,11 @@ class RoadGrade(Effect):
         lower = _lower(self.knots, self.knot_m)
         return -GRAVITY * _spline(position, lower.T, self.knot_m, True).movedim(0, -1)
 
+    def force(self, position: Tensor, coefficients: Tensor) -> Tensor:
+        """Acceleration (..., time) of a slope of `coefficients` (..., knot), linear in them; `position` (time,) [m]."""
+        lower = _lower(self.knots, self.knot_m)
+        return -GRAVITY * _spline(position, coefficients @ lower.T, self.knot_m, True)
+
     def _coefficients(self) -> Tensor:
         profile = tensor(self.profile)
         return profile @ _lower(profile.shape[-1], self.knot_m).T
