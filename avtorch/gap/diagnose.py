@@ -19,7 +19,7 @@ from avtorch.gap.misfit import gap_facts
 from avtorch.gap.odds import favourite, probabilities
 from avtorch.gap.plant import GapPlant, plant
 from avtorch.gap.posterior import Draws
-from avtorch.gap.remainder import remainder
+from avtorch.gap.remainder import Remainder, remainder
 from avtorch.gap.remaining import remaining
 from avtorch.gap.reported import drawn, moved, repaired, reported
 from avtorch.gap.search import Search
@@ -66,11 +66,8 @@ def diagnose(
         each, base, effects=kinds, pairs=pairs, budget_s=budget_s, progress=progress, checkpoint=Checkpoint(checkpoint)
     ).run()
     top = favourite(race.found)
-    left = remainder(
-        Whitener(race.record, top.noise.noise), top.errors, race.record.measured - top.errors
-    )  # fmt: skip
-    chances = probabilities(race.found, left, race.record.rows, prior)
-    candidates = [_told(f, race, chances[f.name]) for f in _first_of_each(race.found)]
+    chances = probabilities(race.found, _left(top, race), prior)
+    candidates = [_told(f, race, chances[f.name]) for f in race.found]
     candidates.append(Candidate("unknown", chances["unknown"], None, {}, {}, None))
     verdict = verdict_of(candidates)
     winner = next((f for f in race.found if f.name == verdict.name), None)
@@ -98,12 +95,17 @@ def diagnose(
     )
 
 
+def _left(top: Found, race: Race) -> Remainder:
+    """What the favourite leaves over, less what lost messages explain row by row."""
+    measured = race.record.measured
+    if top.errors.shape[-1] == 1:
+        measured = measured.mean(-1, keepdims=True)
+    explained = top.losses.evidence if top.losses else 0.0
+    return remainder(Whitener(race.record, top.noise.noise), top.errors, measured - top.errors, explained=explained)
+
+
 def _draws(found: Found, seed: int) -> Draws:
     return posteriors.posterior(found, seed=seed)
-
-
-def _first_of_each(found: Sequence[Found]) -> list[Found]:
-    return list({f.name: f for f in reversed(found)}.values())[::-1]
 
 
 def _told(found: Found, race: Race, probability: float, draws: Draws | None = None) -> Candidate:

@@ -38,6 +38,7 @@ Progress = Callable[[str, int, int], None]
 
 _SINGLES = 6  # fitted with noise of their own
 _LEAST = 3.0  # nats at first sight, for less of which no noise of its own would help
+_LITTLE = -3.0  # nats over none, below which nothing more exact is asked for
 _BASES = 3  # joined with a second effect
 _SECONDS = 4  # tried on each
 _PAIRS = 4  # fitted with noise of their own
@@ -135,7 +136,7 @@ class Search:
         # on averaged commands first, which is several times as fast and ends close by
         for coarse in (True, False) if record.group > 1 else (False,):
             value, best = -np.inf, (z, noise)
-            for _ in range(1 if record.group > 1 and not coarse else rounds + 1):
+            for _ in range(2 if record.group > 1 and not coarse else rounds + 1):
                 noise = noise.seen_through(self._values(candidate, z))
                 white = Whitener(record, noise)
                 enough = ENOUGH if coarse else 0.05
@@ -184,15 +185,27 @@ class Search:
                 break
             noise = max(found, key=lambda f: f.log_evidence).noise.noise
             found.append(self._refined([look for look in seen if look.candidate.name == name], noise))
-        # whatever is left behind keeps the evidence of its screening
-        flat = finish(none.candidate, white, none.z, coarse=True).log_evidence
-        for look in seen:
-            if look.candidate.name not in lead and look.onset is None:
-                found.append(
-                    self._as_found(look.candidate, finish(look.candidate, white, look.z, coarse=True), none, flat)
-                )
+        found += self._left_behind([look for look in seen if look.candidate.name not in lead], white, none)
         if self.pairs:
             found += self._pairs(record, kinds, found, none)
+        return found
+
+    def _left_behind(self, rest: Sequence[Look], white: Whitener, none: Found) -> list[Found]:
+        """The others keep the evidence of their screening, of means only where it is little anyway."""
+        found = []
+        for coarse in (True, False) if none.candidate.record.group > 1 else (False,):
+            flat = finish(none.candidate, white, none.z, coarse=coarse).log_evidence
+            again = []
+            for look in rest:
+                if look.onset is not None:
+                    continue
+                fit = finish(look.candidate, white, look.z, coarse=coarse)
+                if coarse and fit.log_evidence - flat > _LITTLE:
+                    # in closed loop, means only may flatter
+                    again.append(look)
+                else:
+                    found.append(self._as_found(look.candidate, fit, none, flat))
+            rest = again
         return found
 
     def _as_found(self, candidate: Candidate, fit: Fit, none: Found, flat: float) -> Found:
