@@ -12,12 +12,14 @@ from avtorch.gap.candidate import Candidate
 from avtorch.gap.fit import modes
 from avtorch.gap.innovations import Whitener
 from avtorch.gap.onset import allowed, profile, rough
+from avtorch.gap.starts import one_at_a_time
 
 Float = NDArray[np.float64]
 
 ENOUGH = 0.3
 """Nats a step gains at least, or the look is over."""
 _AT_ONCE = 32
+_TURNS = 2  # through the parameters one at a time
 _WORTH = 4.0  # nats an onset must gain to be looked at
 _FAINT = 0.3  # the same where the effect shows over the whole drive: fitted to all of it, it is diluted
 
@@ -56,6 +58,11 @@ def looks(
     made = []
     if more > (_FAINT if value > floor + _WORTH else _WORTH):
         made.append(_from(candidate, white, z, row))
+    beside = one_at_a_time(candidate, z)
+    if len(beside):
+        _, more_late, more_when = _tried(candidate, white, beside, True)
+        starts = np.concatenate([starts, beside])
+        late, when = np.concatenate([late, more_late]), np.concatenate([when, more_when])
     k = int(late.argmax())
     if late[k] > max(value, made[0].value if made else -np.inf) + _WORTH:
         made.append(_from(candidate, white, starts[k], int(when[k])))
@@ -77,8 +84,28 @@ def _from(candidate: Candidate, white: Whitener, z: Float, onset: int) -> Look:
 
 
 def _best(candidate: Candidate, white: Whitener, z: Float, onset: int | None, iterations: int) -> tuple[Float, float]:
+    """The best mode from starts `z` (start, coordinate), also of those beside it."""
     found, values = modes(candidate, white, z, onset=onset, iterations=iterations, coarse=True, enough=ENOUGH)
-    return found[values.argmax()], float(values.max())
+    best, value = found[values.argmax()], float(values.max())
+    for _ in range(_TURNS):
+        places = one_at_a_time(candidate, best)
+        if not len(places):
+            break
+        errors = candidate.errors(places, onset, coarse=True)
+        k = int((white.log_likelihood(errors) - 0.5 * (places**2).sum(1)).argmax())
+        found, values = modes(
+            candidate, white, places[k : k + 1], onset=onset, iterations=iterations, coarse=True, enough=ENOUGH
+        )
+        if values[0] < value + 1:
+            break
+        best, value = found[0], float(values[0])
+    return best, value
+
+
+def rest(candidate: Candidate, white: Whitener, z: Float, onset: int | None) -> Look:
+    """Where a candidate comes to rest from `z` (coordinate,), its onset held."""
+    best, value = _best(candidate, white, z[None], onset, 6)
+    return Look(candidate, best, value, onset)
 
 
 def _tried(candidate: Candidate, white: Whitener, starts: Float, onsets: bool) -> tuple[Float, Float, Float]:

@@ -26,7 +26,7 @@ from avtorch.gap.innovations import NoiseModel, Whitener
 from avtorch.gap.losses import losses
 from avtorch.gap.noise_fit import CALM, fit_noise
 from avtorch.gap.onset import averaged, refined
-from avtorch.gap.pairing import joint, score, swapped
+from avtorch.gap.pairing import Base, joint, swapped
 from avtorch.gap.plant import GapPlant
 from avtorch.gap.record import Record
 from avtorch.gap.screening import ENOUGH, Look, looks
@@ -278,7 +278,7 @@ class Search:
             self.progress("pairs", i, len(bases))
             if self._late():
                 break
-            for look in self._joined(base, kinds, white, alone):
+            for look in self._joined(base, kinds, white, alone, _SECONDS if i == 0 else _SECONDS // 2):
                 known = seen.get(look.candidate.name)
                 if known is None or look.value > known.value:
                     seen[look.candidate.name] = look
@@ -303,18 +303,20 @@ class Search:
         kinds: Sequence[type[Effect]],
         white: Whitener,
         alone: Mapping[str, Mapping[str, float]],
+        most: int,
     ) -> list[Look]:
-        """The effects that promise most on top of `base`, each fitted with it."""
+        """The `most` effects that promise most on top of `base`, each fitted with it."""
         scored = []
+        on = Base(base.candidate, base.z, base.values, base.onset, white)
         for kind in kinds:
             if kind in base.candidate.effects:
                 continue
             candidate = Candidate(white.record, (*base.candidate.effects, kind), self.baseline)
-            scored.append((*score(candidate, base.candidate, base.z, base.values, base.onset, white, alone), candidate))
+            scored.append((*on.score(candidate, alone), candidate))
         scored.sort(key=lambda s: -s[0])
         return [
             joint(candidate, base.candidate.effects[0], z, base.onset, white, onsets=True)
-            for gain, z, candidate in scored[:_SECONDS]
+            for gain, z, candidate in scored[:most]
             if gain > 4 and not self._late()
         ]
 

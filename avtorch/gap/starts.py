@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from itertools import product
+from math import prod
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +47,7 @@ GRIDS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
 """Values by effect and parameter; all combinations are tried. A change of gain starts at shares of the drive."""
 
 _CHANGES = 12
+_MANY = 100
 
 
 def of_effect(candidate: Candidate, name: str) -> list[dict[str, float]]:
@@ -68,6 +70,24 @@ def of_effect(candidate: Candidate, name: str) -> list[dict[str, float]]:
         ]
     keys = [f"{name}.{key}" for key in grid]
     return [dict(zip(keys, values, strict=True)) for values in product(*grid.values())]
+
+
+def one_at_a_time(candidate: Candidate, z: Float) -> Float:
+    """Places (start, coordinate) that differ from `z` in one parameter of an effect, put to one of its starts.
+
+    A limit that is never reached has no slope to follow, and a hill may be climbed from its wrong side.
+    """
+    places = []
+    for i, c in enumerate(candidate.coordinates):
+        effect, _, key = c.key.partition(".")
+        grid = GRIDS.get(effect, {})
+        if prod(map(len, grid.values())) > _MANY:  # already tried closely
+            continue
+        for value in grid.get(key, ()):
+            place = z.copy()
+            place[i] = c.z_of(value)
+            places.append(place)
+    return np.array(places).reshape(-1, len(z))
 
 
 def starts(candidate: Candidate, base: Mapping[str, float]) -> Float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from avtorch.gap.chance import tails
 from avtorch.gap.innovations import NoiseModel
@@ -12,7 +13,7 @@ from tests.gap.records import Float, drawn_errors
 ROWS = 6000
 
 
-def _glitched(fraction: float, scale: float, rng: np.random.Generator) -> tuple[Float, Float]:
+def _glitched(fraction: float, scale: float, rng: np.random.Generator) -> tuple[Float, NDArray[np.bool_]]:
     errors = 0.05 * rng.standard_normal(ROWS)
     hit = rng.random(ROWS) < fraction
     return errors + np.where(hit, 0.05 * scale * rng.standard_normal(ROWS), 0.0), hit

@@ -12,6 +12,8 @@ from scipy.optimize import minimize
 
 from avtorch.gap import AerodynamicDrag, ConstantResistance, DeadTime, Drive, GapPlant, RoadGrade, SensorBias, plant
 from avtorch.gap.candidate import Candidate
+from avtorch.gap.effect import Row
+from avtorch.gap.effects.road_grade import GRAVITY
 from avtorch.gap.fit import finish, modes
 from avtorch.gap.innovations import Whitener
 from avtorch.gap.record import Record
@@ -281,3 +283,63 @@ def test_a_gap_in_a_drive_with_a_slope(rotating_seed: int) -> None:
     fit = finish(candidate, white, candidate.z_of({"T_L": 0.3, "K_L": 1.0}))
     assert np.isfinite(fit.log_evidence)
     assert float((white(fit.errors) ** 2).mean()) == pytest.approx(1.0, abs=0.25)
+
+
+@pytest.mark.parametrize("rate_hz", [20, 100])
+def test_what_a_slope_does_is_the_sum_of_its_columns(rate_hz: int, rotating_seed: int) -> None:
+    """Over two drives, one of them with a gap, of hills of their own."""
+    rng = np.random.default_rng(rotating_seed)
+    first, second = (log_of(seconds=s, rate_hz=rate_hz, name=f"{s} s", rng=rng, speed0=30.0) for s in (20.0, 30.0))
+    record = Record.of([first, replace(second, engaged=(second.time < 12) | (second.time > 15))])
+    assert len(record.starts) == 3
+    candidate = Candidate.named(record, "road_grade+sensor_bias", plant())
+    columns, means = candidate.grade_columns, candidate.grade_means
+    assert columns is not None
+    assert means is not None
+    white = Whitener(record, QUIET)
+    for c in 0.02 * rng.standard_normal((3, len(columns))):
+        whole = np.einsum("k,kwrg->wrg", c, columns)
+        np.testing.assert_allclose(candidate.grade_response(c), whole, atol=1e-12)
+        # of the means, by positions of averaged speeds: white errors of some 30 apart by some 0.2
+        mean = white(whole.mean(-1, keepdims=True))
+        apart = white(np.einsum("k,kwrg->wrg", c, means)) - mean
+        assert np.linalg.norm(apart) <= (0.0 if rate_hz == 20 else 0.04) * np.linalg.norm(mean) + 1e-9
+    assert means.shape == (*columns.shape[:-1], 1)
+    # another candidate of the same record has the same slope, one without a slope none
+    assert Candidate.named(record, "dead_time+road_grade", plant()).grade_means is means
+    assert Candidate.named(record, "sensor_bias", plant()).grade_means is None
+    assert Candidate.named(record, "sensor_bias", plant()).grade_columns is None
+    # coefficients of the one drive do nothing in the other
+    knots = _road(record.drives[0]).knots
+    others = record.stretch > 0
+    assert not columns[:knots][:, :, others].any()
+    assert not columns[knots:][:, :, ~others].any()
+    assert columns[knots:][:, :, others].any()
+
+
+def _road(drive: Drive) -> RoadGrade:
+    return RoadGrade().prepared(drive.time, drive.speed, drive.position)
+
+
+def _row(drive: Drive) -> Row:
+    one = torch.tensor(1.0, dtype=torch.float64)
+    return Row(drive.time, drive.dt, drive.speed, drive.position, one, one)
+
+
+@pytest.mark.parametrize("rate_hz", [20, 100])
+def test_the_size_along_the_road_is_that_of_the_slope_itself(rate_hz: int, rotating_seed: int) -> None:
+    """By what the effect does at every row of both drives."""
+    rng = np.random.default_rng(rotating_seed)
+    logs = [log_of(seconds=s, rate_hz=rate_hz, name=f"{s} s", rng=rng, speed0=30.0) for s in (20.0, 30.0)]
+    record = Record.of(logs)
+    candidate = Candidate.named(record, "road_grade", plant())
+    knots = [_road(drive).knots for drive in record.drives]
+    coefficients = 0.02 * rng.standard_normal((4, sum(knots)))
+    told = candidate.grade_along(coefficients)
+    assert told.shape == (4,)
+    for c, rms in zip(coefficients, told, strict=True):
+        slopes = []
+        for drive, own in zip(record.drives, np.split(c, knots[:1]), strict=True):
+            push = RoadGrade(1.0, torch.as_tensor(own)).apply(torch.zeros_like(drive.time), _row(drive)).numpy()
+            slopes.append(np.tan(np.arcsin(push / -GRAVITY)))
+        assert rms == pytest.approx(np.sqrt((np.concatenate(slopes) ** 2).mean()), rel=1e-9 if rate_hz == 20 else 1e-2)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_are
 
-from avtorch.gap.innovations import NoiseModel, Whitener
+from avtorch.gap.innovations import NoiseModel, Whitener, _motion, _steady
 from avtorch.gap.record import Record
 from tests.gap.records import BOTH, Float, dense_covariance, errors_of, log_normal_density, log_of, record_of
 
@@ -146,3 +148,216 @@ def test_rows_in_groups_count_by_their_mean_and_by_what_they_differ(rotating_see
     assert float(white.log_likelihood(errors)) == pytest.approx(exact, abs=1e-6)
     # errors of group 1, of a coarse rollout, pass without that part
     assert white(means).shape == (2, grouped.rows, 1)
+
+
+# an accelerometer that is late, or shows too much -------------------------------------------------------------------
+
+SENSORS = {
+    "late": replace(NOISES["usual"], sensor_lag=0.2),
+    "hardly late": replace(NOISES["windy"], sensor_lag=0.004),
+    "scaled": replace(NOISES["windy"], sensor_scale=1.2),
+    "late and scaled": replace(NOISES["slow car"], sensor_lag=0.4, sensor_scale=0.85),
+}
+
+
+def _process(noise: NoiseModel) -> tuple[Float, Float, Float]:
+    """State (error of the speed, p, d, what the sensor shows): its drift, spectrum, and how both witnesses see it."""
+    lag = noise.sensor_lag or np.inf
+    drift = np.zeros((4, 4))
+    drift[0, 1:3] = 1.0
+    drift[1, 1], drift[2, 2] = -1 / noise.process_time, -1 / noise.force_time
+    drift[3] = [0.0, 1 / lag, 1 / lag, -1 / lag]
+    # the filter's hair of speed noise is part of the model
+    spectrum = np.diag(
+        [1e-12, 2 * noise.process_sd**2 / noise.process_time, 2 * noise.force_sd**2 / noise.force_time, 0.0]
+    )
+    felt = [0.0, 0.0, 0.0, 1.0] if noise.sensor_lag else [0.0, 1.0, 1.0, 0.0]
+    see = np.array([felt, [1.0, 0.0, 0.0, 0.0]])
+    see[0] *= noise.sensor_scale
+    return (drift, spectrum, see) if noise.sensor_lag else (drift[:3, :3], spectrum[:3, :3], see[:, :3])
+
+
+def _over(noise: NoiseModel, dt: float) -> tuple[Float, Float]:
+    """Transition and added covariance over `dt`: the integral of exp(drift s) spectrum exp(drift s)' by Gauss nodes,
+    on panels that grow from the shortest time there is."""
+    drift, spectrum, _ = _process(noise)
+    nodes, weights = np.polynomial.legendre.leggauss(20)
+    fastest = min(noise.sensor_lag or dt, dt)
+    edges = np.concatenate([[0.0], np.linspace(0, dt, int(np.ceil(2 * dt / fastest)) + 1)[1:]])
+    total = np.zeros_like(drift)
+    for a, b in pairwise(edges):
+        for x, w in zip(nodes, weights, strict=True):
+            moved = expm(drift * (0.5 * (a + b) + 0.5 * (b - a) * x))
+            total += 0.5 * (b - a) * w * moved @ spectrum @ moved.T
+    return expm(drift * dt), total
+
+
+def _drawn(noise: NoiseModel, record: Record, rng: np.random.Generator) -> Float:
+    """(witness, counted, 1) of one stretch, begun stationary."""
+    move, driven = _over(noise, record.dt)
+    drift, spectrum, see = _process(noise)
+    root = np.linalg.cholesky(driven + 1e-16 * np.eye(len(driven)))
+    start = solve_continuous_lyapunov(drift[1:, 1:], -spectrum[1:, 1:])
+    state = np.concatenate(
+        [[0.0], np.linalg.cholesky(start + 1e-16 * np.eye(len(start))) @ rng.standard_normal(len(start))]
+    )
+    shocks = rng.standard_normal((record.rows, len(driven))) @ root.T
+    out = np.empty((record.rows, len(driven)))
+    for k in range(record.rows):
+        out[k] = state
+        state = move @ state + shocks[k]
+    white = np.array([noise.accel_sd, noise.speed_sd])[:, None] * rng.standard_normal((2, record.rows))
+    return (see @ out.T + white)[[BOTH.index(w) for w in record.witnesses], :, None]
+
+
+def _settled(noise: NoiseModel, record: Record) -> tuple[Float, Float, Float, Float, Float]:
+    """Transition, added covariance, the witnesses' sight and noise, and the covariance ahead of a reading at rest."""
+    move, driven = _over(noise, record.dt)
+    see = _process(noise)[2]
+    white = np.diag([noise.accel_sd**2, noise.speed_sd**2])
+    use = [BOTH.index(w) for w in record.witnesses]
+    keep = slice(0 if 1 in use else 1, None)  # without a speed its error is not seen, and never rests
+    move, driven, see = move[keep, keep], driven[keep, keep], see[use][:, keep]
+    white = white[np.ix_(use, use)]
+    return move, driven, see, white, np.asarray(solve_discrete_are(move.T, see.T, driven, white))
+
+
+@pytest.mark.parametrize("witnesses", WITNESSES)
+@pytest.mark.parametrize("noise", [*SENSORS.values(), NOISES["windy"]], ids=[*SENSORS, "windy"])
+def test_begun_at_rest_the_likelihood_is_the_dense_gaussians(
+    noise: NoiseModel, witnesses: tuple[str, ...], rotating_seed: int
+) -> None:
+    """To rounding: the covariance of all rows written down from the state's, the offset under its flat prior."""
+    rng = np.random.default_rng(rotating_seed)
+    record = record_of(12.0, witnesses=witnesses)
+    errors = _drawn(noise, record, rng)
+    move, driven, see, white, ahead = _settled(noise, record)
+    count, rows = len(witnesses), record.rows
+    whole = np.empty((rows, count, rows, count))
+    state = ahead
+    for k in range(rows):
+        across = see @ state
+        whole[k, :, k] = across @ see.T + white
+        for j in range(k + 1, rows):
+            across = across @ move.T
+            whole[k, :, j] = across @ see.T
+            whole[j, :, k] = whole[k, :, j].T
+        state = move @ state @ move.T + driven
+    covariance = whole.reshape(rows * count, rows * count)
+    x = errors[..., 0].T.ravel()
+    want = log_normal_density(x, covariance)
+    if "speed" in witnesses:
+        unit = np.tile(np.eye(count)[-1], rows)
+        solved = np.linalg.solve(covariance, np.stack([x, unit], 1))
+        square = unit @ solved[:, 1]
+        want += 0.5 * (unit @ solved[:, 0]) ** 2 / square - 0.5 * np.log(square)
+    got = float(Whitener(record, noise).log_likelihood(errors))
+    assert got == pytest.approx(want, rel=1e-8)
+
+
+@pytest.mark.parametrize("witnesses", WITNESSES)
+@pytest.mark.parametrize("noise", SENSORS.values(), ids=SENSORS.keys())
+def test_errors_behind_a_sensor_become_white(noise: NoiseModel, witnesses: tuple[str, ...], rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    record = record_of(200.0, witnesses=witnesses, noise=None)
+    errors = _drawn(noise, record, rng)
+    e = Whitener(record, noise)(errors)[..., 0]
+    n, kinds = record.rows, len(witnesses)
+    # 5 standard errors of a mean square and of a lagged product of white noise
+    assert (e**2).mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / (n * kinds)))
+    for lag in (1, 2, 5, 20, 100):
+        for i in range(kinds):
+            for j in range(kinds):
+                assert abs((e[i, lag:] * e[j, :-lag]).mean()) < 5.5 / np.sqrt(n - lag)
+    assert all(abs((e[0] * e[j]).mean()) < 5 / np.sqrt(n) for j in range(1, kinds))
+    if witnesses == BOTH and noise is not SENSORS["hardly late"]:
+        # a filter that knows nothing of the sensor makes far less of them: some 150 nats for a lag, 600 for a scale
+        blind = replace(noise, sensor_lag=0.0, sensor_scale=1.0)
+        assert Whitener(record, noise).log_likelihood(errors) > Whitener(record, blind).log_likelihood(errors) + 40
+
+
+def test_the_speed_alone_knows_nothing_of_the_accelerometer(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    noise = SENSORS["late and scaled"]
+    record = record_of(12.0, witnesses=("speed",))
+    errors = _drawn(noise, record, rng)
+    blind = replace(noise, sensor_lag=0.0, sensor_scale=1.0)
+    seen, plain = (float(Whitener(record, n).log_likelihood(errors)) for n in (noise, blind))
+    assert seen == pytest.approx(plain, abs=1e-6)
+
+
+@pytest.mark.parametrize("noise", [NOISES.values(), SENSORS.values()], ids=["plain", "late"])
+@pytest.mark.parametrize("witnesses", WITNESSES)
+def test_filters_designed_together_are_each_alone(noise: list[NoiseModel], witnesses: tuple[str, ...]) -> None:
+    record = record_of(12.0, witnesses=witnesses)
+    noises = [n for n in noise if n is not SENSORS["scaled"]]  # of one kind in a batch, as of one candidate
+    for white, own in zip(Whitener.each(record, noises), noises, strict=True):
+        alone = Whitener(record, own)
+        assert white.noise is own
+        for got, want in zip(white._filter[0], alone._filter[0], strict=True):
+            np.testing.assert_allclose(np.array(got), np.array(want), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(white._filter[1], alone._filter[1], rtol=0, atol=1e-12)
+        assert white.constant == pytest.approx(alone.constant, rel=1e-12)
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.01, 0.05, 0.1])
+@pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES.keys())
+def test_motion_in_closed_form_is_van_loans(noise: NoiseModel, dt: float) -> None:
+    drift, spectrum, _ = _process(noise)
+    n = len(drift)
+    both = expm(np.block([[-drift, spectrum], [np.zeros((n, n)), drift.T]]) * dt)
+    move, driven = _motion(noise, dt)
+    np.testing.assert_allclose(move, both[n:, n:].T, rtol=1e-12, atol=1e-15)
+    want = both[n:, n:].T @ both[:n, n:]
+    scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
+    np.testing.assert_allclose(driven / scale, want / scale, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.05, 0.1])
+@pytest.mark.parametrize("lag", [0.0021, 0.02, 0.2, 0.5])
+def test_motion_behind_a_late_sensor_is_the_integral(lag: float, dt: float) -> None:
+    noise = replace(NOISES["windy"], sensor_lag=lag)
+    move, driven = _motion(noise, dt)
+    exact, want = _over(noise, dt)
+    np.testing.assert_allclose(move, exact, rtol=1e-10, atol=1e-14)
+    scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
+    np.testing.assert_allclose(driven / scale, want / scale, rtol=0, atol=1e-8)
+    assert np.linalg.eigvalsh(driven / scale).min() > -1e-8
+
+
+@pytest.mark.parametrize("witnesses", WITNESSES)
+@pytest.mark.parametrize("noise", [*NOISES.values(), *SENSORS.values()], ids=[*NOISES, *SENSORS])
+def test_the_covariance_at_rest_solves_the_riccati_equation(noise: NoiseModel, witnesses: tuple[str, ...]) -> None:
+    record = record_of(10.5, witnesses=witnesses)
+    move, driven, see, white, want = _settled(noise, record)
+    got = _steady(move[None], see[None], driven[None], white[None])[0]
+    scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
+    np.testing.assert_allclose(got / scale, want / scale, rtol=0, atol=1e-9)
+
+
+def test_the_sensor_is_the_candidates() -> None:
+    noise = NOISES["windy"]
+    assert noise.seen_through({"T_L": 0.3, "K_L": 1.0}) == noise
+    late = noise.seen_through({"T_L": 0.3, "sensor_lag.lag_s": 0.2, "sensor_scale.scale": 1.1})
+    assert late == replace(noise, sensor_lag=0.2, sensor_scale=1.1)
+    # what the last candidate's was is forgotten, and no lag is told from one of a millisecond
+    assert late.seen_through({"T_L": 0.3}) == noise
+    assert noise.seen_through({"sensor_lag.lag_s": 1e-3}) == noise
+
+
+def test_single_rows_have_the_noise_within_a_group() -> None:
+    noise = replace(NOISES["usual"], within=(0.07, 0.03), sensor_lag=0.1)
+    assert noise.by_rows(BOTH) == replace(noise, within=None, accel_sd=0.07, speed_sd=0.03)
+    speed = replace(NOISES["usual"], within=(0.03,))
+    assert speed.by_rows(("speed",)) == replace(speed, within=None, speed_sd=0.03)
+    assert NOISES["usual"].by_rows(BOTH) is NOISES["usual"]
+
+
+def test_rows_one_by_one_become_white_under_the_noise_of_their_groups(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    raw = Record.of(log_of(seconds=82.0, rate_hz=100, noise=None), rate_hz=1e9)
+    errors = errors_of(replace(NOISES["usual"], accel_sd=0.07, speed_sd=0.03), raw, rng)
+    # the white noise of a group's mean is what it is: rows differ by what they differ by within
+    means = replace(NOISES["usual"], within=(0.07, 0.03), accel_sd=0.4, speed_sd=0.2)
+    e = Whitener(raw, means.by_rows(raw.witnesses))(errors)[..., 0]
+    assert (e**2).mean() == pytest.approx(1.0, abs=5 * np.sqrt(1 / raw.rows))

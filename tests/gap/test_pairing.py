@@ -17,7 +17,6 @@ from avtorch.gap import (
     Effect,
     GapPlant,
     LowSpeedCreep,
-    RateLimit,
     RoadGrade,
     Saturation,
     SensorBias,
@@ -29,7 +28,7 @@ from avtorch.gap.candidate import Candidate
 from avtorch.gap.effect import Row
 from avtorch.gap.fit import modes
 from avtorch.gap.innovations import Whitener
-from avtorch.gap.pairing import joint, score, swapped
+from avtorch.gap.pairing import Base, joint, swapped
 from avtorch.gap.parameter import Parameter
 from avtorch.gap.record import Record
 from avtorch.gap.screening import Look
@@ -61,7 +60,7 @@ def _drive(car: GapPlant, rng: np.random.Generator | None = None, seconds: float
 PAIRS: dict[str, tuple[Effect, Effect]] = {
     "a force and a delay": (ConstantResistance(0.2), DeadTime(0.25)),
     "a delay and a sensor": (DeadTime(0.25), SensorScale(1.15)),
-    "a sensor and a force": (SensorBias(0.15), AerodynamicDrag(5e-4)),
+    "a force and a sensor": (AerodynamicDrag(5e-4), SensorBias(0.15)),
 }
 
 
@@ -74,7 +73,7 @@ def test_the_true_second_effect_is_ranked_first(name: str, rotating_seed: int) -
     for kind in KINDS:
         if kind is not type(first):
             candidate = Candidate(record, (type(first), kind), plant())
-            gains[kind.name], begin = score(candidate, base, z, values, None, white, {})
+            gains[kind.name], begin = Base(base, z, values, None, white).score(candidate, {})
             # what it starts from is one of its own starts, with the base where it is
             assert any((begin == row).all() for row in starts(candidate, values))
     order = sorted(gains, key=lambda k: -gains[k])
@@ -84,17 +83,17 @@ def test_the_true_second_effect_is_ranked_first(name: str, rotating_seed: int) -
 
 def test_a_gain_is_told_before_it_is_fitted(rotating_seed: int) -> None:
     """What one linear step foretells of a faint second effect is what the fit finds."""
-    record, white = _drive(plant([SensorBias(0.1), ConstantResistance(0.04)]), np.random.default_rng(rotating_seed))
+    record, white = _drive(plant([SensorBias(0.1), ConstantResistance(0.1)]), np.random.default_rng(rotating_seed))
     base, z, values = _alone(record, white, SensorBias)
     candidate = Candidate(record, (SensorBias, ConstantResistance), plant())
-    told, begin = score(candidate, base, z, values, None, white, {})
+    told, begin = Base(base, z, values, None, white).score(candidate, {})
     fitted = modes(candidate, white, begin[None], coarse=True, iterations=10)[0]
     before, after = (
         float(white.log_likelihood(c.errors(at[None], coarse=True))[0]) for c, at in ((base, z), (candidate, fitted[0]))
     )
     assert after - before > 15
     # priors hold the fit back a little, and the base's mode is not quite where its own likelihood is flat
-    assert told == pytest.approx(after - before, rel=0.1, abs=1.0)
+    assert told == pytest.approx(after - before, rel=0.1)
 
 
 @dataclass(frozen=True)
@@ -113,84 +112,78 @@ class _Gain(Effect):
         return (1 + tensor(self.more)) * x
 
 
-@pytest.mark.parametrize("kind", [*KINDS, RateLimit])
-def test_what_the_base_itself_can_do_is_no_gain(kind: type[Effect]) -> None:
+@pytest.mark.parametrize("kind", [*(k for k in KINDS if k is not SensorBias), _Gain])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_what_the_base_itself_can_do_is_no_gain(sign: int, kind: type[Effect]) -> None:
     """A base off its mode has large errors, and no second effect is needed for them. No noise: nothing by chance."""
-    record, white = _drive(plant([Saturation(5.0, -8.0)], T_L=0.4, K_L=1.0))
+    record, white = _drive(plant(T_L=0.4))
     base = Candidate(record, (SensorBias,), plant())
-    off = base.z_of({"T_L": 0.404, "K_L": 1.01, "sensor_bias.bias_mps2": 0.02})
+    off = base.z_of({"T_L": 0.4 + 0.004 * sign, "K_L": 1 + 0.01 * sign, "sensor_bias.bias_mps2": 0.02 * sign})
     worth = 0.5 * float((white(base.errors(off[None], coarse=True)) ** 2).sum())
     assert worth > 40
-    if kind is SensorBias:
-        kind = _Gain
-    gain, _ = score(Candidate(record, (SensorBias, kind), plant()), base, off, _values(base, off), None, white, {})
-    assert 0 <= gain < 0.02 * worth
+    gain, _ = Base(base, off, _values(base, off), None, white).score(Candidate(record, (SensorBias, kind), plant()), {})
+    assert 0 <= gain < 0.001 * worth
 
 
 def test_a_second_gain_is_no_second_effect(rotating_seed: int) -> None:
-    record, white = _drive(plant(T_L=0.4, K_L=1.1), np.random.default_rng(rotating_seed))
+    record, white = _drive(plant(T_L=0.4, K_L=1.25), np.random.default_rng(rotating_seed))
     base = Candidate(record, (), plant())
     off = base.z_of({"T_L": 0.4, "K_L": 1.0})
     candidate = Candidate(record, (_Gain,), plant())
-    gain, _ = score(candidate, base, off, {"T_L": 0.4, "K_L": 1.0}, None, white, {})
+    gain, _ = Base(base, off, {"T_L": 0.4, "K_L": 1.0}, None, white).score(candidate, {})
     best = modes(candidate, white, candidate.z_of({"T_L": 0.4, "K_L": 1.0})[None], coarse=True)[1][0]
     flat = float(white.log_likelihood(base.errors(off[None], coarse=True))[0])
-    assert best > flat + 300
+    assert best > flat + 100
     assert 0 <= gain < 12.5  # half of a chi-squared with one degree of freedom, at five standard deviations
 
 
 def test_a_slope_of_the_base_is_taken_out_too(rotating_seed: int) -> None:
-    """On hills a drag's force is what hills could do as well."""
-    generator = torch.Generator().manual_seed(rotating_seed)
-    hills = RoadGrade(0.02, profile=torch.randn(20, generator=generator, dtype=torch.float64))
-    record, white = _drive(plant([hills]))
+    """Uphill a resistance does what the hill does."""
+    climb = 0.5 + np.abs(np.random.default_rng(rotating_seed).standard_normal(20))
+    record, white = _drive(plant([RoadGrade(0.006, profile=torch.as_tensor(climb))]))
     base = Candidate(record, (RoadGrade,), plant())
     bare = Candidate(record, (), plant())
     z = bare.z_of({"T_L": 0.3, "K_L": 1.0})
     kinds = (AerodynamicDrag, ConstantResistance)
     flat, sloped = (
-        [score(Candidate(record, (*b.effects, k), plant()), b, z, _values(b, z), None, white, {})[0] for k in kinds]
+        [
+            Base(b, z, _values(b, z), None, white).score(Candidate(record, (*b.effects, k), plant()), {})[0]
+            for k in kinds
+        ]
         for b in (bare, base)
     )
     worth = 0.5 * float((white(bare.errors(z[None], coarse=True)) ** 2).sum())
     assert worth > 100
-    assert max(sloped) < 0.05 * worth
-    assert max(flat) > max(sloped)
+    assert min(flat) > 0.2 * worth
+    assert max(sloped) < 0.02 * worth
 
 
-@pytest.mark.parametrize("onset", [None, 400])
-def test_a_slope_as_the_second_effect_is_fitted(onset: int | None, rotating_seed: int) -> None:
+def test_a_slope_as_the_second_effect_is_fitted(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
-    profile = torch.as_tensor(rng.standard_normal(20))
-    for hills, sign in (([RoadGrade(0.03, profile=profile)], 1), ([], -1)):
+    climb = 0.5 + np.abs(rng.standard_normal(20))
+    for hills, sign in (([RoadGrade(0.008, profile=torch.as_tensor(climb))], 1), ([], -1)):
         record, white = _drive(plant([*hills, DeadTime(0.25)]), rng)
         base, z, values = _alone(record, white, DeadTime)
         candidate = Candidate(record, (DeadTime, RoadGrade), plant())
-        gain, begin = score(candidate, base, z, values, onset, white, {})
+        gain, begin = Base(base, z, values, None, white).score(candidate, {})
         assert sign * gain > (50 if sign > 0 else -12)
         assert begin.shape == (candidate.size,)
 
 
 def test_an_effect_of_many_starts_begins_where_it_came_to_rest_alone() -> None:
-    """So does one of few, besides its own starts."""
-    record, white = _drive(plant([DeadTime(0.2)]))
+    record, white = _drive(plant([DeadTime(0.2), Saturation(0.6, -8.0)]))
     base, z, values = _alone(record, white, DeadTime)
-    rest = {"gear_shift": {"gear_shift.first_mps": 4.1, "gear_shift.gear_ratio": 1.5}, "sensor_bias": {}}
+    shift = {"gear_shift.first_mps": 4.1, "gear_shift.gear_ratio": 1.5}
     candidate = Candidate.named(record, "dead_time+gear_shift", plant())
     assert len(of_effect(candidate, "gear_shift")) > 50
-    gain, begin = score(candidate, base, z, values, None, white, {"gear_shift": {**values, **rest["gear_shift"]}})
-    np.testing.assert_array_equal(begin, candidate.z_of({**values, **rest["gear_shift"]}))
-    assert gain < 1e-6
-    few = Candidate.named(record, "dead_time+sensor_bias", plant())
-    alone = {"sensor_bias": {"sensor_bias.bias_mps2": 0.123, "T_L": 9.0}}
-    record_off, white_off = _drive(plant([DeadTime(0.2), SensorBias(0.123)]))
-    base = Candidate(record_off, (DeadTime,), plant())
-    few = Candidate(record_off, (DeadTime, SensorBias), plant())
-    _, begin = score(few, base, z, values, None, white_off, alone)
-    told = _values(few, begin)
-    # a bias is linear: all of its sizes of the right sign promise the same, so the first of them is taken
-    assert told["T_L"] == pytest.approx(values["T_L"])
-    assert told["sensor_bias.bias_mps2"] == pytest.approx(0.123)
+    _, begin = Base(base, z, values, None, white).score(candidate, {"gear_shift": {**values, "T_L": 0.9, **shift}})
+    np.testing.assert_array_equal(begin, candidate.z_of({**values, **shift}))
+    # one of few starts has its own besides, so that coming to rest at no effect takes nothing from it
+    candidate = Candidate(record, (DeadTime, Saturation), plant())
+    own, _ = Base(base, z, values, None, white).score(candidate, {})
+    nothing = {"saturation": {"T_L": 0.9, "saturation.accel_max_mps2": 5.0, "saturation.accel_min_mps2": -8.0}}
+    more, _ = Base(base, z, values, None, white).score(candidate, nothing)
+    assert more == own > 100
 
 
 STUCK = {
@@ -210,39 +203,40 @@ def test_a_pair_comes_to_rest_at_the_truth_from_a_new_start_only(case: str) -> N
     base, z, values = _alone(record, white, ConstantResistance)
     assert values["K_L"] < 0.65 * gain
     candidate = Candidate(record, (ConstantResistance, Saturation), plant())
-    _, begin = score(candidate, base, z, values, None, white, {})
+    _, begin = Base(base, z, values, None, white).score(candidate, {})
     truth = candidate.z_of({k: float(v) for k, v in car.values().items()})
     top = float(modes(candidate, white, truth[None], coarse=True)[1][0])
     # on from the first effect, however long, it stays behind a hill
     assert modes(candidate, white, begin[None], coarse=True, iterations=30)[1][0] < top - 40
     found = joint(candidate, ConstantResistance, begin, None, white, onsets=False)
     assert found.value > top - 2
-    assert _values(candidate, found.z)["K_L"] == pytest.approx(gain, rel=0.05)
+    assert _values(candidate, found.z)["K_L"] == pytest.approx(gain, rel=0.1)
     assert found.onset is None
 
 
-def test_a_pair_that_sets_in_late(rotating_seed: int) -> None:
-    """From an onset that is given, it is kept unless the whole drive is better."""
+def test_a_pair_that_sets_in_late_keeps_its_onset(rotating_seed: int) -> None:
+    pair = (ConstantResistance, DeadTime)
+    truth = {"T_L": 0.3, "K_L": 1.0, "constant_resistance.resistance_mps2": 0.2, "dead_time.delay_s": 0.25}
+    quiet, _ = _drive(plant(), np.random.default_rng(rotating_seed))
+    candidate = Candidate(quiet, pair, plant())
+    z = candidate.z_of(truth)[None]
+    onset = 400
+    late = _with(quiet, quiet.measured + candidate.rollouts(z, onset)[0] - candidate.baseline_rollouts(z)[0])
+    white = Whitener(late, QUIET)
+    candidate = Candidate(late, pair, plant())
+    begin = candidate.z_of({**truth, "constant_resistance.resistance_mps2": 0.15, "dead_time.delay_s": 0.2})
+    found = joint(candidate, ConstantResistance, begin, onset, white, onsets=True)
+    assert found.onset == onset
+    whole = joint(candidate, ConstantResistance, begin, None, white, onsets=False)
+    assert whole.onset is None
+    assert found.value > whole.value + 50
+    # one that is not told is found
+    free = joint(candidate, ConstantResistance, begin, None, white, onsets=True)
+    assert free.onset is not None
+    assert abs(free.onset - onset) * late.dt < 3.6
+    # and where both act from the start, none that is told is kept
     record, white = _drive(plant([ConstantResistance(0.2), DeadTime(0.25)]), np.random.default_rng(rotating_seed))
-    candidate = Candidate(record, (ConstantResistance, DeadTime), plant())
-    begin = candidate.z_of({"T_L": 0.3, "K_L": 1.0, "constant_resistance.resistance_mps2": 0.15})
-    wrong = joint(candidate, ConstantResistance, begin, 400, white, onsets=True)
-    assert wrong.onset is None  # the effects are there from the start
-    # the same drive, its first half without the effects
-    plain = log_of(plant(), seconds=40.0, speed0=25.0, rng=np.random.default_rng(rotating_seed))
-    quiet = Record.of(plain)
-    white = Whitener(quiet, QUIET)
-    candidate = Candidate(quiet, (ConstantResistance, DeadTime), plant())
-    z = candidate.z_of(
-        {"T_L": 0.3, "K_L": 1.0, "constant_resistance.resistance_mps2": 0.2, "dead_time.delay_s": 0.25}
-    )
-    moved = candidate.rollouts(z[None], 400)[0] - candidate.rollouts(z[None] * 0 + z, quiet.rows)[0]
-    spliced = _with(quiet, quiet.measured + moved)
-    white = Whitener(spliced, QUIET)
-    candidate = Candidate(spliced, (ConstantResistance, DeadTime), plant())
-    late = joint(candidate, ConstantResistance, begin, 400, white, onsets=True)
-    assert late.onset == 400
-    assert late.value > joint(candidate, ConstantResistance, begin, None, white, onsets=False).value + 50
+    assert joint(Candidate(record, pair, plant()), ConstantResistance, begin, onset, white, onsets=True).onset is None
 
 
 def _with(record: Record, measured: Float) -> Record:
@@ -287,5 +281,7 @@ def test_of_a_right_pair_nothing_is_exchanged_for_better(rotating_seed: int) -> 
     pair = Candidate(record, (ConstantResistance, DeadTime), plant())
     truth = pair.z_of({k: float(v) for k, v in car.values().items()})
     z, value = modes(pair, white, truth[None], coarse=True)
-    others = swapped(Look(pair, z[0], float(value[0])), KINDS, white, {}, tries=1)
+    # at an even speed a drag or an idling drive is a constant force as well
+    kinds = [k for k in KINDS if k not in (AerodynamicDrag, LowSpeedCreep)]
+    others = swapped(Look(pair, z[0], float(value[0])), kinds, white, {}, tries=2)
     assert all(look.value < value[0] - 20 for look in others)

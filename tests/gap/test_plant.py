@@ -280,4 +280,4 @@ def test_settings_come_from_the_drive() -> None:
     known = car.parameters()
     assert car.effects[1] == gap.SpeedDependentLag(mean_speed=8.0)
     assert (known["gain_change.change_s"].low, known["gain_change.change_s"].high) == (40.0, 139.5)
-    assert known["road_grade.profile"].size == int(8 * 99.5 / 120) + 4
+    assert known["road_grade.profile"].size == int(8 * 99.5 / gap.RoadGrade().knot_m) + 4
