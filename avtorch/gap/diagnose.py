@@ -10,6 +10,7 @@ from typing import Literal
 
 from avtorch.errors import InputError
 from avtorch.gap import posterior as posteriors
+from avtorch.gap.aliases import Told
 from avtorch.gap.checkpoint import Checkpoint
 from avtorch.gap.diagnosis import Diagnosis, GapFacts, LogFacts
 from avtorch.gap.effect import EFFECTS, Effect, effect_class
@@ -66,10 +67,12 @@ def diagnose(
         each, base, effects=kinds, pairs=pairs, budget_s=budget_s, progress=progress, checkpoint=Checkpoint(checkpoint)
     ).run()
     top = favourite(race.found)
-    chances = probabilities(race.found, _left(top, race), prior)
+    apart = Told.of(race, kinds, prior)
+    chances = apart.shared(probabilities(race.found, _left(top, race), prior))
     candidates = [_told(f, race, chances[f.name]) for f in race.found]
     candidates.append(Candidate("unknown", chances["unknown"], None, {}, {}, None))
-    verdict = verdict_of(candidates)
+    candidates += apart.mirrored(candidates, chances)
+    verdict = verdict_of(candidates, aliases=apart.alias_set)
     winner = next((f for f in race.found if f.name == verdict.name), None)
     draws = None
     if winner is not None and winner.candidate.size and winner.name != "none" and posterior == "sgld":
@@ -79,6 +82,8 @@ def diagnose(
     noted = () if race.complete else ("The budget ended the search before all candidates were tried.",)
     if draws is not None and draws.method != "sgld":
         noted += (f"The parameters' posterior is by {draws.method}: {draws.why}.",)
+    if apart.note is not None:
+        noted += (apart.note,)
     named = winner is not None and winner.name != "none"
     return Diagnosis(
         log=LogFacts.of(each),

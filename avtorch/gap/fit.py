@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.gap.candidate import Candidate
-from avtorch.gap.innovations import Whitener
+from avtorch.gap.innovations import Whitener, sensed
 from avtorch.gap.slope import Slope
 
 Float = NDArray[np.float64]
@@ -124,7 +124,8 @@ def _slope(white: Whitener, candidate: Candidate, onset: int | None) -> Slope:
     for kept, columns, row, slope in _LAST:
         if kept is white and columns is grade and row == onset:
             return slope
-    made = Slope.of(white(_acting(white, grade, onset))[..., 0].reshape(len(grade), -1))
+    felt = sensed(white.record, white.noise, _acting(white, grade, onset))
+    made = Slope.of(white(felt)[..., 0].reshape(len(grade), -1))
     _LAST[:] = [(white, grade, onset, made)]
     return made
 
@@ -151,7 +152,7 @@ def _sloped(candidate: Candidate, white: Whitener, errors: Float, onset: int | N
     rms, profile = _slope(white, candidate, onset).told(white(errors)[..., 0].ravel())
     part = candidate.grade_response(profile)
     part = part.mean(-1, keepdims=True) if errors.shape[-1] == 1 else part
-    return rms, profile, _acting(white, part, onset)
+    return rms, profile, sensed(white.record, white.noise, _acting(white, part, onset))
 
 
 def finish(candidate: Candidate, white: Whitener, z: Float, onset: int | None = None, *, coarse: bool = False) -> Fit:

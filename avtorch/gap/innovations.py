@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +80,7 @@ class Whitener:
     noise: NoiseModel
 
     @classmethod
-    def each(cls, record: Record, noises: Sequence[NoiseModel]) -> list[Whitener]:
+    def each(cls, record: Record, noises: Sequence[NoiseModel]) -> list[Self]:
         """Of several noise models, their filters designed together: some ten times as fast as one by one."""
         made = [cls(record, noise) for noise in noises]
         for white, filter_ in zip(made, _designed(noises, record.dt, record.witnesses), strict=True):
@@ -156,6 +157,20 @@ class Whitener:
         return self.constant - 0.5 * (e**2).sum((-1, -2, -3))
 
 
+def sensed(record: Record, noise: NoiseModel, motion: Float) -> Float:
+    """What the witnesses show of a motion (..., witness, counted, group), the accelerometer with its scale and lag."""
+    if "accel" not in record.witnesses or (noise.sensor_scale == 1.0 and noise.sensor_lag == 0.0):
+        return motion
+    motion = motion.copy()
+    accel = noise.sensor_scale * motion[..., 0, :, :]
+    if noise.sensor_lag > 0:
+        flat = accel.reshape(*accel.shape[:-2], -1)
+        lost = -np.expm1(-record.dt / accel.shape[-1] / noise.sensor_lag)
+        accel = np.asarray(lfilter([lost], [1, lost - 1], flat, axis=-1)).reshape(accel.shape)
+    motion[..., 0, :, :] = accel
+    return motion
+
+
 Filter = tuple[list[list[Float]], Float, float]
 """Numerators by (out, in), the denominator, log det of the innovations' covariance."""
 
@@ -225,13 +240,13 @@ def _late_motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
     spectrum = np.diag([1e-12, 2 * n.process_sd**2 / n.process_time, 2 * n.force_sd**2 / n.force_time, 0.0])
     # in halves of a step short enough for the growing half of the matrix, then doubled
     halves = max(0, int(np.ceil(np.log2(dt / n.sensor_lag))) + 1)
-    step = expm(np.block([[-drift, spectrum], [np.zeros((4, 4)), drift.T]]) * dt / 2**halves)
+    step = np.asarray(expm(np.block([[-drift, spectrum], [np.zeros((4, 4)), drift.T]]) * dt / 2**halves), float)
     move = step[4:, 4:].T
     driven = move @ step[:4, 4:]
     for _ in range(halves):
         driven = driven + move @ driven @ move.T
         move = move @ move
-    return move, 0.5 * (driven + driven.T)
+    return np.asarray(move, float), np.asarray(0.5 * (driven + driven.T), float)
 
 
 def _integral(x: float) -> float:

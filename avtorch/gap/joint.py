@@ -17,7 +17,7 @@ from torch import Tensor
 
 from avtorch.gap.adjoint import adjoint
 from avtorch.gap.candidate import Candidate
-from avtorch.gap.innovations import Whitener
+from avtorch.gap.innovations import Whitener, sensed
 from avtorch.gap.noise_fit import CALM
 from avtorch.gap.plant import GapPlant, plant
 from avtorch.gap.slope import Slope
@@ -137,7 +137,8 @@ class RolloutDensity:
             return None
         if self.onset is not None:
             columns = spliced(self.candidate, torch.as_tensor(columns), self.onset).numpy()
-        return Slope.of(self._image(columns))
+        white = self.parts[-1][0]
+        return Slope.of(self._image(sensed(white.record, white.noise, columns)))
 
     def _prior(self, z: Tensor) -> Tensor:
         return -0.5 * z.square().sum(-1)

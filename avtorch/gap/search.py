@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from avtorch.gap.aliases import judged
 from avtorch.gap.candidate import Candidate
 from avtorch.gap.chance import Tails, tails
 from avtorch.gap.checkpoint import Checkpoint, Kept
@@ -44,8 +45,6 @@ _SECONDS = 4  # tried on each
 _PAIRS = 4  # fitted with noise of their own
 _SWAPS = 2  # times that either half of the best pair is exchanged for another effect
 _SECOND = 8.0  # nats a pair must be ahead of the best single effect for that
-_HELD = 2  # of none and the single effects, on top of which lost messages are looked for
-_FAR = 12.0  # nats behind the best of these, from where they are not
 _CLOSE = 12.0  # nats by which a pair may be behind at first sight
 
 
@@ -159,7 +158,7 @@ class Search:
         return {key: float(x[0]) for key, x in candidate.values(z[None]).items()}
 
     def _deterministic(self, record: Record, none: Found) -> list[Found]:
-        kinds = [e for e in self.effects if not e.random and self._possible(e, record)]
+        kinds = [e for e in self.effects if not e.random and judged(e, record.witnesses)]
         white = Whitener(record, none.noise.noise)
         seen: list[Look] = []
         floor = float(white.log_likelihood(none.errors.mean(-1, keepdims=True)[None])[0])
@@ -223,12 +222,6 @@ class Search:
             profile=fit.profile,
         )
 
-    @staticmethod
-    def _possible(kind: type[Effect], record: Record) -> bool:
-        if kind.place == "sensor" and record.accel is None:
-            return False
-        return not (kind.needs_speed and record.speed is None)
-
     def _refined(self, forms: Sequence[Look], noise: NoiseModel) -> Found:
         """One cause over the whole drive and from an onset on; both weigh the same a priori."""
         return merged([self._from_onset(f.candidate, f.z, noise, f.onset) for f in forms])
@@ -288,8 +281,9 @@ class Search:
                 break
             # a better partner for either half, now that the noise is what the best pair leaves over
             white = Whitener(record, done.noise.noise)
-            here = Look(done.candidate, done.z, float(white.log_likelihood(done.errors[None])[0]), done.onset)
-            near = here.value - 0.5 * float(here.z @ here.z) - _CLOSE
+            _, value = modes(done.candidate, white, done.z[None], onset=done.onset, iterations=1, coarse=True)
+            here = Look(done.candidate, done.z, float(value[0]), done.onset)
+            near = here.value - _CLOSE
             others = [k for k in swapped(here, kinds, white, alone, tries=_SECONDS) if k.candidate.name not in made]
             better = self._settle_pairs([k for k in others if k.value > near], 2, done.noise.noise, made)
             if better is None or better.log_evidence < done.log_evidence + 1:
@@ -367,12 +361,12 @@ class Search:
 
     def _held(self, raw: Record, found: list[Found], none: Found) -> list[Found]:
         """Lost messages alone and on top of the best single effects."""
-        alone = [f for f in found if "+" not in f.name and not f.gust and f.tails is None]
-        alone = sorted(alone, key=lambda f: -f.log_evidence)[:_HELD]
+        alone = [f for f in found if f.name != "none" and "+" not in f.name and not f.gust and f.tails is None]
+        best = max(alone, key=lambda f: f.log_evidence, default=none)
+        # lost messages pass for a delay, so they are always tried alone, too
+        bases = [none] if best.log_evidence < none.log_evidence + _LEAST else [none, best]
         out = []
-        for f in alone:
-            if f.log_evidence < alone[0].log_evidence - _FAR:
-                continue
+        for f in bases:
             errors = self._raw_errors(raw, f)
             white = Whitener(raw, f.noise.noise.by_rows(raw.witnesses))
             lost = losses(white, errors, raw.command[raw.source], f.values["T_L"], f.values["K_L"])

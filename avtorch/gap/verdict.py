@@ -108,6 +108,10 @@ class Verdict:
         }
 
 
+ALIAS_MASS = 0.95
+"""An alias set holds this much probability."""
+
+
 def most_of(mass: float) -> Callable[[Sequence[Candidate]], tuple[str, ...]]:
     """An alias set by probability: the fewest candidates, the most probable first, that hold `mass` together."""
 
@@ -132,12 +136,12 @@ def verdict_of(
 ) -> Verdict:
     """The most probable candidate.
 
-    `aliases` says which names cannot be told apart (the verdict's is put in front; default `most_of(0.95)`); `why`
-    defaults to a sentence on evidence and runner-up.
+    `aliases` says which names cannot be told apart (the verdict's is put in front; default `most_of(ALIAS_MASS)`);
+    `why` defaults to a sentence on evidence and runner-up.
     """
     ranked = listed(candidates)
     first = ranked[0]
-    others = [name for name in map(candidate_name, (aliases or most_of(0.95))(ranked)) if name != first.name]
+    others = [name for name in map(candidate_name, (aliases or most_of(ALIAS_MASS))(ranked)) if name != first.name]
     names = first.effects or (first.name,)
     return Verdict(names, (first.name, *dict.fromkeys(others)), first.name == "unknown", why or _why(ranked))
 

@@ -351,7 +351,7 @@ def test_lost_messages_have_the_mean_square_that_is_told(rotating_seed: int) -> 
 
 def test_slope_has_the_size_it_names(rotating_seed: int) -> None:
     effect = gap.RoadGrade(0.03, knots=40)
-    position = torch.linspace(0, 36 * 120.0, 300, dtype=D)
+    position = torch.linspace(0, 36 * effect.knot_m, 300, dtype=D)
     drawn = torch.randn(4000, 40, generator=torch.Generator().manual_seed(rotating_seed), dtype=D)
     slope = (effect.columns(position) @ drawn.T) * 0.03 / 9.80665
     spread = slope.square().mean(-1).sqrt()
