@@ -158,8 +158,8 @@ def test_lost_messages_on_top_of_a_single_effect(rotating_seed: int) -> None:
     # everything else is the single effect's
     assert race.best.values == names["sensor_bias"].values
     assert names["sensor_bias"].losses is None
-    # on top of what is far behind, none are looked for
-    assert "command_hold" not in names
+    # alone, they are far behind
+    assert evidence["command_hold"] < evidence["sensor_bias"]
 
 
 def test_lost_messages_alone(rotating_seed: int) -> None:
@@ -173,7 +173,6 @@ def test_lost_messages_alone(rotating_seed: int) -> None:
     assert _evidence(race)["command_hold"] < 12
 
 
-@pytest.mark.xfail(reason="none is not among what they are looked for on, once a delay is far ahead of it", strict=True)
 def test_lost_messages_alone_are_judged_where_they_look_like_a_delay(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     log = _log({"command_hold": {"hold_fraction": 0.4}}, int(rng.integers(2**31)), command=_steps(rng))
