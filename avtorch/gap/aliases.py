@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from avtorch.gap.effect import EFFECTS, Effect
 from avtorch.gap.found import Race
-from avtorch.gap.verdict import ALIAS_MASS, Candidate, candidate_name, most_of
+from avtorch.gap.verdict import ALIAS_RATIO, Candidate, candidate_name, near
 
 _OFFSETS = ("sensor_bias", "constant_resistance")
 _LAGS = ("sensor_lag", "second_order_actuator")
@@ -169,7 +169,7 @@ class Told:
         Exact aliases, and forces that were not judged (`lookalikes`), have their place there whatever their
         probability.
         """
-        names = most_of(ALIAS_MASS)(candidates)
+        names = near(ALIAS_RATIO)(candidates)
         first = max(candidates, key=lambda c: c.probability).name
         like = lookalikes(first, self.witnesses, self.values.get(first), specific_force=self.specific_force)
         more = [*sorted(self._group(first)), *sorted(n for n in like if self._allowed(n))]

@@ -17,6 +17,7 @@ from avtorch.gap.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.found import Found, Race
 from avtorch.gap.innovations import Whitener
 from avtorch.gap.misfit import gap_facts
+from avtorch.gap.noise_fit import CALM
 from avtorch.gap.odds import favourite, probabilities
 from avtorch.gap.plant import GapPlant, plant
 from avtorch.gap.posterior import Draws
@@ -106,7 +107,13 @@ def _left(top: Found, race: Race) -> Remainder:
     if top.errors.shape[-1] == 1:
         measured = measured.mean(-1, keepdims=True)
     explained = top.losses.evidence if top.losses else 0.0
-    return remainder(Whitener(race.record, top.noise.noise), top.errors, measured - top.errors, explained=explained)
+    noise, before = top.noise.noise, None
+    if top.onset is not None:
+        calm = noise.seen_through({})
+        calm = calm.replaced(force_sd=min(CALM, noise.force_sd)) if top.gust else calm
+        before = (Whitener(race.record, calm), top.onset)
+    white = Whitener(race.record, noise)
+    return remainder(white, top.errors, measured - top.errors, explained=explained, before=before)
 
 
 def _draws(found: Found, seed: int) -> Draws:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from avtorch.errors import InputError
 from avtorch.gap.plant import GapPlant
 from avtorch.gap.quantity import Quantity, unit_of
-from avtorch.gap.verdict import Candidate, Verdict, candidate_name, listed, most_of, plain, verdict_of
+from avtorch.gap.verdict import Candidate, Verdict, candidate_name, listed, near, plain, verdict_of
 from avtorch.io import Log, atomic, write_json
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ __all__ = [
     "Verdict",
     "candidate_name",
     "listed",
-    "most_of",
+    "near",
     "verdict_of",
 ]
 

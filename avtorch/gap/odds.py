@@ -7,7 +7,11 @@ things are put right, all of them growing with the square root of the nats at st
 - differences are compressed to a logarithm: `g` nats behind become odds of `(1 + g / unit) ** -power`
 - what the most probable candidate leaves over (`Remainder`) tells the probability of `unknown`
 
-The numbers were fitted by maximum likelihood on drives of the blind test's reference vehicle (`FITTED_ON`).
+The numbers were fitted by penalised maximum likelihood on 135 drives of the blind test's reference vehicle (seed
+909090: 21 % without a cause, 38 % with one, 16 % with two, 26 % with one outside the table, of the families that serve
+to calibrate), each weighed by the share of its kind in the blind test. What an effect must gain is held near 4 nats, so
+that a car without any is seldom blamed. Fitted on three quarters and judged on the last: calibration error 0.075, area
+under the ROC curve of `unknown` 0.87.
 """
 
 from __future__ import annotations
@@ -20,8 +24,6 @@ import numpy as np
 from avtorch.errors import InputError
 from avtorch.gap.found import Found
 from avtorch.gap.remainder import Remainder
-
-FITTED_ON = ""
 
 CHANCE = frozenset({"gust", "outliers", "command_hold"})
 """Effects that chance decides: a second one of these has a price of its own."""
@@ -38,12 +40,18 @@ class Price:
         return self.fixed + self.share * float(np.sqrt(max(partner, 0.0)))
 
 
-EFFECT = Price(4.0)
-SECOND = Price(5.0, 1.0)
-SECOND_BY_CHANCE = Price(3.0, 0.3)
-UNIT, UNIT_SHARE, POWER = 0.3, 0.05, 1.0
+EFFECT = Price(3.57)
+SECOND = Price(1.95, 0.918)
+SECOND_BY_CHANCE = Price(55.0, 3.99)
+UNIT, UNIT_SHARE, POWER = 1.33, 0.488, 2.64
 
-UNKNOWN: Mapping[str, float] = {"constant": 0.0, "most": 0.0, "against gain": 0.0, "gain": 0.0, "none": 0.0}
+UNKNOWN: Mapping[str, float] = {
+    "constant": -0.514,
+    "most": 2.387,
+    "against gain": 0.692,
+    "gain": -1.168,
+    "none": -2.853,
+}
 """Weights of the logistic regression that tells `unknown`; see `_score`."""
 
 

@@ -29,6 +29,7 @@ RATE_HZ = 20.0
 """Rows are averaged as long as at least this many a second are left [Hz]."""
 _SETTLE_S = 2.0  # at a drive's start the actuator's state is not known; a few lags
 _SHORTEST_S = 2.0
+_FEW = 20_000  # rows of a log short enough to be rolled out in full wherever means would do
 _GAP_S = 5.0  # zeros between stretches, over which a filter forgets
 
 
@@ -39,7 +40,7 @@ class Record:
     `accel`, `speed` (row, group): measured, over all drives' rows one after another; None: not in the log. `time`
     (row,) [s], the log's own; `command` (row,), mean of a group. `source`, `target`: of every counted row its index in
     these arrays and in the padded one of `length` rows that is filtered; `stretch` (counted,) numbers the stretches.
-    `group`: rows averaged into one.
+    `group`: rows averaged into one. `coarse` are drives of averaged commands; in a short log the drives themselves.
     """
 
     drives: tuple[Drive, ...]
@@ -138,12 +139,14 @@ class Record:
         def whole(name: str) -> Float | None:
             return np.concatenate(columns[name]) if columns[name] else None
 
+        whole_drives = tuple(drives)
+        few = group == 1 or sum(len(d.time) for d in drives) <= _FEW
         time, command = whole("time"), whole("command")
         assert time is not None
         assert command is not None
         return cls(
-            drives=tuple(drives),
-            coarse=tuple(coarse or drives),
+            drives=whole_drives,
+            coarse=whole_drives if few else tuple(coarse),
             time=time,
             accel=whole("accel"),
             speed=whole("speed"),
@@ -166,7 +169,10 @@ class Record:
         """Responses by drive, (..., time) each, at rows that count: (..., counted, group), `coarse` with group 1."""
         parts = []
         for x in responses:
-            if self.group > 1 and coarse:
+            if coarse and self.coarse is self.drives:
+                parts.append(x.unflatten(-1, (-1, self.group)).mean(-1, keepdim=True))
+                continue
+            if coarse:
                 later = torch.cat([x[..., 1:], x[..., -1:]], -1)
                 x = torch.lerp(x, later, (self.group - 1) / (2 * self.group))
             parts.append(x.unflatten(-1, (-1, 1 if coarse else self.group)))

@@ -59,13 +59,24 @@ class Remainder:
         return _mean((self.flexible, self.drift, self.line, self.memory, self.bursts))
 
 
-def remainder(white: Whitener, errors: Float, rollout: Float, *, explained: float = 0.0) -> Remainder:
+def remainder(
+    white: Whitener,
+    errors: Float,
+    rollout: Float,
+    *,
+    explained: float = 0.0,
+    before: tuple[Whitener, int] | None = None,
+) -> Remainder:
     """Of errors (witness, counted, group) of a candidate whose rollout is (witness, counted, group).
 
     `explained` [nats]: what the candidate's random causes explain although `errors` still show it (lost messages:
-    `found.losses.evidence`); it is taken off whatever is above 0.
+    `found.losses.evidence`); it is taken off whatever is above 0. `before`: another noise, and the row until which it
+    held.
     """
     look = _Look(white, errors, rollout)
+    if before is not None:
+        calm, row = before
+        look.e[:, :row] = calm(errors.mean(-1, keepdims=True))[:, :row, 0]
     return Remainder(
         *(
             max(nats - explained, min(nats, 0.0))

@@ -37,6 +37,7 @@ from avtorch.io import Log
 Float = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
+_TURNS = 10  # of parameters and noise, at most
 _SINGLES = 6  # fitted with noise of their own
 _LEAST = 3.0  # nats at first sight, for less of which no noise of its own would help
 _LITTLE = -3.0  # nats over none, below which nothing more exact is asked for
@@ -135,7 +136,8 @@ class Search:
         # on averaged commands first, which is several times as fast and ends close by
         for coarse in (True, False) if record.group > 1 else (False,):
             value, best = -np.inf, (z, noise)
-            for _ in range(2 if record.group > 1 and not coarse else rounds + 1):
+            usual = 2 if record.group > 1 and not coarse else rounds + 1
+            for turn in range(_TURNS):
                 noise = noise.seen_through(self._values(candidate, z))
                 white = Whitener(record, noise)
                 enough = ENOUGH if coarse else 0.05
@@ -146,7 +148,7 @@ class Search:
                 new = float(fitted.rows.sum()) + fitted.log_prior - 0.5 * float(z @ z)
                 if new > value:
                     best, log_prior = (z, noise), fitted.log_prior
-                if new < value + 0.3:
+                if new < value + (0.3 if turn < usual - 1 else 3.0):
                     break
                 value = new
             z, noise = best
@@ -182,7 +184,8 @@ class Search:
             self.progress("the best of them", i, len(lead))
             if self._late():
                 break
-            noise = max(found, key=lambda f: f.log_evidence).noise.noise
+            # a gust's noise is too quiet for causes that explain less
+            noise = max((f for f in found if not f.gust), key=lambda f: f.log_evidence).noise.noise
             found.append(self._refined([look for look in seen if look.candidate.name == name], noise))
         found += self._left_behind([look for look in seen if look.candidate.name not in lead], white, none)
         if self.pairs:
@@ -198,7 +201,10 @@ class Search:
             for look in rest:
                 if look.onset is not None:
                     continue
-                fit = finish(look.candidate, white, look.z, coarse=coarse)
+                z = look.z
+                if not coarse and none.candidate.record.group > 1:
+                    z = modes(look.candidate, white, z[None], iterations=3, enough=0.1)[0][0]
+                fit = finish(look.candidate, white, z, coarse=coarse)
                 if coarse and fit.log_evidence - flat > _LITTLE:
                     # in closed loop, means only may flatter
                     again.append(look)

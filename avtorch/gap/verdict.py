@@ -108,22 +108,16 @@ class Verdict:
         }
 
 
-ALIAS_MASS = 0.95
-"""An alias set holds this much probability."""
+ALIAS_RATIO = 0.1
+"""Candidates at least this probable, in units of the most probable one, are not told apart from it."""
 
 
-def most_of(mass: float) -> Callable[[Sequence[Candidate]], tuple[str, ...]]:
-    """An alias set by probability: the fewest candidates, the most probable first, that hold `mass` together."""
+def near(ratio: float) -> Callable[[Sequence[Candidate]], tuple[str, ...]]:
+    """An alias set by probability: all candidates at least `ratio` as probable as the first, that one in front."""
 
     def aliases(candidates: Sequence[Candidate]) -> tuple[str, ...]:
-        names: list[str] = []
-        held = 0.0
-        for c in sorted(candidates, key=lambda c: -c.probability):
-            names.append(c.name)
-            held += c.probability
-            if held >= mass:
-                break
-        return tuple(names)
+        ranked = sorted(candidates, key=lambda c: -c.probability)
+        return tuple(c.name for c in ranked if c.probability >= ratio * ranked[0].probability)
 
     return aliases
 
@@ -136,12 +130,12 @@ def verdict_of(
 ) -> Verdict:
     """The most probable candidate.
 
-    `aliases` says which names cannot be told apart (the verdict's is put in front; default `most_of(ALIAS_MASS)`);
+    `aliases` says which names cannot be told apart (the verdict's is put in front; default `near(ALIAS_RATIO)`);
     `why` defaults to a sentence on evidence and runner-up.
     """
     ranked = listed(candidates)
     first = ranked[0]
-    others = [name for name in map(candidate_name, (aliases or most_of(ALIAS_MASS))(ranked)) if name != first.name]
+    others = [name for name in map(candidate_name, (aliases or near(ALIAS_RATIO))(ranked)) if name != first.name]
     names = first.effects or (first.name,)
     return Verdict(names, (first.name, *dict.fromkeys(others)), first.name == "unknown", why or _why(ranked))
 

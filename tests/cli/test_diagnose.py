@@ -19,7 +19,7 @@ from rich.console import Console
 from avtorch.cli import main
 from avtorch.cli.diagnosis_table import bar, diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.gap import EFFECTS, DeadTime, GapPlant, plant
-from avtorch.gap.diagnosis import Candidate, Diagnosis, GapFacts, LogFacts, Quantity, verdict_of
+from avtorch.gap.diagnosis import Candidate, Diagnosis, GapFacts, LogFacts, Quantity, near, verdict_of
 from avtorch.io import Log
 
 ROWS = 600
@@ -413,7 +413,9 @@ def test_headline_for_each_kind_of_verdict(logs: list[Log]) -> None:
 
 def test_notes(logs: list[Log]) -> None:
     remaining = (Candidate("none", 0.1, 0.0), Candidate("aerodynamic_drag", 0.897, 40.0), Candidate("gust", 0.003))
-    notes = diagnosis_notes(answer(logs, onset_s=132.42, remaining=remaining, complete=False, notes=("speed [only]",)))
+    both = verdict_of(CANDIDATES, aliases=near(0.04))
+    more = {"onset_s": 132.42, "remaining": remaining, "complete": False, "notes": ("speed [only]",)}
+    notes = diagnosis_notes(answer(logs, verdict=both, **more))
     told = lines("\n".join(notes), 200)
     assert told[0] == "Not told apart on this log: dead_time, or second_order_actuator."
     assert told[1] == "Onset: at 132.4 s of the log's time."
@@ -437,7 +439,7 @@ def test_notes(logs: list[Log]) -> None:
     )
     many = Candidate("dead_time", 0.3, 9.0), *(Candidate(n, 0.05, 1.0) for n in sorted(EFFECTS) if n != "dead_time")
     told = lines("\n".join(diagnosis_notes(answer(logs, (*many, *CANDIDATES[-2:])))), 200)
-    assert told[0].endswith("command_hold or any of 16 that are less probable.")
+    assert told[0].endswith("command_hold or any of 17 that are less probable.")
 
 
 def test_bar() -> None:

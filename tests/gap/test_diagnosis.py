@@ -25,7 +25,7 @@ from avtorch.gap.diagnosis import (
     Verdict,
     candidate_name,
     listed,
-    most_of,
+    near,
     verdict_of,
 )
 from avtorch.gap.quantity import unit_of, words_of
@@ -185,7 +185,7 @@ def test_verdict_is_the_most_probable_with_its_aliases() -> None:
         "dead_time explains the log 7 nats better than none and has probability 0.66; "
         "next is sensor_lag with probability 0.3."
     )
-    assert verdict_of(given, aliases=most_of(0.6)).alias_set == ("dead_time",)
+    assert verdict_of(given, aliases=near(0.6)).alias_set == ("dead_time",)
     own = verdict_of(given, aliases=lambda ranked: ["gust+dead_time", "dead_time"], why="Because.")
     assert own.alias_set == ("dead_time", "dead_time+gust")
     assert own.why == "Because."

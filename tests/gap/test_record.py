@@ -44,7 +44,12 @@ def test_rows_are_averaged_down_to_some_twenty_a_second(rate_hz: int, group: int
     assert Record.of(log, rate_hz=1e9).group == 1
 
 
-def test_drives_are_rolled_out_at_the_logs_rate_coarse_ones_at_the_groups() -> None:
+def test_drives_are_rolled_out_at_the_logs_rate_coarse_ones_at_the_groups(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    short = Record.of(log_of(seconds=20.0, rate_hz=100))
+    assert short.coarse is short.drives
+    monkeypatch.setattr("avtorch.gap.record._FEW", 0)
     log = log_of(seconds=20.0, rate_hz=100)
     record = Record.of(log)
     (fine,), (coarse,) = record.drives, record.coarse
@@ -132,7 +137,8 @@ def test_short_stretches_are_left_out() -> None:
     )
 
 
-def test_segments_are_drives_of_their_own() -> None:
+def test_segments_are_drives_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avtorch.gap.record._FEW", 0)
     log = log_of(seconds=60.0, rate_hz=100)
     record = Record.of(_cut(log, slice(0, 1503), slice(1600, 4004), slice(4400, 5950)))
     assert [len(d.time) for d in record.drives] == [1500, 2400, 1550]

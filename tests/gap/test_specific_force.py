@@ -49,7 +49,8 @@ def test_hills_are_named_where_the_log_says_what_its_accelerometer_reads(hills: 
     # taken for dv/dt, the same reading contradicts the speed, and no slope explains that
     wrong = avtorch.diagnose(hills, accel_kind="kinematic", pairs=False)
     assert wrong.verdict.names != ("road_grade",)
-    evidence = [next(c.log_evidence for c in a.candidates if c.name == "road_grade") for a in (told, wrong)]
+    # a candidate less probable than 1e-4 is not listed
+    evidence = [next((c.log_evidence for c in a.candidates if c.name == "road_grade"), None) for a in (told, wrong)]
     assert evidence[0] is not None
     assert evidence[0] > 1000
     assert evidence[1] is None or evidence[0] > evidence[1] + 500
