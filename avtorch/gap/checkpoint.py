@@ -35,20 +35,9 @@ class Kept:
         white = Whitener(record, self.noise)
         fit = finish(candidate, white, self.z, onset)
         rows = row_likelihoods(record, fit.errors, self.noise)
-        return Found(
-            name=candidate.name,
-            candidate=candidate,
-            z=self.z,
-            covariance=fit.covariance,
-            values={k: float(v) for k, v in candidate.values(self.z[None]).items()},
-            noise=NoiseFit(self.noise, self.log_prior, rows, {}),
-            log_evidence=fit.log_evidence + self.log_prior,
-            log_likelihood=float(white.log_likelihood(fit.errors)),
-            errors=fit.errors,
-            onset=onset,
-            grade_rms=fit.grade_rms,
-            profile=fit.profile,
-        )
+        noise = NoiseFit(self.noise, self.log_prior, rows, {})
+        likelihood = float(white.log_likelihood(fit.errors))
+        return Found.of(candidate, fit, noise, fit.log_evidence + self.log_prior, likelihood, onset)
 
 
 class Checkpoint:

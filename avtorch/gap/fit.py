@@ -7,6 +7,7 @@ one. The slope of a road is linear in its coefficients, which are integrated out
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,19 +115,19 @@ def _integrated(
     return square, cross, value - total
 
 
-_LAST: list[tuple[Whitener, Float, int | None, Slope]] = []
+_LAST: WeakKeyDictionary[Whitener, tuple[Float, int | None, Slope]] = WeakKeyDictionary()
 
 
 def _slope(white: Whitener, candidate: Candidate, onset: int | None) -> Slope:
-    """Of the candidate's slope under this noise; the last one is kept. Within a group of rows no slope changes."""
+    """Of the candidate's slope under this noise; kept as long as that is. Within a group of rows no slope changes."""
     grade = candidate.grade_means
     assert grade is not None
-    for kept, columns, row, slope in _LAST:
-        if kept is white and columns is grade and row == onset:
-            return slope
+    kept = _LAST.get(white)
+    if kept is not None and kept[0] is grade and kept[1] == onset:
+        return kept[2]
     felt = sensed(white.record, white.noise, _acting(white, grade, onset))
     made = Slope.of(white(felt)[..., 0].reshape(len(grade), -1))
-    _LAST[:] = [(white, grade, onset, made)]
+    _LAST[white] = (grade, onset, made)
     return made
 
 
@@ -158,8 +159,7 @@ def _sloped(candidate: Candidate, white: Whitener, errors: Float, onset: int | N
 def finish(candidate: Candidate, white: Whitener, z: Float, onset: int | None = None, *, coarse: bool = False) -> Fit:
     """Covariance, errors and Laplace evidence at a mode `z` (coordinate,); `coarse`: of the groups' means only."""
     size = len(z)
-    gradient, square, value = (x[0] for x in _quadratic(candidate, white, z[None], onset, coarse))
-    del gradient
+    _, square, value = (x[0] for x in _quadratic(candidate, white, z[None], onset, coarse))
     errors = candidate.errors(z[None], onset, coarse=coarse)[0]
     rms, profile = None, None
     if candidate.grade_means is not None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.gap.candidate import Candidate
 from avtorch.gap.chance import Tails
+from avtorch.gap.fit import Fit
 from avtorch.gap.innovations import NoiseModel
 from avtorch.gap.losses import Losses
 from avtorch.gap.noise_fit import NoiseFit
@@ -42,6 +44,32 @@ class Found:
     tails: Tails | None = field(default=None, repr=False)
     losses: Losses | None = field(default=None, repr=False)
     gust: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        candidate: Candidate,
+        fit: Fit,
+        noise: NoiseFit,
+        log_evidence: float,
+        log_likelihood: float,
+        onset: int | None = None,
+    ) -> Self:
+        """From a fit under this noise."""
+        return cls(
+            name=candidate.name,
+            candidate=candidate,
+            z=fit.z,
+            covariance=fit.covariance,
+            values={k: float(v) for k, v in candidate.values(fit.z[None]).items()},
+            noise=noise,
+            log_evidence=log_evidence,
+            log_likelihood=log_likelihood,
+            errors=fit.errors,
+            onset=onset,
+            grade_rms=fit.grade_rms,
+            profile=fit.profile,
+        )
 
 
 @dataclass(frozen=True, eq=False)

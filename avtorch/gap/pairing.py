@@ -50,8 +50,7 @@ class Base:
     @cached_property
     def _flat(self) -> float:
         """Log joint density where the base has come to rest."""
-        found, value = modes(self.candidate, self.white, self.z[None], onset=self.onset, iterations=2, coarse=True)
-        del found
+        _, value = modes(self.candidate, self.white, self.z[None], onset=self.onset, iterations=2, coarse=True)
         return float(value[0])
 
     def score(self, candidate: Candidate, alone: Mapping[str, Mapping[str, float]]) -> tuple[float, Float]:
@@ -83,6 +82,15 @@ class Base:
             if gains[k] > best:
                 best, at = float(gains[k]), some[k]
         return best, at
+
+    def partners(
+        self, kinds: Sequence[type[Effect]], alone: Mapping[str, Mapping[str, float]], *, most: int, least: float
+    ) -> list[tuple[Candidate, Float]]:
+        """Candidates with one of `kinds` besides, and where to begin: the `most` best, of `least` nats or more."""
+        record, baseline, own = self.candidate.record, self.candidate.baseline, self.candidate.effects
+        pairs = [Candidate(record, (*own, kind), baseline) for kind in kinds if kind not in own]
+        scored = sorted(((*self.score(pair, alone), pair) for pair in pairs), key=lambda s: -s[0])
+        return [(pair, start) for gain, start, pair in scored[:most] if gain > least]
 
 
 def joint(
@@ -119,17 +127,8 @@ def swapped(
         base = Candidate(record, (kept,), baseline)
         own = {k: v for k, v in values.items() if "." not in k or k.startswith(f"{kept.name}.")}
         here = Base(base, base.z_of(own), own, pair.onset, white)
-        scored = []
-        for kind in kinds:
-            if kind in pair.candidate.effects:
-                continue
-            candidate = Candidate(record, (kept, kind), baseline)
-            gain, start = here.score(candidate, alone)
-            scored.append((gain, candidate, start))
-        scored.sort(key=lambda s: -s[0])
-        for gain, candidate, start in scored[:tries]:
-            if gain < 2:
-                break
+        others = [kind for kind in kinds if kind not in pair.candidate.effects]
+        for candidate, start in here.partners(others, alone, most=tries, least=2.0):
             out.append(rest(candidate, white, start, pair.onset))
     return sorted(out, key=lambda look: -look.value)
 

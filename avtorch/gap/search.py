@@ -20,7 +20,7 @@ from avtorch.gap.chance import Tails, tails
 from avtorch.gap.checkpoint import Checkpoint, Kept
 from avtorch.gap.effect import EFFECTS, Effect
 from avtorch.gap.effects.road_grade import RoadGrade
-from avtorch.gap.fit import Fit, finish, left_over, modes
+from avtorch.gap.fit import finish, left_over, modes
 from avtorch.gap.found import Found, Race, cleaned, merged, white_first
 from avtorch.gap.gusts import gust
 from avtorch.gap.innovations import NoiseModel, Whitener
@@ -64,9 +64,7 @@ class Search:
         checkpoint: Checkpoint | None = None,
     ) -> None:
         self.logs, self.baseline, self.pairs = tuple(logs), baseline, pairs
-        own = {e.name for e in baseline.effects}
-        self.effects = [e for e in (EFFECTS.values() if effects is None else effects)]
-        self.own = own
+        self.effects = list(EFFECTS.values() if effects is None else effects)
         self.until = None if budget_s is None else time.monotonic() + budget_s
         self.progress = progress or (lambda what, done, of: None)
         self.complete = True
@@ -209,24 +207,10 @@ class Search:
                     # in closed loop, means only may flatter
                     again.append(look)
                 else:
-                    found.append(self._as_found(look.candidate, fit, none, flat))
+                    evidence = none.log_evidence + fit.log_evidence - flat
+                    found.append(Found.of(look.candidate, fit, none.noise, evidence, fit.log_joint))
             rest = again
         return found
-
-    def _as_found(self, candidate: Candidate, fit: Fit, none: Found, flat: float) -> Found:
-        return Found(
-            name=candidate.name,
-            candidate=candidate,
-            z=fit.z,
-            covariance=fit.covariance,
-            values={k: float(v) for k, v in candidate.values(fit.z[None]).items()},
-            noise=none.noise,
-            log_evidence=none.log_evidence + fit.log_evidence - flat,
-            log_likelihood=fit.log_joint,
-            errors=fit.errors,
-            grade_rms=fit.grade_rms,
-            profile=fit.profile,
-        )
 
     def _refined(self, forms: Sequence[Look], noise: NoiseModel) -> Found:
         """One cause over the whole drive and from an onset on; both weigh the same a priori."""
@@ -306,18 +290,11 @@ class Search:
         most: int,
     ) -> list[Look]:
         """The `most` effects that promise most on top of `base`, each fitted with it."""
-        scored = []
         on = Base(base.candidate, base.z, base.values, base.onset, white)
-        for kind in kinds:
-            if kind in base.candidate.effects:
-                continue
-            candidate = Candidate(white.record, (*base.candidate.effects, kind), self.baseline)
-            scored.append((*on.score(candidate, alone), candidate))
-        scored.sort(key=lambda s: -s[0])
         return [
             joint(candidate, base.candidate.effects[0], z, base.onset, white, onsets=True)
-            for gain, z, candidate in scored[:most]
-            if gain > 4 and not self._late()
+            for candidate, z in on.partners(kinds, alone, most=most, least=4.0)
+            if not self._late()
         ]
 
     def _settle_pairs(self, pairs: list[Look], most: int, noise: NoiseModel, made: dict[str, Found]) -> Found | None:
@@ -327,7 +304,8 @@ class Search:
             if self._late():
                 break
             pair = self._refined([look], noise)
-            made[pair.name] = pair
+            if pair.name not in made or made[pair.name].log_evidence < pair.log_evidence:
+                made[pair.name] = pair
             if best is None or pair.log_evidence > best.log_evidence:
                 best = pair
                 noise = pair.noise.noise
@@ -357,12 +335,7 @@ class Search:
             if len(names) > 1 or "outliers" in names:
                 continue
             name = "+".join(sorted([*names, "outliers"]))
-            onset = f.onset
-            if f.name == "none" and glitches.onset is not None:
-                onset = None
-            out.append(
-                replace(f, name=name, log_evidence=f.log_evidence + glitches.evidence, tails=glitches, onset=onset)
-            )
+            out.append(replace(f, name=name, log_evidence=f.log_evidence + glitches.evidence, tails=glitches))
         return out
 
     def _held(self, raw: Record, found: list[Found], none: Found) -> list[Found]:
