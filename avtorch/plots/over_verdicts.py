@@ -90,7 +90,7 @@ def confusion_figure(answer: Mapping[str, Any]) -> Figure:
     right = sum(count.get(truth, 0) for truth, count in answer["confusion"].items())
     signals = " and ".join(answer.get("signals", ())) or "all signals"
     ax.set_title(
-        f"{answer.get('answerer', 'verdicts')}: {right} of {answer['cases']} sealed cases right; {signals}", fontsize=10
+        f"{right} of {answer['cases']} sealed cases right\n{answer.get('answerer', 'verdicts')}, {signals}", fontsize=10
     )
     return figure
 

@@ -48,5 +48,11 @@ def test_every_case_is_drawn_once_and_pairs_are_put_together() -> None:
 def test_figure_and_nothing_to_draw() -> None:
     figure = plots.confusion_figure({"confusion": COUNTS, "cases": 30, "answerer": "avtorch", "signals": ["accel"]})
     assert "21 of 30" in figure.axes[0].get_title(loc="left")
+    # the narrowest there is: nothing is cut off at the edge
+    few = {"confusion": {"none": {"none": 1}}, "cases": 1, "answerer": "avtorch", "signals": ["accel", "speed"]}
+    small = plots.confusion_figure(few)
+    small.draw_without_rendering()
+    title = small.axes[0]._left_title  # type: ignore[attr-defined]
+    assert title.get_window_extent().x1 <= small.bbox.x1
     with pytest.raises(InputError, match="counts: found no case"):
         plots.confusion(Figure().subplots(), {})
