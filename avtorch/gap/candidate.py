@@ -47,6 +47,7 @@ class Coordinate:
 
 
 _MEANS: WeakKeyDictionary[Record, Float] = WeakKeyDictionary()
+_ROWS: WeakKeyDictionary[Record, Float] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +146,9 @@ class Candidate:
         """
         if not self._roads:
             return None
-        return self._columns(self.record.drives, coarse=False)
+        if self.record not in _ROWS:
+            _ROWS[self.record] = self._columns(self.record.drives, coarse=False)
+        return _ROWS[self.record]
 
     @cached_property
     def grade_means(self) -> Float | None:

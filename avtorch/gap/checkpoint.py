@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from avtorch.errors import InputError
 from avtorch.gap.candidate import Candidate
+from avtorch.gap.earlier import whitener
 from avtorch.gap.fit import finish
 from avtorch.gap.found import Found
-from avtorch.gap.innovations import NoiseModel, Whitener
-from avtorch.gap.noise_fit import NoiseFit, row_likelihoods
+from avtorch.gap.innovations import NoiseModel
+from avtorch.gap.noise_fit import NoiseFit
 from avtorch.io import write_json
 
 Float = NDArray[np.float64]
@@ -32,11 +33,11 @@ class Kept:
     def found(self, candidate: Candidate, onset: int | None) -> Found:
         """All that follows from it."""
         record = candidate.record
-        white = Whitener(record, self.noise)
+        white = whitener(record, self.noise, onset=onset)
         fit = finish(candidate, white, self.z, onset)
-        rows = row_likelihoods(record, fit.errors, self.noise)
+        rows = white.row_likelihoods(fit.errors)
         noise = NoiseFit(self.noise, self.log_prior, rows, {})
-        likelihood = float(white.log_likelihood(fit.errors))
+        likelihood = float(rows.sum())
         return Found.of(candidate, fit, noise, fit.log_evidence + self.log_prior, likelihood, onset)
 
 
@@ -68,8 +69,6 @@ class Checkpoint:
             return None
         self._turn += 1
         noise = dict(entry["noise"])
-        if noise.get("within") is not None:
-            noise["within"] = tuple(noise["within"])
         return Kept(np.array(entry["z"]), NoiseModel(**noise), float(entry["log_prior"]))
 
     def keep(self, name: str, onset: int | None, fit: Kept) -> None:

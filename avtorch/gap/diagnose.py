@@ -15,9 +15,7 @@ from avtorch.gap.checkpoint import Checkpoint
 from avtorch.gap.diagnosis import Diagnosis, GapFacts, LogFacts
 from avtorch.gap.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.found import Found, Race
-from avtorch.gap.innovations import Whitener
 from avtorch.gap.misfit import gap_facts
-from avtorch.gap.noise_fit import CALM
 from avtorch.gap.odds import favourite, probabilities
 from avtorch.gap.plant import GapPlant, plant
 from avtorch.gap.posterior import Draws
@@ -107,13 +105,7 @@ def _left(top: Found, race: Race) -> Remainder:
     if top.errors.shape[-1] == 1:
         measured = measured.mean(-1, keepdims=True)
     explained = top.losses.evidence if top.losses else 0.0
-    noise, before = top.noise.noise, None
-    if top.onset is not None:
-        calm = noise.seen_through({})
-        calm = calm.replaced(force_sd=min(CALM, noise.force_sd)) if top.gust else calm
-        before = (Whitener(race.record, calm), top.onset)
-    white = Whitener(race.record, noise)
-    return remainder(white, top.errors, measured - top.errors, explained=explained, before=before)
+    return remainder(top.white, top.errors, measured - top.errors, explained=explained)
 
 
 def _draws(found: Found, seed: int) -> Draws:
@@ -140,7 +132,7 @@ def _onset(found: Found | None, race: Race) -> float | None:
         return float(race.raw.time[race.raw.source[found.tails.onset]])
     if found.name == "command_hold" and found.losses is not None and found.losses.onset is not None:
         return float(race.raw.time[race.raw.source[found.losses.onset]])
-    return None if found.onset is None else float(race.record.time[race.record.source[found.onset]])
+    return None if found.began is None else float(race.record.time[race.record.source[found.began]])
 
 
 def _gap(race: Race, chances: Mapping[str, float]) -> GapFacts:

@@ -78,7 +78,7 @@ def modes(
         step = step[:, :, 0]
         step *= np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(1, keepdims=True), 1e-12))
         trial = np.clip(best + step, -5.0, 5.0)
-    return best, white.constant - value
+    return best, white.constant_of(coarse=coarse) - value
 
 
 def _quadratic(
@@ -97,9 +97,8 @@ def _quadratic(
     cross = np.einsum("cpr,cr->cp", columns, base)
     value = 0.5 * np.einsum("cr,cr->c", base, base)
     if candidate.grade_means is not None:
-        means = e.reshape(count, size + 1, -1, e.shape[-1])[..., 0]
-        columns, base = (means[:, 1:] - means[:, :1]) / _STEP, means[:, 0]
-        square, cross, value = _integrated(_slope(white, candidate, onset), columns, base, square, cross, value)
+        slope = _slope(white, candidate, onset, coarse)
+        square, cross, value = _integrated(slope, columns, base, square, cross, value)
     return cross + z, square + np.eye(size), value + 0.5 * (z**2).sum(1)
 
 
@@ -118,15 +117,15 @@ def _integrated(
 _LAST: WeakKeyDictionary[Whitener, tuple[Float, int | None, Slope]] = WeakKeyDictionary()
 
 
-def _slope(white: Whitener, candidate: Candidate, onset: int | None) -> Slope:
-    """Of the candidate's slope under this noise; kept as long as that is. Within a group of rows no slope changes."""
-    grade = candidate.grade_means
+def _slope(white: Whitener, candidate: Candidate, onset: int | None, coarse: bool) -> Slope:
+    """Of the candidate's slope under this noise; the last one of each noise is kept."""
+    grade = candidate.grade_means if coarse else candidate.grade_columns
     assert grade is not None
     kept = _LAST.get(white)
     if kept is not None and kept[0] is grade and kept[1] == onset:
         return kept[2]
     felt = sensed(white.record, white.noise, _acting(white, grade, onset))
-    made = Slope.of(white(felt)[..., 0].reshape(len(grade), -1))
+    made = Slope.of(white(felt).reshape(len(grade), -1))
     _LAST[white] = (grade, onset, made)
     return made
 
@@ -150,7 +149,7 @@ def left_over(candidate: Candidate, white: Whitener, z: Float, onset: int | None
 
 def _sloped(candidate: Candidate, white: Whitener, errors: Float, onset: int | None) -> tuple[float, Float, Float]:
     """`grade_rms`, coefficients (knot,), and what they do to the errors."""
-    rms, profile = _slope(white, candidate, onset).told(white(errors)[..., 0].ravel())
+    rms, profile = _slope(white, candidate, onset, errors.shape[-1] == 1).told(white(errors).ravel())
     part = candidate.grade_response(profile)
     part = part.mean(-1, keepdims=True) if errors.shape[-1] == 1 else part
     return rms, profile, sensed(white.record, white.noise, _acting(white, part, onset))
@@ -165,7 +164,7 @@ def finish(candidate: Candidate, white: Whitener, z: Float, onset: int | None = 
     if candidate.grade_means is not None:
         rms, profile, part = _sloped(candidate, white, errors, onset)
         errors = errors - part
-    log_joint = white.constant - float(value)
+    log_joint = white.constant_of(coarse=coarse) - float(value)
     return (
         Fit(
             z=z,

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from avtorch.gap.candidate import Candidate
 from avtorch.gap.chance import Tails
+from avtorch.gap.earlier import whitener
 from avtorch.gap.fit import Fit
-from avtorch.gap.innovations import NoiseModel
+from avtorch.gap.innovations import NoiseModel, Whitener
 from avtorch.gap.losses import Losses
 from avtorch.gap.noise_fit import NoiseFit
 from avtorch.gap.record import Record
@@ -25,8 +26,8 @@ Float = NDArray[np.float64]
 class Found:
     """A candidate fitted: `name`, `z` and parameter `values` at the mode, `log_evidence` [nats], `errors`.
 
-    `onset`: counted row from which it acts, None: from the start. `gain`: log likelihood over the baseline's.
-    `chance`: what random effects among its names found.
+    `onset`, `gust_onset`: counted rows from which its effects act and a gust blows, None: from the start. `tails`,
+    `losses`: what random effects among its names found.
     """
 
     name: str
@@ -44,6 +45,17 @@ class Found:
     tails: Tails | None = field(default=None, repr=False)
     losses: Losses | None = field(default=None, repr=False)
     gust: bool = False
+    gust_onset: int | None = None
+
+    @property
+    def began(self) -> int | None:
+        """Counted row from which anything of it acts; None: from the start."""
+        return self.gust_onset if self.onset is None else self.onset
+
+    @property
+    def white(self) -> Whitener:
+        """Of errors under its noise."""
+        return whitener(self.candidate.record, self.noise.noise, onset=self.onset, gust_onset=self.gust_onset)
 
     @classmethod
     def of(
@@ -93,8 +105,8 @@ class Race:
 
 def white_first(record: Record) -> NoiseModel:
     """Sensor noise from what rows beside each other differ by, as a first guess."""
-    same = np.diff(record.stretch) == 0
-    sds = [1.4826 / np.sqrt(2) * float(np.median(np.abs(np.diff(x.mean(-1))[same]))) + 1e-4 for x in record.measured]
+    same = np.diff(np.repeat(record.stretch, record.group)) == 0
+    sds = [1.4826 / np.sqrt(2) * float(np.median(np.abs(np.diff(x.ravel())[same]))) + 1e-4 for x in record.measured]
     return NoiseModel(**{f"{name}_sd": sd for name, sd in zip(record.witnesses, sds, strict=True)})
 
 

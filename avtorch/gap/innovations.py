@@ -9,8 +9,8 @@ The error of a rollout is what no deterministic response foretells,
 
 with the interval between rows integrated exactly. The Kalman gain settles within some rows, so errors (row,) of both
 witnesses pass one recursive filter to become white, thousands of columns at once. The speed's offset at the start of
-each stretch is unknown and projected out. Where rows come in groups, their means pass the filter, and what rows of a
-group differ by is white already.
+each stretch is unknown and projected out. Errors of groups' means pass the filter of the groups' interval, which is
+good enough for a first look; every row passes the exact one.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -36,10 +37,10 @@ NAMES = ("process_sd", "process_time", "force_sd", "force_time", "accel_sd", "sp
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """`process_sd`, `force_sd`, `accel_sd` [m/s²], `speed_sd` [m/s] (white ones of a group's mean), times [s].
+    """`process_sd`, `force_sd`, `accel_sd` [m/s²], `speed_sd` [m/s] (white, of single rows), times [s].
 
-    `within`: standard deviations by witness of the rows within a group; None where no rows are grouped. What the
-    accelerometer makes of the car's random motion: `sensor_scale` [-] times it, late by a first-order `sensor_lag` [s].
+    What the accelerometer makes of the car's random motion: `sensor_scale` [-] times it, late by a first-order
+    `sensor_lag` [s].
     """
 
     process_sd: float = 0.05
@@ -48,7 +49,6 @@ class NoiseModel:
     force_time: float = 3.0
     accel_sd: float = 0.05
     speed_sd: float = 0.02
-    within: tuple[float, ...] | None = None
     sensor_scale: float = 1.0
     sensor_lag: float = 0.0
 
@@ -64,97 +64,156 @@ class NoiseModel:
             sensor_lag=lag if lag > _NO_LAG else 0.0,
         )
 
-    def by_rows(self, witnesses: tuple[str, ...]) -> NoiseModel:
-        """Of single rows instead of groups: what rows within a group differ by is the sensors' white noise."""
-        if self.within is None:
-            return self
-        own = {f"{name}_sd": sd for name, sd in zip(witnesses, self.within, strict=True)}
-        return replace(self, within=None, **own)
+    def of_means(self, group: int) -> NoiseModel:
+        """Of the means of `group` rows."""
+        size = float(np.sqrt(group))
+        return replace(self, accel_sd=self.accel_sd / size, speed_sd=self.speed_sd / size)
+
+
+Until = tuple[tuple[int, NoiseModel], ...]
+Filter = tuple[list[list[Float]], Float, float]
+"""Numerators by (out, in), the denominator, log det of the innovations' covariance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Whitener:
-    """The filter of `noise` for the rows of `record`."""
+    """The map from errors to white ones of unit variance, for one noise model. Linear in the errors.
+
+    `until`: what else the noise was in earlier parts of the record, each up to a counted row, in order.
+    """
 
     record: Record
     noise: NoiseModel
+    until: Until = ()
 
     @classmethod
-    def each(cls, record: Record, noises: Sequence[NoiseModel]) -> list[Self]:
+    def each(
+        cls, record: Record, noises: Sequence[NoiseModel], until: Sequence[Until] | None = None, *, coarse: bool = False
+    ) -> list[Self]:
         """Of several noise models, their filters designed together: some ten times as fast as one by one."""
-        made = [cls(record, noise) for noise in noises]
-        for white, filter_ in zip(made, _designed(noises, record.dt, record.witnesses), strict=True):
-            white.__dict__["_filter"] = filter_
+        earlier = [()] * len(noises) if until is None else until
+        made = [cls(record, noise, own) for noise, own in zip(noises, earlier, strict=True)]
+        parts = zip(*([*(n for _, n in own), noise] for noise, own in zip(noises, earlier, strict=True)), strict=True)
+        filters = [cls._made(record, part, coarse) for part in parts]
+        for i, white in enumerate(made):
+            white._filters[coarse and record.group > 1] = [f[i] for f in filters]
         return made
 
+    @staticmethod
+    def _made(record: Record, noises: Sequence[NoiseModel], coarse: bool) -> list[Filter]:
+        group = record.group if coarse else 1
+        dt = record.dt if coarse else record.dt / record.group
+        return _designed([n.of_means(group) for n in noises], dt, record.witnesses)
+
     @cached_property
-    def _filter(self) -> Filter:
-        return _designed([self.noise], self.record.dt, self.record.witnesses)[0]
+    def _filters(self) -> dict[bool, list[Filter]]:
+        return {}
+
+    def _parts(self, coarse: bool) -> list[tuple[Filter, slice]]:
+        """Filters, and which of the counted rows each of them judges."""
+        coarse = coarse and self.record.group > 1
+        if coarse not in self._filters:
+            noises = [*(n for _, n in self.until), self.noise]
+            self._filters[coarse] = [self._made(self.record, [n], coarse)[0] for n in noises]
+        rows = [0, *(row for row, _ in self.until), self.record.rows]
+        return [(f, slice(*ends)) for f, ends in zip(self._filters[coarse], pairwise(rows), strict=True)]
 
     def _filtered(self, errors: Float) -> Float:
-        tops, bottom, _ = self._filter
-        padded = self.record.padded(errors)
-        out = np.empty((*errors.shape[:-1], errors.shape[-1]))
-        for o in range(errors.shape[-2]):
-            total = sum(
-                np.asarray(lfilter(tops[o][i], bottom, padded[..., i, :], axis=-1)) for i in range(errors.shape[-2])
-            )
-            out[..., o, :] = total[..., self.record.target]  # type: ignore[index]
+        """Errors (..., witness, counted, group) through the filter."""
+        count, group = errors.shape[-3], errors.shape[-1]
+        record = self.record
+        padded = record.padded(errors)
+        out = np.empty(errors.shape)
+        for (tops, bottom, _), part in self._parts(group == 1):
+            target = record.target[part]
+            seen = padded[..., : (target[-1] + 1) * group]
+            for o in range(count):
+                total = sum(np.asarray(lfilter(tops[o][i], bottom, seen[..., i, :], axis=-1)) for i in range(count))
+                rows = np.asarray(total).reshape(*total.shape[:-1], -1, group)  # type: ignore[union-attr]
+                out[..., o, part, :] = rows[..., target, :]
         return out
+
+    def turned(self, images: Float) -> Float:
+        """The transpose of the map, of images (..., witness, counted, group): the filter run backward in time."""
+        record, (count, group) = self.record, images.shape[-3::2]
+        images = np.array(images)
+        offset = "speed" in record.witnesses
+        if offset:
+            images = self._without_offset(images)
+        total = np.zeros_like(images)
+        for (tops, bottom, _), part in self._parts(group == 1):
+            own = np.zeros_like(images)
+            own[..., part, :] = images[..., part, :]
+            back = record.padded(own)[..., ::-1]
+            for i in range(count):
+                through = [np.asarray(lfilter(tops[o][i], bottom, back[..., o, :], axis=-1)) for o in range(count)]
+                rows = np.sum(through, 0)[..., ::-1].reshape(*back.shape[:-2], -1, group)
+                total[..., i, :, :] += rows[..., record.target, :]
+        if offset:  # each stretch's first speed was taken off all of its rows
+            total[..., -1, record.starts, 0] -= np.add.reduceat(total[..., -1, :, :].sum(-1), record.starts, -1)
+        return total
 
     def response(self, errors: Float) -> Float:
         """White image of errors (witness, time) at consecutive rows that begin with the first, offset and all."""
-        tops, bottom, _ = self._filter
+        tops, bottom, _ = self._parts(False)[-1][0]
         count = len(errors)
         return np.stack(
             [sum(np.asarray(lfilter(tops[o][i], bottom, errors[i])) for i in range(count)) for o in range(count)]
         )
 
     @cached_property
-    def _offset(self) -> tuple[Float, Float]:
-        """White image of a unit offset of the speed from each stretch's start (witness, counted), and its square."""
-        unit = np.zeros((len(self.record.witnesses), self.record.rows))
-        unit[-1] = 1.0
-        image = self._filtered(unit)
-        return image, np.add.reduceat((image**2).sum(0), self.record.starts)
+    def _offsets(self) -> dict[bool, tuple[Float, Float]]:
+        return {}
+
+    def _offset(self, coarse: bool) -> tuple[Float, Float]:
+        """White image of a unit offset of the speed from each stretch's start (witness, counted, group), its square."""
+        coarse = coarse and self.record.group > 1
+        if coarse not in self._offsets:
+            unit = np.zeros((len(self.record.witnesses), self.record.rows, 1 if coarse else self.record.group))
+            unit[-1] = 1.0
+            image = self._filtered(unit)
+            self._offsets[coarse] = image, np.add.reduceat((image**2).sum((0, 2)), self.record.starts)
+        return self._offsets[coarse]
+
+    def _without_offset(self, e: Float) -> Float:
+        image, square = self._offset(e.shape[-1] == 1)
+        part = np.add.reduceat((e * image).sum((-3, -1)), self.record.starts, -1) / square
+        return e - image * part[..., None, self.record.stretch, None]
 
     def __call__(self, errors: Float) -> Float:
-        """Errors (..., witness, counted, group) made white, of unit variance: (..., witness, counted, 1 + group).
+        """Errors (..., witness, counted, group) made white, of unit variance, the same shape.
 
-        First the groups' means, then what their rows differ by; without the latter where `errors` come with group 1.
+        Errors of groups' means come with group 1.
         """
-        mean = errors.mean(-1) if errors.shape[-1] > 1 else errors[..., 0].copy()
-        if "speed" in self.record.witnesses:
-            starts = self.record.starts
-            mean[..., -1, :] -= mean[..., -1, starts][..., self.record.stretch]
-            e = self._filtered(mean)
-            image, square = self._offset
-            part = np.add.reduceat((e * image).sum(-2), starts, -1) / square
-            e -= image * part[..., None, self.record.stretch]
-        else:
-            e = self._filtered(mean)
-        if errors.shape[-1] == 1 or self.noise.within is None:
-            return e[..., None]
-        apart = errors - errors.mean(-1, keepdims=True)
-        apart /= np.array(self.noise.within)[:, None, None]
-        return np.concatenate([e[..., None], apart], -1)
+        if "speed" not in self.record.witnesses:
+            return self._filtered(errors)
+        errors = errors.copy()
+        errors[..., -1, :, :] -= errors[..., -1, self.record.starts, :1][..., self.record.stretch, :]
+        return self._without_offset(self._filtered(errors))
 
-    @property
-    def constant(self) -> float:
-        """The log likelihood's part that does not depend on the errors."""
-        rows, count = self.record.rows, len(self.record.witnesses)
-        value = -0.5 * rows * (self._filter[2] + count * np.log(2 * np.pi))
-        if "speed" in self.record.witnesses:
-            value -= 0.5 * float(np.log(self._offset[1]).sum())
-        if self.noise.within is not None:
-            more = rows * (self.record.group - 1)
-            value -= more * sum(float(np.log(sd)) + 0.5 * np.log(2 * np.pi) for sd in self.noise.within)
-        return value
+    def constants(self, *, coarse: bool) -> Float:
+        """Each row's part (counted,) of what the log likelihood has that does not depend on the errors."""
+        record = self.record
+        each, count = 1 if coarse else record.group, len(record.witnesses)
+        out = np.empty(record.rows)
+        for (_, _, size), part in self._parts(coarse):
+            out[part] = -0.5 * each * (size + count * np.log(2 * np.pi))
+        if "speed" in record.witnesses:
+            out -= 0.5 * float(np.log(self._offset(coarse)[1]).sum()) / record.rows
+        return out
+
+    def constant_of(self, *, coarse: bool) -> float:
+        """What the log likelihood has that does not depend on the errors."""
+        return float(self.constants(coarse=coarse).sum())
 
     def log_likelihood(self, errors: Float) -> Float:
         """Of errors (..., witness, counted, group): (...)."""
         e = self(errors)
-        return self.constant - 0.5 * (e**2).sum((-1, -2, -3))
+        return self.constant_of(coarse=errors.shape[-1] == 1) - 0.5 * (e**2).sum((-1, -2, -3))
+
+    def row_likelihoods(self, errors: Float) -> Float:
+        """Log likelihood (counted,) of each row of errors (witness, counted, group); sums to the whole."""
+        return self.constants(coarse=errors.shape[-1] == 1) - 0.5 * (self(errors) ** 2).sum((0, 2))
 
 
 def sensed(record: Record, noise: NoiseModel, motion: Float) -> Float:
@@ -169,10 +228,6 @@ def sensed(record: Record, noise: NoiseModel, motion: Float) -> Float:
         accel = np.asarray(lfilter([lost], [1, lost - 1], flat, axis=-1)).reshape(accel.shape)
     motion[..., 0, :, :] = accel
     return motion
-
-
-Filter = tuple[list[list[Float]], Float, float]
-"""Numerators by (out, in), the denominator, log det of the innovations' covariance."""
 
 
 def _designed(noises: Sequence[NoiseModel], dt: float, witnesses: tuple[str, ...]) -> list[Filter]:

@@ -15,10 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from avtorch.gap.adjoint import adjoint
 from avtorch.gap.candidate import Candidate
 from avtorch.gap.innovations import Whitener, sensed
-from avtorch.gap.noise_fit import CALM
 from avtorch.gap.plant import GapPlant, plant
 from avtorch.gap.slope import Slope
 from avtorch.inference.priors import LogSpaceNormal
@@ -39,12 +37,11 @@ class RolloutDensity:
     """Log joint density of errors and coordinates `z`: an `avtorch.inference.Density` of a single window.
 
     A priori `z` is standard normal. The noise model is held, and so is the row `onset` from which the effects act
-    (None: from the start). `parts`: the whiteners and which of the counted rows each of them judges. The coefficients
-    of a road's slope and its size are integrated out.
+    (None: from the start). The coefficients of a road's slope and its size are integrated out.
     """
 
     candidate: Candidate
-    parts: tuple[tuple[Whitener, slice], ...]
+    white: Whitener
     centre: Float
     onset: int | None = None
 
@@ -52,15 +49,8 @@ class RolloutDensity:
 
     @classmethod
     def of(cls, found: Found) -> RolloutDensity:
-        """With noise and onset as found. Before a gust's onset the force is calm."""
-        record, noise = found.candidate.record, found.noise.noise
-        acting = acting_onset(found)
-        strong = Whitener(record, noise)
-        parts: tuple[tuple[Whitener, slice], ...] = ((strong, slice(0, record.rows)),)
-        if found.gust and found.onset is not None and acting is None:
-            calm = Whitener(record, noise.replaced(force_sd=min(CALM, noise.force_sd)))
-            parts = ((calm, slice(0, found.onset)), (strong, slice(found.onset, record.rows)))
-        return cls(found.candidate, parts, np.asarray(found.z, float), acting)
+        """With noise and onset as found."""
+        return cls(found.candidate, found.white, np.asarray(found.z, float), found.onset)
 
     # the Density -----------------------------------------------------------------------------------------------------
     @property
@@ -126,8 +116,7 @@ class RolloutDensity:
     @cached_property
     def constant(self) -> float:
         """Of the log likelihood, what does not depend on the errors."""
-        rows = self.candidate.record.rows
-        return sum(white.constant * (part.stop - part.start) / rows for white, part in self.parts)
+        return self.white.constant_of(coarse=False)
 
     @cached_property
     def slope(self) -> Slope | None:
@@ -137,8 +126,7 @@ class RolloutDensity:
             return None
         if self.onset is not None:
             columns = spliced(self.candidate, torch.as_tensor(columns), self.onset).numpy()
-        white = self.parts[-1][0]
-        return Slope.of(self._image(sensed(white.record, white.noise, columns)))
+        return Slope.of(self._image(sensed(self.white.record, self.white.noise, columns)))
 
     def _prior(self, z: Tensor) -> Tensor:
         return -0.5 * z.square().sum(-1)
@@ -179,28 +167,19 @@ class RolloutDensity:
 
     def _image(self, errors: Float) -> Float:
         """White errors, every row once: (column, row)."""
-        return np.concatenate([w(errors)[:, :, part].reshape(len(errors), -1) for w, part in self.parts], 1)
+        return self.white(errors).reshape(len(errors), -1)
 
     def _judged(self, rolled: Float, *, slope: bool = False) -> tuple[Float, Float | None]:
         """Log likelihood (column,) of rollouts and, if asked for its `slope`, the derivative in them."""
         errors = self._errors(rolled)
-        whites = [w(errors) for w, _ in self.parts]
-        cut = [e[:, :, part] for e, (_, part) in zip(whites, self.parts, strict=True)]
-        flat = np.concatenate([e.reshape(len(errors), -1) for e in cut], 1)
+        flat = self._image(errors)
         value = self.constant - 0.5 * np.einsum("cr,cr->c", flat, flat)
         if self.slope is not None:
             gained, less = self.slope.gained(flat)
             value, flat = value + gained, flat - less
         if not slope:
             return value, None
-        total, place = np.zeros_like(errors), 0
-        for (white, part), e, own in zip(self.parts, whites, cut, strict=True):
-            count = own[0].size
-            back = np.zeros_like(e)
-            back[:, :, part] = flat[:, place : place + count].reshape(own.shape)
-            place += count
-            total += adjoint(white, back)
-        return value, total
+        return value, self.white.turned(flat.reshape(errors.shape))
 
 
 class _Exact(torch.autograd.Function):
@@ -228,17 +207,6 @@ def spliced(candidate: Candidate, apart: Tensor, onset: int) -> Tensor:
         first[-1] = 1.0
         apart = apart - first * apart[:, -1:, onset : onset + 1, :1]
     return apart * (torch.arange(record.rows) >= onset)[:, None]
-
-
-def acting_onset(found: Found) -> int | None:
-    """Row from which the deterministic effects of a find act; its `onset` may be that of a gust alone."""
-    if found.onset is None or not found.candidate.effects:
-        return None
-    if not found.gust:
-        return found.onset
-    # if they set in with the gust, errors before it are those of the bare baseline
-    late = found.candidate.errors(found.z[None], found.onset)[0][:, : found.onset]
-    return found.onset if np.allclose(late, found.errors[:, : found.onset], rtol=0, atol=1e-9) else None
 
 
 def root(covariance: Float) -> Tensor:

@@ -9,6 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from avtorch.gap.earlier import earlier, whitener
 from avtorch.gap.innovations import NAMES, NoiseModel, Whitener
 from avtorch.gap.record import Record
 
@@ -37,9 +38,6 @@ GUST: dict[str, Prior] = {
 }
 """Priors where the coloured force is the cause."""
 
-CALM = 0.005
-"""Size of the nuisance force before a gust's onset [m/s²]."""
-
 _STEP = 1e-3
 _LONGEST = 1.5  # of a step, in prior standard deviations
 
@@ -57,21 +55,6 @@ class NoiseFit:
     sds: Mapping[str, float] = field(repr=False)
 
 
-def row_likelihoods(
-    record: Record, errors: Float, noise: NoiseModel, onset: int | None = None, *, white: Whitener | None = None
-) -> Float:
-    """Log likelihood (counted,) of each row of errors (witness, counted, group); sums to the whole.
-
-    With `onset`, the coloured force has its size from that row on only. `white`: of this noise, where it is at hand.
-    """
-    white = Whitener(record, noise) if white is None else white
-    rows = white.constant / record.rows - 0.5 * (white(errors) ** 2).sum((0, 2))
-    if onset:
-        calm = row_likelihoods(record, errors, noise.replaced(force_sd=min(CALM, noise.force_sd)))
-        rows = np.concatenate([calm[:onset], rows[onset:]])
-    return rows
-
-
 def fit_noise(
     record: Record,
     errors: Float,
@@ -80,62 +63,48 @@ def fit_noise(
     T_L: float,
     priors: Mapping[str, Prior] = PRIORS,
     onset: int | None = None,
+    gust_onset: int | None = None,
     iterations: int = 6,
 ) -> NoiseFit:
     """Mode of the noise's parameters given the errors (witness, counted, group) of a rollout; `T_L` [s].
 
-    Errors of means only, with group 1, leave what rows of a group differ by as it was.
+    Errors of groups' means come with group 1. Before `onset` the sensor reads plainly, before `gust_onset` the force is
+    calm.
     """
     means = np.array([priors[n][0] for n in NAMES])
     means[NAMES.index("process_time")] += np.log(T_L)
     sds, ends = (np.array([priors[n][k] for n in NAMES]) for k in (1, 2))
 
-    within = start.within
-    if errors.shape[-1] > 1:
-        apart = errors - errors.mean(-1, keepdims=True)
-        share = record.group / (record.group - 1)
-        within = tuple(float(x) for x in np.sqrt(share * (apart**2).mean((1, 2))).clip(1e-9))
+    onsets = {"onset": onset, "gust_onset": gust_onset}
 
     def model(z: Float) -> NoiseModel:
-        own = {n: float(x) for n, x in zip(NAMES, np.exp(means + sds * z), strict=True)}
-        return replace(start, within=within, **own)
+        return replace(start, **{n: float(x) for n, x in zip(NAMES, np.exp(means + sds * z), strict=True)})
 
-    # what rows of a group differ by does not depend on what is sought
-    mean, fixed = errors.mean(-1, keepdims=True), 0.0
-    if within is not None and errors.shape[-1] > 1:
-        apart = ((errors - mean) / np.array(within)[:, None, None]) ** 2
-        size = (record.group - 1) * sum(np.log(sd) + 0.5 * np.log(2 * np.pi) for sd in within)
-        fixed = -0.5 * apart.sum((0, 2)) - size
-
-    def likelihoods(z: Float) -> Float:
-        return row_likelihoods(record, mean, replace(model(z), within=None), onset) + fixed
+    def white(z: Float) -> Whitener:
+        return whitener(record, model(z), **onsets)
 
     begin = np.log([getattr(start, n) for n in NAMES])
     z = np.clip((begin - means) / sds, -ends, ends)
-    rows = likelihoods(z)
+    rows = white(z).row_likelihoods(errors)
     value = float(rows.sum()) - 0.5 * float(z @ z)
-    if not 0.5 < float((Whitener(record, replace(model(z), within=None))(mean) ** 2).mean()) < 2.0:
+    if not 0.5 < float((white(z)(errors) ** 2).mean()) < 2.0:
         # far off: scores mislead, so begin at the best of a coarse grid of sizes
         for shifts in product((-1.4, 0.0, 1.4), repeat=3):
             other = z.copy()
             for name, shift in zip(("process_sd", "accel_sd", "speed_sd"), shifts, strict=True):
                 other[NAMES.index(name)] = shift
-            tried = likelihoods(other)
+            tried = white(other).row_likelihoods(errors)
             worth = float(tried.sum()) - 0.5 * float(other @ other)
             if worth > value:
                 z, rows, value = other, tried, worth
     damping, information = 1e-2, np.eye(len(z))
     for _ in range(iterations):
-        ahead = [replace(model(x), within=None) for x in z + _STEP * np.eye(len(z))]
-        whites = [None] * len(z) if onset else Whitener.each(record, ahead)
-        slopes = np.stack(
-            [
-                (row_likelihoods(record, mean, n, onset, white=w) + fixed - rows) / _STEP
-                for n, w in zip(ahead, whites, strict=True)
-            ]
-        )
+        ahead = [model(x) for x in z + _STEP * np.eye(len(z))]
+        before = [earlier(n, **onsets) for n in ahead]
+        whites = Whitener.each(record, ahead, before, coarse=errors.shape[-1] == 1)
+        slopes = np.stack([(w.row_likelihoods(errors) - rows) / _STEP for w in whites])
         # squared scores tell the information where the model fits; far from it they are too large by the square of this
-        excess = max(1.0, float((Whitener(record, replace(model(z), within=None))(mean) ** 2).mean()))
+        excess = max(1.0, float((white(z)(errors) ** 2).mean()))
         information = slopes @ slopes.T / excess**2 + np.eye(len(z))
         gradient = slopes.sum(1) - z
         # what an end holds back does not move
@@ -149,7 +118,7 @@ def fit_noise(
             new = z.copy()
             new[free] += step
             new = np.clip(new, -ends, ends)
-            new_rows = likelihoods(new)
+            new_rows = white(new).row_likelihoods(errors)
             new_value = float(new_rows.sum()) - 0.5 * float(new @ new)
             if new_value >= value:
                 better = True

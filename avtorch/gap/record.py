@@ -160,10 +160,10 @@ class Record:
         )
 
     def padded(self, values: Float) -> Float:
-        """Counted rows' `values` (..., counted) at their places in (..., length), zeros between."""
-        out = np.zeros((*values.shape[:-1], self.length))
-        out[..., self.target] = values
-        return out
+        """Counted rows' `values` (..., counted, group) at their places in (..., length * group), zeros between."""
+        out = np.zeros((*values.shape[:-2], self.length, values.shape[-1]))
+        out[..., self.target, :] = values
+        return out.reshape(*values.shape[:-2], -1)
 
     def seen(self, responses: Sequence[Tensor], *, coarse: bool = False) -> Float:
         """Responses by drive, (..., time) each, at rows that count: (..., counted, group), `coarse` with group 1."""

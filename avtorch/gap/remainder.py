@@ -65,18 +65,13 @@ def remainder(
     rollout: Float,
     *,
     explained: float = 0.0,
-    before: tuple[Whitener, int] | None = None,
 ) -> Remainder:
     """Of errors (witness, counted, group) of a candidate whose rollout is (witness, counted, group).
 
     `explained` [nats]: what the candidate's random causes explain although `errors` still show it (lost messages:
-    `found.losses.evidence`); it is taken off whatever is above 0. `before`: another noise, and the row until which it
-    held.
+    `found.losses.evidence`); it is taken off whatever is above 0.
     """
     look = _Look(white, errors, rollout)
-    if before is not None:
-        calm, row = before
-        look.e[:, :row] = calm(errors.mean(-1, keepdims=True))[:, :row, 0]
     return Remainder(
         *(
             max(nats - explained, min(nats, 0.0))
@@ -90,8 +85,9 @@ class _Look:
 
     def __init__(self, white: Whitener, errors: Float, rollout: Float) -> None:
         record = white.record
-        self.white, self.dt, self.witnesses = white, record.dt, record.witnesses
-        self.e = white(errors.mean(-1, keepdims=True))[..., 0]
+        self.white, self.dt, self.witnesses, self.group = white, record.dt, record.witnesses, errors.shape[-1]
+        self.each = white(errors)
+        self.e = _summed(self.each)
         self.rows = self.e.shape[1]
         told = rollout.mean(-1)
         # one row late: within a group of rows, commands already answer to the first rows' noise
@@ -105,15 +101,23 @@ class _Look:
 
     def _force(self, x: Float) -> Float:
         """White image (column, witness * counted) of accelerations (column, counted) of the car itself."""
-        return self._image(x, {"accel": x, "speed": np.cumsum(x, -1) * self.dt})
+        return self._image(x, True, self.witnesses)
 
     def _reading(self, x: Float, witness: str) -> Float:
         """Likewise of what only one witness shows."""
-        return self._image(x, {w: x if w == witness else np.zeros_like(x) for w in self.witnesses})
+        return self._image(x, False, (witness,))
 
-    def _image(self, x: Float, seen: dict[str, Float]) -> Float:
-        columns = np.stack([seen[w] for w in self.witnesses], 1)
-        return self.white(columns[..., None])[..., 0].reshape(len(x), -1)
+    def _image(self, x: Float, moves: bool, seen: Sequence[str]) -> Float:
+        out = np.empty((len(x), len(self.witnesses), self.rows))
+        for i, column in enumerate(x):
+            rows = np.zeros((len(self.witnesses), self.rows, self.group))
+            for k, witness in enumerate(self.witnesses):
+                if witness in seen:
+                    rows[k] = column[:, None]
+                    if moves and witness == "speed":
+                        rows[k] = (np.cumsum(rows[k]) * self.dt / self.group).reshape(self.rows, self.group)
+            out[i] = _summed(self.white(rows))
+        return out.reshape(len(x), -1)
 
     def flexible(self) -> float:
         e, both = self.e.ravel(), len(self.witnesses) == 2
@@ -130,7 +134,7 @@ class _Look:
         told += [_evidence(x, e) for x in (*forces, np.concatenate(forces), self._force(_hats(self.u, 9)))]
         if both:
             told += [_evidence(self._reading(x, "accel"), e) for x in (of_a, of_v, of_t, a * of_v, a * of_t)]
-            told += [_evidence(self._reading(x, "speed"), e) for x in (of_a, of_v, v * of_t)]
+            told += [_evidence(self._reading(x, "speed"), e) for x in (of_a, of_v)]
         push, brake = np.maximum(a, 0), np.minimum(a, 0)
         pushes, brakes = ([_lowpass(x, s, self.dt) for s in (0.2, 0.6, 2.0, 6.0, 20.0)] for x in (push, brake))
         told.append(_evidence(self._force(np.stack([push, brake, *pushes, *brakes])), e))
@@ -164,19 +168,21 @@ class _Look:
         record = self.white.record
         # rows at their own times, zeros between; padded so that no frequency falls between two
         place = record.source - record.source[0]
-        span, count = int(place[-1]) + 1, len(self.e)
-        grid = np.zeros((count, span))
-        grid[:, place] = self.e
-        f = np.fft.rfftfreq(2 * span, self.dt)
+        count, dt = len(self.e), self.dt / self.group
+        grid = np.zeros((count, int(place[-1]) + 1, self.group))
+        grid[:, place] = self.each
+        grid = grid.reshape(count, -1)
+        span = grid.shape[1]
+        f = np.fft.rfftfreq(2 * span, dt)
         use = (f > 0.05) & (f < 0.49 / self.dt)
         seen, f = np.fft.rfft(grid, n=2 * span, axis=-1)[:, use], f[use]
-        length = min(self.rows, 2048)
+        length = min(span, 2048 * self.group)
         through = []
         for i in range(count):
             unit = np.zeros((count, length))
             unit[i, 0] = 1.0
             own = np.fft.rfft(self.white.response(unit))
-            at = np.fft.rfftfreq(length, self.dt)
+            at = np.fft.rfftfreq(length, dt)
             through.append(np.stack([np.interp(f, at, y.real) + 1j * np.interp(f, at, y.imag) for y in own]))
         as_speed = 1 / (2j * np.pi * f)
         answers = [through[0] if "accel" in self.witnesses else through[0] * as_speed]
@@ -185,7 +191,7 @@ class _Look:
         told = []
         for answer in answers:
             weight = np.maximum((np.abs(answer) ** 2).sum(0), 1e-15)
-            power = np.abs((answer.conj() * seen).sum(0)) ** 2 / weight / self.rows
+            power = np.abs((answer.conj() * seen).sum(0)) ** 2 / weight / (self.rows * self.group)
             # against the level of the spectrum around, or a broad hump would pass for lines
             power /= np.maximum(gaussian_filter1d(np.minimum(power, 6.0), 60), 1.0)
             told += [_mean(power * s / (1 + s) - np.log1p(s)) for s in (5.0, 30.0, 200.0)]
@@ -220,6 +226,11 @@ class _Look:
         z = np.clip(np.abs(self.e / self.e.std(-1, keepdims=True)), 0, 8)
         excess = (z**4).mean(-1) - 3
         return float(np.maximum(self.rows * excess**2 / 48 * np.sign(excess), 0).sum())
+
+
+def _summed(e: Float) -> Float:
+    """White rows (..., counted, group) summed over groups to white ones (..., counted)."""
+    return e.sum(-1) / np.sqrt(e.shape[-1])
 
 
 def _mean(nats: Sequence[float] | Float) -> float:

@@ -77,7 +77,7 @@ def repaired(found: Found, baseline: GapPlant | None = None, draws: Draws | None
     if "gust.sd_mps2" in told:
         effects.append(Gust(told["gust.sd_mps2"], told["gust.time_constant_s"]))
     if "outliers.fraction" in told:
-        own_sd = noise.accel_sd if noise.within is None else noise.within[0]
+        own_sd = noise.accel_sd
         effects.append(Outliers(told["outliers.fraction"], told["outliers.scale"], noise_sd=float(own_sd)))
     if "command_hold.hold_fraction" in told:
         effects.append(CommandHold(told["command_hold.hold_fraction"]))

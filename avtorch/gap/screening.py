@@ -118,12 +118,12 @@ def _tried(candidate: Candidate, white: Whitener, starts: Float, onsets: bool) -
         z = starts[i : i + _AT_ONCE]
         cost = 0.5 * (z**2).sum(1)
         rows = -0.5 * (white(measured - candidate.rollouts(z, coarse=True)) ** 2).sum((1, 3))
-        whole.append(white.constant + rows.sum(1) - cost)
+        whole.append(white.constant_of(coarse=True) + rows.sum(1) - cost)
         if not onsets:
             continue
         quiet = -0.5 * (white(measured - candidate.baseline_rollouts(z, coarse=True)) ** 2).sum((1, 3))
         for j, row in enumerate(rows):
             along = profile(quiet[j if len(quiet) > 1 else 0], row)[within]
-            late.append(white.constant + float(along.max()) - cost[j])
+            late.append(white.constant_of(coarse=True) + float(along.max()) - cost[j])
             when.append(within.start + int(along.argmax()))
     return np.concatenate(whole), np.array(late), np.array(when)

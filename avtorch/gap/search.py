@@ -18,6 +18,7 @@ from avtorch.gap.aliases import judged
 from avtorch.gap.candidate import Candidate
 from avtorch.gap.chance import Tails, tails
 from avtorch.gap.checkpoint import Checkpoint, Kept
+from avtorch.gap.earlier import CALM, whitener
 from avtorch.gap.effect import EFFECTS, Effect
 from avtorch.gap.effects.road_grade import RoadGrade
 from avtorch.gap.fit import finish, left_over, modes
@@ -25,7 +26,7 @@ from avtorch.gap.found import Found, Race, cleaned, merged, white_first
 from avtorch.gap.gusts import gust
 from avtorch.gap.innovations import NoiseModel, Whitener
 from avtorch.gap.losses import losses
-from avtorch.gap.noise_fit import CALM, fit_noise
+from avtorch.gap.noise_fit import fit_noise
 from avtorch.gap.onset import averaged, refined
 from avtorch.gap.pairing import Base, joint, swapped
 from avtorch.gap.plant import GapPlant
@@ -137,11 +138,12 @@ class Search:
             usual = 2 if record.group > 1 and not coarse else rounds + 1
             for turn in range(_TURNS):
                 noise = noise.seen_through(self._values(candidate, z))
-                white = Whitener(record, noise)
+                white = whitener(record, noise, onset=onset)
                 enough = ENOUGH if coarse else 0.05
                 z = modes(candidate, white, z[None], onset=onset, iterations=4, coarse=coarse, enough=enough)[0][0]
                 errors = left_over(candidate, white, z, onset, coarse=coarse)
-                fitted = fit_noise(record, errors, noise, T_L=self._values(candidate, z)["T_L"], iterations=3)
+                lag = self._values(candidate, z)["T_L"]
+                fitted = fit_noise(record, errors, noise, T_L=lag, onset=onset, iterations=3)
                 noise = fitted.noise
                 new = float(fitted.rows.sum()) + fitted.log_prior - 0.5 * float(z @ z)
                 if new > value:
@@ -220,7 +222,7 @@ class Search:
         if onset is None:
             return self._settled(candidate, z, noise)
         record = candidate.record
-        white = Whitener(record, noise)
+        white = whitener(record, noise, onset=onset)
         for _ in range(2):
             z = modes(candidate, white, z[None], onset=onset, iterations=4)[0][0]
             moved, _ = refined(white, candidate, z, onset)
@@ -228,12 +230,10 @@ class Search:
                 break
             onset = moved
         settled = self._settled(candidate, z, noise, onset=onset)
-        white = Whitener(record, settled.noise.noise)
-        moved, tried = refined(white, candidate, settled.z, onset)
+        moved, tried = refined(settled.white, candidate, settled.z, onset)
         if abs(moved - onset) * record.dt > 0.5:
             settled = self._settled(candidate, settled.z, settled.noise.noise, onset=moved)
-            white = Whitener(record, settled.noise.noise)
-            _, tried = refined(white, candidate, settled.z, moved)
+            _, tried = refined(settled.white, candidate, settled.z, moved)
         return replace(settled, log_evidence=settled.log_evidence + averaged(tried, record.dt))
 
     # pairs ---------------------------------------------------------------------------------------------------------
@@ -270,7 +270,7 @@ class Search:
             if done is None or done.log_evidence < single[0].log_evidence + _SECOND or self._late():
                 break
             # a better partner for either half, now that the noise is what the best pair leaves over
-            white = Whitener(record, done.noise.noise)
+            white = done.white
             _, value = modes(done.candidate, white, done.z[None], onset=done.onset, iterations=1, coarse=True)
             here = Look(done.candidate, done.z, float(value[0]), done.onset)
             near = here.value - _CLOSE
@@ -320,12 +320,17 @@ class Search:
         """Errors of a candidate's rollout at the log's own rate, (witness, counted)."""
         candidate = Candidate(raw, of.candidate.effects, self.baseline)
         onset = None
-        if of.onset is not None and not of.gust:
-            onset = int(np.searchsorted(raw.source, of.candidate.record.source[of.onset] * of.candidate.record.group))
+        if of.onset is not None:
+            onset = self._raw_row(raw, of, of.onset)
         errors = candidate.errors(of.z[None], onset)[0]
         if of.profile is not None:
             errors = errors - candidate.grade_response(of.profile)
         return errors
+
+    @staticmethod
+    def _raw_row(raw: Record, of: Found, row: int) -> int:
+        """Where a counted row of the search's record lies among those of single rows."""
+        return int(np.searchsorted(raw.source, of.candidate.record.source[row] * of.candidate.record.group))
 
     def _glitched(self, found: list[Found], glitches: Tails) -> list[Found]:
         """Every candidate with outliers besides, and outliers alone."""
@@ -347,7 +352,7 @@ class Search:
         out = []
         for f in bases:
             errors = self._raw_errors(raw, f)
-            white = Whitener(raw, f.noise.noise.by_rows(raw.witnesses))
+            white = Whitener(raw, f.noise.noise, tuple((self._raw_row(raw, f, row), n) for row, n in f.white.until))
             lost = losses(white, errors, raw.command[raw.source], f.values["T_L"], f.values["K_L"])
             name = "+".join(sorted([*([] if f is none else [f.name]), "command_hold"]))
             out.append(replace(f, name=name, log_evidence=f.log_evidence + lost.evidence, losses=lost))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_are
 
+from avtorch.gap.earlier import CALM, earlier
 from avtorch.gap.innovations import NoiseModel, Whitener, _motion, _steady
 from avtorch.gap.record import Record
 from tests.gap.records import BOTH, Float, dense_covariance, errors_of, log_normal_density, log_of, record_of
@@ -123,31 +124,29 @@ def test_the_response_is_the_filter_on_the_first_rows(rotating_seed: int) -> Non
     np.testing.assert_allclose(again, raw - part * image, atol=1e-9)
 
 
-def test_rows_in_groups_count_by_their_mean_and_by_what_they_differ(rotating_seed: int) -> None:
+def test_rows_in_groups_pass_the_filter_of_single_rows(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
-    group, within = 5, (0.07, 0.03)
-    grouped = Record.of(log_of(seconds=16.0, rate_hz=100))
-    assert grouped.group == group
+    log = log_of(seconds=16.0, rate_hz=100)
+    grouped, single = Record.of(log), Record.of(log, rate_hz=1e9)
+    assert (grouped.group, single.group) == (5, 1)
     assert grouped.dt == pytest.approx(0.05)
-    noise = replace(NOISES["usual"], within=within)
-    means = errors_of(noise, grouped, rng)
-    apart = rng.standard_normal((2, grouped.rows, group)) * np.array(within)[:, None, None]
-    apart -= apart.mean(-1, keepdims=True)
-    errors = means + apart
+    assert single.rows == 5 * grouped.rows
+    noise = NOISES["usual"]
+    errors = errors_of(noise, single, rng)
+    together = errors.reshape(2, grouped.rows, 5)
     white = Whitener(grouped, noise)
-    e = white(errors)
-    assert e.shape == (2, grouped.rows, 1 + group)
-    alone = Whitener(grouped, replace(noise, within=None))
-    np.testing.assert_allclose(e[..., :1], alone(means), atol=1e-9)
-    # white differences of a group have `group - 1` degrees of freedom; by QR, contrasts of unit length
-    contrasts = np.linalg.qr(np.column_stack([np.ones(group), np.eye(group)[:, 1:]]))[0][:, 1:]
-    exact = float(alone.log_likelihood(means))
-    for x, sd in zip(errors, within, strict=True):
-        c = x @ contrasts
-        exact += float((-0.5 * (c / sd) ** 2 - np.log(sd) - 0.5 * np.log(2 * np.pi)).sum())
-    assert float(white.log_likelihood(errors)) == pytest.approx(exact, abs=1e-6)
-    # errors of group 1, of a coarse rollout, pass without that part
-    assert white(means).shape == (2, grouped.rows, 1)
+    np.testing.assert_allclose(white(together).reshape(2, -1, 1), Whitener(single, noise)(errors), atol=1e-9)
+    exact = float(Whitener(single, noise).log_likelihood(errors))
+    assert float(white.log_likelihood(together)) == pytest.approx(exact, abs=1e-6)
+
+
+def test_means_of_groups_become_white_at_their_own_interval(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    grouped = Record.of(log_of(seconds=82.0, rate_hz=100))
+    means = errors_of(NOISES["usual"].of_means(5), grouped, rng)
+    assert means.shape[-1] == 1
+    e = Whitener(grouped, NOISES["usual"])(means)
+    assert (e**2).mean() == pytest.approx(1.0, abs=5 * np.sqrt(1 / grouped.rows))
 
 
 # an accelerometer that is late, or shows too much -------------------------------------------------------------------
@@ -294,10 +293,42 @@ def test_filters_designed_together_are_each_alone(noise: list[NoiseModel], witne
     for white, own in zip(Whitener.each(record, noises), noises, strict=True):
         alone = Whitener(record, own)
         assert white.noise is own
-        for got, want in zip(white._filter[0], alone._filter[0], strict=True):
-            np.testing.assert_allclose(np.array(got), np.array(want), rtol=0, atol=1e-12)
-        np.testing.assert_allclose(white._filter[1], alone._filter[1], rtol=0, atol=1e-12)
-        assert white.constant == pytest.approx(alone.constant, rel=1e-12)
+        assert white.constant_of(coarse=False) == pytest.approx(alone.constant_of(coarse=False), rel=1e-12)
+        errors = np.random.default_rng(0).standard_normal(record.measured.shape)
+        np.testing.assert_allclose(white(errors), alone(errors), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("rate_hz", [20, 60])
+@pytest.mark.parametrize("witnesses", WITNESSES)
+def test_each_part_of_a_record_has_its_own_noise(witnesses: tuple[str, ...], rate_hz: int, rotating_seed: int) -> None:
+    """As if the other part did not count, but for the speed's offset, which both tell of."""
+    record = record_of(30.0, rate_hz=rate_hz, witnesses=witnesses)
+    noise, row = NoiseModel(), 300
+    calm = noise.replaced(process_sd=0.02, accel_sd=0.1)
+    errors = np.random.default_rng(rotating_seed).standard_normal((2, *record.measured.shape))
+    both = Whitener(record, noise, ((row, calm),))
+    assert Whitener(record, noise, ((row, noise),)).log_likelihood(errors) == pytest.approx(
+        Whitener(record, noise).log_likelihood(errors), rel=1e-9
+    )
+    parts = both._filtered(errors)
+    np.testing.assert_allclose(parts[..., :row, :], Whitener(record, calm)._filtered(errors)[..., :row, :], atol=1e-9)
+    np.testing.assert_allclose(parts[..., row:, :], Whitener(record, noise)._filtered(errors)[..., row:, :], atol=1e-9)
+    assert both.row_likelihoods(errors[0]).sum() == pytest.approx(both.log_likelihood(errors[:1])[0], rel=1e-9)
+    drawn = Whitener.each(record, [noise, calm], [((row, calm),), ((row, noise),)])
+    np.testing.assert_allclose(drawn[0](errors), both(errors), rtol=0, atol=1e-9)
+
+
+def test_before_an_onset_the_sensor_reads_plainly_and_no_gust_blows() -> None:
+    late = NoiseModel(sensor_lag=0.3, force_sd=0.2)
+    assert earlier(late) == ()
+    assert earlier(NoiseModel(force_sd=0.2), onset=50) == ()
+    plain = late.replaced(sensor_lag=0.0)
+    assert earlier(late, onset=50) == ((50, plain),)
+    assert earlier(late, gust_onset=50) == ((50, late.replaced(force_sd=CALM)),)
+    calm = plain.replaced(force_sd=CALM)
+    assert earlier(late, onset=50, gust_onset=50) == ((50, calm),)
+    assert earlier(late, onset=50, gust_onset=80) == ((50, calm), (80, late.replaced(force_sd=CALM)))
+    assert earlier(late, onset=80, gust_onset=50) == ((50, calm), (80, plain))
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.01, 0.05, 0.1])
@@ -345,19 +376,7 @@ def test_the_sensor_is_the_candidates() -> None:
     assert noise.seen_through({"sensor_lag.lag_s": 1e-3}) == noise
 
 
-def test_single_rows_have_the_noise_within_a_group() -> None:
-    noise = replace(NOISES["usual"], within=(0.07, 0.03), sensor_lag=0.1)
-    assert noise.by_rows(BOTH) == replace(noise, within=None, accel_sd=0.07, speed_sd=0.03)
-    speed = replace(NOISES["usual"], within=(0.03,))
-    assert speed.by_rows(("speed",)) == replace(speed, within=None, speed_sd=0.03)
-    assert NOISES["usual"].by_rows(BOTH) is NOISES["usual"]
-
-
-def test_rows_one_by_one_become_white_under_the_noise_of_their_groups(rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
-    raw = Record.of(log_of(seconds=82.0, rate_hz=100, noise=None), rate_hz=1e9)
-    errors = errors_of(replace(NOISES["usual"], accel_sd=0.07, speed_sd=0.03), raw, rng)
-    # the white noise of a group's mean is what it is: rows differ by what they differ by within
-    means = replace(NOISES["usual"], within=(0.07, 0.03), accel_sd=0.4, speed_sd=0.2)
-    e = Whitener(raw, means.by_rows(raw.witnesses))(errors)[..., 0]
-    assert (e**2).mean() == pytest.approx(1.0, abs=5 * np.sqrt(1 / raw.rows))
+def test_means_have_less_white_noise() -> None:
+    noise = replace(NOISES["usual"], accel_sd=0.06, speed_sd=0.03, sensor_lag=0.1)
+    assert noise.of_means(4) == replace(noise, accel_sd=0.03, speed_sd=0.015)
+    assert noise.of_means(1) == noise

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from avtorch.gap.innovations import NAMES, NoiseModel, Whitener
-from avtorch.gap.noise_fit import CALM, GUST, PRIORS, Prior, fit_noise, row_likelihoods
+from avtorch.gap.noise_fit import GUST, PRIORS, Prior, fit_noise
 from avtorch.gap.onset import allowed, profile
 from avtorch.gap.record import Record
 from tests.gap.records import BOTH, Float, drawn_errors, errors_of, log_of, ornstein, record_of
@@ -81,22 +81,13 @@ def test_what_is_seen_well_is_told_well(rotating_seed: int) -> None:
 def test_row_likelihoods_sum_to_the_whole(rate_hz: int, rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     record = Record.of(log_of(seconds=22.0, rate_hz=rate_hz))
-    noise = NoiseModel(within=(0.05, 0.02) if record.group > 1 else None)
+    noise = NoiseModel()
     errors = errors_of(noise, record, rng) + 0.04 * rng.standard_normal((2, record.rows, record.group))
-    rows = row_likelihoods(record, errors, noise)
+    rows = Whitener(record, noise).row_likelihoods(errors)
     assert rows.shape == (record.rows,)
     assert rows.sum() == pytest.approx(float(Whitener(record, noise).log_likelihood(errors)))
     fit = fit_noise(record, errors, noise, T_L=0.35)
-    np.testing.assert_allclose(fit.rows, row_likelihoods(record, errors, fit.noise), rtol=0, atol=1e-8)
-    if record.group > 1:
-        assert fit.noise.within is not None
-        # 5 standard errors of an estimated standard deviation
-        bar = 5 / np.sqrt(2 * record.rows * (record.group - 1))
-        np.testing.assert_allclose(fit.noise.within, 0.04, rtol=bar)
-    late = replace(noise, force_sd=0.2)
-    spliced = row_likelihoods(record, errors, late, 100)
-    np.testing.assert_array_equal(spliced[:100], row_likelihoods(record, errors, replace(noise, force_sd=CALM))[:100])
-    np.testing.assert_array_equal(spliced[100:], row_likelihoods(record, errors, late)[100:])
+    np.testing.assert_allclose(fit.rows, Whitener(record, fit.noise).row_likelihoods(errors), rtol=0, atol=1e-8)
 
 
 def test_the_moment_a_force_sets_in_is_found(rotating_seed: int) -> None:
@@ -111,14 +102,14 @@ def test_the_moment_a_force_sets_in_is_found(rotating_seed: int) -> None:
     errors[1, at:] += gained
     errors = errors[..., None]
 
-    quiet = row_likelihoods(record, errors, calm)
-    loud = row_likelihoods(record, errors, truth)
+    quiet = Whitener(record, calm).row_likelihoods(errors)
+    loud = Whitener(record, truth).row_likelihoods(errors)
     along = profile(quiet, loud)
     within = allowed(record.rows, record.dt)
     onset = within.start + int(np.argmax(along[within]))
     # the force begins at any size, now and then near nought: it grows by 0.3 m/s² within its time constant
     assert abs(onset - at) * record.dt < 3.0
-    fit = fit_noise(record, errors, truth, T_L=0.35, priors=GUST, onset=onset, iterations=10)
+    fit = fit_noise(record, errors, truth, T_L=0.35, priors=GUST, gust_onset=onset, iterations=10)
     whole = fit_noise(record, errors, truth, T_L=0.35, priors=GUST, iterations=10)
     assert fit.rows.sum() > whole.rows.sum() + 20
     for name in ("force_sd", "force_time"):

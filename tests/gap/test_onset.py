@@ -43,9 +43,7 @@ def test_a_known_onset_is_found(name: str, rate_hz: int, rotating_seed: int) -> 
         seed=int(rng.integers(2**31)),
     )
     record = Record.of(Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed))
-    white = Whitener(
-        record, NOISE.replaced() if record.group == 1 else NoiseModel(**{**vars(NOISE), "within": (0.05, 0.02)})
-    )
+    white = Whitener(record, NOISE)
     candidate = Candidate.named(record, name, plant())
     z = modes(candidate, white, candidate.z_of({"T_L": 0.4, "K_L": 1.0, **start})[None], coarse=True)[0][0]
     onset, gained = rough(white, candidate, z)
@@ -56,7 +54,7 @@ def test_a_known_onset_is_found(name: str, rate_hz: int, rotating_seed: int) -> 
     found = float(record.time[record.source[onset]])
     # a cause of this size is worth some 10 nats a second; the command moves every 3.5 s at the latest
     assert abs(found - at) < 3.6
-    whole = white.log_likelihood(candidate.errors(modes(candidate, white, z[None])[0]))
+    whole = white.log_likelihood(candidate.errors(modes(candidate, white, z[None])[0], coarse=True))
     assert tried.max() > float(whole[0]) + 10
     assert -np.log(record.rows) <= averaged(tried, record.dt) < 0
 

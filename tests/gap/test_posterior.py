@@ -29,11 +29,11 @@ from avtorch.gap import (
     SensorScale,
     plant,
 )
-from avtorch.gap.adjoint import adjoint
+from avtorch.gap.earlier import CALM
 from avtorch.gap.found import Found
 from avtorch.gap.importance import effective, importance
 from avtorch.gap.innovations import Whitener
-from avtorch.gap.joint import RolloutDensity, acting_onset, root
+from avtorch.gap.joint import RolloutDensity, root
 from avtorch.gap.posterior import drawn, exact_one_in, fitted, misfit, moved, posterior, repaired, reported
 from avtorch.gap.surrogate import Corrected
 from avtorch.inference.density import Density, ScoredDensity, SubsampledDensity
@@ -77,14 +77,13 @@ def near(found: Found, count: int, seed: int = 0) -> torch.Tensor:
 @pytest.mark.parametrize("rate_hz", [20, 60])
 def test_the_adjoint_is_the_transpose(rate_hz: int) -> None:
     found = found_of([], rate_hz=rate_hz)
-    white = Whitener(found.candidate.record, found.noise.noise)
+    record, noise = found.candidate.record, found.noise.noise
+    white = Whitener(record, noise, ((100, noise.replaced(accel_sd=0.1)), (300, noise.replaced(force_sd=0.3))))
     rng = np.random.default_rng(0)
     errors = rng.standard_normal((2, *found.errors.shape))
     images = white(errors)
     back = rng.standard_normal(images.shape)
-    np.testing.assert_allclose(
-        (images * back).sum((1, 2, 3)), (errors * adjoint(white, back)).sum((1, 2, 3)), rtol=1e-9
-    )
+    np.testing.assert_allclose((images * back).sum((1, 2, 3)), (errors * white.turned(back)).sum((1, 2, 3)), rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -143,20 +142,17 @@ def test_far_out_there_is_no_rollout_of_infinities() -> None:
 
 def test_before_a_gust_the_force_is_calm() -> None:
     found = found_of([Gust(), DeadTime(0.163)], gust_onset=250, noise=QUIET.replaced(force_sd=0.2))
-    assert acting_onset(found) is None  # the dead time was there from the start
     density = RolloutDensity.of(found)
-    assert [part for _, part in density.parts] == [slice(0, 250), slice(250, found.candidate.record.rows)]
+    assert density.onset is None  # the dead time was there from the start
+    ((row, calm),) = density.white.until
+    assert row == 250
+    assert calm == found.noise.noise.replaced(force_sd=CALM)
     z, h = near(found, 1), 1e-5
     for i in range(z.shape[-1]):
         step = torch.zeros_like(z)
         step[..., i] = h
         slope = (density.value(z + step) - density.value(z - step)) / (2 * h)
         torch.testing.assert_close(density.score(z)[..., i], slope, rtol=1e-4, atol=1e-3)
-
-
-def test_an_effect_from_an_onset_is_told_from_a_gust() -> None:
-    found = found_of([Gust(), DeadTime(0.163)], onset=200, noise=QUIET.replaced(force_sd=0.2))
-    assert acting_onset(found) == 200
 
 
 # the surrogate --------------------------------------------------------------------------------------------------------

@@ -113,9 +113,9 @@ def test_standstill_and_a_drivers_foot_do_not_count() -> None:
     assert (steps[np.diff(record.stretch) == 0] == 1).all()
     assert (steps[np.diff(record.stretch) == 1] >= 4 / record.dt).all()
     assert record.length > record.target.max()
-    padded = record.padded(np.ones((2, record.rows)))
-    assert padded.shape == (2, record.length)
-    assert padded.sum() == 2 * record.rows
+    padded = record.padded(np.ones((2, record.rows, record.group)))
+    assert padded.shape == (2, record.length * record.group)
+    assert padded.sum() == 2 * record.rows * record.group
     # the whole drive is rolled out all the same: one drive
     assert len(record.drives) == 1
 

@@ -58,10 +58,8 @@ def test_a_loop_that_feeds_noise_back_feigns_nothing(rotating_seed: int) -> None
     record = Record.of(log)
     assert record.group == 5
     errors = np.stack([process + seen[0], drifted + seen[1]]).reshape(2, -1, 5)[:, record.source]
-    noise = fine.replaced(accel_sd=fine.accel_sd / np.sqrt(5), speed_sd=fine.speed_sd / np.sqrt(5), force_sd=1e-4)
-    left = remainder(Whitener(record, noise), errors, record.measured - errors)
-    # means of five rows of a process are not quite its values, which memory may tell; nothing else may
-    assert max(left.flexible, left.drift, left.line, left.bursts) < CHANCE
+    left = remainder(Whitener(record, fine.replaced(force_sd=1e-4)), errors, record.measured - errors)
+    assert max(getattr(left, n) for n in NAMES) < CHANCE
 
 
 def _pushed(record: Record, force: Float) -> Float:
