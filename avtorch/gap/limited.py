@@ -1,6 +1,8 @@
-"""Rate-limited recursions row by row, in NumPy: a limit that binds for long leaves nothing to parallelise.
+"""Rate-limited recursions row by row, in NumPy, many stretches of the drive at once.
 
-The batch is the inner dimension, so a hundred columns cost hardly more than one.
+Each stretch first starts at its target, then where the one before it ended, until that no longer changes: a lag forgets
+its start, so a few passes do for all. Where a limit binds for long nothing is forgotten and there are more of them, at
+worst as many as stretches. The batch is the inner dimension, so a hundred columns cost hardly more than one.
 """
 
 from __future__ import annotations
@@ -15,6 +17,9 @@ from torch import Tensor
 
 Float = NDArray[np.float64]
 RowStep = Callable[[Float, Float, Float, Float, Float], Float]
+
+_STRETCHES, _SHORTEST = 128, 128  # rows of the shortest stretch
+_SAME = 1e-13  # [m/s²]
 
 
 class Held(Protocol):
@@ -49,25 +54,40 @@ def by_rows(step: RowStep, start: Tensor, parts: Sequence[Held], jerk: Tensor) -
         (*start.shape, 1), (*limit.shape[:-1], 1) if limit.dim() else (), *(x.shape for p in parts for x in _tensors(p))
     )
     rows = shape[-1]
-    state = start.detach().expand(shape[:-1]).reshape(-1).numpy().copy()
+    size = min(rows, max(_SHORTEST, int(np.ceil(rows / _STRETCHES))))
+    count = -(-rows // size)
+    first = start.detach().expand(shape[:-1]).reshape(-1).numpy()
     bound = limit.expand(*shape[:-1], 1).reshape(-1).numpy()
-    columns = [[_by_time(x, shape) for x in _tensors(p)] for p in parts]
-    out = np.empty((rows, state.size))
-    for k in range(rows):
-        for target, lag, length in columns:
-            state = step(state, target(k), lag(k), length(k), bound)
-        out[k] = state
-    return torch.as_tensor(np.ascontiguousarray(out.T)).reshape(shape)
+    columns = [[_by_time(x, shape, count, size) for x in _tensors(p)] for p in parts]
+    begin = np.array(np.broadcast_to(columns[0][0](0), (count, first.size)))
+    out = np.full((size, count, first.size), np.nan)
+    while True:
+        begin[0] = first
+        state = begin
+        for k in range(size):
+            for target, lag, length in columns:
+                state = step(state, target(k), lag(k), length(k), bound)
+            known = np.abs(state - out[k]).max() <= _SAME
+            out[k] = state
+            if known:  # and so is what follows
+                break
+        ends = np.concatenate([first[None], out[-1, :-1]])
+        if np.abs(ends - begin).max() <= _SAME:
+            break
+        begin = ends
+    whole = np.ascontiguousarray(out.transpose(2, 1, 0)).reshape(first.size, -1)[:, :rows]
+    return torch.as_tensor(np.ascontiguousarray(whole)).reshape(shape)
 
 
 def _tensors(part: Held) -> tuple[Tensor, Tensor, Tensor]:
     return part.target.detach(), part.lag.detach(), part.length.detach()
 
 
-def _by_time(x: Tensor, shape: tuple[int, ...]) -> Any:
-    """`at(k)`: values (batch,) at row `k`; what does not change over time is laid out once."""
+def _by_time(x: Tensor, shape: tuple[int, ...], count: int, size: int) -> Any:
+    """`at(k)`: values (stretch, batch) at row `k` of each; what does not change over time is laid out once."""
     if x.dim() == 0 or x.shape[-1] == 1:
         once = x.expand(*shape[:-1], 1).reshape(-1).numpy() if x.dim() else np.asarray(float(x))
         return lambda k: once
-    table = np.ascontiguousarray(x.expand(shape).reshape(-1, shape[-1]).numpy().T)
-    return table.__getitem__
+    table = x.expand(shape).reshape(-1, shape[-1]).numpy()
+    table = np.pad(table, ((0, 0), (0, count * size - shape[-1])), mode="edge").reshape(-1, count, size)
+    return np.ascontiguousarray(table.transpose(2, 1, 0)).__getitem__

@@ -32,7 +32,7 @@ from avtorch.gap.pairing import Base, joint, swapped
 from avtorch.gap.plant import GapPlant
 from avtorch.gap.record import Record
 from avtorch.gap.screening import ENOUGH, Look, looks
-from avtorch.gap.starts import starts
+from avtorch.gap.starts import starts, traded
 from avtorch.io import Log
 
 Float = NDArray[np.float64]
@@ -136,6 +136,7 @@ class Search:
         for coarse in (True, False) if record.group > 1 else (False,):
             value, best = -np.inf, (z, noise)
             usual = 2 if record.group > 1 and not coarse else rounds + 1
+            z = self._traded(candidate, z, noise, onset, coarse)
             for turn in range(_TURNS):
                 noise = noise.seen_through(self._values(candidate, z))
                 white = whitener(record, noise, onset=onset)
@@ -154,6 +155,16 @@ class Search:
             z, noise = best
         self.checkpoint.keep(candidate.name, onset, Kept(z, noise, log_prior))
         return Kept(z, noise, log_prior).found(candidate, onset)
+
+    def _traded(self, candidate: Candidate, z: Float, noise: NoiseModel, onset: int | None, coarse: bool) -> Float:
+        """`z`, or the best place from which a dead time and the lag are told apart better."""
+        places = np.concatenate([z[None], traded(candidate, z)])
+        if len(places) == 1:
+            return z
+        white = whitener(candidate.record, noise.seen_through(self._values(candidate, z)), onset=onset)
+        # some of them first climb a step
+        moved, values = modes(candidate, white, places, onset=onset, iterations=3, coarse=coarse, enough=ENOUGH)
+        return moved[values.argmax()]
 
     @staticmethod
     def _values(candidate: Candidate, z: Float) -> dict[str, float]:

@@ -47,6 +47,9 @@ GRIDS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
 """Values by effect and parameter; all combinations are tried. A change of gain starts at shares of the drive."""
 
 _CHANGES = 12
+_TRADES = tuple(s * k for k in (0.012, 0.025, 0.04, 0.06, 0.085, 0.12) for s in (-1, 1))
+"""Of a dead time for lag [s]."""
+_LEAST_S = 0.01
 _MANY = 100
 
 
@@ -87,6 +90,21 @@ def one_at_a_time(candidate: Candidate, z: Float) -> Float:
             place = z.copy()
             place[i] = c.z_of(value)
             places.append(place)
+    return np.array(places).reshape(-1, len(z))
+
+
+def traded(candidate: Candidate, z: Float) -> Float:
+    """Places (start, coordinate) with more of a dead time and less lag than at `z`, or the other way round.
+
+    Along this valley the likelihood is rough: a held command that arrives between two rows makes a kink at every row.
+    """
+    keys = [c.key for c in candidate.coordinates]
+    if "dead_time.delay_s" not in keys:
+        return np.zeros((0, len(z)))
+    own = {key: float(x[0]) for key, x in candidate.values(z[None]).items()}
+    lag, delay = own["T_L"], own["dead_time.delay_s"]
+    shifts = [s for s in _TRADES if min(lag - s, delay + s) > _LEAST_S]
+    places = [candidate.z_of({**own, "T_L": lag - s, "dead_time.delay_s": delay + s}) for s in shifts]
     return np.array(places).reshape(-1, len(z))
 
 
