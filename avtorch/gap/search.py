@@ -136,11 +136,12 @@ class Search:
         for coarse in (True, False) if record.group > 1 else (False,):
             value, best = -np.inf, (z, noise)
             usual = 2 if record.group > 1 and not coarse else rounds + 1
-            z = self._traded(candidate, z, noise, onset, coarse)
             for turn in range(_TURNS):
                 noise = noise.seen_through(self._values(candidate, z))
                 white = whitener(record, noise, onset=onset)
                 enough = ENOUGH if coarse else 0.05
+                if turn < 2:  # once under the noise one came with, and once under its own
+                    z = self._traded(candidate, z, white, onset, coarse)
                 z = modes(candidate, white, z[None], onset=onset, iterations=4, coarse=coarse, enough=enough)[0][0]
                 errors = left_over(candidate, white, z, onset, coarse=coarse)
                 lag = self._values(candidate, z)["T_L"]
@@ -156,13 +157,12 @@ class Search:
         self.checkpoint.keep(candidate.name, onset, Kept(z, noise, log_prior))
         return Kept(z, noise, log_prior).found(candidate, onset)
 
-    def _traded(self, candidate: Candidate, z: Float, noise: NoiseModel, onset: int | None, coarse: bool) -> Float:
+    @staticmethod
+    def _traded(candidate: Candidate, z: Float, white: Whitener, onset: int | None, coarse: bool) -> Float:
         """`z`, or the best place from which a dead time and the lag are told apart better."""
         places = np.concatenate([z[None], traded(candidate, z)])
         if len(places) == 1:
             return z
-        white = whitener(candidate.record, noise.seen_through(self._values(candidate, z)), onset=onset)
-        # some of them first climb a step
         moved, values = modes(candidate, white, places, onset=onset, iterations=3, coarse=coarse, enough=ENOUGH)
         return moved[values.argmax()]
 

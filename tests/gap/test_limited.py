@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from avtorch.gap import actuator
+from avtorch.gap import actuator, limited
 from avtorch.gap.actuator import Actuator, Part, State
 from avtorch.gap.limited import by_rows, limited_row, slewed_row
 
@@ -99,6 +99,22 @@ def test_shapes_broadcast_and_nothing_is_differentiated() -> None:
         torch.testing.assert_close(got[i], alone, rtol=0, atol=1e-14)
     single = by_rows(limited_row, torch.zeros((), dtype=D), [own], torch.tensor(4.0, dtype=D))
     torch.testing.assert_close(single, got[1], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("limit", [0.05, 0.5, 5.0])
+def test_stretches_side_by_side_are_one_drive(
+    limit: float, rotating_seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the limit binds for most of the drive and nothing is forgotten."""
+    g = torch.Generator().manual_seed(rotating_seed)
+    rows = 3 * limited._SHORTEST + 17
+    target = torch.cumsum(0.2 * torch.randn(rows, generator=g, dtype=D), 0)
+    length = 0.01 + 0.04 * torch.rand(2, rows, generator=g, dtype=D)
+    part = Part(target, torch.tensor([[0.2], [1.0]], dtype=D), length)
+    start, jerk = torch.tensor([0.0, 1.0], dtype=D), torch.tensor([[limit], [2 * limit]], dtype=D)
+    got = by_rows(limited_row, start, [part, part], jerk)
+    monkeypatch.setattr(limited, "_SHORTEST", rows)
+    torch.testing.assert_close(got, by_rows(limited_row, start, [part, part], jerk), rtol=0, atol=1e-11)
 
 
 def test_a_limit_that_never_binds_is_the_lag_alone() -> None:
