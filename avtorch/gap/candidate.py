@@ -99,13 +99,18 @@ class Candidate:
         """Parameters by key, (column,), for `z` (column, coordinate)."""
         return {c.key: c.value(z[:, i]) for i, c in enumerate(self.coordinates)}
 
+    def held(self, z: Float, onset: int | None) -> Float:
+        """`z` (column, coordinate) with what only an onset can tell put to its prior's centre where there is none."""
+        rests = [c.parameter.of_onset for c in self.coordinates]
+        return np.where(rests, 0.0, z) if onset is None and any(rests) else z
+
     def z_of(self, values: Mapping[str, float]) -> Float:
         """Coordinates for values by key; what is missing gets its prior's centre."""
         return np.array([c.z_of(values[c.key]) if c.key in values else 0.0 for c in self.coordinates])
 
     def rollouts(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
         """Responses for `z` (column, coordinate): (column, witness, counted, group)."""
-        values = self.values(z)
+        values = self.values(self.held(z, onset))
         full = self._rollouts(self.plant, values, coarse)
         if onset is None:
             return full

@@ -102,6 +102,17 @@ def _quadratic(
     return cross + z, square + np.eye(size), value + 0.5 * (z**2).sum(1)
 
 
+def directions(candidate: Candidate, white: Whitener, z: Float, onset: int | None = None) -> Float:
+    """White directions (direction, row) in which its parameters and its road's slope move a rollout from `z`."""
+    moved = np.repeat(z[None], len(z) + 1, 0)
+    moved[1:] += _STEP * np.eye(len(z))
+    e = white(candidate.rollouts(moved, onset)).reshape(len(z) + 1, -1)
+    columns = (e[1:] - e[:1]) / _STEP
+    if candidate.grade_means is None:
+        return columns
+    return np.concatenate([columns, _slope(white, candidate, onset, coarse=False).image])
+
+
 def _integrated(
     slope: Slope, columns: Float, base: Float, square: Float, cross: Float, value: Float
 ) -> tuple[Float, Float, Float]:
@@ -145,6 +156,16 @@ def left_over(candidate: Candidate, white: Whitener, z: Float, onset: int | None
     """Errors (witness, counted, group) at `z` (coordinate,), less what a road's slope explains of them."""
     errors = candidate.errors(z[None], onset, coarse=coarse)[0]
     return errors if candidate.grade_means is None else errors - _sloped(candidate, white, errors, onset)[2]
+
+
+def log_joint(candidate: Candidate, white: Whitener, z: Float, onset: int | None = None, *, coarse: bool) -> float:
+    """Log joint density at `z` (coordinate,), a road's slope integrated out."""
+    e = white(candidate.errors(z[None], onset, coarse=coarse)[0]).ravel()
+    value = white.constant_of(coarse=coarse) - 0.5 * float(e @ e) - 0.5 * float(z @ z)
+    if candidate.grade_means is not None:
+        slope = _slope(white, candidate, onset, coarse)
+        value += float(slope.weighed((slope.image @ e)[None])[0][0])
+    return value
 
 
 def _sloped(candidate: Candidate, white: Whitener, errors: Float, onset: int | None) -> tuple[float, Float, Float]:

@@ -72,7 +72,9 @@ class RolloutDensity:
     def constrain(self, z: Tensor) -> Tensor:
         """Values of the plant's parameters, each in its unit."""
         each = zip(self.candidate.coordinates, z.unbind(-1), strict=True)
-        return torch.stack([c.parameter.constrain(c.wider * x) for c, x in each], -1)
+        held = self.onset is None
+        places = [(c, torch.zeros_like(x) if held and c.parameter.of_onset else x) for c, x in each]
+        return torch.stack([c.parameter.constrain(c.wider * x) for c, x in places], -1)
 
     def unconstrain(self, values: Tensor) -> Tensor:
         """`z` for values."""

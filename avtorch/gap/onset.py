@@ -6,10 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.gap.candidate import Candidate, splice
+from avtorch.gap.fit import log_joint
 from avtorch.gap.innovations import Whitener
 
 Float = NDArray[np.float64]
 
+_PLACES, _HALVINGS = 10, 5  # where a slope is first asked, and how often between the best and those beside it
 _NEAREST_S = 4.0  # an onset this close to the start or the end is none
 
 
@@ -28,6 +30,8 @@ def allowed(rows: int, dt: float) -> slice:
 
 def rough(white: Whitener, candidate: Candidate, z: Float) -> tuple[int, float]:
     """Best onset row for parameters `z` of a fit over the whole drive, and what it gains [nats] over none."""
+    if candidate.grade_means is not None:
+        return _along_the_road(white, candidate, z)
     full = candidate.errors(z[None], coarse=True)[0]
     silent = candidate.record.measured.mean(-1, keepdims=True) - candidate.baseline_rollouts(z[None], coarse=True)[0]
     rows = profile(-0.5 * (white(silent) ** 2).sum((0, 2)), -0.5 * (white(full) ** 2).sum((0, 2)))
@@ -39,6 +43,8 @@ def rough(white: Whitener, candidate: Candidate, z: Float) -> tuple[int, float]:
 def refined(white: Whitener, candidate: Candidate, z: Float, onset: int) -> tuple[int, Float]:
     """Best onset row near `onset`, and the log likelihood over all rows tried, (row,), -inf elsewhere."""
     record = white.record
+    if candidate.grade_means is not None:
+        return _beside(white, candidate, z, onset)
     full = candidate.rollouts(z[None], coarse=True)[0]
     silent = candidate.baseline_rollouts(z[None], coarse=True)[0]
     measured = record.measured.mean(-1, keepdims=True)
@@ -52,6 +58,37 @@ def refined(white: Whitener, candidate: Candidate, z: Float, onset: int) -> tupl
             continue
         errors = np.stack([measured - splice(record, full[None], silent[None], int(t))[0] for t in tries])
         found[tries] = white.log_likelihood(errors)
+        onset = int(np.argmax(found))
+    return onset, found
+
+
+def _along_the_road(white: Whitener, candidate: Candidate, z: Float) -> tuple[int, float]:
+    """`rough` for a slope, which is flat where it does not act: what an onset spares is the prior of its coefficients.
+
+    By the density with the slope integrated out, at some places and then between them.
+    """
+    within = allowed(candidate.record.rows, candidate.record.dt)
+    step = (within.stop - 1 - within.start) / (_PLACES - 1)
+    found = {int(row): 0.0 for row in np.linspace(within.start, within.stop - 1, _PLACES)}
+    tries = list(found)
+    for _ in range(_HALVINGS):
+        found |= {row: log_joint(candidate, white, z, row, coarse=True) for row in tries}
+        best = max(found, key=lambda row: found[row])
+        step *= 0.5
+        tries = [int(np.clip(best + s * step, within.start, within.stop - 1)) for s in (-1, 1)]
+    return best, found[best] - log_joint(candidate, white, z, coarse=True)
+
+
+def _beside(white: Whitener, candidate: Candidate, z: Float, onset: int) -> tuple[int, Float]:
+    """`refined` for a slope."""
+    record = candidate.record
+    within = allowed(record.rows, record.dt)
+    found = np.full(record.rows, -np.inf)
+    for reach in (4.0, 1.0):
+        for s in (-1.0, -0.5, 0.0, 0.5, 1.0):
+            row = int(np.clip(onset + round(s * reach / record.dt), within.start, within.stop - 1))
+            if np.isneginf(found[row]):
+                found[row] = log_joint(candidate, white, z, row, coarse=True)
         onset = int(np.argmax(found))
     return onset, found
 

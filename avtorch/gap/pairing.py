@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from avtorch.gap.candidate import Candidate
 from avtorch.gap.effect import Effect
-from avtorch.gap.fit import modes
+from avtorch.gap.fit import directions, modes
 from avtorch.gap.innovations import Whitener
-from avtorch.gap.screening import Look, looks, rest
+from avtorch.gap.onset import allowed
+from avtorch.gap.record import Record
+from avtorch.gap.screening import Look, closer, looks, rest
 from avtorch.gap.starts import of_effect, starts
 
 Float = NDArray[np.float64]
@@ -33,25 +35,37 @@ class Base:
     white: Whitener
 
     @cached_property
+    def _rested(self) -> tuple[Float, float]:
+        """Where the base comes to rest under this noise, and its log joint density there."""
+        z, value = modes(self.candidate, self.white, self.z[None], onset=self.onset, iterations=4)
+        return z[0], float(value[0])
+
+    @property
+    def flat(self) -> float:
+        """Log joint density of the base alone."""
+        return self._rested[1]
+
+    @cached_property
     def _silent(self) -> Float:
-        return self.candidate.rollouts(self.z[None], self.onset, coarse=True)[0]
+        return self.candidate.rollouts(self._rested[0][None], self.onset)[0]
 
     @cached_property
     def _errors(self) -> Float:
         """White errors (row,), less whatever the base's own parameters can do."""
-        e = self.white(self.candidate.record.measured.mean(-1, keepdims=True) - self._silent).ravel()
-        return e - self._own.T @ (self._own @ e)
+        return self._apart(self.white(self.candidate.record.measured - self._silent).reshape(1, -1))[0]
 
     @cached_property
-    def _own(self) -> Float:
-        """Orthonormal white directions (direction, row) along which the base's own parameters move its rollout."""
-        return _directions(self.candidate, self.z, self.onset, self.white)
+    def _own(self) -> tuple[Float, Float]:
+        """White directions (direction, row) in which the base's own parameters move its rollout; their inverse Gram."""
+        columns = directions(self.candidate, self.white, self._rested[0], self.onset)
+        columns = columns[np.linalg.norm(columns, axis=1) > 1e-9]
+        gram = columns @ columns.T
+        return columns, np.linalg.pinv(gram, rcond=1e-10, hermitian=True)
 
-    @cached_property
-    def _flat(self) -> float:
-        """Log joint density where the base has come to rest."""
-        _, value = modes(self.candidate, self.white, self.z[None], onset=self.onset, iterations=2, coarse=True)
-        return float(value[0])
+    def _apart(self, images: Float) -> Float:
+        """White `images` (column, row) less whatever the base's own parameters can do."""
+        columns, inverse = self._own
+        return images - (images @ columns.T) @ inverse @ columns
 
     def score(self, candidate: Candidate, alone: Mapping[str, Mapping[str, float]]) -> tuple[float, Float]:
         """Nats a `candidate` of one effect more could gain, and from which start of its.
@@ -67,21 +81,24 @@ class Base:
         if not known or len(of_effect(candidate, more.name)) <= _MANY:
             begin = np.concatenate([begin, starts(candidate, self.values)])
         if candidate.grade_means is not None and self.candidate.grade_means is None:
-            step, value = modes(candidate, self.white, begin[:1], onset=self.onset, iterations=2, coarse=True)
-            return float(value[0]) - self._flat, step[0]
-        own, e = self._own, self._errors
+            step, value = modes(candidate, self.white, begin[:1], onset=self.onset, iterations=2)
+            return float(value[0]) - self.flat, step[0]
+        e = self._errors
         best, at = -np.inf, begin[0]
         for i in range(0, len(begin), _AT_ONCE):
             some = begin[i : i + _AT_ONCE]
-            apart = self.white(candidate.rollouts(some, self.onset, coarse=True) - self._silent).reshape(len(some), -1)
-            apart = apart - (apart @ own.T) @ own
-            square, cross = np.einsum("cr,cr->c", apart, apart), apart @ e
+            apart = self.white(candidate.rollouts(some, self.onset) - self._silent).reshape(len(some), -1)
+            apart = self._apart(apart)
             # a start that overshoots still tells the direction
-            gains = np.where(square > 1e-6, 0.5 * np.maximum(cross, 0) ** 2 / np.maximum(square, 1e-6), 0.0)
+            gains = _gained(apart**2, apart * e, self.onset is None, self.candidate.record)
             k = int(gains.argmax())
             if gains[k] > best:
                 best, at = float(gains[k]), some[k]
         return best, at
+
+    def closer(self, look: Look) -> Look:
+        """A look at every row, under this noise."""
+        return closer(look, self.white)
 
     def partners(
         self, kinds: Sequence[type[Effect]], alone: Mapping[str, Mapping[str, float]], *, most: int, least: float
@@ -91,6 +108,22 @@ class Base:
         pairs = [Candidate(record, (*own, kind), baseline) for kind in kinds if kind not in own]
         scored = sorted(((*self.score(pair, alone), pair) for pair in pairs), key=lambda s: -s[0])
         return [(pair, start) for gain, start, pair in scored[:most] if gain > least]
+
+
+def _gained(squares: Float, crosses: Float, onsets: bool, record: Record) -> Float:
+    """Nats (column,) along a direction of the best size, from rows' parts (column, row).
+
+    Over the whole drive or, with `onsets`, from any row on.
+    """
+    square, cross = (
+        x.reshape(len(x), -1, record.rows, record.group).sum((1, 3))[:, ::-1].cumsum(1)[:, ::-1]
+        for x in (squares, crosses)
+    )
+    gains = np.where(square > 1e-6, 0.5 * np.maximum(cross, 0) ** 2 / np.maximum(square, 1e-6), 0.0)
+    if not onsets:
+        return gains[:, 0]
+    late = gains[:, allowed(record.rows, record.dt)].max(1) - np.log(record.rows)
+    return np.maximum(gains[:, 0], late)
 
 
 def joint(
@@ -129,22 +162,5 @@ def swapped(
         here = Base(base, base.z_of(own), own, pair.onset, white)
         others = [kind for kind in kinds if kind not in pair.candidate.effects]
         for candidate, start in here.partners(others, alone, most=tries, least=2.0):
-            out.append(rest(candidate, white, start, pair.onset))
+            out.append(closer(rest(candidate, white, start, pair.onset), white))
     return sorted(out, key=lambda look: -look.value)
-
-
-def _directions(base: Candidate, z: Float, onset: int | None, white: Whitener) -> Float:
-    size = len(z)
-    moved = np.repeat(z[None], size + 1, 0)
-    moved[1:] += 1e-4 * np.eye(size)
-    e = white(base.rollouts(moved, onset, coarse=True)).reshape(size + 1, -1)
-    columns = e[1:] - e[:1]
-    grade = base.grade_means
-    if grade is not None:
-        columns = np.concatenate([columns, white(grade).reshape(len(grade), -1)])
-    norms = np.linalg.norm(columns, axis=1)
-    columns = columns[norms > 1e-9] / norms[norms > 1e-9][:, None]
-    if not len(columns):
-        return np.zeros((0, e.shape[1]))
-    axes, sizes, _ = np.linalg.svd(columns.T, full_matrices=False)
-    return axes[:, sizes > 1e-6 * sizes[0]].T

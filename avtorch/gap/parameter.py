@@ -28,7 +28,8 @@ class Parameter:
     `constraint` is the link: `"real"` the value itself, `"positive"` its log, `"negative"` the log of its opposite,
     `"unit"` (0 to 1) its logit, `"interval"` uniform from `low` to `high`, by the normal distribution function.
     `reported` False: a coordinate that the table of effects does not name, fitted and kept out of the answer.
-    `size`: 1, or the length of a vector-valued coordinate, then on its last dimension.
+    `size`: 1, or the length of a vector-valued coordinate, then on its last dimension. `of_onset`: one that can only be
+    told where an effect sets in during a drive, and rests at its prior's centre elsewhere.
 
     Raises `InputError` for a range that is empty or outside the constraint.
     """
@@ -41,6 +42,7 @@ class Parameter:
     constraint: Constraint = "positive"
     reported: bool = True
     size: int = 1
+    of_onset: bool = False
 
     def __post_init__(self) -> None:
         if not self.low < self.high:

@@ -97,7 +97,7 @@ def _values(found: Found, draws: Draws | None) -> dict[str, Float]:
         return dict(draws.values)
     noise = np.random.default_rng(0).standard_normal((_LAPLACE, len(found.z)))
     z = np.clip(found.z + noise @ root(found.covariance).numpy().T, -8.0, 8.0)
-    return {key: x.numpy() for key, x in found.candidate.values(z).items()}
+    return {key: x.numpy() for key, x in found.candidate.values(found.candidate.held(z, found.onset)).items()}
 
 
 def _deterministic(found: Found, draws: Draws | None) -> dict[str, Float]:

@@ -31,7 +31,7 @@ from avtorch.gap.onset import averaged, refined
 from avtorch.gap.pairing import Base, joint, swapped
 from avtorch.gap.plant import GapPlant
 from avtorch.gap.record import Record
-from avtorch.gap.screening import ENOUGH, Look, looks
+from avtorch.gap.screening import ENOUGH, Look, closer, looks
 from avtorch.gap.starts import starts, traded
 from avtorch.io import Log
 
@@ -41,7 +41,6 @@ Progress = Callable[[str, int, int], None]
 _TURNS = 10  # of parameters and noise, at most
 _SINGLES = 6  # fitted with noise of their own
 _LEAST = 3.0  # nats at first sight, for less of which no noise of its own would help
-_LITTLE = -3.0  # nats over none, below which nothing more exact is asked for
 _BASES = 3  # joined with a second effect
 _SECONDS = 4  # tried on each
 _PAIRS = 4  # fitted with noise of their own
@@ -174,14 +173,17 @@ class Search:
         kinds = [e for e in self.effects if not e.random and judged(e, record.witnesses)]
         white = Whitener(record, none.noise.noise)
         seen: list[Look] = []
-        floor = float(white.log_likelihood(none.errors.mean(-1, keepdims=True)[None])[0])
+        floor, coarse_floor = (
+            float(white.log_likelihood(e[None])[0]) for e in (none.errors, none.errors.mean(-1, keepdims=True))
+        )
         for i, kind in enumerate(kinds):
             self.progress("single effects", i, len(kinds))
             if self._late():
                 break
             candidate = Candidate(record, (kind,), self.baseline)
             begin = starts(candidate, none.values)
-            seen += looks(candidate, white, begin, onsets=kind.name != "gain_change", floor=floor)
+            found = looks(candidate, white, begin, onsets=kind.name != "gain_change", floor=coarse_floor)
+            seen += [closer(look, white) for look in found]
         best: dict[str, float] = {}
         for look in seen:
             best[look.candidate.name] = max(best.get(look.candidate.name, -np.inf), look.value)
@@ -204,25 +206,14 @@ class Search:
         return found
 
     def _left_behind(self, rest: Sequence[Look], white: Whitener, none: Found) -> list[Found]:
-        """The others keep the evidence of their screening, of means only where it is little anyway."""
+        """The others keep the evidence of their screening."""
+        flat = finish(none.candidate, white, none.z).log_evidence
         found = []
-        for coarse in (True, False) if none.candidate.record.group > 1 else (False,):
-            flat = finish(none.candidate, white, none.z, coarse=coarse).log_evidence
-            again = []
-            for look in rest:
-                if look.onset is not None:
-                    continue
-                z = look.z
-                if not coarse and none.candidate.record.group > 1:
-                    z = modes(look.candidate, white, z[None], iterations=3, enough=0.1)[0][0]
-                fit = finish(look.candidate, white, z, coarse=coarse)
-                if coarse and fit.log_evidence - flat > _LITTLE:
-                    # in closed loop, means only may flatter
-                    again.append(look)
-                else:
-                    evidence = none.log_evidence + fit.log_evidence - flat
-                    found.append(Found.of(look.candidate, fit, none.noise, evidence, fit.log_joint))
-            rest = again
+        for look in rest:
+            if look.onset is None:
+                fit = finish(look.candidate, white, look.z)
+                evidence = none.log_evidence + fit.log_evidence - flat
+                found.append(Found.of(look.candidate, fit, none.noise, evidence, fit.log_joint))
         return found
 
     def _refined(self, forms: Sequence[Look], noise: NoiseModel) -> Found:
@@ -265,7 +256,9 @@ class Search:
                 candidate = Candidate(record, (*base.candidate.effects, RoadGrade), self.baseline)
                 look = Look(candidate, candidate.z_of(base.values), 0.0, base.onset)
                 self._settle_pairs([look], 1, gusty.noise.noise.replaced(force_sd=CALM), made)
-        white = Whitener(record, single[0].noise.noise)
+        # a gust's noise is too quiet for causes that explain less
+        noise = (bases[0] if bases else none).noise.noise
+        white = Whitener(record, noise)
         alone = {f.name: f.values for f in single if not f.gust}
         seen: dict[str, Look] = {}
         for i, base in enumerate(bases):
@@ -276,13 +269,13 @@ class Search:
                 known = seen.get(look.candidate.name)
                 if known is None or look.value > known.value:
                     seen[look.candidate.name] = look
-        done = self._settle_pairs(list(seen.values()), _PAIRS, single[0].noise.noise, made)
+        done = self._settle_pairs(list(seen.values()), _PAIRS, noise, made)
         for _ in range(_SWAPS):
             if done is None or done.log_evidence < single[0].log_evidence + _SECOND or self._late():
                 break
             # a better partner for either half, now that the noise is what the best pair leaves over
             white = done.white
-            _, value = modes(done.candidate, white, done.z[None], onset=done.onset, iterations=1, coarse=True)
+            _, value = modes(done.candidate, white, done.z[None], onset=done.onset, iterations=1)
             here = Look(done.candidate, done.z, float(value[0]), done.onset)
             near = here.value - _CLOSE
             others = [k for k in swapped(here, kinds, white, alone, tries=_SECONDS) if k.candidate.name not in made]
@@ -302,11 +295,13 @@ class Search:
     ) -> list[Look]:
         """The `most` effects that promise most on top of `base`, each fitted with it."""
         on = Base(base.candidate, base.z, base.values, base.onset, white)
-        return [
+        found = [
             joint(candidate, base.candidate.effects[0], z, base.onset, white, onsets=True)
             for candidate, z in on.partners(kinds, alone, most=most, least=4.0)
             if not self._late()
         ]
+        # on averaged commands a controller's noise passes for a partner
+        return [look for look in map(on.closer, found) if look.value > on.flat + _LEAST]
 
     def _settle_pairs(self, pairs: list[Look], most: int, noise: NoiseModel, made: dict[str, Found]) -> Found | None:
         """The best `most` of them with noise of their own, added to `made`; the best of these."""
@@ -330,10 +325,16 @@ class Search:
     def _raw_errors(self, raw: Record, of: Found) -> Float:
         """Errors of a candidate's rollout at the log's own rate, (witness, counted)."""
         candidate = Candidate(raw, of.candidate.effects, self.baseline)
-        onset = None
+        errors = candidate.errors(of.z[None])[0]
         if of.onset is not None:
-            onset = self._raw_row(raw, of, of.onset)
-        errors = candidate.errors(of.z[None], onset)[0]
+            onset, group = self._raw_row(raw, of, of.onset), of.candidate.record.group
+            if raw.accel is not None:
+                # rows of the group in which it sets in would pass for glitches
+                silent = raw.measured[0] - candidate.baseline_rollouts(of.z[None])[0, 0]
+                near = slice(max(onset - group, 0), onset + group)
+                before = np.cumsum((silent**2 - errors[0] ** 2)[near, 0])
+                onset = near.start + int(np.concatenate([[0.0], before]).argmin())
+            errors = candidate.errors(of.z[None], onset)[0]
         if of.profile is not None:
             errors = errors - candidate.grade_response(of.profile)
         return errors

@@ -17,20 +17,28 @@ _LEAST = 0.0  # the factor's least value, out of a drive's range of speeds
 @register
 @dataclass(frozen=True)
 class SpeedDependentGain(Effect):
-    """`K_L (1 + gain_slope (v - v_mean) / v_mean)`; neutral at 0. `mean_speed` [m/s] is taken from a drive."""
+    """`K_L (1 + gain_slope (v - v_mean) / v_mean)`; neutral at 0. `mean_speed` [m/s] is taken from a drive.
+
+    `pivot` [-]: the speed, as a share of the mean one, at which nothing changes. It bears on K_L alone as long as the
+    effect was always there, and is 1 then.
+    """
 
     gain_slope: Number = 0.3
     mean_speed: Number = 15.0
+    pivot: Number = 1.0
 
     name = "speed_dependent_gain"
     place = "actuator"
     needs_speed = True
     meaning = "the realised share of the command depends on speed"
     equation = "K_L (1 + slope (v - v_mean) / v_mean)"
-    parameters = (Parameter("gain_slope", "-", 0.0, -0.4, 0.4, "real"),)
+    parameters = (
+        Parameter("gain_slope", "-", 0.0, -0.4, 0.4, "real"),
+        Parameter("pivot", "-", None, 0.6, 1 / 0.6, reported=False, of_onset=True),
+    )
 
     def apply(self, x: Tensor, row: Row) -> tuple[Tensor, float]:
-        away = row.speed / tensor(self.mean_speed) - 1
+        away = row.speed / (tensor(self.mean_speed) * tensor(self.pivot)) - 1
         factor = (1 + tensor(self.gain_slope) * away).clamp_min(_LEAST)
         return factor, 1.0
 

@@ -17,20 +17,28 @@ _LEAST = 0.05  # the factor's least value, out of a drive's range of speeds
 @register
 @dataclass(frozen=True)
 class SpeedDependentLag(Effect):
-    """`T_L (1 + lag_slope (v - v_mean) / v_mean)`; neutral at 0. `mean_speed` [m/s] is taken from a drive."""
+    """`T_L (1 + lag_slope (v - v_mean) / v_mean)`; neutral at 0. `mean_speed` [m/s] is taken from a drive.
+
+    `pivot` [-]: the speed, as a share of the mean one, at which nothing changes. It bears on T_L alone as long as the
+    effect was always there, and is 1 then.
+    """
 
     lag_slope: Number = 0.5
     mean_speed: Number = 15.0
+    pivot: Number = 1.0
 
     name = "speed_dependent_lag"
     place = "actuator"
     needs_speed = True
     meaning = "the actuator is slower at some speeds"
     equation = "T_L (1 + slope (v - v_mean) / v_mean)"
-    parameters = (Parameter("lag_slope", "-", 0.0, -0.7, 0.7, "real"),)
+    parameters = (
+        Parameter("lag_slope", "-", 0.0, -0.7, 0.7, "real"),
+        Parameter("pivot", "-", None, 0.6, 1 / 0.6, reported=False, of_onset=True),
+    )
 
     def apply(self, x: Tensor, row: Row) -> tuple[float, Tensor]:
-        away = row.speed / tensor(self.mean_speed) - 1
+        away = row.speed / (tensor(self.mean_speed) * tensor(self.pivot)) - 1
         factor = (1 + tensor(self.lag_slope) * away).clamp_min(_LEAST)
         return 1.0, factor
 
