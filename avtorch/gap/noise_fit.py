@@ -40,6 +40,7 @@ GUST: dict[str, Prior] = {
 
 _STEP = 1e-3
 _LONGEST = 1.5  # of a step, in prior standard deviations
+_TRIES = 8  # of a step, each shorter; far from the mode squared scores are no information at all
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +113,7 @@ def fit_noise(
         free = np.flatnonzero(~held)
         part = information[np.ix_(free, free)]
         better = False
-        for _ in range(4):
+        for _ in range(_TRIES):
             step = np.linalg.solve(part + damping * np.diag(np.diag(part)), gradient[free])
             step *= min(1.0, _LONGEST / max(float(np.abs(step).max(initial=0)), 1e-12))
             new = z.copy()
