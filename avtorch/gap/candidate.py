@@ -3,8 +3,7 @@
 Coordinates `z` are standard normal a priori. An effect whose size can go to its neutral value may be far fainter than
 what is typical, so the prior of sizes is twice as wide here as the table's range.
 
-With an `onset`, a row number, the effects act from there on: the responses with and without them are spliced, the
-speed going on from where it is. What lags behind the splice is forgotten within some lags.
+With an `onset`, a row number, the effects act from there on, see `avtorch.gap.setting_in`.
 """
 
 from __future__ import annotations
@@ -18,12 +17,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from avtorch.gap.drive import Drive
+from avtorch.gap.drive import Drive, Response
 from avtorch.gap.effect import Effect, effect_class
 from avtorch.gap.effects.road_grade import GRAVITY, RoadGrade
 from avtorch.gap.parameter import Parameter
 from avtorch.gap.plant import GapPlant, plant
 from avtorch.gap.record import Record
+from avtorch.gap.setting_in import response_from
 
 Float = NDArray[np.float64]
 
@@ -111,12 +111,13 @@ class Candidate:
     def rollouts(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
         """Responses for `z` (column, coordinate): (column, witness, counted, group)."""
         values = self.values(self.held(z, onset))
-        full = self._rollouts(self.plant, values, coarse)
         if onset is None:
-            return full
-        base = {k: v for k, v in values.items() if k in ("T_L", "K_L")}
-        without = self._rollouts(self._without, base, coarse)
-        return splice(self.record, full, without, onset)
+            return self._rollouts(self.plant, values, coarse)
+        drives = self.record.coarse if coarse else self.record.drives
+        with torch.inference_mode():
+            place = self.record.place(onset, coarse=coarse)
+            responses = response_from(self.plant, self._without, drives, values, place)
+        return self._seen(responses, len(z), coarse)
 
     def baseline_rollouts(self, z: Float, *, coarse: bool = False) -> Float:
         """What the baseline alone does with the `T_L` and `K_L` of `z` (column, coordinate); one column if all
@@ -130,12 +131,14 @@ class Candidate:
         record = self.record
         with torch.inference_mode():  # no derivatives: faster recursions
             responses = [of.response(drive, values) for drive in (record.coarse if coarse else record.drives)]
-        parts = []
+        return self._seen(responses, max(len(v) for v in values.values()), coarse)
+
+    def _seen(self, responses: Sequence[Response], columns: int, coarse: bool) -> Float:
+        record, parts = self.record, []
         if record.accel is not None:
             parts.append(record.seen([r.accel_measured for r in responses], coarse=coarse))
         if record.speed is not None:
             parts.append(record.seen([r.speed for r in responses], coarse=coarse))
-        columns = max(len(v) for v in values.values())
         return np.stack([np.broadcast_to(p, (columns, *p.shape[-2:])) for p in parts], 1)
 
     def errors(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
@@ -218,12 +221,3 @@ class Candidate:
 def _position(drive: Drive) -> torch.Tensor:
     assert drive.position is not None
     return drive.position
-
-
-def splice(record: Record, full: Float, without: Float, onset: int) -> Float:
-    """Rollouts (column, witness, counted, group) `without` before counted row `onset`, going on as `full` does."""
-    apart = full - without
-    if record.speed is not None and onset < record.rows:
-        apart[:, -1] -= apart[:, -1, onset, :1][:, :, None]
-    apart[:, :, :onset] = 0.0
-    return without + apart

@@ -7,6 +7,7 @@ likelihood ratio of single rows, given the errors of a rollout.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,16 @@ class Tails:
 _TAIL_PRIOR = ((np.log(0.01), 1.5), (np.log(7.0), 0.4))
 
 
+_LEVEL_S = 20.0  # of a drive in which noise has one size: a gust that sets in makes it rougher, which is no glitch
+
+
+def _level(x: Float, size: int) -> Float:
+    """Running median (row,) of x (row,) over blocks of about `size` rows, straight between their middles."""
+    ends = np.linspace(0, len(x), max(1, round(len(x) / max(size, 1))) + 1).astype(int)
+    medians = [float(np.median(x[a:b])) for a, b in pairwise(ends)]
+    return np.asarray(np.interp(np.arange(len(x)), 0.5 * (ends[1:] + ends[:-1]), medians))
+
+
 def tails(errors: Float, dt: float) -> Tails:
     """Outliers among accelerometer errors (row,), by their distance from the rows beside them.
 
@@ -46,7 +57,7 @@ def tails(errors: Float, dt: float) -> Tails:
     beside = np.median(np.stack([x[:-4], x[1:-3], x[3:-1], x[4:]]), 0)
     away = errors - beside
     # a jump of the car shows in all rows of its moment, a glitch in one
-    sd = max(1.4826 * float(np.median(np.abs(away - np.median(away)))), 1e-9)
+    sd = np.maximum(1.4826 * _level(np.abs(away - np.median(away)), round(_LEVEL_S / dt)), 1e-9)
     spread = np.abs(np.stack([x[:-4], x[1:-3], x[3:-1], x[4:]]) - beside)
     rough = np.sort(spread, 0)[1]  # of four neighbours, those nearest to their median
     away = away / np.maximum(sd, rough)

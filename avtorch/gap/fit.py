@@ -135,13 +135,13 @@ def _slope(white: Whitener, candidate: Candidate, onset: int | None, coarse: boo
     kept = _LAST.get(white)
     if kept is not None and kept[0] is grade and kept[1] == onset:
         return kept[2]
-    felt = sensed(white.record, white.noise, _acting(white, grade, onset))
+    felt = sensed(white.record, white.noise, acting(white, grade, onset))
     made = Slope.of(white(felt).reshape(len(grade), -1))
     _LAST[white] = (grade, onset, made)
     return made
 
 
-def _acting(white: Whitener, force: Float, onset: int | None) -> Float:
+def acting(white: Whitener, force: Float, onset: int | None) -> Float:
     """What a slope does (..., witness, counted, group), if only from `onset` on."""
     if onset is None:
         return force
@@ -173,7 +173,7 @@ def _sloped(candidate: Candidate, white: Whitener, errors: Float, onset: int | N
     rms, profile = _slope(white, candidate, onset, errors.shape[-1] == 1).told(white(errors).ravel())
     part = candidate.grade_response(profile)
     part = part.mean(-1, keepdims=True) if errors.shape[-1] == 1 else part
-    return rms, profile, sensed(white.record, white.noise, _acting(white, part, onset))
+    return rms, profile, sensed(white.record, white.noise, acting(white, part, onset))
 
 
 def finish(candidate: Candidate, white: Whitener, z: Float, onset: int | None = None, *, coarse: bool = False) -> Fit:

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from avtorch.gap.candidate import Candidate
+from avtorch.gap.fit import acting
 from avtorch.gap.innovations import Whitener, sensed
 from avtorch.gap.plant import GapPlant, plant
+from avtorch.gap.setting_in import response_from
 from avtorch.gap.slope import Slope
 from avtorch.inference.priors import LogSpaceNormal
 
@@ -126,8 +128,7 @@ class RolloutDensity:
         columns = self.candidate.grade_columns
         if columns is None:
             return None
-        if self.onset is not None:
-            columns = spliced(self.candidate, torch.as_tensor(columns), self.onset).numpy()
+        columns = acting(self.white, columns, self.onset)
         return Slope.of(self._image(sensed(self.white.record, self.white.noise, columns)))
 
     def _prior(self, z: Tensor) -> Tensor:
@@ -146,15 +147,11 @@ class RolloutDensity:
         keys = self.names
         near = z.nan_to_num(0.0).clamp(-_FURTHEST, _FURTHEST)
         values = dict(zip(keys, self.constrain(near).unbind(-1), strict=True))
-        full = self._responses(self.candidate.plant, values)
+        record, whole = self.candidate.record, self.candidate.plant
         if self.onset is None:
-            return full
-        without = self._responses(self._without, {k: values[k] for k in ("T_L", "K_L")})
-        return without + spliced(self.candidate, full - without, self.onset)
-
-    def _responses(self, of: GapPlant, values: dict[str, Tensor]) -> Tensor:
-        record = self.candidate.record
-        responses = [of.response(drive, values) for drive in record.drives]
+            responses = [whole.response(drive, values) for drive in record.drives]
+        else:
+            responses = response_from(whole, self._without, record.drives, values, record.place(self.onset))
         seen = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
         source, columns = torch.as_tensor(record.source), len(values["T_L"])
         parts = []
@@ -199,16 +196,6 @@ class _Exact(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         (score,) = ctx.saved_tensors
         return gradient[..., None] * score, None
-
-
-def spliced(candidate: Candidate, apart: Tensor, onset: int) -> Tensor:
-    """What the effects do (column, witness, counted, group), put to nothing before `onset`; see `candidate.splice`."""
-    record = candidate.record
-    if "speed" in record.witnesses and onset < record.rows:
-        first = torch.zeros(apart.shape[1], 1, 1, dtype=apart.dtype)
-        first[-1] = 1.0
-        apart = apart - first * apart[:, -1:, onset : onset + 1, :1]
-    return apart * (torch.arange(record.rows) >= onset)[:, None]
 
 
 def root(covariance: Float) -> Tensor:

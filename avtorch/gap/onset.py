@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.gap.candidate import Candidate, splice
+from avtorch.gap.candidate import Candidate
 from avtorch.gap.fit import log_joint
 from avtorch.gap.innovations import Whitener
 
@@ -45,9 +45,6 @@ def refined(white: Whitener, candidate: Candidate, z: Float, onset: int) -> tupl
     record = white.record
     if candidate.grade_means is not None:
         return _beside(white, candidate, z, onset)
-    full = candidate.rollouts(z[None], coarse=True)[0]
-    silent = candidate.baseline_rollouts(z[None], coarse=True)[0]
-    measured = record.measured.mean(-1, keepdims=True)
     within = allowed(record.rows, record.dt)
     found = np.full(record.rows, -np.inf)
     for reach in (8.0, 1.5):
@@ -56,7 +53,7 @@ def refined(white: Whitener, candidate: Candidate, z: Float, onset: int) -> tupl
         tries = tries[np.isneginf(found[tries])]
         if not len(tries):
             continue
-        errors = np.stack([measured - splice(record, full[None], silent[None], int(t))[0] for t in tries])
+        errors = np.stack([candidate.errors(z[None], int(t), coarse=True)[0] for t in tries])
         found[tries] = white.log_likelihood(errors)
         onset = int(np.argmax(found))
     return onset, found

@@ -22,6 +22,7 @@ Float = NDArray[np.float64]
 
 _AT_ONCE = 32
 _MANY = 50  # starts of one effect, more than which are left to the fit of that effect alone
+_MUCH = 6_000_000  # starts times rows, likewise
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,8 @@ class Base:
         begin = np.zeros((0, candidate.size))
         if known:
             begin = candidate.z_of({**self.values, **known})[None]
-        if not known or len(of_effect(candidate, more.name)) <= _MANY:
+        rows = self.candidate.record.rows * self.candidate.record.group
+        if not known or len(of_effect(candidate, more.name)) * rows <= _MUCH:
             begin = np.concatenate([begin, starts(candidate, self.values)])
         if candidate.grade_means is not None and self.candidate.grade_means is None:
             step, value = modes(candidate, self.white, begin[:1], onset=self.onset, iterations=2)

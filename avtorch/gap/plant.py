@@ -105,15 +105,19 @@ class GapPlant:
         parameters: Mapping[str, Tensor] | None = None,
         *,
         generator: torch.Generator | None = None,
+        actuator0: Tensor | None = None,
     ) -> Response:
         """The noise-free response to `drive`; with a `generator`, one in which the random effects are drawn.
 
         `parameters` by the names of `parameters()`, in their own units, each (...), which broadcast with the drive's
         leading dimensions (a vector-valued one has its size on a further, last dimension). What is missing keeps the
         plant's own value. Differentiable in all of them. Speed-dependent effects look at the drive's measured speed.
+        `actuator0` (...) [m/s²]: where the actuator stands at the first row, in place of what the drive says of it.
         """
         this = self if parameters is None else self.with_values(parameters)
-        return respond(this.effects, tensor(this.T_L), tensor(this.K_L), drive, generator)
+        return respond(
+            this.effects, tensor(this.T_L), tensor(this.K_L), drive, generator, actuator0=actuator0
+        )
 
     # one step ------------------------------------------------------------------------------------------------------
     @torch.no_grad()

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.gap.drive import Drive
+from avtorch.gap.setting_in import Place
 from avtorch.io import Log
 from avtorch.io.log import AccelKind
 
@@ -158,6 +159,16 @@ class Record:
             length=length,
             group=group,
         )
+
+    def place(self, row: int, *, coarse: bool = False) -> Place:
+        """Where a counted `row` begins in the drives, or in the `coarse` ones."""
+        drives = self.coarse if coarse else self.drives
+        each = 1 if self.coarse is not self.drives and coarse else self.group
+        place, number = int(self.source[row]) * each, 0
+        while place >= len(drives[number].time):
+            place -= len(drives[number].time)
+            number += 1
+        return Place(number, place)
 
     def padded(self, values: Float) -> Float:
         """Counted rows' `values` (..., counted, group) at their places in (..., length * group), zeros between."""

@@ -13,9 +13,18 @@ from avtorch.gap.chain import actuator_of, at_place, parts_of_step
 from avtorch.gap.drive import Drive, Response
 from avtorch.gap.effect import Effect, Row, row_at
 
+STANDS_MPS = 0.1
+"""Below this measured speed the car stands and its acceleration is nought [m/s]."""
+
 
 def respond(
-    effects: Iterable[Effect], T_L: Tensor, K_L: Tensor, drive: Drive, generator: torch.Generator | None
+    effects: Iterable[Effect],
+    T_L: Tensor,
+    K_L: Tensor,
+    drive: Drive,
+    generator: torch.Generator | None = None,
+    *,
+    actuator0: Tensor | None = None,
 ) -> Response:
     """See `GapPlant.response`; effects with values (...), in the chain's order."""
     single = [e if generator is None else e.drawn(generator) for e in effects]
@@ -35,7 +44,9 @@ def respond(
 
     parts = parts_of_step(whole, drive.command, row, lambda e, u: e.over(u, rows[e.name]))
     accel0 = parts[0].target[..., 0]
-    if drive.accel0 is not None:
+    if actuator0 is not None:
+        accel0 = actuator0
+    elif drive.accel0 is not None:
         accel0 = start = torch.as_tensor(drive.accel0).expand(shape[:-1])
         # the actuator gives what the car does beyond the other forces
         for e in at_place(single, "body"):
@@ -55,7 +66,11 @@ def respond(
     if drive.specific_force:
         for e, force in zip(at_place(whole, "body"), forces, strict=True):
             measured = measured - force if e.gravity else measured
-    for e in at_place(whole, "sensor"):
+    sensors = at_place(whole, "sensor")
+    if sensors and drive.speed is not None:
+        # a late sensor shows the standstill for a while after it
+        measured = torch.where(drive.speed < STANDS_MPS, 0.0, measured)
+    for e in sensors:
         measured = e.over(measured, rows[e.name])
     v0 = torch.zeros((), dtype=a.dtype) if drive.speed is None else drive.speed[..., 0]
     v0 = v0.expand(shape[:-1])[..., None]

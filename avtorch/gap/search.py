@@ -258,6 +258,8 @@ class Search:
                 self._settle_pairs([look], 1, gusty.noise.noise.replaced(force_sd=CALM), made)
         # a gust's noise is too quiet for causes that explain less
         noise = (bases[0] if bases else none).noise.noise
+        if single[0].gust:
+            self._under(single[0], kinds, none, made)
         white = Whitener(record, noise)
         alone = {f.name: f.values for f in single if not f.gust}
         seen: dict[str, Look] = {}
@@ -284,6 +286,18 @@ class Search:
                 break
             done = better
         return list(made.values())
+
+    def _under(self, blown: Found, kinds: Sequence[type[Effect]], none: Found, made: dict[str, Found]) -> None:
+        """Causes that show only once a gust's noise is in, each with the gust, added to `made`."""
+        on = Base(none.candidate, none.z, none.values, none.onset, blown.white)
+        for candidate, z in on.partners(kinds, {}, most=_BASES, least=_LEAST):
+            if self._late():
+                break
+            forms = looks(candidate, blown.white, z[None], onsets=candidate.name != "gain_change")
+            look = max((closer(form, blown.white) for form in forms), key=lambda form: form.value)
+            both = gust(Kept(look.z, blown.noise.noise, 0.0).found(look.candidate, look.onset))
+            if both.name not in made or made[both.name].log_evidence < both.log_evidence:
+                made[both.name] = both
 
     def _joined(
         self,

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from math import prod
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from avtorch.gap.candidate import Candidate
@@ -26,6 +27,7 @@ GRIDS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
     "rate_limit": {"jerk_max_mps3": (0.4, 0.7, 1.1, 1.8, 3.0, 5.0)},
     "speed_dependent_lag": {"lag_slope": (-0.4, 0.4)},
     "speed_dependent_gain": {"gain_slope": (-0.15, 0.15)},
+    "gain_change": {"ramp_s": (0.3, 3.0, 30.0)},
     "gear_shift": {
         "depth": (0.5,),
         "duration_s": (0.25,),
@@ -47,6 +49,7 @@ GRIDS: Mapping[str, Mapping[str, tuple[float, ...]]] = {
 """Values by effect and parameter; all combinations are tried. A change of gain starts at shares of the drive."""
 
 _CHANGES = 12
+_MOMENTS = 60
 _TRADES = tuple(s * k for k in (0.012, 0.025, 0.04, 0.06, 0.085, 0.12) for s in (-1, 1))
 """Of a dead time for lag [s]."""
 _LEAST_S = 0.01
@@ -75,6 +78,12 @@ def of_effect(candidate: Candidate, name: str) -> list[dict[str, float]]:
     return [dict(zip(keys, values, strict=True)) for values in product(*grid.values())]
 
 
+def _moments(candidate: Candidate) -> Sequence[float]:
+    """When a gain may change [s]: in a quiet drive only a few moments tell, so many are tried."""
+    time = candidate.record.drives[0].time
+    return torch.linspace(float(time[0]), float(time[-1]), _MOMENTS + 2)[1:-1].tolist()
+
+
 def one_at_a_time(candidate: Candidate, z: Float) -> Float:
     """Places (start, coordinate) that differ from `z` in one parameter of an effect, put to one of its starts.
 
@@ -86,7 +95,8 @@ def one_at_a_time(candidate: Candidate, z: Float) -> Float:
         grid = GRIDS.get(effect, {})
         if prod(map(len, grid.values())) > _MANY:  # already tried closely
             continue
-        for value in grid.get(key, ()):
+        values = _moments(candidate) if c.key == "gain_change.change_s" else grid.get(key, ())
+        for value in values:
             place = z.copy()
             place[i] = c.z_of(value)
             places.append(place)

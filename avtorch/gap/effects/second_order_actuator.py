@@ -23,25 +23,30 @@ class SecondOrderActuator(Effect):
     Fitted as `tau² a'' + T_L a' + a = K u` with `tau = inverse_frequency_s`: neutral at 0, where the GLVD comes out
     exactly, and `T_L` keeps its meaning, the slope of the phase. The answer names `natural_frequency_radps = 1 / tau`
     and `damping_ratio = T_L / (2 tau)`. With `damping_ratio` given, `plant` sets `T_L` to `2 zeta tau`; from then on
-    `T_L` tells the damping, and the effect in the plant has no `damping_ratio` of its own.
+    `T_L` tells the damping, and the effect in the plant has no `damping_ratio` of its own. Where it sets in during a
+    drive, `T_L` is the lag until then and `lag_ratio` times it that from then on.
     """
 
     inverse_frequency_s: Number = 1 / 6
     damping_ratio: Number | None = None
+    lag_ratio: Number = 1.0
 
     name = "second_order_actuator"
     place = "actuator"
     order = 1
     meaning = "the actuator has inertia and may overshoot"
     equation = "a'' = omega² (K u - a) - 2 zeta omega a'"
-    parameters = (Parameter("inverse_frequency_s", "s", 0.0, 1 / 12, 1 / 3, reported=False),)
+    parameters = (
+        Parameter("inverse_frequency_s", "s", 0.0, 1 / 12, 1 / 3, reported=False),
+        Parameter("lag_ratio", "-", 1.0, 0.65, 1 / 0.65, reported=False, of_onset=True),
+    )
 
-    def apply(self, x: Tensor, row: Row) -> tuple[float, float]:
-        return 1.0, 1.0  # the second derivative is the actuator's own affair, see `actuator.py`
+    def apply(self, x: Tensor, row: Row) -> tuple[float, Tensor]:
+        return 1.0, tensor(self.lag_ratio)  # the second derivative is the actuator's own affair, see `actuator.py`
 
     def report(self, T_L: Tensor) -> dict[str, Tensor]:
         tau = tensor(self.inverse_frequency_s)
-        return {"natural_frequency_radps": 1 / tau, "damping_ratio": T_L / (2 * tau)}
+        return {"natural_frequency_radps": 1 / tau, "damping_ratio": T_L * tensor(self.lag_ratio) / (2 * tau)}
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:
