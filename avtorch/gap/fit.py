@@ -97,7 +97,7 @@ def _quadratic(
     cross = np.einsum("cpr,cr->cp", columns, base)
     value = 0.5 * np.einsum("cr,cr->c", base, base)
     if candidate.grade_means is not None:
-        slope = _slope(white, candidate, onset, coarse)
+        slope = slope_of(white, candidate, onset, coarse=coarse)
         square, cross, value = _integrated(slope, columns, base, square, cross, value)
     return cross + z, square + np.eye(size), value + 0.5 * (z**2).sum(1)
 
@@ -110,7 +110,7 @@ def directions(candidate: Candidate, white: Whitener, z: Float, onset: int | Non
     columns = (e[1:] - e[:1]) / _STEP
     if candidate.grade_means is None:
         return columns
-    return np.concatenate([columns, _slope(white, candidate, onset, coarse=False).image])
+    return np.concatenate([columns, slope_of(white, candidate, onset, coarse=False).image])
 
 
 def _integrated(
@@ -128,7 +128,7 @@ def _integrated(
 _LAST: WeakKeyDictionary[Whitener, tuple[Float, int | None, Slope]] = WeakKeyDictionary()
 
 
-def _slope(white: Whitener, candidate: Candidate, onset: int | None, coarse: bool) -> Slope:
+def slope_of(white: Whitener, candidate: Candidate, onset: int | None, *, coarse: bool) -> Slope:
     """Of the candidate's slope under this noise; the last one of each noise is kept."""
     grade = candidate.grade_means if coarse else candidate.grade_columns
     assert grade is not None
@@ -158,19 +158,9 @@ def left_over(candidate: Candidate, white: Whitener, z: Float, onset: int | None
     return errors if candidate.grade_means is None else errors - _sloped(candidate, white, errors, onset)[2]
 
 
-def log_joint(candidate: Candidate, white: Whitener, z: Float, onset: int | None = None, *, coarse: bool) -> float:
-    """Log joint density at `z` (coordinate,), a road's slope integrated out."""
-    e = white(candidate.errors(z[None], onset, coarse=coarse)[0]).ravel()
-    value = white.constant_of(coarse=coarse) - 0.5 * float(e @ e) - 0.5 * float(z @ z)
-    if candidate.grade_means is not None:
-        slope = _slope(white, candidate, onset, coarse)
-        value += float(slope.weighed((slope.image @ e)[None])[0][0])
-    return value
-
-
 def _sloped(candidate: Candidate, white: Whitener, errors: Float, onset: int | None) -> tuple[float, Float, Float]:
     """`grade_rms`, coefficients (knot,), and what they do to the errors."""
-    rms, profile = _slope(white, candidate, onset, errors.shape[-1] == 1).told(white(errors).ravel())
+    rms, profile = slope_of(white, candidate, onset, coarse=errors.shape[-1] == 1).told(white(errors).ravel())
     part = candidate.grade_response(profile)
     part = part.mean(-1, keepdims=True) if errors.shape[-1] == 1 else part
     return rms, profile, sensed(white.record, white.noise, acting(white, part, onset))

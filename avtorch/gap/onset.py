@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.gap.candidate import Candidate
-from avtorch.gap.fit import log_joint
+from avtorch.gap.fit import slope_of
 from avtorch.gap.innovations import Whitener
+from avtorch.gap.slope import Slope
 
 Float = NDArray[np.float64]
 
-_PLACES, _HALVINGS = 10, 5  # where a slope is first asked, and how often between the best and those beside it
+_PLACES = 12  # where a slope is first asked
 _NEAREST_S = 4.0  # an onset this close to the start or the end is none
 
 
@@ -31,7 +35,7 @@ def allowed(rows: int, dt: float) -> slice:
 def rough(white: Whitener, candidate: Candidate, z: Float) -> tuple[int, float]:
     """Best onset row for parameters `z` of a fit over the whole drive, and what it gains [nats] over none."""
     if candidate.grade_means is not None:
-        return _along_the_road(white, candidate, z)
+        return _Road.of(white, candidate, z).best(allowed(candidate.record.rows, white.record.dt))
     full = candidate.errors(z[None], coarse=True)[0]
     silent = candidate.record.measured.mean(-1, keepdims=True) - candidate.baseline_rollouts(z[None], coarse=True)[0]
     rows = profile(-0.5 * (white(silent) ** 2).sum((0, 2)), -0.5 * (white(full) ** 2).sum((0, 2)))
@@ -43,9 +47,8 @@ def rough(white: Whitener, candidate: Candidate, z: Float) -> tuple[int, float]:
 def refined(white: Whitener, candidate: Candidate, z: Float, onset: int) -> tuple[int, Float]:
     """Best onset row near `onset`, and the log likelihood over all rows tried, (row,), -inf elsewhere."""
     record = white.record
-    if candidate.grade_means is not None:
-        return _beside(white, candidate, z, onset)
     within = allowed(record.rows, record.dt)
+    road = None if candidate.grade_means is None else _Road.of(white, candidate, z)
     found = np.full(record.rows, -np.inf)
     for reach in (8.0, 1.5):
         steps = np.unique(np.round(np.linspace(-reach, reach, 17) / record.dt).astype(int))
@@ -53,41 +56,50 @@ def refined(white: Whitener, candidate: Candidate, z: Float, onset: int) -> tupl
         tries = tries[np.isneginf(found[tries])]
         if not len(tries):
             continue
-        errors = np.stack([candidate.errors(z[None], int(t), coarse=True)[0] for t in tries])
-        found[tries] = white.log_likelihood(errors)
+        if road is not None:
+            found[tries] = road.at(tries.tolist())
+        else:
+            errors = np.stack([candidate.errors(z[None], int(t), coarse=True)[0] for t in tries])
+            found[tries] = white.log_likelihood(errors)
         onset = int(np.argmax(found))
     return onset, found
 
 
-def _along_the_road(white: Whitener, candidate: Candidate, z: Float) -> tuple[int, float]:
-    """`rough` for a slope, which is flat where it does not act: what an onset spares is the prior of its coefficients.
+@dataclass(frozen=True, eq=False)
+class _Road:
+    """Log joint densities with a slope integrated out, if it and all other effects set in at some row.
 
-    By the density with the slope integrated out, at some places and then between them.
+    A slope is flat where it does not act: what an onset spares is the prior of its coefficients.
     """
-    within = allowed(candidate.record.rows, candidate.record.dt)
-    step = (within.stop - 1 - within.start) / (_PLACES - 1)
-    found = {int(row): 0.0 for row in np.linspace(within.start, within.stop - 1, _PLACES)}
-    tries = list(found)
-    for _ in range(_HALVINGS):
-        found |= {row: log_joint(candidate, white, z, row, coarse=True) for row in tries}
-        best = max(found, key=lambda row: found[row])
-        step *= 0.5
-        tries = [int(np.clip(best + s * step, within.start, within.stop - 1)) for s in (-1, 1)]
-    return best, found[best] - log_joint(candidate, white, z, coarse=True)
 
+    slope: Slope
+    full: Float
+    along: Float
 
-def _beside(white: Whitener, candidate: Candidate, z: Float, onset: int) -> tuple[int, Float]:
-    """`refined` for a slope."""
-    record = candidate.record
-    within = allowed(record.rows, record.dt)
-    found = np.full(record.rows, -np.inf)
-    for reach in (4.0, 1.0):
-        for s in (-1.0, -0.5, 0.0, 0.5, 1.0):
-            row = int(np.clip(onset + round(s * reach / record.dt), within.start, within.stop - 1))
-            if np.isneginf(found[row]):
-                found[row] = log_joint(candidate, white, z, row, coarse=True)
-        onset = int(np.argmax(found))
-    return onset, found
+    @classmethod
+    def of(cls, white: Whitener, candidate: Candidate, z: Float) -> _Road:
+        full = white(candidate.errors(z[None], coarse=True)[0])[..., 0]
+        silent = white(
+            candidate.record.measured.mean(-1, keepdims=True) - candidate.baseline_rollouts(z[None], coarse=True)[0]
+        )[..., 0]
+        along = profile(-0.5 * (silent**2).sum(0), -0.5 * (full**2).sum(0))
+        return cls(slope_of(white, candidate, None, coarse=True), full, along)
+
+    def at(self, rows: Sequence[int]) -> Float:
+        return self.along[list(rows)] + self.slope.from_rows(self.full, rows)
+
+    def best(self, within: slice) -> tuple[int, float]:
+        """Row, and what it gains over the first row of all."""
+        step = (within.stop - 1 - within.start) / (_PLACES - 1)
+        tries = np.linspace(within.start, within.stop - 1, _PLACES).astype(int)
+        found: dict[int, float] = {}
+        for _ in range(3):
+            found |= dict(zip(tries.tolist(), self.at(tries.tolist()).tolist(), strict=True))
+            best = max(found, key=lambda row: found[row])
+            shifts = np.linspace(-1, 1, 9)[1:-1] * step
+            tries = np.unique(np.clip(best + shifts, within.start, within.stop - 1).astype(int))
+            step /= 4
+        return best, found[best] - float(self.at([0])[0])
 
 
 def averaged(found: Float, dt: float) -> float:

@@ -115,9 +115,7 @@ class GapPlant:
         `actuator0` (...) [m/s²]: where the actuator stands at the first row, in place of what the drive says of it.
         """
         this = self if parameters is None else self.with_values(parameters)
-        return respond(
-            this.effects, tensor(this.T_L), tensor(this.K_L), drive, generator, actuator0=actuator0
-        )
+        return respond(this.effects, tensor(this.T_L), tensor(this.K_L), drive, generator, actuator0=actuator0)
 
     # one step ------------------------------------------------------------------------------------------------------
     @torch.no_grad()

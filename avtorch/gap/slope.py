@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +65,24 @@ class Slope:
         match = errors @ self.image.T
         total, taken = self.weighed(match)
         return total, (taken * match) @ self.image
+
+    def from_rows(self, errors: Float, rows: Sequence[int]) -> Float:
+        """Log likelihood gained (onset,) by white errors (witness, row) if the slope acts from each of `rows` on only.
+
+        What a coefficient does before an onset is cut off its image, which is as good as exact some rows after it.
+        """
+        image = self.image.reshape(len(self.image), *errors.shape)
+        ends = [*sorted(rows), errors.shape[-1]]
+        gram: Float = np.zeros((len(image), len(image)))
+        match: Float = np.zeros(len(image))
+        found: dict[int, float] = {}
+        for begin, end in reversed(list(pairwise(ends))):
+            part = image[..., begin:end].reshape(len(image), -1)
+            gram, match = gram + part @ part.T, match + part @ errors[:, begin:end].ravel()
+            squares, axes = np.linalg.eigh(gram)
+            late = Slope(np.zeros((len(image), 0)), np.maximum(squares, 0.0), axes)
+            found[begin] = float(late.weighed((match @ axes)[None])[0][0])
+        return np.array([found[row] for row in rows])
 
     def sampled(self, match: Float, rng: np.random.Generator) -> Float:
         """Coefficients (column, knot) drawn given what errors have in common with the axes, (column, knot)."""
