@@ -74,9 +74,7 @@ class RolloutDensity:
     def constrain(self, z: Tensor) -> Tensor:
         """Values of the plant's parameters, each in its unit."""
         each = zip(self.candidate.coordinates, z.unbind(-1), strict=True)
-        held = self.onset is None
-        places = [(c, torch.zeros_like(x) if held and c.parameter.of_onset else x) for c, x in each]
-        return torch.stack([c.parameter.constrain(c.wider * x) for c, x in places], -1)
+        return torch.stack([c.parameter.constrain(c.wider * x) for c, x in each], -1)
 
     def unconstrain(self, values: Tensor) -> Tensor:
         """`z` for values."""
@@ -146,6 +144,8 @@ class RolloutDensity:
         """What the witnesses would have seen, (column, witness, counted, group)."""
         keys = self.names
         near = z.nan_to_num(0.0).clamp(-_FURTHEST, _FURTHEST)
+        if self.onset is None:
+            near = near * torch.tensor([not c.parameter.of_onset for c in self.candidate.coordinates])
         values = dict(zip(keys, self.constrain(near).unbind(-1), strict=True))
         record, whole = self.candidate.record, self.candidate.plant
         if self.onset is None:

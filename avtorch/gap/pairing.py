@@ -61,7 +61,7 @@ class Base:
         columns = directions(self.candidate, self.white, self._rested[0], self.onset)
         columns = columns[np.linalg.norm(columns, axis=1) > 1e-9]
         gram = columns @ columns.T
-        return columns, np.linalg.pinv(gram, rcond=1e-10, hermitian=True)
+        return columns, np.asarray(np.linalg.pinv(gram, rcond=1e-10, hermitian=True), np.float64)
 
     def _apart(self, images: Float) -> Float:
         """White `images` (column, row) less whatever the base's own parameters can do."""

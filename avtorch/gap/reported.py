@@ -94,7 +94,9 @@ def repaired(found: Found, baseline: GapPlant | None = None, draws: Draws | None
 def _values(found: Found, draws: Draws | None) -> dict[str, Float]:
     """Coordinates' values by key: (chain, draw), or (draw,) from Laplace's approximation."""
     if draws is not None:
-        return dict(draws.values)
+        rests = {c.key for c in found.candidate.coordinates if c.parameter.of_onset and found.onset is None}
+        centre = found.candidate.values(np.zeros((1, len(found.z))))
+        return {k: np.full_like(x, float(centre[k])) if k in rests else x for k, x in draws.values.items()}
     noise = np.random.default_rng(0).standard_normal((_LAPLACE, len(found.z)))
     z = np.clip(found.z + noise @ root(found.covariance).numpy().T, -8.0, 8.0)
     return {key: x.numpy() for key, x in found.candidate.values(found.candidate.held(z, found.onset)).items()}

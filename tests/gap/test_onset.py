@@ -7,8 +7,8 @@ import pytest
 
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest.drives import Recorded
-from avtorch.gap import plant
-from avtorch.gap.candidate import Candidate, splice
+from avtorch.gap import DeadTime, SensorBias, plant
+from avtorch.gap.candidate import Candidate
 from avtorch.gap.fit import modes
 from avtorch.gap.innovations import NoiseModel, Whitener
 from avtorch.gap.onset import allowed, averaged, profile, refined, rough
@@ -59,30 +59,64 @@ def test_a_known_onset_is_found(name: str, rate_hz: int, rotating_seed: int) -> 
     assert -np.log(record.rows) <= averaged(tried, record.dt) < 0
 
 
-@pytest.mark.parametrize("name", ["constant_resistance", "dead_time", "sensor_bias"])
-@pytest.mark.parametrize("rate_hz", [20, 100])
-def test_a_splice_goes_on_where_the_car_is(name: str, rate_hz: int) -> None:
-    record = Record.of(log_of(seconds=30.0, rate_hz=rate_hz))
+CAUSES = {
+    "dead_time": ({"delay_s": 0.3}, {}),
+    "sensor_lag": ({"lag_s": 1.0}, {}),
+    "sensor_scale": ({"scale": 1.2}, {}),
+    "rate_limit": ({"jerk_max_mps3": 1.0}, {}),
+    "constant_resistance": ({"resistance_mps2": 0.2}, {}),
+    "backlash": ({"half_width_mps2": 0.15}, {}),
+    "second_order_actuator": (
+        {"natural_frequency_radps": 2.0, "damping_ratio": 0.5},
+        {"inverse_frequency_s": 0.5, "lag_ratio": 0.5 / 0.4},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CAUSES)
+def test_what_sets_in_is_what_the_reference_vehicle_does(name: str) -> None:
+    """A car of its own code, without noise: also the seconds after the onset agree."""
+    rate = 100
+    parameters, other = CAUSES[name]
+    command = command_over(np.arange(60 * rate) / rate)
+    car = Car(T_L=0.4, K_L=1.0, process_sd=0.0, accel_sd=1e-9, speed_sd=1e-9)
+    pilot = Recorded(command, start_speed=25.0)
+    run = simulate(car, pilot, seconds=60.0, rate_hz=rate, effects={name: parameters}, onset=30.0)
+    record = Record.of(Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed))
     candidate = Candidate.named(record, name, plant())
-    z = np.stack([candidate.z_of({"T_L": 0.4, "K_L": 1.0, **CASES[name][1]}), np.zeros(candidate.size)])
-    onset = 257
-    full, spliced = candidate.rollouts(z), candidate.rollouts(z, onset)
-    without = np.concatenate([candidate.baseline_rollouts(row[None]) for row in z])
-    assert spliced.shape == full.shape
-    np.testing.assert_array_equal(spliced[:, :, :onset], without[:, :, :onset])
-    np.testing.assert_allclose(spliced[:, 0, onset:], full[:, 0, onset:], atol=1e-12)
-    # the speed gains from the onset on what the whole rollout gains, and does not jump there
-    speed = spliced[:, 1].reshape(2, -1)
-    np.testing.assert_allclose(
-        np.diff(spliced[:, 1, onset:].reshape(2, -1)), np.diff(full[:, 1, onset:].reshape(2, -1)), atol=1e-12
-    )
-    assert np.abs(np.diff(speed)).max() < 2.5 / rate_hz
-    np.testing.assert_allclose(spliced[:, 1, onset, 0], without[:, 1, onset, 0], atol=1e-12)
-    # neither of its parts is written to
-    kept, bare = full.copy(), without.copy()
-    splice(record, full, without, onset)
-    np.testing.assert_array_equal(full, kept)
-    np.testing.assert_array_equal(without, bare)
+    told = {f"{name}.{key}": value for key, value in (other or parameters).items()}
+    z = candidate.z_of({"T_L": 0.4, "K_L": 1.0, **told})[None]
+    time = record.time[record.source]
+    onset = int(np.searchsorted(time, 30.0 - 1e-6))
+    errors = candidate.errors(z, onset)[0]
+    whole = candidate.errors(z)[0]
+    first = (time >= 30.0) & (time < 34.0)
+    # the message of the very row that it sets in with is read by the one car before and by the other after; a row of
+    # 10 ms at some m/s³, or a force that is there a row late
+    assert np.sqrt((errors[0][first] ** 2).mean()) < 0.015
+    assert np.sqrt((errors[0][time > 40] ** 2).mean()) < 2e-3
+    assert np.sqrt((errors[0][time < 30] ** 2).mean()) < 2e-3
+    assert np.abs(np.diff(errors[1][first].ravel())).max() < 2e-3
+    assert np.sqrt((whole[0][time < 30] ** 2).mean()) > 0.02
+
+
+def test_before_it_sets_in_and_in_other_drives() -> None:
+    logs = [log_of(seconds=20.0), log_of(seconds=30.0), log_of(seconds=20.0)]
+    record = Record.of(logs)
+    candidate = Candidate.named(record, "sensor_bias", plant())
+    z = candidate.z_of({"T_L": 0.4, "K_L": 1.0, "sensor_bias.bias_mps2": 0.3})[None]
+    without, full = candidate.baseline_rollouts(z)[0, 0], candidate.rollouts(z)[0, 0]
+    for row in (0, 100, 360, 600, 900, 1200):
+        late = candidate.rollouts(z, row)[0, 0]
+        np.testing.assert_allclose(late[:row], without[:row], atol=1e-12)
+        np.testing.assert_allclose(late[row:], full[row:], atol=1e-9)
+
+
+def test_a_baseline_of_effects_keeps_what_it_has_in_mind() -> None:
+    record = Record.of(log_of(seconds=30.0))
+    candidate = Candidate(record, (SensorBias,), plant([DeadTime(0.2)]))
+    z = candidate.z_of({"T_L": 0.4, "K_L": 1.0, "sensor_bias.bias_mps2": 0.0})[None]
+    np.testing.assert_allclose(candidate.rollouts(z, 300), candidate.baseline_rollouts(z), atol=1e-9)
 
 
 def test_the_profile_is_the_sum_on_both_sides(rotating_seed: int) -> None:

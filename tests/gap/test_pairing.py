@@ -22,6 +22,7 @@ from avtorch.gap import (
     SensorBias,
     SensorScale,
     SpeedDependentLag,
+    pairing,
     plant,
 )
 from avtorch.gap.candidate import Candidate
@@ -170,7 +171,8 @@ def test_a_slope_as_the_second_effect_is_fitted(rotating_seed: int) -> None:
         assert begin.shape == (candidate.size,)
 
 
-def test_an_effect_of_many_starts_begins_where_it_came_to_rest_alone() -> None:
+def test_an_effect_of_many_starts_begins_where_it_came_to_rest_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pairing, "_MUCH", 50 * 1000)  # as for a drive of several minutes
     record, white = _drive(plant([DeadTime(0.2), Saturation(0.6, -8.0)]))
     base, z, values = _alone(record, white, DeadTime)
     shift = {"gear_shift.first_mps": 4.1, "gear_shift.gear_ratio": 1.5}

@@ -199,7 +199,7 @@ def test_sgld_is_laplaces_where_that_is_right(rotating_seed: int) -> None:
     assert draws.method == "sgld"
     assert draws.exact_share < 0.1
     assert draws.z.shape == (64, 50, 3)
-    z = draws.z.reshape(-1, 3)
+    z = draws.z.reshape(-1, len(found.z))
     mean, mean_error, sd, sd_error = moments(z, len(z) / 2)
     laplace = np.sqrt(np.diag(found.covariance))
     # a lag's skew moves its mean and sd by a few hundredths of an sd
@@ -216,7 +216,7 @@ def test_sgld_against_nuts(effect: Effect, rotating_seed: int) -> None:
     found = found_of([effect], seconds=20)
     draws = posterior(found, chains=32, seed=rotating_seed)
     assert draws.method == "sgld"
-    z = draws.z.reshape(-1, 3)
+    z = draws.z.reshape(-1, len(found.z))
     mean, mean_error, sd, sd_error = moments(z, len(z) / 2)
     density: Any = RolloutDensity.of(found)
     walked = nuts(density, draws=120, warmup=50, seed=rotating_seed % 2**31)
