@@ -41,9 +41,13 @@ _LEVEL_S = 20.0  # of a drive in which noise has one size: a gust that sets in m
 
 
 def _level(x: Float, size: int) -> Float:
-    """Running median (row,) of x (row,) over blocks of about `size` rows, straight between their middles."""
+    """Running median (row,) of x (row,) over blocks of about `size` rows, straight between their middles.
+
+    Each block counts as its roughest neighbour, so that where the level rises no row is held against the lower one.
+    """
     ends = np.linspace(0, len(x), max(1, round(len(x) / max(size, 1))) + 1).astype(int)
-    medians = [float(np.median(x[a:b])) for a, b in pairwise(ends)]
+    own = np.pad([float(np.median(x[a:b])) for a, b in pairwise(ends)], 1, mode="edge")
+    medians = np.maximum(own[1:-1], np.maximum(own[:-2], own[2:]))
     return np.asarray(np.interp(np.arange(len(x)), 0.5 * (ends[1:] + ends[:-1]), medians))
 
 

@@ -1,9 +1,8 @@
 """What a diagnosis looks at: drives at one rate, their witnesses, and the stretches that count.
 
-Rows above some 20 Hz come in groups of which only the means pass the innovations filter; within a group the rows
-differ by sensor noise, which is white. Both parts count: a controller feeds the noise of a row back into the command
-of the next, and means alone would take that for a lag. Rollouts are made at the log's own rate; a search may begin
-with `coarse` ones, of averaged commands, whose groups have one row. Rows at standstill or with a driver's foot in
+Rows above some 20 Hz come in groups. A search may begin with `coarse` rollouts, of which only the groups' means are
+compared; what a candidate is worth is told at every row, since a controller feeds the noise of a row back into the
+command of the next, and means alone would take that for a lag. Rows at standstill or with a driver's foot in
 (`engaged` 0) do not count.
 """
 

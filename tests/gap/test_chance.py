@@ -71,3 +71,14 @@ def test_outliers_from_a_moment_on(rotating_seed: int) -> None:
     assert -150 < found.onset - at < 700
     throughout = tails(_glitched(0.03, 8.0, rng)[0], 0.05)
     assert throughout.onset is None or throughout.onset < 1500
+
+
+def test_noise_that_grows_rougher_has_no_outliers(rotating_seed: int) -> None:
+    """As where a gust sets in: against one size for the whole drive its rows would lie far off."""
+    rng = np.random.default_rng(rotating_seed)
+    for _ in range(6):
+        errors = 0.05 * rng.standard_normal(ROWS)
+        errors[ROWS // 2 :] *= 3.0
+        found = tails(errors, 0.05)
+        assert found.evidence < np.log(6 / 1e-5)
+        assert found.hit.sum() <= 12

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -264,6 +265,18 @@ def test_uneven_steps() -> None:
     for effect in (gap.SensorLag(0.2), gap.DrivelineOscillation(), gap.Gust()):
         whole = plant([effect]).response(Drive(time[keep], command[keep], speed[keep]))
         assert torch.isfinite(whole.accel_measured).all()
+
+
+def test_a_late_sensor_shows_the_standstill_after_it() -> None:
+    """The car's brakes still hold while it stands; dv/dt, and what a sensor makes of it, is nought by then."""
+    time = 0.05 * torch.arange(400, dtype=D)
+    command = torch.where(time < 10, -1.5, 1.0).to(D)
+    speed = torch.where(time < 4, 6 - 1.5 * time, torch.where(time < 10, 0.0, time - 10)).to(D)
+    drive = Drive(time, command, speed)
+    seen = plant([gap.SensorLag(1.0)], T_L=0.2, K_L=1.0).response(drive).accel_measured
+    assert float(seen[199]) == pytest.approx(-1.5 * math.exp(-6.0), abs=0.01)
+    without = replace(drive, speed=None)
+    assert float(plant([gap.SensorLag(1.0)], T_L=0.2, K_L=1.0).response(without).accel_measured[199]) < -1.4
 
 
 def test_sensor_faults_leave_the_car_alone() -> None:

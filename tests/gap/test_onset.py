@@ -9,7 +9,7 @@ from avtorch.blindtest import Car, simulate
 from avtorch.blindtest.drives import Recorded
 from avtorch.gap import DeadTime, SensorBias, plant
 from avtorch.gap.candidate import Candidate
-from avtorch.gap.fit import modes
+from avtorch.gap.fit import finish, modes, slope_of
 from avtorch.gap.innovations import NoiseModel, Whitener
 from avtorch.gap.onset import allowed, averaged, profile, refined, rough
 from avtorch.gap.record import Record
@@ -117,6 +117,44 @@ def test_a_baseline_of_effects_keeps_what_it_has_in_mind() -> None:
     candidate = Candidate(record, (SensorBias,), plant([DeadTime(0.2)]))
     z = candidate.z_of({"T_L": 0.4, "K_L": 1.0, "sensor_bias.bias_mps2": 0.0})[None]
     np.testing.assert_allclose(candidate.rollouts(z, 300), candidate.baseline_rollouts(z), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["speed_dependent_lag", "speed_dependent_gain", "second_order_actuator"])
+def test_what_only_an_onset_tells_rests_without_one(name: str) -> None:
+    candidate = Candidate.named(Record.of(log_of(seconds=30.0)), name, plant())
+    rests = np.array([c.parameter.of_onset for c in candidate.coordinates])
+    assert rests.sum() == 1
+    z = np.full(candidate.size, 0.3)
+    moved = np.stack([z, np.where(rests, 1.5, z)])
+    np.testing.assert_array_equal(*candidate.rollouts(moved))
+    late = candidate.rollouts(moved, 300)
+    np.testing.assert_array_equal(late[0, :, :300], late[1, :, :300])
+    assert np.abs(late[0, 0, 300:] - late[1, 0, 300:]).max() > 0.01
+
+
+def test_a_slopes_onset_is_found_though_it_is_flat_before(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    effects = {"road_grade": {"grade_rms": 0.03, "length_m": 120.0}}
+    command = command_over(np.arange(120 * 20) / 20)
+    pilot, seed = Recorded(command, start_speed=25.0), int(rng.integers(2**31))
+    run = simulate(Car(), pilot, seconds=120.0, rate_hz=20, effects=effects, onset=60.0, seed=seed)
+    record = Record.of(Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed))
+    white = Whitener(record, NOISE)
+    candidate = Candidate.named(record, "road_grade", plant())
+    z = modes(candidate, white, candidate.z_of({"T_L": 0.4, "K_L": 1.0})[None])[0][0]
+    row, gain = rough(white, candidate, z)
+    row = refined(white, candidate, z, row)[0]
+    assert gain > 3  # the prior of some knots
+    # hills of 120 m at 25 m/s: the first of them may begin with a level stretch of half its length
+    assert abs(float(record.time[record.source[row]]) - 60.0) < 6.0
+    # cut off at the onset, the image of a coefficient is nearly what it is when it acts from there on
+    exact = [finish(candidate, white, z, int(k)).log_joint for k in (row - 100, row, row + 100)]
+    slope = slope_of(white, candidate, None, coarse=False)
+    full = white(candidate.errors(z[None])[0])[..., 0]
+    rows = [row - 100, row, row + 100]
+    silent = white(record.measured - candidate.baseline_rollouts(z[None])[0])[..., 0]
+    cut = profile(-0.5 * (silent**2).sum(0), -0.5 * (full**2).sum(0))[rows] + slope.from_rows(full, rows)
+    np.testing.assert_allclose(np.diff(cut), np.diff(exact), rtol=0.1, atol=3.0)
 
 
 def test_the_profile_is_the_sum_on_both_sides(rotating_seed: int) -> None:
