@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
@@ -81,6 +81,13 @@ class Drive:
         accel0 = None if log.accel is None or settled else float(log.accel[rows][0])
         time, command = torch.as_tensor(log.time[rows]), torch.as_tensor(log.accel_cmd[rows])
         return cls(time, command, speed, accel0, log.accel_kind == "specific-force")
+
+
+class Place(NamedTuple):
+    """A row of one of several drives."""
+
+    drive: int
+    row: int
 
 
 @dataclass(frozen=True)

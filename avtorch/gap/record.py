@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.gap.drive import Drive
-from avtorch.gap.setting_in import Place
+from avtorch.gap.drive import Drive, Place
 from avtorch.io import Log
 from avtorch.io.log import AccelKind
 

@@ -4,20 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from avtorch.gap.drive import Drive, Response
+from avtorch.gap.drive import Drive, Place, Response
 from avtorch.gap.plant import GapPlant
-
-
-class Place(NamedTuple):
-    """A row of one of several drives."""
-
-    drive: int
-    row: int
 
 
 def response_from(
