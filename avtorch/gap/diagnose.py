@@ -102,8 +102,6 @@ def diagnose(
 def _left(top: Found, race: Race) -> Remainder:
     """What the favourite leaves over, less what lost messages explain row by row."""
     measured = race.record.measured
-    if top.errors.shape[-1] == 1:
-        measured = measured.mean(-1, keepdims=True)
     explained = top.losses.evidence if top.losses else 0.0
     return remainder(top.white, top.errors, measured - top.errors, explained=explained)
 

@@ -71,6 +71,7 @@ class NoiseModel:
 
 
 Until = tuple[tuple[int, NoiseModel], ...]
+"""Noise of earlier parts of a record, each up to a counted row, in order."""
 Filter = tuple[list[list[Float]], Float, float]
 """Numerators by (out, in), the denominator, log det of the innovations' covariance."""
 

@@ -98,10 +98,6 @@ class Base:
                 best, at = float(gains[k]), some[k]
         return best, at
 
-    def closer(self, look: Look) -> Look:
-        """A look at every row, under this noise."""
-        return closer(look, self.white)
-
     def partners(
         self, kinds: Sequence[type[Effect]], alone: Mapping[str, Mapping[str, float]], *, most: int, least: float
     ) -> list[tuple[Candidate, Float]]:

@@ -315,7 +315,7 @@ class Search:
             if not self._late()
         ]
         # on averaged commands a controller's noise passes for a partner
-        return [look for look in map(on.closer, found) if look.value > on.flat + _LEAST]
+        return [near for near in (closer(look, white) for look in found) if near.value > on.flat + _LEAST]
 
     def _settle_pairs(self, pairs: list[Look], most: int, noise: NoiseModel, made: dict[str, Found]) -> Found | None:
         """The best `most` of them with noise of their own, added to `made`; the best of these."""
