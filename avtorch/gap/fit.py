@@ -166,16 +166,16 @@ def _sloped(candidate: Candidate, white: Whitener, errors: Float, onset: int | N
     return rms, profile, sensed(white.record, white.noise, acting(white, part, onset))
 
 
-def finish(candidate: Candidate, white: Whitener, z: Float, onset: int | None = None, *, coarse: bool = False) -> Fit:
-    """Covariance, errors and Laplace evidence at a mode `z` (coordinate,); `coarse`: of the groups' means only."""
+def finish(candidate: Candidate, white: Whitener, z: Float, onset: int | None = None) -> Fit:
+    """Covariance, errors and Laplace evidence at a mode `z` (coordinate,)."""
     size = len(z)
-    _, square, value = (x[0] for x in _quadratic(candidate, white, z[None], onset, coarse))
-    errors = candidate.errors(z[None], onset, coarse=coarse)[0]
+    _, square, value = (x[0] for x in _quadratic(candidate, white, z[None], onset))
+    errors = candidate.errors(z[None], onset)[0]
     rms, profile = None, None
     if candidate.grade_means is not None:
         rms, profile, part = _sloped(candidate, white, errors, onset)
         errors = errors - part
-    log_joint = white.constant_of(coarse=coarse) - float(value)
+    log_joint = white.constant_of(coarse=False) - float(value)
     return (
         Fit(
             z=z,
