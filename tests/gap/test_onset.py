@@ -14,7 +14,7 @@ from avtorch.gap.innovations import NoiseModel, Whitener
 from avtorch.gap.onset import allowed, averaged, profile, refined, rough
 from avtorch.gap.record import Record
 from avtorch.io import Log
-from tests.gap.records import command_over, log_of
+from tests.gap.records import Float, command_over, log_of
 
 NOISE = NoiseModel(process_sd=0.03, process_time=0.4, force_sd=0.004, accel_sd=0.05, speed_sd=0.02)
 CASES = {
@@ -132,8 +132,8 @@ def test_what_only_an_onset_tells_rests_without_one(name: str) -> None:
     assert np.abs(late[0, 0, 300:] - late[1, 0, 300:]).max() > 0.01
 
 
-def test_a_slopes_onset_is_found_though_it_is_flat_before(rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def _slope_that_sets_in(rng: np.random.Generator) -> tuple[float, float, Float]:
+    """Error of the onset [s], what it gained [nats], and how the cut images' gains compare with the exact ones."""
     effects = {"road_grade": {"grade_rms": 0.03, "length_m": 120.0}}
     command = command_over(np.arange(120 * 20) / 20)
     pilot, seed = Recorded(command, start_speed=25.0), int(rng.integers(2**31))
@@ -144,17 +144,25 @@ def test_a_slopes_onset_is_found_though_it_is_flat_before(rotating_seed: int) ->
     z = modes(candidate, white, candidate.z_of({"T_L": 0.4, "K_L": 1.0})[None])[0][0]
     row, gain = rough(white, candidate, z)
     row = refined(white, candidate, z, row)[0]
-    assert gain > 3  # the prior of some knots
-    # hills of 120 m at 25 m/s: the first of them may begin with a level stretch of half its length
-    assert abs(float(record.time[record.source[row]]) - 60.0) < 6.0
-    # cut off at the onset, the image of a coefficient is nearly what it is when it acts from there on
-    exact = [finish(candidate, white, z, int(k)).log_joint for k in (row - 100, row, row + 100)]
+    rows = [row - 100, row, row + 100]
+    exact = [finish(candidate, white, z, int(k)).log_joint for k in rows]
     slope = slope_of(white, candidate, None, coarse=False)
     full = white(candidate.errors(z[None])[0])[..., 0]
-    rows = [row - 100, row, row + 100]
     silent = white(record.measured - candidate.baseline_rollouts(z[None])[0])[..., 0]
     cut = profile(-0.5 * (silent**2).sum(0), -0.5 * (full**2).sum(0))[rows] + slope.from_rows(full, rows)
-    np.testing.assert_allclose(np.diff(cut), np.diff(exact), rtol=0.1, atol=3.0)
+    return float(record.time[record.source[row]]) - 60.0, gain, np.diff(cut) / np.diff(exact)
+
+
+def test_a_slopes_onset_is_found_though_it_is_flat_before(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    late, gains, ratios = zip(*(_slope_that_sets_in(rng) for _ in range(7)), strict=True)
+    assert min(gains) > 3  # the prior of some knots
+    # hills of 120 m at 25 m/s: most begin within a level stretch of half their length. About one road in twenty is
+    # level for longer, so that four of seven are once in three thousand runs
+    assert np.median(np.abs(late)) < 6.0
+    # cut off at the onset, the image of a coefficient is nearly what it is when it acts from there on: what is lost is
+    # the step that the slope begins with, a sixth of either gain (standard deviation), so a twentieth in the median
+    assert np.median(np.concatenate(ratios)) == pytest.approx(1.0, abs=0.2)
 
 
 def test_the_profile_is_the_sum_on_both_sides(rotating_seed: int) -> None:
