@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from avtorch.decision.strategist import Strategist
     from avtorch.decision.supervisor import Supervisor
     from avtorch.errors import InputError
+    from avtorch.gap.answer.diagnosis import Diagnosis
     from avtorch.gap.diagnose import diagnose
-    from avtorch.gap.diagnosis import Diagnosis
     from avtorch.inference import SGLD, BeliefStream, SequentialInference
     from avtorch.io import Log
     from avtorch.validation import Validation, validate
@@ -47,7 +47,7 @@ _HOME = {
     "avtorch.decision.supervisor": ("Supervisor",),
     "avtorch.errors": ("InputError",),
     "avtorch.gap.diagnose": ("diagnose",),
-    "avtorch.gap.diagnosis": ("Diagnosis",),
+    "avtorch.gap.answer.diagnosis": ("Diagnosis",),
     "avtorch.inference": ("SGLD", "BeliefStream", "SequentialInference"),
     "avtorch.io": ("Log",),
     "avtorch.validation": ("Validation", "validate"),

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from avtorch.gap.diagnosis import Candidate, Diagnosis, Quantity
+    from avtorch.gap.answer.diagnosis import Candidate, Diagnosis, Quantity
 
 ROWS = 8
 BAR = 8
@@ -24,7 +24,7 @@ _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 def diagnosis_headline(found: Diagnosis) -> list[str]:
     """The verdict as one sentence, and below it the diagnosis' own reason."""
-    from avtorch.gap.verdict import meanings
+    from avtorch.gap.answer.verdict import meanings
 
     verdict, p = found.verdict, _share(found.winner.probability)
     if verdict.abstained:
@@ -102,7 +102,7 @@ def _shown(candidates: Iterable[Candidate]) -> tuple[list[Candidate], list[Candi
 
 
 def _parameter(key: str, candidate: Candidate, q: Quantity) -> str:
-    from avtorch.gap.quantity import unit_of, words_of
+    from avtorch.gap.answer.quantity import unit_of, words_of
 
     effect, _, own = key.rpartition(".")
     # a pair's parameters need the effect's name only where both have one of that name

@@ -1,8 +1,11 @@
 """What the simulator lacks: effects along the chain command, actuator, body, sensor, and plants made of them."""
 
 from avtorch.gap import effects
-from avtorch.gap.drive import Drive, Response
-from avtorch.gap.effect import EFFECTS, PLACES, Effect, NoiseChange, Row, effect_class, register
+from avtorch.gap.chain.drive import Drive, Response
+from avtorch.gap.chain.effect import EFFECTS, PLACES, Effect, NoiseChange, Row, effect_class, register
+from avtorch.gap.chain.parameter import Parameter
+from avtorch.gap.chain.plant import BASELINE, GapPlant, plant
+from avtorch.gap.chain.recursion import scan, scan_pair
 from avtorch.gap.effects import (
     AerodynamicDrag,
     Backlash,
@@ -27,9 +30,6 @@ from avtorch.gap.effects import (
     SpeedDependentGain,
     SpeedDependentLag,
 )
-from avtorch.gap.parameter import Parameter
-from avtorch.gap.plant import BASELINE, GapPlant, plant
-from avtorch.gap.recursion import scan, scan_pair
 
 __all__ = [
     "BASELINE",

@@ -9,21 +9,21 @@ from pathlib import Path
 from typing import Literal
 
 from avtorch.errors import InputError
-from avtorch.gap import posterior as posteriors
-from avtorch.gap.aliases import Told
-from avtorch.gap.checkpoint import Checkpoint
-from avtorch.gap.diagnosis import Diagnosis, GapFacts, LogFacts
-from avtorch.gap.effect import EFFECTS, Effect, effect_class
-from avtorch.gap.found import Found, Race
-from avtorch.gap.misfit import gap_facts
-from avtorch.gap.odds import favourite, probabilities
-from avtorch.gap.plant import GapPlant, plant
-from avtorch.gap.posterior import Draws
-from avtorch.gap.remainder import Remainder, remainder
-from avtorch.gap.remaining import remaining
-from avtorch.gap.reported import drawn, moved, repaired, reported
-from avtorch.gap.search import Search
-from avtorch.gap.verdict import Candidate, verdict_of
+from avtorch.gap.answer import posterior as posteriors
+from avtorch.gap.answer.aliases import Told
+from avtorch.gap.answer.diagnosis import Diagnosis, GapFacts, LogFacts
+from avtorch.gap.answer.misfit import gap_facts
+from avtorch.gap.answer.odds import favourite, probabilities
+from avtorch.gap.answer.posterior import Draws
+from avtorch.gap.answer.remainder import Remainder, remainder
+from avtorch.gap.answer.remaining import remaining
+from avtorch.gap.answer.reported import drawn, moved, repaired, reported
+from avtorch.gap.answer.verdict import Candidate, verdict_of
+from avtorch.gap.chain.effect import EFFECTS, Effect, effect_class
+from avtorch.gap.chain.plant import GapPlant, plant
+from avtorch.gap.search.checkpoint import Checkpoint
+from avtorch.gap.search.found import Found, Race
+from avtorch.gap.search.search import Search
 from avtorch.io import Log
 
 

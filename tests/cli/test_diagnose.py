@@ -19,7 +19,7 @@ from rich.console import Console
 from avtorch.cli import main
 from avtorch.cli.diagnosis_table import bar, diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.gap import EFFECTS, DeadTime, GapPlant, plant
-from avtorch.gap.diagnosis import Candidate, Diagnosis, GapFacts, LogFacts, Quantity, near, verdict_of
+from avtorch.gap.answer.diagnosis import Candidate, Diagnosis, GapFacts, LogFacts, Quantity, near, verdict_of
 from avtorch.io import Log
 
 ROWS = 600

@@ -8,14 +8,15 @@ import numpy as np
 import torch
 
 from avtorch.gap import Effect, GapPlant, plant
-from avtorch.gap.candidate import Candidate
-from avtorch.gap.chance import Tails
-from avtorch.gap.fit import finish, modes
-from avtorch.gap.found import Found
-from avtorch.gap.innovations import NoiseModel, Whitener
-from avtorch.gap.losses import Losses
-from avtorch.gap.noise_fit import GUST, PRIORS, fit_noise
-from avtorch.gap.record import Record
+from avtorch.gap.likelihood.candidate import Candidate
+from avtorch.gap.likelihood.fit import finish, modes
+from avtorch.gap.likelihood.noise_fit import GUST, PRIORS, fit_noise
+from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.search.chance import Tails
+from avtorch.gap.search.found import Found
+from avtorch.gap.search.losses import Losses
 from tests.gap.records import QUIET, log_of
 
 SEED = 5

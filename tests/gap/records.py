@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from avtorch.gap import Drive, GapPlant, plant
-from avtorch.gap.innovations import NoiseModel
-from avtorch.gap.record import Record
+from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.likelihood.record import Record
 from avtorch.io import Log
 
 Float = NDArray[np.float64]

@@ -8,8 +8,8 @@ import pytest
 import avtorch
 from avtorch.blindtest import draw_case
 from avtorch.errors import InputError
-from avtorch.gap.checkpoint import Checkpoint
-from avtorch.gap.plant import GapPlant
+from avtorch.gap.chain.plant import GapPlant
+from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.io import Log
 
 

@@ -16,14 +16,14 @@ from avtorch.blindtest.car import Car
 from avtorch.blindtest.drives import Recorded
 from avtorch.blindtest.vehicle import simulate
 from avtorch.gap import DeadTime, RoadGrade, SecondOrderActuator, plant
-from avtorch.gap.candidate import Candidate
-from avtorch.gap.diagnosis import Diagnosis
-from avtorch.gap.effect import Effect
-from avtorch.gap.fit import Fit, finish, modes
-from avtorch.gap.found import Found, Race
-from avtorch.gap.innovations import Whitener
-from avtorch.gap.remainder import remainder
-from avtorch.gap.search import Search
+from avtorch.gap.answer.diagnosis import Diagnosis
+from avtorch.gap.answer.remainder import remainder
+from avtorch.gap.chain.effect import Effect
+from avtorch.gap.likelihood.candidate import Candidate
+from avtorch.gap.likelihood.fit import Fit, finish, modes
+from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.search.found import Found, Race
+from avtorch.gap.search.search import Search
 from avtorch.io import Log
 
 LAPS = (1, 2, 3)

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.gap.effect import Effect, Row, register
-from avtorch.gap.parameter import Parameter
+from avtorch.gap.chain.effect import Effect, Row, register
+from avtorch.gap.chain.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 _REARMED = 1.5  # [m/s] below a shift speed the gear counts as changed back, without interruption

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.gap.effect import Effect, NoiseChange, Row, register
-from avtorch.gap.parameter import Parameter
-from avtorch.gap.recursion import scan
+from avtorch.gap.chain.effect import Effect, NoiseChange, Row, register
+from avtorch.gap.chain.parameter import Parameter
+from avtorch.gap.chain.recursion import scan
 from avtorch.vehicle.arguments import Number, tensor
 
 

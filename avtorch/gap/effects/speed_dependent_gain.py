@@ -7,8 +7,8 @@ from typing import Self
 
 from torch import Tensor
 
-from avtorch.gap.effect import Effect, Row, register
-from avtorch.gap.parameter import Parameter
+from avtorch.gap.chain.effect import Effect, Row, register
+from avtorch.gap.chain.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 _LEAST = 0.0  # the factor's least value, out of a drive's range of speeds

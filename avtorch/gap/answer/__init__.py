@@ -1,0 +1,1 @@
+"""What is said of them: probabilities, `unknown`, alias sets, posteriors, the verdict."""

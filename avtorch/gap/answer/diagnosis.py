@@ -1,0 +1,215 @@
+"""The answer of a diagnosis: candidates with their probabilities, the verdict, the gap, and the repaired simulator."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.errors import InputError
+from avtorch.gap.answer.quantity import Quantity, unit_of
+from avtorch.gap.answer.verdict import Candidate, Verdict, candidate_name, listed, near, plain, verdict_of
+from avtorch.gap.chain.plant import GapPlant
+from avtorch.io import Log, atomic, write_json
+
+if TYPE_CHECKING:
+    from arviz import InferenceData
+
+__all__ = [
+    "Candidate",
+    "Diagnosis",
+    "GapFacts",
+    "LogFacts",
+    "Quantity",
+    "Verdict",
+    "candidate_name",
+    "listed",
+    "near",
+    "verdict_of",
+]
+
+SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead_accel", "grade")
+
+
+@dataclass(frozen=True)
+class LogFacts:
+    """What was looked at: usable or not, all `rows`; `seconds` without gaps; `signals` in any of the logs.
+
+    `name`: the logs' own, files without their folders, which are nobody's business where an answer is read.
+    """
+
+    rows: int
+    segments: int
+    seconds: float
+    rate_hz: float
+    signals: tuple[str, ...] = ()
+    name: str = "log"
+
+    @classmethod
+    def of(cls, logs: Log | Sequence[Log]) -> LogFacts:
+        """Of one log, or of several drives of one car; the rate is then their mean by time."""
+        all_ = [logs] if isinstance(logs, Log) else list(logs)
+        seconds = math.fsum(log.seconds for log in all_)
+        return cls(
+            rows=sum(log.rows for log in all_),
+            segments=sum(len(log.segments()) for log in all_),
+            seconds=seconds,
+            rate_hz=math.fsum(log.rate_hz * log.seconds for log in all_) / seconds,
+            signals=tuple(name for name in SIGNALS if any(getattr(log, name) is not None for log in all_)),
+            name=", ".join(Path(log.name).name or log.name for log in all_),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        given = {"rows": self.rows, "segments": self.segments, "seconds": self.seconds, "rate_hz": self.rate_hz}
+        return given | {"signals": list(self.signals), "name": self.name}
+
+
+@dataclass(frozen=True)
+class GapFacts:
+    """How far the baseline is from the log, and how far noise alone would be (`floor`); None where not measured.
+
+    Rollouts go over `horizon_s` [s]; accelerations [m/s²], speed [m/s]. `detected`: there is a gap, at `p_value`.
+    """
+
+    detected: bool
+    p_value: float | None = None
+    one_step_rmse: float | None = None
+    one_step_floor: float | None = None
+    rollout_rmse_accel: float | None = None
+    rollout_floor_accel: float | None = None
+    rollout_rmse_speed: float | None = None
+    horizon_s: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "one_step": {"rmse": self.one_step_rmse, "floor": self.one_step_floor},
+            "rollout": {
+                "rmse_accel": self.rollout_rmse_accel,
+                "floor_accel": self.rollout_floor_accel,
+                "rmse_speed": self.rollout_rmse_speed,
+                "horizon_s": self.horizon_s,
+            },
+            "detected": bool(self.detected),
+            "p_value": self.p_value,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What the simulator lacks, by a log.
+
+    `candidates` are listed as `listed` has them, whatever was given. `plant`: the simulator with the verdict's effects
+    in, at the posterior mean; None where nothing was named. `draws`: posterior of the winner's parameters (chain,
+    draw) by name. `remaining`: with the default baseline, the candidates for what is left once `dead_time` is in.
+    `complete` False: the budget ended the search. `where`, `shrinkage`, `next_experiment`: objects of the schema, or
+    empty. Raises `InputError` where verdict and candidates do not agree.
+    """
+
+    log: LogFacts
+    baseline: Mapping[str, Quantity]
+    gap: GapFacts
+    candidates: tuple[Candidate, ...]
+    verdict: Verdict
+    onset_s: float | None = None
+    plant: GapPlant | None = None
+    draws: Mapping[str, NDArray] | None = None
+    remaining: tuple[Candidate, ...] | None = None
+    where: tuple[Mapping[str, Any], ...] = ()
+    shrinkage: Mapping[str, Any] | None = None
+    next_experiment: Mapping[str, Any] | None = None
+    complete: bool = True
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "candidates", listed(self.candidates))
+        said = self.verdict.name
+        if self.probability(said) < self.candidates[0].probability - 1e-12:
+            raise InputError(f"verdict: found {said}, needs the most probable, {self.candidates[0].name}")
+        if said not in self.verdict.alias_set or self.verdict.abstained != (said == "unknown"):
+            raise InputError(f"verdict: found {self.verdict}, needs itself in its alias set, and to abstain on unknown")
+
+    @property
+    def winner(self) -> Candidate:
+        """The verdict's candidate."""
+        return next(c for c in self.candidates if c.name == self.verdict.name)
+
+    def probability(self, names: str | Iterable[str]) -> float:
+        """Of a candidate, by name or names; 0 where it is not listed."""
+        name = candidate_name(names)
+        return next((c.probability for c in self.candidates if c.name == name), 0.0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The object of `diagnosis.json`; beside the schema's keys `moved` and `onset_s` of each effect, `remaining`,
+        `complete` and `notes`.
+        """
+        return {
+            "schema": "avtorch.diagnosis/1",
+            "log": self.log.to_dict(),
+            "baseline": plain(self.baseline),
+            "gap": self.gap.to_dict(),
+            "where": [dict(x) for x in self.where],
+            "onset_s": self.onset_s,
+            "effects": [c.to_dict() for c in self.candidates],
+            "verdict": self.verdict.to_dict(),
+            "shrinkage": None if self.shrinkage is None else dict(self.shrinkage),
+            "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),
+            "remaining": None if self.remaining is None else [c.to_dict() for c in self.remaining],
+            "complete": self.complete,
+            "notes": list(self.notes),
+        }
+
+    def write(self, folder: str | PathLike[str]) -> list[Path]:
+        """Write `plant.toml` (where there is a plant), then `diagnosis.json`; returns the files.
+
+        The plant's effects act from the start, also where the log shows them from an onset on; a comment in
+        `plant.toml` then says so (a `gain_change` has its moment among its parameters).
+        An earlier answer in the folder goes first: while `diagnosis.json` is missing, what lies there is not whole.
+        Raises `InputError` where the folder cannot be written or a number is not finite.
+        """
+        answer, repaired = Path(folder) / "diagnosis.json", Path(folder) / "plant.toml"
+        text = None if self.plant is None else self._late() + self.plant.to_toml()
+        for path in (answer, repaired):
+            path.unlink(missing_ok=True)
+        if text is not None:
+            with atomic(repaired) as stream:
+                stream.write(text)
+        write_json(answer, self.to_dict())
+        return [answer] if text is None else [answer, repaired]
+
+    def _late(self) -> str:
+        """A comment for `plant.toml` where the effects set in within the log."""
+        late = " and ".join(name for name in self.verdict.names if name != "gain_change")
+        if self.onset_s is None or not late:
+            return ""
+        return f"# In the log {late} from {self.onset_s:.6g} s on (the log's own time); in this plant from the start.\n"
+
+    def to_arviz(self) -> InferenceData:
+        """The winner's draws as `arviz.InferenceData`, one variable (chain, draw) a parameter, its unit in `attrs`.
+
+        Needs `pip install 'avtorch[arviz]'`. Raises `InputError` where there are no draws.
+        """
+        if not self.draws:
+            raise InputError(
+                f"draws: the diagnosis has none of {self.verdict.name}; a posterior is kept of effects only"
+            )
+        with warnings.catch_warnings():
+            # ArviZ 0.23 announces its successor on import
+            warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major refactor", FutureWarning)
+            try:
+                import arviz
+                import xarray
+            except ImportError:
+                raise InputError("arviz: not installed; to_arviz needs pip install 'avtorch[arviz]'") from None
+        dims = ("chain", "draw")
+        variables = {name: (dims, np.asarray(x), {"units": unit_of(name)}) for name, x in self.draws.items()}
+        sizes = zip(dims, next(iter(variables.values()))[1].shape, strict=True)
+        attributes = {"inference_library": "avtorch", "candidate": self.verdict.name, "log": self.log.name}
+        data = xarray.Dataset(variables, coords={dim: range(size) for dim, size in sizes}, attrs=attributes)
+        return arviz.InferenceData(posterior=data)

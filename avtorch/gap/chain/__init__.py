@@ -1,0 +1,1 @@
+"""The car as a chain of effects: command, actuator, body, sensor."""

@@ -1,0 +1,137 @@
+"""The noise model fitted to what a rollout leaves over: scoring steps on the innovations' likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.likelihood.earlier import earlier, whitener
+from avtorch.gap.likelihood.noise_model import NAMES, NoiseModel
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.likelihood.whitener import Whitener
+
+Float = NDArray[np.float64]
+
+Prior = tuple[float, float, float]
+
+PRIORS: dict[str, Prior] = {
+    "process_sd": (np.log(0.05), 1.2, 4.0),
+    "process_time": (0.0, 0.3, 2.0),
+    "force_sd": (np.log(0.005), 0.5, 1.5),
+    "force_time": (np.log(3.0), 0.3, 1.0),
+    "accel_sd": (np.log(0.05), 1.2, 4.0),
+    "speed_sd": (np.log(0.02), 1.2, 4.0),
+}
+"""Log-normal priors: mean and sd of the logarithm, and beyond how many sds they end.
+
+White jerk noise passes the actuator's lag, so `process_time` is told in units of `T_L`. The nuisance force is small and
+slow by decree: free, it would swallow whatever the car does that no candidate foretells, and every cause with it.
+"""
+
+GUST: dict[str, Prior] = {
+    **PRIORS,
+    "force_sd": (np.log(0.1), 1.0, 4.0),
+    "force_time": (np.log(2.2), 0.63, 2.5),
+}
+"""Priors where the coloured force is the cause."""
+
+_STEP = 1e-3
+_LONGEST = 1.5  # of a step, in prior standard deviations
+_TRIES = 8  # of a step, each shorter; far from the mode squared scores are no information at all
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseFit:
+    """`noise` at its mode; `log_prior` there with Laplace's term: what it adds to a log evidence.
+
+    `rows` (counted,): log likelihood of each row; `sds` of the logarithms, by name.
+    """
+
+    noise: NoiseModel
+    log_prior: float
+    rows: Float = field(repr=False)
+    sds: Mapping[str, float] = field(repr=False)
+
+
+def fit_noise(
+    record: Record,
+    errors: Float,
+    start: NoiseModel,
+    *,
+    T_L: float,
+    priors: Mapping[str, Prior] = PRIORS,
+    onset: int | None = None,
+    gust_onset: int | None = None,
+    iterations: int = 6,
+) -> NoiseFit:
+    """Mode of the noise's parameters given the errors (witness, counted, group) of a rollout; `T_L` [s].
+
+    Errors of groups' means come with group 1. Before `onset` the sensor reads plainly, before `gust_onset` the force is
+    calm.
+    """
+    means = np.array([priors[n][0] for n in NAMES])
+    means[NAMES.index("process_time")] += np.log(T_L)
+    sds, ends = (np.array([priors[n][k] for n in NAMES]) for k in (1, 2))
+
+    onsets = {"onset": onset, "gust_onset": gust_onset}
+
+    def model(z: Float) -> NoiseModel:
+        return replace(start, **{n: float(x) for n, x in zip(NAMES, np.exp(means + sds * z), strict=True)})
+
+    def white(z: Float) -> Whitener:
+        return whitener(record, model(z), **onsets)
+
+    begin = np.log([getattr(start, n) for n in NAMES])
+    z = np.clip((begin - means) / sds, -ends, ends)
+    rows = white(z).row_likelihoods(errors)
+    value = float(rows.sum()) - 0.5 * float(z @ z)
+    if not 0.5 < float((white(z)(errors) ** 2).mean()) < 2.0:
+        # far off: scores mislead, so begin at the best of a coarse grid of sizes
+        for shifts in product((-1.4, 0.0, 1.4), repeat=3):
+            other = z.copy()
+            for name, shift in zip(("process_sd", "accel_sd", "speed_sd"), shifts, strict=True):
+                other[NAMES.index(name)] = shift
+            tried = white(other).row_likelihoods(errors)
+            worth = float(tried.sum()) - 0.5 * float(other @ other)
+            if worth > value:
+                z, rows, value = other, tried, worth
+    damping, information = 1e-2, np.eye(len(z))
+    for _ in range(iterations):
+        ahead = [model(x) for x in z + _STEP * np.eye(len(z))]
+        before = [earlier(n, **onsets) for n in ahead]
+        whites = Whitener.each(record, ahead, before, coarse=errors.shape[-1] == 1)
+        slopes = np.stack([(w.row_likelihoods(errors) - rows) / _STEP for w in whites])
+        # squared scores tell the information where the model fits; far from it they are too large by the square of this
+        excess = max(1.0, float((white(z)(errors) ** 2).mean()))
+        information = slopes @ slopes.T / excess**2 + np.eye(len(z))
+        gradient = slopes.sum(1) - z
+        # what an end holds back does not move
+        held = ((z >= ends) & (gradient > 0)) | ((z <= -ends) & (gradient < 0))
+        free = np.flatnonzero(~held)
+        part = information[np.ix_(free, free)]
+        better = False
+        for _ in range(_TRIES):
+            step = np.linalg.solve(part + damping * np.diag(np.diag(part)), gradient[free])
+            step *= min(1.0, _LONGEST / max(float(np.abs(step).max(initial=0)), 1e-12))
+            new = z.copy()
+            new[free] += step
+            new = np.clip(new, -ends, ends)
+            new_rows = white(new).row_likelihoods(errors)
+            new_value = float(new_rows.sum()) - 0.5 * float(new @ new)
+            if new_value >= value:
+                better = True
+                break
+            damping = max(damping * 8, 1e-2)
+        if not better:
+            break
+        gained, z, rows, value = new_value - value, new, new_rows, new_value
+        damping *= 0.2
+        if gained < 0.02:
+            break
+    log_prior = -0.5 * float(z @ z) - 0.5 * float(np.linalg.slogdet(information)[1])
+    spread = np.sqrt(np.diag(np.linalg.inv(information))) * sds
+    return NoiseFit(model(z), log_prior, rows, dict(zip(NAMES, spread.tolist(), strict=True)))

@@ -1,0 +1,55 @@
+"""The noise of a rollout's errors: its linear-Gaussian model, in six numbers.
+
+The error of a rollout is what no deterministic response foretells,
+
+    dw/dt = p + d            error of the speed
+    p: white jerk noise through the actuator's lag, an Ornstein-Uhlenbeck process (sd, time constant)
+    d: a slow coloured force, the nuisance of every candidate and the cause called `gust`, likewise
+    accel measured = p + d + white,   speed measured = w + white
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+_NO_LAG = 2e-3  # [s], of which no log tells
+
+NAMES = ("process_sd", "process_time", "force_sd", "force_time", "accel_sd", "speed_sd")
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """`process_sd`, `force_sd`, `accel_sd` [m/s²], `speed_sd` [m/s] (white, of single rows), times [s].
+
+    What the accelerometer makes of the car's random motion: `sensor_scale` [-] times it, late by a first-order
+    `sensor_lag` [s].
+    """
+
+    process_sd: float = 0.05
+    process_time: float = 0.35
+    force_sd: float = 0.01
+    force_time: float = 3.0
+    accel_sd: float = 0.05
+    speed_sd: float = 0.02
+    sensor_scale: float = 1.0
+    sensor_lag: float = 0.0
+
+    def replaced(self, **values: float) -> NoiseModel:
+        return replace(self, **values)
+
+    def seen_through(self, values: Mapping[str, float]) -> NoiseModel:
+        """With the accelerometer that a candidate's parameter `values`, by key, speak of."""
+        lag = values.get("sensor_lag.lag_s", 0.0)
+        return replace(
+            self,
+            sensor_scale=values.get("sensor_scale.scale", 1.0),
+            sensor_lag=lag if lag > _NO_LAG else 0.0,
+        )
+
+    def of_means(self, group: int) -> NoiseModel:
+        """Of the means of `group` rows."""
+        size = float(np.sqrt(group))
+        return replace(self, accel_sd=self.accel_sd / size, speed_sd=self.speed_sd / size)

@@ -1,0 +1,114 @@
+"""From when on: the row at which a cause sets in, found by running sums of likelihoods with and without it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.likelihood.candidate import Candidate
+from avtorch.gap.likelihood.fit import slope_of
+from avtorch.gap.likelihood.slope import Slope
+from avtorch.gap.likelihood.whitener import Whitener
+
+Float = NDArray[np.float64]
+
+_PLACES = 12  # where a slope is first asked
+_NEAREST_S = 4.0  # an onset this close to the start or the end is none
+
+
+def profile(without: Float, with_cause: Float) -> Float:
+    """Log likelihood (row,) if the cause sets in at each row, from those of single rows (row,)."""
+    before = np.concatenate([[0.0], np.cumsum(without)[:-1]])
+    after = np.cumsum(with_cause[::-1])[::-1]
+    return before + after
+
+
+def allowed(rows: int, dt: float) -> slice:
+    """Rows at which a cause can be said to set in."""
+    edge = min(round(_NEAREST_S / dt), rows // 4)
+    return slice(edge, rows - edge)
+
+
+def rough(white: Whitener, candidate: Candidate, z: Float) -> tuple[int, float]:
+    """Best onset row for parameters `z` of a fit over the whole drive, and what it gains [nats] over none."""
+    if candidate.grade_means is not None:
+        return _Road.of(white, candidate, z).best(allowed(candidate.record.rows, white.record.dt))
+    full = candidate.errors(z[None], coarse=True)[0]
+    silent = candidate.record.measured.mean(-1, keepdims=True) - candidate.baseline_rollouts(z[None], coarse=True)[0]
+    rows = profile(-0.5 * (white(silent) ** 2).sum((0, 2)), -0.5 * (white(full) ** 2).sum((0, 2)))
+    within = allowed(len(rows), white.record.dt)
+    best = within.start + int(np.argmax(rows[within]))
+    return best, float(rows[best] - rows[0])
+
+
+def refined(white: Whitener, candidate: Candidate, z: Float, onset: int) -> tuple[int, Float]:
+    """Best onset row near `onset`, and the log likelihood over all rows tried, (row,), -inf elsewhere."""
+    record = white.record
+    within = allowed(record.rows, record.dt)
+    road = None if candidate.grade_means is None else _Road.of(white, candidate, z)
+    found = np.full(record.rows, -np.inf)
+    for reach in (8.0, 1.5):
+        steps = np.unique(np.round(np.linspace(-reach, reach, 17) / record.dt).astype(int))
+        tries = np.unique(np.clip(onset + steps, within.start, within.stop - 1))
+        tries = tries[np.isneginf(found[tries])]
+        if not len(tries):
+            continue
+        if road is not None:
+            found[tries] = road.at(tries.tolist())
+        else:
+            errors = np.stack([candidate.errors(z[None], int(t), coarse=True)[0] for t in tries])
+            found[tries] = white.log_likelihood(errors)
+        onset = int(np.argmax(found))
+    return onset, found
+
+
+@dataclass(frozen=True, eq=False)
+class _Road:
+    """Log joint densities with a slope integrated out, if it and all other effects set in at some row.
+
+    A slope is flat where it does not act: what an onset spares is the prior of its coefficients.
+    """
+
+    slope: Slope
+    full: Float
+    along: Float
+
+    @classmethod
+    def of(cls, white: Whitener, candidate: Candidate, z: Float) -> _Road:
+        full = white(candidate.errors(z[None], coarse=True)[0])[..., 0]
+        silent = white(
+            candidate.record.measured.mean(-1, keepdims=True) - candidate.baseline_rollouts(z[None], coarse=True)[0]
+        )[..., 0]
+        along = profile(-0.5 * (silent**2).sum(0), -0.5 * (full**2).sum(0))
+        return cls(slope_of(white, candidate, None, coarse=True), full, along)
+
+    def at(self, rows: Sequence[int]) -> Float:
+        return self.along[list(rows)] + self.slope.from_rows(self.full, rows)
+
+    def best(self, within: slice) -> tuple[int, float]:
+        """Row, and what it gains over the first row of all."""
+        step = (within.stop - 1 - within.start) / (_PLACES - 1)
+        tries = np.linspace(within.start, within.stop - 1, _PLACES).astype(int)
+        found: dict[int, float] = {}
+        for _ in range(3):
+            found |= dict(zip(tries.tolist(), self.at(tries.tolist()).tolist(), strict=True))
+            best = max(found, key=lambda row: found[row])
+            shifts = np.linspace(-1, 1, 9)[1:-1] * step
+            tries = np.unique(np.clip(best + shifts, within.start, within.stop - 1).astype(int))
+            step /= 4
+        return best, found[best] - float(self.at([0])[0])
+
+
+def averaged(found: Float, dt: float) -> float:
+    """What not knowing the onset costs [nats]: mean over a uniform prior against the best row."""
+    tried = np.flatnonzero(np.isfinite(found))
+    if len(tried) < 2:
+        return -float(np.log(len(found)))
+    best = found[tried].max()
+    # between rows tried the likelihood is taken to run straight
+    rows = np.arange(tried[0], tried[-1] + 1)
+    inside = np.interp(rows, tried, np.exp(found[tried] - best))
+    return float(np.log(max(inside.sum(), 1.0) / len(found)))

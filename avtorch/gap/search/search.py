@@ -1,0 +1,386 @@
+"""The search for the cause: all single effects, then pairs where a second effect still gains.
+
+Every candidate is first fitted under the noise of the bare baseline, over the whole drive and from an onset on. The
+best are fitted anew, each with noise of its own, and joined with whatever else gains most on top of them. Causes that
+chance decides (gusts, outliers, lost messages) are judged on the errors that these leave over.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.chain.effect import EFFECTS, Effect
+from avtorch.gap.chain.plant import GapPlant
+from avtorch.gap.effects.road_grade import RoadGrade
+from avtorch.gap.likelihood.candidate import Candidate
+from avtorch.gap.likelihood.earlier import CALM, whitener
+from avtorch.gap.likelihood.fit import finish, left_over, modes
+from avtorch.gap.likelihood.noise_fit import fit_noise
+from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.likelihood.witnesses import judged
+from avtorch.gap.search.chance import Tails, tails
+from avtorch.gap.search.checkpoint import Checkpoint, Kept
+from avtorch.gap.search.found import Found, Race, cleaned, merged, white_first
+from avtorch.gap.search.gusts import gust
+from avtorch.gap.search.losses import losses
+from avtorch.gap.search.onset import averaged, refined
+from avtorch.gap.search.pairing import Base, joint, swapped
+from avtorch.gap.search.screening import ENOUGH, Look, closer, looks
+from avtorch.gap.search.starts import starts, traded
+from avtorch.io import Log
+
+Float = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+
+_TURNS = 10  # of parameters and noise, at most
+_SINGLES = 6  # fitted with noise of their own
+_LEAST = 3.0  # nats at first sight, for less of which no noise of its own would help
+_BASES = 3  # joined with a second effect
+_SECONDS = 4  # tried on each
+_PAIRS = 4  # fitted with noise of their own
+_SWAPS = 2  # times that either half of the best pair is exchanged for another effect
+_SECOND = 8.0  # nats a pair must be ahead of the best single effect for that
+_CLOSE = 12.0  # nats by which a pair may be behind at first sight
+
+
+class Search:
+    """One search over one or several logs of a car."""
+
+    def __init__(
+        self,
+        logs: Sequence[Log],
+        baseline: GapPlant,
+        *,
+        effects: Sequence[type[Effect]] | None = None,
+        pairs: bool = True,
+        budget_s: float | None = None,
+        progress: Progress | None = None,
+        checkpoint: Checkpoint | None = None,
+    ) -> None:
+        self.logs, self.baseline, self.pairs = tuple(logs), baseline, pairs
+        self.effects = list(EFFECTS.values() if effects is None else effects)
+        self.until = None if budget_s is None else time.monotonic() + budget_s
+        self.progress = progress or (lambda what, done, of: None)
+        self.complete = True
+        self.checkpoint = checkpoint or Checkpoint(None)
+
+    # the whole ---------------------------------------------------------------------------------------------------
+    def run(self) -> Race:
+        glitches = None
+        logs = self.logs
+        record = Record.of(logs)
+        raw = Record.of(logs, rate_hz=1e9)
+        none = self._none(record)
+        if self._has("outliers") and record.accel is not None:
+            glitches = self._tails(raw, none)
+            if glitches.hit.any() and glitches.evidence > 2:
+                logs = cleaned(logs, raw, glitches)
+                record = Record.of(logs)
+                none = self._none(record)
+        found = self._deterministic(record, none)
+        if self._has("outliers") and record.accel is not None:
+            again = self._tails(raw, max(found, key=lambda f: f.log_evidence))
+            was = glitches is not None and glitches.evidence > 2 and bool(glitches.hit.any())
+            now = again.evidence > 2 and bool(again.hit.any())
+            before = 0 if glitches is None else int(glitches.hit.sum())
+            if was != now or (now and abs(before - int(again.hit.sum())) > 0.3 * before + 3):
+                logs = cleaned(self.logs, raw, again) if now else self.logs
+                record = Record.of(logs)
+                none = self._none(record)
+                found = self._deterministic(record, none)
+            glitches = again
+        if self._has("command_hold"):
+            found += self._held(Record.of(logs, rate_hz=1e9), found, none)
+        if glitches is not None:
+            found += self._glitched(found, glitches)
+        best: dict[str, Found] = {}
+        for f in sorted(found, key=lambda f: -f.log_evidence):
+            best.setdefault(f.name, f)
+        return Race(record, raw, tuple(logs), tuple(best.values()), self.complete)
+
+    def _has(self, name: str) -> bool:
+        return any(e.name == name for e in self.effects)
+
+    def _late(self) -> bool:
+        if self.until is not None and time.monotonic() > self.until:
+            self.complete = False
+            return True
+        return False
+
+    # deterministic causes and gusts --------------------------------------------------------------------------------
+    def _none(self, record: Record) -> Found:
+        """The bare baseline, with its noise."""
+        candidate = Candidate(record, (), self.baseline)
+        noise = white_first(record)
+        white = Whitener(record, noise)
+        z = np.stack([candidate.z_of({"T_L": t, "K_L": 1.0}) for t in (0.12, 0.3, 0.8)])
+        found, values = modes(candidate, white, z, iterations=6)
+        return self._settled(candidate, found[values.argmax()], noise, rounds=6)
+
+    def _settled(
+        self, candidate: Candidate, z: Float, noise: NoiseModel, *, onset: int | None = None, rounds: int = 2
+    ) -> Found:
+        """Parameters and noise in turn until both rest."""
+        record = candidate.record
+        known = self.checkpoint.next(candidate.name, onset)
+        if known is not None:
+            return known.found(candidate, onset)
+        # on averaged commands first, which is several times as fast and ends close by
+        for coarse in (True, False) if record.group > 1 else (False,):
+            value, best = -np.inf, (z, noise)
+            usual = 2 if record.group > 1 and not coarse else rounds + 1
+            for turn in range(_TURNS):
+                noise = noise.seen_through(self._values(candidate, z))
+                white = whitener(record, noise, onset=onset)
+                enough = ENOUGH if coarse else 0.05
+                if turn < 2:  # once under the noise one came with, and once under its own
+                    z = self._traded(candidate, z, white, onset, coarse)
+                z = modes(candidate, white, z[None], onset=onset, iterations=4, coarse=coarse, enough=enough)[0][0]
+                errors = left_over(candidate, white, z, onset, coarse=coarse)
+                lag = self._values(candidate, z)["T_L"]
+                fitted = fit_noise(record, errors, noise, T_L=lag, onset=onset, iterations=3)
+                noise = fitted.noise
+                new = float(fitted.rows.sum()) + fitted.log_prior - 0.5 * float(z @ z)
+                if new > value:
+                    best, log_prior = (z, noise), fitted.log_prior
+                if new < value + (0.3 if turn < usual - 1 else 3.0):
+                    break
+                value = new
+            z, noise = best
+        self.checkpoint.keep(candidate.name, onset, Kept(z, noise, log_prior))
+        return Kept(z, noise, log_prior).found(candidate, onset)
+
+    @staticmethod
+    def _traded(candidate: Candidate, z: Float, white: Whitener, onset: int | None, coarse: bool) -> Float:
+        """`z`, or the best place from which a dead time and the lag are told apart better."""
+        places = np.concatenate([z[None], traded(candidate, z)])
+        if len(places) == 1:
+            return z
+        moved, values = modes(candidate, white, places, onset=onset, iterations=3, coarse=coarse, enough=ENOUGH)
+        return moved[values.argmax()]
+
+    @staticmethod
+    def _values(candidate: Candidate, z: Float) -> dict[str, float]:
+        return {key: float(x[0]) for key, x in candidate.values(z[None]).items()}
+
+    def _deterministic(self, record: Record, none: Found) -> list[Found]:
+        kinds = [e for e in self.effects if not e.random and judged(e, record.witnesses)]
+        white = Whitener(record, none.noise.noise)
+        seen: list[Look] = []
+        floor, coarse_floor = (
+            float(white.log_likelihood(e[None])[0]) for e in (none.errors, none.errors.mean(-1, keepdims=True))
+        )
+        for i, kind in enumerate(kinds):
+            self.progress("single effects", i, len(kinds))
+            if self._late():
+                break
+            candidate = Candidate(record, (kind,), self.baseline)
+            begin = starts(candidate, none.values)
+            found = looks(candidate, white, begin, onsets=kind.name != "gain_change", floor=coarse_floor)
+            seen += [closer(look, white) for look in found]
+        best: dict[str, float] = {}
+        for look in seen:
+            best[look.candidate.name] = max(best.get(look.candidate.name, -np.inf), look.value)
+        order = sorted(best, key=lambda n: -best[n])
+        top = best[order[0]] - floor if order else 0.0
+        lead = [n for n in order[:_SINGLES] if best[n] - floor > max(min(0.25 * top, top - 30), _LEAST)]
+        found = [none]
+        if self._has("gust"):
+            found.append(gust(none))
+        for i, name in enumerate(lead):
+            self.progress("the best of them", i, len(lead))
+            if self._late():
+                break
+            # a gust's noise is too quiet for causes that explain less
+            noise = max((f for f in found if not f.gust), key=lambda f: f.log_evidence).noise.noise
+            found.append(self._refined([look for look in seen if look.candidate.name == name], noise))
+        found += self._left_behind([look for look in seen if look.candidate.name not in lead], white, none)
+        if self.pairs:
+            found += self._pairs(record, kinds, found, none)
+        return found
+
+    def _left_behind(self, rest: Sequence[Look], white: Whitener, none: Found) -> list[Found]:
+        """The others keep the evidence of their screening."""
+        flat = finish(none.candidate, white, none.z).log_evidence
+        found = []
+        for look in rest:
+            if look.onset is None:
+                fit = finish(look.candidate, white, look.z)
+                evidence = none.log_evidence + fit.log_evidence - flat
+                found.append(Found.of(look.candidate, fit, none.noise, evidence, fit.log_joint))
+        return found
+
+    def _refined(self, forms: Sequence[Look], noise: NoiseModel) -> Found:
+        """One cause over the whole drive and from an onset on; both weigh the same a priori."""
+        return merged([self._from_onset(f.candidate, f.z, noise, f.onset) for f in forms])
+
+    def _from_onset(self, candidate: Candidate, z: Float, noise: NoiseModel, onset: int | None) -> Found:
+        if onset is None:
+            return self._settled(candidate, z, noise)
+        record = candidate.record
+        white = whitener(record, noise, onset=onset)
+        for _ in range(2):
+            z = modes(candidate, white, z[None], onset=onset, iterations=4)[0][0]
+            moved, _ = refined(white, candidate, z, onset)
+            if moved == onset:
+                break
+            onset = moved
+        settled = self._settled(candidate, z, noise, onset=onset)
+        moved, tried = refined(settled.white, candidate, settled.z, onset)
+        if abs(moved - onset) * record.dt > 0.5:
+            settled = self._settled(candidate, settled.z, settled.noise.noise, onset=moved)
+            _, tried = refined(settled.white, candidate, settled.z, moved)
+        return replace(settled, log_evidence=settled.log_evidence + averaged(tried, record.dt))
+
+    # pairs ---------------------------------------------------------------------------------------------------------
+    def _pairs(self, record: Record, kinds: Sequence[type[Effect]], found: list[Found], none: Found) -> list[Found]:
+        single = sorted((f for f in found if f.name != "none"), key=lambda f: -f.log_evidence)
+        if not single or single[0].log_evidence < none.log_evidence + _LEAST:
+            return []
+        top = single[0].log_evidence - none.log_evidence
+        bases = [f for f in single if not f.gust and f.log_evidence - none.log_evidence > 0.2 * top][:_BASES]
+        made = {f.name: f for f in map(gust, bases[:2])} if self._has("gust") else {}
+        for base in bases[:2]:
+            # what drifts slowly is a gust or a road, and the noise that was fitted without either hides the road
+            name = "+".join(sorted([base.name, "gust"]))
+            gusty = made.get(name)
+            if gusty is None or RoadGrade not in kinds or RoadGrade in base.candidate.effects:
+                continue
+            if gusty.log_evidence > base.log_evidence + _SECOND:
+                candidate = Candidate(record, (*base.candidate.effects, RoadGrade), self.baseline)
+                look = Look(candidate, candidate.z_of(base.values), 0.0, base.onset)
+                self._settle_pairs([look], 1, gusty.noise.noise.replaced(force_sd=CALM), made)
+        # a gust's noise is too quiet for causes that explain less
+        noise = (bases[0] if bases else none).noise.noise
+        if single[0].gust:
+            self._under(single[0], kinds, none, made)
+        white = Whitener(record, noise)
+        alone = {f.name: f.values for f in single if not f.gust}
+        seen: dict[str, Look] = {}
+        for i, base in enumerate(bases):
+            self.progress("pairs", i, len(bases))
+            if self._late():
+                break
+            for look in self._joined(base, kinds, white, alone, _SECONDS if i == 0 else _SECONDS // 2):
+                known = seen.get(look.candidate.name)
+                if known is None or look.value > known.value:
+                    seen[look.candidate.name] = look
+        done = self._settle_pairs(list(seen.values()), _PAIRS, noise, made)
+        for _ in range(_SWAPS):
+            if done is None or done.log_evidence < single[0].log_evidence + _SECOND or self._late():
+                break
+            # a better partner for either half, now that the noise is what the best pair leaves over
+            white = done.white
+            _, value = modes(done.candidate, white, done.z[None], onset=done.onset, iterations=1)
+            here = Look(done.candidate, done.z, float(value[0]), done.onset)
+            near = here.value - _CLOSE
+            others = [k for k in swapped(here, kinds, white, alone, tries=_SECONDS) if k.candidate.name not in made]
+            better = self._settle_pairs([k for k in others if k.value > near], 2, done.noise.noise, made)
+            if better is None or better.log_evidence < done.log_evidence + 1:
+                break
+            done = better
+        return list(made.values())
+
+    def _under(self, blown: Found, kinds: Sequence[type[Effect]], none: Found, made: dict[str, Found]) -> None:
+        """Causes that show only once a gust's noise is in, each with the gust, added to `made`."""
+        on = Base(none.candidate, none.z, none.values, none.onset, blown.white)
+        for candidate, z in on.partners(kinds, {}, most=_BASES, least=_LEAST):
+            if self._late():
+                break
+            forms = looks(candidate, blown.white, z[None], onsets=candidate.name != "gain_change")
+            look = max((closer(form, blown.white) for form in forms), key=lambda form: form.value)
+            both = gust(Kept(look.z, blown.noise.noise, 0.0).found(look.candidate, look.onset))
+            if both.name not in made or made[both.name].log_evidence < both.log_evidence:
+                made[both.name] = both
+
+    def _joined(
+        self,
+        base: Found,
+        kinds: Sequence[type[Effect]],
+        white: Whitener,
+        alone: Mapping[str, Mapping[str, float]],
+        most: int,
+    ) -> list[Look]:
+        """The `most` effects that promise most on top of `base`, each fitted with it."""
+        on = Base(base.candidate, base.z, base.values, base.onset, white)
+        found = [
+            joint(candidate, base.candidate.effects[0], z, base.onset, white, onsets=True)
+            for candidate, z in on.partners(kinds, alone, most=most, least=4.0)
+            if not self._late()
+        ]
+        # on averaged commands a controller's noise passes for a partner
+        return [near for near in (closer(look, white) for look in found) if near.value > on.flat + _LEAST]
+
+    def _settle_pairs(self, pairs: list[Look], most: int, noise: NoiseModel, made: dict[str, Found]) -> Found | None:
+        """The best `most` of them with noise of their own, added to `made`; the best of these."""
+        best: Found | None = None
+        for look in sorted(pairs, key=lambda k: -k.value)[:most]:
+            if self._late():
+                break
+            pair = self._refined([look], noise)
+            if pair.name not in made or made[pair.name].log_evidence < pair.log_evidence:
+                made[pair.name] = pair
+            if best is None or pair.log_evidence > best.log_evidence:
+                best = pair
+                noise = pair.noise.noise
+        return best
+
+    # chance --------------------------------------------------------------------------------------------------------
+    def _tails(self, raw: Record, of: Found) -> Tails:
+        errors = self._raw_errors(raw, of)
+        return tails(errors[0, :, 0], raw.dt)
+
+    def _raw_errors(self, raw: Record, of: Found) -> Float:
+        """Errors of a candidate's rollout at the log's own rate, (witness, counted)."""
+        candidate = Candidate(raw, of.candidate.effects, self.baseline)
+        errors = candidate.errors(of.z[None])[0]
+        if of.onset is not None:
+            onset, group = self._raw_row(raw, of, of.onset), of.candidate.record.group
+            if raw.accel is not None:
+                # rows of the group in which it sets in would pass for glitches
+                silent = raw.measured[0] - candidate.baseline_rollouts(of.z[None])[0, 0]
+                near = slice(max(onset - group, 0), onset + group)
+                before = np.cumsum((silent**2 - errors[0] ** 2)[near, 0])
+                onset = near.start + int(np.concatenate([[0.0], before]).argmin())
+            errors = candidate.errors(of.z[None], onset)[0]
+        if of.profile is not None:
+            errors = errors - candidate.grade_response(of.profile)
+        return errors
+
+    @staticmethod
+    def _raw_row(raw: Record, of: Found, row: int) -> int:
+        """Where a counted row of the search's record lies among those of single rows."""
+        return int(np.searchsorted(raw.source, of.candidate.record.source[row] * of.candidate.record.group))
+
+    def _glitched(self, found: list[Found], glitches: Tails) -> list[Found]:
+        """Every candidate with outliers besides, and outliers alone."""
+        out = []
+        for f in found:
+            names = [] if f.name == "none" else f.name.split("+")
+            if len(names) > 1 or "outliers" in names:
+                continue
+            name = "+".join(sorted([*names, "outliers"]))
+            out.append(replace(f, name=name, log_evidence=f.log_evidence + glitches.evidence, tails=glitches))
+        return out
+
+    def _held(self, raw: Record, found: list[Found], none: Found) -> list[Found]:
+        """Lost messages alone and on top of the best single effects."""
+        alone = [f for f in found if f.name != "none" and "+" not in f.name and not f.gust and f.tails is None]
+        best = max(alone, key=lambda f: f.log_evidence, default=none)
+        # lost messages pass for a delay, so they are always tried alone, too
+        bases = [none] if best.log_evidence < none.log_evidence + _LEAST else [none, best]
+        out = []
+        for f in bases:
+            errors = self._raw_errors(raw, f)
+            white = Whitener(raw, f.noise.noise, tuple((self._raw_row(raw, f, row), n) for row, n in f.white.until))
+            lost = losses(white, errors, raw.command[raw.source], f.values["T_L"], f.values["K_L"])
+            name = "+".join(sorted([*([] if f is none else [f.name]), "command_hold"]))
+            out.append(replace(f, name=name, log_evidence=f.log_evidence + lost.evidence, losses=lost))
+        return out

@@ -1,0 +1,117 @@
+"""The noise model found again in errors drawn from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from avtorch.gap.likelihood.noise_fit import GUST, PRIORS, Prior, fit_noise
+from avtorch.gap.likelihood.noise_model import NAMES, NoiseModel
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.search.onset import allowed, profile
+from tests.gap.records import BOTH, Float, drawn_errors, errors_of, log_of, ornstein, record_of
+
+
+def _drawn(rng: np.random.Generator, priors: dict[str, Prior], T_L: float) -> NoiseModel:
+    """A noise model from the middle of the priors."""
+    values = {n: float(np.exp(m + s * rng.uniform(-1, 1))) for n, (m, s, _) in priors.items()}
+    values["process_time"] *= T_L
+    return NoiseModel(**values)
+
+
+def _away(fit, truth: NoiseModel) -> Float:  # type: ignore[no-untyped-def]
+    """By parameter, in its own standard deviations."""
+    return np.array([np.log(getattr(fit.noise, n) / getattr(truth, n)) / fit.sds[n] for n in NAMES])
+
+
+@pytest.mark.parametrize("witnesses", [BOTH, ("accel",), ("speed",)])
+@pytest.mark.parametrize("priors", [PRIORS, GUST], ids=["nuisance", "gust"])
+def test_parameters_are_found_within_their_own_bars(
+    priors: dict[str, Prior], witnesses: tuple[str, ...], rotating_seed: int
+) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    record = record_of(120.0, noise=None, witnesses=witnesses)
+    away = []
+    for _ in range(4):
+        T_L = float(np.exp(rng.uniform(np.log(0.15), np.log(0.9))))
+        truth = _drawn(rng, priors, T_L)
+        # begun at the truth: whether it is found from afar is the next test's
+        fit = fit_noise(record, errors_of(truth, record, rng), truth, T_L=T_L, priors=priors, iterations=12)
+        away.append(_away(fit, truth))
+    # sds are of squared scores, right to some 10 %; the mode of a parameter hardly seen is the prior's
+    assert np.abs(away).max() < 7.0
+    assert np.sqrt((np.array(away) ** 2).mean()) < 2.0
+
+
+def test_the_mode_is_found_from_afar(rotating_seed: int) -> None:
+    """From the usual start, whatever the sensors are: never thousands of nats short."""
+    rng = np.random.default_rng(rotating_seed)
+    record = record_of(120.0, noise=None)
+    short = []
+    for seed in [13, 60, 82, *rng.integers(2**31, size=12).tolist()]:
+        own = np.random.default_rng(seed)
+        T_L = float(np.exp(own.normal(np.log(0.3), 0.5)))
+        values = {
+            n: float(np.exp(m + s * x))
+            for (n, (m, s, _)), x in zip(PRIORS.items(), own.uniform(-1.2, 1.2, 6), strict=True)
+        }
+        truth = NoiseModel(**values).replaced(process_time=values["process_time"] * T_L)
+        errors = errors_of(truth, record, own)
+        near = fit_noise(record, errors, truth, T_L=T_L, iterations=12).rows.sum()
+        short.append(near - fit_noise(record, errors, NoiseModel(), T_L=T_L, iterations=12).rows.sum())
+    assert max(short) < 2.0
+
+
+def test_what_is_seen_well_is_told_well(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    record = record_of(120.0, noise=None)
+    truth = NoiseModel(process_sd=0.08, process_time=0.4, force_sd=0.005, accel_sd=0.06, speed_sd=0.03)
+    fit = fit_noise(record, errors_of(truth, record, rng), NoiseModel(), T_L=0.4, iterations=12)
+    assert fit.sds["accel_sd"] < 0.04
+    assert fit.sds["speed_sd"] < 0.04
+    assert fit.sds["process_sd"] < 0.15
+    # the prior alone tells the nuisance's size, and what it cannot tell it does not claim to
+    assert 0.2 < fit.sds["force_sd"] < 0.6
+    assert np.abs(_away(fit, truth)).max() < 7
+
+
+@pytest.mark.parametrize("rate_hz", [20, 100])
+def test_row_likelihoods_sum_to_the_whole(rate_hz: int, rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    record = Record.of(log_of(seconds=22.0, rate_hz=rate_hz))
+    noise = NoiseModel()
+    errors = errors_of(noise, record, rng) + 0.04 * rng.standard_normal((2, record.rows, record.group))
+    rows = Whitener(record, noise).row_likelihoods(errors)
+    assert rows.shape == (record.rows,)
+    assert rows.sum() == pytest.approx(float(Whitener(record, noise).log_likelihood(errors)))
+    fit = fit_noise(record, errors, noise, T_L=0.35)
+    np.testing.assert_allclose(fit.rows, Whitener(record, fit.noise).row_likelihoods(errors), rtol=0, atol=1e-8)
+
+
+def test_the_moment_a_force_sets_in_is_found(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    record = record_of(100.0, noise=None)
+    calm = NoiseModel(process_sd=0.03, accel_sd=0.03, speed_sd=0.01, force_sd=0.003)
+    truth = replace(calm, force_sd=0.3, force_time=2.0)
+    at = 900
+    errors = drawn_errors(calm, record.rows, record.dt, rng)
+    force, gained = ornstein(truth.force_sd, truth.force_time, record.rows - at, record.dt, rng)
+    errors[0, at:] += force
+    errors[1, at:] += gained
+    errors = errors[..., None]
+
+    quiet = Whitener(record, calm).row_likelihoods(errors)
+    loud = Whitener(record, truth).row_likelihoods(errors)
+    along = profile(quiet, loud)
+    within = allowed(record.rows, record.dt)
+    onset = within.start + int(np.argmax(along[within]))
+    # the force begins at any size, now and then near nought: it grows by 0.3 m/s² within its time constant
+    assert abs(onset - at) * record.dt < 3.0
+    fit = fit_noise(record, errors, truth, T_L=0.35, priors=GUST, gust_onset=onset, iterations=10)
+    whole = fit_noise(record, errors, truth, T_L=0.35, priors=GUST, iterations=10)
+    assert fit.rows.sum() > whole.rows.sum() + 20
+    for name in ("force_sd", "force_time"):
+        assert abs(np.log(getattr(fit.noise, name) / getattr(truth, name))) < 6 * fit.sds[name]

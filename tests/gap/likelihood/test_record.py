@@ -1,0 +1,210 @@
+"""What of a log counts for a diagnosis, and how rows come in groups."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from avtorch.errors import InputError
+from avtorch.gap import plant
+from avtorch.gap.likelihood.candidate import Candidate
+from avtorch.gap.likelihood.record import Record
+from avtorch.io import Log
+from tests.gap.records import log_of
+
+
+def _cut(log: Log, *parts: slice) -> Log:
+    """The log with only these rows, each part a drive of its own."""
+    rows = np.concatenate([np.arange(log.rows)[p] for p in parts])
+    number = np.concatenate([np.full(len(np.arange(log.rows)[p]), i) for i, p in enumerate(parts)])
+    cut = {name: getattr(log, name)[rows] for name in ("time", "accel_cmd", "accel", "speed")}
+    return Log.from_arrays(name=log.name, segment=number, **cut)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "group", "dt"), [(10, 1, 0.1), (20, 1, 0.05), (25, 1, 0.04), (50, 2, 0.04), (100, 5, 0.05)]
+)
+def test_rows_are_averaged_down_to_some_twenty_a_second(rate_hz: int, group: int, dt: float) -> None:
+    log = log_of(seconds=20.0, rate_hz=rate_hz)
+    record = Record.of(log)
+    assert record.group == group
+    assert record.dt == pytest.approx(dt)
+    assert record.accel is not None
+    assert record.speed is not None
+    assert log.accel is not None
+    assert record.accel.shape == record.speed.shape == (log.rows // group, group)
+    np.testing.assert_array_equal(record.accel.ravel(), log.accel)
+    np.testing.assert_array_equal(record.time, log.time[::group])
+    np.testing.assert_allclose(record.command, log.accel_cmd.reshape(-1, group).mean(1))  # type: ignore[union-attr]
+    assert record.measured.shape == (2, record.rows, group)
+    # all but the first two seconds, in which the actuator's state is not known
+    np.testing.assert_allclose(record.time[record.source[[0, -1]]], [2.0, record.time[-1]], atol=1e-9)
+    assert Record.of(log, rate_hz=1e9).group == 1
+
+
+def test_drives_are_rolled_out_at_the_logs_rate_coarse_ones_at_the_groups(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    short = Record.of(log_of(seconds=20.0, rate_hz=100))
+    assert short.coarse is short.drives
+    monkeypatch.setattr("avtorch.gap.likelihood.record._FEW", 0)
+    log = log_of(seconds=20.0, rate_hz=100)
+    record = Record.of(log)
+    (fine,), (coarse,) = record.drives, record.coarse
+    assert len(fine.time) == log.rows
+    assert len(coarse.time) == log.rows // 5
+    assert fine.uniform
+    assert coarse.uniform
+    np.testing.assert_array_equal(fine.command.numpy(), log.accel_cmd)
+    single = Record.of(log_of(seconds=20.0, rate_hz=20))
+    assert single.coarse[0] is single.drives[0]
+
+
+@pytest.mark.parametrize("rate_hz", [20, 40, 100])
+def test_the_truth_leaves_nothing_over(rate_hz: int) -> None:
+    car = plant(T_L=0.4, K_L=0.9)
+    record = Record.of(log_of(car, seconds=40.0, rate_hz=rate_hz, noise=None))
+    candidate = Candidate.named(record, "none", plant())
+    z = candidate.z_of({"T_L": 0.4, "K_L": 0.9})[None]
+    errors = candidate.errors(z)[0]
+    # the first acceleration, taken from 0.3 s, is forgotten within some lags; what it added to the speed is not
+    assert np.abs(errors[0]).max() < 2e-2
+    assert np.abs(np.diff(errors[1], axis=0)).max() < 2e-3
+    assert np.abs(errors[:, errors.shape[1] // 2 :] - errors[:, -1:, -1:]).max() < 1e-6
+
+
+@pytest.mark.parametrize("rate_hz", [50, 100])
+def test_coarse_responses_are_close_to_the_groups_means(rate_hz: int) -> None:
+    car = plant(T_L=0.4, K_L=0.9)
+    record = Record.of(log_of(car, seconds=40.0, rate_hz=rate_hz, noise=None))
+    candidate = Candidate.named(record, "none", plant())
+    z = candidate.z_of({"T_L": 0.4, "K_L": 0.9})[None]
+    means = candidate.rollouts(z).mean(-1, keepdims=True)
+    coarse = candidate.rollouts(z, coarse=True)
+    assert coarse.shape == means.shape
+    # within a group the exponential is taken for a straight line, and a step of the command for its mean
+    jumps = np.abs(np.diff(record.command)).max()
+    assert np.abs(coarse - means)[:, 0].max() < 0.5 * jumps * record.dt / 0.4
+    assert np.sqrt(((coarse - means)[:, 0] ** 2).mean()) < 0.01
+    speeds = (coarse - means)[0, 1] - (coarse - means)[0, 1, :1]
+    assert np.abs(speeds).max() < 0.02
+
+
+def _stretches(record: Record) -> list[tuple[float, float]]:
+    ends = [*record.starts[1:], record.rows]
+    return [
+        (float(record.time[record.source[a]]), float(record.time[record.source[b - 1]]))
+        for a, b in zip(record.starts, ends, strict=True)
+    ]
+
+
+def test_standstill_and_a_drivers_foot_do_not_count() -> None:
+    log = log_of(seconds=60.0, rate_hz=40)
+    assert log.speed is not None
+    engaged = (log.time < 20) | (log.time >= 24.5)
+    speed = np.where((log.time >= 40) & (log.time < 43), 0.0, log.speed)
+    record = Record.of(replace(log, engaged=engaged, speed=speed))
+    assert record.group == 2
+    np.testing.assert_allclose(_stretches(record), [(2, 19.95), (24.5, 39.95), (43, 59.95)], atol=1e-6)
+    # within a stretch rows follow each other, between two lies a gap
+    steps = np.diff(record.target)
+    assert (steps[np.diff(record.stretch) == 0] == 1).all()
+    assert (steps[np.diff(record.stretch) == 1] >= 4 / record.dt).all()
+    assert record.length > record.target.max()
+    padded = record.padded(np.ones((2, record.rows, record.group)))
+    assert padded.shape == (2, record.length * record.group)
+    assert padded.sum() == 2 * record.rows * record.group
+    # the whole drive is rolled out all the same: one drive
+    assert len(record.drives) == 1
+
+
+def test_a_group_with_one_row_that_does_not_count_does_not_count() -> None:
+    log = log_of(seconds=30.0, rate_hz=100)
+    engaged = np.ones(log.rows, bool)
+    engaged[1503] = False
+    record = Record.of(replace(log, engaged=engaged))
+    assert 300 not in record.source
+    assert {299, 301} <= set(record.source.tolist())
+
+
+def test_short_stretches_are_left_out() -> None:
+    log = log_of(seconds=40.0)
+    engaged = (log.time < 20) | ((log.time >= 21) & (log.time < 22)) | (log.time >= 25)
+    np.testing.assert_allclose(
+        _stretches(Record.of(replace(log, engaged=engaged))), [(2, 19.95), (25, 39.95)], atol=1e-6
+    )
+
+
+def test_segments_are_drives_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avtorch.gap.likelihood.record._FEW", 0)
+    log = log_of(seconds=60.0, rate_hz=100)
+    record = Record.of(_cut(log, slice(0, 1503), slice(1600, 4004), slice(4400, 5950)))
+    assert [len(d.time) for d in record.drives] == [1500, 2400, 1550]
+    assert [len(d.time) for d in record.coarse] == [300, 480, 310]
+    np.testing.assert_allclose(_stretches(record), [(2, 14.95), (18, 39.95), (46, 59.45)], atol=1e-6)
+    # measured and rolled out stand at the same rows
+    seen = record.seen([d.command for d in record.drives])
+    np.testing.assert_allclose(seen.mean(-1), record.command[record.source])
+    at = record.seen([d.time for d in record.drives])
+    np.testing.assert_allclose(at[:, 0], record.time[record.source], atol=1e-6)
+
+
+def test_several_logs_are_one_after_another() -> None:
+    a, b = log_of(seconds=20.0, name="a"), log_of(seconds=30.0, name="b", speed0=25.0)
+    record = Record.of([a, b])
+    alone = [Record.of(a), Record.of(b)]
+    assert record.rows == sum(r.rows for r in alone)
+    np.testing.assert_array_equal(record.measured, np.concatenate([r.measured for r in alone], 1))
+    candidate = Candidate.named(record, "none", plant())
+    z = np.zeros((2, 2))
+    together = candidate.rollouts(z)
+    parts = [Candidate.named(r, "none", plant()).rollouts(z) for r in alone]
+    np.testing.assert_allclose(together, np.concatenate(parts, 2), atol=1e-9)
+    np.testing.assert_array_equal(Record.of(iter([a])).source, alone[0].source)
+
+
+@pytest.mark.parametrize("witness", ["accel", "speed"])
+def test_one_witness_is_enough(witness: str) -> None:
+    record = Record.of(log_of(seconds=20.0, witnesses=(witness,)))
+    assert record.witnesses == (witness,)
+    assert record.measured.shape == (1, record.rows, 1)
+    assert (record.drives[0].speed is None) == (witness == "accel")
+
+
+def test_stamps_that_jitter_in_their_last_digits_are_even() -> None:
+    log = log_of(seconds=30.0)
+    rng = np.random.default_rng(0)
+    stamped = replace(log, time=np.round(log.time + rng.uniform(-4e-4, 4e-4, log.rows), 4))
+    assert Record.of(stamped).drives[0].uniform
+    lost = np.delete(np.arange(log.rows), [200, 333])
+    assert not Record.of(_cut(log, lost)).drives[0].uniform  # type: ignore[arg-type]
+
+
+def _refused(logs: object, *words: str) -> None:
+    with pytest.raises(InputError) as told:
+        Record.of(logs)  # type: ignore[arg-type]
+    assert "\n" not in str(told.value)
+    for word in words:
+        assert word in str(told.value)
+
+
+def test_bad_input_is_one_clear_error() -> None:
+    log = log_of(seconds=30.0)
+    _refused([], "logs", "none given")
+    _refused(replace(log, accel_cmd=None), "drive", "accel_cmd")
+    _refused(log_of(seconds=1.5), "nothing to diagnose")
+    _refused(log_of(seconds=9.0), "7.0 s", "10 s")
+    _refused(replace(log, speed=np.zeros(log.rows)), "0.0 s", "moving")
+    _refused(replace(log, engaged=np.zeros(log.rows, bool)), "0.0 s", "engaged")
+    _refused([log, log_of(seconds=30.0, name="other", witnesses=("speed",))], "drive", "other", "witnesses")
+
+
+def test_logs_of_one_name_with_other_witnesses_are_refused() -> None:
+    _refused([log_of(seconds=30.0), log_of(seconds=30.0, witnesses=("speed",))], "witnesses")
+
+
+def test_logs_of_different_rates_are_refused() -> None:
+    """Rows of 25 and 40 Hz do not pass one filter."""
+    _refused([log_of(seconds=30.0, rate_hz=r, name=f"at {r} Hz") for r in (25, 40)], "rate", "at 25 Hz", "at 40 Hz")

@@ -1,0 +1,90 @@
+"""An accelerometer feels every force but gravity: on hills it and the speed tell two tales, and that is what slopes do.
+
+The reference vehicle gives the log. Its actuator does not look at the speed, so under the same commands and the same
+noise what an accelerometer reads on hills is what it shows on the flat.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import avtorch
+from avtorch.blindtest.car import Car
+from avtorch.blindtest.drives import Drive as Plan
+from avtorch.blindtest.drives import Recorded
+from avtorch.blindtest.vehicle import Run, simulate
+from avtorch.errors import InputError
+from avtorch.gap import AerodynamicDrag, Drive, RoadGrade, SensorLag, plant
+from avtorch.gap.likelihood.candidate import Candidate
+from avtorch.gap.likelihood.record import Record
+from avtorch.io import Log
+from tests.gap.records import log_of
+
+D = torch.float64
+
+
+@pytest.fixture(scope="module")
+def hills() -> Log:
+    """90 s of steps at 14 to 31 m/s over slopes of 1.5 %, the accelerometer fixed to the car."""
+    car, plan = Car(T_L=0.4, K_L=0.95, process_sd=0.04), Plan("steps", 90.0, 20, 1)
+    command = simulate(car, plan.pilot(), seconds=90.0, rate_hz=20, seed=1).command
+
+    def again(effects: dict[str, dict[str, float]]) -> Run:
+        pilot = Recorded(command, start_speed=plan.pilot().start_speed + 5)
+        return simulate(car, pilot, seconds=90.0, rate_hz=20, effects=effects, seed=1)
+
+    flat, hilly = again({}), again({"road_grade": {"grade_rms": 0.015, "length_m": 150.0}})
+    assert float(np.std(hilly.true_accel - flat.true_accel)) > 0.05
+    return Log.from_arrays(time=hilly.time, accel_cmd=hilly.command, accel=flat.accel, speed=hilly.speed)
+
+
+@pytest.mark.slow
+def test_hills_are_named_where_the_log_says_what_its_accelerometer_reads(hills: Log) -> None:
+    told = avtorch.diagnose(hills, accel_kind="specific-force", pairs=False)
+    assert told.verdict.names == ("road_grade",)
+    # taken for dv/dt, the same reading contradicts the speed, and no slope explains that
+    wrong = avtorch.diagnose(hills, accel_kind="kinematic", pairs=False)
+    assert wrong.verdict.names != ("road_grade",)
+    # a candidate less probable than 1e-4 is not listed
+    evidence = [next((c.log_evidence for c in a.candidates if c.name == "road_grade"), None) for a in (told, wrong)]
+    assert evidence[0] is not None
+    assert evidence[0] > 1000
+    assert evidence[1] is None or evidence[0] > evidence[1] + 500
+
+
+def test_a_drive_with_an_accelerometer_shows_the_slope_in_the_speed_alone() -> None:
+    road = RoadGrade(0.04, torch.linspace(-1, 1, 8, dtype=D), 8)
+    car, flat = plant([road, AerodynamicDrag(), SensorLag(0.2)]), plant([AerodynamicDrag(), SensorLag(0.2)])
+    time = torch.arange(200, dtype=D) * 0.05
+    drive = Drive(time, torch.sin(time), 20 + torch.sin(time), 0.3)
+    bus, fixed = car.response(drive), car.response(replace(drive, specific_force=True))
+    level = flat.response(drive)
+    # the drag is felt, the slope is not; the start is the actuator's own in both, gravity in it or not
+    torch.testing.assert_close(fixed.accel_measured, level.accel_measured, rtol=0, atol=1e-12)
+    assert float((bus.accel_measured - level.accel_measured).abs().max()) > 0.1
+    assert float((fixed.speed - level.speed).abs().max()) > 0.5
+    late = torch.arange(200) > 100  # what the start differs by is forgotten
+    torch.testing.assert_close(fixed.accel[late], bus.accel[late], rtol=0, atol=1e-3)
+
+
+def test_the_kind_travels_with_the_log() -> None:
+    log = replace(log_of(seconds=20.0, rate_hz=40), accel_kind="specific-force")
+    assert log[0:100].accel_kind == "specific-force"
+    record = Record.of(log)
+    assert record.accel_kind == "specific-force"
+    assert all(d.specific_force for d in (*record.drives, *record.coarse))
+    assert Drive.from_log(log).specific_force
+    columns = [Candidate(Record.of(x), (RoadGrade,), plant()).grade_columns for x in (log, log_of(seconds=20.0))]
+    assert columns[0] is not None
+    assert columns[1] is not None
+    assert not columns[0][:, 0].any()
+    assert columns[0][:, 1].any()
+    assert columns[1][:, 0].any()
+    with pytest.raises(InputError, match="different kinds of accel"):
+        Record.of([log, replace(log, accel_kind="kinematic")])
+    with pytest.raises(InputError, match="accel_kind: found 'gravity'"):
+        avtorch.diagnose(log, accel_kind="gravity")  # type: ignore[arg-type]
