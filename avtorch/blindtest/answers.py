@@ -23,8 +23,8 @@ class Answered:
     """A case with its answer.
 
     `truth`: `none`, `unknown` (a cause outside the table), an effect or two joined by `+`; `kind`, `tier` of the
-    case. `verdict` likewise; `probabilities` by candidate; `alias_set`. `closed_error`, `placebo`, `onset_error`
-    [s]: None where the case or the answer has none.
+    case. `verdict` likewise; `probabilities` by candidate; `alias_set`. `closed_error`, `closed_covered`,
+    `placebo` (mean, q05), `onset_error` [s]: None where the case or the answer has none.
     """
 
     truth: str
@@ -34,7 +34,8 @@ class Answered:
     probabilities: Mapping[str, float]
     alias_set: frozenset[str]
     closed_error: float | None
-    placebo: float | None
+    closed_covered: bool | None
+    placebo: Mapping[str, float] | None
     onset_error: float | None
 
     @property
@@ -68,12 +69,12 @@ class Answered:
 def read(truth: Mapping[str, Any], answer: Mapping[str, Any] | None) -> Answered:
     """A truth (`Case.truth()`) and the answer to its log (None: there was none).
 
-    Beside the schema's fields, `answer["placebo"]["closed"]` may hold what adding a wrong effect closed of the
-    held-out gap. Raises `InputError` for probabilities that do not sum to 1, or `none` and `unknown` missing.
+    Beside the schema's fields, `answer["shrinkage"]["placebo"]["closed"]` may hold what adding a wrong effect closed of
+    the held-out gap. Raises `InputError` for probabilities that do not sum to 1, or `none` and `unknown` missing.
     """
     of = str(truth.get("case", "answer"))
     if answer is None:
-        return Answered(truth["verdict"], truth["kind"], truth["tier"], FAILED, {}, frozenset(), None, None, None)
+        return Answered(truth["verdict"], truth["kind"], truth["tier"], FAILED, {}, frozenset(), None, None, None, None)
     probabilities = {joined(effect["name"]): float(effect["probability"]) for effect in answer["effects"]}
     if abs(sum(probabilities.values()) - 1) > 1e-6 or min(probabilities.values(), default=-1) < 0:
         raise InputError(f"{of}: probabilities sum to {sum(probabilities.values()):.8g}, need 1 and none below 0")
@@ -89,25 +90,40 @@ def read(truth: Mapping[str, Any], answer: Mapping[str, Any] | None) -> Answered
         probabilities=probabilities,
         alias_set=frozenset(joined(name) for name in answer["verdict"]["alias_set"]),
         closed_error=_closed_error(truth, answer) if named_right else None,
-        placebo=(answer.get("placebo") or {}).get("closed"),
+        closed_covered=_closed_covered(truth, answer) if named_right else None,
+        placebo=_placebo(answer),
         onset_error=_onset_error(truth, answer) if named_right else None,
     )
 
 
 def _closed_error(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> float | None:
-    """How far the answer's `closed` lies from the oracle's.
+    """How far the answer's `closed` lies from the oracle's."""
+    oracle, said = _oracle_closed(truth, answer), _closed(answer)
+    return None if oracle is None or said is None else abs(float(said["mean"]) - oracle)
 
-    The oracle knows the cause, and so how much of the error before is noise: it takes the answer's own error before
-    and after, on the answer's own held-out blocks, and puts the floor where the truth has it.
+
+def _closed_covered(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> bool | None:
+    """Whether the 90 % interval of the answer's `closed` holds the oracle's."""
+    oracle, said = _oracle_closed(truth, answer), _closed(answer)
+    return None if oracle is None or said is None else bool(said["q05"] <= oracle <= said["q95"])
+
+
+def _oracle_closed(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> float | None:
+    """What was closed, by one who knows the cause, and so what of the error is noise.
+
+    It takes the answer's own error before and after, every block of the drive held out once, and puts the floor where
+    the truth has it. None where there was nothing to close.
     """
     shrinkage = answer.get("shrinkage") or {}
     oracle = (truth.get("oracle") or {}).get(shrinkage.get("metric"))
-    said = (shrinkage.get("closed") or {}).get("mean")
-    if said is None or oracle is None or oracle["closed"] is None:
+    if oracle is None or oracle["closed"] is None:
         return None
-    before, after = float(shrinkage["before"]), float(shrinkage["after"])
-    floor = before * oracle["floor"] / oracle["before"]
-    return abs(float(said) - (before - after) / (before - floor)) if before > floor else None
+    before, after, floor = float(shrinkage["before"]), float(shrinkage["after"]), float(oracle["floor"])
+    return (before - after) / (before - floor) if before > floor else None
+
+
+def _closed(answer: Mapping[str, Any]) -> Mapping[str, float] | None:
+    return (answer.get("shrinkage") or {}).get("closed")
 
 
 def _onset_error(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> float | None:
@@ -116,3 +132,7 @@ def _onset_error(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> float |
         return None
     said = answer.get("onset_s")
     return float(truth["drive"]["seconds"]) if said is None else abs(float(said) - float(truth["onset_s"]))
+
+
+def _placebo(answer: Mapping[str, Any]) -> Mapping[str, float] | None:
+    return ((answer.get("shrinkage") or {}).get("placebo") or {}).get("closed")

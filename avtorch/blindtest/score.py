@@ -38,8 +38,8 @@ def score(
       cases. `unknown_confidently_blamed`: share of the former that give a named effect or pair 0.5 or more.
     - `confident_errors`, `ece` (ten bins of the probability of the most probable candidate), `brier`: all cases.
     - `macro_f1`: over the labels that occur, an effect found within a pair counts for that effect.
-    - `closed_error`, `onset_error_s` (median): where the verdict is right. `placebo_closed`: mean over the answers
-      that tell one.
+    - `closed_error`, `closed_covered` (by the 90 % interval), `onset_error_s` (median): where the verdict is right.
+      `placebo_closed`: mean over the answers that tell one, `placebo_nothing`: how often its interval reaches 0.
 
     Args: `seconds` each answer took. `resamples`, `seed` of the bootstrap. Raises `InputError` for lengths that
     differ and for answers that break the schema.
@@ -66,7 +66,10 @@ def score(
     sheet.share("pairs_exact", [r.right for r in by_kind["pair"]])
     sheet.mean("pairs_jaccard", [_jaccard(r) for r in by_kind["pair"]])
     sheet.mean("closed_error", [r.closed_error for r in rows if r.closed_error is not None])
-    sheet.mean("placebo_closed", [r.placebo for r in rows if r.placebo is not None])
+    sheet.share("closed_covered", [r.closed_covered for r in rows if r.closed_covered is not None])
+    placebos = [r.placebo for r in rows if r.placebo is not None]
+    sheet.mean("placebo_closed", [float(p["mean"]) for p in placebos])
+    sheet.share("placebo_nothing", [p["q05"] <= 0 for p in placebos])
     late = [r for r in rows if r.onset_error is not None]
     sheet.measure("onset_error_s", late, lambda some: float(np.median([r.onset_error or 0.0 for r in some])))
     sheet.mean("seconds_per_case", list(seconds or ()))

@@ -46,7 +46,8 @@ class Run:
     `time`, `command`, `accel`, `speed`: what the log shows. `noise_accel`: the part of `accel` that is process and
     sensor noise. `noise_speed`: the part of `speed` that is sensor noise and rounding; `drift_speed`: what process
     noise has summed to since the drive began. `chance_accel`, `chance_speed`: the part that comes of an effect but
-    that nobody can foretell (gusts, outliers), the latter summed likewise.
+    that nobody can foretell (gusts, outliers), the latter summed likewise. `felt_accel`: what a late or wrongly scaled
+    accelerometer shows of process noise and gusts beyond the noise itself.
     `true_accel`, `true_speed`, `position`: the car's own.
     """
 
@@ -59,6 +60,7 @@ class Run:
     drift_speed: Float
     chance_accel: Float
     chance_speed: Float
+    felt_accel: Float
     true_accel: Float
     true_speed: Float
     position: Float
@@ -231,6 +233,18 @@ class _Drive:
             a, v, raw, place = (x[i] + share * (x[i - 1] - x[i]) for x in (filtered, speeds, accels, places))
         return sensors.accel(a, place, time), sensors.speed(v, raw, place, time)
 
+    def _felt(self) -> Float:
+        """(row,): process noise and gusts through the accelerometer's lag and scale, less themselves."""
+        begin, rows = self.first * self.per_row, np.arange(self.rows) * self.per_row
+        motion = self.process + self.gust
+        shown = motion.copy()
+        if "sensor_lag" in self.effects:
+            (late,) = filters({"sensor_lag": self.effects["sensor_lag"]}, float(motion[begin]))
+            shown[begin:] = [late(x) for x in motion[begin:].tolist()]
+        if "sensor_scale" in self.effects:
+            shown[begin:] *= self.effects["sensor_scale"]["scale"]
+        return (shown - motion)[rows]
+
     def _logged(
         self,
         commands: list[float],
@@ -262,6 +276,7 @@ class _Drive:
             drift_speed=summed(self.process),
             chance_accel=self.gust[rows] + self.white_accel - self.base_accel,
             chance_speed=summed(self.gust),
+            felt_accel=self._felt(),
             true_accel=np.array(accels)[rows],
             true_speed=true_v,
             position=np.array(places)[rows],

@@ -160,7 +160,7 @@ class Oracle:
 
 
 def oracles(run: Run, fitted: Sight, *, foretold: bool) -> dict[str, Oracle]:
-    """`rollout_rmse_accel` [m/s²] and `rollout_rmse_speed` [m/s, over 10 s], by metric.
+    """`rollout_rmse_accel` [m/s²] and `rollout_rmse_speed` [m/s, over 10 s from a measured speed], by metric.
 
     `foretold`: False where the cause decides by chance what the car does with its command (lost messages), so that
     knowing it helps no rollout. Gusts and outliers are left to the floor, whose share of the log is known.
@@ -169,15 +169,14 @@ def oracles(run: Run, fitted: Sight, *, foretold: bool) -> dict[str, Oracle]:
     dt = float(run.time[1] - run.time[0])
     unit_a, unit_v = exact_gain(run.command, dt, fitted.T_L)
     before_a = witness.rms_accel(run.accel - fitted.K_L * unit_a)
-    clean = run.speed - run.noise_speed
-    before_v = witness.rms_speed(run.noise_speed + witness.since_start(clean - fitted.K_L * unit_v))
+    before_v = witness.rms_speed(witness.since_start(run.speed - fitted.K_L * unit_v))
     if not foretold:
         return {
             "rollout_rmse_accel": Oracle(before_a, before_a, before_a),
             "rollout_rmse_speed": Oracle(before_v, before_v, before_v),
         }
-    floor_a = witness.rms_accel(run.noise_accel + run.chance_accel)
-    floor_v = witness.rms_speed(run.noise_speed + witness.since_start(run.drift_speed + run.chance_speed))
+    floor_a = witness.rms_accel(run.noise_accel + run.chance_accel + run.felt_accel)
+    floor_v = witness.rms_speed(witness.since_start(run.noise_speed + run.drift_speed + run.chance_speed))
     return {
         "rollout_rmse_accel": Oracle(before_a, floor_a, floor_a),
         "rollout_rmse_speed": Oracle(before_v, floor_v, floor_v),

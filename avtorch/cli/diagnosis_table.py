@@ -72,7 +72,7 @@ def diagnosis_notes(found: Diagnosis) -> list[str]:
         lines.append(f"Onset: at {found.onset_s:.1f} s of the log's time.")
     elif found.winner.effects:
         lines.append("Onset: there from the start.")
-    lines += _moved(found.baseline, found.winner.moved) + _gap(found)
+    lines += _moved(found.baseline, found.winner.moved) + _gap(found) + _shrinkage(found)
     if found.remaining:
         best = sorted(found.remaining, key=lambda c: -c.probability)[:3]
         told = ", ".join(f"{c.name} {_number(c.probability)}" for c in best if c.probability >= 0.005)
@@ -156,6 +156,30 @@ def _gap(found: Diagnosis) -> list[str]:
         return []
     over = "" if gap.horizon_s is None else f", over {gap.horizon_s:.3g} s"
     return [f"Gap of the simulator as it is{over}: {', '.join(parts)}."]
+
+
+_MEASURES = {
+    "rollout_rmse_accel": ("acceleration, rolled out over the drive,", "m/s²"),
+    "rollout_rmse_speed": ("speed, rolled out over 10 s,", "m/s"),
+}
+
+
+def _shrinkage(found: Diagnosis) -> list[str]:
+    told = found.shrinkage
+    if told is None:
+        return []
+    top, few = told.top, "" if told.chosen == 1 else f"; chosen there by {100 * told.chosen:.0f} % of the parts"
+    if told.metric in _MEASURES:
+        words, unit = _MEASURES[told.metric]
+        line = f"On blocks held out: {words} off by {top.before:.2g}, with the effect by {top.after:.2g} {unit}"
+    else:
+        gain = top.after - top.before
+        line = f"On blocks held out: log density {gain:+.2g} nats a row with the effect; no rollout shows it"
+    if top.closed is None:
+        return [f"{line}; next to nothing could be closed{few}."]
+    q = top.closed
+    share = f"{100 * q.mean:.0f} % ({100 * q.q05:.0f} to {100 * q.q95:.0f})"
+    return [f"{line}: closes {share} of what can be closed{few}."]
 
 
 def _number(p: float) -> str:

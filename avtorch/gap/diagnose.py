@@ -21,6 +21,7 @@ from avtorch.gap.answer.reported import drawn, moved, repaired, reported
 from avtorch.gap.answer.verdict import Candidate, verdict_of
 from avtorch.gap.chain.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.chain.plant import GapPlant, plant
+from avtorch.gap.heldout.shrink import shrinkage
 from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.gap.search.found import Found, Race
 from avtorch.gap.search.search import Search
@@ -84,6 +85,10 @@ def diagnose(
     if apart.note is not None:
         noted += (apart.note,)
     named = winner is not None and winner.name != "none"
+    shrunk = None
+    if named and winner is not None:
+        alike = {part for name in verdict.alias_set for part in name.split("+")}
+        shrunk = shrinkage(race, winner, alike=sorted(alike), progress=progress)
     return Diagnosis(
         log=LogFacts.of(each),
         baseline=moved(race.none),
@@ -93,6 +98,7 @@ def diagnose(
         onset_s=_onset(winner, race) if named and winner is not None else None,
         plant=repaired(winner, base, draws) if named and winner is not None else None,
         draws=drawn(winner, draws) if draws is not None and winner is not None else None,
+        shrinkage=shrunk,
         remaining=remaining(candidates, verdict, base),
         complete=race.complete,
         notes=noted,

@@ -124,7 +124,15 @@ def test_errors_of_size_and_of_time() -> None:
     assert wrong.onset_error is None
     assert wrong.closed_error is None
     assert wrong.brier == pytest.approx(0.36 + 0.16 + 1.0)
-    assert read(case, said | {"placebo": {"closed": 0.02}}).placebo == 0.02
+    assert one.closed_covered is True  # the interval ends at 1, which is the oracle's
+    sham = {"closed": {"mean": 0.02, "q05": -0.01}}
+    assert read(case, said | {"shrinkage": said["shrinkage"] | {"placebo": sham}}).placebo == sham["closed"]
+    # half of the error is left, and of that the truth has a third for noise
+    half = said["shrinkage"] | {"before": 0.7, "after": 0.4, "closed": {"mean": 0.45, "q05": 0.4, "q95": 0.55}}
+    part = read(case, said | {"shrinkage": half})
+    assert part.closed_error == pytest.approx(abs(0.45 - 0.3 / 0.6))
+    assert part.closed_covered is True
+    assert read(case, said | {"shrinkage": half | {"after": 0.3}}).closed_covered is False
 
 
 def test_half_right_pairs_missing_answers_and_aliases() -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from avtorch.errors import InputError
 from avtorch.gap.answer.quantity import Quantity, unit_of
+from avtorch.gap.answer.shrinkage import Closed, Shrinkage
 from avtorch.gap.answer.verdict import Candidate, Verdict, candidate_name, listed, near, plain, verdict_of
 from avtorch.gap.chain.plant import GapPlant
 from avtorch.io import Log, atomic, write_json
@@ -24,10 +25,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Candidate",
+    "Closed",
     "Diagnosis",
     "GapFacts",
     "LogFacts",
     "Quantity",
+    "Shrinkage",
     "Verdict",
     "candidate_name",
     "listed",
@@ -108,8 +111,9 @@ class Diagnosis:
     `candidates` are listed as `listed` has them, whatever was given. `plant`: the simulator with the verdict's effects
     in, at the posterior mean; None where nothing was named. `draws`: posterior of the winner's parameters (chain,
     draw) by name. `remaining`: with the default baseline, the candidates for what is left once `dead_time` is in.
-    `complete` False: the budget ended the search. `where`, `shrinkage`, `next_experiment`: objects of the schema, or
-    empty. Raises `InputError` where verdict and candidates do not agree.
+    `complete` False: the budget ended the search. `shrinkage`: how far the gap shrinks on parts that were held out;
+    None where nothing was named or the drives are too short to be parted. `where`, `next_experiment`: objects of the
+    schema, or empty. Raises `InputError` where verdict and candidates do not agree.
     """
 
     log: LogFacts
@@ -122,7 +126,7 @@ class Diagnosis:
     draws: Mapping[str, NDArray] | None = None
     remaining: tuple[Candidate, ...] | None = None
     where: tuple[Mapping[str, Any], ...] = ()
-    shrinkage: Mapping[str, Any] | None = None
+    shrinkage: Shrinkage | None = None
     next_experiment: Mapping[str, Any] | None = None
     complete: bool = True
     notes: tuple[str, ...] = ()
@@ -158,7 +162,7 @@ class Diagnosis:
             "onset_s": self.onset_s,
             "effects": [c.to_dict() for c in self.candidates],
             "verdict": self.verdict.to_dict(),
-            "shrinkage": None if self.shrinkage is None else dict(self.shrinkage),
+            "shrinkage": None if self.shrinkage is None else self.shrinkage.to_dict(),
             "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),
             "remaining": None if self.remaining is None else [c.to_dict() for c in self.remaining],
             "complete": self.complete,

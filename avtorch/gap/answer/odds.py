@@ -91,22 +91,27 @@ def favourite(found: Sequence[Found]) -> Found:
     return max(found, key=lambda f: worth[f.name])
 
 
+def prices(found: Sequence[Found]) -> dict[str, float]:
+    """What each candidate has to gain over none before it counts for anything [nats]."""
+    gained = {f.name: f.log_evidence - _none(found).log_evidence for f in found}
+    paid = {}
+    for name in gained:
+        parts = name.split("+")
+        paid[name] = 0.0 if name == "none" else EFFECT.of(0.0)
+        if len(parts) > 1:
+            price = SECOND_BY_CHANCE if CHANCE & set(parts) else SECOND
+            paid[name] += price.of(max(gained.get(part, 0.0) for part in parts))
+    return paid
+
+
 def _none(found: Sequence[Found]) -> Found:
     return next(f for f in found if f.name == "none")
 
 
 def _worth(found: Sequence[Found]) -> dict[str, float]:
     """Log evidence over none less what each candidate pays [nats]."""
-    gained = {f.name: f.log_evidence - _none(found).log_evidence for f in found}
-    worth = {}
-    for name, gain in gained.items():
-        parts = name.split("+")
-        paid = 0.0 if name == "none" else EFFECT.of(0.0)
-        if len(parts) > 1:
-            price = SECOND_BY_CHANCE if CHANCE & set(parts) else SECOND
-            paid += price.of(max(gained.get(part, 0.0) for part in parts))
-        worth[name] = gain - paid
-    return worth
+    flat, paid = _none(found).log_evidence, prices(found)
+    return {f.name: f.log_evidence - flat - paid[f.name] for f in found}
 
 
 def _shares(found: Sequence[Found]) -> dict[str, float]:

@@ -9,7 +9,7 @@ command of the next, and means alone would take that for a lag. Rows at standsti
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -157,6 +157,18 @@ class Record:
             length=length,
             group=group,
         )
+
+    def only(self, rows: NDArray[np.bool_]) -> Record:
+        """The same drives of which only these `rows` (counted,) still count, in stretches of 2 s or more.
+
+        Rollouts go over whole drives as before; what counts no more is neither fitted nor judged.
+        """
+        each = 1 if self.coarse is self.drives else self.group
+        sizes = [len(d.time) * each // self.group for d in self.coarse]
+        use = np.zeros(sum(sizes))
+        use[self.source[rows]] = 1.0
+        source, target, stretch, length = _places(np.split(use, np.cumsum(sizes)[:-1]), self.dt)
+        return replace(self, source=source, target=target, stretch=stretch, length=length)
 
     def place(self, row: int, *, coarse: bool = False) -> Place:
         """Where a counted `row` begins in the drives, or in the `coarse` ones."""

@@ -51,12 +51,14 @@ def _level(x: Float, size: int) -> Float:
     return np.asarray(np.interp(np.arange(len(x)), 0.5 * (ends[1:] + ends[:-1]), medians))
 
 
-def tails(errors: Float, dt: float) -> Tails:
+def tails(errors: Float, dt: float, *, fits: NDArray[np.bool_] | None = None) -> Tails:
     """Outliers among accelerometer errors (row,), by their distance from the rows beside them.
 
     A row is held against the median of two before and two after it, which a single glitch does not move. The middle
-    of these distances gives the size of the noise.
+    of these distances gives the size of the noise. `fits` (row,): rows by which fraction and scale are found, all if
+    not given.
     """
+    fits = np.ones(len(errors), bool) if fits is None else fits
     x = np.pad(errors, 2, mode="edge")
     beside = np.median(np.stack([x[:-4], x[1:-3], x[3:-1], x[4:]]), 0)
     away = errors - beside
@@ -78,7 +80,7 @@ def tails(errors: Float, dt: float) -> Tails:
         return np.log1p(fraction * np.expm1(np.minimum(gain, 500.0)))
 
     def cost(z: Float) -> float:
-        return -float(ratios(z).sum()) + 0.5 * float(z @ z)
+        return -float(ratios(z)[fits].sum()) + 0.5 * float(z @ z)
 
     best = min((minimize(cost, np.array([a, 0.0]), method="Nelder-Mead") for a in (-1.5, 0.5)), key=lambda m: m.fun)
     z = best.x

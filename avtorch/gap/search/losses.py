@@ -79,6 +79,21 @@ def losses(white: Whitener, errors: Float, command: Float, T_L: float, K_L: floa
     return Losses(evidence, fraction, found.sd * _SD, onset if more > 1 else None)
 
 
+def rows_gained(
+    white: Whitener, errors: Float, command: Float, T_L: float, K_L: float, fits: NDArray[np.bool_]
+) -> Float:
+    """Log likelihood ratio (counted,) of each row, losses over none, at the fraction that the rows in `fits` like best.
+
+    Arguments as of `losses`.
+    """
+    bank = Bank.of(white, white(errors)[..., 0], command, T_L, K_L)
+    if not len(bank.place):
+        return np.zeros(white.record.rows)
+    z = np.linspace(-3.0, 3.0, 13)
+    rows = bank.ratios(_fraction(z))
+    return rows[int((rows[:, fits].sum(1) - 0.5 * z**2).argmax())]
+
+
 def _fraction(z: Float) -> Float:
     return 1 / (1 + np.exp(-_CENTRE - _SD * z))
 

@@ -32,6 +32,7 @@ from avtorch.gap.search.gusts import gust
 from avtorch.gap.search.losses import losses
 from avtorch.gap.search.onset import averaged, refined
 from avtorch.gap.search.pairing import Base, joint, swapped
+from avtorch.gap.search.raw_rows import raw_errors, raw_white
 from avtorch.gap.search.screening import ENOUGH, Look, closer, looks
 from avtorch.gap.search.starts import starts, traded
 from avtorch.io import Log
@@ -334,30 +335,8 @@ class Search:
 
     # chance --------------------------------------------------------------------------------------------------------
     def _tails(self, raw: Record, of: Found) -> Tails:
-        errors = self._raw_errors(raw, of)
+        errors = raw_errors(raw, of)
         return tails(errors[0, :, 0], raw.dt)
-
-    def _raw_errors(self, raw: Record, of: Found) -> Float:
-        """Errors of a candidate's rollout at the log's own rate, (witness, counted)."""
-        candidate = Candidate(raw, of.candidate.effects, self.baseline)
-        errors = candidate.errors(of.z[None])[0]
-        if of.onset is not None:
-            onset, group = self._raw_row(raw, of, of.onset), of.candidate.record.group
-            if raw.accel is not None:
-                # rows of the group in which it sets in would pass for glitches
-                silent = raw.measured[0] - candidate.baseline_rollouts(of.z[None])[0, 0]
-                near = slice(max(onset - group, 0), onset + group)
-                before = np.cumsum((silent**2 - errors[0] ** 2)[near, 0])
-                onset = near.start + int(np.concatenate([[0.0], before]).argmin())
-            errors = candidate.errors(of.z[None], onset)[0]
-        if of.profile is not None:
-            errors = errors - candidate.grade_response(of.profile)
-        return errors
-
-    @staticmethod
-    def _raw_row(raw: Record, of: Found, row: int) -> int:
-        """Where a counted row of the search's record lies among those of single rows."""
-        return int(np.searchsorted(raw.source, of.candidate.record.source[row] * of.candidate.record.group))
 
     def _glitched(self, found: list[Found], glitches: Tails) -> list[Found]:
         """Every candidate with outliers besides, and outliers alone."""
@@ -378,8 +357,8 @@ class Search:
         bases = [none] if best.log_evidence < none.log_evidence + _LEAST else [none, best]
         out = []
         for f in bases:
-            errors = self._raw_errors(raw, f)
-            white = Whitener(raw, f.noise.noise, tuple((self._raw_row(raw, f, row), n) for row, n in f.white.until))
+            errors = raw_errors(raw, f)
+            white = raw_white(raw, f)
             lost = losses(white, errors, raw.command[raw.source], f.values["T_L"], f.values["K_L"])
             name = "+".join(sorted([*([] if f is none else [f.name]), "command_hold"]))
             out.append(replace(f, name=name, log_evidence=f.log_evidence + lost.evidence, losses=lost))

@@ -1,0 +1,108 @@
+"""What rollouts and densities of a refitted find are worth on the blocks that judge it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.answer.joint import root
+from avtorch.gap.heldout.parts import Part
+from avtorch.gap.heldout.refit import Refit
+from avtorch.gap.heldout.rollout_errors import Measure
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.likelihood.whitener import Whitener
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """Sums over the rows of each block: `squares` (measure, block) of rollout errors, log density `nats` (block,)."""
+
+    squares: Float
+    nats: Float
+
+    @classmethod
+    def joined(cls, parts: Sequence[Judged]) -> Judged:
+        """Blocks of several parts, one after another."""
+        return cls(np.concatenate([p.squares for p in parts], 1), np.concatenate([p.nats for p in parts]))
+
+
+@dataclass(frozen=True)
+class Judge:
+    """The blocks of one part. `lag` [s]: how fast an actuator forgets where a rollout began."""
+
+    record: Record
+    part: Part
+    measures: Sequence[Measure]
+    lag: float
+
+    def squares(self, errors: Float) -> Float:
+        """(measure, block) of errors (..., witness, counted, group), summed over what leads."""
+        record = self.record
+        out = np.empty((len(self.measures), len(self.part.blocks)))
+        for i, measure in enumerate(self.measures):
+            k = record.witnesses.index(measure.witness)
+            for j, block in enumerate(self.part.blocks):
+                rows = errors[..., k, block, :].reshape(*errors.shape[:-3], -1)
+                if measure.horizon_s is None and measure.witness == "speed":
+                    first = record.starts[record.stretch[block.start]]
+                    rows = rows - errors[..., k, first, :1]
+                out[i, j] = (measure.of(rows, record.dt / record.group, self.lag) ** 2).sum()
+        return out
+
+    def judged(self, refit: Refit, *, less: Float | None = None, chance: Float | None = None) -> Judged:
+        """A refit; `less`: what else (witness, counted, 1) is taken off its errors, `chance` (counted,) [nats]: what
+        else is added to the density of each row."""
+        errors = refit.errors if less is None else refit.errors - less
+        nats = self._white(refit).row_likelihoods(self._seen(errors))
+        if chance is not None:
+            nats = nats + self._seen(chance[:, None])[..., 0]
+        return Judged(self.squares(errors), self.by_block(nats))
+
+    def owed(self, refit: Refit) -> Judged:
+        """What not knowing the parameters better costs on average: squares, and nats.
+
+        By the curvature on the rows that fit. A step along each axis of the posterior that leaves the joint density
+        lower than a normal posterior would have it counts for less.
+        """
+        count = len(refit.z)
+        steps = root(refit.covariance).numpy().T
+        around = refit.around(np.concatenate([np.zeros((1, count)), steps, -steps]))
+        moved = around[1:] - around[:1]
+        white = refit.white(refit.fits)
+        fits = np.isin(self.record.source, refit.fits.source)
+        here, there = refit.errors[:, fits], moved[:, :, fits]
+        lost = 0.5 * ((white(here - there) ** 2).sum((1, 2, 3)) - (white(here) ** 2).sum())
+        # at one standard deviation half a nat
+        moved = moved * np.sqrt(0.5 * np.minimum(1.0, 0.5 / np.maximum(lost, 0.5)))[:, None, None, None]
+        if refit.found.candidate.grade_columns is not None:
+            moved = np.concatenate([moved, refit.slope_spread(white)])
+        nats = 0.5 * (self._white(refit)(self._seen(moved)) ** 2).sum((0, 1, 3))
+        return Judged(self.squares(moved), self.by_block(nats))
+
+    def by_block(self, rows: Float) -> Float:
+        """Sums (block,) of values (judged,) by row of what judges."""
+        place = np.searchsorted(self.record.source, self.part.judges.source)
+        return np.array([rows[(place >= b.start) & (place < b.stop)].sum() for b in self.part.blocks])
+
+    @property
+    def rows_inside(self) -> NDArray[np.bool_]:
+        """Which counted rows (counted,) lie in the blocks."""
+        inside = np.zeros(self.record.rows, bool)
+        inside[self.part.rows] = True
+        return inside
+
+    @property
+    def rows(self) -> Float:
+        """Rows (block,), single ones."""
+        return np.array([(b.stop - b.start) * self.record.group for b in self.part.blocks], float)
+
+    def _white(self, refit: Refit) -> Whitener:
+        return refit.white(self.part.judges)
+
+    def _seen(self, errors: Float) -> Float:
+        return errors[..., np.isin(self.record.source, self.part.judges.source), :]

@@ -1,0 +1,47 @@
+"""A find fitted to a part of its drives."""
+
+import numpy as np
+import pytest
+
+from avtorch.gap import AerodynamicDrag, DeadTime, Gust, SensorScale
+from avtorch.gap.heldout.judged import Judge
+from avtorch.gap.heldout.parts import parted
+from avtorch.gap.heldout.refit import Refit
+from avtorch.gap.heldout.rollout_errors import measures
+from tests.gap.finds import found_of
+
+
+@pytest.mark.parametrize("effects", [[DeadTime(0.2)], [AerodynamicDrag()], [Gust(0.3, 2.0)]])
+def test_a_part_tells_the_same_within_its_uncertainty(effects: list, rotating_seed: int) -> None:
+    found = found_of(effects, seconds=120.0, rng=np.random.default_rng(rotating_seed))
+    for part in parted(found.candidate.record):
+        refit = Refit.of(found, part.fits)
+        away = (refit.z - found.z) @ np.linalg.solve(refit.covariance, refit.z - found.z)
+        # chi-squared of some three coordinates, of which the two fits share three quarters of the data
+        assert away < 30
+        assert refit.errors.shape == found.errors.shape
+        white = refit.white(part.judges)
+        assert 0.7 < (white(refit.errors[:, part.rows]) ** 2).mean() < 1.4
+
+
+def test_the_whole_is_the_find_itself() -> None:
+    found = found_of([SensorScale(1.2)], seconds=60.0)
+    refit = Refit.whole(found)
+    np.testing.assert_allclose(refit.errors, found.errors, atol=1e-9)
+    assert refit.values == pytest.approx(found.values)
+
+
+def test_what_is_owed_is_what_draws_of_the_posterior_cost(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    found = found_of([DeadTime(0.2), AerodynamicDrag()], seconds=90.0, rng=rng)
+    record = found.candidate.record
+    part = parted(record)[0]
+    refit = Refit.of(found, part.fits)
+    judge = Judge(record, part, measures(record.witnesses), 0.35)
+    owed = judge.owed(refit)
+    draws = rng.multivariate_normal(np.zeros(len(refit.z)), refit.covariance, size=400)
+    around = refit.around(np.concatenate([np.zeros((1, len(refit.z))), draws]))
+    cost = judge.squares(around[1:] - around[:1]) / 400
+    # 400 draws of a sum of four squares: 5 % a standard deviation at most; rollouts bend a little
+    np.testing.assert_allclose(owed.squares.sum(1), cost.sum(1), rtol=0.3)
+    assert (owed.nats >= 0).all()

@@ -1,0 +1,71 @@
+"""How far the gap shrinks, told by the find and by one who knows."""
+
+import numpy as np
+import pytest
+
+from avtorch.blindtest import draw_case
+from avtorch.gap.answer.odds import favourite
+from avtorch.gap.chain.plant import plant
+from avtorch.gap.heldout.chance_gains import chance_gains
+from avtorch.gap.heldout.parts import parted
+from avtorch.gap.heldout.shrink import DENSITY, shrinkage
+from avtorch.gap.search.search import Search
+
+SINGLE = {"none": 0.0, "single": 1.0, "pair": 0.0, "outside": 0.0}
+
+
+def _raced(effect: str, among: list, seed: int, **more):  # type: ignore[no-untyped-def]
+    case = draw_case(0, seed, mix=SINGLE, effects=[effect], seconds=60.0, manoeuvre="steps", **more)
+    race = Search([case.log()], plant(), effects=among, pairs=False).run()
+    return case, race
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", ["sensor_bias", "aerodynamic_drag", "dead_band"])
+def test_what_is_closed_is_what_one_who_knows_would_say(effect: str, rotating_seed: int) -> None:
+    from avtorch.gap import AerodynamicDrag, DeadBand, SensorBias
+
+    case, race = _raced(effect, [SensorBias, AerodynamicDrag, DeadBand], rotating_seed, tiers=["easy"])
+    found = next(f for f in race.found if f.name == effect)
+    told = shrinkage(race, found)
+    assert told is not None
+    assert told.metric in case.oracles
+    top, floor = told.top, case.oracles[told.metric].floor
+    assert top.closed is not None
+    knows = (top.before - top.after) / (top.before - floor)
+    # of an easy case, whose gap is at least twice the noise, 5 blocks tell the floor to a tenth or so
+    assert top.closed.mean == pytest.approx(knows, abs=0.15)
+    assert top.closed.mean > 0.7
+    assert told.placebo is not None
+    assert told.placebo.mean < 0.1
+    assert told.blocks >= 4
+
+
+@pytest.mark.slow
+def test_a_wrong_effect_closes_nothing(rotating_seed: int) -> None:
+    from avtorch.gap import AerodynamicDrag, SensorBias
+
+    _, race = _raced("sensor_bias", [SensorBias, AerodynamicDrag], rotating_seed, tiers=["easy"])
+    wrong = next(f for f in race.found if f.name == "aerodynamic_drag")
+    told = shrinkage(race, wrong)
+    assert told is not None
+    # the other blocks alone choose the right one, and so do not choose the one that was asked for
+    assert told.chosen == 0.0
+
+
+@pytest.mark.slow
+def test_glitches_show_in_the_density_alone(rotating_seed: int) -> None:
+    from avtorch.gap import Outliers, SensorBias
+
+    _, race = _raced("outliers", [Outliers, SensorBias], rotating_seed, tiers=["medium"])
+    found = next(f for f in race.found if f.name == "outliers")
+    assert favourite(race.found) is found
+    told = shrinkage(race, found)
+    assert told is not None
+    assert told.metric == DENSITY
+    assert told.top.closed is not None
+    assert 0.8 < told.top.closed.mean <= 1.1
+    gains = chance_gains(found, race.raw, parted(race.record)[0].fits)
+    assert gains.shape == (race.record.rows,)
+    assert gains.sum() == pytest.approx(found.tails.ratios.sum(), rel=0.1)  # type: ignore[union-attr]
+    assert np.isfinite(gains).all()
