@@ -283,8 +283,8 @@ def test_plants_with_more_than_plain_numbers_are_written(effect: Saturation | Ro
 def test_no_half_answer_is_left(tmp_path: Path) -> None:
     given = candidates(dead_time=0.8, none=0.15, unknown=0.05)
     diagnosis(given, plant=plant([DeadTime()])).write(tmp_path)
-    bad = diagnosis(given, plant=plant([DeadTime()]), shrinkage={"before": math.nan})
-    with pytest.raises(InputError, match=r"shrinkage\.before"):
+    bad = diagnosis(given, plant=plant([DeadTime()]), next_experiment={"before": math.nan})
+    with pytest.raises(InputError, match=r"next_experiment\.before"):
         bad.write(tmp_path)
     assert not (tmp_path / "diagnosis.json").exists()
 
