@@ -23,8 +23,9 @@ class Answered:
     """A case with its answer.
 
     `truth`: `none`, `unknown` (a cause outside the table), an effect or two joined by `+`; `kind`, `tier` of the
-    case. `verdict` likewise; `probabilities` by candidate; `alias_set`. `closed_error`, `closed_covered`,
-    `placebo` (mean, q05), `onset_error` [s]: None where the case or the answer has none.
+    case. `verdict` likewise; `probabilities` by candidate; `alias_set`. `closed_error`, `closed_covered`, `placebo`
+    (mean, q05), `onset_error` [s]: None where the case or the answer has none. `overlaps` of each true part with the
+    named one on its axis; `parts_named`: how many.
     """
 
     truth: str
@@ -37,6 +38,8 @@ class Answered:
     closed_covered: bool | None
     placebo: Mapping[str, float] | None
     onset_error: float | None
+    overlaps: tuple[float, ...]
+    parts_named: int
 
     @property
     def right(self) -> bool:
@@ -74,7 +77,9 @@ def read(truth: Mapping[str, Any], answer: Mapping[str, Any] | None) -> Answered
     """
     of = str(truth.get("case", "answer"))
     if answer is None:
-        return Answered(truth["verdict"], truth["kind"], truth["tier"], FAILED, {}, frozenset(), None, None, None, None)
+        return Answered(
+            truth["verdict"], truth["kind"], truth["tier"], FAILED, {}, frozenset(), None, None, None, None, (), 0
+        )
     probabilities = {joined(effect["name"]): float(effect["probability"]) for effect in answer["effects"]}
     if abs(sum(probabilities.values()) - 1) > 1e-6 or min(probabilities.values(), default=-1) < 0:
         raise InputError(f"{of}: probabilities sum to {sum(probabilities.values()):.8g}, need 1 and none below 0")
@@ -93,6 +98,8 @@ def read(truth: Mapping[str, Any], answer: Mapping[str, Any] | None) -> Answered
         closed_covered=_closed_covered(truth, answer) if named_right else None,
         placebo=_placebo(answer),
         onset_error=_onset_error(truth, answer) if named_right else None,
+        overlaps=tuple(_overlap(part, answer) for part in truth.get("where") or ()),
+        parts_named=len(answer.get("where") or ()),
     )
 
 
@@ -136,3 +143,13 @@ def _onset_error(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> float |
 
 def _placebo(answer: Mapping[str, Any]) -> Mapping[str, float] | None:
     return ((answer.get("shrinkage") or {}).get("placebo") or {}).get("closed")
+
+
+def _overlap(part: Mapping[str, Any], answer: Mapping[str, Any]) -> float:
+    """Intersection over union of a true part with the answer's on the same axis, 0 where it names none."""
+    named = next((w for w in answer.get("where") or () if w["axis"] == part["axis"]), None)
+    if named is None:
+        return 0.0
+    ends = [float(named["from"]), float(part["from"])], [float(named["to"]), float(part["to"])]
+    whole = max(ends[1]) - min(ends[0])
+    return max(0.0, min(ends[1]) - max(ends[0])) / whole if whole > 0 else 0.0

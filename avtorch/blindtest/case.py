@@ -21,6 +21,8 @@ from avtorch.errors import InputError
 from avtorch.io import Log, write_json
 
 Float = NDArray[np.float64]
+_MOVING_MPS = 0.3  # slower rows are masked
+
 Kind = Literal["none", "single", "pair", "outside"]
 
 
@@ -73,6 +75,19 @@ class Case:
             return self.without
         return self.run.accel - self.run.noise_accel - self.run.chance_accel
 
+    @property
+    def parts(self) -> list[dict[str, Any]]:
+        """Where the cause is known to act, by axis: since its onset, below a speed, braking."""
+        run, parts = self.run, []
+        if self.onset_s is not None and self.onset_scored:
+            parts.append({"axis": "time", "from": self.onset_s, "to": float(run.time[-1])})
+        if self.names == ("low_speed_creep",):
+            ends = self.parameters["low_speed_creep"]["ends_mps"]
+            parts.append({"axis": "speed", "from": _MOVING_MPS, "to": ends})
+        if self.names == ("brake_throttle_asymmetry",):
+            parts.append({"axis": "command", "from": float(run.command.min()), "to": 0.0})
+        return parts
+
     def log(self, *, signals: Sequence[str] = ("accel", "speed")) -> Log:
         """The log a diagnosis sees: `time`, `accel_cmd` and the witnesses in `signals`."""
         columns = {"accel": self.run.accel, "speed": self.run.speed}
@@ -94,6 +109,7 @@ class Case:
             "parameters": {name: dict(values) for name, values in self.parameters.items()},
             "onset_s": self.onset_s,
             "onset_scored": self.onset_scored,
+            "where": self.parts,
             "visibility": self.visibility,
             "visibility_each": dict(self.visibility_each),
             "tier": self.tier,

@@ -40,6 +40,8 @@ def score(
     - `macro_f1`: over the labels that occur, an effect found within a pair counts for that effect.
     - `closed_error`, `closed_covered` (by the 90 % interval), `onset_error_s` (median): where the verdict is right.
       `placebo_closed`: mean over the answers that tell one, `placebo_nothing`: how often its interval reaches 0.
+    - `where_overlap`: median intersection over union of true and named parts, where the cause acts in a known part;
+      `where_nowhere`: share of cases without a cause of which no part is named.
 
     Args: `seconds` each answer took. `resamples`, `seed` of the bootstrap. Raises `InputError` for lengths that
     differ and for answers that break the schema.
@@ -70,6 +72,9 @@ def score(
     placebos = [r.placebo for r in rows if r.placebo is not None]
     sheet.mean("placebo_closed", [float(p["mean"]) for p in placebos])
     sheet.share("placebo_nothing", [p["q05"] <= 0 for p in placebos])
+    overlaps = [r for r in rows if r.overlaps]
+    sheet.measure("where_overlap", overlaps, lambda some: float(np.median([x for r in some for x in r.overlaps])))
+    sheet.share("where_nowhere", [r.parts_named == 0 for r in by_kind["none"]])
     late = [r for r in rows if r.onset_error is not None]
     sheet.measure("onset_error_s", late, lambda some: float(np.median([r.onset_error or 0.0 for r in some])))
     sheet.mean("seconds_per_case", list(seconds or ()))

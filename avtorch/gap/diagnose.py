@@ -8,6 +8,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from avtorch.errors import InputError
 from avtorch.gap.answer import posterior as posteriors
 from avtorch.gap.answer.aliases import Told
@@ -21,7 +23,9 @@ from avtorch.gap.answer.reported import drawn, moved, repaired, reported
 from avtorch.gap.answer.verdict import Candidate, verdict_of
 from avtorch.gap.chain.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.chain.plant import GapPlant, plant
+from avtorch.gap.heldout.held_out import HeldOut, held_out
 from avtorch.gap.heldout.shrink import shrinkage
+from avtorch.gap.heldout.where import where
 from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.gap.search.found import Found, Race
 from avtorch.gap.search.search import Search
@@ -85,20 +89,21 @@ def diagnose(
     if apart.note is not None:
         noted += (apart.note,)
     named = winner is not None and winner.name != "none"
-    shrunk = None
-    if named and winner is not None:
-        alike = {part for name in verdict.alias_set for part in name.split("+")}
-        shrunk = shrinkage(race, winner, alike=sorted(alike), progress=progress)
+    onset = _onset(winner, race) if named and winner is not None else None
+    alike = {part for name in verdict.alias_set for part in name.split("+")}
+    held = held_out(race, winner or top, blamed=named, alike=sorted(alike), progress=progress)
+    lag = race.none.values["T_L"]
     return Diagnosis(
         log=LogFacts.of(each),
         baseline=moved(race.none),
-        gap=_gap(race, chances),
+        gap=_gap(race, chances, held),
         candidates=tuple(candidates),
         verdict=verdict,
-        onset_s=_onset(winner, race) if named and winner is not None else None,
+        onset_s=onset,
         plant=repaired(winner, base, draws) if named and winner is not None else None,
         draws=drawn(winner, draws) if draws is not None and winner is not None else None,
-        shrinkage=shrunk,
+        where=() if held is None or verdict.name == "none" else where(held, onset_s=onset, lag=lag),
+        shrinkage=shrinkage(held) if held is not None and named else None,
         remaining=remaining(candidates, verdict, base),
         complete=race.complete,
         notes=noted,
@@ -139,6 +144,8 @@ def _onset(found: Found | None, race: Race) -> float | None:
     return None if found.began is None else float(race.record.time[race.record.source[found.began]])
 
 
-def _gap(race: Race, chances: Mapping[str, float]) -> GapFacts:
+def _gap(race: Race, chances: Mapping[str, float], held: HeldOut | None) -> GapFacts:
     """Errors of the fitted baseline's rollout; the floor is what the favourite leaves."""
-    return gap_facts(race, favourite(race.found), detected=chances["none"] < 0.5)
+    # what held-out rows gain is an e-value against the bare baseline, and its inverse bounds the p-value
+    p_value = None if held is None else float(np.exp(-np.clip(held.gained.sum(), 0.0, 700.0)))
+    return gap_facts(race, favourite(race.found), detected=chances["none"] < 0.5, p_value=p_value)

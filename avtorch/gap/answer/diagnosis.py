@@ -17,6 +17,7 @@ from avtorch.errors import InputError
 from avtorch.gap.answer.quantity import Quantity, unit_of
 from avtorch.gap.answer.shrinkage import Closed, Shrinkage
 from avtorch.gap.answer.verdict import Candidate, Verdict, candidate_name, listed, near, plain, verdict_of
+from avtorch.gap.answer.where import Where
 from avtorch.gap.chain.plant import GapPlant
 from avtorch.io import Log, atomic, write_json
 
@@ -125,7 +126,7 @@ class Diagnosis:
     plant: GapPlant | None = None
     draws: Mapping[str, NDArray] | None = None
     remaining: tuple[Candidate, ...] | None = None
-    where: tuple[Mapping[str, Any], ...] = ()
+    where: tuple[Where, ...] = ()
     shrinkage: Shrinkage | None = None
     next_experiment: Mapping[str, Any] | None = None
     complete: bool = True
@@ -158,7 +159,7 @@ class Diagnosis:
             "log": self.log.to_dict(),
             "baseline": plain(self.baseline),
             "gap": self.gap.to_dict(),
-            "where": [dict(x) for x in self.where],
+            "where": [w.to_dict() for w in self.where],
             "onset_s": self.onset_s,
             "effects": [c.to_dict() for c in self.candidates],
             "verdict": self.verdict.to_dict(),

@@ -15,7 +15,7 @@ HORIZON_S = 5.0
 """Seconds over which a rollout goes before it begins anew at the measured speed."""
 
 
-def gap_facts(race: Race, best: Found, *, detected: bool) -> GapFacts:
+def gap_facts(race: Race, best: Found, *, detected: bool, p_value: float | None = None) -> GapFacts:
     """Root mean square errors of `race.none`, the fitted baseline, and as their floors those of `best` if smaller.
 
     (An effect may help the speed and cost the acceleration something, and the best of wrong ones may well.)
@@ -31,6 +31,7 @@ def gap_facts(race: Race, best: Found, *, detected: bool) -> GapFacts:
             rollout.append(_size(f.errors[0]))
     return GapFacts(
         detected=detected,
+        p_value=p_value,
         one_step_rmse=one[0] if one else None,
         one_step_floor=min(one, default=None),
         rollout_rmse_accel=rollout[0] if rollout else None,

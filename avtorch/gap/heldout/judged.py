@@ -58,10 +58,16 @@ class Judge:
         """A refit; `less`: what else (witness, counted, 1) is taken off its errors, `chance` (counted,) [nats]: what
         else is added to the density of each row."""
         errors = refit.errors if less is None else refit.errors - less
-        nats = self._white(refit).row_likelihoods(self._seen(errors))
-        if chance is not None:
-            nats = nats + self._seen(chance[:, None])[..., 0]
-        return Judged(self.squares(errors), self.by_block(nats))
+        nats = self.row_nats(refit, less=less)
+        return Judged(self.squares(errors), self._by_block(nats if chance is None else nats + chance))
+
+    def row_nats(self, refit: Refit, *, less: Float | None = None) -> Float:
+        """Log density (counted,) of each row that judges, 0 elsewhere."""
+        errors = refit.errors if less is None else refit.errors - less
+        out = np.zeros(self.record.rows)
+        rows = np.isin(self.record.source, self.part.judges.source)
+        out[rows] = self._white(refit).row_likelihoods(errors[:, rows])
+        return out
 
     def owed(self, refit: Refit) -> Judged:
         """What not knowing the parameters better costs on average: squares, and nats.
@@ -81,16 +87,17 @@ class Judge:
         moved = moved * np.sqrt(0.5 * np.minimum(1.0, 0.5 / np.maximum(lost, 0.5)))[:, None, None, None]
         if refit.found.candidate.grade_columns is not None:
             moved = np.concatenate([moved, refit.slope_spread(white)])
-        nats = 0.5 * (self._white(refit)(self._seen(moved)) ** 2).sum((0, 1, 3))
-        return Judged(self.squares(moved), self.by_block(nats))
+        rows = np.isin(self.record.source, self.part.judges.source)
+        nats = np.zeros(self.record.rows)
+        nats[rows] = 0.5 * (self._white(refit)(moved[:, :, rows]) ** 2).sum((0, 1, 3))
+        return Judged(self.squares(moved), self._by_block(nats))
 
-    def by_block(self, rows: Float) -> Float:
-        """Sums (block,) of values (judged,) by row of what judges."""
-        place = np.searchsorted(self.record.source, self.part.judges.source)
-        return np.array([rows[(place >= b.start) & (place < b.stop)].sum() for b in self.part.blocks])
+    def _by_block(self, nats: Float) -> Float:
+        """Sums (block,) over rows (counted,)."""
+        return np.array([nats[b].sum() for b in self.part.blocks])
 
     @property
-    def rows_inside(self) -> NDArray[np.bool_]:
+    def inside(self) -> NDArray[np.bool_]:
         """Which counted rows (counted,) lie in the blocks."""
         inside = np.zeros(self.record.rows, bool)
         inside[self.part.rows] = True
@@ -103,6 +110,3 @@ class Judge:
 
     def _white(self, refit: Refit) -> Whitener:
         return refit.white(self.part.judges)
-
-    def _seen(self, errors: Float) -> Float:
-        return errors[..., np.isin(self.record.source, self.part.judges.source), :]

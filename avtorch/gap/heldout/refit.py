@@ -114,12 +114,33 @@ class Refit:
     def errors(self) -> Float:
         """Measured less rolled out over the whole record, (witness, counted, group)."""
         candidate = self.found.candidate
-        errors = candidate.errors(self.z[None], self.onset)[0]
+        return candidate.record.measured - self._rolled(candidate, self.z)
+
+    @cached_property
+    def effect(self) -> Float:
+        """What its effects do over the whole record, (witness, counted, group): its rollout less one without them."""
+        candidate = self.found.candidate
+        return self._rolled(candidate, self.z) - candidate.baseline_rollouts(self.z[None])[0]
+
+    @cached_property
+    def felt(self) -> Float:
+        """What of that is the accelerometer's alone, (witness, counted, group)."""
+        candidate = self.found.candidate
+        others = tuple(e for e in candidate.effects if e.place != "sensor")
+        if len(others) == len(candidate.effects):
+            return np.zeros_like(self.errors)
+        car = Candidate(candidate.record, others, candidate.baseline)
+        return self._rolled(candidate, self.z) - self._rolled(car, car.z_of(self.values))
+
+    def _rolled(self, candidate: Candidate, z: Float) -> Float:
+        """Rollout (witness, counted, group) with the slope that was found, where the candidate has one."""
+        record, onset = candidate.record, self.onset if candidate.effects else None
+        rolled = candidate.rollouts(z[None], onset)[0]
         if self.profile is None:
-            return errors
-        white = whitener(candidate.record, self.noise, onset=self.onset)
+            return rolled
         part = candidate.grade_response(self.profile)
-        return errors - sensed(candidate.record, self.noise, acting(white, part, self.onset))
+        noise = self.noise.seen_through({k: float(x[0]) for k, x in candidate.values(z[None]).items()})
+        return rolled + sensed(record, noise, acting(whitener(record, noise, onset=onset), part, onset))
 
     def around(self, steps: Float) -> Float:
         """Rollouts over the whole record at `z` plus `steps` (step, coordinate): (step, witness, counted, group)."""

@@ -7,6 +7,7 @@ from avtorch.blindtest import draw_case
 from avtorch.gap.answer.odds import favourite
 from avtorch.gap.chain.plant import plant
 from avtorch.gap.heldout.chance_gains import chance_gains
+from avtorch.gap.heldout.held_out import held_out
 from avtorch.gap.heldout.parts import parted
 from avtorch.gap.heldout.shrink import DENSITY, shrinkage
 from avtorch.gap.search.search import Search
@@ -27,8 +28,9 @@ def test_what_is_closed_is_what_one_who_knows_would_say(effect: str, rotating_se
 
     case, race = _raced(effect, [SensorBias, AerodynamicDrag, DeadBand], rotating_seed, tiers=["easy"])
     found = next(f for f in race.found if f.name == effect)
-    told = shrinkage(race, found)
-    assert told is not None
+    held = held_out(race, found)
+    assert held is not None
+    told = shrinkage(held)
     assert told.metric in case.oracles
     top, floor = told.top, case.oracles[told.metric].floor
     assert top.closed is not None
@@ -47,8 +49,9 @@ def test_a_wrong_effect_closes_nothing(rotating_seed: int) -> None:
 
     _, race = _raced("sensor_bias", [SensorBias, AerodynamicDrag], rotating_seed, tiers=["easy"])
     wrong = next(f for f in race.found if f.name == "aerodynamic_drag")
-    told = shrinkage(race, wrong)
-    assert told is not None
+    held = held_out(race, wrong)
+    assert held is not None
+    told = shrinkage(held)
     # the other blocks alone choose the right one, and so do not choose the one that was asked for
     assert told.chosen == 0.0
 
@@ -60,8 +63,9 @@ def test_glitches_show_in_the_density_alone(rotating_seed: int) -> None:
     _, race = _raced("outliers", [Outliers, SensorBias], rotating_seed, tiers=["medium"])
     found = next(f for f in race.found if f.name == "outliers")
     assert favourite(race.found) is found
-    told = shrinkage(race, found)
-    assert told is not None
+    held = held_out(race, found)
+    assert held is not None
+    told = shrinkage(held)
     assert told.metric == DENSITY
     assert told.top.closed is not None
     assert 0.8 < told.top.closed.mean <= 1.1

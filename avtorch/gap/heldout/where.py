@@ -1,0 +1,118 @@
+"""Where the gap lies: in time, speed, command, frequency, and whether the car moves or the sensor shows it otherwise.
+
+What a cause does to each row is half the square of the white image of its change, the nats it is expected to bring. On
+each axis the part named is the shortest stretch that holds nearly all of it, if plainly fewer rows lie there. A part is
+named on the strength of what it gains where it was held out: as the competing densities have not seen these rows, their
+ratio is an e-value, and e-values of any dependence keep the false-discovery rate by the procedure of Wang and Ramdas
+(2022).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from avtorch.gap.answer.where import Axis, Where
+from avtorch.gap.heldout.held_out import HeldOut
+
+Float = NDArray[np.float64]
+
+_MOST = 0.95  # of the sizes of what the cause does
+_PLAINLY = 0.6  # of the rows since it set in, for more of which a stretch is no part
+_BAND = 0.9  # of the power
+_RATE = 0.05  # of false discoveries
+
+
+def where(held: HeldOut, *, onset_s: float | None, lag: float) -> tuple[Where, ...]:
+    """The parts, the surest first. `onset_s`: when the cause set in, on the log's time; `lag` [s] of the actuator."""
+    parts = [*_stretches(held, onset_s, lag), *_signals(held), *_band(held)]
+    q_values = _q_values([gain for *_, gain in parts])
+    named = [Where(axis, a, b, share, q) for (axis, a, b, share, _), q in zip(parts, q_values, strict=True)]
+    return tuple(sorted((w for w in named if w.q_value <= _RATE), key=lambda w: w.q_value))
+
+
+Part = tuple[Axis, float | str, float | str, float, float]
+"""Axis, ends, share of what the cause does, and what was gained there [nats]."""
+
+
+def _stretches(held: HeldOut, onset_s: float | None, lag: float) -> Iterator[Part]:
+    record, does = held.record, held.does if held.does.any() else np.maximum(held.gained, 0.0)
+    if not does.any():
+        return
+    time = record.time[record.source]
+    one_clock = bool((np.diff(time) > 0).all())
+    if onset_s is not None and one_clock:
+        yield _part(held, "time", time, onset_s, float(time[-1]), does)
+    axes: list[tuple[Axis, Float]] = [("time", time)] if onset_s is None and one_clock else []
+    if record.speed is not None:
+        axes.append(("speed", record.speed.mean(-1)[record.source]))
+    # what the car is about to do: an effect of the command shows when the actuator has followed
+    share = -np.expm1(-record.dt / lag)
+    command = np.asarray(lfilter([share], [1, share - 1], record.command))[record.source]
+    axes.append(("command", command))
+    since = time >= onset_s if onset_s is not None and one_clock else np.ones(len(time), bool)
+    for axis, x in axes:
+        # by sizes and not by squares, or the edges of where it acts would not count
+        low, high = shortest(x, np.sqrt(does), _MOST)
+        if ((x >= low) & (x <= high))[since].mean() <= _PLAINLY:
+            yield _part(held, axis, x, low, high, does)
+
+
+def _part(held: HeldOut, axis: Axis, x: Float, low: float, high: float, does: Float) -> Part:
+    inside = (x >= low) & (x <= high)
+    return axis, low, high, float(does[inside].sum() / does.sum()), float(held.gained[inside].sum())
+
+
+def shortest(x: Float, weight: Float, share: float) -> tuple[float, float]:
+    """Ends of the shortest interval of `x` (row,) that holds `share` of the `weight` (row,)."""
+    order = np.argsort(x)
+    x, total = x[order], np.concatenate([[0.0], np.cumsum(weight[order])])
+    ends = np.searchsorted(total, total[:-1] + share * total[-1] * (1 - 1e-12))
+    fits = np.flatnonzero(ends <= len(x))
+    lengths = x[ends[fits] - 1] - x[fits]
+    best = fits[int(lengths.argmin())]
+    return float(x[best]), float(x[ends[best] - 1])
+
+
+def _signals(held: HeldOut) -> Iterator[Part]:
+    does, felt = float(held.does.sum()), float(held.felt.sum())
+    if does <= 0:
+        return
+    gained = float(held.gained.sum())
+    sensing = min(felt / does, 1.0)
+    for name, share in (("actuation", 1 - sensing), ("sensing", sensing)):
+        if share > 0:
+            yield "signal", name, name, share, share * gained
+
+
+def _band(held: HeldOut) -> Iterator[Part]:
+    """The band of frequencies of what the cause does to the acceleration."""
+    record = held.record
+    accel = held.moved[0] if "accel" in record.witnesses else np.gradient(held.moved[-1]) / record.dt
+    power, f = np.zeros(0), np.zeros(0)
+    for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
+        x = accel[first:last]
+        power = np.concatenate([power, np.abs(np.fft.rfft(x * np.hanning(len(x))))[1:] ** 2])
+        f = np.concatenate([f, np.fft.rfftfreq(len(x), record.dt)[1:]])
+    if not power.sum() > 0:
+        return
+    low, high = shortest(np.log(f), power, _BAND)
+    if high - low <= 0.75 * np.ptp(np.log(f)):
+        share = float(power[(np.log(f) >= low) & (np.log(f) <= high)].sum() / power.sum())
+        yield "frequency", float(np.exp(low)), float(np.exp(high)), share, share * float(held.gained.sum())
+
+
+def _q_values(gains: Sequence[float]) -> list[float]:
+    """Of e-values given by their logarithms."""
+    if not gains:
+        return []
+    order = np.argsort(-np.asarray(gains))
+    rank = np.arange(1, len(gains) + 1)
+    told = np.minimum(1.0, len(gains) / rank * np.exp(-np.clip(np.asarray(gains)[order], -50.0, 700.0)))
+    told = np.minimum.accumulate(told[::-1])[::-1]
+    out = np.empty(len(gains))
+    out[order] = told
+    return out.tolist()
