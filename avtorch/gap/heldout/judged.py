@@ -83,7 +83,8 @@ class Judge:
         fits = np.isin(self.record.source, refit.fits.source)
         here, there = refit.errors[:, fits], moved[:, :, fits]
         lost = 0.5 * ((white(here - there) ** 2).sum((1, 2, 3)) - (white(here) ** 2).sum())
-        # at one standard deviation half a nat
+        # at one standard deviation half a nat, the mean of both sides
+        lost = np.tile(lost.reshape(2, -1).mean(0), 2)
         moved = moved * np.sqrt(0.5 * np.minimum(1.0, 0.5 / np.maximum(lost, 0.5)))[:, None, None, None]
         if refit.found.candidate.grade_columns is not None:
             moved = np.concatenate([moved, refit.slope_spread(white)])

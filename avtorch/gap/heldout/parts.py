@@ -18,7 +18,7 @@ from avtorch.gap.likelihood.record import Record
 
 Rows = NDArray[np.bool_]
 
-PARTS = 4
+PARTS = 5
 _BLOCKS = 20  # of a long drive
 _WHOLE_S = 10.0  # of which a block has one to six: rollouts of that length have to fit in
 

