@@ -2,13 +2,15 @@
 
 The floor is what the verdict leaves where all drives fit its parameters, and what it takes to know them no better than
 that; or what a flexible regression leaves, where it is below by more than chance. Intervals are of blocks drawn anew,
-with replacement.
+with replacement, wider by what few blocks tell too little of their own spread (Student's t).
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm as normal
+from scipy.stats import t as student
 
 from avtorch.gap.answer.quantity import Quantity
 from avtorch.gap.answer.shrinkage import Closed, Shrinkage
@@ -38,16 +40,16 @@ def shrinkage(held: HeldOut) -> Shrinkage:
         total = {name: np.sqrt(weights @ x / (weights @ rows)) for name, x in square.items()}
         total["floor"] = np.sqrt(np.maximum(weights @ floor, 0.0) / (weights @ rows))
         tells = total["before"][0] > _TELLS * total["floor"][0]
-        by_metric[measure.name] = _closed(total, tells)
-        placebos[measure.name] = _placebo(total, tells)
+        by_metric[measure.name] = _closed(total, tells, blocks)
+        placebos[measure.name] = _placebo(total, tells, blocks)
         ceiling[measure.name] = float(total["ceiling"][0])
     nats = {name: s.nats for name, s in sums.items()}
     best = _floor(nats["fitted"] - nats["owed"], nats["flexible"], below=False)
     total = {name: weights @ x / (weights @ rows) for name, x in nats.items()}
     total["floor"] = weights @ best / (weights @ rows)
     tells = (total["floor"][0] - total["before"][0]) * rows.sum() > _TELLS_NATS
-    by_metric[DENSITY] = _closed(total, tells)
-    placebos[DENSITY] = _placebo(total, tells)
+    by_metric[DENSITY] = _closed(total, tells, blocks)
+    placebos[DENSITY] = _placebo(total, tells, blocks)
     ceiling[DENSITY] = float(total["ceiling"][0])
     usual = [m.name for m in kinds if m.horizon_s == USUAL[m.witness]]
     shows = {name: by_metric[name].before / max(by_metric[name].floor, 1e-12) for name in usual}
@@ -73,22 +75,25 @@ def _floor(model: Float, flexible: Float, *, below: bool) -> Float:
     return model
 
 
-def _closed(total: dict[str, Float], tells: bool) -> Closed:
+def _closed(total: dict[str, Float], tells: bool, blocks: int) -> Closed:
     """From values (draw,), the first of all blocks once."""
-    share = _share(total["before"] - total["after"], total["before"] - total["floor"]) if tells else None
+    share = None
+    if tells:
+        share = _share(total["before"] - total["after"], total["before"] - total["floor"], blocks)
     before, after, floor = (float(total[name][0]) for name in ("before", "after", "floor"))
     return Closed(before, after, floor, share)
 
 
-def _placebo(total: dict[str, Float], tells: bool) -> Quantity | None:
+def _placebo(total: dict[str, Float], tells: bool, blocks: int) -> Quantity | None:
     if not tells or "placebo" not in total:
         return None
-    return _share(total["verdict"] - total["placebo"], total["before"] - total["floor"])
+    return _share(total["verdict"] - total["placebo"], total["before"] - total["floor"], blocks)
 
 
-def _share(part: Float, whole: Float) -> Quantity:
+def _share(part: Float, whole: Float, blocks: int) -> Quantity:
     draws = part[1:] / np.where(np.abs(whole[1:]) > 1e-12, whole[1:], np.nan)
     draws = draws[np.isfinite(draws)]
-    q05, q95 = np.quantile(draws, (0.05, 0.95))
     mean = float(part[0] / whole[0])
-    return Quantity(mean, float(draws.std()), min(float(q05), mean), max(float(q95), mean))
+    wider = float(student.ppf(0.95, blocks - 1) / normal.ppf(0.95) * np.sqrt(blocks / (blocks - 1)))
+    q05, q95 = mean + wider * (np.quantile(draws, (0.05, 0.95)) - mean)
+    return Quantity(mean, wider * float(draws.std()), min(float(q05), mean), max(float(q95), mean))
