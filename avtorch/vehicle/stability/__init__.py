@@ -7,6 +7,7 @@ from avtorch.vehicle.stability.belief import (
     p_string_stable,
     stability_belief,
 )
+from avtorch.vehicle.stability.chain import Chain, ChainVerdict, actuator, chain_verdict, frequencies
 from avtorch.vehicle.stability.conditions import (
     Conditions,
     local_conditions,
@@ -25,11 +26,16 @@ from avtorch.vehicle.stability.verdict import (
 )
 
 __all__ = [
+    "Chain",
+    "ChainVerdict",
     "Conditions",
     "Interval",
     "Region",
     "StabilityBelief",
+    "actuator",
+    "chain_verdict",
     "dead_time_margin",
+    "frequencies",
     "gain",
     "local_conditions",
     "local_stable",

@@ -1,0 +1,104 @@
+"""Stability of the loop around any linear chain: dead time, a second pole, a late sensor, drag (SPEC section 2).
+
+With `P` from command to acceleration, `S` from acceleration to its reading, a drag `d` and a lower level that sends
+`alpha` times the reading plus `beta` times what the upper level asks, the loop is
+
+    F(s) = (1 - alpha P S) s (s + d) + beta P (k_s + g s - k_a S s^2),    g = k_s tau + k_v
+    V / V_lead = beta P (k_s + k_v s) / F
+
+`P` and `S` are stable and fade at high frequencies, so `F / (s + 1)^2` goes to 1 and its phase along the imaginary axis
+counts the growing modes (the argument principle). Everything is told on a grid of frequencies.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+
+SLACK = 1e-4
+"""A gain above one by less than this is one: responses that were measured on a grid are no better known."""
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A car for small motions: `omega` (frequency,) [rad/s], rising from near 0 to where nothing is left.
+
+    `motion` (..., frequency): complex acceleration for a unit command; `sensed` (..., frequency): the reading's share
+    of the acceleration; `drag` (...) [1/s]: by how much the acceleration falls with the speed.
+    """
+
+    omega: Tensor
+    motion: Tensor
+    sensed: Tensor
+    drag: Tensor
+
+    def __post_init__(self) -> None:
+        rises = bool((self.omega[1:] > self.omega[:-1]).all()) and float(self.omega[0]) > 0
+        if self.omega.ndim != 1 or not rises or len(self.omega) < 10:
+            raise InputError("omega: needs ten or more rising frequencies above 0")
+        for name in ("motion", "sensed"):
+            if getattr(self, name).shape[-1:] != self.omega.shape:
+                raise InputError(f"{name}: found shape {tuple(getattr(self, name).shape)}, needs (..., frequency)")
+
+
+@dataclass(frozen=True)
+class ChainVerdict:
+    """`locally_stable`, `string_stable` (bool), `peak_gain` [-], inf where locally unstable, of the batch's shape."""
+
+    locally_stable: Tensor
+    string_stable: Tensor
+    peak_gain: Tensor
+
+
+def frequencies(*, points: int = 600, least: float = 0.01, most: float = 200.0) -> Tensor:
+    """A grid [rad/s] for `Chain.omega`: 1.7 % apart, from far below a platoon's modes to far above an actuator's."""
+    return torch.logspace(math.log10(least), math.log10(most), points, dtype=torch.float64)
+
+
+def actuator(omega: Tensor, T_L: Tensor, K_L: Tensor, dead_time: Tensor | float = 0.0) -> Chain:
+    """GLVD with a dead time [s] as a chain, parameters (...)."""
+    s = 1j * omega
+    T, K, theta = torch.broadcast_tensors(T_L, K_L, torch.as_tensor(dead_time, dtype=torch.float64))
+    motion = K[..., None] * torch.exp(-s * theta[..., None]) / (1 + s * T[..., None])
+    return Chain(omega, motion, torch.ones_like(motion), torch.zeros_like(T))
+
+
+def chain_verdict(
+    chain: Chain,
+    time_gap: Tensor,
+    gains: Tensor,
+    *,
+    inner: Tensor | float = 0.0,
+    forward: Tensor | float = 1.0,
+) -> ChainVerdict:
+    """Of a linear controller around `chain`, batches that broadcast with each other.
+
+    `time_gap` (...) [s], `gains` (..., 3); the lower level sends `inner` times the sensed acceleration plus `forward`
+    times what the upper level asks, (...) (0 and 1: it passes that through).
+    """
+    s = 1j * chain.omega
+    ks, kv, ka = (k[..., None] for k in gains.unbind(-1))
+    g = ks * time_gap[..., None] + kv
+    alpha, beta = (torch.as_tensor(x, dtype=torch.float64)[..., None] for x in (inner, forward))
+    free = s * (s + chain.drag[..., None])
+    own = (1 - alpha * chain.motion * chain.sensed) * free
+    loop = own + beta * chain.motion * (ks + g * s - ka * chain.sensed * s**2)
+    gain = (beta * chain.motion * (ks + kv * s)).abs() / loop.abs().clamp_min(1e-300)
+    local = _growing(loop / (s + 1) ** 2) < 0.5
+    at_rest = (beta * chain.motion[..., :1].real * ks)[..., 0] > 0
+    local = local & at_rest
+    peak = torch.where(local, gain.amax(-1).clamp_min(1.0), torch.inf)
+    return ChainVerdict(local, local & (peak <= 1 + SLACK), peak)
+
+
+def _growing(curve: Tensor) -> Tensor:
+    """How many modes grow, (...): half turns that `curve` (..., frequency) makes clockwise from above to below."""
+    turns = torch.angle(curve[..., 1:] / curve[..., :-1]).sum(-1)
+    # from the real axis at omega 0 and back to it at the top
+    ends = torch.angle(curve[..., 0]) - torch.angle(curve[..., -1])
+    return -(turns + ends) / math.pi
