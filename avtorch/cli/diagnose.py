@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -125,7 +126,11 @@ def diagnose(
             told = f"no answer was written; what is done is kept in {out / FITS}: the same command goes on from there"
             raise KeyboardInterrupt(told) from None
         raise
-    written = found.write(out)
+    from avtorch.remedy import setting_for, write_exports
+
+    told = setting_for(found, [x for drive in drives if drive.accel_cmd is not None for x in drive.accel_cmd])
+    found = replace(found, setting=None if told is None else told.to_dict())
+    written = [*found.write(out), *write_exports(found.plant, out)]
     if talk.json:
         talk.done(out, found.to_dict())
         return
@@ -135,8 +140,11 @@ def diagnose(
     talk.out.print()
     for note in diagnosis_notes(found):
         talk.out.print(note)
-    names = [p.name + (" (the repaired simulator)" if p.suffix == ".toml" else "") for p in written]
+    names = [p.name + _FILES.get(p.suffix, "") for p in written]
     talk.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {', '.join(names)}", soft_wrap=True)
+
+
+_FILES = {".toml": " (the repaired simulator)", ".yaml": " (in that tool's terms)"}
 
 
 def _known(option: str, name: str, more: Sequence[str] = ()) -> str:

@@ -73,6 +73,8 @@ def diagnosis_notes(found: Diagnosis) -> list[str]:
     elif found.winner.effects:
         lines.append("Onset: there from the start.")
     lines += _moved(found.baseline, found.winner.moved) + _gap(found) + _shrinkage(found)
+    if found.setting is not None:
+        lines.append(escape(f"To set: {found.setting['why']}"))
     if found.remaining:
         best = sorted(found.remaining, key=lambda c: -c.probability)[:3]
         told = ", ".join(f"{c.name} {_number(c.probability)}" for c in best if c.probability >= 0.005)

@@ -19,7 +19,7 @@ from avtorch.gap.answer.odds import favourite, probabilities
 from avtorch.gap.answer.posterior import Draws
 from avtorch.gap.answer.remainder import Remainder, remainder
 from avtorch.gap.answer.remaining import remaining
-from avtorch.gap.answer.reported import drawn, moved, repaired, reported
+from avtorch.gap.answer.reported import belief, drawn, moved, repaired, reported
 from avtorch.gap.answer.verdict import Candidate, verdict_of
 from avtorch.gap.chain.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.chain.plant import GapPlant, plant
@@ -101,6 +101,9 @@ def diagnose(
         verdict=verdict,
         onset_s=onset,
         plant=repaired(winner, base, draws) if named and winner is not None else None,
+        simulator=repaired(race.none, base),
+        belief=belief(winner if named and winner is not None else race.none, draws if named else None),
+        assumed=belief(race.none),
         draws=drawn(winner, draws) if draws is not None and winner is not None else None,
         where=() if held is None or verdict.name == "none" else where(held, onset_s=onset, lag=lag),
         shrinkage=shrinkage(held) if held is not None and named else None,

@@ -109,12 +109,19 @@ class GapFacts:
 class Diagnosis:
     """What the simulator lacks, by a log.
 
-    `candidates` are listed as `listed` has them, whatever was given. `plant`: the simulator with the verdict's effects
-    in, at the posterior mean; None where nothing was named. `draws`: posterior of the winner's parameters (chain,
-    draw) by name. `remaining`: with the default baseline, the candidates for what is left once `dead_time` is in.
-    `complete` False: the budget ended the search. `shrinkage`: how far the gap shrinks on parts that were held out;
-    None where nothing was named or the drives are too short to be parted. `where`, `next_experiment`: objects of the
-    schema, or empty. Raises `InputError` where verdict and candidates do not agree.
+    - `candidates` are listed as `listed` has them, whatever was given
+    - `simulator`: the user's own, `T_L` and `K_L` as fitted without any effect; `plant`: the same with the verdict's
+      effects in, at the posterior mean, None where nothing was named
+    - `assumed`: draws (draw,) of the simulator's `T_L` [s] and `K_L`; `belief`: draws (draw,) of the parameters of
+      `plant`, or of `simulator` where there is none, by its own names; `draws`: posterior of the winner's parameters
+      (chain, draw) by the table's names
+    - `where`, `shrinkage`: where the gap lies and how far it shrinks, on parts that were held out; None where the drives
+      are too short to be parted, and `shrinkage` where nothing was named
+    - `next_experiment`, `setting`: objects as in `diagnosis.json`, None where nobody asked
+    - `remaining`: with the default baseline, the candidates for what is left once `dead_time` is in
+    - `complete` False: the budget ended the search
+
+    Raises `InputError` where verdict and candidates do not agree.
     """
 
     log: LogFacts
@@ -125,10 +132,14 @@ class Diagnosis:
     onset_s: float | None = None
     plant: GapPlant | None = None
     draws: Mapping[str, NDArray] | None = None
+    simulator: GapPlant | None = None
+    belief: Mapping[str, NDArray] | None = None
+    assumed: Mapping[str, NDArray] | None = None
     remaining: tuple[Candidate, ...] | None = None
     where: tuple[Where, ...] = ()
     shrinkage: Shrinkage | None = None
     next_experiment: Mapping[str, Any] | None = None
+    setting: Mapping[str, Any] | None = None
     complete: bool = True
     notes: tuple[str, ...] = ()
 
@@ -151,8 +162,8 @@ class Diagnosis:
         return next((c.probability for c in self.candidates if c.name == name), 0.0)
 
     def to_dict(self) -> dict[str, Any]:
-        """The object of `diagnosis.json`; beside the schema's keys `moved` and `onset_s` of each effect, `remaining`,
-        `complete` and `notes`.
+        """The object of `diagnosis.json`; beside the schema's keys `moved` and `onset_s` of each effect, `setting`,
+        `remaining`, `complete` and `notes`.
         """
         return {
             "schema": "avtorch.diagnosis/1",
@@ -165,6 +176,7 @@ class Diagnosis:
             "verdict": self.verdict.to_dict(),
             "shrinkage": None if self.shrinkage is None else self.shrinkage.to_dict(),
             "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),
+            "setting": None if self.setting is None else dict(self.setting),
             "remaining": None if self.remaining is None else [c.to_dict() for c in self.remaining],
             "complete": self.complete,
             "notes": list(self.notes),

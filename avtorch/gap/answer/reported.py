@@ -45,6 +45,13 @@ def moved(found: Found, draws: Draws | None = None) -> dict[str, Quantity]:
     return {name: Quantity.of_draws(values[name]) for name in ("T_L", "K_L")}
 
 
+def belief(found: Found, draws: Draws | None = None, *, count: int = 64) -> dict[str, Float]:
+    """Draws (draw,) of the repaired simulator's parameters, by its own names."""
+    values = {key: x.reshape(-1) for key, x in _values(found, draws).items()}
+    every = max(1, len(values["T_L"]) // count)
+    return {key: x[::every][:count] for key, x in values.items()}
+
+
 def drawn(found: Found, draws: Draws) -> dict[str, Float]:
     """Draws (chain, draw) under the names of `reported`, `T_L` and `K_L` first."""
     rng = np.random.default_rng(0)

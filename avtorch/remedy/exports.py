@@ -1,0 +1,89 @@
+"""The repaired plant in the terms of other tools, as far as these have a word for it.
+
+- Autoware's planning simulator (`simple_planning_simulator`, model `DELAY_STEER_ACC_GEARED_WO_FALL_GUARD` and its
+  kin): `acc_time_delay` [s], `acc_time_constant` [s], `vel_rate_lim` [m/s²], `acc_scaling_factor` of the debug model
+- openpilot (`CarParams`): `longitudinalActuatorDelay` [s], from command to response, lag and all
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+from avtorch.gap import GapPlant
+from avtorch.io import atomic
+
+
+@dataclass(frozen=True)
+class Exported:
+    """`values` by the tool's own names; `lost`: what the plant has and the tool cannot say, one sentence each."""
+
+    tool: str
+    values: Mapping[str, float]
+    lost: tuple[str, ...]
+
+    def to_text(self) -> str:
+        """YAML lines, with what is lost as comments."""
+        lines = [f"# {self.tool}", *(f"# not expressed: {text}" for text in self.lost)]
+        return "\n".join([*lines, *(f"{name}: {value:.6g}" for name, value in self.values.items())]) + "\n"
+
+
+_SENSING = {"sensor_lag", "sensor_bias", "sensor_scale", "outliers"}
+
+
+def to_autoware(plant: GapPlant) -> Exported:
+    """Delay, time constant, scaling and limits of `plant`."""
+    effects = {e.name: {k: float(v) for k, v in e.values().items() if v.dim() == 0} for e in plant.effects}
+    values = {
+        "acc_time_delay": effects.get("dead_time", {}).get("delay_s", 0.0),
+        "acc_time_constant": float(plant.T_L),
+        "debug_acc_scaling_factor": float(plant.K_L),
+    }
+    told = {"dead_time"}
+    if "saturation" in effects:
+        values["vel_rate_lim"] = max(effects["saturation"]["accel_max_mps2"], -effects["saturation"]["accel_min_mps2"])
+        told.add("saturation")
+    lost = []
+    if "second_order_actuator" in effects:
+        lost.append("second_order_actuator: its overshoot; the time constant is that of the two poles together")
+        told.add("second_order_actuator")
+    return Exported("Autoware planning simulator", values, (*lost, *_unsaid(plant, told)))
+
+
+def to_openpilot(plant: GapPlant) -> Exported:
+    """The actuator's delay as openpilot means it: until the response to a step has gone 63 % of its way."""
+    effects = {e.name: {k: float(v) for k, v in e.values().items() if v.dim() == 0} for e in plant.effects}
+    delay = effects.get("dead_time", {}).get("delay_s", 0.0) + float(plant.T_L)
+    lost = [f"K_L {float(plant.K_L):.3g}: a gain is learned on the way"] if abs(float(plant.K_L) - 1) > 0.01 else []
+    return Exported(
+        "openpilot CarParams", {"longitudinalActuatorDelay": delay}, (*lost, *_unsaid(plant, {"dead_time"}))
+    )
+
+
+def write_exports(plant: GapPlant | None, folder: str | PathLike[str]) -> list[Path]:
+    """Write `plant.autoware.yaml` and `plant.openpilot.yaml`; returns the files. None: earlier ones go.
+
+    Raises `InputError` where the folder cannot be written.
+    """
+    written = []
+    for name, told in (("autoware", to_autoware), ("openpilot", to_openpilot)):
+        path = Path(folder) / f"plant.{name}.yaml"
+        if plant is None:
+            path.unlink(missing_ok=True)
+            continue
+        with atomic(path) as stream:
+            stream.write(told(plant).to_text())
+        written.append(path)
+    return written
+
+
+def _unsaid(plant: GapPlant, told: set[str]) -> tuple[str, ...]:
+    lost = []
+    for e in plant.effects:
+        if e.name in told:
+            continue
+        where = "the sensor's, not the car's" if e.name in _SENSING else e.meaning
+        lost.append(f"{e.name}: {where}")
+    return tuple(lost)

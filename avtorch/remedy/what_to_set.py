@@ -1,0 +1,234 @@
+"""Is the car string stable as it really is, and which setting makes it so with the least intrusion?
+
+The repaired plant is judged whole, with its dead time, second pole or late sensor in the loop, at slow, usual and quick
+speeds and for driving and braking; a draw of its parameters counts as stable where all of these are. Settings and what
+they cost are the strategist's (`avtorch.decision.grid`), with calmer gains besides; a setting that would have more than
+one in twenty of the log's commands clipped is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from avtorch.decision import Setting
+from avtorch.decision.algorithm2 import ACCEPTED_CHANGE
+from avtorch.decision.grid import GAINS_GRID, Grid
+from avtorch.errors import InputError
+from avtorch.gap import GapPlant
+from avtorch.gap.answer.diagnosis import Diagnosis
+from avtorch.remedy.linearised import NOT_LINEAR, linearised
+from avtorch.vehicle.stability import Chain, chain_verdict
+
+SOFTER: tuple[tuple[float, float, float], ...] = tuple(product((0.1, 0.2, 0.4, 0.8), (0.4, 0.7, 1.0), (-0.8, -0.2)))
+"""Gains on offer besides the strategist's: a loop with dead time in it needs calmer ones, and a longer gap."""
+SPEEDS_MPS = (5.0, 15.0, 30.0)
+STEP_MPS2 = 0.5
+_BLOCK = 32  # settings judged at a time
+
+
+@dataclass(frozen=True, eq=False)
+class WhatToSet:
+    """`p_now`, `p_then`: P(string stable) with the setting in force and with the one to `set`.
+
+    `peak_now`, `peak_then`: median peak gain [-] at the worst of speeds and pedals, inf where disturbances grow.
+    `p_assumed`: what P(string stable) would be for the simulator as it was, without the effect. `sufficient`: `p_then`
+    reaches `required`. `clipped`: share of the log's commands that `set` would have clipped. `strategies` out of 1
+    (lower level), 2 (time gap), 3 (gains). `why`: one sentence. `notes`: what holds for steps of one size only.
+    """
+
+    in_force: Setting = field(repr=False)
+    set: Setting = field(repr=False)
+    p_assumed: float
+    p_now: float
+    p_then: float
+    peak_now: float
+    peak_then: float
+    required: float
+    sufficient: bool
+    strategies: tuple[int, ...]
+    clipped: float
+    why: str
+    notes: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain numbers; a peak gain that is infinite is null."""
+        return {
+            "in_force": self.in_force.as_dict(),
+            "settings": self.set.as_dict(),
+            "strategies": list(self.strategies),
+            "p_string_stable": {"assumed": self.p_assumed, "in_force": self.p_now, "then": self.p_then},
+            "peak_gain": {"in_force": _finite(self.peak_now), "then": _finite(self.peak_then)},
+            "required": self.required,
+            "sufficient": self.sufficient,
+            "clipped_share": self.clipped,
+            "why": self.why,
+            "notes": list(self.notes),
+        }
+
+
+def what_to_set(
+    plant: GapPlant,
+    belief: Mapping[str, NDArray[np.float64] | Tensor],
+    *,
+    assumed: Mapping[str, NDArray[np.float64] | Tensor] | None = None,
+    commands: Sequence[float] | NDArray[np.float64] | None = None,
+    in_force: Setting | None = None,
+    grid: Grid | None = None,
+    required: float = 0.95,
+    speeds: Sequence[float] = SPEEDS_MPS,
+    accel_min: float = -6.0,
+    accel_max: float = 4.0,
+) -> WhatToSet:
+    """The least intrusive setting that makes `plant` string stable with probability `required`.
+
+    `belief`: draws (draw,) of the plant's parameters by its names (`T_L`, `K_L`, `effect.parameter`); `assumed`: draws
+    of `T_L` [s] and `K_L` of the simulator without the effect. `commands` (row,) [m/s²]: a log's, in which clipping is
+    counted. Default setting in force: time gap 1 s, the paper's gains, the lower level passing through. `grid`: what is
+    on offer. Limits [m/s²]. Raises `InputError` for a probability or speeds out of range.
+    """
+    if not 0.0 < required < 1.0:
+        raise InputError(f"required: found {required}, needs a number between 0 and 1")
+    if not speeds or min(speeds) <= 0:
+        raise InputError(f"speeds: found {tuple(speeds)}, needs one or more above 0")
+    draws = {k: torch.as_tensor(np.asarray(v), dtype=torch.float64) for k, v in belief.items()}
+    now = Setting(scenarios=1) if in_force is None else in_force
+    chains = _chains(plant, draws, speeds)
+    T, K = (draws[name].mean().reshape(1) for name in ("T_L", "K_L"))
+    # a model no further off than the paper accepts is none that is known to be wrong
+    stale = ((T - now.T_hat).abs() > ACCEPTED_CHANGE[0]) | ((K - now.K_hat).abs() > ACCEPTED_CHANGE[1])
+    offers = (Grid(gains=(*GAINS_GRID, *SOFTER)) if grid is None else grid).candidates(
+        T, K, current=now, default=now, model_wrong=stale
+    )
+    cost = offers.cost[0]
+    order = [i for i in cost.argsort(stable=True).tolist() if bool(torch.isfinite(cost[i]))]
+    used = np.zeros(0) if commands is None else np.asarray(commands, float)
+    clipped = _clipped(offers.setting[0], used, accel_min, accel_max)
+
+    p_now, peak_now = (float(x[0]) for x in _judged(chains, now))
+    best, p_best, peak_best = 0, p_now, peak_now
+    for first in range(0, len(order), _BLOCK):
+        some = order[first : first + _BLOCK]
+        p, peak = _judged(chains, offers.setting[0][torch.tensor(some)])
+        good = [k for k, i in enumerate(some) if p[k] >= required and clipped[i] <= 0.05]
+        if good:
+            best, p_best, peak_best = some[good[0]], float(p[good[0]]), float(peak[good[0]])
+            break
+        allowed = torch.tensor([clipped[i] <= max(0.05, clipped[0]) for i in some])
+        top = int(torch.where(allowed, p, -1.0).argmax())
+        if bool(allowed[top]) and float(p[top]) > p_best + 0.02:
+            best, p_best, peak_best = some[top], float(p[top]), float(peak[top])
+    chosen = offers.setting[0][torch.tensor([best])]
+    bare = GapPlant((), T_L=plant.T_L, K_L=plant.K_L, sigma=0.0)
+    thought = {k: torch.as_tensor(np.asarray(v), dtype=torch.float64) for k, v in (assumed or {}).items()}
+    p_assumed = float(_judged(_chains(bare, thought or draws, speeds[:1]), now)[0][0])
+    sufficient = p_best >= required
+    strategies = tuple(sorted(chosen.strategies(now)[0]))
+    names = [e.name for e in plant.effects if e.name in NOT_LINEAR]
+    notes = (f"{' and '.join(names)}: told for steps of {STEP_MPS2:g} m/s².",) if names else ()
+    return WhatToSet(
+        in_force=now,
+        set=chosen,
+        p_assumed=p_assumed,
+        p_now=p_now,
+        p_then=p_best,
+        peak_now=peak_now,
+        peak_then=peak_best,
+        required=required,
+        sufficient=sufficient,
+        strategies=strategies,
+        clipped=float(clipped[best]),
+        why=_sentence(chosen, now, strategies, p_now, p_best, sufficient, required),
+        notes=notes,
+    )
+
+
+def setting_for(
+    found: Diagnosis, commands: Sequence[float] | NDArray[np.float64] | None = None, **more: Any
+) -> WhatToSet | None:
+    """`what_to_set` for the car of a diagnosis; None where nothing is known to judge it by (verdict `unknown`).
+
+    `more`: `in_force`, `grid`, `required`, `speeds`, limits.
+    """
+    if found.verdict.abstained or found.simulator is None or found.belief is None:
+        return None
+    car = found.simulator if found.plant is None else found.plant
+    return what_to_set(car, found.belief, assumed=found.assumed, commands=commands, **more)
+
+
+def _chains(plant: GapPlant, draws: Mapping[str, Tensor], speeds: Sequence[float]) -> list[Chain]:
+    """At every speed; driving and braking apart where the plant answers them otherwise."""
+    names = {e.name for e in plant.effects}
+    bends = names & {"brake_throttle_asymmetry", "saturation"}
+    at = speeds if any(e.needs_speed for e in plant.effects) else speeds[:1]
+    steps = (STEP_MPS2, -STEP_MPS2) if bends else (STEP_MPS2,)
+    return [linearised(plant, draws, speed=v, step=u) for v in at for u in steps]
+
+
+def _judged(chains: Sequence[Chain], settings: Setting) -> tuple[Tensor, Tensor]:
+    """P(string stable) and the median peak gain, (setting,), each draw at its worst chain."""
+    inner, forward = _lower(settings)
+    stable, peak = None, None
+    for chain in chains:
+        seen = chain_verdict(
+            chain,
+            settings.time_gap[:, None],
+            settings.gains[:, None],
+            inner=inner[:, None],
+            forward=forward[:, None],
+        )
+        stable = seen.string_stable if stable is None else stable & seen.string_stable
+        peak = seen.peak_gain if peak is None else torch.maximum(peak, seen.peak_gain)
+    assert stable is not None
+    assert peak is not None
+    return stable.double().mean(-1), peak.median(-1).values
+
+
+def _lower(settings: Setting) -> tuple[Tensor, Tensor]:
+    """What the lower level sends for a unit of sensed acceleration, and of demanded."""
+    zero, one = torch.zeros_like(settings.T_hat), torch.ones_like(settings.T_hat)
+    lower = settings.lower_level(accel_min=-1e9, accel_max=1e9)
+    return lower.raw_command(one, zero), lower.raw_command(zero, one)
+
+
+def _clipped(settings: Setting, commands: NDArray[np.float64], low: float, high: float) -> list[float]:
+    """Share of the log's commands that each setting would have clipped, as much larger as its inversion makes them."""
+    if not len(commands):
+        return [0.0] * len(settings.T_hat)
+    sizes = settings.amplification().numpy()[:, None] * commands
+    return ((sizes < low) | (sizes > high)).mean(1).tolist()
+
+
+def _sentence(
+    chosen: Setting, now: Setting, strategies: tuple[int, ...], before: float, then: float, good: bool, required: float
+) -> str:
+    steps = []
+    s = chosen.as_dict()
+    if 1 in strategies:
+        steps.append(f"let the lower level model T {s['T_hat']:.2f} s, K {s['K_hat']:.2f} and aim at {s['T_d']:.2f} s")
+    if 2 in strategies:
+        steps.append(f"time gap {s['time_gap_s']:g} s instead of {now.as_dict()['time_gap_s']:g} s")
+    if 3 in strategies:
+        steps.append("gains " + ", ".join(f"{k:g}" for k in s["gains"]))
+    if not steps:
+        if good:
+            return f"Nothing to set: P(string stable) is {before:.2f} as it is."
+        return (
+            f"No setting on offer is sufficient, and none better than the one in force (P(string stable) {before:.2f})."
+        )
+    what = "; ".join(steps)
+    told = f"P(string stable) {then:.2f} instead of {before:.2f}"
+    if good:
+        return f"Least intrusive of what suffices: {what} ({told})."
+    return f"No setting on offer reaches {required:g}; the best is: {what} ({told})."
+
+
+def _finite(x: float) -> float | None:
+    return x if np.isfinite(x) else None
