@@ -115,8 +115,8 @@ class Diagnosis:
     - `assumed`: draws (draw,) of the simulator's `T_L` [s] and `K_L`; `belief`: draws (draw,) of the parameters of
       `plant`, or of `simulator` where there is none, by its own names; `draws`: posterior of the winner's parameters
       (chain, draw) by the table's names
-    - `where`, `shrinkage`: where the gap lies and how far it shrinks, on parts that were held out; None where the drives
-      are too short to be parted, and `shrinkage` where nothing was named
+    - `where`, `shrinkage`: where the gap lies and how far it shrinks, on parts that were held out; empty and None where
+      the drives are too short to be parted, and `shrinkage` None where nothing was named
     - `next_experiment`, `setting`: objects as in `diagnosis.json`, None where nobody asked
     - `remaining`: with the default baseline, the candidates for what is left once `dead_time` is in
     - `complete` False: the budget ended the search
