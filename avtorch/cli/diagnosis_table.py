@@ -72,6 +72,7 @@ def diagnosis_notes(found: Diagnosis) -> list[str]:
         lines.append(f"Onset: at {found.onset_s:.1f} s of the log's time.")
     elif found.winner.effects:
         lines.append("Onset: there from the start.")
+    lines += _where(found)
     lines += _moved(found.baseline, found.winner.moved) + _gap(found) + _shrinkage(found)
     if found.setting is not None:
         lines.append(escape(f"To set: {found.setting['why']}"))
@@ -158,6 +159,23 @@ def _gap(found: Diagnosis) -> list[str]:
         return []
     over = "" if gap.horizon_s is None else f", over {gap.horizon_s:.3g} s"
     return [f"Gap of the simulator as it is{over}: {', '.join(parts)}."]
+
+
+def _where(found: Diagnosis) -> list[str]:
+    from avtorch.gap.answer.where import UNITS
+
+    told = []
+    for part in found.where:
+        if part.axis == "time" and found.onset_s is not None:
+            continue  # the onset says it
+        if part.axis == "signal":
+            if part.share >= 0.5:
+                told.append("in what the car does" if part.begin == "actuation" else "in what the accelerometer shows")
+        elif not isinstance(part.begin, str) and not isinstance(part.end, str):
+            at, unit = "frequencies" if part.axis == "frequency" else f"{part.axis}s", UNITS[part.axis]
+            ends = f"from {part.begin:.2g} to {part.end:.2g}" if part.begin else f"below {part.end:.2g}"
+            told.append(f"at {at} {ends} {unit}")
+    return [f"It lies {', '.join(told)}."] if told else []
 
 
 _MEASURES = {

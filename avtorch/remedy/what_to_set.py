@@ -114,7 +114,7 @@ def what_to_set(
 
     p_now, peak_now = (float(x[0]) for x in _judged(chains, now))
     best, p_best, peak_best = 0, p_now, peak_now
-    for first in range(0, len(order), _BLOCK):
+    for first in range(0, len(order) if p_now < required else 0, _BLOCK):
         some = order[first : first + _BLOCK]
         p, peak = _judged(chains, offers.setting[0][torch.tensor(some)])
         good = [k for k, i in enumerate(some) if p[k] >= required and clipped[i] <= 0.05]

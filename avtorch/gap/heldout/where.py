@@ -102,7 +102,10 @@ def _band(held: HeldOut) -> Iterator[Part]:
     low, high = shortest(np.log(f), power, _BAND)
     if high - low <= 0.75 * np.ptp(np.log(f)):
         share = float(power[(np.log(f) >= low) & (np.log(f) <= high)].sum() / power.sum())
-        yield "frequency", float(np.exp(low)), float(np.exp(high)), share, share * float(held.gained.sum())
+        # the slowest that a drive holds is as good as steady
+        slowest = low <= np.log(f.min()) + 1e-9
+        begin, end = 0.0 if slowest else float(np.exp(low)), float(np.exp(high))
+        yield "frequency", begin, end, share, share * float(held.gained.sum())
 
 
 def _q_values(gains: Sequence[float]) -> list[float]:
