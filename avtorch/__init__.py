@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from avtorch.decision.supervisor import Supervisor
     from avtorch.errors import InputError
     from avtorch.gap.answer.diagnosis import Diagnosis
+    from avtorch.gap.compare import compare
     from avtorch.gap.diagnose import diagnose
     from avtorch.inference import SGLD, BeliefStream, SequentialInference
     from avtorch.io import Log
@@ -46,6 +47,7 @@ _HOME = {
     "avtorch.decision.strategist": ("Strategist",),
     "avtorch.decision.supervisor": ("Supervisor",),
     "avtorch.errors": ("InputError",),
+    "avtorch.gap.compare": ("compare",),
     "avtorch.gap.diagnose": ("diagnose",),
     "avtorch.gap.answer.diagnosis": ("Diagnosis",),
     "avtorch.inference": ("SGLD", "BeliefStream", "SequentialInference"),
@@ -87,6 +89,7 @@ __all__ = [
     "Supervisor",
     "Validation",
     "algorithm2",
+    "compare",
     "decision",
     "diagnose",
     "estimate",

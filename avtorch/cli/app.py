@@ -12,6 +12,7 @@ from cyclopts import App, CycloptsError
 
 from avtorch import __version__
 from avtorch.cli.blindtest import blindtest
+from avtorch.cli.compare import compare
 from avtorch.cli.diagnose import diagnose
 from avtorch.cli.estimate import estimate
 from avtorch.cli.run import run
@@ -29,6 +30,7 @@ app = App(
 app.command(run)
 app.command(estimate)
 app.command(diagnose)
+app.command(compare)
 app.command(stability)
 app.command(validate)
 app.command(blindtest)

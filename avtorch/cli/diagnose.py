@@ -18,11 +18,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, positive, seed_number
 from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.cli.resume import FITS, same_work
+from avtorch.cli.simulator import read_simulator
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
-    from avtorch.gap import GapPlant
     from avtorch.io import Log
 
 CAUSES = ("none", "unknown", "pair")
@@ -83,7 +83,7 @@ def diagnose(
 
     chosen = _effects(effects)
     weights = _prior(prior or ())
-    simulator = _baseline(baseline)
+    simulator = read_simulator("--baseline", baseline)
 
     from avtorch.io import Log, check
 
@@ -181,28 +181,6 @@ def _prior(given: Sequence[str]) -> dict[str, float]:
             raise InputError(f"--prior: found {name} twice, needs each name once")
         weights[name] = weight
     return weights
-
-
-def _baseline(text: str) -> GapPlant | None:
-    """None for the bare GLVD, whose answer says as well what remains once a delay is in."""
-    from avtorch.gap import plant
-
-    if text.strip().lower() == "glvd":
-        return None
-    if text.endswith(".toml") and not Path(text).is_file():
-        raise InputError(f"--baseline {text!r}: no such file; needs a TOML file, or effects such as dead_time=0.2")
-    try:
-        simulator = plant(baseline=Path(text) if text.endswith(".toml") or Path(text).is_file() else text)
-    except InputError as fault:
-        raise InputError(f"--baseline {text!r}: {fault}") from None
-    known = simulator.parameters()
-    for name, value in simulator.values().items():
-        # the ends of an interval are a drive's, which is not known yet
-        if known[name].constraint != "interval" and known[name].unconstrain(value).isnan().any():
-            raise InputError(
-                f"--baseline {text!r}: {name} is {value.tolist():g}, needs a {known[name].constraint} number"
-            )
-    return simulator
 
 
 def _usable(path: Path, drive: Log, accel_kind: str) -> None:

@@ -39,15 +39,19 @@ class Part:
 
 def parted(record: Record, *, apart_s: float = 3.0, parts: int = PARTS) -> tuple[Part, ...]:
     """The record's parts, `apart_s` [s] between what fits and what judges; none where there is too little for two."""
-    blocks = list(_blocks(record))
+    blocks = blocks_of(record)
     count = min(parts, len(blocks))
     if count < 2:
         return ()
     return tuple(_part(record, tuple(blocks[k::count]), apart_s) for k in range(count))
 
 
+def blocks_of(record: Record) -> list[slice]:
+    """Every counted row in one block, of 10 to 60 s; short stretches are blocks of their own."""
+    return list(_blocks(record))
+
+
 def _blocks(record: Record) -> Iterator[slice]:
-    """Every counted row in one block; short stretches are blocks of their own."""
     seconds = _WHOLE_S * float(np.clip(round(record.rows * record.dt / _BLOCKS / _WHOLE_S), 1, 6))
     for begin, end in pairwise([*record.starts.tolist(), record.rows]):
         count = max(1, int((end - begin) * record.dt / seconds + 1e-9))

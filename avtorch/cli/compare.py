@@ -1,0 +1,103 @@
+"""`avtorch compare`: did a change to the car or to the simulator help?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+from rich.markup import escape
+from rich.table import Table
+
+from avtorch.cli.arguments import OUTPUT, Json, Quiet, free_folder
+from avtorch.cli.simulator import read_simulator
+from avtorch.cli.talk import Talk
+from avtorch.errors import InputError
+
+if TYPE_CHECKING:
+    from avtorch.gap.answer.comparison import Comparison, Moved
+
+_ROWS = {
+    "T_L": "lag T_L [s]",
+    "K_L": "gain K_L [-]",
+    "rollout_rmse_accel": "off in acceleration [m/s²]",
+    "rollout_rmse_speed": "off in speed, 10 s [m/s]",
+}
+
+
+def compare(
+    before: Path,
+    after: Path,
+    /,
+    *,
+    baseline: Annotated[
+        str, Parameter(help="The simulator: effects such as dead_time=0.2, or TOML; glvd is fitted to BEFORE.")
+    ] = "glvd",
+    baseline_after: Annotated[
+        str | None, Parameter(help="The simulator that AFTER is held against; default: the same.")
+    ] = None,
+    out: Annotated[Path | None, Parameter(name="--out", group=OUTPUT, help="Folder for comparison.json.")] = None,
+    map: Annotated[
+        list[str] | None, Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN; repeatable.")
+    ] = None,
+    unit: Annotated[list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT; repeatable.")] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Did a change to the car, or to the simulator, help? By how much, with intervals.
+
+    Parameters
+    ----------
+    before
+        CSV or Parquet, as for diagnose: the drive before the change.
+    after
+        The drive after it. The same file twice compares two simulators on one drive.
+    """
+    if out is not None:
+        free_folder(out)
+    simulator = read_simulator("--baseline", baseline)
+    other = None if baseline_after is None else read_simulator("--baseline-after", baseline_after)
+    if baseline_after is not None and (simulator is None or other is None):
+        raise InputError("--baseline-after: found without two simulators; needs --baseline and --baseline-after given")
+
+    from avtorch.gap.compare import compare as work
+    from avtorch.io import Log, check, write_json
+
+    talk = Talk(json=json, quiet=quiet)
+    logs = [Log.read(path, map=map, unit=unit) for path in (before, after)]
+    for path, log in zip((before, after), logs, strict=True):
+        if not log.usable.any():
+            raise InputError(f"{path}: has no row to use; all are driven by hand (engaged 0) or at standstill")
+        talk.notes(log.name, check(log).notes)
+    with talk.waiting("fitting both drives"):
+        told = work(*logs, baseline=simulator, baseline_after=other)
+    if out is not None:
+        write_json(out / "comparison.json", told.to_dict())
+    if talk.json:
+        import json as text
+
+        print(text.dumps(told.to_dict()))
+        return
+    talk.out.print(f"[bold]{escape(told.why)}[/bold]")
+    talk.out.print()
+    talk.out.print(_table(told))
+    if out is not None:
+        talk.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: comparison.json", soft_wrap=True)
+
+
+def _table(told: Comparison) -> Table:
+    table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column("")
+    for name in ("before", "after", "after / before (90 %)"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, moved in {**told.car, **told.gap}.items():
+        table.add_row(escape(_ROWS.get(name, name)), *_cells(moved))
+    return table
+
+
+def _cells(moved: Moved) -> list[str]:
+    r = moved.ratio
+    return [
+        *(f"{q.mean:.3g}" for q in (moved.before, moved.after)),
+        f"{r.mean:.2f} ({r.q05:.2f} to {r.q95:.2f})",
+    ]

@@ -1,0 +1,36 @@
+"""The simulator that a command starts from, as it is given on the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from avtorch.errors import InputError
+
+if TYPE_CHECKING:
+    from avtorch.gap import GapPlant
+
+
+def read_simulator(option: str, text: str) -> GapPlant | None:
+    """None for the bare GLVD, whose answer says as well what remains once a delay is in.
+
+    Raises `InputError` that names the `option`, for a file that is not there and for values out of range.
+    """
+    from avtorch.gap import plant
+
+    if text.strip().lower() == "glvd":
+        return None
+    if text.endswith(".toml") and not Path(text).is_file():
+        raise InputError(f"{option} {text!r}: no such file; needs a TOML file, or effects such as dead_time=0.2")
+    try:
+        simulator = plant(baseline=Path(text) if text.endswith(".toml") or Path(text).is_file() else text)
+    except InputError as fault:
+        raise InputError(f"{option} {text!r}: {fault}") from None
+    known = simulator.parameters()
+    for name, value in simulator.values().items():
+        # the ends of an interval are a drive's, which is not known yet
+        if known[name].constraint != "interval" and known[name].unconstrain(value).isnan().any():
+            raise InputError(
+                f"{option} {text!r}: {name} is {value.tolist():g}, needs a {known[name].constraint} number"
+            )
+    return simulator

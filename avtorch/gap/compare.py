@@ -1,0 +1,218 @@
+"""Did a change to the car or to the simulator help? Two sets of drives, held against each other.
+
+The car: `T_L` and `K_L` are fitted to each set. How far such estimates differ between drives of one and the same car is
+told by blocks of the drives, each of which pulls at the estimate its own way (the sandwich of White 1982), never less
+than the posterior has it. So what the model lacks, and the manoeuvre brings out more or less, counts as spread and not
+as a change.
+
+The simulator: rollout errors over both sets, and their ratio over blocks drawn anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from os import PathLike
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import f as fisher
+from scipy.stats import t as student
+
+from avtorch.errors import InputError
+from avtorch.gap.answer.comparison import Comparison, Moved, Telling
+from avtorch.gap.answer.diagnosis import LogFacts
+from avtorch.gap.answer.quantity import Quantity
+from avtorch.gap.chain.plant import GapPlant, plant
+from avtorch.gap.heldout.parts import blocks_of
+from avtorch.gap.heldout.rollout_errors import USUAL, Measure
+from avtorch.gap.likelihood.fit import directions
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.search.found import Found
+from avtorch.gap.search.search import Search
+from avtorch.io import Log
+
+Float = NDArray[np.float64]
+Simulator = GapPlant | str | PathLike[str] | None
+
+LEVEL = 0.04
+"""Chance at which one car's drives are said to be of two: so that "no change" is right in more than 95 % of them."""
+_DRAWS = 2000
+_CAR = ("T_L", "K_L")
+_LEAST = 5  # blocks of 10 s
+
+
+def compare(
+    before: Log | Sequence[Log],
+    after: Log | Sequence[Log],
+    *,
+    baseline: Simulator = None,
+    baseline_after: Simulator = None,
+    level: float = LEVEL,
+) -> Comparison:
+    """What changed from the drives `before` to those `after`.
+
+    `baseline`: the simulator that both are held against (`baseline_after`: the second by another), with its own `T_L`
+    and `K_L`; default: bare GLVD as the drives before fit it. Its effects keep their values in the fits of the car.
+    `level`: chance at which drives of one car are said to differ.
+
+    Raises `InputError` for logs that cannot be diagnosed or hold less than 50 s, witnesses that differ, or a level out
+    of range.
+    """
+    if not 0 < level < 1:
+        raise InputError(f"level: found {level}, needs a number between 0 and 1")
+    sides = [[x] if isinstance(x, Log) else list(x) for x in (before, after)]
+    given = [baseline, baseline if baseline_after is None else baseline_after]
+    plants = [b if isinstance(b, GapPlant) else plant([], baseline=b) for b in given]
+    fitted = [_Side.of(logs, plants[0], name) for logs, name in zip(sides, ("before", "after"), strict=True)]
+    one, two = fitted
+    if one.found.candidate.record.witnesses != two.found.candidate.record.witnesses:
+        raise InputError("before, after: have different witnesses; needs accel, speed or both in both")
+    away = two.mean - one.mean
+    covariance = one.covariance + two.covariance
+    blocks = min(one.blocks, two.blocks)
+    # Hotelling's: two numbers, spreads known from so many blocks
+    square = float(away @ np.linalg.solve(covariance, away))
+    count = len(_CAR)
+    p_value = float(fisher.sf(square * (blocks - count) / (count * (blocks - 1)), count, blocks - count))
+    sure = float(student.ppf(0.95, blocks - 1))
+    car = {
+        name: Moved(
+            _log_quantity(one.mean[i], one.covariance[i, i], sure),
+            _log_quantity(two.mean[i], two.covariance[i, i], sure),
+            _log_quantity(away[i], covariance[i, i], sure),
+        )
+        for i, name in enumerate(_CAR)
+    }
+    simulators = [p if b is not None else _as_fitted(one.found) for p, b in zip(plants, given, strict=True)]
+    same = all(x is y or _alike(x, y) for x, y in zip(*sides, strict=False)) and len(sides[0]) == len(sides[1])
+    gap = _gaps(fitted, simulators, same=same)
+    telling = _telling(gap)
+    changed = p_value < level
+    return Comparison(
+        before=LogFacts.of(sides[0]),
+        after=LogFacts.of(sides[1]),
+        car=car,
+        gap=gap,
+        p_value=p_value,
+        changed=changed,
+        simulator=telling,
+        why=_sentence(car, p_value, changed, telling, same=same),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """One set of drives: `mean` and `covariance` of ln T_L and ln K_L, from so many `blocks`."""
+
+    found: Found
+    mean: Float
+    covariance: Float = field(repr=False)
+    blocks: int
+
+    @classmethod
+    def of(cls, logs: Sequence[Log], base: GapPlant, which: str) -> _Side:
+        found = Search(logs, base, effects=[], pairs=False).run().none
+        record = found.candidate.record
+        blocks = blocks_of(record)
+        if len(blocks) < _LEAST:
+            raise InputError(f"{which}: {len(blocks)} blocks of 10 s of usable driving, needs {_LEAST} or more")
+        columns = directions(found.candidate, found.white, found.z).reshape(len(found.z), -1)
+        # how each parameter moves the errors: less of the rollout
+        pulls = -columns * found.white(found.errors).ravel()
+        shape = (len(found.z), len(record.witnesses), record.rows, record.group)
+        by_row = pulls.reshape(shape).sum((1, 3))
+        scores = np.stack([by_row[:, b].sum(1) for b in blocks], 1)
+        scores = scores - scores.mean(1, keepdims=True)
+        between = scores @ scores.T * len(blocks) / (len(blocks) - 1)
+        root = np.linalg.cholesky(found.covariance)
+        # in coordinates in which the posterior is round: no direction is told better than it says
+        sizes, axes = np.linalg.eigh(root.T @ between @ root)
+        spread = root @ axes @ np.diag(np.maximum(sizes, 1.0)) @ axes.T @ root.T
+        here = np.array([np.log(found.values[name]) for name in _CAR])
+        step = 1e-4
+        each = found.candidate.values(found.z + step * np.eye(len(found.z)))
+        slope = np.stack([(np.log(each[name].numpy()) - here[i]) / step for i, name in enumerate(_CAR)])
+        return cls(found, here, slope @ spread @ slope.T, len(blocks))
+
+
+def _as_fitted(found: Found) -> GapPlant:
+    values = {name: found.values[name] for name in _CAR}
+    return found.candidate.baseline.with_values(values)
+
+
+def _alike(one: Log, two: Log) -> bool:
+    """Whether these are the same rows."""
+    signals = ((getattr(x, name) for x in (one, two)) for name in ("time", "accel_cmd", "accel", "speed"))
+    return all((a is None and b is None) or np.array_equal(a, b) for a, b in signals)
+
+
+def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], *, same: bool) -> dict[str, Moved]:
+    """Blocks are drawn alike for both sides where these are the `same` drives."""
+    drawn = []
+    for i, (side, simulator) in enumerate(zip(sides, simulators, strict=True)):
+        rng = np.random.default_rng(0 if same else i)
+        record = side.found.candidate.record
+        errors = record.measured - _rolled(record, simulator)
+        blocks = blocks_of(record)
+        squares = _squares(record, errors, blocks, float(simulator.T_L))
+        rows = np.array([(b.stop - b.start) * record.group for b in blocks], float)
+        weights = rng.multinomial(len(blocks), np.full(len(blocks), 1 / len(blocks)), size=_DRAWS)
+        weights = np.concatenate([np.ones((1, len(blocks))), weights])
+        drawn.append({name: np.sqrt(weights @ x / (weights @ rows)) for name, x in squares.items()})
+    return {
+        name: Moved(*(_of_draws(x) for x in (drawn[0][name], drawn[1][name], drawn[1][name] / drawn[0][name])))
+        for name in drawn[0]
+    }
+
+
+def _rolled(record: Record, simulator: GapPlant) -> Float:
+    responses = [simulator.prepared(drive).response(drive) for drive in record.drives]
+    seen = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
+    return np.stack([record.seen(seen[name]) for name in record.witnesses])
+
+
+def _squares(record: Record, errors: Float, blocks: Sequence[slice], lag: float) -> dict[str, Float]:
+    out = {}
+    for k, witness in enumerate(record.witnesses):
+        measure = Measure(witness, USUAL[witness])
+        rows = [measure.of(errors[k, b].ravel(), record.dt / record.group, lag) for b in blocks]
+        out[measure.name] = np.array([float((x**2).sum()) for x in rows])
+    return out
+
+
+def _of_draws(x: Float) -> Quantity:
+    q05, q95 = np.quantile(x[1:], (0.05, 0.95))
+    return Quantity(float(x[0]), float(x[1:].std()), min(float(q05), float(x[0])), max(float(q95), float(x[0])))
+
+
+def _log_quantity(mean: float, variance: float, sure: float) -> Quantity:
+    """Of exp(x), x about `mean` with this `variance`; `sure`: standard deviations of the central 90 %."""
+    sd = float(np.sqrt(variance))
+    middle = float(np.exp(mean))
+    return Quantity(middle, middle * sd, float(np.exp(mean - sure * sd)), float(np.exp(mean + sure * sd)))
+
+
+def _telling(gap: Mapping[str, Moved]) -> Telling:
+    ratios = [moved.ratio for moved in gap.values()]
+    closer, farther = (any(r.q95 < 1 for r in ratios), any(r.q05 > 1 for r in ratios))
+    if closer == farther:
+        return "no telling"
+    return "closer" if closer else "farther"
+
+
+def _sentence(car: Mapping[str, Moved], p_value: float, changed: bool, telling: Telling, *, same: bool) -> str:
+    if same:
+        of_two = {"closer": "The second simulator is closer", "farther": "The second simulator is farther from it"}
+        return f"One drive, two simulators. {of_two.get(telling, 'Neither simulator is measurably closer to it')}."
+    parts = []
+    for name, unit in (("T_L", " s"), ("K_L", "")):
+        m = car[name]
+        parts.append(f"{name} {m.before.mean:.2f} to {m.after.mean:.2f}{unit}")
+    first = "The car has changed" if changed else "No change of the car shows"
+    words = {
+        "closer": "the drives after are closer to the simulator",
+        "farther": "the drives after are farther from the simulator",
+        "no telling": "how close the simulator is has not changed measurably",
+    }
+    return f"{first}: {', '.join(parts)} (p = {p_value:.2g}); {words[telling]}."
