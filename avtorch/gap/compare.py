@@ -144,7 +144,7 @@ def _as_fitted(found: Found) -> GapPlant:
 def _alike(one: Log, two: Log) -> bool:
     """Whether these are the same rows."""
     signals = ((getattr(x, name) for x in (one, two)) for name in ("time", "accel_cmd", "accel", "speed"))
-    return all((a is None and b is None) or np.array_equal(a, b) for a, b in signals)
+    return all(a is b if a is None or b is None else np.array_equal(a, b) for a, b in signals)
 
 
 def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], *, same: bool) -> dict[str, Moved]:
