@@ -20,6 +20,7 @@ from avtorch.gap.answer.posterior import Draws
 from avtorch.gap.answer.remainder import Remainder, remainder
 from avtorch.gap.answer.remaining import remaining
 from avtorch.gap.answer.reported import belief, drawn, moved, repaired, reported
+from avtorch.gap.answer.traces import Traces
 from avtorch.gap.answer.verdict import Candidate, verdict_of
 from avtorch.gap.chain.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.chain.plant import GapPlant, plant
@@ -107,6 +108,7 @@ def diagnose(
         draws=drawn(winner, draws) if draws is not None and winner is not None else None,
         where=() if held is None or verdict.name == "none" else where(held, onset_s=onset, lag=lag),
         shrinkage=shrinkage(held) if held is not None and named else None,
+        traces=_traces(race, winner, held),
         remaining=remaining(candidates, verdict, base),
         complete=race.complete,
         notes=noted,
@@ -118,6 +120,22 @@ def _left(top: Found, race: Race) -> Remainder:
     measured = race.record.measured
     explained = top.losses.evidence if top.losses else 0.0
     return remainder(top.white, top.errors, measured - top.errors, explained=explained)
+
+
+def _traces(race: Race, winner: Found | None, held: HeldOut | None) -> Traces:
+    record = race.record
+    measured = record.measured.mean(-1)
+    after = race.none if winner is None else winner
+    return Traces(
+        time=record.time[record.source],
+        command=record.command[record.source],
+        witnesses=record.witnesses,
+        measured=measured,
+        before=measured - race.none.errors.mean(-1),
+        after=measured - after.errors.mean(-1),
+        does=np.zeros(record.rows) if held is None else held.does,
+        stretch=record.stretch,
+    )
 
 
 def _draws(found: Found, seed: int) -> Draws:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from avtorch.errors import InputError
 from avtorch.gap.answer.quantity import Quantity, unit_of
 from avtorch.gap.answer.shrinkage import Closed, Shrinkage
+from avtorch.gap.answer.traces import Traces
 from avtorch.gap.answer.verdict import Candidate, Verdict, candidate_name, listed, near, plain, verdict_of
 from avtorch.gap.answer.where import Where
 from avtorch.gap.chain.plant import GapPlant
@@ -117,6 +118,7 @@ class Diagnosis:
       (chain, draw) by the table's names
     - `where`, `shrinkage`: where the gap lies and how far it shrinks, on parts that were held out; empty and None where
       the drives are too short to be parted, and `shrinkage` None where nothing was named
+    - `traces`: the drives beside the rollouts of `simulator` and `plant`
     - `next_experiment`, `setting`: objects as in `diagnosis.json`, None where nobody asked
     - `remaining`: with the default baseline, the candidates for what is left once `dead_time` is in
     - `complete` False: the budget ended the search
@@ -135,6 +137,7 @@ class Diagnosis:
     simulator: GapPlant | None = None
     belief: Mapping[str, NDArray] | None = None
     assumed: Mapping[str, NDArray] | None = None
+    traces: Traces | None = None
     remaining: tuple[Candidate, ...] | None = None
     where: tuple[Where, ...] = ()
     shrinkage: Shrinkage | None = None

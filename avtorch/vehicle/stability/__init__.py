@@ -7,7 +7,7 @@ from avtorch.vehicle.stability.belief import (
     p_string_stable,
     stability_belief,
 )
-from avtorch.vehicle.stability.chain import Chain, ChainVerdict, actuator, chain_verdict, frequencies
+from avtorch.vehicle.stability.chain import Chain, ChainVerdict, actuator, chain_gain, chain_verdict, frequencies
 from avtorch.vehicle.stability.conditions import (
     Conditions,
     local_conditions,
@@ -33,6 +33,7 @@ __all__ = [
     "Region",
     "StabilityBelief",
     "actuator",
+    "chain_gain",
     "chain_verdict",
     "dead_time_margin",
     "frequencies",

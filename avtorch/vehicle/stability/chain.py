@@ -81,19 +81,39 @@ def chain_verdict(
     `time_gap` (...) [s], `gains` (..., 3); the lower level sends `inner` times the sensed acceleration plus `forward`
     times what the upper level asks, (...) (0 and 1: it passes that through).
     """
+    loop, asked = _loop(chain, time_gap, gains, inner, forward)
+    gain = asked.abs() / loop.abs().clamp_min(1e-300)
+    local = _growing(loop / (1j * chain.omega + 1) ** 2) < 0.5
+    # pushed the right way at rest
+    local = local & (asked[..., 0].real > 0)
+    peak = torch.where(local, gain.amax(-1).clamp_min(1.0), torch.inf)
+    return ChainVerdict(local, local & (peak <= 1 + SLACK), peak)
+
+
+def chain_gain(
+    chain: Chain,
+    time_gap: Tensor,
+    gains: Tensor,
+    *,
+    inner: Tensor | float = 0.0,
+    forward: Tensor | float = 1.0,
+) -> Tensor:
+    """|V / V_lead| (..., frequency), arguments as in `chain_verdict`; formal where the loop is locally unstable."""
+    loop, asked = _loop(chain, time_gap, gains, inner, forward)
+    return asked.abs() / loop.abs().clamp_min(1e-300)
+
+
+def _loop(
+    chain: Chain, time_gap: Tensor, gains: Tensor, inner: Tensor | float, forward: Tensor | float
+) -> tuple[Tensor, Tensor]:
+    """F and the numerator of V / V_lead, (..., frequency)."""
     s = 1j * chain.omega
     ks, kv, ka = (k[..., None] for k in gains.unbind(-1))
     g = ks * time_gap[..., None] + kv
     alpha, beta = (torch.as_tensor(x, dtype=torch.float64)[..., None] for x in (inner, forward))
-    free = s * (s + chain.drag[..., None])
-    own = (1 - alpha * chain.motion * chain.sensed) * free
+    own = (1 - alpha * chain.motion * chain.sensed) * s * (s + chain.drag[..., None])
     loop = own + beta * chain.motion * (ks + g * s - ka * chain.sensed * s**2)
-    gain = (beta * chain.motion * (ks + kv * s)).abs() / loop.abs().clamp_min(1e-300)
-    local = _growing(loop / (s + 1) ** 2) < 0.5
-    at_rest = (beta * chain.motion[..., :1].real * ks)[..., 0] > 0
-    local = local & at_rest
-    peak = torch.where(local, gain.amax(-1).clamp_min(1.0), torch.inf)
-    return ChainVerdict(local, local & (peak <= 1 + SLACK), peak)
+    return loop, beta * chain.motion * (ks + kv * s)
 
 
 def _growing(curve: Tensor) -> Tensor:

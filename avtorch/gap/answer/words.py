@@ -1,0 +1,139 @@
+"""A diagnosis in words: the sentences that the terminal and the report share. Plain text, a sentence or two each."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from avtorch.gap.answer.verdict import meanings
+from avtorch.gap.answer.where import UNITS
+
+if TYPE_CHECKING:
+    from avtorch.gap.answer.diagnosis import Diagnosis
+
+SURE = 0.9
+"""What a headline says without a perhaps."""
+_ALIASES = 4  # told by name beside the verdict
+_MEASURES = {
+    "rollout_rmse_accel": ("acceleration, rolled out over the drive,", "m/s²"),
+    "rollout_rmse_speed": ("speed, rolled out over 10 s,", "m/s"),
+}
+
+
+def headline(found: Diagnosis) -> str:
+    """The verdict as one sentence."""
+    verdict, p = found.verdict, _share(found.winner.probability)
+    if verdict.abstained:
+        return f"The cause is none of the effects known here ({p}): nothing is blamed."
+    if verdict.name == "none":
+        first = "The" if found.winner.probability >= SURE else "No effect stands out: probably the"
+        return f"{first} simulator lacks nothing that this log shows ({p})."
+    told = meanings(verdict.name)
+    told = f": {told}." if told else "."
+    share = found.winner.probability
+    who = "The" if share >= SURE else "Probably the" if share >= 0.5 else "Perhaps the"
+    return f"{who} simulator lacks {' and '.join(verdict.names)} ({p}){told}"
+
+
+def onset(found: Diagnosis) -> list[str]:
+    """From when on."""
+    if found.onset_s is not None:
+        return [f"Onset: at {found.onset_s:.1f} s of the log's time."]
+    return ["Onset: there from the start."] if found.winner.effects else []
+
+
+def where(found: Diagnosis) -> list[str]:
+    """Where the gap lies, an onset apart."""
+    told = []
+    for part in found.where:
+        if part.axis == "time" and found.onset_s is not None:
+            continue  # the onset says it
+        if part.axis == "signal":
+            if part.share >= 0.5:
+                told.append("in what the car does" if part.begin == "actuation" else "in what the accelerometer shows")
+        elif not isinstance(part.begin, str) and not isinstance(part.end, str):
+            at, unit = "frequencies" if part.axis == "frequency" else f"{part.axis}s", UNITS[part.axis]
+            ends = f"from {part.begin:.2g} to {part.end:.2g}" if part.begin else f"below {part.end:.2g}"
+            told.append(f"at {at} {ends} {unit}")
+    return [f"It lies {', '.join(told)}."] if told else []
+
+
+def shrinkage(found: Diagnosis) -> list[str]:
+    """How far it shrinks on what was held out."""
+    told = found.shrinkage
+    if told is None:
+        return []
+    top, few = told.top, "" if told.chosen == 1 else f"; chosen there by {100 * told.chosen:.0f} % of the parts"
+    if told.metric in _MEASURES:
+        words, unit = _MEASURES[told.metric]
+        line = f"On blocks held out: {words} off by {top.before:.2g}, with the effect by {top.after:.2g} {unit}"
+    else:
+        gain = top.after - top.before
+        line = f"On blocks held out: log density {gain:+.2g} nats a row with the effect; no rollout shows it"
+    if top.closed is None:
+        return [f"{line}; next to nothing could be closed{few}."]
+    q = top.closed
+    share = f"{100 * q.mean:.0f} % ({100 * q.q05:.0f} to {100 * q.q95:.0f})"
+    return [f"{line}: closes {share} of what can be closed{few}."]
+
+
+def moved(found: Diagnosis) -> list[str]:
+    """What the effect does to the baseline."""
+    baseline, with_it, told = found.baseline, found.winner.moved, []
+    for name in ("T_L", "K_L"):
+        if name in with_it and name in baseline:
+            unit = " s" if name == "T_L" else ""
+            told.append(f"{name} {baseline[name].mean:.2f} → {with_it[name].mean:.2f}{unit}")
+    return [f"The baseline, fitted without and with it: {', '.join(told)}."] if told else []
+
+
+def aliases(found: Diagnosis) -> str:
+    """What the log does not tell apart."""
+    from_words = {"none": "no effect at all", "unknown": "a cause outside the table"}
+    others = [from_words.get(n, n.replace("+", " with ")) for n in found.verdict.alias_set if n != found.verdict.name]
+    if not others:
+        return "Told apart from every other candidate on this log."
+    if len(others) > _ALIASES + 1:
+        others = [*others[:_ALIASES], f"any of {len(others) - _ALIASES} that are less probable"]
+    listing = others[0] if len(others) == 1 else f"{', '.join(others[:-1])} or {others[-1]}"
+    name = from_words.get(found.verdict.name, found.verdict.name.replace("+", " with "))
+    return f"Not told apart on this log: {name}, or {listing}."
+
+
+def gap(found: Diagnosis) -> list[str]:
+    """How far the simulator as it is is off."""
+    gap = found.gap
+    parts = []
+    if gap.rollout_rmse_accel is not None:
+        floor = "" if gap.rollout_floor_accel is None else f" ({gap.rollout_floor_accel:.2g} is left at best)"
+        if gap.rollout_floor_accel is not None and gap.rollout_floor_accel > 0.97 * gap.rollout_rmse_accel:
+            floor = " (no less with the best candidate in)"
+        parts.append(f"acceleration off by {gap.rollout_rmse_accel:.2g} m/s²{floor}")
+    if gap.rollout_rmse_speed is not None:
+        parts.append(f"speed by {gap.rollout_rmse_speed:.2g} m/s")
+    if not parts:
+        return []
+    over = "" if gap.horizon_s is None else f", over {gap.horizon_s:.3g} s"
+    return [f"Gap of the simulator as it is{over}: {', '.join(parts)}."]
+
+
+def number(p: float) -> str:
+    """A probability of three digits."""
+    return "<.001" if 0 < p < 0.0005 else ">.999" if 0.9995 <= p < 1 else f"{p:.3f}"
+
+
+def remains(found: Diagnosis) -> list[str]:
+    """What there is besides the delay."""
+    if not found.remaining:
+        return []
+    best = sorted(found.remaining, key=lambda c: -c.probability)[:3]
+    told = ", ".join(f"{c.name} {number(c.probability)}" for c in best if c.probability >= 0.005)
+    return [f"Once dead_time is in, what remains: {told}."]
+
+
+def to_set(found: Diagnosis) -> list[str]:
+    """What to set."""
+    return [] if found.setting is None else [f"To set: {found.setting['why']}"]
+
+
+def _share(p: float) -> str:
+    return f"probability {p:.2f}" if p < 0.995 else "probability over 0.99"
