@@ -101,8 +101,11 @@ def diagnose(
         "--seed": seed,
     }
     same_work(out, drives, settings, resume=resume)
+    quality = []
     for drive in drives:
-        talk.notes(f"{drive.name}", check(drive).notes)
+        noted = check(drive).notes
+        talk.notes(f"{drive.name}", noted)
+        quality += [f"{Path(drive.name).name}: {note}" for note in noted]
 
     from avtorch.gap.diagnose import diagnose as work
 
@@ -130,7 +133,9 @@ def diagnose(
 
     told = setting_for(found, [x for drive in drives if drive.accel_cmd is not None for x in drive.accel_cmd])
     found = replace(found, setting=None if told is None else told.to_dict())
-    written = [*found.write(out), *write_exports(found.plant, out)]
+    from avtorch.report import write_report
+
+    written = [*found.write(out), *write_exports(found.plant, out), write_report(found, out, quality=quality)]
     if talk.json:
         talk.done(out, found.to_dict())
         return
@@ -144,7 +149,7 @@ def diagnose(
     talk.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {', '.join(names)}", soft_wrap=True)
 
 
-_FILES = {".toml": " (the repaired simulator)", ".yaml": " (in that tool's terms)"}
+_FILES = {".toml": " (the repaired simulator)", ".yaml": " (in that tool's terms)", ".html": " (to read)"}
 
 
 def _known(option: str, name: str, more: Sequence[str] = ()) -> str:

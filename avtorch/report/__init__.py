@@ -1,0 +1,5 @@
+"""The report of a diagnosis: one HTML file that a reader opens anywhere."""
+
+from avtorch.report.page import report_html, write_report
+
+__all__ = ["report_html", "write_report"]

@@ -1,0 +1,168 @@
+"""A self-contained page: words, tables and pictures of a diagnosis. Nothing is fetched, all from the log is escaped."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib.resources import files
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from avtorch import __version__
+from avtorch.gap.answer import words
+from avtorch.gap.answer.diagnosis import Diagnosis, Quantity
+from avtorch.gap.answer.quantity import unit_of, words_of
+from avtorch.gap.answer.where import UNITS
+from avtorch.io import atomic
+from avtorch.plots.over_diagnosis import road_figure, shrinkage_figure, where_figure, which_figure
+
+_METRICS = {
+    "rollout_rmse_accel_0.5s": "acceleration, 0.5 s [m/s²]",
+    "rollout_rmse_accel_2s": "acceleration, 2 s [m/s²]",
+    "rollout_rmse_accel_10s": "acceleration, 10 s [m/s²]",
+    "rollout_rmse_accel": "acceleration, whole drive [m/s²]",
+    "rollout_rmse_speed_0.5s": "speed, 0.5 s [m/s]",
+    "rollout_rmse_speed_2s": "speed, 2 s [m/s]",
+    "rollout_rmse_speed": "speed, 10 s [m/s]",
+    "rollout_rmse_speed_whole": "speed, whole drive [m/s]",
+    "log_predictive_density": "log density [nats a row]",
+}
+
+
+def report_html(found: Diagnosis, *, quality: Iterable[str] = ()) -> str:
+    """The page as text. `quality`: what was noted of the data when it was read, a line each."""
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string(files("avtorch.report").joinpath("template.html").read_text(encoding="utf-8"))
+    return template.render(
+        found=found,
+        log=found.log,
+        headline=words.headline(found),
+        lead=[found.verdict.why, words.aliases(found), *words.onset(found)],
+        tone={"unknown": "amber", "none": "green"}.get(found.verdict.name, "blue"),
+        where=words.where(found),
+        parts=[_part(w) for w in found.where],
+        gap=[*words.gap(found), *words.moved(found), *words.remains(found)],
+        candidates=[_candidate(found, c) for c in found.candidates[:10]],
+        shrinkage=words.shrinkage(found),
+        measures=_measures(found),
+        placebo=_placebo(found),
+        setting=_setting(found),
+        notes=list(found.notes),
+        quality=list(quality),
+        version=__version__,
+        pictures=_pictures(found),
+    )
+
+
+def write_report(found: Diagnosis, folder: str | PathLike[str], *, quality: Iterable[str] = ()) -> Path:
+    """Write `report.html` into `folder`; returns its path. Raises `InputError` where it cannot be written."""
+    path = Path(folder) / "report.html"
+    text = report_html(found, quality=quality)
+    with atomic(path) as stream:
+        stream.write(text)
+    return path
+
+
+def _pictures(found: Diagnosis) -> dict[str, Markup | None]:
+    drawn: dict[str, tuple[bool, Callable[[Diagnosis], Figure]]] = {
+        "road": (found.traces is not None, road_figure),
+        "where": (found.traces is not None and bool(found.traces.does.any()), where_figure),
+        "which": (True, which_figure),
+        "shrinkage": (found.shrinkage is not None, shrinkage_figure),
+    }
+    return {name: _svg(name, draw(found)) if there else None for name, (there, draw) in drawn.items()}
+
+
+def _svg(name: str, figure: Figure) -> Markup:
+    """Inline: text as text, no date, the same for the same figure, its ids its own on the page."""
+    stream = io.StringIO()
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "avtorch"}):
+        figure.savefig(stream, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    text = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", stream.getvalue())
+    # matplotlib escapes what it writes; the prologue has no place inside a page
+    return Markup(text[text.index("<svg") :])
+
+
+def _number(q: Quantity | None, digits: int = 3) -> str:
+    if q is None:
+        return ""
+    return f"{q.mean:.{digits}g} ({q.q05:.{digits}g} to {q.q95:.{digits}g})"
+
+
+def _candidate(found: Diagnosis, c: Any) -> Mapping[str, Any]:
+    parameters = []
+    for key, q in c.parameters.items():
+        unit = unit_of(key)
+        parameters.append(f"{words_of(key.rpartition('.')[2])} {_number(q)}{'' if unit == '-' else ' ' + unit}")
+    return {
+        "name": c.name.replace("+", " + "),
+        "probability": words.number(c.probability),
+        "width": round(100 * c.probability, 1),
+        "nats": "" if c.log_evidence is None else f"{c.log_evidence:+.0f}",
+        "parameters": parameters,
+        "near": c.name in found.verdict.alias_set,
+    }
+
+
+def _part(part: Any) -> Mapping[str, str]:
+    unit = UNITS[part.axis]
+    ends = part.begin if part.axis == "signal" else f"{part.begin:.3g} to {part.end:.3g} {unit}"
+    return {"axis": part.axis, "ends": ends, "share": f"{100 * part.share:.0f} %", "q": _small(part.q_value)}
+
+
+def _small(p: float) -> str:
+    return "<1e-12" if p < 1e-12 else f"{p:.1g}"
+
+
+def _measures(found: Diagnosis) -> Sequence[Mapping[str, Any]]:
+    told = found.shrinkage
+    if told is None:
+        return []
+    return [
+        {
+            "name": _METRICS.get(name, name),
+            "before": f"{c.before:.3g}",
+            "after": f"{c.after:.3g}",
+            "floor": f"{c.floor:.3g}",
+            "ceiling": f"{told.ceiling[name]:.3g}",
+            "closed": "" if c.closed is None else _percent(c.closed),
+            "top": name == told.metric,
+        }
+        for name, c in told.by_metric.items()
+    ]
+
+
+def _percent(q: Quantity) -> str:
+    return f"{100 * q.mean:.0f} % ({100 * q.q05:.0f} to {100 * q.q95:.0f})"
+
+
+def _placebo(found: Diagnosis) -> str | None:
+    told = found.shrinkage
+    if told is None or told.placebo is None or told.placebo_effect is None:
+        return None
+    return f"A placebo ({told.placebo_effect}, which is not the cause) on top closes {_percent(told.placebo)}."
+
+
+def _setting(found: Diagnosis) -> Mapping[str, Any] | None:
+    if found.setting is None:
+        return None
+    told, p = found.setting, found.setting["p_string_stable"]
+    peaks = {k: "grows without end" if x is None else f"{x:.2f}" for k, x in told["peak_gain"].items()}
+    return {
+        "why": told["why"],
+        "rows": [
+            ("P(string stable), simulator as it was", f"{p['assumed']:.2f}"),
+            ("P(string stable), car as it is", f"{p['in_force']:.2f}"),
+            ("P(string stable), with this setting", f"{p['then']:.2f}"),
+            ("peak gain now", peaks["in_force"]),
+            ("peak gain then", peaks["then"]),
+        ],
+        "notes": told["notes"],
+    }
