@@ -1,4 +1,4 @@
-"""The pages on the diagnosis and on its blind test: their code runs, their commands and options exist."""
+"""The pages on the diagnosis, its blind test and comparisons: their code runs, their commands and options exist."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from avtorch.cli import main
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-PAGES = ("diagnosis.md", "blindtest.md")
+PAGES = ("diagnosis.md", "blindtest.md", "compare.md")
 
 
 def blocks(page: str, language: str) -> list[str]:
