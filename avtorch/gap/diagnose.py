@@ -26,7 +26,7 @@ from avtorch.gap.chain.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.chain.plant import GapPlant, plant
 from avtorch.gap.heldout.held_out import HeldOut, held_out
 from avtorch.gap.heldout.shrink import shrinkage
-from avtorch.gap.heldout.where import where
+from avtorch.gap.heldout.where import onset_price, where
 from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.gap.search.found import Found, Race
 from avtorch.gap.search.search import Search
@@ -167,6 +167,9 @@ def _onset(found: Found | None, race: Race) -> float | None:
 
 def _gap(race: Race, chances: Mapping[str, float], held: HeldOut | None) -> GapFacts:
     """Errors of the fitted baseline's rollout; the floor is what the favourite leaves."""
-    # what held-out rows gain is an e-value against the bare baseline, and its inverse bounds the p-value
-    p_value = None if held is None else float(np.exp(-np.clip(held.gained.sum(), 0.0, 700.0)))
+    # what held-out rows gain is taken for an e-value against the bare baseline: its inverse bounds the p-value
+    p_value = None
+    if held is not None:
+        paid = onset_price(race.record) if favourite(race.found).began is not None else 0.0
+        p_value = float(np.exp(-np.clip(held.gained.sum() - paid, 0.0, 700.0)))
     return gap_facts(race, favourite(race.found), detected=chances["none"] < 0.5, p_value=p_value)

@@ -46,6 +46,8 @@ def to_autoware(plant: GapPlant) -> Exported:
         values["vel_rate_lim"] = max(effects["saturation"]["accel_max_mps2"], -effects["saturation"]["accel_min_mps2"])
         told.add("saturation")
     lost = []
+    if "saturation" in effects:
+        lost.append("saturation: limits that differ for driving and braking; the tool's one is the wider")
     if "second_order_actuator" in effects:
         lost.append("second_order_actuator: its overshoot; the time constant is that of the two poles together")
         told.add("second_order_actuator")

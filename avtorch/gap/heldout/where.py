@@ -2,9 +2,10 @@
 
 What a cause does to each row is half the square of the white image of its change, the nats it is expected to bring. On
 each axis the part named is the shortest stretch that holds nearly all of it, if plainly fewer rows lie there. A part is
-named on the strength of what it gains where it was held out: as the competing densities have not seen these rows, their
-ratio is an e-value, and e-values of any dependence keep the false-discovery rate by the procedure of Wang and Ramdas
-(2022).
+named on the strength of what it gains where it was held out: densities that have not seen these rows compete, and their
+ratio is taken for an e-value, for which the procedure of Wang and Ramdas (2022) keeps the false-discovery rate whatever
+the dependence. It is one up to what the other blocks did not tell of the baseline, and what the parts' fits share. An
+onset was found on all rows and pays for all that it might have been.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from scipy.signal import lfilter
 
 from avtorch.gap.answer.where import Axis, Where
 from avtorch.gap.heldout.held_out import HeldOut
+from avtorch.gap.likelihood.record import Record
 
 Float = NDArray[np.float64]
 
@@ -29,9 +31,15 @@ _RATE = 0.05  # of false discoveries
 def where(held: HeldOut, *, onset_s: float | None, lag: float) -> tuple[Where, ...]:
     """The parts, the surest first. `onset_s`: when the cause set in, on the log's time; `lag` [s] of the actuator."""
     parts = [*_stretches(held, onset_s, lag), *_signals(held), *_band(held)]
-    q_values = _q_values([gain for *_, gain in parts])
+    paid = 0.0 if onset_s is None else onset_price(held.record)
+    q_values = _q_values([gain - paid for *_, gain in parts])
     named = [Where(axis, a, b, share, q) for (axis, a, b, share, _), q in zip(parts, q_values, strict=True)]
     return tuple(sorted((w for w in named if w.q_value <= _RATE), key=lambda w: w.q_value))
+
+
+def onset_price(record: Record) -> float:
+    """What not having known the onset costs [nats]: any row might have been it."""
+    return float(np.log(record.rows))
 
 
 Part = tuple[Axis, float | str, float | str, float, float]
@@ -39,13 +47,15 @@ Part = tuple[Axis, float | str, float | str, float, float]
 
 
 def _stretches(held: HeldOut, onset_s: float | None, lag: float) -> Iterator[Part]:
-    record, does = held.record, held.does if held.does.any() else np.maximum(held.gained, 0.0)
-    if not does.any():
-        return
+    record, does = held.record, held.does
     time = record.time[record.source]
     one_clock = bool((np.diff(time) > 0).all())
     if onset_s is not None and one_clock:
-        yield _part(held, "time", time, onset_s, float(time[-1]), does)
+        # what chance decides (glitches, lost messages) has an onset, and nothing that is known beforehand
+        since_then = does if does.any() else np.ones(len(time))
+        yield _part(held, "time", time, onset_s, float(time[-1]), since_then)
+    if not does.any():
+        return
     axes: list[tuple[Axis, Float]] = [("time", time)] if onset_s is None and one_clock else []
     if record.speed is not None:
         axes.append(("speed", record.speed.mean(-1)[record.source]))

@@ -45,7 +45,7 @@ def test_what_is_closed_is_what_one_who_knows_would_say(effect: str, rotating_se
 
 
 @pytest.mark.slow
-def test_a_wrong_effect_closes_nothing(rotating_seed: int) -> None:
+def test_a_wrong_effect_is_not_what_the_rest_chooses(rotating_seed: int) -> None:
     from avtorch.gap import AerodynamicDrag, SensorBias
 
     _, race = _raced("sensor_bias", [SensorBias, AerodynamicDrag], rotating_seed, tiers=["easy"])
