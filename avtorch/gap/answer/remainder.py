@@ -20,8 +20,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
 
+from avtorch.gap.likelihood.shapes import hats, lowpass
 from avtorch.gap.likelihood.whitener import Whitener
 
 Float = NDArray[np.float64]
@@ -96,7 +96,7 @@ class _Look:
         self.jerk = np.diff(self.a, prepend=self.a[0]) / self.dt
         self.v = np.zeros(self.rows)
         if "speed" in self.witnesses:
-            self.v = _lowpass(_late(record.measured[-1].mean(-1), 1), 0.5, self.dt)
+            self.v = lowpass(_late(record.measured[-1].mean(-1), 1), 0.5, self.dt)
         self.t = np.linspace(0.0, 1.0, self.rows)
 
     def _force(self, x: Float) -> Float:
@@ -129,14 +129,14 @@ class _Look:
             responses += [self._reading(late, "accel"), self._reading(late, "speed")]
         for response in responses:
             told.append(_mean([_evidence(_decaying(keep).T @ response, e) for keep in (0.6, 0.9)]))
-        of_a, of_v, of_t = _hats(a, 9), _hats(v, 7), _hats(t, 7)
+        of_a, of_v, of_t = hats(a, 9), hats(v, 7), hats(t, 7)
         forces = [self._force(x) for x in (of_a, of_v, of_t, a * of_v, a * of_t)]
-        told += [_evidence(x, e) for x in (*forces, np.concatenate(forces), self._force(_hats(self.u, 9)))]
+        told += [_evidence(x, e) for x in (*forces, np.concatenate(forces), self._force(hats(self.u, 9)))]
         if both:
             told += [_evidence(self._reading(x, "accel"), e) for x in (of_a, of_v, of_t, a * of_v, a * of_t)]
             told += [_evidence(self._reading(x, "speed"), e) for x in (of_a, of_v)]
         push, brake = np.maximum(a, 0), np.minimum(a, 0)
-        pushes, brakes = ([_lowpass(x, s, self.dt) for s in (0.2, 0.6, 2.0, 6.0, 20.0)] for x in (push, brake))
+        pushes, brakes = ([lowpass(x, s, self.dt) for s in (0.2, 0.6, 2.0, 6.0, 20.0)] for x in (push, brake))
         told.append(_evidence(self._force(np.stack([push, brake, *pushes, *brakes])), e))
         products = [x * y for x in (push, brake) for y in (*pushes, *brakes)]
         told.append(_evidence(self._force(np.stack(products)), e))
@@ -207,7 +207,7 @@ class _Look:
     def bursts(self) -> float:
         square = np.minimum(self.e**2 / self.e.var(-1, keepdims=True), 9.0)
         square = (square - square.mean(-1, keepdims=True)) / square.std(-1, keepdims=True)
-        a, brisk = np.abs(self.a), _lowpass(np.abs(self.jerk), 0.3, self.dt)
+        a, brisk = np.abs(self.a), lowpass(np.abs(self.jerk), 0.3, self.dt)
         told = []
         for x in (a, brisk, np.abs(self.u - self.a), self.v, self.t, a * self.v):
             if x.std() > 1e-9:
@@ -258,19 +258,6 @@ def _scattered(square: Float, match: Float, variance: float) -> float:
 def _late(x: Float, rows: int) -> Float:
     rows = min(rows, len(x))
     return np.concatenate([np.full(rows, x[0]), x[: len(x) - rows]])
-
-
-def _lowpass(x: Float, seconds: float, dt: float) -> Float:
-    share = -np.expm1(-dt / seconds)
-    return np.asarray(lfilter([share], [1, share - 1], x - x[0])) + x[0]
-
-
-def _hats(x: Float, knots: int) -> Float:
-    """Piecewise linear functions (function, row) of x (row,), each 1 at one of its quantiles."""
-    at = np.unique(np.quantile(x, np.linspace(0.01, 0.99, knots)))
-    if len(at) < 2:
-        return np.zeros((1, len(x)))
-    return np.stack([np.interp(x, at, one) for one in np.eye(len(at))])
 
 
 def _decaying(keep: float) -> Float:

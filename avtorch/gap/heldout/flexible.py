@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from avtorch.gap.likelihood.record import Record
+from avtorch.gap.likelihood.shapes import hats, lowpass
 from avtorch.gap.likelihood.whitener import Whitener
 
 Float = NDArray[np.float64]
@@ -76,27 +76,13 @@ def _shapes(record: Record, rollout: Float) -> Float:
     t = np.linspace(0.0, 1.0, record.rows)
     v = np.zeros(record.rows)
     if record.speed is not None:
-        v = _slow(record.speed.mean(-1)[record.source], 0.5, dt)
+        v = lowpass(record.speed.mean(-1)[record.source], 0.5, dt)
     jerk = np.gradient(a) / dt
-    past = [_slow(u, s, dt) for s in _LAGS_S]
+    past = [lowpass(u, s, dt) for s in _LAGS_S]
     push, brake = np.maximum(u, 0.0), np.minimum(u, 0.0)
-    one_sided = [_slow(x, s, dt) for x in (push, brake) for s in (0.2, 0.8, 3.2)]
+    one_sided = [lowpass(x, s, dt) for x in (push, brake) for s in (0.2, 0.8, 3.2)]
     play = [np.tanh(jerk / s) for s in (0.1, 0.5, 2.0)] + [np.tanh((u - a) / s) for s in (0.05, 0.2)]
-    of_a, of_u, of_v, of_t = _hats(a, 9), _hats(u, 9), _hats(v, 7), _hats(t, 7)
+    of_a, of_u, of_v, of_t = hats(a, 9), hats(u, 9), hats(v, 7), hats(t, 7)
     columns = [u, a, jerk, *past, *one_sided, *play, *of_a, *of_u, *of_v, *of_t, *(a * of_v), *(a * of_t)]
     columns += [*(jerk * of_v), *((u - a) * of_v), *((u - a) * of_t), v**2 / 400]
     return np.stack(columns)
-
-
-def _slow(x: Float, seconds: float, dt: float) -> Float:
-    """Through a first-order lag."""
-    share = -np.expm1(-dt / seconds)
-    return np.asarray(lfilter([share], [1, share - 1], x - x[0])) + x[0]
-
-
-def _hats(x: Float, knots: int) -> Float:
-    """Piecewise linear functions (function, row) of x (row,), each 1 at one of its quantiles."""
-    at = np.unique(np.quantile(x, np.linspace(0.01, 0.99, knots)))
-    if len(at) < 2:
-        return np.ones((1, len(x)))
-    return np.stack([np.interp(x, at, one) for one in np.eye(len(at))])
