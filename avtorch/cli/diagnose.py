@@ -11,7 +11,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from cyclopts import Parameter
+from cyclopts import Group, Parameter
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -25,6 +25,7 @@ from avtorch.errors import InputError
 if TYPE_CHECKING:
     from avtorch.io import Log
 
+TRACK = Group("Next experiment", sort_key=20)
 CAUSES = ("none", "unknown", "pair")
 """What a prior may weigh beside the effects; `pair`: all pairs together."""
 
@@ -61,6 +62,12 @@ def diagnose(
         Literal["laplace", "sgld"], Parameter(help="Of the winner's parameters: normal approximation, or SGLD.")
     ] = "sgld",
     resume: Annotated[bool, Parameter(help="Go on from an interrupted run in --out, or begin anew.")] = True,
+    speed_min: Annotated[float, Parameter(group=TRACK, help="Slowest of the next experiment [m/s].")] = 1.0,
+    speed_max: Annotated[float, Parameter(group=TRACK, help="Fastest [m/s].")] = 30.0,
+    accel_min: Annotated[float, Parameter(group=TRACK, help="Hardest braking [m/s²], below 0.")] = -3.0,
+    accel_max: Annotated[float, Parameter(group=TRACK, help="Hardest push [m/s²].")] = 2.0,
+    road: Annotated[float, Parameter(group=TRACK, help="Length of the road [m].")] = 2000.0,
+    seconds: Annotated[float, Parameter(group=TRACK, help="Duration [s].")] = 60.0,
     seed: Seed = 0,
     json: Json = False,
     quiet: Quiet = False,
@@ -80,6 +87,9 @@ def diagnose(
         positive("--budget", budget, "s")
     seed_number(seed)
     free_folder(out)
+    from avtorch.experiment import Limits
+
+    limits = Limits(speed_min, speed_max, accel_min, accel_max, road, seconds)
 
     chosen = _effects(effects)
     weights = _prior(prior or ())
@@ -132,10 +142,18 @@ def diagnose(
     from avtorch.remedy import setting_for, write_exports
 
     told = setting_for(found, [x for drive in drives if drive.accel_cmd is not None for x in drive.accel_cmd])
-    found = replace(found, setting=None if told is None else told.to_dict())
+    from avtorch.experiment import next_experiment, write_table
     from avtorch.report import write_report
 
-    written = [*found.write(out), *write_exports(found.plant, out), write_report(found, out, quality=quality)]
+    ahead = next_experiment(found, limits, seed=seed)
+    found = replace(
+        found,
+        setting=None if told is None else told.to_dict(),
+        next_experiment=None if ahead is None else ahead.to_dict(),
+    )
+    table = write_table(ahead, out)
+    written = [*found.write(out), *table, *write_exports(found.plant, out)]
+    written.append(write_report(found, out, quality=quality, experiment=ahead))
     if talk.json:
         talk.done(out, found.to_dict())
         return
@@ -149,7 +167,12 @@ def diagnose(
     talk.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {', '.join(names)}", soft_wrap=True)
 
 
-_FILES = {".toml": " (the repaired simulator)", ".yaml": " (in that tool's terms)", ".html": " (to read)"}
+_FILES = {
+    ".toml": " (the repaired simulator)",
+    ".csv": " (what to drive next)",
+    ".yaml": " (in that tool's terms)",
+    ".html": " (to read)",
+}
 
 
 def _known(option: str, name: str, more: Sequence[str] = ()) -> str:

@@ -58,7 +58,7 @@ def diagnosis_notes(found: Diagnosis) -> list[str]:
     from avtorch.gap.answer import words
 
     told = [words.aliases(found), *words.onset(found), *words.where(found), *words.moved(found), *words.gap(found)]
-    told += [*words.shrinkage(found), *words.to_set(found), *words.remains(found)]
+    told += [*words.shrinkage(found), *words.to_set(found), *words.to_drive(found), *words.remains(found)]
     lines = [escape(line) for line in told]
     if not found.complete:
         text = "The budget ended the search: the answer is provisional; the same command with more goes on from here."

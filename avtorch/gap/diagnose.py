@@ -13,6 +13,7 @@ import numpy as np
 from avtorch.errors import InputError
 from avtorch.gap.answer import posterior as posteriors
 from avtorch.gap.answer.aliases import Told
+from avtorch.gap.answer.contender import contenders
 from avtorch.gap.answer.diagnosis import Diagnosis, GapFacts, LogFacts
 from avtorch.gap.answer.misfit import gap_facts
 from avtorch.gap.answer.odds import favourite, probabilities
@@ -108,6 +109,7 @@ def diagnose(
         draws=drawn(winner, draws) if draws is not None and winner is not None else None,
         where=() if held is None or verdict.name == "none" else where(held, onset_s=onset, lag=lag),
         shrinkage=shrinkage(held) if held is not None and named else None,
+        contenders=contenders(race, verdict),
         traces=_traces(race, winner, held),
         remaining=remaining(candidates, verdict, base),
         complete=race.complete,

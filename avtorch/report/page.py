@@ -16,12 +16,14 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from avtorch import __version__
+from avtorch.experiment import Experiment
 from avtorch.gap.answer import words
 from avtorch.gap.answer.diagnosis import Diagnosis, Quantity
 from avtorch.gap.answer.quantity import unit_of, words_of
 from avtorch.gap.answer.where import UNITS
 from avtorch.io import atomic
 from avtorch.plots.over_diagnosis import road_figure, shrinkage_figure, where_figure, which_figure
+from avtorch.plots.over_experiment import experiment_figure
 
 _METRICS = {
     "rollout_rmse_accel_0.5s": "acceleration, 0.5 s [m/s²]",
@@ -36,8 +38,12 @@ _METRICS = {
 }
 
 
-def report_html(found: Diagnosis, *, quality: Iterable[str] = ()) -> str:
-    """The page as text. `quality`: what was noted of the data when it was read, a line each."""
+def report_html(found: Diagnosis, *, quality: Iterable[str] = (), experiment: Experiment | None = None) -> str:
+    """The page as text.
+
+    `quality`: what was noted of the data when it was read, a line each. `experiment`: what to drive next, for a picture
+    of it.
+    """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(files("avtorch.report").joinpath("template.html").read_text(encoding="utf-8"))
     return template.render(
@@ -54,30 +60,38 @@ def report_html(found: Diagnosis, *, quality: Iterable[str] = ()) -> str:
         measures=_measures(found),
         placebo=_placebo(found),
         setting=_setting(found),
+        next_experiment=words.to_drive(found),
         notes=list(found.notes),
         quality=list(quality),
         version=__version__,
-        pictures=_pictures(found),
+        pictures=_pictures(found, experiment),
     )
 
 
-def write_report(found: Diagnosis, folder: str | PathLike[str], *, quality: Iterable[str] = ()) -> Path:
+def write_report(
+    found: Diagnosis,
+    folder: str | PathLike[str],
+    *,
+    quality: Iterable[str] = (),
+    experiment: Experiment | None = None,
+) -> Path:
     """Write `report.html` into `folder`; returns its path. Raises `InputError` where it cannot be written."""
     path = Path(folder) / "report.html"
-    text = report_html(found, quality=quality)
+    text = report_html(found, quality=quality, experiment=experiment)
     with atomic(path) as stream:
         stream.write(text)
     return path
 
 
-def _pictures(found: Diagnosis) -> dict[str, Markup | None]:
+def _pictures(found: Diagnosis, experiment: Experiment | None) -> dict[str, Markup | None]:
     drawn: dict[str, tuple[bool, Callable[[Diagnosis], Figure]]] = {
         "road": (found.traces is not None, road_figure),
         "where": (found.traces is not None and bool(found.traces.does.any()), where_figure),
         "which": (True, which_figure),
         "shrinkage": (found.shrinkage is not None, shrinkage_figure),
     }
-    return {name: _svg(name, draw(found)) if there else None for name, (there, draw) in drawn.items()}
+    pictures = {name: _svg(name, draw(found)) if there else None for name, (there, draw) in drawn.items()}
+    return pictures | {"next": None if experiment is None else _svg("next", experiment_figure(experiment))}
 
 
 def _svg(name: str, figure: Figure) -> Markup:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.errors import InputError
+from avtorch.gap.answer.contender import Contender
 from avtorch.gap.answer.quantity import Quantity, unit_of
 from avtorch.gap.answer.shrinkage import Closed, Shrinkage
 from avtorch.gap.answer.traces import Traces
@@ -119,6 +120,7 @@ class Diagnosis:
     - `where`, `shrinkage`: where the gap lies and how far it shrinks, on parts that were held out; empty and None where
       the drives are too short to be parted, and `shrinkage` None where nothing was named
     - `traces`: the drives beside the rollouts of `simulator` and `plant`
+    - `contenders`: the alias set as far as it was fitted, with what it takes to foretell another drive
     - `next_experiment`, `setting`: objects as in `diagnosis.json`, None where nobody asked
     - `remaining`: with the default baseline, the candidates for what is left once `dead_time` is in
     - `complete` False: the budget ended the search
@@ -141,6 +143,7 @@ class Diagnosis:
     remaining: tuple[Candidate, ...] | None = None
     where: tuple[Where, ...] = ()
     shrinkage: Shrinkage | None = None
+    contenders: tuple[Contender, ...] = ()
     next_experiment: Mapping[str, Any] | None = None
     setting: Mapping[str, Any] | None = None
     complete: bool = True

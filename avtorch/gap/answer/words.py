@@ -135,5 +135,16 @@ def to_set(found: Diagnosis) -> list[str]:
     return [] if found.setting is None else [f"To set: {found.setting['why']}"]
 
 
+def to_drive(found: Diagnosis) -> list[str]:
+    """Which experiment next."""
+    told = found.next_experiment
+    if told is None:
+        return []
+    begin, seconds, metres = (told[key] for key in ("start_speed_mps", "seconds", "metres"))
+    return [
+        f"Next experiment: {told['why']} It begins at {begin:.0f} m/s and takes {seconds:.0f} s and {metres:.0f} m."
+    ]
+
+
 def _share(p: float) -> str:
     return f"probability {p:.2f}" if p < 0.995 else "probability over 0.99"

@@ -1,0 +1,26 @@
+"""Which experiment next: the manoeuvre that separates what a log left confused."""
+
+from avtorch.experiment.information import Information, information
+from avtorch.experiment.limits import Limits
+from avtorch.experiment.manoeuvres import Manoeuvre, library
+from avtorch.experiment.next_experiment import Experiment, next_experiment, write_table
+
+__all__ = [
+    "Experiment",
+    "Information",
+    "Limits",
+    "Manoeuvre",
+    "information",
+    "library",
+    "next_experiment",
+    "write_table",
+]
+    "Experiment",
+    "Information",
+    "Limits",
+    "Manoeuvre",
+    "information",
+    "library",
+    "next_experiment",
+    "write_table",
+]

@@ -1,0 +1,178 @@
+"""Manoeuvres for a test track or a driver in the loop: commands over time, within limits.
+
+Each begins and ends with some seconds without a command, and comes back to the speed it began at. What shows where:
+steps show delay, lag and order, both pedals to the limit saturation and asymmetry, small reversals a dead band or
+play, ramps a limited jerk, holds whatever depends on speed, a sweep of frequencies the modes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import chirp
+
+from avtorch.experiment.limits import Limits
+
+Float = NDArray[np.float64]
+Pattern = Callable[[Float], Float]
+
+_BEFORE_S, _AFTER_S = 3.0, 2.0
+_SPEEDS = (0.2, 0.5, 0.8)  # of the span between slowest and fastest
+_SHORTEST_HOLD_S = 1.5
+_GAIN_MPS = 4.0  # by one push of a pedal
+
+
+@dataclass(frozen=True, eq=False)
+class Manoeuvre:
+    """`command` (row,) [m/s²] at `time` (row,) [s], and the `speed` (row,) [m/s] that is expected of the car."""
+
+    name: str
+    time: Float = field(repr=False)
+    command: Float = field(repr=False)
+    speed: Float = field(repr=False)
+
+    @property
+    def metres(self) -> float:
+        """Road that it takes."""
+        return float(np.trapezoid(self.speed, self.time))
+
+    @property
+    def effort(self) -> float:
+        """Root mean square of the command [m/s²]: how hard it is on driver and car."""
+        return float(np.sqrt(np.mean(self.command**2)))
+
+    def within(self, limits: Limits) -> bool:
+        """Whether all of it keeps to the limits."""
+        slow, fast = float(self.speed.min()), float(self.speed.max())
+        low, high = float(self.command.min()), float(self.command.max())
+        return (
+            limits.speed_min - 1e-6 <= slow
+            and fast <= limits.speed_max + 1e-6
+            and limits.accel_min - 1e-9 <= low
+            and high <= limits.accel_max + 1e-9
+            and self.metres <= limits.road
+            and self.time[-1] <= limits.seconds + 1e-9
+        )
+
+    def expecting(self, speed: Float) -> Manoeuvre:
+        """The same with another expected speed (row,)."""
+        return replace(self, speed=speed)
+
+    def trimmed(self, gain: float, start: float | None = None) -> Manoeuvre:
+        """With what changes the speed by `gain` [m/s] spread over its commands, the more the gentler they are.
+
+        The speed expected is then that of a perfect car from `start` [m/s] on.
+        """
+        dt = float(self.time[1] - self.time[0])
+        active = (self.time >= _BEFORE_S - 1e-9) & (self.time <= self.time[-1] - _AFTER_S + 1e-9)
+        limit = np.where(self.command < 0, self.command.min(), self.command.max())
+        # none where a pedal is at its most, and no jumps where there were none
+        gentle = np.where(active, 1.0 - (self.command / np.where(limit == 0, 1.0, limit)) ** 2, 0.0)
+        command = self.command + gain / (gentle.sum() * dt) * gentle
+        begin = float(self.speed[0]) if start is None else start
+        return replace(self, command=command, speed=begin + np.concatenate([[0.0], np.cumsum(command[:-1]) * dt]))
+
+
+def library(limits: Limits | None = None, *, rate_hz: float = 20.0) -> tuple[Manoeuvre, ...]:
+    """All manoeuvres that a perfect car could drive within the limits, each as long as they allow."""
+    given = Limits() if limits is None else limits
+    return tuple(m for m in _all(given, rate_hz) if m.within(given))
+
+
+def _all(limits: Limits, rate_hz: float) -> Iterator[Manoeuvre]:
+    low = max(limits.speed_min, 0.5)
+    span, push, brake = limits.speed_max - low, limits.accel_max, -limits.accel_min
+    both = min(push, brake)
+    time = np.arange(math.floor(limits.seconds * rate_hz + 1e-9) + 1) / rate_hz
+    whole = float(time[-1]) - _BEFORE_S - _AFTER_S
+
+    def made(name: str, start: float, pattern: Pattern, period: float = whole) -> Iterator[Manoeuvre]:
+        lasts = whole // period * period
+        if lasts > 0:
+            yield _made(name, time, start, pattern, lasts)
+
+    for share in _SPEEDS:
+        v = low + share * span
+        at = f"at {v:.0f} m/s"
+        for size in (0.25 * both, both):
+            for hold in (2.0, 5.0):
+                name = f"steps of {size:.2g} m/s² held {hold:g} s {at}"
+                yield from made(name, v, lambda t, a=size, h=hold: _steps(t, a, h), 4 * hold)
+        period = 3 * _GAIN_MPS * (1 / push + 1 / brake) + 2.0
+        name = f"pedals to {push:.2g} and {-brake:.2g} m/s² {at}"
+        yield from made(name, v, lambda t: _pedals(t, push, brake), period)
+        yield from made(f"sweep of {0.5 * both:.2g} m/s², 0.05 to 2 Hz, {at}", v, lambda t: _sweep(t, 0.5 * both))
+        yield from made(f"small reversals {at}", v, lambda t: _reversals(t, whole), 6.0)
+        for slope in (0.4, 1.5):
+            name = f"ramps of {slope:g} m/s³ {at}"
+            yield from made(name, v, lambda t, s=slope: _ramps(t, s, both), 4 * both / slope)
+    for size in (0.3 * both, 0.7 * both):
+        for top in (0.5, 0.75, 0.98):
+            v = low + top * span
+            each = (v - low - 1) / 3 / size
+            rest = whole / 6 - each
+            if rest >= _SHORTEST_HOLD_S:
+                name = f"holds at speeds from {low + 1:.0f} to {v:.0f} m/s, {size:.2g} m/s² between"
+                yield from made(name, low + 1, lambda t, a=size, e=each, r=rest: _holds(t, a, e, r))
+    for size in (0.5 * both, both):
+        name = f"slow and go, {size:.2g} m/s²"
+        yield from made(name, low + 0.5, lambda t, a=size: _slow_and_go(t, a), 2 * _GAIN_MPS * 2 / size + 5.0)
+
+
+def _made(name: str, time: Float, start: float, pattern: Pattern, lasts: float) -> Manoeuvre:
+    t = time - _BEFORE_S
+    active = (t >= -1e-9) & (t < lasts - 1e-9)
+    u = np.zeros_like(time)
+    u[active] = pattern(t[active])
+    made = Manoeuvre(name, time, u, np.full_like(time, start))
+    dt = time[1] - time[0]
+    return made.trimmed(-float(u.sum() * dt), start)
+
+
+def _steps(t: Float, size: float, hold: float) -> Float:
+    """+, 0, -, 0, -, 0, +, 0: every level meets rest, both signs begin."""
+    return size * np.array([1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0, 0.0])[(t / hold + 1e-9).astype(int) % 8]
+
+
+def _pedals(t: Float, push: float, brake: float) -> Float:
+    """The whole of one pedal after the whole of the other, then half of each, as long as gives back the speed."""
+    on, off = _GAIN_MPS / push, _GAIN_MPS / brake
+    ends = np.cumsum([on, off, 1.0, 2 * off, 2 * on, 1.0])
+    levels = np.array([push, -brake, 0.0, -0.5 * brake, 0.5 * push, 0.0])
+    return levels[_stage(t, ends)]
+
+
+def _sweep(t: Float, size: float) -> Float:
+    return size * np.asarray(chirp(t, 0.05, float(t[-1]), 2.0, method="logarithmic", phi=-90))
+
+
+def _reversals(t: Float, whole: float) -> Float:
+    """Steps smaller than a dead band or play, ever larger."""
+    sizes = np.array([0.05, 0.1, 0.15, 0.2, 0.3, 0.4])
+    part = np.minimum((t // 6.0 * 6.0 / whole * len(sizes)).astype(int), len(sizes) - 1)
+    return sizes[part] * np.array([1.0, -1.0, -1.0, 1.0])[(t / 1.5 + 1e-9).astype(int) % 4]
+
+
+def _ramps(t: Float, slope: float, top: float) -> Float:
+    phase = (t * slope / (4 * top)) % 1.0
+    return 4 * top * np.where(phase < 0.25, phase, np.where(phase < 0.75, 0.5 - phase, phase - 1.0))
+
+
+def _holds(t: Float, size: float, each: float, rest: float) -> Float:
+    """Up in three stages and down in three, without a command between."""
+    return np.array([size, 0.0] * 3 + [-size, 0.0] * 3)[_stage(t, np.cumsum([each, rest] * 6))]
+
+
+def _slow_and_go(t: Float, size: float) -> Float:
+    """From walking pace up and back, and some seconds of rolling."""
+    each = 2 * _GAIN_MPS / size
+    return np.array([size, 0.0, -size, 0.0])[_stage(t, np.cumsum([each, 1.0, each, 4.0]))]
+
+
+def _stage(t: Float, ends: Float) -> NDArray[np.int64]:
+    """Number of the stage at each moment, over and over."""
+    return np.searchsorted(ends, t % ends[-1] + 1e-9, side="right").clip(0, len(ends) - 1)

@@ -1,0 +1,154 @@
+"""The manoeuvre that best separates what a log left confused: the gentlest of those that surely do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avtorch.errors import InputError
+from avtorch.experiment.foretold import Foretold, responses
+from avtorch.experiment.information import Information, information
+from avtorch.experiment.limits import Limits
+from avtorch.experiment.manoeuvres import Manoeuvre, library
+from avtorch.gap.answer.contender import Contender
+from avtorch.gap.answer.diagnosis import Diagnosis
+from avtorch.io import atomic
+
+_RATE_HZ = 20.0
+_DRAWS = 32
+_SURE = 12.0
+"""Log odds [nats] of the worst pair that are enough: more than a real car's differing from every model can cost."""
+_FAINT = 0.1  # of what there is to learn
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """Drive `manoeuvre` next: it `separates` those causes.
+
+    `information`: what is to be expected of it; `entropy` [nats]: how much is unknown of the cause. `every`: the same
+    of all manoeuvres within the limits. `untold`: what no manoeuvre tells apart with these signals. `why`: a sentence.
+    """
+
+    manoeuvre: Manoeuvre
+    separates: tuple[str, ...]
+    information: Information
+    entropy: float
+    every: Mapping[str, Information] = field(repr=False)
+    untold: tuple[str, ...] = ()
+    why: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The object `next_experiment` of `diagnosis.json`."""
+        return {
+            "manoeuvre": self.manoeuvre.name,
+            "separates": list(self.separates),
+            "expected_information_nats": self.information.nats,
+            "entropy_nats": self.entropy,
+            "expected_probability_of_truth": self.information.told,
+            "seconds": round(float(self.manoeuvre.time[-1]), 6),
+            "metres": self.manoeuvre.metres,
+            "start_speed_mps": float(self.manoeuvre.speed[0]),
+            "untold": list(self.untold),
+            "why": self.why,
+        }
+
+
+def next_experiment(found: Diagnosis, limits: Limits | None = None, *, seed: int = 0) -> Experiment | None:
+    """The manoeuvre out of the library that tells the diagnosis' `contenders` apart; None where nothing is confused.
+
+    Start it at its first expected speed, on a level road if there is one. Raises `InputError` where the limits allow
+    no manoeuvre at all.
+    """
+    rivals = list(found.contenders)
+    if len(rivals) < 2:
+        return None
+    witnesses = tuple(name for name in ("accel", "speed") if name in found.log.signals)
+    group = max(1, int(found.log.rate_hz / _RATE_HZ + 1e-6))
+    given = Limits() if limits is None else limits
+    offers = _expected(rivals[0], library(given, rate_hz=found.log.rate_hz / group), given)
+    if not offers:
+        raise InputError("limits: no manoeuvre of the library keeps to them; needs more speed, road or time")
+    weights = np.array([max(found.probability(r.name), 1e-3) for r in rivals])
+    weights = weights / weights.sum()
+    entropy = float(-(weights * np.log(weights)).sum())
+    foretold = [Foretold.of(r, offers, witnesses, group, _DRAWS) for r in rivals]
+    judged = [information(foretold, i, weights.tolist(), seed=seed) for i in range(len(offers))]
+    best = _chosen(offers, judged)
+    names = tuple(r.name for r in rivals)
+    untold = tuple(n for n in found.verdict.alias_set if n not in names and n != "unknown")
+    return Experiment(
+        manoeuvre=offers[best],
+        separates=names,
+        information=judged[best],
+        entropy=entropy,
+        every={m.name: i for m, i in zip(offers, judged, strict=True)},
+        untold=untold,
+        why=_sentence(offers[best], names, judged[best], entropy, untold, witnesses),
+    )
+
+
+def write_table(experiment: Experiment | None, folder: str | PathLike[str]) -> list[Path]:
+    """Write `manoeuvre.csv`, the command table: `time` [s], `accel_cmd` [m/s²], `speed_expected` [m/s].
+
+    A command holds until the next row's time. An earlier table in the folder goes where there is no experiment.
+    Raises `InputError` where the folder cannot be written.
+    """
+    path = Path(folder) / "manoeuvre.csv"
+    if experiment is None:
+        path.unlink(missing_ok=True)
+        return []
+    m = experiment.manoeuvre
+    with atomic(path) as stream:
+        stream.write("time,accel_cmd,speed_expected\n")
+        rows = zip(m.time, m.command, m.speed, strict=True)
+        stream.writelines(f"{t:.6g},{u:.6g},{v:.6g}\n" for t, u, v in rows)
+    return [path]
+
+
+def _expected(first: Contender, manoeuvres: tuple[Manoeuvre, ...], limits: Limits) -> list[Manoeuvre]:
+    """With the speeds that the likeliest cause foretells, trimmed so that they come back; those within the limits."""
+    offers = list(manoeuvres)
+    for last in (False, True):
+        if not offers:
+            return []
+        speeds = responses(first, offers, slice(None)).speed.mean(1).numpy()
+        K_L = float(np.mean(first.belief["K_L"]))
+        if last:
+            offers = [m.expecting(m.speed[0] + v - v[0]) for m, v in zip(offers, speeds, strict=True)]
+        else:
+            offers = [m.trimmed(-float(v[-1] - v[0]) / K_L) for m, v in zip(offers, speeds, strict=True)]
+    return [m for m in offers if m.within(limits)]
+
+
+def _chosen(offers: list[Manoeuvre], judged: list[Information]) -> int:
+    """The gentlest that surely tells every pair apart, or else the one that tells most."""
+    sure = [i for i, j in enumerate(judged) if j.margin >= _SURE]
+    if sure:
+        return min(sure, key=lambda i: (round(offers[i].effort, 1), offers[i].metres))
+    return max(range(len(offers)), key=lambda i: (round(judged[i].nats, 2), judged[i].margin))
+
+
+def _sentence(
+    m: Manoeuvre,
+    names: tuple[str, ...],
+    told: Information,
+    entropy: float,
+    untold: tuple[str, ...],
+    witnesses: tuple[str, ...],
+) -> str:
+    causes = ["no effect" if n == "none" else n.replace("+", " with ") for n in names]
+    listing = " and ".join([", ".join(causes[:-1]), causes[-1]])
+    if told.nats < _FAINT * entropy:
+        text = f"nothing within the limits tells {listing} apart; nearest comes {m.name}"
+    else:
+        share = "over 0.99" if told.told > 0.99 else f"{told.told:.2f}"
+        text = f"{m.name}, to tell apart {listing}; expected probability of the true one afterwards: {share}"
+    if untold and len(witnesses) == 1:
+        other = "speed" if witnesses == ("accel",) else "accel"
+        text += f"; {', '.join(untold)} can only be told with {other} in the log as well"
+    return text[0].upper() + text[1:] + "."

@@ -1,0 +1,171 @@
+"""What a manoeuvre is expected to tell, and which one is chosen."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avtorch.errors import InputError
+from avtorch.experiment import Limits, information, library, next_experiment, write_table
+from avtorch.experiment.foretold import Foretold, responses
+from avtorch.gap import Effect, plant
+from avtorch.gap.answer.contender import Contender
+from avtorch.gap.answer.diagnosis import Diagnosis, GapFacts, LogFacts
+from avtorch.gap.answer.verdict import Candidate, verdict_of
+from avtorch.gap.effects import ConstantResistance, DeadBand, GainChange, RoadGrade, SensorBias
+from avtorch.gap.likelihood.noise_draws import noise_draws
+from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.io import Log
+
+BOTH = ("accel", "speed")
+NOISE = NoiseModel(process_sd=0.04, accel_sd=0.06, speed_sd=0.03)
+
+
+def contender(
+    effects: list[Effect], *, spread: float = 0.01, rng: np.random.Generator, noise: NoiseModel = NOISE
+) -> Contender:
+    """Of a plant, its parameters known to a share of `spread`."""
+    own = plant(effects, T_L=0.4, K_L=0.9)
+    belief = {k: float(v) * np.exp(spread * rng.standard_normal(64)) for k, v in own.values().items() if v.dim() == 0}
+    name = "+".join(sorted(e.name for e in effects)) or "none"
+    grade = 0.02 if name == "road_grade" else None
+    return Contender(name, own, belief, noise, grade_rms=grade)
+
+
+def left(rivals: list[Contender], shares: list[float]) -> Diagnosis:
+    """A diagnosis that leaves these."""
+    each = [Candidate(r.name, p, 0.0) for r, p in zip(rivals, shares, strict=True)]
+    each += [Candidate(n, 0.01, None) for n in ("none", "unknown") if n not in {r.name for r in rivals}]
+    log = LogFacts(rows=1200, segments=1, seconds=60.0, rate_hz=20.0, signals=("accel_cmd", *BOTH))
+    verdict = verdict_of(each, aliases=lambda _: [r.name for r in rivals])
+    return Diagnosis(log, {}, GapFacts(True), tuple(each), verdict, contenders=tuple(rivals))
+
+
+def test_draws_of_the_noise_are_white_to_its_own_filter(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    noise = NoiseModel(0.05, 0.4, 0.04, 2.5, 0.03, 0.02, sensor_scale=1.1, sensor_lag=0.2)
+    time = np.arange(0.0, 60.0, 0.05)
+    speed = 10 + np.sin(0.3 * time)
+    log = Log.from_arrays(time=time, accel_cmd=0.3 * np.cos(0.3 * time), accel=0.3 * np.cos(0.3 * time), speed=speed)
+    record = Record.of(log)
+    white = Whitener(record, noise)(noise_draws(noise, len(time), 0.05, BOTH, 40, rng)[..., record.source, None])
+    size = white[:, 0].size
+    # squares of standard normals have variance 2; four standard errors
+    for k in (0, 1):
+        assert (white[:, k] ** 2).mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / size) + 2 / record.rows)
+        lagged = (white[:, k, 1:] * white[:, k, :-1]).mean()
+        assert lagged == pytest.approx(0.0, abs=4 / np.sqrt(size))
+
+
+def test_margin_is_half_the_square_of_the_distance(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    m = [x for x in library() if x.name.startswith("holds")][:1]
+    rivals = [contender([], spread=1e-6, rng=rng), contender([SensorBias(0.02)], spread=1e-6, rng=rng)]
+    foretold = [Foretold.of(r, m, BOTH, 1, 64) for r in rivals]
+    law = foretold[0].law(0)
+    away = law._white((foretold[1].law(0).mean - law.mean)[None])
+    distance = float(np.linalg.norm(away))
+    told = information(foretold, 0, [0.5, 0.5], seed=rotating_seed)
+    # the log odds of 32 examples are normal with this mean and a standard deviation of `distance`; a median of them
+    assert told.margin == pytest.approx(distance**2 / 2, abs=4 * 1.26 * distance / np.sqrt(32))
+
+
+def test_the_same_cause_twice_is_never_told_apart(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    one = contender([DeadBand(0.1)], rng=rng)
+    m = library()[:1]
+    told = information([Foretold.of(one, m, BOTH, 1, 32)] * 2, 0, [0.5, 0.5])
+    assert told.nats == pytest.approx(0.0, abs=1e-9)
+    assert told.told == pytest.approx(0.5)
+
+
+def test_a_resistance_and_a_bias_differ_in_the_speed_alone(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    rivals = [contender([ConstantResistance(0.1)], rng=rng), contender([SensorBias(-0.1)], rng=rng)]
+    m = [x for x in library() if x.name.startswith("steps")][:1]
+    both = information([Foretold.of(r, m, BOTH, 1, 32) for r in rivals], 0, [0.5, 0.5])
+    alone = information([Foretold.of(r, m, ("accel",), 1, 32) for r in rivals], 0, [0.5, 0.5])
+    assert both.nats == pytest.approx(np.log(2), abs=1e-6)
+    assert alone.nats < 0.05
+
+
+def test_of_what_surely_tells_the_gentlest_is_driven(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    found = left([contender([], rng=rng), contender([DeadBand(0.1)], rng=rng)], [0.6, 0.3])
+    told = next_experiment(found)
+    assert told is not None
+    assert told.separates == ("none", "dead_band")
+    assert 0 < told.information.nats <= told.entropy + 1e-9
+    assert told.information.told > 0.99
+    sure = {name: i for name, i in told.every.items() if i.margin >= 12}
+    efforts = {m.name: m.effort for m in library() if m.name in sure}
+    assert efforts[told.manoeuvre.name] <= min(efforts.values()) + 0.1
+    told_dict = told.to_dict()
+    assert told_dict["expected_information_nats"] == told.information.nats
+    assert told_dict["seconds"] <= 60.0
+
+
+def test_limits_hold_for_the_speed_that_the_car_will_drive(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    rivals = [contender([ConstantResistance(0.2)], rng=rng), contender([], rng=rng)]
+    limits = Limits(speed_min=3, speed_max=18, road=700, seconds=45)
+    told = next_experiment(left(rivals, [0.6, 0.3]), limits)
+    assert told is not None
+    m = told.manoeuvre
+    speed = responses(rivals[0], [m], slice(None)).speed.mean((0, 1)).numpy()
+    assert m.metres <= 700
+    assert m.speed.min() >= 3
+    np.testing.assert_allclose(speed, m.speed, atol=0.3)
+    # resistance is met by a push: the speed comes back all the same
+    assert m.speed[-1] == pytest.approx(m.speed[0], abs=0.5)
+
+
+def test_an_unknown_road_widens_what_is_foretold(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    hilly = contender([RoadGrade(0.02)], rng=rng)
+    m = library()[:1]
+    law = Foretold.of(hilly, m, BOTH, 1, 32).law(0)
+    flat = Foretold.of(replace(hilly, grade_rms=None), m, BOTH, 1, 32).law(0)
+    assert len(law.spread) > len(flat.spread)
+    push = 9.81 * 0.02 * np.sin(0.02 * m[0].time)
+    pushed = law.mean + np.stack([push, np.cumsum(push) * 0.05])
+    assert law.log_density(pushed[None])[0] > flat.log_density(pushed[None])[0] + 20
+
+
+def test_a_gain_that_has_changed_stays_changed(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    changed = contender([GainChange(0.7, change_s=200.0)], spread=1e-9, rng=rng)
+    m = library()[:1]
+    accel = responses(changed, m, slice(0, 2)).accel[0, 0].numpy()
+    plain = responses(contender([], spread=1e-9, rng=rng), m, slice(0, 2)).accel[0, 0].numpy()
+    np.testing.assert_allclose(accel, 0.7 * plain, atol=1e-6)
+
+
+def test_the_table_is_written_and_an_old_one_goes(tmp_path: Path, rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    told = next_experiment(left([contender([], rng=rng), contender([DeadBand(0.1)], rng=rng)], [0.6, 0.3]))
+    (path,) = write_table(told, tmp_path)
+    rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+    assert told is not None
+    assert list(rows[0]) == ["time", "accel_cmd", "speed_expected"]
+    np.testing.assert_allclose([float(r["accel_cmd"]) for r in rows], told.manoeuvre.command, rtol=1e-5, atol=1e-9)
+    assert write_table(None, tmp_path) == []
+    assert not path.exists()
+
+
+def test_nothing_confused_needs_no_experiment(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    assert next_experiment(left([contender([], rng=rng)], [0.9])) is None
+
+
+def test_limits_without_any_manoeuvre_are_an_error(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    found = left([contender([], rng=rng), contender([DeadBand(0.1)], rng=rng)], [0.6, 0.3])
+    with pytest.raises(InputError, match="limits: no manoeuvre"):
+        next_experiment(found, Limits(speed_min=20, speed_max=30, road=150, seconds=60))
