@@ -15,12 +15,3 @@ __all__ = [
     "next_experiment",
     "write_table",
 ]
-    "Experiment",
-    "Information",
-    "Limits",
-    "Manoeuvre",
-    "information",
-    "library",
-    "next_experiment",
-    "write_table",
-]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from avtorch.errors import InputError
 from avtorch.experiment import Limits, library
 
 
+@settings(deadline=None, max_examples=50)
 @given(
     low=st.floats(0, 15),
     span=st.floats(5.1, 40),
@@ -39,6 +40,7 @@ def test_every_manoeuvre_keeps_to_the_limits(
         assert not m.command[m.time > m.time[-1] - 2 + 1e-6].any()
 
 
+@settings(deadline=None, max_examples=25)
 @given(seconds=st.floats(30, 90), brake=st.floats(1.5, 5), push=st.floats(1, 4))
 def test_usual_limits_leave_manoeuvres_of_every_kind(seconds: float, brake: float, push: float) -> None:
     kinds = {m.name.split()[0] for m in library(Limits(accel_min=-brake, accel_max=push, seconds=seconds, road=3000))}
