@@ -17,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, positive, seed_number
 from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes, diagnosis_table
+from avtorch.cli.follower import follow, refuse
 from avtorch.cli.resume import FITS, same_work
 from avtorch.cli.simulator import read_simulator
 from avtorch.cli.talk import Talk
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from avtorch.io import Log
 
 TRACK = Group("Next experiment", sort_key=20)
+FOLLOWER = Group("Car following", sort_key=21)
 CAUSES = ("none", "unknown", "pair")
 """What a prior may weigh beside the effects; `pair`: all pairs together."""
 
@@ -61,6 +63,14 @@ def diagnose(
     posterior: Annotated[
         Literal["laplace", "sgld"], Parameter(help="Of the winner's parameters: normal approximation, or SGLD.")
     ] = "sgld",
+    follower: Annotated[
+        bool, Parameter(group=FOLLOWER, negative=(), help="The log is of a car that follows, and has no accel_cmd.")
+    ] = False,
+    vehicle: Annotated[int | None, Parameter(group=FOLLOWER, help="Which vehicle of an OpenACC platoon.")] = None,
+    law: Annotated[
+        Literal["constant_time_gap", "intelligent_driver"] | None,
+        Parameter(group=FOLLOWER, help="What its controller is taken to be; default: what foretells it better."),
+    ] = None,
     resume: Annotated[bool, Parameter(help="Go on from an interrupted run in --out, or begin anew.")] = True,
     speed_min: Annotated[float, Parameter(group=TRACK, help="Slowest of the next experiment [m/s].")] = 1.0,
     speed_max: Annotated[float, Parameter(group=TRACK, help="Fastest [m/s].")] = 30.0,
@@ -81,7 +91,7 @@ def diagnose(
     ----------
     logs
         CSV or Parquet: time, accel_cmd, and accel or speed. Several are drives of one car. LOG.toml beside a log may
-        map names and units.
+        map names and units. With --follower: time, speed, spacing, lead_speed, or an OpenACC, NGSIM or I-24 file.
     """
     if budget is not None:
         positive("--budget", budget, "s")
@@ -98,6 +108,14 @@ def diagnose(
     from avtorch.io import Log, check
 
     talk = Talk(json=json, quiet=quiet)
+    if follower:
+        refuse(logs, baseline=simulator, prior=weights, budget=budget)
+        columns = {"map": map, "unit": unit, "stamp": stamp}
+        with _progress(talk, None) as step:
+            follow(talk, logs[0], out, columns=columns, vehicle=vehicle, law=law, effects=chosen, seed=seed, step=step)
+        return
+    if vehicle is not None or law is not None:
+        raise InputError(f"{'--law' if vehicle is None else '--vehicle'}: has a meaning with --follower only")
     drives = [Log.read(path, map=map, unit=unit, stamp=stamp) for path in logs]
     for path, drive in zip(logs, drives, strict=True):
         _usable(path, drive, accel_kind)

@@ -2,6 +2,7 @@
 
 from avtorch.io.answers import write_json
 from avtorch.io.atomic import atomic
+from avtorch.io.following import read_following
 from avtorch.io.log import STANDSTILL_MPS, Log
 from avtorch.io.merge import held
 from avtorch.io.quality import Gap, Quality, check
@@ -17,6 +18,7 @@ __all__ = [
     "atomic",
     "check",
     "held",
+    "read_following",
     "read_leader",
     "write_json",
 ]

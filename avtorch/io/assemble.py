@@ -107,7 +107,10 @@ def _require(table: Table, mapping: SignalMap, following: bool) -> None:
     needed = ("time", "spacing", "lead_speed") if following and not there("accel_cmd") else ("time", "accel_cmd")
     for signal in needed:
         if not there(signal):
-            raise InputError(f"{table.source}: column {signal!r} is missing; {_advice(signal, table.names)}")
+            advice = _advice(signal, table.names)
+            if signal == "accel_cmd" and there("spacing") and there("lead_speed"):
+                advice += "; `--follower` diagnoses a car-following log without it"
+            raise InputError(f"{table.source}: column {signal!r} is missing; {advice}")
     if not there("accel") and not there("speed"):
         advice = _advice("speed", table.names)
         raise InputError(f"{table.source}: columns 'accel' and 'speed' are both missing; one is needed; {advice}")

@@ -38,11 +38,17 @@ _METRICS = {
 }
 
 
-def report_html(found: Diagnosis, *, quality: Iterable[str] = (), experiment: Experiment | None = None) -> str:
+def report_html(
+    found: Diagnosis,
+    *,
+    quality: Iterable[str] = (),
+    experiment: Experiment | None = None,
+    sections: Mapping[str, Sequence[str]] | None = None,
+) -> str:
     """The page as text.
 
     `quality`: what was noted of the data when it was read, a line each. `experiment`: what to drive next, for a picture
-    of it.
+    of it. `sections`: what else there is to say after the verdict, lines by title.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(files("avtorch.report").joinpath("template.html").read_text(encoding="utf-8"))
@@ -60,6 +66,7 @@ def report_html(found: Diagnosis, *, quality: Iterable[str] = (), experiment: Ex
         measures=_measures(found),
         placebo=_placebo(found),
         setting=_setting(found),
+        sections=dict(sections or {}),
         next_experiment=words.to_drive(found),
         notes=list(found.notes),
         quality=list(quality),
@@ -74,10 +81,11 @@ def write_report(
     *,
     quality: Iterable[str] = (),
     experiment: Experiment | None = None,
+    sections: Mapping[str, Sequence[str]] | None = None,
 ) -> Path:
     """Write `report.html` into `folder`; returns its path. Raises `InputError` where it cannot be written."""
     path = Path(folder) / "report.html"
-    text = report_html(found, quality=quality, experiment=experiment)
+    text = report_html(found, quality=quality, experiment=experiment, sections=sections)
     with atomic(path) as stream:
         stream.write(text)
     return path

@@ -23,7 +23,10 @@ _UNITS = {
     "_radps": "rad/s",
     "_hz": "Hz",
     "_per_m": "1/m",
+    "_per_s2": "1/s²",
+    "_per_s": "1/s",
     "_s": "s",
+    "_m": "m",
 }
 
 

@@ -1,0 +1,23 @@
+"""Cars that follow: what can be said of loop, gap and cause without knowing what was demanded."""
+
+from avtorch.follower.closed_loop import LoopErrors, loop_errors
+from avtorch.follower.diagnose_follower import FollowerDiagnosis, diagnose_follower
+from avtorch.follower.identify import Identified
+from avtorch.follower.laws import LAWS, ConstantTimeGap, IntelligentDriver, Law, Seen, Slopes
+from avtorch.follower.loop_stability import LoopStability, loop_stability
+
+__all__ = [
+    "LAWS",
+    "ConstantTimeGap",
+    "FollowerDiagnosis",
+    "Identified",
+    "IntelligentDriver",
+    "Law",
+    "LoopErrors",
+    "LoopStability",
+    "Seen",
+    "Slopes",
+    "diagnose_follower",
+    "loop_errors",
+    "loop_stability",
+]

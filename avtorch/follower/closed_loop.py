@@ -1,0 +1,80 @@
+"""The whole loop driven by the recorded leader alone: law, delay, lag, speed and spacing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from avtorch.follower.laws import Law, Seen, tensors
+
+Float = NDArray[np.float64]
+
+
+class LoopErrors(NamedTuple):
+    """Root mean square errors of stretches begun at the measured state, and how much the car amplifies.
+
+    `spacing` [m], `speed` [m/s]; `amplified`, `amplified_simulated`: spread of the car's speed over the leader's, as
+    measured and in the simulated loop.
+    """
+
+    spacing: float
+    speed: float
+    amplified: float
+    amplified_simulated: float
+
+
+def loop_errors(law: Law, values: Mapping[str, float], seen: Seen, dt: float, *, seconds: float = 60.0) -> LoopErrors:
+    """Of stretches of `seconds` of one drive, side by side; rows `dt` [s] apart.
+
+    `values`: the law's as `law.*`, `T_L` [s], `dead_time.delay_s` [s]; `K_L` is 1.
+    """
+    own = tensors({k.partition(".")[2]: v for k, v in values.items() if k.startswith("law.")})
+    s, v, lead = (x.numpy() for x in seen)
+    length = min(round(seconds / dt), len(s) - 1)
+    delay = values.get("dead_time.delay_s", 0.0) / dt
+    whole, part = int(delay), delay - int(delay)
+    starts = np.arange(0, len(s) - length, length)
+    rows = starts + np.arange(length + 1)[:, None]
+    # commands before a stretch are those of what was measured
+    demanded = law.command(own, seen).numpy()
+    sent = [demanded[np.maximum(starts - k, 0)] for k in range(whole + 2, 0, -1)]
+    keep = float(np.exp(-dt / values["T_L"]))
+    speed, spacing = v[rows[0]].copy(), s[rows[0]].copy()
+    accel = np.gradient(v, dt)[rows[0]]
+    speeds, spacings = [speed], [spacing]
+    for k in range(length):
+        now = Seen(*(torch.as_tensor(x) for x in (spacing, speed, lead[rows[k]])))
+        sent.append(law.command(own, now).numpy())
+        acting = (1 - part) * sent[-1 - whole] + part * sent[-2 - whole]
+        ahead = keep * accel + (1 - keep) * acting
+        faster = np.maximum(speed + 0.5 * dt * (accel + ahead), 0.0)
+        spacing = spacing + 0.5 * dt * (lead[rows[k]] + lead[rows[k + 1]] - speed - faster)
+        speed, accel = faster, ahead
+        speeds.append(speed)
+        spacings.append(spacing)
+    simulated, gaps = np.stack(speeds), np.stack(spacings)
+    return LoopErrors(
+        spacing=float(np.sqrt(np.mean((gaps - s[rows]) ** 2))),
+        speed=float(np.sqrt(np.mean((simulated - v[rows]) ** 2))),
+        amplified=_spread(v[rows]) / _spread(lead[rows]),
+        amplified_simulated=_spread(simulated) / _spread(lead[rows]),
+    )
+
+
+def keeps_speed(seen: Sequence[Seen], dt: float, *, seconds: float = 60.0) -> float:
+    """Root mean square error [m/s] over the same stretches of a car that goes on as fast as it was."""
+    off = []
+    for speed in (one.speed.numpy() for one in seen):
+        length = min(round(seconds / dt), len(speed) - 1)
+        rows = np.arange(0, len(speed) - length, length) + np.arange(length + 1)[:, None]
+        off.append((speed[rows] - speed[rows[0]]).ravel())
+    return float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
+
+
+def _spread(x: Float) -> float:
+    """About each stretch's own mean, (row, stretch)."""
+    return float(np.sqrt(np.mean((x - x.mean(0)) ** 2))) + 1e-12

@@ -1,0 +1,203 @@
+"""The diagnosis of a car that follows another, where nobody logged what its controller demanded.
+
+A law is assumed, identified on one half of the drive and judged on the other. With the commands that the law would have
+given, the half that judges is then diagnosed like any other log: all that is said of causes is conditional on the law.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from avtorch.errors import InputError
+from avtorch.follower.closed_loop import LoopErrors, keeps_speed, loop_errors
+from avtorch.follower.followed import Followed, car_of, followed
+from avtorch.follower.identify import Identified, identified, widened
+from avtorch.follower.laws import LAWS, Law, Seen, law_named
+from avtorch.follower.loop_stability import LoopStability, loop_stability
+from avtorch.gap.answer.diagnosis import Diagnosis
+from avtorch.gap.answer.quantity import Quantity
+from avtorch.gap.diagnose import diagnose
+from avtorch.gap.likelihood.record import Record
+from avtorch.io import Log
+
+Float = NDArray[np.float64]
+
+_LEAST_S = 40.0
+_LOWEST, _HIGHEST = -8.0, 5.0  # of a command [m/s²]; what a law asks beyond, no car is sent
+
+
+@dataclass(frozen=True, eq=False)
+class FollowerDiagnosis:
+    """Of one follower under one `law`.
+
+    - `parameters` of law, lag `T_L` and `delay_s` by name; `lag_with_delay_s`, and at the median speed `headway_s`
+    - `loops` by law, `without_delay` (the law chosen, on the bare GLVD) among them: errors of the closed loop over
+      60 s, driven by the leader alone, each half by what the other fitted; `keeps_speed` [m/s]: that of a car that does
+    - `stability` about slow, usual and quick speeds of the drive
+    - `diagnosis`: gap and cause on that half, conditional on the law; None where it was not asked for
+    - `conditional`: which claims are conditional on what, one sentence each
+    """
+
+    name: str
+    law: Law
+    identified: Identified = field(repr=False)
+    draws: Mapping[str, Float] = field(repr=False)
+    parameters: Mapping[str, Quantity]
+    loops: Mapping[str, LoopErrors]
+    keeps_speed: float
+    stability: tuple[LoopStability, ...]
+    diagnosis: Diagnosis | None
+    conditional: tuple[str, ...]
+
+    @property
+    def usual(self) -> LoopStability:
+        """At the median speed."""
+        return self.stability[len(self.stability) // 2]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The object of `diagnosis.json` with a further key `follower`; only that, where no cause was sought."""
+        told = {
+            "law": self.law.name,
+            "parameters": {name: q.to_dict() for name, q in self.parameters.items()},
+            "stability": [
+                {
+                    "speed_mps": s.speed,
+                    "p_locally_stable": s.p_locally_stable,
+                    "p_string_stable": s.p_string_stable,
+                    "peak_gain": None if s.peak_gain is None else s.peak_gain.to_dict(),
+                }
+                for s in self.stability
+            ],
+            "closed_loop": {name: errors._asdict() for name, errors in self.loops.items()},
+            "keeps_speed_rmse": self.keeps_speed,
+            "conditional": list(self.conditional),
+        }
+        return ({} if self.diagnosis is None else self.diagnosis.to_dict()) | {"follower": told}
+
+
+def diagnose_follower(
+    log: Log,
+    *,
+    law: str | None = None,
+    cause: bool = True,
+    effects: Sequence[str] | None = None,
+    seed: int = 0,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> FollowerDiagnosis:
+    """Time gap, gains, lag with delay, string stability, gap and cause of a car-following `log`.
+
+    `law`: `constant_time_gap` or `intelligent_driver`; default: the one that foretells better what did not fit it.
+    `cause` False: stop at the loop. `effects`, `progress`: as `avtorch.diagnose` has them.
+
+    Raises `InputError` for a log without speed, spacing or the leader's speed, with less than 40 s of following, or for
+    an unknown law.
+    """
+    laws = list(LAWS.values()) if law is None else [law_named(law)]
+    plain = followed(log, laws[0])
+    record = plain.record
+    if record.rows * record.dt < _LEAST_S:
+        raise InputError(
+            f"{log.name}: {record.rows * record.dt:.0f} s of following (moving, engaged), needs {_LEAST_S:g} s or more"
+        )
+    halves = _halves(record)
+    tried: dict[str, tuple[LoopErrors, Identified]] = {}
+    for i, own in enumerate(laws):
+        if progress is not None:
+            progress("laws", i, len(laws))
+        tried[own.name] = _crossed(followed(log, own), halves)
+    best = min(tried, key=lambda name: tried[name][0].speed)
+    chosen, first = LAWS[best], tried[best][1]
+    bare, _ = _crossed(followed(log, chosen, dead_time=False), halves)
+    full = identified(first.candidate, start=first)
+    draws = full.draws(widened(full, record), seed=seed)
+    speeds = np.quantile(record.measured[-1], (0.1, 0.5, 0.9))
+    keeps = keeps_speed([_longest(first.candidate, half) for half in halves], _step(record))
+    return FollowerDiagnosis(
+        name=log.name,
+        law=chosen,
+        identified=full,
+        draws=draws,
+        parameters=_parameters(chosen, draws, float(speeds[1])),
+        loops={name: errors for name, (errors, _) in tried.items()} | {"without_delay": bare},
+        keeps_speed=keeps,
+        stability=tuple(loop_stability(chosen, draws, speeds.tolist())),
+        diagnosis=_cause(log, first, halves[1], effects, seed, progress) if cause else None,
+        conditional=_conditional(chosen, tried[best][0].speed, keeps),
+    )
+
+
+def _halves(record: Record) -> tuple[Record, Record]:
+    numbers = np.arange(record.rows)
+    half = record.rows // 2
+    return record.only(numbers < half), record.only(numbers >= half)
+
+
+def _crossed(candidate: Followed, halves: tuple[Record, Record]) -> tuple[LoopErrors, Identified]:
+    """The closed loop's errors on each half by what the other fitted; and the fit to the first."""
+    first, second = (identified(candidate, half) for half in halves)
+    each = [
+        loop_errors(candidate.law, found.values, _longest(candidate, half), _step(half))
+        for found, half in ((first, halves[1]), (second, halves[0]))
+    ]
+    return LoopErrors(*(float(np.sqrt(np.mean(np.square(pair)))) for pair in zip(*each, strict=True))), first
+
+
+def _step(record: Record) -> float:
+    return record.dt / record.group
+
+
+def _longest(candidate: Followed, half: Record) -> Seen:
+    """What was seen in the longest stretch of a half."""
+    offsets = np.cumsum([0, *(len(s.speed) for s in candidate.seen)])
+    number = np.bincount(half.stretch).argmax()
+    rows = half.source[half.stretch == number] * half.group
+    drive = int(np.searchsorted(offsets, rows[0], side="right") - 1)
+    part = slice(int(rows[0] - offsets[drive]), int(rows[-1] - offsets[drive]) + half.group)
+    return Seen(*(x[part] for x in candidate.seen[drive]))
+
+
+def _cause(
+    log: Log,
+    first: Identified,
+    half: Record,
+    effects: Sequence[str] | None,
+    seed: int,
+    progress: Callable[[str, int, int], None] | None,
+) -> Diagnosis:
+    """The half that judges, with the law's commands, from lag and delay as the other half has them."""
+    commands = np.concatenate(first.candidate.command(first.z))
+    times = np.concatenate([d.time.numpy() for d in first.candidate.record.drives])
+    begin = half.time[half.source[0]]
+    at = np.clip(np.searchsorted(times, log.time), 0, len(times) - 1)
+    sent = np.clip(commands[at], _LOWEST, _HIGHEST)
+    kept = log.time >= begin
+    part = slice(int(np.argmax(kept)), log.rows)
+    late = replace(log, accel=None, accel_cmd=sent)[part]
+    return diagnose(late, baseline=car_of(first.values), effects=effects, seed=seed, progress=progress)
+
+
+def _parameters(law: Law, draws: Mapping[str, Float], speed: float) -> dict[str, Quantity]:
+    told = {k.removeprefix("law.").removeprefix("dead_time."): Quantity.of_draws(x) for k, x in draws.items()}
+    own = {k.removeprefix("law."): torch.as_tensor(x) for k, x in draws.items() if k.startswith("law.")}
+    total = draws["T_L"] + draws.get("dead_time.delay_s", 0.0)
+    more = {"lag_with_delay_s": total, "headway_s": law.spacing(own, speed) / speed}
+    return told | {name: Quantity.of_draws(x) for name, x in more.items()}
+
+
+def _conditional(law: Law, off: float, keeps: float) -> tuple[str, ...]:
+    return (
+        f"The controller is not known: {law.name} is assumed. With it the leader's motion alone foretells the speed "
+        f"over a minute, on the half that did not fit it, to {off:.2g} m/s; a car that keeps its speed would be off by "
+        f"{keeps:.2g} m/s.",
+        "K_L is held at 1: it cannot be told from the law's gains, which are those of controller and car together.",
+        "Lag and delay are those of the way from what was recorded to the speed, radar and controller included; a gain "
+        "on the car's own acceleration is part of T_L.",
+        "P(string stable) is about small motions; it is the loop's, whatever of it is controller or car.",
+        "The cause is conditional on the law: what the real controller does otherwise is taken for the car's.",
+    )

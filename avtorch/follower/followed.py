@@ -1,0 +1,106 @@
+"""A car that follows: its controller's law in front of the plant, fitted to its speed together with lag and delay.
+
+The law is fed with what was measured, so that a rollout goes over the plant alone; what the car does otherwise feeds
+back through its own sensors, and the noise filter makes of it what is new in each row. `K_L` is held at 1: it cannot be
+told from the law's gains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from avtorch.errors import InputError
+from avtorch.follower.laws import Law, Seen
+from avtorch.gap.chain.drive import Drive
+from avtorch.gap.chain.plant import GapPlant, plant
+from avtorch.gap.effects import DeadTime
+from avtorch.gap.likelihood.candidate import Candidate, Coordinate
+from avtorch.gap.likelihood.record import Record
+from avtorch.io import Log
+
+Float = NDArray[np.float64]
+
+NEEDED = ("speed", "spacing", "lead_speed")
+
+
+@dataclass(frozen=True, eq=False)
+class Followed(Candidate):
+    """`law` and a plant with `effects` over a record of speeds; `seen` of each drive."""
+
+    law: Law = field(kw_only=True)
+    seen: tuple[Seen, ...] = field(kw_only=True, repr=False)
+
+    @cached_property
+    def coordinates(self) -> tuple[Coordinate, ...]:
+        """The law's parameters by `law.parameter`, `T_L`, and the effects'."""
+        law = tuple(Coordinate(f"law.{p.name}", p, 1.0) for p in self.law.parameters)
+        return law + tuple(c for c in super().coordinates if c.key != "K_L")
+
+    def rollouts(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
+        values = self.values(z)
+        law = {k.partition(".")[2]: v[:, None] for k, v in values.items() if k.startswith("law.")}
+        car = {k: v for k, v in values.items() if not k.startswith("law.")} | {"K_L": torch.ones(len(z)).double()}
+        out = []
+        with torch.inference_mode():
+            for drive, seen in zip(self.record.drives, self.seen, strict=True):
+                sent = Drive(drive.time, self.law.command(law, seen), seen.speed)
+                out.append(self.plant.response(sent, car).speed)
+        return self._seen(cast(list, [_Speed(x) for x in out]), len(z), coarse)
+
+    def command(self, z: Float) -> list[Float]:
+        """What the law of `z` (coordinate,) demands in each drive, (time,) [m/s²]."""
+        values = self.values(z[None])
+        law = {k.partition(".")[2]: v[:, None] for k, v in values.items() if k.startswith("law.")}
+        return [self.law.command(law, seen)[0].numpy() for seen in self.seen]
+
+    def on(self, record: Record) -> Followed:
+        """The same over another record of the same drives."""
+        return replace(self, record=record)
+
+
+@dataclass(frozen=True)
+class _Speed:
+    """A response of which only the speed is looked at."""
+
+    speed: torch.Tensor
+
+
+def followed(log: Log, law: Law, *, dead_time: bool = True) -> Followed:
+    """Of a car-following log; `dead_time` False: the plant is the bare GLVD.
+
+    Only its speed is a witness, as the acceleration of public recordings is that speed's derivative. Raises
+    `InputError` for a log without speed, spacing and the leader's speed.
+    """
+    for name in NEEDED:
+        if getattr(log, name) is None:
+            raise InputError(f"{log.name}: has no {name}, which a follower needs (with {', '.join(NEEDED)})")
+    assert log.speed is not None
+    assert log.spacing is not None
+    assert log.lead_speed is not None
+    record = Record.of(replace(log, accel=None, accel_cmd=np.zeros(log.rows)))
+    seen = []
+    for drive in record.drives:
+        first = _row_of(log, float(drive.time[0]))
+        rows = slice(first, first + len(drive.time))
+        seen.append(Seen(*(torch.as_tensor(x[rows]) for x in (log.spacing, log.speed, log.lead_speed))))
+    kinds = (DeadTime,) if dead_time else ()
+    return Followed(record, kinds, plant([]), law=law, seen=tuple(seen))
+
+
+def _row_of(log: Log, time: float) -> int:
+    """The row of a drive's first time; segments may begin their time anew."""
+    begins = np.array([part.start for part in log.segments()])
+    return int(begins[np.argmin(np.abs(log.time[begins] - time))])
+
+
+def car_of(values: Mapping[str, float]) -> GapPlant:
+    """The plant with lag and delay as found, `K_L` 1."""
+    delay = values.get("dead_time.delay_s")
+    return plant([] if delay is None else [DeadTime(delay)], T_L=values["T_L"], K_L=1.0)

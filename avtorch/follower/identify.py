@@ -1,0 +1,111 @@
+"""Law, lag and delay found from a car-following record, with intervals that parts of the drive agree to.
+
+The noise is an Ornstein-Uhlenbeck force beside jerk noise (the prior of a gust): a real controller does much that no
+law foretells. Such a likelihood is too sure of itself, so the spread between fits to parts of the drive widens it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.follower.followed import Followed
+from avtorch.gap.answer.joint import root
+from avtorch.gap.likelihood.fit import finish, left_over, modes
+from avtorch.gap.likelihood.noise_fit import GUST, fit_noise
+from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.likelihood.whitener import Whitener
+
+Float = NDArray[np.float64]
+
+_START = NoiseModel(process_sd=0.05, force_sd=0.1, speed_sd=0.02)
+_TURNS = 5
+_DRAWS = 2000
+_PART_S = 60.0
+_PARTS = 6
+_DELAYS_S = (0.3, 1.2)
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """`z` (coordinate,) at the mode, its `covariance`, `noise`; `log_evidence` [nats] of what was fitted."""
+
+    candidate: Followed = field(repr=False)
+    z: Float
+    covariance: Float = field(repr=False)
+    noise: NoiseModel
+    log_evidence: float
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """Parameters at the mode, by key: `law.*`, `T_L` [s], `dead_time.delay_s` [s]."""
+        return {k: float(v[0]) for k, v in self.candidate.values(self.z[None]).items()}
+
+    def draws(self, covariance: Float | None = None, *, count: int = _DRAWS, seed: int = 0) -> dict[str, Float]:
+        """Parameters (draw,) of a normal posterior in `z`."""
+        noise = np.random.default_rng(seed).standard_normal((count, len(self.z)))
+        spread = root(self.covariance if covariance is None else covariance).numpy()
+        z = np.clip(self.z + noise @ spread.T, -8.0, 8.0)
+        return {k: x.numpy() for k, x in self.candidate.values(z).items()}
+
+    def errors(self, record: Record) -> Float:
+        """Measured less rolled out (witness, counted, group) at the rows of `record`."""
+        return self.candidate.on(record).errors(self.z[None])[0]
+
+
+def identified(candidate: Followed, record: Record | None = None, *, start: Identified | None = None) -> Identified:
+    """Fitted to `record` (default: all rows), parameters and noise in turn, from a short and a long delay."""
+    record = candidate.record if record is None else record
+    own = candidate.on(record)
+    noise, value = _START if start is None else start.noise, -np.inf
+    z = _starts(own) if start is None else start.z[None]
+    for _ in range(_TURNS):
+        white = Whitener(record, noise)
+        tried, worth = modes(own, white, z, iterations=12, enough=0.1)
+        z = tried[[int(np.argmax(worth))]]
+        errors = left_over(own, white, z[0], coarse=False)
+        lag = float(own.values(z)["T_L"][0])
+        fitted = fit_noise(record, errors, noise, T_L=lag, priors=GUST, iterations=4)
+        noise = fitted.noise
+        new = float(fitted.rows.sum()) + fitted.log_prior - 0.5 * float(z[0] @ z[0])
+        if new < value + 0.5:
+            break
+        value = new
+    fit = finish(own, Whitener(record, noise), z[0])
+    return Identified(candidate, fit.z, fit.covariance, noise, fit.log_evidence + fitted.log_prior)
+
+
+def widened(found: Identified, record: Record) -> Float:
+    """Its covariance, each coordinate wider by what fits to parts of `record` differ by beyond it."""
+    count = int(min(_PARTS, record.rows * record.dt // _PART_S))
+    if count < 2:
+        return found.covariance
+    edges = np.linspace(0, record.rows, count + 1).astype(int)
+    numbers = np.arange(record.rows)
+    parts = []
+    for first, last in pairwise(edges.tolist()):
+        part = record.only((numbers >= first) & (numbers < last))
+        if part.rows * part.dt > 0.3 * _PART_S:
+            parts.append(identified(found.candidate, part, start=found).z)
+    if len(parts) < 2:
+        return found.covariance
+    # each part is pulled by the same prior: what they differ by is a lower bound of what they know
+    between = np.var(parts, axis=0, ddof=1) / len(parts)
+    wider = np.sqrt(np.maximum(between / np.diag(found.covariance), 1.0))
+    return found.covariance * np.outer(wider, wider)
+
+
+def _starts(candidate: Followed) -> Float:
+    centre = np.zeros(candidate.size)
+    keys = [c.key for c in candidate.coordinates]
+    if "dead_time.delay_s" not in keys:
+        return centre[None]
+    at = keys.index("dead_time.delay_s")
+    out = np.tile(centre, (len(_DELAYS_S), 1))
+    out[:, at] = [candidate.coordinates[at].z_of(d) for d in _DELAYS_S]
+    return out

@@ -1,0 +1,31 @@
+"""A follower's diagnosis in words: what is said of the loop, a sentence or two each."""
+
+from __future__ import annotations
+
+from avtorch.follower.diagnose_follower import FollowerDiagnosis
+from avtorch.gap.answer.quantity import Quantity
+
+LAWS = {"constant_time_gap": "a constant time gap", "intelligent_driver": "the Intelligent Driver Model"}
+
+
+def loop_lines(found: FollowerDiagnosis) -> list[str]:
+    """Law, headway, lag with delay, string stability, and how well the closed loop does."""
+    q, usual = found.parameters, found.usual
+    own, bare = found.loops[found.law.name], found.loops["without_delay"]
+    peak = "" if usual.peak_gain is None else f", peak gain {_told(usual.peak_gain, '')}"
+    rivals = [x for name, x in found.loops.items() if name not in (found.law.name, "without_delay")]
+    other = f" (the other law: {rivals[0].speed:.2g} m/s)" if rivals else ""
+    return [
+        f"Held to {LAWS[found.law.name]}: headway {_told(q['headway_s'], ' s')} at {usual.speed:.0f} m/s, "
+        f"lag with delay {_told(q['lag_with_delay_s'], ' s')}.",
+        f"P(string stable) is {usual.p_string_stable:.2f} at {usual.speed:.0f} m/s{peak}. Over a minute the car's "
+        f"speed spread {own.amplified:.2f} times as much as its leader's; {own.amplified_simulated:.2f} times in the "
+        "simulated loop.",
+        f"Driven by the leader alone, the loop is off by {own.speed:.2g} m/s and {own.spacing:.2g} m over a minute "
+        f"that did not fit it{other}; without a dead time by {bare.speed:.2g} m/s and {bare.spacing:.2g} m, and a car "
+        f"that keeps its speed by {found.keeps_speed:.2g} m/s.",
+    ]
+
+
+def _told(q: Quantity, unit: str) -> str:
+    return f"{q.mean:.2f}{unit} ({q.q05:.2f} to {q.q95:.2f})"

@@ -1,0 +1,122 @@
+"""A follower whose law and plant are known: found again, with its loop's stability, and bad input told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from avtorch.errors import InputError
+from avtorch.follower import LAWS, FollowerDiagnosis, Seen, diagnose_follower, loop_errors, loop_stability
+from avtorch.follower.followed import followed
+from avtorch.follower.identify import identified, widened
+from avtorch.vehicle.stability import local_stable, peak_gain, string_stable
+from tests.follower.loops import CTG, DELAY, DT, IDM, T_L, followed_log
+
+TRUTHS = {"constant_time_gap": CTG, "intelligent_driver": IDM}
+
+
+def key_values(values: dict[str, float]) -> dict[str, float]:
+    return {f"law.{k}": v for k, v in values.items()} | {"T_L": T_L, "dead_time.delay_s": DELAY}
+
+
+@pytest.mark.parametrize("name", TRUTHS)
+def test_law_lag_and_delay_are_found(name: str, rotating_seed: int) -> None:
+    log = followed_log(name, TRUTHS[name], seconds=240, rng=np.random.default_rng(rotating_seed))
+    found = diagnose_follower(log, cause=False)
+    assert found.law.name == name
+    candidate = found.identified.candidate
+    truth = candidate.z_of(key_values(TRUTHS[name]))
+    z = {k: (x.mean(), x.std()) for k, x in zip(truth_names(found), drawn_z(found).T, strict=True)}
+    for value, (mean, sd) in zip(truth, z.values(), strict=True):
+        # widened by the spread of four parts, of which the sd is known to 40 %
+        assert abs(mean - value) < 6 * sd + 0.02
+    total = found.parameters["lag_with_delay_s"]
+    assert total.mean == pytest.approx(T_L + DELAY, abs=6 * total.sd + 0.01)
+    own, bare = found.loops[name], found.loops["without_delay"]
+    assert own.speed < bare.speed < found.keeps_speed
+    assert own.amplified_simulated == pytest.approx(own.amplified, rel=0.05)
+
+
+def truth_names(found: FollowerDiagnosis) -> list[str]:
+    return [c.key for c in found.identified.candidate.coordinates]
+
+
+def drawn_z(found: FollowerDiagnosis) -> np.ndarray:
+    each = found.identified.candidate.coordinates
+    return np.stack([(c.parameter.unconstrain(torch.as_tensor(found.draws[c.key])) / c.wider).numpy() for c in each], 1)
+
+
+def test_a_gap_that_was_changed_midway_is_not_told_to_a_hair(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    near, far = (followed_log("constant_time_gap", CTG | {"time_gap_s": h}, seconds=120, rng=rng) for h in (1.2, 1.8))
+    columns = {n: np.concatenate([getattr(near, n), getattr(far, n)]) for n in ("speed", "spacing", "lead_speed")}
+    time = np.concatenate([near.time, far.time + near.time[-1] + 30])
+    both = replace(near, time=time, segment=np.repeat([0, 1], [near.rows, far.rows]), engaged=np.ones(len(time), bool))
+    candidate = followed(replace(both, **columns), LAWS["constant_time_gap"])
+    found = identified(candidate)
+    wide = widened(found, candidate.record)
+    assert (np.diag(wide) >= np.diag(found.covariance)).all()
+    assert (np.linalg.eigvalsh(wide) > 0).all()
+    # the two are 0.6 s apart; one gap alone is told to 0.01 s
+    assert found.draws(wide)["law.time_gap_s"].std() > 0.1
+
+
+@pytest.mark.parametrize("name", TRUTHS)
+def test_loop_of_the_truth_goes_with_the_drive(name: str, rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    log = followed_log(name, TRUTHS[name], seconds=120, rng=rng, noise=0.0)
+    assert log.speed is not None
+    assert log.spacing is not None
+    assert log.lead_speed is not None
+    seen = Seen(*(torch.as_tensor(x) for x in (log.spacing, log.speed, log.lead_speed)))
+    errors = loop_errors(LAWS[name], key_values(TRUTHS[name]), seen, DT, seconds=40.0)
+    # sensors' noise of 0.01 m/s and 0.02 m, the start's acceleration told by a difference, and steps of 0.1 s
+    assert errors.speed < 0.05
+    assert errors.spacing < 0.15
+
+
+def test_stability_is_that_of_the_exact_verdicts_without_delay(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    k_s, k_v, h, T = rng.uniform([[0.02], [0.1], [0.5], [0.1]], [[0.5], [1.5], [3.0], [1.0]], (4, 60))
+    gains = torch.as_tensor(np.stack([k_s, k_v, np.zeros(60)], -1))
+    setting = (torch.as_tensor(T), torch.ones(60, dtype=torch.float64), torch.as_tensor(h), gains)
+    local, string, peak = local_stable(*setting), string_stable(*setting), peak_gain(*setting)
+    for i in range(60):
+        draws = {
+            "law.spacing_gain_per_s2": k_s[[i]],
+            "law.speed_gain_per_s": k_v[[i]],
+            "law.time_gap_s": h[[i]],
+            "law.standstill_m": np.zeros(1),
+            "T_L": T[[i]],
+        }
+        (told,) = loop_stability(LAWS["constant_time_gap"], draws, [20.0])
+        assert told.p_locally_stable == float(local[i])
+        if not 1 < float(peak[i]) < 1 + 1e-3:
+            assert told.p_string_stable == float(string[i] & local[i])
+
+
+def test_cause_is_told_conditionally(rotating_seed: int) -> None:
+    log = followed_log("constant_time_gap", CTG, seconds=240, rng=np.random.default_rng(rotating_seed))
+    found = diagnose_follower(log, law="constant_time_gap", effects=["aerodynamic_drag", "road_grade"])
+    assert found.diagnosis is not None
+    assert not (found.diagnosis.winner.effects and found.diagnosis.winner.probability > 0.9)
+    answer = found.to_dict()
+    assert answer["schema"] == "avtorch.diagnosis/1"
+    assert answer["follower"]["law"] == "constant_time_gap"
+    assert any("conditional" in line for line in answer["follower"]["conditional"])
+
+
+@pytest.mark.parametrize("name", ["speed", "spacing", "lead_speed"])
+def test_what_is_missing_is_named(name: str) -> None:
+    log = followed_log("constant_time_gap", CTG, seconds=60, rng=np.random.default_rng(0))
+    with pytest.raises(InputError, match=f"has no {name}"):
+        diagnose_follower(replace(log, **{name: None}))
+
+
+def test_a_short_drive_is_refused() -> None:
+    log = followed_log("constant_time_gap", CTG, seconds=30, rng=np.random.default_rng(0))
+    with pytest.raises(InputError, match="needs 40 s or more"):
+        diagnose_follower(log)
