@@ -1,4 +1,4 @@
-"""The pages on the diagnosis, its blind test and comparisons: their code runs, their commands and options exist."""
+"""The pages on the diagnosis, its blind test, comparisons and followers: their code runs, their commands and options exist."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import pytest
 from avtorch.cli import main
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-PAGES = ("diagnosis.md", "blindtest.md", "compare.md")
+PAGES = ("diagnosis.md", "blindtest.md", "compare.md", "followers.md")
+COMMANDS = {"diagnosis.md": "diagnose", "followers.md": "diagnose"}
 
 
 def blocks(page: str, language: str) -> list[str]:
@@ -32,7 +33,7 @@ def test_code_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize("page", PAGES)
 def test_options_exist(page: str, capsys: pytest.CaptureFixture[str]) -> None:
     text = (DOCS / page).read_text(encoding="utf-8")
-    assert main([page.removesuffix(".md").replace("diagnosis", "diagnose"), "--help"]) == 0
+    assert main([COMMANDS.get(page, page.removesuffix(".md")), "--help"]) == 0
     known = set(re.findall(r"--[a-z][a-z-]*", capsys.readouterr().out))
     assert set(re.findall(r"(?<!-)--[a-z][a-z-]*", text)) <= known
 

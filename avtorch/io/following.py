@@ -18,6 +18,7 @@ from avtorch.io.tables import Table, read_table
 Float = NDArray[np.float64]
 
 _LONG_STEP_S = 0.25
+_DRIFT_M, _DRIFT_MPS = 5.0, 0.15  # by which gap and speeds may differ over a stretch
 _JUMP_M = 2.0  # of the gap from row to row, beyond what both speeds make of it: another leader
 
 
@@ -35,7 +36,7 @@ def read_following(
 
     Recordings are cut to the longest stretch in which all three are known and the leader stays the same; ``remarks``
     says so. Raises InputError for a
-    vehicle or event that is not there or follows nobody, and as ``Log.read`` does.
+    vehicle or event that is not there or follows nobody, for a gap that is not the speeds', and as ``Log.read`` does.
     """
     table = read_table(path, header="Time")
     names = set(table.names)
@@ -116,6 +117,13 @@ def _whole(name: str, time: Float, speed: Float, spacing: Float, lead: Float) ->
         raise InputError(f"{name}: no two rows in a row hold speed, spacing and the leader's speed")
     best = int(np.argmax(edges[1::2] - edges[::2]))
     part = slice(int(edges[::2][best]), int(edges[1::2][best]) + 1)
+    opened = float(spacing[part][-1] - spacing[part][0])
+    told = float(np.sum(np.diff(time[part]) * (lead - speed)[part][:-1]))
+    if abs(opened - told) > _DRIFT_M + _DRIFT_MPS * float(time[part][-1] - time[part][0]):
+        raise InputError(
+            f"{name}: the gap opened by {opened:.0f} m where the speeds say {told:.0f} m; "
+            "needs gap and speeds of one and the same leader"
+        )
     log = Log.from_arrays(
         name=name,
         time=time[part],

@@ -74,7 +74,7 @@ def test_a_plain_log_has_no_vehicles(tmp_path: Path) -> None:
         ("openacc_astazero/ASta_040719_platoon7.csv", 5, 9000),
         ("openacc_zalazone/handling_part1.csv", 3, 1000),
         ("openacc_zalazone/dynamic_part12.csv", 3, 500),
-        ("i24/2021-03-08-22-35-14_0.csv", None, 300),
+        ("i24/2021-03-12-22-20-57_0.csv", None, 4000),
         ("ngsim/events_000_249.csv", None, 100),
     ],
 )
@@ -89,3 +89,8 @@ def test_recordings(data_dir: Path, name: str, vehicle: int | None, rows: int) -
     change = np.diff(log.spacing)
     foretold = np.diff(log.time) * (log.lead_speed - log.speed)[:-1]
     assert np.corrcoef(np.cumsum(change), np.cumsum(foretold))[0, 1] > 0.9
+
+
+def test_a_gap_that_is_another_leaders_is_refused(data_dir: Path) -> None:
+    with pytest.raises(InputError, match="the gap opened by -19 m where the speeds say 509 m"):
+        read_following(data_dir / "i24/2021-03-08-22-35-14_0.csv")
