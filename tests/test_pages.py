@@ -1,4 +1,4 @@
-"""The pages on the diagnosis, its blind test, comparisons and followers: their code runs, their commands and options exist."""
+"""The pages on diagnosis, blind test, comparisons and followers: their code runs, their commands and options exist."""
 
 from __future__ import annotations
 

@@ -34,6 +34,8 @@ _METRICS = {
     "rollout_rmse_speed_2s": "speed, 2 s [m/s]",
     "rollout_rmse_speed": "speed, 10 s [m/s]",
     "rollout_rmse_speed_whole": "speed, whole drive [m/s]",
+    "closed_loop_rmse_speed": "speed, closed loop [m/s]",
+    "closed_loop_rmse_spacing": "spacing, closed loop [m]",
     "log_predictive_density": "log density [nats a row]",
 }
 

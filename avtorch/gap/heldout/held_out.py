@@ -17,6 +17,7 @@ from avtorch.gap.chain.effect import EFFECTS, Effect
 from avtorch.gap.heldout.chance_gains import chance_gains
 from avtorch.gap.heldout.flexible import Flexible
 from avtorch.gap.heldout.judged import Judge, Judged
+from avtorch.gap.heldout.loop_measures import LoopMeasure, loop_measures
 from avtorch.gap.heldout.parts import Part, parted
 from avtorch.gap.heldout.refit import Refit
 from avtorch.gap.heldout.rollout_errors import Measure, measures
@@ -49,7 +50,7 @@ class HeldOut:
     """
 
     record: Record
-    measures: Sequence[Measure]
+    measures: Sequence[Measure | LoopMeasure]
     sums: Mapping[str, Judged]
     rows: Float
     gained: Float = field(repr=False)
@@ -81,7 +82,8 @@ def held_out(
     price = prices(race.found)
     contenders = _contenders(race, verdict, price)
     sham = _sham(verdict, {*alike, *verdict.name.split("+")}, record.witnesses) if blamed else None
-    kinds = measures(record.witnesses)
+    bare = race.none.values
+    kinds = (*measures(record.witnesses), *loop_measures(record.witnesses, bare["T_L"], bare["K_L"]))
     whole = Refit.whole(verdict)
     all_in = {f.name: chance_gains(f, race.raw, record) for f in contenders}
     # what a part cannot tell of chance is told by all: how much less its evidence is than the gain of its rows

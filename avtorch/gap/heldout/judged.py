@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.gap.answer.joint import root
+from avtorch.gap.heldout.loop_measures import LoopMeasure
 from avtorch.gap.heldout.parts import Part
 from avtorch.gap.heldout.refit import Refit
 from avtorch.gap.heldout.rollout_errors import Measure
@@ -37,7 +38,7 @@ class Judge:
 
     record: Record
     part: Part
-    measures: Sequence[Measure]
+    measures: Sequence[Measure | LoopMeasure]
     lag: float
 
     def squares(self, errors: Float) -> Float:
