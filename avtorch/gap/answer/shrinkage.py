@@ -34,6 +34,7 @@ class Shrinkage:
     `metric`: the one of `by_metric` in which the gap shows most. `placebo`: what `placebo_effect`, a wrong effect with
     about as many parameters, closes on top. `ceiling`: after a flexible black box is put on top of the bare baseline,
     by metric. `chosen`: share of the parts in which the other parts alone choose the verdict. `blocks`: how many judge.
+    `by_drives`: whole drives were held out.
     """
 
     metric: str
@@ -43,6 +44,7 @@ class Shrinkage:
     ceiling: Mapping[str, float]
     chosen: float
     blocks: int
+    by_drives: bool = False
 
     @property
     def top(self) -> Closed:
@@ -60,4 +62,5 @@ class Shrinkage:
             "ceiling": dict(self.ceiling),
             "chosen": self.chosen,
             "blocks": self.blocks,
+            "heldout_by": "drives" if self.by_drives else "blocks",
         }

@@ -63,12 +63,13 @@ def shrinkage(found: Diagnosis) -> list[str]:
     if told is None:
         return []
     top, few = told.top, "" if told.chosen == 1 else f"; chosen there by {100 * told.chosen:.0f} % of the parts"
+    parts = "drives" if told.by_drives else "blocks"
     if told.metric in _MEASURES:
         words, unit = _MEASURES[told.metric]
-        line = f"On blocks held out: {words} off by {top.before:.2g}, with the effect by {top.after:.2g} {unit}"
+        line = f"On {parts} held out: {words} off by {top.before:.2g}, with the effect by {top.after:.2g} {unit}"
     else:
         gain = top.after - top.before
-        line = f"On blocks held out: log density {gain:+.2g} nats a row with the effect; no rollout shows it"
+        line = f"On {parts} held out: log density {gain:+.2g} nats a row with the effect; no rollout shows it"
     if top.closed is None:
         return [f"{line}; next to nothing could be closed{few}."]
     q = top.closed

@@ -18,7 +18,7 @@ from avtorch.gap.heldout.chance_gains import chance_gains
 from avtorch.gap.heldout.flexible import Flexible
 from avtorch.gap.heldout.judged import Judge, Judged
 from avtorch.gap.heldout.loop_measures import LoopMeasure, loop_measures
-from avtorch.gap.heldout.parts import Part, parted
+from avtorch.gap.heldout.parts import Part, drives_apart, parted
 from avtorch.gap.heldout.refit import Refit
 from avtorch.gap.heldout.rollout_errors import Measure, measures
 from avtorch.gap.likelihood.candidate import Candidate
@@ -46,7 +46,8 @@ class HeldOut:
       density of each row; `does` (counted,) [nats]: what it is expected to add, half the square of the white image of
       what it changes; `felt` likewise of the accelerometer's faults alone
     - `moved` (witness, counted): the change itself
-    - `chosen`: share of the parts that chose the verdict; `by_chance`: it has no effect that a rollout could foretell
+    - `chosen`: share of the parts that chose the verdict; `by_chance`: it has no effect that a rollout could foretell;
+      `by_drives`: whole drives are held out, not blocks of them
     """
 
     record: Record
@@ -60,6 +61,7 @@ class HeldOut:
     chosen: float
     sham: type[Effect] | None
     by_chance: bool = False
+    by_drives: bool = False
 
 
 def held_out(
@@ -137,6 +139,7 @@ def held_out(
         moved=moved,
         chosen=float(np.mean(chosen)),
         sham=sham,
+        by_drives=bool(drives_apart(record)),
         by_chance=set(verdict.name.split("+")) <= CHANCE,
     )
 

@@ -2,7 +2,7 @@
 
 Every block judges once. Rows beside a block are left out of the fit that it judges, as far as what chance did to the
 one is still felt in the other. Blocks of one part lie all over the drive, so that each part sees early and late, slow
-and fast.
+and fast. Where there are three drives or more, none of which is more than half of all, whole drives judge.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ Rows = NDArray[np.bool_]
 
 PARTS = 5
 _BLOCKS = 20  # of a long drive
+_DRIVES = 3  # or more, for whole ones to be held out
 _WHOLE_S = 10.0  # of which a block has one to six: rollouts of that length have to fit in
 
 
@@ -40,10 +41,35 @@ class Part:
 def parted(record: Record, *, apart_s: float = 3.0, parts: int = PARTS) -> tuple[Part, ...]:
     """The record's parts, `apart_s` [s] between what fits and what judges; none where there is too little for two."""
     blocks = blocks_of(record)
+    groups = drives_apart(record, parts)
+    if groups:
+        numbers = _drive_of(record)
+        each = [tuple(b for b in blocks if numbers[b.start] in group) for group in groups]
+        return tuple(_part(record, own, apart_s) for own in each)
     count = min(parts, len(blocks))
     if count < 2:
         return ()
     return tuple(_part(record, tuple(blocks[k::count]), apart_s) for k in range(count))
+
+
+def drives_apart(record: Record, parts: int = PARTS) -> list[set[int]]:
+    """Numbers of the drives that judge together, about equal shares of the rows; empty where drives are too few."""
+    sizes = np.bincount(_drive_of(record), minlength=len(record.drives))
+    there = [int(k) for k in np.argsort(-sizes, kind="stable") if sizes[k] > 0]
+    if len(there) < _DRIVES or sizes.max() > 0.5 * record.rows:
+        return []
+    groups: list[set[int]] = [set() for _ in range(min(parts, len(there)))]
+    for number in there:
+        least = min(groups, key=lambda g: sum(int(sizes[k]) for k in g))
+        least.add(number)
+    return groups
+
+
+def _drive_of(record: Record) -> NDArray[np.int64]:
+    """Number of each counted row's drive."""
+    each = 1 if record.coarse is record.drives else record.group
+    ends = np.cumsum([len(d.time) * each // record.group for d in record.coarse])
+    return np.searchsorted(ends, record.source, side="right")
 
 
 def blocks_of(record: Record) -> list[slice]:

@@ -64,6 +64,7 @@ def shrinkage(held: HeldOut) -> Shrinkage:
         ceiling=ceiling,
         chosen=held.chosen,
         blocks=blocks,
+        by_drives=held.by_drives,
     )
 
 

@@ -32,6 +32,26 @@ def test_drives_apart_need_no_distance() -> None:
     assert all(len(p.fits.source) == len(p.judges.source) for p in parts)
 
 
+@pytest.mark.parametrize("rate_hz", [20, 100])
+def test_of_three_drives_each_judges_what_the_others_fitted(rate_hz: int) -> None:
+    lengths = (70.0, 60.0, 50.0, 14.0, 13.0, 30.0)
+    record = Record.of([log_of(seconds=s, rate_hz=rate_hz) for s in lengths])
+    parts = parted(record)
+    assert len(parts) == 5
+    judging = np.concatenate([p.rows for p in parts])
+    np.testing.assert_array_equal(np.sort(judging), np.arange(record.rows))
+    ends = np.flatnonzero(np.diff(record.time) < 0) + 1
+    drive = np.searchsorted(ends, np.arange(len(record.time)), side="right")
+    for part in parts:
+        assert not set(drive[part.judges.source]) & set(drive[part.fits.source])
+        assert set(drive[part.judges.source]) | set(drive[part.fits.source]) == set(range(6))
+
+
+def test_one_long_drive_beside_short_ones_is_cut_into_blocks() -> None:
+    record = Record.of([log_of(seconds=120.0), log_of(seconds=14.0), log_of(seconds=14.0)])
+    assert len(parted(record)) == 5
+
+
 def test_too_short_to_be_parted() -> None:
     assert parted(Record.of(log_of(seconds=17.0))) == ()
 
