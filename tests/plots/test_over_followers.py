@@ -25,7 +25,7 @@ def cars() -> list[FollowerDiagnosis]:
 def test_each_car_has_its_row(cars: list[FollowerDiagnosis]) -> None:
     ax = over_followers.parameter_of_each(Figure().subplots(), cars, "headway_s")
     (points,) = ax.lines
-    np.testing.assert_allclose(points.get_xdata(), [c.parameters["headway_s"].mean for c in cars])
+    np.testing.assert_allclose(np.asarray(points.get_xdata(), float), [c.parameters["headway_s"].mean for c in cars])
     assert [label.get_text() for label in ax.get_yticklabels()] == [c.name for c in cars]
     with pytest.raises(InputError, match="needs one of"):
         over_followers.parameter_of_each(Figure().subplots(), cars, "colour")
@@ -37,13 +37,13 @@ def test_a_loop_that_may_not_be_stable_has_no_peak(cars: list[FollowerDiagnosis]
     assert len(points) == 1
     peak = cars[0].usual.peak_gain
     assert peak is not None
-    assert float(np.ravel(points[0].get_xdata())[0]) == pytest.approx(min(peak.mean, 4.0))
+    assert float(np.asarray(points[0].get_xdata(), float)[0]) == pytest.approx(min(peak.mean, 4.0))
 
 
 def test_amplification_is_that_of_the_loop(cars: list[FollowerDiagnosis]) -> None:
     ax = over_followers.amplification(Figure().subplots(), cars)
     own = cars[0].loops["constant_time_gap"]
-    assert ax.lines[1].get_xydata()[0].tolist() == [own.amplified, own.amplified_simulated]
+    assert np.asarray(ax.lines[1].get_xydata(), float)[0].tolist() == [own.amplified, own.amplified_simulated]
 
 
 def test_figure_has_three_panels(cars: list[FollowerDiagnosis]) -> None:
