@@ -12,9 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ import numpy as np
 
 from avtorch import diagnose
 from avtorch.blindtest import Case, Recorded, draw_cases, simulate
+from avtorch.blindtest.intervals import wilson
 from avtorch.experiment import Experiment, Limits, next_experiment
 from avtorch.io import Log
 
@@ -67,7 +66,7 @@ def tried(case: Case, limits: Limits, *, seed: int) -> dict[str, Any]:
     experiment = next_experiment(before, limits)
     if experiment is None:
         return told
-    after = diagnose([log, replace(driven(case, experiment, seed=seed))])
+    after = diagnose([log, driven(case, experiment, seed=seed)])
     return told | {
         "manoeuvre": experiment.manoeuvre.name,
         "nats": experiment.information.nats,
@@ -76,15 +75,6 @@ def tried(case: Case, limits: Limits, *, seed: int) -> dict[str, Any]:
         "separated": after.verdict.alias_set == (case.truth_name,),
         "kept": case.truth_name in after.verdict.alias_set,
     }
-
-
-def wilson(hits: int, of: int, z: float = 1.645) -> tuple[float, float]:
-    """90 % interval of a share."""
-    if of == 0:
-        return 0.0, 1.0
-    p = hits / of
-    middle, half = p + z * z / (2 * of), z * math.sqrt(p * (1 - p) / of + z * z / (4 * of * of))
-    return (middle - half) / (1 + z * z / of), (middle + half) / (1 + z * z / of)
 
 
 def main() -> None:
@@ -106,8 +96,9 @@ def main() -> None:
     ):
         for key in ("separated", "kept"):
             hits = sum(r[key] for r in some)
-            low, high = wilson(hits, len(some))
-            print(f"{what}: {key} {hits} of {len(some)} ({low:.2f} to {high:.2f})")
+            interval = wilson(hits, len(some))
+            told = "" if interval is None else f" ({interval[0]:.2f} to {interval[1]:.2f})"
+            print(f"{what}: {key} {hits} of {len(some)}{told}")
     if given.json:
         given.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
 

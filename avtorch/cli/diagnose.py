@@ -24,6 +24,7 @@ from avtorch.cli.talk import Talk
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
+    from avtorch.experiment import Limits
     from avtorch.io import Log
 
 TRACK = Group("Next experiment", sort_key=20)
@@ -71,6 +72,7 @@ def diagnose(
         Literal["constant_time_gap", "intelligent_driver"] | None,
         Parameter(group=FOLLOWER, help="What its controller is taken to be; default: what foretells it better."),
     ] = None,
+    event: Annotated[int | None, Parameter(group=FOLLOWER, help="Which event of an NGSIM file.")] = None,
     resume: Annotated[bool, Parameter(help="Go on from an interrupted run in --out, or begin anew.")] = True,
     speed_min: Annotated[float, Parameter(group=TRACK, help="Slowest of the next experiment [m/s].")] = 1.0,
     speed_max: Annotated[float, Parameter(group=TRACK, help="Fastest [m/s].")] = 30.0,
@@ -97,10 +99,7 @@ def diagnose(
         positive("--budget", budget, "s")
     seed_number(seed)
     free_folder(out)
-    from avtorch.experiment import Limits
-
-    limits = Limits(speed_min, speed_max, accel_min, accel_max, road, seconds)
-
+    limits = _limits(speed_min, speed_max, accel_min, accel_max, road, seconds)
     chosen = _effects(effects)
     weights = _prior(prior or ())
     simulator = read_simulator("--baseline", baseline)
@@ -109,13 +108,16 @@ def diagnose(
 
     talk = Talk(json=json, quiet=quiet)
     if follower:
-        refuse(logs, baseline=simulator, prior=weights, budget=budget)
-        columns = {"map": map, "unit": unit, "stamp": stamp}
+        usual = {"accel_kind": accel_kind == "kinematic", "no_pairs": pairs, "posterior": posterior == "sgld"}
+        idle = {"baseline": simulator, "prior": weights, "budget": budget is not None}
+        refuse(logs, limits, **idle, **{option: not default for option, default in usual.items()})
+        source = {"map": map, "unit": unit, "stamp": stamp, "vehicle": vehicle, "event": event}
         with _progress(talk, None) as step:
-            follow(talk, logs[0], out, columns=columns, vehicle=vehicle, law=law, effects=chosen, seed=seed, step=step)
+            follow(talk, logs[0], out, source=source, law=law, effects=chosen, seed=seed, step=step)
         return
-    if vehicle is not None or law is not None:
-        raise InputError(f"{'--law' if vehicle is None else '--vehicle'}: has a meaning with --follower only")
+    for option, given in (("--vehicle", vehicle), ("--law", law), ("--event", event)):
+        if given is not None:
+            raise InputError(f"{option}: has a meaning with --follower only")
     drives = [Log.read(path, map=map, unit=unit, stamp=stamp) for path in logs]
     for path, drive in zip(logs, drives, strict=True):
         _usable(path, drive, accel_kind)
@@ -163,9 +165,14 @@ def diagnose(
     from avtorch.experiment import next_experiment, write_table
     from avtorch.report import write_report
 
-    ahead = next_experiment(found, limits, seed=seed)
+    notes = found.notes
+    try:
+        ahead = next_experiment(found, limits, seed=seed)
+    except InputError as error:  # this car within these limits: no reason to lose the answer
+        ahead, notes = None, (*notes, f"No next experiment: {error}.")
     found = replace(
         found,
+        notes=notes,
         setting=None if told is None else told.to_dict(),
         next_experiment=None if ahead is None else ahead.to_dict(),
     )
@@ -191,6 +198,19 @@ _FILES = {
     ".yaml": " (in that tool's terms)",
     ".html": " (to read)",
 }
+
+
+def _limits(*given: float) -> Limits:
+    """Refused before the search where they allow nothing at all."""
+    from avtorch.experiment import Limits, library
+
+    limits = Limits(*given)
+    if not library(limits):
+        raise InputError(
+            "--speed-min, --speed-max, --accel-min, --accel-max, --road, --seconds: found limits that no manoeuvre of "
+            "the library keeps to; needs more speed, effort, road or time"
+        )
+    return limits
 
 
 def _known(option: str, name: str, more: Sequence[str] = ()) -> str:

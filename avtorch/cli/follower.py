@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 from rich.table import Table
@@ -14,12 +14,17 @@ from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError
 
+if TYPE_CHECKING:
+    from avtorch.experiment import Limits
 
-def refuse(logs: Sequence[Path], **given: object) -> None:
-    """Raise `InputError` for what has no meaning for a follower."""
+
+def refuse(logs: Sequence[Path], limits: Limits, **given: object) -> None:
+    """Raise `InputError` for what has no meaning for a follower: more logs, `limits` set, an option `given`."""
     if len(logs) > 1:
         raise InputError(f"--follower: found {len(logs)} logs, needs one at a time")
-    for option, value in given.items():
+    usual = type(limits)()
+    track = {f.name: getattr(limits, f.name) != getattr(usual, f.name) for f in fields(limits)}
+    for option, value in (given | track).items():
         if value:
             raise InputError(f"--{option.replace('_', '-')}: has no meaning with --follower")
 
@@ -29,20 +34,24 @@ def follow(
     path: Path,
     out: Path,
     *,
-    columns: Mapping[str, Any],
-    vehicle: int | None,
+    source: Mapping[str, Any],
     law: str | None,
     effects: Sequence[str] | None,
     seed: int,
     step: Callable[[str, int, int], None],
 ) -> None:
-    """Diagnose the follower, write the answer and the page, and print what a person wants to know."""
+    """Diagnose the follower, write the answer and the page, and print what a person wants to know.
+
+    `source`: keywords of `read_following`.
+    """
+    from avtorch.experiment import write_table
     from avtorch.follower import diagnose_follower
     from avtorch.follower.words import loop_lines
     from avtorch.io import check, read_following, write_json
+    from avtorch.remedy import write_exports
     from avtorch.report import write_report
 
-    log = read_following(path, vehicle=vehicle, **columns)
+    log = read_following(path, **source)
     noted = [*check(log).notes, *log.remarks]
     talk.notes(log.name, noted)
     found = diagnose_follower(log, law=law, effects=effects, seed=seed, progress=step)
@@ -50,7 +59,8 @@ def follow(
     assert gap is not None
     gap = replace(gap, notes=(*gap.notes, *found.conditional))
     lines = loop_lines(found)
-    written = gap.write(out)
+    # what an earlier diagnosis left in the folder is not this one's
+    written = [*gap.write(out), *write_table(None, out), *write_exports(gap.plant, out)]
     answer = replace(found, diagnosis=gap).to_dict()
     write_json(out / "diagnosis.json", answer)
     written.append(write_report(gap, out, quality=noted, sections={"The loop": lines}))

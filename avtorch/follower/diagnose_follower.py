@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from avtorch.errors import InputError
 from avtorch.follower.closed_loop import LoopErrors, keeps_speed, loop_errors
-from avtorch.follower.followed import Followed, car_of, followed
+from avtorch.follower.followed import Followed, car_of, followed, seen_in
 from avtorch.follower.identify import Identified, identified, widened
-from avtorch.follower.laws import LAWS, Law, Seen, law_named
+from avtorch.follower.laws import LAWS, Law, Seen, law_named, tensors
 from avtorch.follower.loop_stability import LoopStability, loop_stability
 from avtorch.gap.answer.diagnosis import Diagnosis
 from avtorch.gap.answer.quantity import Quantity
@@ -171,14 +171,10 @@ def _cause(
     progress: Callable[[str, int, int], None] | None,
 ) -> Diagnosis:
     """The half that judges, with the law's commands, from lag and delay as the other half has them."""
-    commands = np.concatenate(first.candidate.command(first.z))
-    times = np.concatenate([d.time.numpy() for d in first.candidate.record.drives])
-    begin = half.time[half.source[0]]
-    at = np.clip(np.searchsorted(times, log.time), 0, len(times) - 1)
-    sent = np.clip(commands[at], _LOWEST, _HIGHEST)
-    kept = log.time >= begin
-    part = slice(int(np.argmax(kept)), log.rows)
-    late = replace(log, accel=None, accel_cmd=sent)[part]
+    law = tensors({k.removeprefix("law."): v for k, v in first.values.items() if k.startswith("law.")})
+    sent = first.candidate.law.command(law, seen_in(log)).numpy()
+    begin = first.candidate.on(half).row(0)
+    late = replace(log, accel=None, accel_cmd=np.clip(sent, _LOWEST, _HIGHEST))[begin : log.rows]
     return diagnose(late, baseline=car_of(first.values), effects=effects, seed=seed, progress=progress)
 
 
@@ -193,8 +189,8 @@ def _parameters(law: Law, draws: Mapping[str, Float], speed: float) -> dict[str,
 def _conditional(law: Law, off: float, keeps: float) -> tuple[str, ...]:
     return (
         f"The controller is not known: {law.name} is assumed. With it the leader's motion alone foretells the speed "
-        f"over a minute, on the half that did not fit it, to {off:.2g} m/s; a car that keeps its speed would be off by "
-        f"{keeps:.2g} m/s.",
+        f"over a minute, on each half as fitted to the other, to {off:.2g} m/s; a car that keeps its speed would be "
+        f"off by {keeps:.2g} m/s.",
         "K_L is held at 1: it cannot be told from the law's gains, which are those of controller and car together.",
         "Lag and delay are those of the way from what was recorded to the speed, radar and controller included; a gain "
         "on the car's own acceleration is part of T_L.",

@@ -22,7 +22,7 @@ from avtorch.gap.chain.drive import Drive
 from avtorch.gap.chain.plant import GapPlant, plant
 from avtorch.gap.effects import DeadTime
 from avtorch.gap.likelihood.candidate import Candidate, Coordinate
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.likelihood.record import Record, rolled
 from avtorch.io import Log
 
 Float = NDArray[np.float64]
@@ -32,10 +32,11 @@ NEEDED = ("speed", "spacing", "lead_speed")
 
 @dataclass(frozen=True, eq=False)
 class Followed(Candidate):
-    """`law` and a plant with `effects` over a record of speeds; `seen` of each drive."""
+    """`law` and a plant with `effects` over a record of speeds; `seen` of each drive, `begins`: its row of the log."""
 
     law: Law = field(kw_only=True)
     seen: tuple[Seen, ...] = field(kw_only=True, repr=False)
+    begins: tuple[int, ...] = field(kw_only=True, repr=False)
 
     @cached_property
     def coordinates(self) -> tuple[Coordinate, ...]:
@@ -54,11 +55,10 @@ class Followed(Candidate):
                 out.append(self.plant.response(sent, car).speed)
         return self._seen(cast(list, [_Speed(x) for x in out]), len(z), coarse)
 
-    def command(self, z: Float) -> list[Float]:
-        """What the law of `z` (coordinate,) demands in each drive, (time,) [m/s²]."""
-        values = self.values(z[None])
-        law = {k.partition(".")[2]: v[:, None] for k, v in values.items() if k.startswith("law.")}
-        return [self.law.command(law, seen)[0].numpy() for seen in self.seen]
+    def row(self, counted: int) -> int:
+        """Which row of the log a `counted` row of the record begins at."""
+        place = self.record.place(counted)
+        return self.begins[place.drive] + place.row
 
     def on(self, record: Record) -> Followed:
         """The same over another record of the same drives."""
@@ -81,23 +81,20 @@ def followed(log: Log, law: Law, *, dead_time: bool = True) -> Followed:
     for name in NEEDED:
         if getattr(log, name) is None:
             raise InputError(f"{log.name}: has no {name}, which a follower needs (with {', '.join(NEEDED)})")
-    assert log.speed is not None
-    assert log.spacing is not None
-    assert log.lead_speed is not None
     record = Record.of(replace(log, accel=None, accel_cmd=np.zeros(log.rows)))
-    seen = []
-    for drive in record.drives:
-        first = _row_of(log, float(drive.time[0]))
-        rows = slice(first, first + len(drive.time))
-        seen.append(Seen(*(torch.as_tensor(x[rows]) for x in (log.spacing, log.speed, log.lead_speed))))
+    whole = seen_in(log)
+    rows = list(rolled(log, record.group))
+    seen = tuple(Seen(*(x[part] for x in whole)) for part in rows)
     kinds = (DeadTime,) if dead_time else ()
-    return Followed(record, kinds, plant([]), law=law, seen=tuple(seen))
+    return Followed(record, kinds, plant([]), law=law, seen=seen, begins=tuple(part.start for part in rows))
 
 
-def _row_of(log: Log, time: float) -> int:
-    """The row of a drive's first time; segments may begin their time anew."""
-    begins = np.array([part.start for part in log.segments()])
-    return int(begins[np.argmin(np.abs(log.time[begins] - time))])
+def seen_in(log: Log) -> Seen:
+    """What the car saw, over all rows of the log."""
+    assert log.spacing is not None
+    assert log.speed is not None
+    assert log.lead_speed is not None
+    return Seen(*(torch.as_tensor(x) for x in (log.spacing, log.speed, log.lead_speed)))
 
 
 def car_of(values: Mapping[str, float]) -> GapPlant:

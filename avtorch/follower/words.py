@@ -5,7 +5,7 @@ from __future__ import annotations
 from avtorch.follower.diagnose_follower import FollowerDiagnosis
 from avtorch.gap.answer.quantity import Quantity
 
-LAWS = {"constant_time_gap": "a constant time gap", "intelligent_driver": "the Intelligent Driver Model"}
+_SPOKEN = {"constant_time_gap": "a constant time gap", "intelligent_driver": "the Intelligent Driver Model"}
 
 
 def loop_lines(found: FollowerDiagnosis) -> list[str]:
@@ -16,7 +16,7 @@ def loop_lines(found: FollowerDiagnosis) -> list[str]:
     rivals = [x for name, x in found.loops.items() if name not in (found.law.name, "without_delay")]
     other = f" (the other law: {rivals[0].speed:.2g} m/s)" if rivals else ""
     return [
-        f"Held to {LAWS[found.law.name]}: headway {_told(q['headway_s'], ' s')} at {usual.speed:.0f} m/s, "
+        f"Held to {_SPOKEN[found.law.name]}: headway {_told(q['headway_s'], ' s')} at {usual.speed:.0f} m/s, "
         f"lag with delay {_told(q['lag_with_delay_s'], ' s')}.",
         f"P(string stable) is {usual.p_string_stable:.2f} at {usual.speed:.0f} m/s{peak}. Over a minute the car's "
         f"speed spread {own.amplified:.2f} times as much as its leader's; {own.amplified_simulated:.2f} times in the "

@@ -35,35 +35,40 @@ def read_following(
     NGSIM (``event``, default: the longest), or any log with ``speed``, ``spacing`` and ``lead_speed``.
 
     Recordings are cut to the longest stretch in which all three are known and the leader stays the same; ``remarks``
-    says so. Raises InputError for a
-    vehicle or event that is not there or follows nobody, for a gap that is not the speeds', and as ``Log.read`` does.
+    says so. ``map``, ``unit``, ``stamp``: of a log, as ``Log.read`` has them; a recording's form tells its own. Raises
+    InputError for a vehicle or event that is not there or follows nobody, for a gap that is not the speeds', for an
+    option without a meaning, and as ``Log.read`` does.
     """
     table = read_table(path, header="Time")
     names = set(table.names)
+    columns: dict[str, object] = {"map": map or None, "unit": unit or None, "stamp": stamp or None}
     if any(n.startswith("SpeedDoppler") for n in names):
+        _idle(table.source, event=event, **columns)
         numbers = openacc.numbered("SpeedDoppler", names)
         own = _chosen(table.source, vehicle, [n for n in numbers if n - 1 in numbers and f"Spacing{n}" in names])
         return _log(table, f"SpeedDoppler{own}", f"Spacing{own}", f"SpeedDoppler{own - 1}", f"vehicle {own}")
     if "Time" in names and openacc.numbered("Speed", names):
+        _idle(table.source, event=event, **columns)
         numbers = openacc.numbered("Speed", names)
         own = _chosen(table.source, vehicle, [n for n in numbers if n - 1 in numbers and f"IVS{n - 1}" in names])
         makes = openacc.vehicle_order(Path(path))
         make = f" ({makes[own - 1]})" if own <= len(makes) else ""
         return _log(table, f"Speed{own}", f"IVS{own - 1}", f"Speed{own - 1}", f"vehicle {own}{make}")
     if {"Time", "Velocity", "SpaceGap", "RelativeVelocity"} <= names:
-        _idle(table.source, vehicle=vehicle, event=event)
+        _idle(table.source, vehicle=vehicle, event=event, **columns)
         return _instrumented(table)
     if {"event", "time", "spacing", "speed", "lead_speed"} <= names:
-        _idle(table.source, vehicle=vehicle)
+        _idle(table.source, vehicle=vehicle, **columns)
         return _event(table, event)
     _idle(table.source, vehicle=vehicle, event=event)
     return Log.read(path, map=map, unit=unit, stamp=stamp, following=True)
 
 
-def _idle(source: str, **given: int | None) -> None:
+def _idle(source: str, **given: object) -> None:
     for option, value in given.items():
         if value is not None:
-            raise InputError(f"{source}: {option} {value} has no meaning for a file of this form")
+            told = f"{option} {value}" if isinstance(value, int) else option
+            raise InputError(f"{source}: {told} has no meaning for a file of this form")
 
 
 def _chosen(source: str, vehicle: int | None, followers: list[int]) -> int:

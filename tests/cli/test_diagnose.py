@@ -18,6 +18,7 @@ from rich.console import Console
 
 from avtorch.cli import main
 from avtorch.cli.diagnosis_table import bar, diagnosis_headline, diagnosis_notes, diagnosis_table
+from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, DeadTime, GapPlant, plant
 from avtorch.gap.answer.diagnosis import Candidate, Diagnosis, GapFacts, LogFacts, Quantity, near, verdict_of
 from avtorch.io import Log
@@ -305,6 +306,7 @@ def test_a_note_that_cannot_be_read(
         (["--posterior", "nuts"], "--posterior"),
         (["--unit", "speed=furlong"], "furlong"),
         (["--map", "speed=NOPE"], "NOPE"),
+        (["--speed-min", "20", "--road", "150"], "--road, --seconds: found limits that no manoeuvre"),
     ],
 )
 def test_bad_arguments(
@@ -312,6 +314,21 @@ def test_bad_arguments(
 ) -> None:
     refused(["diagnose", drive, *options], fault, tmp_path, capsys)
     assert not search.calls
+
+
+def test_a_manoeuvre_that_cannot_be_had_costs_no_answer(
+    search: Search, drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuses(*_: object, **__: object) -> None:
+        raise InputError("limits: no manoeuvre of the library keeps to them")
+
+    monkeypatch.setattr("avtorch.experiment.next_experiment", refuses)
+    assert main(["diagnose", drive, "--out", str(tmp_path / "out")]) == 0
+    answer = json.loads((tmp_path / "out" / "diagnosis.json").read_text(encoding="utf-8"))
+    assert answer["next_experiment"] is None
+    told = "No next experiment: limits: no manoeuvre of the library keeps to them."
+    assert told in answer["notes"]
+    assert told in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,8 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_answer_and_page(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
+    out.mkdir()
+    (out / "manoeuvre.csv").write_text("of an earlier diagnosis\n", encoding="utf-8")
     assert main(["diagnose", str(log), "--follower", "--effects", "aerodynamic_drag", "--out", str(out)]) == 0
     answer = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
     assert answer["schema"] == "avtorch.diagnosis/1"
@@ -29,6 +31,7 @@ def test_answer_and_page(log: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "headway" in said
     assert "P(string stable)" in said
     assert "conditional on the law" in " ".join(said.split())
+    assert not (out / "manoeuvre.csv").exists()
     assert "The loop" in (out / "report.html").read_text(encoding="utf-8")
 
 
@@ -37,6 +40,12 @@ def test_answer_and_page(log: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     [
         (["--follower", "--budget", "5"], "--budget: has no meaning with --follower"),
         (["--follower", "--vehicle", "2"], "vehicle 2 has no meaning"),
+        (["--follower", "--event", "2"], "event 2 has no meaning"),
+        (["--follower", "--no-pairs"], "--no-pairs: has no meaning with --follower"),
+        (["--follower", "--accel-kind", "specific-force"], "--accel-kind: has no meaning with --follower"),
+        (["--follower", "--posterior", "laplace"], "--posterior: has no meaning with --follower"),
+        (["--follower", "--road", "500"], "--road: has no meaning with --follower"),
+        (["--event", "2"], "--event: has a meaning with --follower only"),
         (["--vehicle", "2"], "--vehicle: has a meaning with --follower only"),
         ([], "`--follower` diagnoses"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from avtorch.errors import InputError
 from avtorch.follower import LAWS, FollowerDiagnosis, Seen, diagnose_follower, loop_errors, loop_stability
 from avtorch.follower.followed import followed
 from avtorch.follower.identify import identified, widened
+from avtorch.io import Log
 from avtorch.vehicle.stability import local_stable, peak_gain, string_stable
 from tests.follower.loops import CTG, DELAY, DT, IDM, T_L, followed_log
 
@@ -120,3 +122,35 @@ def test_a_short_drive_is_refused() -> None:
     log = followed_log("constant_time_gap", CTG, seconds=30, rng=np.random.default_rng(0))
     with pytest.raises(InputError, match="needs 40 s or more"):
         diagnose_follower(log)
+
+
+def test_drives_that_begin_their_time_anew_keep_their_own_rows(
+    rotating_seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    each = [followed_log("constant_time_gap", CTG, seconds=s, rng=rng) for s in (2.0, 50.0, 70.0)]
+    columns = {n: np.concatenate([getattr(x, n) for x in each]) for n in ("time", "speed", "spacing", "lead_speed")}
+    rows = [x.rows for x in each]
+    whole = replace(each[0], segment=np.repeat([0, 1, 2], rows), engaged=np.ones(sum(rows), bool), **columns)
+    candidate = followed(whole, LAWS["constant_time_gap"])
+    # the first is too short to be a drive
+    assert candidate.begins == (rows[0], rows[0] + rows[1])
+    for seen, log in zip(candidate.seen, each[1:], strict=True):
+        np.testing.assert_array_equal(seen.spacing.numpy(), log.spacing)
+
+    given: list[Log] = []
+
+    def only_look(log: Log, **_: object) -> None:
+        given.append(log)
+
+    monkeypatch.setattr(sys.modules[diagnose_follower.__module__], "diagnose", only_look)
+    found = diagnose_follower(whole, law="constant_time_gap")
+    (late,) = given
+    # half of the rows that count, all in the last drive; the first two seconds of a drive do not count
+    assert late.rows == (rows[1] + rows[2] - 40) // 2
+    np.testing.assert_array_equal(late.spacing, whole.spacing[-late.rows :])
+    own = {k.removeprefix("law."): torch.tensor(v) for k, v in found.identified.values.items() if k.startswith("law.")}
+    seen = Seen(*(torch.as_tensor(getattr(each[2], n)[-late.rows :]) for n in Seen._fields))
+    foretold = LAWS["constant_time_gap"].command(own, seen).numpy()
+    # by the half that came first, hence not the same to a hair; another drive's commands would be off by their size
+    assert np.std(late.accel_cmd - foretold) < 0.3 * np.std(foretold)

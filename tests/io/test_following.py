@@ -59,6 +59,14 @@ def test_other_vehicles_are_refused(tmp_path: Path) -> None:
         read_following(path, vehicle=1)
 
 
+def test_a_recording_tells_its_own_columns(tmp_path: Path) -> None:
+    path = platoon(tmp_path / "p.csv")
+    with pytest.raises(InputError, match=r"p\.csv: unit has no meaning for a file of this form"):
+        read_following(path, vehicle=3, unit={"speed": "km/h"})
+    with pytest.raises(InputError, match="event 1 has no meaning"):
+        read_following(path, vehicle=3, event=1)
+
+
 def test_a_plain_log_has_no_vehicles(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     rows = "\n".join(f"{0.1 * k:.1f},20,{25 + 0.01 * k},20.1" for k in range(50))

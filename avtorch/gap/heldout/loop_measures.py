@@ -41,7 +41,7 @@ class LoopMeasure:
     time_gap: float = 1.0
     gains: Sequence[float] = NOMINAL_GAINS
 
-    horizon_s = float("inf")
+    horizon_s = float("inf")  # nothing is restarted on the way, as with the measure over the whole drive
 
     @property
     def name(self) -> str:

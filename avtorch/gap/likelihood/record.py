@@ -8,7 +8,7 @@ command of the next, and means alone would take that for a lag. Rows at standsti
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -99,11 +99,8 @@ class Record:
         for log in each:
             if log.accel_cmd is None:
                 raise InputError(f"{log.name}: has no accel_cmd, which the diagnosis needs")
-            for part in log.segments():
-                rows = (part.stop - part.start) // group
-                if rows < 2 * RATE_HZ:
-                    continue
-                cut = slice(part.start, part.start + rows * group)
+            for cut in rolled(log, group):
+                rows = (cut.stop - cut.start) // group
 
                 def mean(x: Float, cut: slice = cut, rows: int = rows) -> Float:
                     return x[cut].reshape(rows, group).mean(1)
@@ -204,6 +201,14 @@ class Record:
     def measured(self) -> Float:
         """What the witnesses saw, (witness, counted, group)."""
         return np.stack([x[self.source] for x in (self.accel, self.speed) if x is not None])
+
+
+def rolled(log: Log, group: int) -> Iterator[slice]:
+    """The rows of `log` that become a drive each: its segments of 40 groups or more, whole groups of them."""
+    for part in log.segments():
+        rows = (part.stop - part.start) // group
+        if rows >= 2 * RATE_HZ:
+            yield slice(part.start, part.start + rows * group)
 
 
 def _drive(time: Float, command: Float, speed: Float | None, accel0: float | None, specific: bool) -> Drive:
