@@ -24,6 +24,7 @@ from avtorch.blindtest.visibility import TIERS, Sight, oracles, sight, tier_of
 from avtorch.errors import InputError
 
 _ATTEMPTS = 10
+SIGNALS = ("accel", "speed")
 _PAIR_EXCESS = (1.25, 8.0)
 """Each effect of a pair, alone on the drive, shows between these: plainly enough that two can be asked for."""
 _TOP_SPEED_MPS = 44.0
@@ -40,14 +41,16 @@ def draw_cases(
     outside: Literal["sealed", "calibration"] = "sealed",
     seconds: float | None = None,
     manoeuvre: str | None = None,
+    signals: Sequence[str] = SIGNALS,
 ) -> Iterator[Case]:
     """Cases `start` to `start + n - 1` of the set `seed`, one after another.
 
     Args: `mix`: shares of the kinds (default 25 % none, 40 % single, 20 % pair, 15 % outside), kept in every 20
     cases. `tiers` and `effects`: single cases run through all their combinations in random order; causes outside are
     drawn from all `tiers`. `outside`: which of the two groups of families outside the table. `seconds`, `manoeuvre`:
-    instead of drawing them. A cause that cannot show as asked on the drive drawn gets another drive, and after ten
-    the plainest of these stands, in the tier it has.
+    instead of drawing them. `signals`: the witnesses that the logs are to have, in which a cause must show. A cause
+    that cannot show as asked on the drive drawn gets another drive; one that showed in none of ten gives way to another
+    cause, or else its plainest drive stands, in the tier it has.
 
     Raises `InputError` for unknown kinds, tiers or effects.
     """
@@ -61,6 +64,7 @@ def draw_cases(
             outside=outside,
             seconds=seconds,
             manoeuvre=manoeuvre,
+            signals=signals,
         )
 
 
@@ -74,6 +78,7 @@ def draw_case(
     outside: Literal["sealed", "calibration"] = "sealed",
     seconds: float | None = None,
     manoeuvre: str | None = None,
+    signals: Sequence[str] = SIGNALS,
 ) -> Case:
     """One case; arguments as `draw_cases`."""
     if set(tiers) - TIERS.keys() or not tiers:
@@ -91,7 +96,7 @@ def draw_case(
             # at first the cause that is due; one that showed in none of ten drives gives way to any other
             due = count if attempt == 0 else int(rng.integers(2**31))
             families, tier = _causes(kind, due, seed, rng, effects, tiers, group)
-        case = _attempt(index, seed, kind, families, tier, rng, seconds, manoeuvre)
+        case = _attempt(index, seed, kind, families, tier, rng, seconds, manoeuvre, signals)
         if case is None:
             continue
         if kind in ("none", "pair") or case.tier == tier:
@@ -137,6 +142,7 @@ def _attempt(
     rng: np.random.Generator,
     seconds: float | None,
     manoeuvre: str | None,
+    signals: Sequence[str],
 ) -> Case | None:
     """A case on a drive drawn anew; None where the drive is no drive, or one of a pair cannot show on it."""
     car, drive = draw_car(rng), draw_drive(rng, seconds=seconds, manoeuvre=manoeuvre)
@@ -157,7 +163,7 @@ def _attempt(
         run = simulate(
             car, pilots[-1], seconds=drive.seconds, rate_hz=drive.rate_hz, effects=effects, onset=onset, seed=noise
         )
-        return run, sight(run)
+        return run, sight(run, signals)
 
     def alone(f: Family) -> tuple[Parameters, Run, Sight] | None:
         """The effect by itself, as strong as it takes."""

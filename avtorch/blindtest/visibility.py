@@ -7,17 +7,17 @@ noise itself, both RMS over the rows that move (speed of 0.3 m/s or more), the v
 
     sqrt(n² + e²) / n
 
-the rollout error of the refitted GLVD over the error it would have if the cause were not there; the larger of the
-witnesses' two values counts. Drawn by chance (`gust`, `outliers`, `command_hold`), `e` is no less there, but no
-rollout of any model takes it away: for these the number says how much the predictive density loses, exp(loss of the
-mean log density of a Gaussian error whose size is refitted), which is the same ratio.
+the rollout error of the refitted GLVD over the error it would have if the cause were not there; the larger of the two
+values counts, of those that are in the log. Drawn by chance (`gust`, `outliers`, `command_hold`), `e` is no less there,
+but no rollout of any model takes it away: for these the number says how much the predictive density loses, exp(loss of
+the mean log density of a Gaussian error whose size is refitted), which is the same ratio.
 
 Tiers: easy from 3 on, medium 1.6 to 3, hard 1.15 to 1.6, faint 1.02 to 1.15; below 1.02 there is no tier (None).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +49,8 @@ def glvd_response(command: Float, dt: float, T_L: float, K_L: float) -> Float:
 
 @dataclass(frozen=True)
 class Sight:
-    """What a drive shows. `accel`, `speed`: visibility in one witness; `T_L`, `K_L`: GLVD refitted to the drive."""
+    """What a drive shows. `accel`, `speed`: visibility in one witness, 1 in one that is not logged; `T_L`, `K_L`: GLVD
+    refitted to the drive."""
 
     accel: float
     speed: float
@@ -111,8 +112,8 @@ def exact_gain(command: Float, dt: float, T_L: float) -> tuple[Float, Float]:
     return accel, speed
 
 
-def sight(run: Run) -> Sight:
-    """How plainly the drive differs from any GLVD; see the head of this file for what is measured."""
+def sight(run: Run, signals: Sequence[str] = ("accel", "speed")) -> Sight:
+    """How plainly the drive differs from any GLVD in the witnesses `signals`; the head of this file says how."""
     witness = _Witnesses(run)
     dt = float(run.time[1] - run.time[0])
     accel = run.accel - run.noise_accel
@@ -123,12 +124,13 @@ def sight(run: Run) -> Sight:
     def fit(log_lag: float) -> tuple[float, float, float, float]:
         unit_a, unit_v = exact_gain(run.command, dt, float(np.exp(log_lag)))
         unit_v = witness.since_start(unit_v)
-        weigh_a, weigh_v = witness.moving / noise_a**2, witness.inside / noise_v**2
+        weigh_a = ("accel" in signals) * witness.moving / noise_a**2
+        weigh_v = ("speed" in signals) * witness.inside / noise_v**2
         top = float(np.sum(weigh_a * unit_a * accel) + np.sum(weigh_v * unit_v * speed))
         bottom = float(np.sum(weigh_a * unit_a**2) + np.sum(weigh_v * unit_v**2))
         gain = max(top / bottom, 0.0) if bottom > 0 else 1.0
-        e_a = witness.rms_accel(accel - gain * unit_a) / noise_a
-        e_v = witness.rms_speed(speed - gain * unit_v) / noise_v
+        e_a = ("accel" in signals) * witness.rms_accel(accel - gain * unit_a) / noise_a
+        e_v = ("speed" in signals) * witness.rms_speed(speed - gain * unit_v) / noise_v
         return e_a**2 + e_v**2, e_a, e_v, gain
 
     grid = np.linspace(np.log(_LAGS_S[0]), np.log(_LAGS_S[1]), 13)

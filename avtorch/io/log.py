@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +18,7 @@ from avtorch.io.assemble import assemble
 from avtorch.io.atomic import atomic
 from avtorch.io.mapping import SIGNALS, Pairs, SignalMap, pairs, read_mapping
 from avtorch.io.segments import median_step, stretches
+from avtorch.io.standstill import standing
 from avtorch.io.tables import Table, read_table
 from avtorch.io.validity import check_units
 
@@ -155,10 +157,19 @@ class Log:
         """Rows per second, by the median step inside segments."""
         return 1 / median_step(self.time, np.diff(self.segment) == 0)
 
-    @property
+    @cached_property
     def moving(self) -> NDArray[np.bool_]:
-        """Rows not at standstill, ``(time,)``; all of them where the log has no speed."""
-        return np.ones(self.rows, bool) if self.speed is None else self.speed >= STANDSTILL_MPS
+        """Rows not at standstill, ``(time,)``; without speed as the answer to the brake tells (``standing``)."""
+        if self.speed is not None:
+            return self.speed >= STANDSTILL_MPS
+        moving = np.ones(self.rows, bool)
+        if self.accel is None or self.accel_cmd is None:
+            return moving
+        for part in self.segments():
+            if part.stop - part.start > 1:
+                step = float(np.median(np.diff(self.time[part])))
+                moving[part] = ~standing(self.accel_cmd[part], self.accel[part], step, STANDSTILL_MPS)
+        return moving
 
     @property
     def usable(self) -> NDArray[np.bool_]:

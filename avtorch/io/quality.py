@@ -31,7 +31,7 @@ class Quality:
 
     ``jitter``: 95 % point of the deviation of a step from the median one, as its share [-]; ``late_rows``: steps over
     1.5 median ones that are no gap; ``masked_rows``: rows not usable, of which ``driver_rows`` not engaged and
-    ``standstill_rows`` below 0.3 m/s; ``notes``: all of it in sentences, worth telling a person.
+    ``standstill_rows`` below 0.3 m/s or, without speed, taken for it; ``notes``: all of it in sentences.
     """
 
     rows: int
@@ -90,7 +90,8 @@ def check(log: Log) -> Quality:
     if driver:
         notes.append(f"{driver} rows masked: not engaged")
     if still:
-        notes.append(f"{still} rows masked: standstill (below 0.3 m/s)")
+        how = "below 0.3 m/s" if log.speed is not None else "braked, yet not slowing"
+        notes.append(f"{still} rows masked: standstill ({how})")
     if masked == log.rows:
         notes.append("no row is left to learn from")
     notes.extend(f"{name} is constant ({present[name][0]:.6g}): it excites nothing" for name in constant)
@@ -112,7 +113,7 @@ def _says_missing(missing: tuple[str, ...]) -> list[str]:
     said = {
         "accel_cmd": "no accel_cmd: what is said of the actuator is conditional on an assumed controller",
         "accel": "no accel: speed is the only witness, so sensor faults and real forces cannot be told apart",
-        "speed": "no speed: accel is the only witness, standstill is not masked, and sensor faults look like forces",
+        "speed": "no speed: accel is the only witness, short stops stay unseen, and sensor faults look like forces",
     }
     return [said[name] for name in missing]
 

@@ -43,7 +43,7 @@ def work(task: Task) -> int:
     folder = TrialFolder(task.root)
     log = folder.kept_log(task.index, task.signals)
     if log is None:
-        case = draw_case(task.index, task.seed, **task.options)
+        case = draw_case(task.index, task.seed, signals=task.signals, **task.options)
         if task.keep_logs:
             case.log().write(folder.log_path(task.index))
         folder.keep_truth(case)

@@ -117,6 +117,13 @@ def test_tier_on_request(tier: str) -> None:
         draw_case(0, 1, tiers=("loud",))
 
 
+def test_a_cause_shows_in_the_witnesses_that_are_logged() -> None:
+    some = ("sensor_bias", "outliers", "backlash")
+    for case in draw_cases(3, 1, mix={"single": 1.0}, effects=some, seconds=60.0, signals=("speed",)):
+        assert case.names == ("backlash",)
+        assert case.tier is not None
+
+
 def test_calibration_families_on_request() -> None:
     made = list(draw_cases(3, 1, mix={"outside": 1.0}, outside="calibration", seconds=60.0))
     assert all(case.names[0] in CALIBRATION for case in made)

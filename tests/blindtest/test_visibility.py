@@ -81,3 +81,11 @@ def test_strength_is_found_in_few_trials(power: float, tier: str) -> None:
     assert found is not None
     assert low <= 2 * found**power < high
     assert solve(trial, 1.0, 0.9, 1.1, begin=1.0, strongest=1e-3) is None
+
+
+def test_only_what_is_logged_is_seen() -> None:
+    made = run({"sensor_bias": {"bias_mps2": 0.3}})
+    assert sight(made, ["speed"]).most == pytest.approx(1.0, abs=1e-3)
+    assert pytest.approx(0.9, rel=1e-3) == sight(made, ["speed"]).K_L
+    assert sight(made, ["accel"]).most == pytest.approx(sight(made).most, rel=0.05)
+    assert sight(made, ["accel"]).speed == 1.0
