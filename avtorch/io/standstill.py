@@ -52,7 +52,7 @@ def _braked_at_rest(accel_cmd: Float, accel: Float, dt: float) -> NDArray[np.boo
     answers = (braked > _LATEST_S / dt) & (felt < 0.4 * asked)
     answered = rows - np.maximum.accumulate(np.where(answers, rows, -len(rows))) < braked
     rests = brakes & (np.abs(felt) < -_ANSWERED * asked) & ((braked > _SLOWEST_S / dt) | answered)
-    return np.asarray(minimum_filter1d(rests, max(round(_REST_S / dt), 1), mode="nearest"))
+    return minimum_filter1d(rests, max(round(_REST_S / dt), 1), mode="nearest").astype(bool)
 
 
 def _trailing_max(x: Float, width: int) -> Float:

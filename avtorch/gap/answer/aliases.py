@@ -158,7 +158,7 @@ class Told:
         return out
 
     def alias_set(self, candidates: Sequence[Candidate]) -> tuple[str, ...]:
-        """The fewest candidates that hold 95 %, and whatever cannot be told from the most probable of them.
+        """The candidates `near` the most probable one, and whatever cannot be told from that one.
 
         Exact aliases, and forces that were not judged (`lookalikes`), have their place there whatever their
         probability.

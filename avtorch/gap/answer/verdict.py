@@ -108,16 +108,22 @@ class Verdict:
         }
 
 
-ALIAS_RATIO = 0.1
+ALIAS_RATIO = 0.03
 """Candidates at least this probable, in units of the most probable one, are not told apart from it."""
+UNKNOWN_RATIO = 0.5
+"""The same for `unknown`. It foretells nothing, so no log ever rules it out: below this it is a doubt, no rival."""
 
 
-def near(ratio: float) -> Callable[[Sequence[Candidate]], tuple[str, ...]]:
-    """An alias set by probability: all candidates at least `ratio` as probable as the first, that one in front."""
+def near(ratio: float, unknown: float = UNKNOWN_RATIO) -> Callable[[Sequence[Candidate]], tuple[str, ...]]:
+    """An alias set by probability: all candidates at least `ratio` as probable as the first, that one in front.
+
+    For `unknown` it takes the ratio `unknown`.
+    """
 
     def aliases(candidates: Sequence[Candidate]) -> tuple[str, ...]:
         ranked = sorted(candidates, key=lambda c: -c.probability)
-        return tuple(c.name for c in ranked if c.probability >= ratio * ranked[0].probability)
+        first = ranked[0].probability
+        return tuple(c.name for c in ranked if c.probability >= (unknown if c.name == "unknown" else ratio) * first)
 
     return aliases
 

@@ -178,14 +178,18 @@ def test_a_pair_has_one_name() -> None:
 
 
 def test_verdict_is_the_most_probable_with_its_aliases() -> None:
-    given = candidates(sensor_lag=0.3, dead_time=0.66, none=0.03, unknown=0.01)
+    given = candidates(sensor_lag=0.3, dead_time=0.63, none=0.01, unknown=0.06)
     verdict = verdict_of(given)
     assert (verdict.names, verdict.alias_set, verdict.abstained) == (("dead_time",), ("dead_time", "sensor_lag"), False)
     assert verdict.why == (
-        "dead_time explains the log 7 nats better than none and has probability 0.66; "
+        "dead_time explains the log 6 nats better than none and has probability 0.63; "
         "next is sensor_lag with probability 0.3."
     )
     assert verdict_of(given, aliases=near(0.6)).alias_set == ("dead_time",)
+    # what foretells nothing is a rival only where it is about as probable
+    assert verdict_of(given, aliases=near(0.6, unknown=0.05)).alias_set == ("dead_time", "unknown")
+    doubted = candidates(dead_time=0.6, none=0.05, unknown=0.35)
+    assert verdict_of(doubted).alias_set == ("dead_time", "unknown", "none")
     own = verdict_of(given, aliases=lambda ranked: ["gust+dead_time", "dead_time"], why="Because.")
     assert own.alias_set == ("dead_time", "dead_time+gust")
     assert own.why == "Because."
@@ -195,7 +199,7 @@ def test_verdict_is_the_most_probable_with_its_aliases() -> None:
 
 @pytest.mark.parametrize("name", ["none", "unknown"])
 def test_verdict_without_a_cause(name: str) -> None:
-    verdict = verdict_of(candidates(**{"dead_time": 0.04, "none": 0.0, "unknown": 0.0, name: 0.96}))
+    verdict = verdict_of(candidates(**{"dead_time": 0.02, "none": 0.0, "unknown": 0.0, name: 0.98}))
     assert verdict.names == verdict.alias_set == (name,)
     assert verdict.abstained == (name == "unknown")
     assert "next is dead_time" in verdict.why
