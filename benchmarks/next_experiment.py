@@ -4,8 +4,10 @@
 
 Draws sealed cases that followed a vehicle, diagnoses each, and where more than one named cause (or none at all) is
 left, drives the proposed manoeuvre with the same car and the same cause: an open loop, with noise and road of its own.
-Then both drives are diagnosed together. Separated is a case in which only the truth is left; the share comes with its
-90 % interval (Wilson). Cases where only `unknown` stood beside the verdict are counted apart.
+Then both drives are diagnosed together. Separated is a case in which only the truth is left, right one whose verdict is
+the truth; shares come with their 90 % intervals (Wilson). Cases where only `unknown` stood beside the verdict are
+counted apart, and so are those whose truth was among what was left: no manoeuvre parts a truth from causes that it is
+not held against.
 """
 
 from __future__ import annotations
@@ -90,12 +92,14 @@ def main() -> None:
         row = tried(case, Limits(seconds=60.0), seed=given.seed + case.index)
         rows.append(row)
         print(json.dumps(row), flush=True)
+    several = [r for r in rows if "after" in r and r["confused"]]
     for what, some in (
-        ("several named", [r for r in rows if "after" in r and r["confused"]]),
+        ("several named", several),
+        ("... the truth among them", [r for r in several if r["truth"] in r["before"]]),
         ("one named or none, and unknown", [r for r in rows if "after" in r and not r["confused"]]),
     ):
-        for key in ("separated", "kept"):
-            hits = sum(r[key] for r in some)
+        for key, of in (("right before", "before"), ("right", "after"), ("separated", ""), ("kept", "")):
+            hits = sum(r[of][0] == r["truth"] if of else r[key] for r in some)
             interval = wilson(hits, len(some))
             told = "" if interval is None else f" ({interval[0]:.2f} to {interval[1]:.2f})"
             print(f"{what}: {key} {hits} of {len(some)}{told}")

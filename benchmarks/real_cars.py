@@ -4,7 +4,8 @@
 
 Reads the OpenACC platoons in ``openacc_astazero`` and ``openacc_zalazone`` and prints a line a car. ``--cause`` also
 diagnoses the half of each drive that judges. ``--slope`` prints how much of the surveyed slope (AstaZero) each follower
-shows in its speed: the slope's coefficient in the identified loop, 1 for a car that does nothing against it.
+shows in its speed, the slope's coefficient in the identified loop, 1 for a car that does nothing against it; and how
+near a slope that is fitted without the survey comes to it. ``--only TEXT``: files with that in their path.
 """
 
 from __future__ import annotations
@@ -12,20 +13,24 @@ from __future__ import annotations
 import argparse
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from avtorch.errors import InputError
 from avtorch.follower import FollowerDiagnosis, diagnose_follower
+from avtorch.gap.effects import RoadGrade
+from avtorch.gap.effects.road_grade import GRAVITY
+from avtorch.gap.likelihood.fit import finish, modes
 from avtorch.gap.likelihood.whitener import Whitener
 from avtorch.io import Log, read_following
 from avtorch.io.openacc import numbered
-from avtorch.io.tables import Table, read_table
+from avtorch.io.tables import read_table
 
 LAP_M = 5757.9
-GRAVITY = 9.80665
 
 
 def cars(folder: Path) -> list[tuple[Path, int]]:
@@ -68,13 +73,12 @@ def row_of(found: FollowerDiagnosis, log: Log) -> dict[str, Any]:
     }
 
 
-def slope_coefficient(found: FollowerDiagnosis, log: Log, survey: Table, positions: np.ndarray) -> tuple[float, float]:
-    """How much of the surveyed slope acts on the car that is not met by its controller: mean and sd.
+def slope_coefficient(found: FollowerDiagnosis, log: Log, grade: np.ndarray) -> tuple[float, float]:
+    """How much of the surveyed ``grade`` (row,) [-] acts on the car that is not met by its controller: mean and sd.
 
     By regression of the loop's white errors on the white image of the slope's pull, law and plant held.
     """
-    where = np.mod(positions, LAP_M)
-    pull = -GRAVITY * np.interp(where, survey.numbers("X"), survey.numbers("Y"))
+    pull = -GRAVITY * grade
     record, one = found.identified.candidate.record, found.identified
     steps = np.diff(log.time)
     gained = np.concatenate([[0.0], np.cumsum(0.5 * steps * (pull[1:] + pull[:-1]))])
@@ -83,6 +87,33 @@ def slope_coefficient(found: FollowerDiagnosis, log: Log, survey: Table, positio
     left = white(one.errors(record)).ravel()
     square = float(image @ image)
     return float(image @ left) / square, square**-0.5
+
+
+def slope_recovered(found: FollowerDiagnosis, log: Log, grade: np.ndarray) -> dict[str, float]:
+    """A slope fitted together with law, lag and delay, held against the surveyed ``grade`` (row,) [-].
+
+    ``correlation``; ``rmse`` [-] about both means; ``zero``: the same of no slope at all.
+    """
+    own = found.identified.candidate
+    candidate = replace(own, effects=(*own.effects, RoadGrade))
+    white = Whitener(own.record, found.identified.noise)
+    z, _ = modes(candidate, white, found.identified.z[None])
+    profile = finish(candidate, white, z[0]).profile
+    assert profile is not None
+    told, true, first = [], [], 0
+    for drive, begin in zip(own.record.drives, own.begins, strict=True):
+        assert drive.position is not None
+        road = RoadGrade().prepared(drive.time, drive.speed, drive.position)
+        force = road.force(drive.position, torch.as_tensor(profile[first : first + road.knots]))
+        told.append(-force.numpy() / GRAVITY)
+        true.append(grade[begin : begin + len(drive.time)])
+        first += road.knots
+    a, b = (x - x.mean() for x in (np.concatenate(told), np.concatenate(true)))
+    return {
+        "correlation": float(np.corrcoef(a, b)[0, 1]),
+        "rmse": float(np.sqrt(np.mean((a - b) ** 2))),
+        "zero": float(np.sqrt(np.mean(b**2))),
+    }
 
 
 def main() -> None:
@@ -108,7 +139,10 @@ def main() -> None:
             table = read_table(path, header="Time")
             keep = np.isin(table.numbers("Time"), log.time)
             survey = read_table(path.parent / "Slope.csv")
-            row["slope"] = slope_coefficient(found, log, survey, table.numbers(f"X{number}")[keep])
+            positions = table.numbers(f"X{number}")[keep]
+            grade = np.interp(np.mod(positions, LAP_M), survey.numbers("X"), survey.numbers("Y"))
+            row["slope"] = slope_coefficient(found, log, grade)
+            row["slope_recovered"] = slope_recovered(found, log, grade)
         rows.append(row)
         print(json.dumps(row), flush=True)
     if given.json:

@@ -13,8 +13,6 @@
 import os
 from pathlib import Path
 
-import numpy as np
-
 import avtorch
 from avtorch.errors import InputError
 from avtorch.follower import diagnose_follower
@@ -71,13 +69,21 @@ figure
 if DATA is not None:
     try:
         laps = [Log.read(DATA / "genesis" / f"lap{k}.csv") for k in (1, 2, 3)]
-        told = avtorch.diagnose(laps, effects=["dead_time", "second_order_actuator"], pairs=False)
+        among = ["brake_throttle_asymmetry", "constant_resistance", "dead_time", "second_order_actuator"]
+        as_it_is = avtorch.diagnose(laps, effects=among, pairs=False)
+        told = avtorch.diagnose(laps, effects=among, pairs=False, prior={"unknown": 0})
     except InputError as error:
         print(error)
     else:
-        print(
-            told.verdict.name, f"{told.winner.probability:.2f}", {k: f"{q.mean:.2f}" for k, q in told.baseline.items()}
-        )
+        print("as it is:", as_it_is.verdict.name, f"{as_it_is.winner.probability:.2f}")
+        print("if it must be one of these:", told.verdict.name, f"{told.winner.probability:.2f}")
         if told.shrinkage is not None:
-            closed = told.shrinkage.top.closed
-            print(told.shrinkage.metric, "closed:", "nothing to close" if closed is None else np.round(closed.mean, 2))
+            for metric, moved in told.shrinkage.by_metric.items():
+                share = "nothing to close" if moved.closed is None else f"{moved.closed.mean:.2f}"
+                between = "" if moved.closed is None else f" ({moved.closed.q05:.2f} to {moved.closed.q95:.2f})"
+                print(f"{metric}: {moved.before:.3g} -> {moved.after:.3g}, closed {share}{between}")
+
+# %% [markdown]
+# The measured speed trembles at 8 to 20 Hz as no effect of the table makes it, so the honest answer is `unknown`. Made
+# to choose, the diagnosis takes brakes that are stronger than the engine. On the lap that was held out this makes the
+# speed a little better, and the intervals say that three minutes cannot show it.
