@@ -1,8 +1,9 @@
-"""Where a car stands, told by a log that has no speed: braked, yet not slowing.
+"""Where a car stands, told by a log that has no speed.
 
-A stop shows itself by a brake command, held for longer than any car takes to answer, to which nothing more happens.
-From there the acceleration is integrated both ways, its reading at rest taken as zero, up to the speed at which GLVD
-holds again. A stop that asks for less braking than `_BRAKED_MPS2`, or one shorter than a second, is not seen.
+A stop shows itself in two ways: a brake command, held for longer than any car takes to answer, to which nothing
+happens; and a deceleration that ends at once while the brake stays on, faster than any actuator lets go. From there the
+acceleration is integrated both ways, its reading at rest taken as zero, up to the speed at which GLVD holds again. What
+slows down on the way did not stand. A stop that asks for hardly any braking is not seen.
 """
 
 from __future__ import annotations
@@ -12,53 +13,86 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 Float = NDArray[np.float64]
+Rows = NDArray[np.bool_]
 
 _BRAKED_MPS2 = -0.5  # more than a dead band hides or a hill of 5 % takes
-_ANSWERED = 0.15  # of the command, by the weakest of cars
+_RESTS = 0.15  # of the demand at most is felt
 _SLOWEST_S = 2.0  # dead time and lag of a car slower than any
-_LATEST_S = 0.9  # dead time alone
-_FELT_S = 0.3
+_FELT_S = 0.3  # over which a reading is averaged
 _REST_S = 0.5
+_SLOWED_MPS2 = -0.25  # a deceleration, and no noise
+_STILL_BRAKED_MPS2 = -0.3
+_SINCE_S = 1.0  # for which the brake has not been eased where a deceleration ends by itself
+_EASED_MPS2 = 0.2
 
 
-def standing(accel_cmd: Float, accel: Float, dt: float, below: float) -> NDArray[np.bool_]:
+def standing(accel_cmd: Float, accel: Float, dt: float, below: float) -> Rows:
     """Rows (time,) of one drive, `dt` [s] apart, in which the car is slower than `below` [m/s].
 
     `accel_cmd`, `accel` (time,) [m/s²].
     """
-    core = _braked_at_rest(accel_cmd, accel, dt)
+    out = np.zeros(len(accel), bool)
+    core = _braked_at_rest(accel_cmd, accel, dt) | _halted(accel_cmd, accel, dt)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], core.astype(int), [0]])))
-    begins, ends = edges[::2], edges[1::2]
-    out = core.copy()
-    for i, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
+    begins, ends = edges[::2].tolist(), edges[1::2].tolist()
+    felt = _felt(accel, dt)
+    for before, begin, end, after in zip([0, *ends], begins, ends, [*begins[1:], len(accel)], strict=False):
         rest = float(accel[begin:end].mean())
-        before = slice(0 if i == 0 else int(ends[i - 1]), begin)
-        after = slice(end, len(accel) if i + 1 == len(begins) else int(begins[i + 1]))
-        stays = _slow(accel[after] - rest, dt, below)
-        out[end : end + stays] = True
-        stays = _slow(rest - accel[before][::-1], dt, below)
-        out[begin - stays : begin] = True
+        last = end + _slow(accel[end:after] - rest, dt, below)
+        if (felt[end:last] < rest + _SLOWED_MPS2).any():
+            continue
+        out[begin - _slow(rest - accel[before:begin][::-1], dt, below) : last] = True
     return out
 
 
-def _braked_at_rest(accel_cmd: Float, accel: Float, dt: float) -> NDArray[np.bool_]:
-    """Braked for longer than the slowest car takes to answer; or braked, answered, and at rest again all the same."""
+def _braked_at_rest(accel_cmd: Float, accel: Float, dt: float) -> Rows:
+    """Braked for longer than the slowest car takes to answer, and at rest."""
     brakes = accel_cmd < _BRAKED_MPS2
     rows = np.arange(len(brakes))
-    braked = rows - np.maximum.accumulate(np.where(brakes, -1, rows))  # rows since the brake is on
-    felt = uniform_filter1d(accel, max(round(_FELT_S / dt), 1), mode="nearest")
+    braked = rows - np.maximum.accumulate(np.where(brakes, -1, rows))
     # the weakest demand that the car may still be answering to
-    asked = _trailing_max(np.where(brakes, accel_cmd, -np.inf), round(_SLOWEST_S / dt))
-    answers = (braked > _LATEST_S / dt) & (felt < 0.4 * asked)
-    answered = rows - np.maximum.accumulate(np.where(answers, rows, -len(rows))) < braked
-    rests = brakes & (np.abs(felt) < -_ANSWERED * asked) & ((braked > _SLOWEST_S / dt) | answered)
-    return minimum_filter1d(rests, max(round(_REST_S / dt), 1), mode="nearest").astype(bool)
+    asked = _latest_max(np.where(brakes, accel_cmd, -np.inf), _count(_SLOWEST_S, dt))
+    rests = (braked > _SLOWEST_S / dt) & (np.abs(_felt(accel, dt)) < -_RESTS * asked)
+    return minimum_filter1d(rests, _count(_REST_S, dt), mode="nearest").astype(bool)
 
 
-def _trailing_max(x: Float, width: int) -> Float:
+def _halted(accel_cmd: Float, accel: Float, dt: float) -> Rows:
+    """The `_FELT_S` after a deceleration ended from one row to the next but one, the brake on and not eased."""
+    n, rows = _count(_FELT_S, dt), len(accel)
+    if rows < 2 * n + 3:
+        return np.zeros(rows, bool)
+    # means of the rows before each row, and of those that begin two rows later
+    sums = np.concatenate([[0.0], np.cumsum(accel)])
+    at = np.arange(n, rows - n - 1)
+    slowed, rests = (sums[at] - sums[at - n]) / n, (sums[at + 1 + n] - sums[at + 1]) / n
+    short = max(n // 3, 1)
+    late = (sums[at] - sums[at - short]) / short  # no sooner than in the last third
+    early = (sums[at + 1 + short] - sums[at + 1]) / short
+    since = _count(0.5 * _SINCE_S, dt)  # a rise is sought from up to as long before as it is looked back
+    eased = _latest_max(accel_cmd - _latest_min(accel_cmd, since), since) > _EASED_MPS2
+    ends = (slowed < _SLOWED_MPS2) & (late < 0.7 * slowed) & (early > 0.4 * slowed) & (np.abs(rests) < -0.25 * slowed)
+    found = np.zeros(rows, bool)
+    found[at + 1] = ends & ~eased[at + n] & (_latest_max(accel_cmd, n)[at + n] < _STILL_BRAKED_MPS2)
+    return _latest_max(found.astype(float), n - 1) > 0
+
+
+def _felt(accel: Float, dt: float) -> Float:
+    return np.asarray(uniform_filter1d(accel, _count(_FELT_S, dt), mode="nearest"))
+
+
+def _count(seconds: float, dt: float) -> int:
+    return max(round(seconds / dt), 1)
+
+
+def _latest_max(x: Float, width: int) -> Float:
     """The largest of each row and the `width` rows before it."""
-    padded = np.concatenate([np.full(2 * width, -np.inf), x])
-    return np.asarray(maximum_filter1d(padded, width + 1, origin=width // 2)[2 * width :])
+    padded = np.concatenate([np.full(2 * width + 1, -np.inf), x])
+    return np.asarray(maximum_filter1d(padded, width + 1, origin=width // 2)[2 * width + 1 :])
+
+
+def _latest_min(x: Float, width: int) -> Float:
+    """The smallest of each row and the `width` rows before it."""
+    return -_latest_max(-x, width)
 
 
 def _slow(accel: Float, dt: float, below: float) -> int:
