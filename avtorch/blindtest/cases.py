@@ -52,7 +52,7 @@ def draw_cases(
     that cannot show as asked on the drive drawn gets another drive; one that showed in none of ten gives way to another
     cause, or else its plainest drive stands, in the tier it has.
 
-    Raises `InputError` for unknown kinds, tiers or effects.
+    Raises `InputError` for unknown kinds, tiers, effects or signals.
     """
     for i in range(start, start + n):
         yield draw_case(
@@ -85,6 +85,8 @@ def draw_case(
         raise InputError(f"tiers: found {tuple(tiers)}, needs some of {', '.join(TIERS)}")
     if set(effects) - EFFECTS.keys() or not effects:
         raise InputError(f"effects: found {tuple(effects)}, needs some of {', '.join(EFFECTS)}")
+    if set(signals) - set(SIGNALS) or not signals:
+        raise InputError(f"signals: found {tuple(signals)}, needs accel, speed or both")
     kind, count = kind_of(index, seed, MIX if mix is None else mix)
     rng = np.random.default_rng([seed, index, 3])
     group = SEALED if outside == "sealed" else CALIBRATION

@@ -219,6 +219,7 @@ EFFECTS: dict[str, Family] = {
         Family("outliers", "sensor", _outliers, 6.0, by_chance=True),
     )
 }
+"""The 22 effects of the table, by name."""
 
 CALIBRATION: dict[str, Family] = {
     family.name: family
@@ -231,6 +232,7 @@ CALIBRATION: dict[str, Family] = {
         Family("wheel_slip", "sensor", _fixed(slip_s=0.15), 8.0),
     )
 }
+"""Families outside the table that may serve to calibrate `unknown`, by name."""
 
 SEALED: dict[str, Family] = {
     family.name: family
@@ -244,6 +246,7 @@ SEALED: dict[str, Family] = {
         Family("tyre_radius", "sensor", _fixed(growth=0.03), 5.0),
     )
 }
+"""Families outside the table that never do, by name."""
 
 
 def family(name: str) -> Family:

@@ -9,6 +9,7 @@ import numpy as np
 from avtorch.errors import InputError
 
 MIX: dict[str, float] = {"none": 0.25, "single": 0.40, "pair": 0.20, "outside": 0.15}
+"""Shares of the kinds of case."""
 _ROUND = 20
 
 

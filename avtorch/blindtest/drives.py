@@ -14,8 +14,11 @@ from avtorch.errors import InputError
 
 Manoeuvre = Literal["cruise", "following", "stop_and_go", "steps"]
 MANOEUVRES: tuple[Manoeuvre, ...] = get_args(Manoeuvre)
+"""Kinds of drive."""
 DURATIONS_S = (60.0, 300.0, 900.0)
+"""Lengths of the drives [s]."""
 RATES_HZ = (20, 25, 40, 50, 100)
+"""Rates of the logs [Hz]."""
 TYPICAL_SPEED_MPS = {"cruise": 25.0, "following": 16.0, "stop_and_go": 5.0, "steps": 17.0}
 """Speed around which an effect that depends on speed is drawn."""
 ACCEL_MAX_MPS2, ACCEL_MIN_MPS2 = 2.0, -3.5

@@ -28,9 +28,12 @@ from scipy.signal import lfilter
 from avtorch.blindtest.vehicle import Run
 
 Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 
 TIERS = {"easy": (3.0, np.inf), "medium": (1.6, 3.0), "hard": (1.15, 1.6), "faint": (1.02, 1.15)}
+"""Bounds of visibility by tier: how many times larger the error of rollouts is without the effect than with it."""
 HORIZON_S = 10.0
+_SETTLED_S = 2.0  # of a drive, in which no log tells what the actuator was at before
 _MOVING_MPS = 0.3
 _LAGS_S = (0.02, 3.0)
 
@@ -164,22 +167,47 @@ class Oracle:
 def oracles(run: Run, fitted: Sight, *, foretold: bool) -> dict[str, Oracle]:
     """`rollout_rmse_accel` [m/s²] and `rollout_rmse_speed` [m/s, over 10 s from a measured speed], by metric.
 
-    `foretold`: False where the cause decides by chance what the car does with its command (lost messages), so that
-    knowing it helps no rollout. Gusts and outliers are left to the floor, whose share of the log is known.
+    Of rows that move, from 2 s on. `foretold`: False where the cause decides by chance what the car does with its
+    command (lost messages), so that knowing it helps no rollout. Gusts and outliers are left to the floor, whose share
+    of the log is known.
     """
-    witness = _Witnesses(run)
     dt = float(run.time[1] - run.time[0])
+    judged = (run.true_speed >= _MOVING_MPS) & (run.time >= run.time[0] + _SETTLED_S)
     unit_a, unit_v = exact_gain(run.command, dt, fitted.T_L)
-    before_a = witness.rms_accel(run.accel - fitted.K_L * unit_a)
-    before_v = witness.rms_speed(witness.since_start(run.speed - fitted.K_L * unit_v))
+    before_a = _rms(run.accel - fitted.K_L * unit_a, judged)
+    before_v = _from_all_starts(run.speed - fitted.K_L * unit_v, judged, dt)
     if not foretold:
         return {
             "rollout_rmse_accel": Oracle(before_a, before_a, before_a),
             "rollout_rmse_speed": Oracle(before_v, before_v, before_v),
         }
-    floor_a = witness.rms_accel(run.noise_accel + run.chance_accel + run.felt_accel)
-    floor_v = witness.rms_speed(witness.since_start(run.noise_speed + run.drift_speed + run.chance_speed))
+    floor_a = _rms(run.noise_accel + run.chance_accel + run.felt_accel, judged)
+    floor_v = _from_all_starts(run.noise_speed + run.drift_speed + run.chance_speed, judged, dt)
     return {
         "rollout_rmse_accel": Oracle(before_a, floor_a, floor_a),
         "rollout_rmse_speed": Oracle(before_v, floor_v, floor_v),
     }
+
+
+def _rms(error: Float, rows: Bool) -> float:
+    return float(np.sqrt(np.mean(error[rows] ** 2))) if rows.any() else 0.0
+
+
+def _from_all_starts(error: Float, rows: Bool, dt: float) -> float:
+    """RMS of a speed's error over rollouts of up to 10 s, begun at a measured speed at every one of the `rows`.
+
+    A minute has six rollouts one after another, and what noise does to the speeds that they begin at would decide.
+    """
+    length, shortest = round(HORIZON_S / dt), round(2.0 / dt)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], rows.astype(int), [0]])))
+    squares, count = 0.0, 0
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        if end - begin >= shortest:
+            e = error[begin:end]
+            at = np.arange(len(e)) + 1
+            since = np.maximum(at - length, 0)
+            once, twice = (np.concatenate([[0.0], np.cumsum(e**power)]) for power in (1, 2))
+            mean, square = ((x[at] - x[since]) / (at - since) for x in (once, twice))
+            squares += float((e**2 - 2 * e * mean + square).sum())
+            count += len(e)
+    return float(np.sqrt(squares / count)) if count else 0.0

@@ -22,7 +22,8 @@ _FELT_S = 0.3  # over which a reading is averaged
 _REST_S = 0.5
 _SLOWED_MPS2 = -0.25  # a deceleration, and no noise
 _STILL_BRAKED_MPS2 = -0.3
-_SINCE_S = 1.0  # for which the brake has not been eased where a deceleration ends by itself
+# Where a deceleration ends by itself the brake was not eased for longer than a car takes to answer.
+_SINCE_S = 1.8
 _EASED_MPS2 = 0.2
 
 

@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from avtorch.blindtest import MIX
+from avtorch.blindtest.cases import SIGNALS
 from avtorch.errors import InputError
 from avtorch.io import write_json
 from avtorch.trial.folder import TrialFolder
 from avtorch.trial.tally import tally
 from avtorch.trial.work import Answerer, Task, begin_worker, work
-
-SIGNALS = ("accel", "speed")
 
 
 def run_trial(
@@ -47,8 +46,8 @@ def run_trial(
         answerers: by name (letters, digits, `_`, `-`): `Log` to a dict of `avtorch.diagnosis/1`.
         workers: processes, each with one thread; more than one needs answerers that can be pickled, and a script that
             begins work under `if __name__ == "__main__"`.
-        mix, outside, draw_options: as `avtorch.blindtest.draw_cases`. signals: the witnesses in the logs,
-            in which a cause must show.
+        mix, outside, draw_options: as `avtorch.blindtest.draw_cases`.
+        signals: the witnesses in the logs, in which a cause must show.
         keep_logs: keep `out/logs/NAME.csv`, so that a rerun need not draw the cases again.
         progress: is told (cases done, of).
 

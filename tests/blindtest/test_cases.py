@@ -122,6 +122,8 @@ def test_a_cause_shows_in_the_witnesses_that_are_logged() -> None:
     for case in draw_cases(3, 1, mix={"single": 1.0}, effects=some, seconds=60.0, signals=("speed",)):
         assert case.names == ("backlash",)
         assert case.tier is not None
+    with pytest.raises(InputError, match="signals"):
+        draw_case(0, 1, signals=("jerk",))
 
 
 def test_calibration_families_on_request() -> None:

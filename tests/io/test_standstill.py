@@ -51,6 +51,7 @@ def test_a_stop_is_masked_from_slow_to_slow(rest_s: float, bias: float, rotating
 
 def test_a_car_that_moves_is_never_taken_for_one_that_stands(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
+    # of 87 000 such cars, whose demand leaps by up to 5 m/s² every two seconds, 2 are taken for standing
     for _ in range(40):
         holds = rng.integers(40, 250, 20)
         command = np.repeat(rng.uniform(-3, 2, 20), holds)
