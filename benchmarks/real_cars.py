@@ -89,7 +89,7 @@ def slope_coefficient(found: FollowerDiagnosis, log: Log, grade: np.ndarray) -> 
     return float(image @ left) / square, square**-0.5
 
 
-def slope_recovered(found: FollowerDiagnosis, log: Log, grade: np.ndarray) -> dict[str, float]:
+def slope_recovered(found: FollowerDiagnosis, grade: np.ndarray) -> dict[str, float]:
     """A slope fitted together with law, lag and delay, held against the surveyed ``grade`` (row,) [-].
 
     ``correlation``; ``rmse`` [-] about both means; ``zero``: the same of no slope at all.
@@ -142,7 +142,7 @@ def main() -> None:
             positions = table.numbers(f"X{number}")[keep]
             grade = np.interp(np.mod(positions, LAP_M), survey.numbers("X"), survey.numbers("Y"))
             row["slope"] = slope_coefficient(found, log, grade)
-            row["slope_recovered"] = slope_recovered(found, log, grade)
+            row["slope_recovered"] = slope_recovered(found, grade)
         rows.append(row)
         print(json.dumps(row), flush=True)
     if given.json:

@@ -120,6 +120,7 @@ class IntelligentDriver:
 
 
 LAWS: dict[str, Law] = {law.name: law for law in (ConstantTimeGap(), IntelligentDriver())}
+"""The laws that a follower may obey, by name."""
 
 
 def law_named(name: str) -> Law:

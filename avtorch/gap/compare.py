@@ -25,7 +25,7 @@ from avtorch.gap.answer.diagnosis import LogFacts
 from avtorch.gap.answer.quantity import Quantity
 from avtorch.gap.chain.plant import GapPlant, plant
 from avtorch.gap.heldout.parts import blocks_of
-from avtorch.gap.heldout.rollout_errors import USUAL, Measure
+from avtorch.gap.heldout.rollout_errors import USUAL, Measure, products
 from avtorch.gap.likelihood.fit import directions
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.search.found import Found
@@ -174,10 +174,9 @@ def _rolled(record: Record, simulator: GapPlant) -> Float:
 
 def _squares(record: Record, errors: Float, blocks: Sequence[slice], lag: float) -> dict[str, Float]:
     out = {}
-    for k, witness in enumerate(record.witnesses):
+    for witness in record.witnesses:
         measure = Measure(witness, USUAL[witness])
-        rows = [measure.of(errors[k, b].ravel(), record.dt / record.group, lag) for b in blocks]
-        out[measure.name] = np.array([float((x**2).sum()) for x in rows])
+        out[measure.name] = products(measure, record, errors[None], blocks, lag)[:, 0, 0]
     return out
 
 

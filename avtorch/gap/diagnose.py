@@ -8,13 +8,11 @@ from os import PathLike
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from avtorch.errors import InputError
 from avtorch.gap.answer import posterior as posteriors
 from avtorch.gap.answer.aliases import Told
 from avtorch.gap.answer.contender import contenders
-from avtorch.gap.answer.diagnosis import Diagnosis, GapFacts, LogFacts
+from avtorch.gap.answer.diagnosis import Diagnosis, LogFacts
 from avtorch.gap.answer.misfit import gap_facts
 from avtorch.gap.answer.odds import favourite, probabilities
 from avtorch.gap.answer.posterior import Draws
@@ -25,9 +23,10 @@ from avtorch.gap.answer.traces import Traces
 from avtorch.gap.answer.verdict import Candidate, verdict_of
 from avtorch.gap.chain.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.chain.plant import GapPlant, plant
-from avtorch.gap.heldout.held_out import HeldOut, held_out
+from avtorch.gap.heldout.held_out import held_out
+from avtorch.gap.heldout.shown import Shown
 from avtorch.gap.heldout.shrink import shrinkage
-from avtorch.gap.heldout.where import onset_price, where
+from avtorch.gap.heldout.where import where
 from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.gap.search.found import Found, Race
 from avtorch.gap.search.search import Search
@@ -91,14 +90,15 @@ def diagnose(
     if apart.note is not None:
         noted += (apart.note,)
     named = winner is not None and winner.name != "none"
-    onset = _onset(winner, race) if named and winner is not None else None
+    # what is unknown sets in where the best of the named ones does
+    onset = None if verdict.name == "none" else _onset(winner or top, race)
     alike = {part for name in verdict.alias_set for part in name.split("+")}
     held = held_out(race, winner or top, blamed=named, alike=sorted(alike), progress=progress)
-    lag = race.none.values["T_L"]
+    shown = Shown.of(race, winner or top)
     return Diagnosis(
         log=LogFacts.of(each),
         baseline=moved(race.none),
-        gap=_gap(race, chances, held),
+        gap=gap_facts(race, top, detected=chances["none"] < 0.5, p_value=shown.p_value),
         candidates=tuple(candidates),
         verdict=verdict,
         onset_s=onset,
@@ -107,10 +107,10 @@ def diagnose(
         belief=belief(winner if named and winner is not None else race.none, draws if named else None),
         assumed=belief(race.none),
         draws=drawn(winner, draws) if draws is not None and winner is not None else None,
-        where=() if held is None or verdict.name == "none" else where(held, onset_s=onset, lag=lag),
+        where=() if verdict.name == "none" else where(shown, onset_s=onset, lag=race.none.values["T_L"]),
         shrinkage=shrinkage(held) if held is not None and named else None,
         contenders=contenders(race, verdict),
-        traces=_traces(race, winner, held),
+        traces=_traces(race, winner, shown),
         remaining=remaining(candidates, verdict, base),
         complete=race.complete,
         notes=noted,
@@ -124,7 +124,7 @@ def _left(top: Found, race: Race) -> Remainder:
     return remainder(top.white, top.errors, measured - top.errors, explained=explained)
 
 
-def _traces(race: Race, winner: Found | None, held: HeldOut | None) -> Traces:
+def _traces(race: Race, winner: Found | None, shown: Shown) -> Traces:
     record = race.record
     measured = record.measured.mean(-1)
     after = race.none if winner is None else winner
@@ -135,7 +135,7 @@ def _traces(race: Race, winner: Found | None, held: HeldOut | None) -> Traces:
         measured=measured,
         before=measured - race.none.errors.mean(-1),
         after=measured - after.errors.mean(-1),
-        does=np.zeros(record.rows) if held is None else held.does,
+        does=shown.does,
         stretch=record.stretch,
     )
 
@@ -165,13 +165,3 @@ def _onset(found: Found | None, race: Race) -> float | None:
     if found.name == "command_hold" and found.losses is not None and found.losses.onset is not None:
         return float(race.raw.time[race.raw.source[found.losses.onset]])
     return None if found.began is None else float(race.record.time[race.record.source[found.began]])
-
-
-def _gap(race: Race, chances: Mapping[str, float], held: HeldOut | None) -> GapFacts:
-    """Errors of the fitted baseline's rollout; the floor is what the favourite leaves."""
-    # what held-out rows gain is taken for an e-value against the bare baseline: its inverse bounds the p-value
-    p_value = None
-    if held is not None:
-        paid = onset_price(race.record) if favourite(race.found).began is not None else 0.0
-        p_value = float(np.exp(-np.clip(held.gained.sum() - paid, 0.0, 700.0)))
-    return gap_facts(race, favourite(race.found), detected=chances["none"] < 0.5, p_value=p_value)

@@ -38,10 +38,11 @@ _BLOCK = 32  # settings judged at a time
 class WhatToSet:
     """`p_now`, `p_then`: P(string stable) with the setting in force and with the one to `set`.
 
-    `peak_now`, `peak_then`: median peak gain [-] at the worst of speeds and pedals, inf where disturbances grow.
-    `p_assumed`: what P(string stable) would be for the simulator as it was, without the effect. `sufficient`: `p_then`
-    reaches `required`. `clipped`: share of the log's commands that `set` would have clipped. `strategies` out of 1
-    (lower level), 2 (time gap), 3 (gains). `why`: one sentence. `notes`: what holds for steps of one size only.
+    `peak_now`, `peak_then`: median peak gain [-] at the worst of speeds and pedals, inf where disturbances grow, and in
+    `peaks` with its 5 and 95 % quantiles. `p_assumed`, `peak_assumed`: of the simulator as it was, without the effect;
+    so its string gain was off by `peak_now - peak_assumed`. `sufficient`: `p_then` reaches `required`. `clipped`: share
+    of the log's commands that `set` would have clipped. `strategies` out of 1 (lower level), 2 (time gap), 3 (gains), 4
+    (feed-forward). `why`: one sentence. `notes`: what holds for steps of one size only.
     """
 
     in_force: Setting = field(repr=False)
@@ -49,8 +50,10 @@ class WhatToSet:
     p_assumed: float
     p_now: float
     p_then: float
+    peak_assumed: float
     peak_now: float
     peak_then: float
+    peaks: Mapping[str, tuple[float, float, float]]
     required: float
     sufficient: bool
     strategies: tuple[int, ...]
@@ -65,7 +68,10 @@ class WhatToSet:
             "settings": self.set.as_dict(),
             "strategies": list(self.strategies),
             "p_string_stable": {"assumed": self.p_assumed, "in_force": self.p_now, "then": self.p_then},
-            "peak_gain": {"in_force": _finite(self.peak_now), "then": _finite(self.peak_then)},
+            "peak_gain": {
+                name: dict(zip(("median", "q05", "q95"), map(_finite, told), strict=True))
+                for name, told in self.peaks.items()
+            },
             "required": self.required,
             "sufficient": self.sufficient,
             "clipped_share": self.clipped,
@@ -86,13 +92,15 @@ def what_to_set(
     speeds: Sequence[float] = SPEEDS_MPS,
     accel_min: float = -6.0,
     accel_max: float = 4.0,
+    link_delay: float = 0.0,
 ) -> WhatToSet:
     """The least intrusive setting that makes `plant` string stable with probability `required`.
 
     `belief`: draws (draw,) of the plant's parameters by its names (`T_L`, `K_L`, `effect.parameter`); `assumed`: draws
     of `T_L` [s] and `K_L` of the simulator without the effect. `commands` (row,) [m/s²]: a log's, in which clipping is
     counted. Default setting in force: time gap 1 s, the paper's gains, the lower level passing through. `grid`: what is
-    on offer. Limits [m/s²]. Raises `InputError` for a probability or speeds out of range.
+    on offer. Limits [m/s²]. `link_delay` [s]: age of the leader's acceleration, where a setting feeds it forward.
+    Raises `InputError` for a probability or speeds out of range.
     """
     if not 0.0 < required < 1.0:
         raise InputError(f"required: found {required}, needs a number between 0 and 1")
@@ -112,23 +120,25 @@ def what_to_set(
     used = np.zeros(0) if commands is None else np.asarray(commands, float)
     clipped = _clipped(offers.setting[0], used, accel_min, accel_max)
 
-    p_now, peak_now = (float(x[0]) for x in _judged(chains, now))
-    best, p_best, peak_best = 0, p_now, peak_now
+    p, peaks = _judged(chains, now, link_delay)
+    p_now, now_at = float(p[0]), _told(peaks[0])
+    best, p_best, then_at = 0, p_now, now_at
     for first in range(0, len(order) if p_now < required else 0, _BLOCK):
         some = order[first : first + _BLOCK]
-        p, peak = _judged(chains, offers.setting[0][torch.tensor(some)])
+        p, peaks = _judged(chains, offers.setting[0][torch.tensor(some)], link_delay)
         good = [k for k, i in enumerate(some) if p[k] >= required and clipped[i] <= 0.05]
         if good:
-            best, p_best, peak_best = some[good[0]], float(p[good[0]]), float(peak[good[0]])
+            best, p_best, then_at = some[good[0]], float(p[good[0]]), _told(peaks[good[0]])
             break
         allowed = torch.tensor([clipped[i] <= max(0.05, clipped[0]) for i in some])
         top = int(torch.where(allowed, p, -1.0).argmax())
         if bool(allowed[top]) and float(p[top]) > p_best + 0.02:
-            best, p_best, peak_best = some[top], float(p[top]), float(peak[top])
+            best, p_best, then_at = some[top], float(p[top]), _told(peaks[top])
     chosen = offers.setting[0][torch.tensor([best])]
     bare = GapPlant((), T_L=plant.T_L, K_L=plant.K_L, sigma=0.0)
     thought = {k: torch.as_tensor(np.asarray(v), dtype=torch.float64) for k, v in (assumed or {}).items()}
-    p_assumed = float(_judged(_chains(bare, thought or draws, speeds[:1]), now)[0][0])
+    p_thought, thought_at = _judged(_chains(bare, thought or draws, speeds[:1]), now, link_delay)
+    at = {"assumed": _told(thought_at[0]), "in_force": now_at, "then": then_at}
     sufficient = p_best >= required
     strategies = tuple(sorted(chosen.strategies(now)[0]))
     names = [e.name for e in plant.effects if e.name in NOT_LINEAR]
@@ -136,11 +146,13 @@ def what_to_set(
     return WhatToSet(
         in_force=now,
         set=chosen,
-        p_assumed=p_assumed,
+        p_assumed=float(p_thought[0]),
         p_now=p_now,
         p_then=p_best,
-        peak_now=peak_now,
-        peak_then=peak_best,
+        peak_assumed=at["assumed"][0],
+        peak_now=now_at[0],
+        peak_then=then_at[0],
+        peaks=at,
         required=required,
         sufficient=sufficient,
         strategies=strategies,
@@ -172,8 +184,8 @@ def _chains(plant: GapPlant, draws: Mapping[str, Tensor], speeds: Sequence[float
     return [linearised(plant, draws, speed=v, step=u) for v in at for u in steps]
 
 
-def _judged(chains: Sequence[Chain], settings: Setting) -> tuple[Tensor, Tensor]:
-    """P(string stable) and the median peak gain, (setting,), each draw at its worst chain."""
+def _judged(chains: Sequence[Chain], settings: Setting, link_delay: float) -> tuple[Tensor, Tensor]:
+    """P(string stable) (setting,) and the peak gain (setting, draw), each draw at its worst chain."""
     inner, forward = _lower(settings)
     stable, peak = None, None
     for chain in chains:
@@ -183,12 +195,21 @@ def _judged(chains: Sequence[Chain], settings: Setting) -> tuple[Tensor, Tensor]
             settings.gains[:, None],
             inner=inner[:, None],
             forward=forward[:, None],
+            feedforward=settings.feedforward[:, None],
+            feedforward_delay=link_delay,
         )
         stable = seen.string_stable if stable is None else stable & seen.string_stable
         peak = seen.peak_gain if peak is None else torch.maximum(peak, seen.peak_gain)
     assert stable is not None
     assert peak is not None
-    return stable.double().mean(-1), peak.median(-1).values
+    return stable.double().mean(-1), peak
+
+
+def _told(peak: Tensor) -> tuple[float, float, float]:
+    """Median, 5 and 95 % quantile over draws (draw,), of which some may be inf."""
+    # by rank: between a number and inf there is nothing to interpolate
+    low, middle, high = torch.quantile(peak, torch.tensor([0.05, 0.5, 0.95]).to(peak), interpolation="nearest").tolist()
+    return middle, low, high
 
 
 def _lower(settings: Setting) -> tuple[Tensor, Tensor]:
@@ -217,6 +238,8 @@ def _sentence(
         steps.append(f"time gap {s['time_gap_s']:g} s instead of {now.as_dict()['time_gap_s']:g} s")
     if 3 in strategies:
         steps.append("gains " + ", ".join(f"{k:g}" for k in s["gains"]))
+    if 4 in strategies:
+        steps.append(f"feed the leader's acceleration forward with k_f {s['feedforward']:g}")
     if not steps:
         if good:
             return f"Nothing to set: P(string stable) is {before:.2f} as it is."

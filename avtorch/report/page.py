@@ -174,19 +174,26 @@ def _placebo(found: Diagnosis) -> str | None:
     return f"A placebo ({told.placebo_effect}, which is not the cause) on top closes {_percent(told.placebo)}."
 
 
+def _peak(told: Mapping[str, float | None]) -> str:
+    """A peak gain with its 90 % interval."""
+    middle, low, high = (f"{x:.2f}" if x is not None else "no end" for x in (told[k] for k in ("median", "q05", "q95")))
+    return f"{middle} ({low} to {high})"
+
+
 def _setting(found: Diagnosis) -> Mapping[str, Any] | None:
     if found.setting is None:
         return None
     told, p = found.setting, found.setting["p_string_stable"]
-    peaks = {k: "grows without end" if x is None else f"{x:.2f}" for k, x in told["peak_gain"].items()}
+    peaks = {k: _peak(x) for k, x in told["peak_gain"].items()}
     return {
         "why": told["why"],
         "rows": [
             ("P(string stable), simulator as it was", f"{p['assumed']:.2f}"),
             ("P(string stable), car as it is", f"{p['in_force']:.2f}"),
             ("P(string stable), with this setting", f"{p['then']:.2f}"),
-            ("peak gain now", peaks["in_force"]),
-            ("peak gain then", peaks["then"]),
+            ("string gain at its peak, simulator as it was", peaks["assumed"]),
+            ("string gain at its peak, car as it is", peaks["in_force"]),
+            ("string gain at its peak, with this setting", peaks["then"]),
         ],
         "notes": told["notes"],
     }

@@ -55,12 +55,14 @@ def test_draws_of_the_noise_are_white_to_its_own_filter(rotating_seed: int) -> N
     log = Log.from_arrays(time=time, accel_cmd=0.3 * np.cos(0.3 * time), accel=0.3 * np.cos(0.3 * time), speed=speed)
     record = Record.of(log)
     white = Whitener(record, noise)(noise_draws(noise, len(time), 0.05, BOTH, 40, rng)[..., record.source, None])
+    # a steady filter begins cold, and is settled within a second
+    white = white[:, :, 20:]
     size = white[:, 0].size
-    # squares of standard normals have variance 2; four standard errors
+    # squares of standard normals have variance 2; five standard errors
     for k in (0, 1):
-        assert (white[:, k] ** 2).mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / size) + 2 / record.rows)
+        assert (white[:, k] ** 2).mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / size))
         lagged = (white[:, k, 1:] * white[:, k, :-1]).mean()
-        assert lagged == pytest.approx(0.0, abs=4 / np.sqrt(size))
+        assert lagged == pytest.approx(0.0, abs=5 / np.sqrt(size))
 
 
 def test_margin_is_half_the_square_of_the_distance(rotating_seed: int) -> None:

@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.errors import InputError
+from avtorch.gap.answer import words
 from avtorch.gap.answer.contender import Contender
 from avtorch.gap.answer.quantity import Quantity, unit_of
+from avtorch.gap.answer.repeats import Repeats
 from avtorch.gap.answer.shrinkage import Closed, Shrinkage
 from avtorch.gap.answer.traces import Traces
 from avtorch.gap.answer.verdict import Candidate, Verdict, candidate_name, listed, near, plain, verdict_of
@@ -82,6 +84,7 @@ class GapFacts:
     """How far the baseline is from the log, and how far noise alone would be (`floor`); None where not measured.
 
     Rollouts go over `horizon_s` [s]; accelerations [m/s²], speed [m/s]. `detected`: there is a gap, at `p_value`.
+    `repeats`: the floor as commands that were given twice tell it, None where there are none.
     """
 
     detected: bool
@@ -92,6 +95,7 @@ class GapFacts:
     rollout_floor_accel: float | None = None
     rollout_rmse_speed: float | None = None
     horizon_s: float | None = None
+    repeats: Repeats | None = None
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -104,12 +108,13 @@ class GapFacts:
             },
             "detected": bool(self.detected),
             "p_value": self.p_value,
+            "repeats": None if self.repeats is None else self.repeats.to_dict(),
         }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis:
-    """What the simulator lacks, by a log.
+    """What the simulator lacks, by a log; printed, it says so in a few sentences.
 
     - `candidates` are listed as `listed` has them, whatever was given
     - `simulator`: the user's own, `T_L` and `K_L` as fitted without any effect; `plant`: the same with the verdict's
@@ -117,8 +122,8 @@ class Diagnosis:
     - `assumed`: draws (draw,) of the simulator's `T_L` [s] and `K_L`; `belief`: draws (draw,) of the parameters of
       `plant`, or of `simulator` where there is none, by its own names; `draws`: posterior of the winner's parameters
       (chain, draw) by the table's names
-    - `where`, `shrinkage`: where the gap lies and how far it shrinks, on parts that were held out; empty and None where
-      the drives are too short to be parted, and `shrinkage` None where nothing was named
+    - `where`, `shrinkage`: where the gap lies, and how far it shrinks on parts that were held out; empty where there is
+      no gap, None where the drives are too short to be parted or nothing was named
     - `traces`: the drives beside the rollouts of `simulator` and `plant`
     - `contenders`: the alias set as far as it was fitted, with what it takes to foretell another drive
     - `next_experiment`, `setting`: objects as in `diagnosis.json`, None where nobody asked
@@ -156,6 +161,15 @@ class Diagnosis:
             raise InputError(f"verdict: found {said}, needs the most probable, {self.candidates[0].name}")
         if said not in self.verdict.alias_set or self.verdict.abstained != (said == "unknown"):
             raise InputError(f"verdict: found {self.verdict}, needs itself in its alias set, and to abstain on unknown")
+
+    def __str__(self) -> str:
+        """The sentences of the terminal, one a line."""
+        told = [words.headline(self), self.verdict.why, words.aliases(self), *words.onset(self), *words.where(self)]
+        told += [*words.moved(self), *words.gap(self), *words.shrinkage(self), *words.to_set(self)]
+        return "\n".join([*told, *words.to_drive(self), *words.remains(self), *self.notes])
+
+    def __repr__(self) -> str:
+        return f"<Diagnosis of {self.log.name}: {words.headline(self)}>"
 
     @property
     def winner(self) -> Candidate:

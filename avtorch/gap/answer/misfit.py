@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.gap.answer.diagnosis import GapFacts
+from avtorch.gap.answer.repeats import repeats
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.search.found import Found, Race
 
@@ -38,6 +39,7 @@ def gap_facts(race: Race, best: Found, *, detected: bool, p_value: float | None 
         rollout_floor_accel=min(rollout, default=None),
         rollout_rmse_speed=None if record.speed is None else _anew(record, none.errors[-1].mean(-1)),
         horizon_s=HORIZON_S,
+        repeats=repeats(record),
     )
 
 

@@ -16,7 +16,7 @@ class Traces:
 
     `command` (row,); `measured`, `before`, `after` (witness, row): what the log shows, and rollouts over whole drives
     of the fitted simulator without and with the effect (equal where nothing was named). `does` (row,) [nats]: what the
-    effect does to each row, held out; zeros where nothing was held out. `stretch` (row,) numbers parts without gaps.
+    effect does to each row. `stretch` (row,) numbers parts without gaps.
     """
 
     time: Float

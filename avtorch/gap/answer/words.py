@@ -114,7 +114,13 @@ def gap(found: Diagnosis) -> list[str]:
     if not parts:
         return []
     over = "" if gap.horizon_s is None else f", over {gap.horizon_s:.3g} s"
-    return [f"Gap of the simulator as it is{over}: {', '.join(parts)}."]
+    lines = [f"Gap of the simulator as it is{over}: {', '.join(parts)}."]
+    if gap.repeats is not None:
+        alike = [("accelerations", gap.repeats.accel, "m/s²"), ("speeds", gap.repeats.speed, "m/s")]
+        told = " and ".join(f"{name} to {x:.2g} {unit}" for name, x, unit in alike if x is not None)
+        again = f"The same commands given again ({gap.repeats.seconds:.0f} s)"
+        lines.append(f"{again} repeat {told}: noise, or not their doing.")
+    return lines
 
 
 def number(p: float) -> str:

@@ -31,6 +31,7 @@ from avtorch.vehicle.arguments import tensor
 
 Place = Literal["command", "actuator", "body", "sensor"]
 PLACES: tuple[Place, ...] = ("command", "actuator", "body", "sensor")
+"""Places in the chain, in its order."""
 
 
 @dataclass(frozen=True)

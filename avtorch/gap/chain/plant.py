@@ -29,6 +29,7 @@ BASELINE = (
     Parameter("T_L", "s", None, 0.3 * 0.408, 0.3 * 2.452),  # log-normal, median 0.3, log sd 0.7
     Parameter("K_L", "-", None, 0.681, 1.469),  # log-normal, median 1, log sd 0.3
 )
+"""Parameters of the baseline, with their priors."""
 
 
 class GapPlant:

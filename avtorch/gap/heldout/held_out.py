@@ -7,7 +7,7 @@ all. What judges has chosen neither the effect nor its parameters.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,8 @@ from avtorch.gap.answer.odds import CHANCE, prices
 from avtorch.gap.chain.effect import EFFECTS, Effect
 from avtorch.gap.heldout.chance_gains import chance_gains
 from avtorch.gap.heldout.flexible import Flexible
-from avtorch.gap.heldout.judged import Judge, Judged
+from avtorch.gap.heldout.floor import Floor
+from avtorch.gap.heldout.judged import Judge, Judged, unknown_by
 from avtorch.gap.heldout.loop_measures import LoopMeasure, loop_measures
 from avtorch.gap.heldout.parts import Part, drives_apart, parted
 from avtorch.gap.heldout.refit import Refit
@@ -40,12 +41,8 @@ class HeldOut:
 
     - `sums` by name: `before` (the bare baseline), `after` (what the rest chose), `flexible` (a black box on top of
       that), `ceiling` (a black box on the bare baseline), `verdict`, `placebo` (the wrong effect `sham` on top of it);
-      `fitted` and `owed`: the verdict as all blocks fit it, and what not knowing its parameters better costs on average
+      `fitted`: the verdict as all blocks fit it; `floor`: what that leaves over, as far as its parameters are known
     - `rows` (block,): how many single rows judge
-    - `gained` (counted,) [nats]: what the choice, with the black box on top where nothing is blamed, adds to the log
-      density of each row; `does` (counted,) [nats]: what it is expected to add, half the square of the white image of
-      what it changes; `felt` likewise of the accelerometer's faults alone
-    - `moved` (witness, counted): the change itself
     - `chosen`: share of the parts that chose the verdict; `by_chance`: it has no effect that a rollout could foretell;
       `by_drives`: whole drives are held out, not blocks of them
     """
@@ -53,11 +50,8 @@ class HeldOut:
     record: Record
     measures: Sequence[Measure | LoopMeasure]
     sums: Mapping[str, Judged]
+    floor: Floor
     rows: Float
-    gained: Float = field(repr=False)
-    does: Float = field(repr=False)
-    felt: Float = field(repr=False)
-    moved: Float = field(repr=False)
     chosen: float
     sham: type[Effect] | None
     by_chance: bool = False
@@ -90,10 +84,9 @@ def held_out(
     all_in = {f.name: chance_gains(f, race.raw, record) for f in contenders}
     # what a part cannot tell of chance is told by all: how much less its evidence is than the gain of its rows
     owed = {f.name: price[f.name] + all_in[f.name].sum() - _chance_evidence(f) for f in contenders}
+    images = unknown_by(whole)
     told: dict[str, list[Judged]] = {}
-    chosen, rows = [], []
-    gained, does, felt = np.zeros((3, record.rows))
-    moved = np.zeros((len(record.witnesses), record.rows))
+    chosen, rows, floors = [], [], []
     for i, part in enumerate(parts):
         if progress is not None:
             progress("parts held out", i, len(parts))
@@ -108,7 +101,6 @@ def held_out(
             "before": judge.judged(none),
             "after": judge.judged(best, chance=chance),
             "fitted": judge.judged(whole, chance=all_in[verdict.name]),
-            "owed": judge.owed(whole),
             "flexible": judge.judged(best, less=boxes[best.name], chance=chance),
             "ceiling": judge.judged(none, less=boxes["none"]),
         }
@@ -116,27 +108,15 @@ def held_out(
             seen |= {"verdict": judge.judged(own), "placebo": judge.judged(_with_sham(own, sham, part))}
         for name, values in seen.items():
             told.setdefault(name, []).append(values)
+        floors.append(judge.floor(whole, images))
         chosen.append(best is own)
         rows.append(judge.rows)
-
-        inside = judge.inside
-        box = 0.0 if blamed else boxes[best.name]
-        change = best.effect + box
-        white = best.white(record)
-        moved[:, inside] = change.mean(-1)[:, inside]
-        does[inside] = _worth(white(change))[inside]
-        felt[inside] = _worth(white(best.felt))[inside] if blamed else 0.0
-        after = judge.row_nats(best, less=None if blamed else boxes[best.name])
-        gained[inside] = (after + chance - judge.row_nats(none))[inside]
     return HeldOut(
         record=record,
         measures=kinds,
         sums={name: Judged.joined(each) for name, each in told.items()},
+        floor=Floor.joined(floors),
         rows=np.concatenate(rows),
-        gained=gained,
-        does=does,
-        felt=felt,
-        moved=moved,
         chosen=float(np.mean(chosen)),
         sham=sham,
         by_drives=bool(drives_apart(record)),
@@ -157,11 +137,6 @@ def _foretold(refit: Refit, part: Part) -> Float:
     """What a black box makes of a refit's errors."""
     record = refit.found.candidate.record
     return Flexible.of(record, record.measured - refit.errors).foretold(refit.errors, refit.white(part.fits))
-
-
-def _worth(e: Float) -> Float:
-    """Half the squares (counted,) of white images (witness, counted, group)."""
-    return np.asarray(0.5 * (e**2).sum((0, 2)), np.float64)
 
 
 def _chance_evidence(found: Found) -> float:

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.gap.answer.joint import root
+from avtorch.gap.heldout.floor import Floor
 from avtorch.gap.heldout.loop_measures import LoopMeasure
 from avtorch.gap.heldout.parts import Part
 from avtorch.gap.heldout.refit import Refit
-from avtorch.gap.heldout.rollout_errors import Measure
+from avtorch.gap.heldout.rollout_errors import Measure, products
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitener import Whitener
 
@@ -41,26 +42,16 @@ class Judge:
     measures: Sequence[Measure | LoopMeasure]
     lag: float
 
-    def squares(self, errors: Float) -> Float:
-        """(measure, block) of errors (..., witness, counted, group), summed over what leads."""
-        record = self.record
-        out = np.empty((len(self.measures), len(self.part.blocks)))
-        for i, measure in enumerate(self.measures):
-            k = record.witnesses.index(measure.witness)
-            for j, block in enumerate(self.part.blocks):
-                rows = errors[..., k, block, :].reshape(*errors.shape[:-3], -1)
-                if measure.horizon_s is None and measure.witness == "speed":
-                    first = record.starts[record.stretch[block.start]]
-                    rows = rows - errors[..., k, first, :1]
-                out[i, j] = (measure.of(rows, record.dt / record.group, self.lag) ** 2).sum()
-        return out
+    def products(self, errors: Float) -> Float:
+        """(measure, block, one, other) of errors (one, witness, counted, group)."""
+        return np.stack([products(m, self.record, errors, self.part.blocks, self.lag) for m in self.measures])
 
     def judged(self, refit: Refit, *, less: Float | None = None, chance: Float | None = None) -> Judged:
         """A refit; `less`: what else (witness, counted, 1) is taken off its errors, `chance` (counted,) [nats]: what
         else is added to the density of each row."""
         errors = refit.errors if less is None else refit.errors - less
         nats = self.row_nats(refit, less=less)
-        return Judged(self.squares(errors), self._by_block(nats if chance is None else nats + chance))
+        return Judged(self.products(errors[None])[..., 0, 0], self._by_block(nats if chance is None else nats + chance))
 
     def row_nats(self, refit: Refit, *, less: Float | None = None) -> Float:
         """Log density (counted,) of each row that judges, 0 elsewhere."""
@@ -70,33 +61,30 @@ class Judge:
         out[rows] = self._white(refit).row_likelihoods(errors[:, rows])
         return out
 
-    def owed(self, refit: Refit) -> Judged:
-        """What not knowing the parameters better costs on average: squares, and nats.
-
-        By the curvature on the rows that fit. A step along each axis of the posterior that leaves the joint density
-        lower than a normal posterior would have it counts for less.
-        """
-        count = len(refit.z)
-        steps = root(refit.covariance).numpy().T
-        around = refit.around(np.concatenate([np.zeros((1, count)), steps, -steps]))
-        moved = around[1:] - around[:1]
-        white = refit.white(refit.fits)
-        fits = np.isin(self.record.source, refit.fits.source)
-        here, there = refit.errors[:, fits], moved[:, :, fits]
-        lost = 0.5 * ((white(here - there) ** 2).sum((1, 2, 3)) - (white(here) ** 2).sum())
-        # at one standard deviation half a nat, the mean of both sides
-        lost = np.tile(lost.reshape(2, -1).mean(0), 2)
-        moved = moved * np.sqrt(0.5 * np.minimum(1.0, 0.5 / np.maximum(lost, 0.5)))[:, None, None, None]
-        if refit.found.candidate.grade_columns is not None:
-            moved = np.concatenate([moved, refit.slope_spread(white)])
+    def floor(self, refit: Refit, images: Float) -> Floor:
+        """What noise leaves over of a refit, whose parameters move its errors by `images` (axis, witness, counted,
+        group) (`unknown_by`)."""
+        errors = np.concatenate([refit.errors[None], images])
         rows = np.isin(self.record.source, self.part.judges.source)
-        nats = np.zeros(self.record.rows)
-        nats[rows] = 0.5 * (self._white(refit)(moved[:, :, rows]) ** 2).sum((0, 1, 3))
-        return Judged(self.squares(moved), self._by_block(nats))
+        white = self._white(refit)(errors[:, :, rows])
+        nats = np.empty((len(self.part.blocks), len(errors), len(errors)))
+        number = self._block_of[rows]
+        for j in range(len(nats)):
+            some = white[:, :, number == j].reshape(len(errors), -1)
+            nats[j] = 0.5 * some @ some.T
+        return Floor(self.products(errors), nats)
 
     def _by_block(self, nats: Float) -> Float:
         """Sums (block,) over rows (counted,)."""
         return np.array([nats[b].sum() for b in self.part.blocks])
+
+    @property
+    def _block_of(self) -> NDArray[np.intp]:
+        """Number (counted,) of each row's block, -1 outside."""
+        number = np.full(self.record.rows, -1)
+        for j, block in enumerate(self.part.blocks):
+            number[block] = j
+        return number
 
     @property
     def inside(self) -> NDArray[np.bool_]:
@@ -112,3 +100,26 @@ class Judge:
 
     def _white(self, refit: Refit) -> Whitener:
         return refit.white(self.part.judges)
+
+
+def unknown_by(refit: Refit) -> Float:
+    """What a standard deviation along each axis of the posterior moves, (axis, witness, counted, group).
+
+    By the curvature on the rows that fit. A step that leaves the joint density lower than a normal posterior would have
+    it counts for less.
+    """
+    count = len(refit.z)
+    steps = root(refit.covariance).numpy().T
+    around = refit.around(np.concatenate([np.zeros((1, count)), steps, -steps]))
+    moved = around[1:] - around[:1]
+    white = refit.white(refit.fits)
+    fits = np.isin(refit.found.candidate.record.source, refit.fits.source)
+    here, there = refit.errors[:, fits], moved[:, :, fits]
+    lost = 0.5 * ((white(here - there) ** 2).sum((1, 2, 3)) - (white(here) ** 2).sum())
+    # at one standard deviation half a nat, the mean of both sides
+    lost = lost.reshape(2, -1).mean(0)
+    images = 0.5 * (moved[:count] - moved[count:])
+    images = images * np.sqrt(np.minimum(1.0, 0.5 / np.maximum(lost, 0.5)))[:, None, None, None]
+    if refit.found.candidate.grade_columns is not None:
+        images = np.concatenate([images, refit.slope_spread(white)])
+    return images

@@ -61,10 +61,18 @@ class LoopMeasure:
         """Whether the loop forgets."""
         return bool(np.roots(self._transfer[1]).real.max() < -_LEAST_DECAY)
 
-    def of(self, errors: Float, dt: float, lag: float) -> Float:
+    def products(self, x: Float, blocks: Sequence[slice], dt: float, lag: float) -> Float:
+        """(block, one, other): sums over each block of products of errors in the loop.
+
+        From those of long rollouts, `x` (one, row); `dt` [s] between rows. `lag` is not used: the loop has its own.
+        """
+        off = self.of(x, dt)
+        return np.stack([off[:, b] @ off[:, b].T for b in blocks])
+
+    def of(self, errors: Float, dt: float) -> Float:
         """Errors (..., row) in the loop from those of a long rollout (..., row), both nothing at the first row.
 
-        `dt` [s] between rows; `lag` is not used: the loop has its own.
+        `dt` [s] between rows.
         """
         off = errors
         if self.witness == "accel":

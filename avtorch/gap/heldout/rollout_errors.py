@@ -3,16 +3,25 @@
 A rollout begun anew in the middle of a drive starts at what is measured there: of the acceleration at the measured one,
 of the speed at the measured one with the actuator where the commands have brought it. What the long rollout was wrong
 by at that moment `t0` is then gone: of the speed for good, of the acceleration it would have died away with the lag
-anyway. So the errors are `e(t) - e(t0) exp(-(t - t0) / T_L)` and `e(t) - e(t0)`, where `e` is the long one's.
+anyway. So the errors are `e(t) - e(t0) w(t - t0)`, where `e` is the long one's and `w` is 1 or `exp(-(t - t0) / T_L)`.
+
+One start is as good as another, and what is measured there is noisy: rollouts begin at every row. Of two errors `x`
+and `y` the mean over all starts within a horizon of `t` is `x y - x M(y) - M(x) y + M2(x y)`, with moving averages `M`
+weighed by `w` and `M2` by its square.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from avtorch.gap.heldout.loop_measures import LoopMeasure
+from avtorch.gap.likelihood.record import Record
 
 Float = NDArray[np.float64]
 
@@ -34,22 +43,60 @@ class Measure:
         over = "" if self.horizon_s == usual else "_whole" if self.horizon_s is None else f"_{self.horizon_s:g}s"
         return f"rollout_rmse_{self.witness}{over}"
 
-    def of(self, errors: Float, dt: float, lag: float) -> Float:
-        """Errors (..., row) of rollouts within a block, from those of a long one (..., row) of this witness.
+    def products(self, x: Float, blocks: Sequence[slice], dt: float, lag: float) -> Float:
+        """(block, one, other): sums over each block of products of the errors of rollouts within a stretch.
 
-        `dt` [s] between rows, `lag` [s] of the actuator. Where a horizon does not fit into the block it is as long as
-        the block.
+        From those of a long one, `x` (one, row) of this witness; `dt` [s] between rows, `lag` [s] of the actuator.
+        Where a horizon does not fit before a row, rollouts begin as early as the stretch does.
         """
         if self.horizon_s is None:
-            return errors
-        rows, length = errors.shape[-1], max(2, round(self.horizon_s / dt))
-        at = np.arange(rows)
-        # what is left at the end is a shorter one, or joins the last
-        first = np.minimum(at - at % length, max(0, (rows - length // 5) // length * length))
-        begun = errors[..., first]
-        if self.witness == "accel":
-            begun = begun * np.exp(-(at - first) * dt / lag)
-        return errors - begun
+            whole = x - x[:, :1] if self.witness == "speed" else x
+            return np.stack([whole[:, b] @ whole[:, b].T for b in blocks])
+        length = max(2, round(self.horizon_s / dt))
+        keeps = float(np.exp(-dt / lag)) if self.witness == "accel" else 1.0
+        starts = np.minimum(np.arange(x.shape[1]) + 1, length)
+        mean = _window(x, length, keeps) / starts
+        out = []
+        for b in blocks:
+            # how often each row is a start of what is judged in this block
+            judged = np.zeros(x.shape[1])
+            judged[b] = 1.0 / starts[b]
+            often = _window(judged[::-1], length, keeps**2)[::-1]
+            used = slice(max(b.start - length + 1, 0), b.stop)
+            mixed = x[:, b] @ mean[:, b].T
+            squares = (x[:, used] * often[used]) @ x[:, used].T
+            out.append(x[:, b] @ x[:, b].T - mixed - mixed.T + squares)
+        return np.stack(out)
+
+
+def _window(x: Float, length: int, keeps: float) -> Float:
+    """Sums (..., row) over the last `length` rows of `x`, each weighed by `keeps` to the power of its age."""
+    if keeps < 1.0:
+        ended = np.zeros_like(x)
+        ended[..., length:] = keeps**length * x[..., :-length]
+        return np.asarray(lfilter([1.0], [1.0, -keeps], x - ended))
+    total = np.cumsum(x, -1)
+    total[..., length:] -= total[..., :-length].copy()
+    return total
+
+
+def products(
+    measure: Measure | LoopMeasure, record: Record, errors: Float, blocks: Sequence[slice], lag: float
+) -> Float:
+    """(block, one, other): sums of products of `errors` (one, witness, counted, group) of long rollouts, by a measure.
+
+    `blocks` of counted rows, each within a stretch; `lag` [s]. Rollouts begin wherever a stretch was measured, whether
+    or not a block judges there.
+    """
+    long = errors[:, record.witnesses.index(measure.witness)]
+    group, out = record.group, np.zeros((len(blocks), len(errors), len(errors)))
+    for begin, end in pairwise([*record.starts.tolist(), record.rows]):
+        own = [j for j, b in enumerate(blocks) if begin <= b.start < end]
+        if own:
+            rows = long[:, begin:end].reshape(len(errors), -1)
+            within = [slice((blocks[j].start - begin) * group, (blocks[j].stop - begin) * group) for j in own]
+            out[own] = measure.products(rows, within, record.dt / group, lag)
+    return out
 
 
 def measures(witnesses: Iterable[str]) -> tuple[Measure, ...]:

@@ -1,11 +1,15 @@
 """How far the gap shrinks: before, after, floor and placebo on blocks that chose neither effect nor parameters.
 
-The floor is what the verdict leaves where all drives fit its parameters, and what it takes to know them no better than
-that; or what a flexible regression leaves, where it is below by more than chance. Intervals are of blocks drawn anew,
-with replacement, wider by what few blocks tell too little of their own spread (Student's t).
+The floor is what noise leaves over of the verdict, as far as all drives tell its parameters (`floor.py`); or what a
+flexible regression leaves, where it is below by more than chance. Intervals are of floors drawn with the parameters,
+of what the regression takes, and of blocks drawn anew, with replacement, wider by what few blocks tell too little of
+their own spread (Student's t).
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +18,7 @@ from scipy.stats import t as student
 
 from avtorch.gap.answer.quantity import Quantity
 from avtorch.gap.answer.shrinkage import Closed, Shrinkage
+from avtorch.gap.heldout.floor import drawn, expected
 from avtorch.gap.heldout.held_out import HeldOut
 from avtorch.gap.heldout.rollout_errors import USUAL
 
@@ -22,35 +27,29 @@ Float = NDArray[np.float64]
 DENSITY = "log_predictive_density"
 _DRAWS = 2000
 _TELLS = 1.1  # before over floor, for less of which there is nothing to close
+_MATERIAL = 0.1  # of the gap (of its squares), for less of which a flexible regression is not believed
 _TELLS_NATS = 5.0  # likewise of densities, over all blocks
 
 
 def shrinkage(held: HeldOut) -> Shrinkage:
     """From what blocks held out say of a verdict."""
-    sums, rows, kinds = held.sums, held.rows, held.measures
+    sums, kinds, blocks = held.sums, held.measures, len(held.rows)
     rng = np.random.default_rng(0)
-    blocks = len(rows)
-    drawn = rng.multinomial(blocks, np.full(blocks, 1 / blocks), size=_DRAWS).astype(float)
-    weights = np.concatenate([np.ones((1, blocks)), drawn])
-
-    by_metric, placebos, ceiling = {}, {}, {}
+    again = rng.multinomial(blocks, np.full(blocks, 1 / blocks), size=_DRAWS).astype(float)
+    z = rng.standard_normal((_DRAWS, held.floor.axes))
+    told: dict[str, _Told] = {}
     for k, measure in enumerate(kinds):
         square = {name: s.squares[k] for name, s in sums.items()}
-        floor = _floor(square["fitted"] + square["owed"], square["flexible"], below=True)
-        total = {name: np.sqrt(weights @ x / (weights @ rows)) for name, x in square.items()}
-        total["floor"] = np.sqrt(np.maximum(weights @ floor, 0.0) / (weights @ rows))
-        tells = total["before"][0] > _TELLS * total["floor"][0]
-        by_metric[measure.name] = _closed(total, tells, blocks)
-        placebos[measure.name] = _placebo(total, tells, blocks)
-        ceiling[measure.name] = float(total["ceiling"][0])
+        form = held.floor.squares[k]
+        floors = _floors(square, expected(form), drawn(form, z), rng, better=-1)
+        told[measure.name] = _Told(square, floors, held.rows, again, better=-1)
     nats = {name: s.nats for name, s in sums.items()}
-    best = _floor(nats["fitted"] - nats["owed"], nats["flexible"], below=False)
-    total = {name: weights @ x / (weights @ rows) for name, x in nats.items()}
-    total["floor"] = weights @ best / (weights @ rows)
-    tells = (total["floor"][0] - total["before"][0]) * rows.sum() > _TELLS_NATS
-    by_metric[DENSITY] = _closed(total, tells, blocks)
-    placebos[DENSITY] = _placebo(total, tells, blocks)
-    ceiling[DENSITY] = float(total["ceiling"][0])
+    form = held.floor.nats
+    best = nats["fitted"] + form[:, 0, 0]
+    floors = _floors(nats, best - expected(form), best - drawn(form, z), rng, better=1)
+    told[DENSITY] = _Told(nats, floors, held.rows, again, better=1)
+
+    by_metric = {name: one.closed for name, one in told.items()}
     usual = [m.name for m in kinds if m.horizon_s == USUAL[m.witness]]
     shows = {name: by_metric[name].before / max(by_metric[name].floor, 1e-12) for name in usual}
     metric = max(shows, key=lambda name: shows[name])
@@ -60,41 +59,81 @@ def shrinkage(held: HeldOut) -> Shrinkage:
         metric=metric,
         by_metric=by_metric,
         placebo_effect=None if held.sham is None else held.sham.name,
-        placebo=placebos[metric],
-        ceiling=ceiling,
+        placebo=told[metric].placebo,
+        ceiling={m.name: told[m.name].all_in("ceiling") for m in kinds} | {DENSITY: told[DENSITY].all_in("ceiling")},
         chosen=held.chosen,
         blocks=blocks,
         by_drives=held.by_drives,
     )
 
 
-def _floor(model: Float, flexible: Float, *, below: bool) -> Float:
-    """(block,): the flexible regression's where it beats the model by more than blocks differ."""
-    gain = (model - flexible) if below else (flexible - model)
-    if len(gain) > 1 and gain.mean() > 1.645 * gain.std(ddof=1) / np.sqrt(len(gain)):
-        return flexible
-    return model
+def _floors(sums: Mapping[str, Float], mean: Float, draws: Float, rng: np.random.Generator, *, better: int) -> Float:
+    """(1 + draw, block), the mean first.
+
+    The flexible regression's, where by more than blocks differ it beats the model by a tenth of the gap or more: where
+    a controller feeds noise back into its commands a regression foretells a little of the noise itself. How much of
+    what it takes could be had is not known: any share, in the draws.
+    """
+    gain = better * (sums["flexible"] - mean)
+    count = len(gain)
+    if gain.sum() > 0:
+        draws = draws + better * rng.random((len(draws), 1)) * gain
+    sure = count > 1 and gain.mean() > student.ppf(0.95, count - 1) * gain.std(ddof=1) / np.sqrt(count)
+    if sure and gain.sum() > _MATERIAL * (better * (mean - sums["before"])).sum():
+        mean = sums["flexible"]
+    return np.concatenate([mean[None], draws])
 
 
-def _closed(total: dict[str, Float], tells: bool, blocks: int) -> Closed:
-    """From values (draw,), the first of all blocks once."""
-    share = None
-    if tells:
-        share = _share(total["before"] - total["after"], total["before"] - total["floor"], blocks)
-    before, after, floor = (float(total[name][0]) for name in ("before", "after", "floor"))
-    return Closed(before, after, floor, share)
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """By one measure: sums by name (block,), `floors` (1 + draw, block), rows (block,), and how often each block is
+    drawn (draw, block). `better` -1: sums are of squares, of whose means the roots count."""
 
+    sums: Mapping[str, Float]
+    floors: Float
+    rows: Float
+    again: Float
+    better: int
 
-def _placebo(total: dict[str, Float], tells: bool, blocks: int) -> Quantity | None:
-    if not tells or "placebo" not in total:
-        return None
-    return _share(total["verdict"] - total["placebo"], total["before"] - total["floor"], blocks)
+    def all_in(self, name: str) -> float:
+        """Of all blocks once."""
+        return float(self._mean(self.sums[name], np.ones(len(self.rows))))
 
+    @property
+    def closed(self) -> Closed:
+        before, after = self.all_in("before"), self.all_in("after")
+        floor = float(self._mean(self.floors[0], np.ones(len(self.rows))))
+        return Closed(before, after, floor, self._share("before", "after") if self._tells else None)
 
-def _share(part: Float, whole: Float, blocks: int) -> Quantity:
-    draws = part[1:] / np.where(np.abs(whole[1:]) > 1e-12, whole[1:], np.nan)
-    draws = draws[np.isfinite(draws)]
-    mean = float(part[0] / whole[0])
-    wider = float(student.ppf(0.95, blocks - 1) / normal.ppf(0.95) * np.sqrt(blocks / (blocks - 1)))
-    q05, q95 = mean + wider * (np.quantile(draws, (0.05, 0.95)) - mean)
-    return Quantity(mean, wider * float(draws.std()), min(float(q05), mean), max(float(q95), mean))
+    @property
+    def placebo(self) -> Quantity | None:
+        return self._share("verdict", "placebo") if self._tells and "placebo" in self.sums else None
+
+    @property
+    def _tells(self) -> bool:
+        """Whether there is a gap to close."""
+        before, floor = self.all_in("before"), float(self._mean(self.floors[0], np.ones(len(self.rows))))
+        if self.better < 0:
+            return before > _TELLS * floor
+        return (floor - before) * self.rows.sum() > _TELLS_NATS
+
+    def _mean(self, sums: Float, weights: Float) -> Float:
+        """Of a row, over blocks (..., block) weighed (..., block)."""
+        mean = (weights * sums).sum(-1) / (weights * self.rows).sum(-1)
+        return np.sqrt(np.maximum(mean, 0.0)) if self.better < 0 else mean
+
+    def _share(self, one: str, other: str) -> Quantity:
+        """Of the reducible gap, what lies between two sums."""
+
+        def share(weights: Float, floors: Float) -> Float:
+            before, a, b = (self._mean(self.sums[name], weights) for name in ("before", one, other))
+            whole = before - self._mean(floors, weights)
+            return (a - b) / np.where(np.abs(whole) > 1e-12, whole, np.nan)
+
+        blocks = len(self.rows)
+        mean = float(share(np.ones(blocks), self.floors[0]))
+        wider = float(student.ppf(0.95, blocks - 1) / normal.ppf(0.95) * np.sqrt(blocks / (blocks - 1)))
+        away = wider * (share(self.again, self.floors[0]) - mean) + share(np.ones(blocks), self.floors[1:]) - mean
+        away = away[np.isfinite(away)]
+        q05, q95 = mean + np.quantile(away, (0.05, 0.95))
+        return Quantity(mean, float(away.std()), min(float(q05), mean), max(float(q95), mean))

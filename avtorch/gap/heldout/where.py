@@ -2,10 +2,8 @@
 
 What a cause does to each row is half the square of the white image of its change, the nats it is expected to bring. On
 each axis the part named is the shortest stretch that holds nearly all of it, if plainly fewer rows lie there. A part is
-named on the strength of what it gains where it was held out: densities that have not seen these rows compete, and their
-ratio is taken for an e-value, for which the procedure of Wang and Ramdas (2022) keeps the false-discovery rate whatever
-the dependence. It is one up to what the other blocks did not tell of the baseline, and what the parts' fits share. An
-onset was found on all rows and pays for all that it might have been.
+named on the strength of what its rows gain, less all that the find has paid (`shown.py`): an e-value, for which the
+procedure of Wang and Ramdas (2022) keeps the false-discovery rate whatever the dependence between parts.
 """
 
 from __future__ import annotations
@@ -17,8 +15,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from avtorch.gap.answer.where import Axis, Where
-from avtorch.gap.heldout.held_out import HeldOut
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.heldout.shown import Shown
 
 Float = NDArray[np.float64]
 
@@ -28,32 +25,26 @@ _BAND = 0.9  # of the power
 _RATE = 0.05  # of false discoveries
 
 
-def where(held: HeldOut, *, onset_s: float | None, lag: float) -> tuple[Where, ...]:
+def where(shown: Shown, *, onset_s: float | None, lag: float) -> tuple[Where, ...]:
     """The parts, the surest first. `onset_s`: when the cause set in, on the log's time; `lag` [s] of the actuator."""
-    parts = [*_stretches(held, onset_s, lag), *_signals(held), *_band(held)]
-    paid = 0.0 if onset_s is None else onset_price(held.record)
-    q_values = _q_values([gain - paid for *_, gain in parts])
+    parts = [*_stretches(shown, onset_s, lag), *_signals(shown), *_band(shown)]
+    q_values = _q_values([gain - shown.paid for *_, gain in parts])
     named = [Where(axis, a, b, share, q) for (axis, a, b, share, _), q in zip(parts, q_values, strict=True)]
     return tuple(sorted((w for w in named if w.q_value <= _RATE), key=lambda w: w.q_value))
-
-
-def onset_price(record: Record) -> float:
-    """What not having known the onset costs [nats]: any row might have been it."""
-    return float(np.log(record.rows))
 
 
 Part = tuple[Axis, float | str, float | str, float, float]
 """Axis, ends, share of what the cause does, and what was gained there [nats]."""
 
 
-def _stretches(held: HeldOut, onset_s: float | None, lag: float) -> Iterator[Part]:
-    record, does = held.record, held.does
+def _stretches(shown: Shown, onset_s: float | None, lag: float) -> Iterator[Part]:
+    record, does = shown.record, shown.does
     time = record.time[record.source]
     one_clock = bool((np.diff(time) > 0).all())
     if onset_s is not None and one_clock:
         # what chance decides (glitches, lost messages) has an onset, and nothing that is known beforehand
         since_then = does if does.any() else np.ones(len(time))
-        yield _part(held, "time", time, onset_s, float(time[-1]), since_then)
+        yield _part(shown, "time", time, onset_s, float(time[-1]), since_then)
     if not does.any():
         return
     axes: list[tuple[Axis, Float]] = [("time", time)] if onset_s is None and one_clock else []
@@ -68,12 +59,21 @@ def _stretches(held: HeldOut, onset_s: float | None, lag: float) -> Iterator[Par
         # by sizes and not by squares, or the edges of where it acts would not count
         low, high = shortest(x, np.sqrt(does), _MOST)
         if ((x >= low) & (x <= high))[since].mean() <= _PLAINLY:
-            yield _part(held, axis, x, low, high, does)
+            part = _part(shown, axis, x, low, high, does)
+            yield part if axis != "command" else (axis, *_own_ends(x, low, high, record.command), *part[3:])
 
 
-def _part(held: HeldOut, axis: Axis, x: Float, low: float, high: float, does: Float) -> Part:
+def _own_ends(x: Float, low: float, high: float, command: Float) -> tuple[float, float]:
+    """`low` and `high` of an answered command `x`; where it goes no further, as far as the `command` itself goes."""
+    return (
+        float(command.min()) if low <= x.min() + 1e-9 else low,
+        float(command.max()) if high >= x.max() - 1e-9 else high,
+    )
+
+
+def _part(shown: Shown, axis: Axis, x: Float, low: float, high: float, does: Float) -> Part:
     inside = (x >= low) & (x <= high)
-    return axis, low, high, float(does[inside].sum() / does.sum()), float(held.gained[inside].sum())
+    return axis, low, high, float(does[inside].sum() / does.sum()), float(shown.gained[inside].sum())
 
 
 def shortest(x: Float, weight: Float, share: float) -> tuple[float, float]:
@@ -87,21 +87,21 @@ def shortest(x: Float, weight: Float, share: float) -> tuple[float, float]:
     return float(x[best]), float(x[ends[best] - 1])
 
 
-def _signals(held: HeldOut) -> Iterator[Part]:
-    does, felt = float(held.does.sum()), float(held.felt.sum())
+def _signals(shown: Shown) -> Iterator[Part]:
+    does, felt = float(shown.does.sum()), float(shown.felt.sum())
     if does <= 0:
         return
-    gained = float(held.gained.sum())
+    gained = float(shown.gained.sum())
     sensing = min(felt / does, 1.0)
     for name, share in (("actuation", 1 - sensing), ("sensing", sensing)):
         if share > 0:
             yield "signal", name, name, share, share * gained
 
 
-def _band(held: HeldOut) -> Iterator[Part]:
+def _band(shown: Shown) -> Iterator[Part]:
     """The band of frequencies of what the cause does to the acceleration."""
-    record = held.record
-    accel = held.moved[0] if "accel" in record.witnesses else np.gradient(held.moved[-1]) / record.dt
+    record = shown.record
+    accel = shown.moved[0] if "accel" in record.witnesses else np.gradient(shown.moved[-1]) / record.dt
     power, f = np.zeros(0), np.zeros(0)
     for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
         x = accel[first:last]
@@ -115,7 +115,7 @@ def _band(held: HeldOut) -> Iterator[Part]:
         # the slowest that a drive holds is as good as steady
         slowest = low <= np.log(f.min()) + 1e-9
         begin, end = 0.0 if slowest else float(np.exp(low)), float(np.exp(high))
-        yield "frequency", begin, end, share, share * float(held.gained.sum())
+        yield "frequency", begin, end, share, share * float(shown.gained.sum())
 
 
 def _q_values(gains: Sequence[float]) -> list[float]:

@@ -1,12 +1,13 @@
-"""Draws of a rollout's errors from their noise model."""
+"""Draws of a rollout's errors from their noise model, by the same exact steps that its filter takes."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
+from scipy.linalg import solve_discrete_lyapunov
 
 from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.likelihood.steady_filter import motion
 
 Float = NDArray[np.float64]
 
@@ -15,26 +16,22 @@ def noise_draws(
     noise: NoiseModel, rows: int, dt: float, witnesses: tuple[str, ...], count: int, rng: np.random.Generator
 ) -> Float:
     """(draw, witness, row) at rows `dt` [s] apart; the error of the speed begins at 0, its sensor's noise apart."""
-    process = _coloured(noise.process_sd, noise.process_time, rows, dt, count, rng)
-    motion = process + _coloured(noise.force_sd, noise.force_time, rows, dt, count, rng)
-    out = []
-    for name in witnesses:
-        if name == "accel":
-            seen = noise.sensor_scale * motion
-            if noise.sensor_lag > 0:
-                lost = -np.expm1(-dt / noise.sensor_lag)
-                seen = np.asarray(lfilter([lost], [1, lost - 1], seen, axis=-1))
-            out.append(seen + noise.accel_sd * rng.standard_normal((count, rows)))
-        else:
-            gained = np.cumsum(0.5 * dt * (motion[:, 1:] + motion[:, :-1]), -1)
-            speed = np.concatenate([np.zeros((count, 1)), gained], -1)
-            out.append(speed + noise.speed_sd * rng.standard_normal((count, rows)))
-    return np.stack(out, 1)
+    move, driven = motion(noise, dt)
+    # what forgets is in its steady state when the drive begins
+    start = np.zeros_like(move)
+    start[1:, 1:] = solve_discrete_lyapunov(move[1:, 1:], driven[1:, 1:])
+    root, first = _root(driven), _root(start)
+    state = np.empty((rows, count, len(move)))
+    state[0] = rng.standard_normal((count, len(move))) @ first.T
+    pushed = rng.standard_normal((rows, count, len(move))) @ root.T
+    for k in range(1, rows):
+        state[k] = state[k - 1] @ move.T + pushed[k]
+    accel = state[..., 3] if noise.sensor_lag > 0 else state[..., 1] + state[..., 2]
+    clean = {"accel": noise.sensor_scale * accel, "speed": state[..., 0]}
+    sds = {"accel": noise.accel_sd, "speed": noise.speed_sd}
+    return np.stack([clean[w].T + sds[w] * rng.standard_normal((count, rows)) for w in witnesses], 1)
 
 
-def _coloured(sd: float, time: float, rows: int, dt: float, count: int, rng: np.random.Generator) -> Float:
-    """A stationary Ornstein-Uhlenbeck process, (draw, row)."""
-    keep = float(np.exp(-dt / max(time, 1e-6)))
-    white = rng.standard_normal((count, rows))
-    white[:, 1:] *= np.sqrt(1 - keep**2)
-    return sd * np.asarray(lfilter([1.0], [1.0, -keep], white, axis=-1))
+def _root(covariance: Float) -> Float:
+    values, axes = np.linalg.eigh(covariance)
+    return np.asarray(axes * np.sqrt(np.maximum(values, 0.0)))

@@ -24,7 +24,7 @@ def designed(noises: Sequence[NoiseModel], dt: float, witnesses: tuple[str, ...]
 
     The models have a sensor's lag all of them, or none.
     """
-    pairs = [_motion(n, dt) for n in noises]
+    pairs = [motion(n, dt) for n in noises]
     move, driven = np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])
     use = [i for i, name in enumerate(("accel", "speed")) if name in witnesses]
     keep = slice(0 if 1 in use else 1, move.shape[-1])
@@ -58,7 +58,7 @@ def designed(noises: Sequence[NoiseModel], dt: float, witnesses: tuple[str, ...]
     return [([list(row) for row in mixed[i]], bottom[i], float(sizes[i])) for i in range(len(noises))]
 
 
-def _motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
+def motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
     """State (error of the speed, p, d) over `dt`: its transition and the covariance that is added, both exact.
 
     Two Ornstein-Uhlenbeck processes and the integral of their sum. Behind a late sensor its reading is a fourth state.

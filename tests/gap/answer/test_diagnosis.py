@@ -240,6 +240,26 @@ def test_verdict_and_candidates_agree_or_are_refused() -> None:
         diagnosis(given, verdict=Verdict(("dead_time",), ("dead_time",), True, ""))
 
 
+def test_printed_it_says_what_it_found() -> None:
+    found = diagnosis(candidates(dead_time=0.8, unknown=0.1, none=0.1), onset_s=12.0, notes=("Mind the gap.",))
+    told = str(found).splitlines()
+    assert told[0].startswith("Probably the simulator lacks dead_time (probability 0.80)")
+    assert found.verdict.why in told
+    assert "Onset: at 12.0 s of the log's time." in told
+    assert told[-1] == "Mind the gap."
+    assert "dead_time" in repr(found)
+    assert "\n" not in repr(found)
+    assert len(repr(found)) < 300
+
+
+@pytest.mark.parametrize("name", ["none", "unknown"])
+def test_printed_it_blames_nothing_where_nothing_was_measured(name: str) -> None:
+    weights = {"none": 0.05, "unknown": 0.05, "dead_time": 0.1} | {name: 0.85}
+    bare = replace(diagnosis(candidates(**weights)), gap=GapFacts(name == "unknown"))
+    assert "nothing" in str(bare).splitlines()[0]
+    assert "None" not in str(bare)
+
+
 def test_written_files_read_back(tmp_path: Path) -> None:
     given = candidates(aerodynamic_drag_and_dead_time=0.8, none=0.15, unknown=0.05)
     repaired = plant([DeadTime(0.21), AerodynamicDrag(4e-4)], T_L=0.31, K_L=0.97)

@@ -40,7 +40,7 @@ def test_superposition_is_what_the_loops_differ_by(witness: str, rotating_seed: 
     error = push if witness == "accel" else np.concatenate([[0.0], np.cumsum(push[:-1]) * DT])
     for quantity, want in (("speed", v1 - v0), ("spacing", s1 - s0)):
         measure = LoopMeasure(witness, quantity, T, K, GAP, GAINS)
-        told = measure.of(np.stack([error, 2 * error]), DT, 0.3)
+        told = measure.of(np.stack([error, 2 * error]), DT)
         # Euler steps of 5 ms against a bilinear transform
         np.testing.assert_allclose(told[0], want, atol=0.01 * np.abs(want).max() + 1e-4)
         np.testing.assert_allclose(told[1], 2 * told[0])

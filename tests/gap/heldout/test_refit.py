@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from avtorch.gap import AerodynamicDrag, DeadTime, Gust, SensorScale
-from avtorch.gap.heldout.judged import Judge
+from avtorch.gap.heldout.floor import drawn, expected
+from avtorch.gap.heldout.judged import Judge, unknown_by
 from avtorch.gap.heldout.parts import parted
 from avtorch.gap.heldout.refit import Refit
 from avtorch.gap.heldout.rollout_errors import measures
@@ -38,10 +39,16 @@ def test_what_is_owed_is_what_draws_of_the_posterior_cost(rotating_seed: int) ->
     part = parted(record)[0]
     refit = Refit.of(found, part.fits)
     judge = Judge(record, part, measures(record.witnesses), 0.35)
-    owed = judge.owed(refit)
+    floor = judge.floor(refit, unknown_by(refit))
     draws = rng.multivariate_normal(np.zeros(len(refit.z)), refit.covariance, size=400)
     around = refit.around(np.concatenate([np.zeros((1, len(refit.z))), draws]))
-    cost = judge.squares(around[1:] - around[:1]) / 400
+    cost = sum(judge.products(one[None]) for one in around[1:] - around[:1])[..., 0, 0] / 400
     # 400 draws of a sum of squares: 7 % a standard deviation at most; rollouts bend a little
-    np.testing.assert_allclose(owed.squares.sum(1), cost.sum(1), rtol=0.4)
-    assert (owed.nats >= 0).all()
+    owed = expected(floor.squares) - floor.squares[..., 0, 0]
+    np.testing.assert_allclose(owed.sum(1), cost.sum(1), rtol=0.4)
+    assert (expected(floor.nats) >= floor.nats[:, 0, 0]).all()
+    # whole rollouts under the posterior, as long as they do not bend: medians of 400 against 4000
+    squares = np.stack([judge.products(record.measured[None] - one)[..., 0, 0] for one in around[1:]])
+    told = drawn(floor.squares, rng.standard_normal((4000, floor.axes)))
+    away = np.median(told.sum(-1), 0) - np.median(squares.sum(-1), 0)
+    assert (np.abs(away) < 0.5 * squares.sum(-1).std(0)).all()

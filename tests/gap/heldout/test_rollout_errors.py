@@ -1,7 +1,5 @@
 """Errors of short rollouts against short rollouts."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 import torch
@@ -11,14 +9,14 @@ from avtorch.gap.chain.plant import plant
 from avtorch.gap.heldout.rollout_errors import Measure, measures
 from tests.gap.records import command_over
 
-RATE = 50
+RATE = 10
 
 
 @pytest.mark.parametrize("witness", ["accel", "speed"])
 @pytest.mark.parametrize("horizon", [0.5, 2.0, 10.0])
 def test_they_are_those_of_rollouts_begun_at_what_was_measured(witness: str, horizon: float) -> None:
     rng = np.random.default_rng(3)
-    time = np.arange(21 * RATE) / RATE
+    time = np.arange(15 * RATE) / RATE
     command = command_over(time)
     seen = {"accel": rng.normal(size=len(time)), "speed": 15 + np.cumsum(rng.normal(size=len(time))) / RATE}
     car = plant(T_L=0.4, K_L=0.9)
@@ -33,17 +31,25 @@ def test_they_are_those_of_rollouts_begun_at_what_was_measured(witness: str, hor
     # the speed's rollout begins with the actuator where the commands have brought it
     begun = seen["accel"] if witness == "accel" else whole["accel"]
     long = seen[witness] - whole[witness]
-    told = Measure(witness, horizon).of(long, 1 / RATE, 0.4)
+    blocks = [slice(0, 40), slice(40, 45), slice(70, len(time))]
+    told = Measure(witness, horizon).products(np.stack([long, -2 * long]), blocks, 1 / RATE, 0.4)
     length = round(horizon * RATE)
-    edges = [*range(0, len(time), length), len(time)]
-    if edges[-1] - edges[-2] <= length // 5:
-        edges.pop(-2)
-    want = [seen[witness][a:b] - rolled(a, b, begun[a])[witness] for a, b in pairwise(edges)]
-    np.testing.assert_allclose(told, np.concatenate(want), atol=1e-9)
+    squares: list[list[float]] = [[] for _ in time]
+    squares[-1].append(0.0)  # a rollout begun at the last row
+    for first in range(len(time) - 1):
+        last = min(first + length, len(time))
+        errors = seen[witness][first:last] - rolled(first, last, begun[first])[witness]
+        for row, error in enumerate(errors, first):
+            squares[row].append(error**2)
+    by_row = np.array([np.mean(each) for each in squares])
+    want = np.array([by_row[b].sum() for b in blocks])
+    np.testing.assert_allclose(told, want[:, None, None] * np.array([[1, -2], [-2, 4]]), atol=1e-9)
 
 
 def test_the_usual_ones_have_the_schemas_names() -> None:
     names = [m.name for m in measures(("accel", "speed"))]
     assert {"rollout_rmse_accel", "rollout_rmse_speed", "rollout_rmse_accel_2s", "rollout_rmse_speed_whole"} <= {*names}
     assert len(set(names)) == len(names) == 8
-    assert Measure("accel", None).of(np.arange(5.0), 0.1, 0.3).tolist() == [0, 1, 2, 3, 4]
+    rows = np.arange(1.0, 6.0)[None]
+    assert Measure("accel", None).products(rows, [slice(1, 5)], 0.1, 0.3).tolist() == [[[4 + 9 + 16 + 25]]]
+    assert Measure("speed", None).products(rows, [slice(1, 5)], 0.1, 0.3).tolist() == [[[1 + 4 + 9 + 16]]]

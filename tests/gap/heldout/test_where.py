@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avtorch.gap.heldout.held_out import HeldOut
+from avtorch.gap.heldout.shown import Shown
 from avtorch.gap.heldout.where import _q_values, shortest, where
 from avtorch.gap.likelihood.record import Record
 from tests.gap.records import log_of
 
 
-def _held(does: np.ndarray, record: Record, *, nats: float = 200.0, felt: float = 0.0) -> HeldOut:
+def _shown(does: np.ndarray, record: Record, *, nats: float = 200.0, felt: float = 0.0, paid: float = 10.0) -> Shown:
     size = does / does.sum() * nats
     moved = np.stack([np.sqrt(does), np.cumsum(np.sqrt(does)) * record.dt])
-    return HeldOut(record, (), {}, np.zeros(0), size, size, felt * size, moved, 1.0, None)
+    return Shown(record, size, paid, size, felt * size, moved)
 
 
 @pytest.fixture(scope="module")
@@ -25,17 +25,17 @@ def record() -> Record:
 def test_a_speed_range_is_named_and_a_uniform_cause_is_not(record: Record) -> None:
     speed = record.measured[1, :, 0]
     slow = np.quantile(speed, 0.3)
-    named = where(_held((speed < slow) + 0.0, record), onset_s=None, lag=0.3)
+    named = where(_shown((speed < slow) + 0.0, record), onset_s=None, lag=0.3)
     part = next(w for w in named if w.axis == "speed")
     assert (part.begin, part.end) == pytest.approx((speed.min(), slow), abs=0.15)
     assert part.share > 0.9
-    even = where(_held(np.ones(record.rows), record), onset_s=None, lag=0.3)
+    even = where(_shown(np.ones(record.rows), record), onset_s=None, lag=0.3)
     assert {w.axis for w in even} <= {"signal", "frequency"}
 
 
 def test_braking_is_named(record: Record) -> None:
     command = record.command[record.source]
-    named = where(_held(np.maximum(-command, 0) ** 2 + 1e-9, record), onset_s=None, lag=0.05)
+    named = where(_shown(np.maximum(-command, 0) ** 2 + 1e-9, record), onset_s=None, lag=0.05)
     part = next(w for w in named if w.axis == "command")
     assert float(part.end) < 0.15
     assert float(part.begin) == pytest.approx(command.min(), abs=0.3)
@@ -43,20 +43,20 @@ def test_braking_is_named(record: Record) -> None:
 
 def test_an_onset_is_a_part_of_the_time(record: Record) -> None:
     time = record.time[record.source]
-    named = where(_held((time > 70) + 0.0, record), onset_s=70.0, lag=0.3)
+    named = where(_shown((time > 70) + 0.0, record), onset_s=70.0, lag=0.3)
     part = next(w for w in named if w.axis == "time")
     assert (part.begin, part.end) == (70.0, time[-1])
     assert part.share == pytest.approx(1.0)
 
 
 def test_what_gains_nothing_is_not_named(record: Record) -> None:
-    quiet = _held(np.ones(record.rows), record)
+    quiet = _shown(np.ones(record.rows), record)
     assert where(replace(quiet, gained=np.zeros(record.rows)), onset_s=30.0, lag=0.3) == ()
     assert where(replace(quiet, gained=-quiet.gained), onset_s=30.0, lag=0.3) == ()
 
 
 def test_sensing_and_actuation_share(record: Record) -> None:
-    named = {w.begin: w.share for w in where(_held(np.ones(record.rows), record, felt=0.25), onset_s=None, lag=0.3)}
+    named = {w.begin: w.share for w in where(_shown(np.ones(record.rows), record, felt=0.25), onset_s=None, lag=0.3)}
     assert (named["actuation"], named["sensing"]) == pytest.approx((0.75, 0.25))
 
 

@@ -12,7 +12,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_are
 from avtorch.gap.likelihood.earlier import CALM, earlier
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.steady_filter import _motion, _steady
+from avtorch.gap.likelihood.steady_filter import _steady, motion
 from avtorch.gap.likelihood.whitener import Whitener
 from tests.gap.records import BOTH, Float, dense_covariance, errors_of, log_normal_density, log_of, record_of
 
@@ -339,7 +339,7 @@ def test_motion_in_closed_form_is_van_loans(noise: NoiseModel, dt: float) -> Non
     drift, spectrum, _ = _process(noise)
     n = len(drift)
     both = expm(np.block([[-drift, spectrum], [np.zeros((n, n)), drift.T]]) * dt)
-    move, driven = _motion(noise, dt)
+    move, driven = motion(noise, dt)
     np.testing.assert_allclose(move, both[n:, n:].T, rtol=1e-12, atol=1e-15)
     want = both[n:, n:].T @ both[:n, n:]
     scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
@@ -350,7 +350,7 @@ def test_motion_in_closed_form_is_van_loans(noise: NoiseModel, dt: float) -> Non
 @pytest.mark.parametrize("lag", [0.0021, 0.02, 0.2, 0.5])
 def test_motion_behind_a_late_sensor_is_the_integral(lag: float, dt: float) -> None:
     noise = replace(NOISES["windy"], sensor_lag=lag)
-    move, driven = _motion(noise, dt)
+    move, driven = motion(noise, dt)
     exact, want = _over(noise, dt)
     np.testing.assert_allclose(move, exact, rtol=1e-10, atol=1e-14)
     scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
