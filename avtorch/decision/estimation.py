@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from statistics import median, stdev
+from statistics import fmean
 from typing import Any, Literal
 
 import torch
@@ -31,7 +32,8 @@ class Estimates:
     """What `estimate` found.
 
     `windows` in the order of the log; `seconds_per_window` of computing; `form` "jerk" or "latent"; `quality` of the
-    log, looked at first; `setting` under which P(string stable) was asked: a log does not tell its controller.
+    log, looked at first; `setting` under which P(string stable) was asked: a log does not tell its controller;
+    `estimator` by name.
     """
 
     windows: list[WatchedWindow]
@@ -39,6 +41,7 @@ class Estimates:
     form: str
     quality: Quality
     setting: Setting
+    estimator: str = "sgld"
 
     @property
     def excited_share(self) -> float:
@@ -50,13 +53,15 @@ class Estimates:
         """Spread of a parameter from window to window over its posterior SD, None below three used windows.
 
         About 1 where the vehicle stays as it is and the posterior is honest; above 1.5 the posterior is too narrow for
-        what the log shows, or the vehicle changed (SPEC section 3).
+        what the log shows, or the vehicle changed. Each window's distance from the mean counts in its own SD, and the
+        mean weighs windows by precision (the Birge ratio), so windows that know little do not pass for spread.
         """
         beliefs = [w.window.belief for w in self.windows]
         stats = [b.stat(name) for b in beliefs if bool(b.excited[0] & b.converged[0])]
         if len(stats) < 3:
             return None
-        return stdev(s["mean"] for s in stats) / median(s["sd"] for s in stats)
+        centre = fmean([s["mean"] for s in stats], weights=[s["sd"] ** -2 for s in stats])
+        return math.sqrt(sum(((s["mean"] - centre) / s["sd"]) ** 2 for s in stats) / (len(stats) - 1))
 
 
 def estimate(
@@ -64,6 +69,7 @@ def estimate(
     window: float = 2.0,
     *,
     form: FormName = "auto",
+    estimator: str = "sgld",
     setting: Setting | None = None,
     monitor: Monitor | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -75,9 +81,14 @@ def estimate(
     `form`: "jerk" needs measured jerk and accel (Eq. 4); "latent" takes accel and/or speed with their noise;
     "auto" is "jerk" where the log has both. Windows lie on a grid that starts afresh with each segment of the log; the
     last of a segment may be short. Rows at standstill or with `engaged` 0 are masked. `progress(done, of)` is called
-    with rows. Further keywords go to `SequentialInference` (`mode`, `lam`, `settings`, ...).
+    with rows.
 
-    Raises `InputError` for a log without accel_cmd, a form whose columns it lacks, or a window longer than the log.
+    `estimator`: "sgld" samples each window's posterior, "map" takes its mode and curvature, "rls" is recursive least
+    squares (measured jerk only), "ekf" and "ukf" are joint Kalman filters. Further keywords are the estimator's own
+    (`mode`, `lam`, `settings`, ...; see `avtorch.inference.estimators.make_estimator`).
+
+    Raises `InputError` for a log without accel_cmd, a form whose columns it lacks, a window longer than the log, or an
+    estimator that is not known or cannot take the form.
     """
     if log.accel_cmd is None:
         raise InputError(f"{log.name}: has no accel_cmd; T_L and K_L need the demanded acceleration")
@@ -95,7 +106,8 @@ def estimate(
     setting = Setting() if setting is None else setting
     if setting.shape != (1,):
         raise InputError(f"setting: found shape {tuple(setting.shape)}, needs one, (1,), for one log")
-    watch = Watch(BeliefStream(window=window, form=chosen, gap=float("inf"), seed=seed, **inference), monitor)
+    options = {"estimator": estimator, "seed": seed, **inference}
+    watch = Watch(BeliefStream(window=window, form=chosen, gap=float("inf"), **options), monitor)
     usable = torch.from_numpy(log.usable)
     signals = {name: torch.from_numpy(getattr(log, name)) for name in chosen.columns}
     windows: list[WatchedWindow] = []
@@ -119,7 +131,8 @@ def estimate(
         seen += watch.flush(setting)
         windows += [_on_the_logs_clock(w, ahead) for w in seen]
     seconds = (clock.perf_counter() - begun) / max(len(windows), 1)
-    return Estimates(windows, seconds, "jerk" if isinstance(chosen, JerkForm) else "latent", quality, setting)
+    name = "jerk" if isinstance(chosen, JerkForm) else "latent"
+    return Estimates(windows, seconds, name, quality, setting, estimator)
 
 
 def _on_the_logs_clock(watched: WatchedWindow, ahead: float) -> WatchedWindow:

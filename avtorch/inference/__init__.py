@@ -1,5 +1,6 @@
 """What we believe: densities and priors, SGLD, Algorithm 1, and the sequential loop."""
 
+from avtorch.inference.belief import Belief
 from avtorch.inference.conjugate import Conjugate, sample_conjugate
 from avtorch.inference.control_variates import ControlVariates
 from avtorch.inference.density import (
@@ -16,7 +17,9 @@ from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.posterior import Posterior, nested_rhat
 from avtorch.inference.quadrature import Quadrature, integrate
 from avtorch.inference.sampler import SamplerSettings, sample
-from avtorch.inference.sequential import Belief, SequentialInference
+from avtorch.inference.second_order import PositionLagDensity, SpeedLagDensity
+from avtorch.inference.second_order_form import PositionLagForm, SpeedLagForm
+from avtorch.inference.sequential import SequentialInference
 from avtorch.inference.sghmc import SGHMC
 from avtorch.inference.sgld import SGLD
 from avtorch.inference.stream import BeliefStream, Window
@@ -39,12 +42,16 @@ __all__ = [
     "JerkPoints",
     "JerkStatistics",
     "Mode",
+    "PositionLagDensity",
+    "PositionLagForm",
     "Posterior",
     "Quadrature",
     "SamplerSettings",
     "ScoredDensity",
     "SelectableDensity",
     "SequentialInference",
+    "SpeedLagDensity",
+    "SpeedLagForm",
     "SubsampledDensity",
     "TorchDensity",
     "Window",

@@ -70,7 +70,7 @@ def even_rows(runs: LatentWindow) -> EvenRows | None:
 
 
 class LatentDensity:
-    """Posterior of ``T_L`` [s], ``K_L`` [-] and the noise of every window (SPEC section 3, latent form).
+    """Posterior of ``T_L`` [s], ``K_L`` [-] and the noise of every window (latent form).
 
     ``names`` is ``latent_names``; the density is in ``z = log(parameter)``. Even rows take the fast route, others the
     row-by-row filter; both give the same number. Gaps and unused rows split a window into runs, whose likelihoods add.

@@ -15,7 +15,7 @@ from avtorch.inference.latent_window import LatentWindow
 REFERENCE = (0.3, 1.0)
 #: Noise level at which it is predicted: the medians of the noise priors.
 REFERENCE_NOISE = {name: median for name, (median, _) in NOISE_PRIOR.items()}
-#: What is known beforehand of log T_L and log K_L: the first prior's SDs (SPEC section 3).
+#: What is known beforehand of log T_L and log K_L: the first prior's SDs.
 KNOWN = (0.7, 0.3)
 #: A window is excited from one bit on: where it promises to halve the area of the belief about (T_L, K_L).
 LEAST_BITS = 1.0

@@ -47,7 +47,7 @@ def latent_log_likelihood(
     ``accel`` and ``speed``. The start is that of `initial_covariance`; the first speed's prior is centred on the first
     unmasked measured one, and the centre moves with the data: a constant added to all speeds changes nothing.
 
-    Source: SPEC section 3 (latent form), DIAGNOSIS.md. Raises InputError where neither signal, or a signal without its
+    Raises `InputError` where neither signal, or a signal without its
     noise, is given.
     """
     if accel is None and speed is None:

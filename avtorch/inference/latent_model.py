@@ -1,4 +1,4 @@
-r"""The latent-acceleration model and its exact discretisation (SPEC section 3, latent form).
+r"""The latent-acceleration model and its exact discretisation (latent form).
 
 State ``(v, a, c, e)``: the speed that the actuator alone would give, the actuator's acceleration, and what the
 simulator does not know: ``c``, by how much the car is faster than that, and its derivative ``e``, an external

@@ -1,6 +1,6 @@
 """Priors, stated on the positive parameters and evaluated in ``z = log(parameter)`` with the Jacobian counted.
 
-Defaults (SPEC, section 3): ``T_L ~ LogNormal(log 0.3, 0.7)``, ``K_L ~ LogNormal(log 1, 0.3)``,
+Defaults: ``T_L ~ LogNormal(log 0.3, 0.7)``, ``K_L ~ LogNormal(log 1, 0.3)``,
 ``sigma ~ HalfNormal(1 m/s^3)``.
 """
 
@@ -246,10 +246,10 @@ class Switch:
 
 
 def default_actuation_prior() -> LogNormalPrior:
-    """The first prior of ``(T_L [s], K_L [-])`` (SPEC, section 3)."""
+    """The first prior of ``(T_L [s], K_L [-])``."""
     return LogNormalPrior(torch.tensor([0.3, 1.0], dtype=torch.float64), torch.tensor([0.7, 0.3], dtype=torch.float64))
 
 
 def default_jerk_noise_prior() -> HalfNormalPrior:
-    """The prior of ``sigma`` [m/s^3] for every window (SPEC, section 3)."""
+    """The prior of ``sigma`` [m/s^3] for every window."""
     return HalfNormalPrior(torch.tensor([1.0], dtype=torch.float64))

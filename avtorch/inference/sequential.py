@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
+from avtorch.inference.belief import Belief, Summary
 from avtorch.inference.density import Density
+from avtorch.inference.evidence import Evidence, Rows
 from avtorch.inference.posterior import sorted_quantile
 from avtorch.inference.priors import (
     Joint,
@@ -24,34 +25,6 @@ from avtorch.inference.priors import (
 from avtorch.inference.sampler import SamplerSettings, sample
 
 Mode = Literal["lambda", "posterior", "forgetting"]
-
-
-@dataclass(frozen=True)
-class Belief:
-    """What is believed of every vehicle after a window.
-
-    Attributes:
-        names: parameter names, ``T_L`` [s] and ``K_L`` [-] first, then the noise parameters.
-        mean, sd, q05, q95: shape ``(vehicle, parameter)``.
-        draws: ``(draw, vehicle, parameter)``.
-        excited: ``(vehicle,)`` bool; where false the window was not used and the rest is carried over unchanged.
-        converged: ``(vehicle,)`` bool; false where the window was excited but its chains did not settle: carried over,
-            too.
-    """
-
-    names: tuple[str, ...]
-    mean: Tensor
-    sd: Tensor
-    q05: Tensor
-    q95: Tensor
-    draws: Tensor
-    excited: Tensor
-    converged: Tensor
-
-    def stat(self, name: str, vehicle: int = 0) -> dict[str, float]:
-        """``{"mean", "sd", "q05", "q95"}`` of one parameter of one vehicle."""
-        i = self.names.index(name)
-        return {key: float(getattr(self, key)[vehicle, i]) for key in ("mean", "sd", "q05", "q95")}
 
 
 class SequentialInference:
@@ -108,11 +81,9 @@ class SequentialInference:
             default_actuation_prior() if actuation_prior is None else actuation_prior, self.noise_prior
         )
         self.generator = torch.Generator().manual_seed(seed)
-        draws = self.first_prior.sample(kept, vehicles, generator=self.generator)
-        never = torch.zeros(vehicles, dtype=torch.bool)
-        self.belief = _summarise(names, draws.exp(), excited=never, converged=~never)
-        self._started = never.clone()
-        self._mean_z = draws.mean(0)
+        self.belief = Belief.of_prior(names, self.first_prior, kept, vehicles, self.generator)
+        self._started = torch.zeros(vehicles, dtype=torch.bool)
+        self._mean_z = self.belief.draws.log().mean(0)
         self._cov_z = torch.eye(len(names), dtype=torch.float64).repeat(vehicles, 1, 1)
 
     def prior(self) -> Prior:
@@ -133,43 +104,39 @@ class SequentialInference:
             excited: ``(vehicle,)`` bool; the others keep their belief.
         """
         index = excited.nonzero().squeeze(-1)
-        old = self.belief
-        draws, converged = old.draws, torch.ones_like(excited)
-        table = {key: getattr(old, key) for key in ("mean", "sd", "q05", "q95")}
-        if len(index):
-            posterior = sample(density(index, self.prior().select(index)), self.settings, generator=self.generator)
-            settled = posterior.converged
-            converged = converged.index_put((index,), settled)
-            used, good = index[settled], settled.nonzero().squeeze(-1)
-            if len(used):
-                ordered = posterior.flat[:, good].sort(0).values
-                new = {
-                    "mean": posterior.mean[good],
-                    "sd": posterior.sd[good],
-                    "q05": sorted_quantile(ordered, 0.05),
-                    "q95": sorted_quantile(ordered, 0.95),
-                }
-                table = {key: old_value.index_put((used,), new[key]) for key, old_value in table.items()}
-                mean_z, cov_z = posterior.log_moments()
-                self._mean_z = self._mean_z.index_put((used,), mean_z[good])
-                self._cov_z = self._cov_z.index_put((used,), cov_z[good])
-                self._started = self._started.index_put((used,), torch.tensor(True))
-                draws = draws.clone()
-                draws[:, used] = _thin(posterior.flat[:, good], len(draws))
-        self.belief = Belief(old.names, draws=draws, excited=excited, converged=converged, **table)
+        if not len(index):
+            self.belief = self.belief.unused(excited)
+            return self.belief
+        found, mean_z, cov_z, settled = self._solve(density(index, self.prior().select(index)))
+        used = index[settled]
+        self._mean_z = self._mean_z.index_put((used,), mean_z[settled])
+        self._cov_z = self._cov_z.index_put((used,), cov_z[settled])
+        self._started = self._started.index_put((used,), torch.tensor(True))
+        self.belief = self.belief.updated(excited, index, found, settled)
         return self.belief
+
+    def take(self, rows: Rows, evidence: Evidence) -> Belief:
+        """:meth:`update` as every estimator of a stream has it; the evidence holds all that is needed of the rows."""
+        return self.update(evidence.density, evidence.excited)
+
+    def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
+        """Posterior of some vehicles: its summary, log moments, and where it settled ``(vehicle,)`` bool."""
+        posterior = sample(density, self.settings, generator=self.generator)
+        ordered = posterior.flat.sort(0).values
+        quantiles = sorted_quantile(ordered, 0.05), sorted_quantile(ordered, 0.95)
+        draws = _thin(posterior.flat, len(self.belief.draws))
+        summary = Summary(posterior.mean, posterior.sd, *quantiles, draws)
+        return summary, *posterior.log_moments(), posterior.converged
 
     def state_dict(self) -> dict[str, Any]:
         """Everything a resumed loop needs to go on equal to the bit; plain tensors and names."""
-        b = self.belief
-        tensors = {key: getattr(b, key) for key in ("mean", "sd", "q05", "q95", "draws", "excited", "converged")}
         own = {
             "started": self._started,
             "mean_z": self._mean_z,
             "cov_z": self._cov_z,
             "generator": self.generator.get_state(),
         }
-        return {"names": list(b.names), "mode": self.mode, **tensors, **own}
+        return {"mode": self.mode, **self.belief.state_dict(), **own}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from :meth:`state_dict`.
@@ -181,8 +148,7 @@ class SequentialInference:
         own = (self.mode, self.belief.names, len(self.belief.mean))
         if saved != own:
             raise InputError(f"state: (mode, names, vehicles) were {saved} when it was saved, here they are {own}")
-        keys = ("mean", "sd", "q05", "q95", "draws", "excited", "converged")
-        self.belief = Belief(self.belief.names, **{key: state[key].clone() for key in keys})
+        self.belief = Belief.from_state(state)
         self._started, self._mean_z, self._cov_z = (state[key].clone() for key in ("started", "mean_z", "cov_z"))
         self.generator.set_state(state["generator"])
 
@@ -190,9 +156,3 @@ class SequentialInference:
 def _thin(draws: Tensor, count: int) -> Tensor:
     """``count`` draws spread evenly over the first dimension (repeated where there are fewer)."""
     return draws[torch.linspace(0, len(draws) - 1, count, dtype=torch.float64).round().long()]
-
-
-def _summarise(names: tuple[str, ...], draws: Tensor, *, excited: Tensor, converged: Tensor) -> Belief:
-    ordered = draws.sort(0).values
-    quantiles = (sorted_quantile(ordered, 0.05), sorted_quantile(ordered, 0.95))
-    return Belief(names, draws.mean(0), draws.std(0), *quantiles, draws, excited, converged)

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
+from avtorch.inference.belief import Belief
+from avtorch.inference.estimators.choose import make_estimator
 from avtorch.inference.evidence import Form, JerkForm
-from avtorch.inference.sequential import Belief, SequentialInference
 
 
 @dataclass(frozen=True)
@@ -41,14 +42,23 @@ class BeliefStream:
         window: length [s].
         form: which density; :class:`JerkForm` by default.
         gap: a step between rows longer than this [s] ends the window early; the next starts with the next row.
-        **inference: passed to :class:`SequentialInference` (``mode``, ``lam``, ``settings``, ``seed`` ...).
+        estimator: a name of :data:`~avtorch.inference.estimators.ESTIMATORS`.
+        **inference: the estimator's options, for ``"sgld"`` those of
+            :class:`~avtorch.inference.sequential.SequentialInference` (``mode``, ``lam``, ``settings``, ``seed`` ...).
 
     Raises:
-        InputError: for a ``window`` or ``gap`` that is not positive.
+        InputError: for a ``window`` or ``gap`` that is not positive, an unknown estimator or an option it lacks.
     """
 
     def __init__(
-        self, *, window: float = 2.0, form: Form | None = None, gap: float = 0.5, vehicles: int = 1, **inference: Any
+        self,
+        *,
+        window: float = 2.0,
+        form: Form | None = None,
+        gap: float = 0.5,
+        vehicles: int = 1,
+        estimator: str = "sgld",
+        **inference: Any,
     ) -> None:
         if not window > 0:
             raise InputError(f"window: {window} s is not positive")
@@ -56,10 +66,8 @@ class BeliefStream:
             raise InputError(f"gap: {gap} s is not positive")
         self.window, self.gap, self.vehicles = float(window), float(gap), vehicles
         self.form: Form = JerkForm() if form is None else form
-        inference.setdefault("settings", self.form.sampler)
-        self.inference = SequentialInference(
-            vehicles=vehicles, names=self.form.names, noise_prior=self.form.noise_prior, **inference
-        )
+        self.estimator = estimator
+        self.inference = make_estimator(estimator, self.form, vehicles=vehicles, **inference)
         self._rows: dict[str, Tensor] = self._empty()
         self._origin: float | None = None  # start of the first window since the last gap
         self._index = 0  # windows closed since then
@@ -169,7 +177,7 @@ class BeliefStream:
             # what lies behind the last row's own step belongs to no window
             end = min(end, float(rows["time"][-1]) + (self.window / full))
         evidence = self.form.evidence(rows, full)
-        belief = self.inference.update(evidence.density, evidence.excited)
+        belief = self.inference.take(rows, evidence)
         self._index += 1
         return Window(start, end, evidence.n, belief)
 
@@ -181,14 +189,18 @@ class BeliefStream:
     def state_dict(self) -> dict[str, Any]:
         """The open window's rows and the belief: all that a resumed stream needs to go on equal to the bit."""
         clock = {"origin": self._origin, "index": self._index, "last": self._last, "window": self.window}
-        return {"rows": dict(self._rows), **clock, "inference": self.inference.state_dict()}
+        own = {"estimator": self.estimator, "inference": self.inference.state_dict()}
+        return {"rows": dict(self._rows), **clock, **own}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from :meth:`state_dict`.
 
         Raises:
-            InputError: if it was saved by a stream of another window length or form.
+            InputError: if it was saved by a stream of another window length, form or estimator.
         """
+        # states older than the choice of an estimator are SGLD's
+        if state.get("estimator", "sgld") != self.estimator:
+            raise InputError(f"state: saved by the estimator {state['estimator']!r}, not {self.estimator!r}")
         if state["window"] != self.window:
             raise InputError(f"state: saved with a window of {state['window']} s, not {self.window} s")
         if set(state["rows"]) != set(self._rows):

@@ -1,0 +1,104 @@
+"""What is believed of every vehicle after a window, whichever estimator says so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from avtorch.inference.posterior import sorted_quantile
+from avtorch.inference.priors import Prior
+
+Z90 = 1.6448536269514722
+"""The standard normal's 95 % quantile: 90 % lie within this many SDs."""
+
+
+class Summary(NamedTuple):
+    """Of some vehicles: ``draws`` ``(draw, vehicle, parameter)``, the rest ``(vehicle, parameter)``."""
+
+    mean: Tensor
+    sd: Tensor
+    q05: Tensor
+    q95: Tensor
+    draws: Tensor
+
+    @classmethod
+    def log_normal(cls, mean_z: Tensor, cov_z: Tensor, kept: int, generator: torch.Generator) -> Summary:
+        """Of parameters whose logarithms are normal: moments and quantiles in closed form, and ``kept`` draws.
+
+        Args:
+            mean_z: ``(vehicle, parameter)``. cov_z: ``(vehicle, parameter, parameter)``, positive semidefinite.
+        """
+        sd_z = cov_z.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
+        mean = (mean_z + 0.5 * sd_z.square()).exp()
+        values, basis = torch.linalg.eigh(cov_z)  # a parameter that is known has no spread, and no Cholesky factor
+        noise = torch.randn(kept, *mean_z.shape, generator=generator, dtype=mean_z.dtype)
+        draws = mean_z + torch.einsum("vij,kvj->kvi", basis * values.clamp_min(0.0).sqrt().unsqueeze(-2), noise)
+        low, high = (mean_z - Z90 * sd_z).exp(), (mean_z + Z90 * sd_z).exp()
+        return cls(mean, mean * sd_z.square().expm1().sqrt(), low, high, draws.exp())
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is believed of every vehicle after a window.
+
+    Attributes:
+        names: parameter names, ``T_L`` [s] and ``K_L`` [-] first, then the noise parameters.
+        mean, sd, q05, q95: shape ``(vehicle, parameter)``.
+        draws: ``(draw, vehicle, parameter)``.
+        excited: ``(vehicle,)`` bool; where false the window was not used and the rest is carried over unchanged.
+        converged: ``(vehicle,)`` bool; false where the window was excited but its chains did not settle: carried over,
+            too.
+    """
+
+    names: tuple[str, ...]
+    mean: Tensor
+    sd: Tensor
+    q05: Tensor
+    q95: Tensor
+    draws: Tensor
+    excited: Tensor
+    converged: Tensor
+
+    def stat(self, name: str, vehicle: int = 0) -> dict[str, float]:
+        """``{"mean", "sd", "q05", "q95"}`` of one parameter of one vehicle."""
+        i = self.names.index(name)
+        return {key: float(getattr(self, key)[vehicle, i]) for key in ("mean", "sd", "q05", "q95")}
+
+    def updated(self, excited: Tensor, index: Tensor, found: Summary, settled: Tensor) -> Belief:
+        """After a window: ``found`` of the vehicles ``index`` where it ``settled``, all others carried over."""
+        used = index[settled]
+        table = {key: getattr(self, key) for key in ("mean", "sd", "q05", "q95")}
+        table = {key: value.index_put((used,), getattr(found, key)[settled]) for key, value in table.items()}
+        draws = self.draws
+        if len(used):
+            draws = draws.clone()
+            draws[:, used] = found.draws[:, settled]
+        converged = torch.ones_like(excited).index_put((index,), settled)
+        return Belief(self.names, draws=draws, excited=excited, converged=converged, **table)
+
+    def unused(self, excited: Tensor) -> Belief:
+        """After a window that none was learnt from: all carried over."""
+        return replace(self, excited=excited, converged=torch.ones_like(excited))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain tensors and names."""
+        keys = ("mean", "sd", "q05", "q95", "draws", "excited", "converged")
+        return {"names": list(self.names), **{key: getattr(self, key) for key in keys}}
+
+    @classmethod
+    def from_state(cls, state: dict[str, Any]) -> Belief:
+        """The inverse of :meth:`state_dict`; what else the state holds is left."""
+        keys = ("mean", "sd", "q05", "q95", "draws", "excited", "converged")
+        return cls(tuple(state["names"]), **{key: state[key].clone() for key in keys})
+
+    @classmethod
+    def of_prior(cls, names: tuple[str, ...], prior: Prior, kept: int, vehicles: int, g: torch.Generator) -> Belief:
+        """Before any window: ``kept`` draws of the prior, from the generator ``g``."""
+        draws = prior.sample(kept, vehicles, generator=g).exp()
+        ordered = draws.sort(0).values
+        quantiles = (sorted_quantile(ordered, 0.05), sorted_quantile(ordered, 0.95))
+        never = torch.zeros(vehicles, dtype=torch.bool)
+        return cls(names, draws.mean(0), draws.std(0), *quantiles, draws, excited=never, converged=~never)

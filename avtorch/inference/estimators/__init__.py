@@ -1,0 +1,18 @@
+"""Estimators behind one interface: SGLD's loop, its modes alone, least squares and joint Kalman filters."""
+
+from avtorch.inference.estimators.choose import ESTIMATORS, make_estimator
+from avtorch.inference.estimators.contract import Estimator
+from avtorch.inference.estimators.ekf import JointEKF
+from avtorch.inference.estimators.map import MaximumAPosteriori
+from avtorch.inference.estimators.rls import RecursiveLeastSquares
+from avtorch.inference.estimators.ukf import JointUKF
+
+__all__ = [
+    "ESTIMATORS",
+    "Estimator",
+    "JointEKF",
+    "JointUKF",
+    "MaximumAPosteriori",
+    "RecursiveLeastSquares",
+    "make_estimator",
+]

@@ -1,0 +1,58 @@
+"""Estimators by name, as `estimate`, the stream and the command line take them."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from avtorch.errors import InputError
+from avtorch.inference.estimators.contract import Estimator
+from avtorch.inference.estimators.ekf import JointEKF
+from avtorch.inference.estimators.map import MaximumAPosteriori
+from avtorch.inference.estimators.rls import RecursiveLeastSquares
+from avtorch.inference.estimators.ukf import JointUKF
+from avtorch.inference.estimators.windowed import WindowedEstimator
+from avtorch.inference.evidence import Form
+from avtorch.inference.sequential import SequentialInference
+
+ESTIMATORS: dict[str, type[SequentialInference] | type[WindowedEstimator]] = {
+    "sgld": SequentialInference,
+    "map": MaximumAPosteriori,
+    "rls": RecursiveLeastSquares,
+    "ekf": JointEKF,
+    "ukf": JointUKF,
+}
+"""By name: SGLD over windows, its modes alone, recursive least squares, joint extended and unscented Kalman filter."""
+
+_OF_THE_FORM = ("self", "form", "names", "noise_prior", "vehicles", "options")
+
+
+def make_estimator(name: str, form: Form, *, vehicles: int = 1, **options: Any) -> Estimator:
+    """The estimator called ``name`` for rows of ``form``.
+
+    ``options`` are its own: those of :class:`SequentialInference` for ``sgld`` and ``map``, ``forgetting`` for ``rls``,
+    ``drift`` and ``noise`` for ``ekf`` and ``ukf``, and ``actuation_prior``, ``kept`` and ``seed`` for all.
+
+    Raises:
+        InputError: for an unknown name, an option that the estimator does not have, or one out of range.
+    """
+    made = ESTIMATORS.get(name)
+    if made is None:
+        raise InputError(f"estimator: {name!r} is none of {', '.join(ESTIMATORS)}")
+    known = _options(made)
+    for option in options:
+        if option not in known:
+            raise InputError(f"{option}: the estimator {name!r} has no such option; it has {', '.join(known)}")
+    if issubclass(made, WindowedEstimator):
+        return made(form, vehicles=vehicles, **options)
+    options.setdefault("settings", form.sampler)
+    return made(vehicles=vehicles, names=form.names, noise_prior=form.noise_prior, **options)
+
+
+def _options(made: type) -> list[str]:
+    """Keywords of a class and of those it hands its ``options`` on to."""
+    named: list[str] = []
+    for each in made.__mro__[:-1]:
+        if "__init__" in vars(each):
+            named += [p for p in inspect.signature(vars(each)["__init__"]).parameters if p not in _OF_THE_FORM]
+    return list(dict.fromkeys(named))

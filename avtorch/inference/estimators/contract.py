@@ -1,0 +1,30 @@
+"""What a stream of windows asks of an estimator."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from avtorch.inference.belief import Belief
+from avtorch.inference.evidence import Evidence, Rows
+
+
+class Estimator(Protocol):
+    """Takes the windows of many vehicles one after the other and holds a belief about them.
+
+    A window that is not excited leaves the belief of its vehicle as it was.
+    """
+
+    @property
+    def belief(self) -> Belief:
+        """After the last window; before the first, the first prior."""
+        ...
+
+    def take(self, rows: Rows, evidence: Evidence) -> Belief:
+        """Take in one window: its rows, each column ``(vehicle, time)``, and what the form made of them."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain tensors and names, from which a resumed estimator goes on equal to the bit."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...

@@ -1,0 +1,44 @@
+r"""The joint extended Kalman filter (Jazwinski 1970): the model is replaced by its tangent at the mean.
+
+.. math::
+    \bar x = f(x),\quad \bar P = F P F^\top + Q, \qquad
+    x^+ = \bar x + k\,(y - h(\bar x)),\quad P^+ = \bar P - k s k^\top,\quad
+    s = H \bar P H^\top + r,\ k = \bar P H^\top / s
+"""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor
+
+from avtorch.inference.estimators.kalman import JointKalman
+from avtorch.inference.estimators.state_model import Row, State, StateModel
+
+
+class JointEKF(JointKalman):
+    """One tangent a row: cheap, and overconfident where the belief is wide against the model's curvature."""
+
+    def predict(self, model: StateModel, state: State, row: Row) -> State:
+        slope = model.slope(state.mean, row)
+        cov = slope @ state.cov @ slope.mT + model.noise(state.mean, row)
+        return State(model.advance(state.mean, row), cov)
+
+    def correct(self, model: StateModel, state: State, row: Row, channel: int) -> tuple[State, Tensor]:
+        slope = model.observed_slope(state.mean, row, channel)
+        pointing = (state.cov @ slope.unsqueeze(-1)).squeeze(-1)
+        spread = (pointing * slope).sum(-1) + model.variance[:, channel]
+        innovation = row.measured[:, channel] - model.observe(state.mean, row, channel)
+        return gained(state, innovation, pointing, spread)
+
+
+def gained(state: State, innovation: Tensor, pointing: Tensor, spread: Tensor) -> tuple[State, Tensor]:
+    """The linear update: ``pointing`` ``(vehicle, d)`` is the covariance of state and reading, ``spread`` its variance.
+
+    Returns the state and the log likelihood of the reading, ``(vehicle,)``.
+    """
+    gain = pointing / spread.unsqueeze(-1)
+    mean = state.mean + gain * innovation.unsqueeze(-1)
+    cov = state.cov - gain.unsqueeze(-1) * pointing.unsqueeze(-2)
+    likelihood = -0.5 * (spread.log() + innovation.square() / spread + math.log(2 * math.pi))
+    return State(mean, 0.5 * (cov + cov.mT)), likelihood

@@ -1,0 +1,42 @@
+"""The state of the jerk form: acceleration is known, so that ``(log T_L, log K_L)`` is all there is to filter."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from avtorch.inference.estimators.state_model import Row, State
+
+
+class JerkState:
+    """``(log T_L, log K_L)`` as a random walk, seen through Eq. 1: ``jerk = (K_L u - a)/T_L + N(0, sigma^2)``.
+
+    Args:
+        sigma: jerk noise [m/s³], ``(vehicle,)``.
+        drift: SD of the walk per square root of a second, of both logarithms.
+    """
+
+    def __init__(self, sigma: Tensor, drift: float) -> None:
+        self.variance = sigma.square().unsqueeze(-1)
+        self._walk = drift**2 * torch.eye(2, dtype=sigma.dtype)
+        self._still = torch.eye(2, dtype=sigma.dtype)
+
+    def start(self, actuation: State, row: Row) -> State:
+        return actuation
+
+    def advance(self, x: Tensor, row: Row) -> Tensor:
+        return x
+
+    def slope(self, x: Tensor, row: Row) -> Tensor:
+        return self._still.expand(*x.shape, 2)
+
+    def noise(self, x: Tensor, row: Row) -> Tensor:
+        return row.dt * self._walk
+
+    def observe(self, x: Tensor, row: Row, channel: int) -> Tensor:
+        log_T, log_K = x.unbind(-1)
+        return (log_K.exp() * row.u - row.a) * (-log_T).exp()
+
+    def observed_slope(self, x: Tensor, row: Row, channel: int) -> Tensor:
+        by_gain = (x[..., 1] - x[..., 0]).exp() * row.u
+        return torch.stack([(-x[..., 0]).exp() * row.a - by_gain, by_gain], -1)

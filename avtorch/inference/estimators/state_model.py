@@ -1,0 +1,62 @@
+"""What a joint Kalman filter asks of a model: a mean that moves and is observed, with noise, both differentiable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from torch import Tensor
+
+
+class State(NamedTuple):
+    """A normal state: ``mean`` ``(vehicle, d)``, ``cov`` ``(vehicle, d, d)``; the last two are ``log T_L, log K_L``."""
+
+    mean: Tensor
+    cov: Tensor
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of every vehicle.
+
+    ``u`` and ``a``: demanded and, where it is known exactly, realised acceleration [m/s²], ``(vehicle,)``;
+    ``measured``: ``(vehicle, channel)``; ``dt``: to the next row [s].
+    """
+
+    u: Tensor
+    a: Tensor
+    measured: Tensor
+    dt: Tensor
+
+
+class StateModel(Protocol):
+    """A state-space model, batched over vehicles; ``x`` is ``(..., vehicle, d)``."""
+
+    @property
+    def variance(self) -> Tensor:
+        """Of every channel's noise, ``(vehicle, channel)``."""
+        ...
+
+    def start(self, actuation: State, row: Row) -> State:
+        """The state at the first row of a run, given what is known of ``(log T_L, log K_L)``."""
+        ...
+
+    def advance(self, x: Tensor, row: Row) -> Tensor:
+        """The state a step later, its noise apart, shape of ``x``."""
+        ...
+
+    def slope(self, x: Tensor, row: Row) -> Tensor:
+        """Derivative of :meth:`advance`, ``(..., vehicle, d, d)``."""
+        ...
+
+    def noise(self, x: Tensor, row: Row) -> Tensor:
+        """Covariance of the step's noise, ``(vehicle, d, d)``, at ``x`` ``(vehicle, d)``."""
+        ...
+
+    def observe(self, x: Tensor, row: Row, channel: int) -> Tensor:
+        """What the channel reads, its noise apart, ``(..., vehicle)``."""
+        ...
+
+    def observed_slope(self, x: Tensor, row: Row, channel: int) -> Tensor:
+        """Derivative of :meth:`observe`, ``(..., vehicle, d)``."""
+        ...

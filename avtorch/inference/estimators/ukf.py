@@ -1,0 +1,44 @@
+r"""The joint unscented Kalman filter (Julier and Uhlmann 1997) with ``kappa = 0``: 2d points of equal weight.
+
+The points :math:`x \pm \sqrt{d}\, L_i`, ``L`` the Cholesky factor of the covariance, pass the model itself; mean and
+covariance of where they end are the prediction. Positive weights keep every covariance positive, and no tuning is left.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from avtorch.inference.estimators.ekf import gained
+from avtorch.inference.estimators.kalman import JointKalman
+from avtorch.inference.estimators.state_model import Row, State, StateModel
+
+
+class JointUKF(JointKalman):
+    """Second order in the mean and no derivatives, at ``2d`` runs of the model a row."""
+
+    def predict(self, model: StateModel, state: State, row: Row) -> State:
+        points = model.advance(sigma_points(state), row)
+        mean = points.mean(0)
+        centred = points - mean
+        cov = torch.einsum("pvi,pvj->vij", centred, centred) / len(points) + model.noise(state.mean, row)
+        return State(mean, cov)
+
+    def correct(self, model: StateModel, state: State, row: Row, channel: int) -> tuple[State, Tensor]:
+        points = sigma_points(state)
+        seen = model.observe(points, row, channel)
+        expected = seen.mean(0)
+        off = seen - expected
+        pointing = ((points - state.mean) * off.unsqueeze(-1)).mean(0)
+        spread = off.square().mean(0) + model.variance[:, channel]
+        return gained(state, row.measured[:, channel] - expected, pointing, spread)
+
+
+def sigma_points(state: State) -> Tensor:
+    """``(2d, vehicle, d)``; not a number where the covariance has no Cholesky factor: the filter has diverged."""
+    root, failed = torch.linalg.cholesky_ex(state.cov)
+    root = torch.where((failed == 0)[:, None, None], root, torch.nan)
+    reach = math.sqrt(state.mean.shape[-1]) * root.movedim(-1, 0)
+    return torch.cat([state.mean + reach, state.mean - reach])

@@ -1,0 +1,79 @@
+"""What the recursive estimators share: a belief a vehicle, carried over where a window teaches nothing, and resume."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.inference.belief import Belief, Summary
+from avtorch.inference.evidence import Evidence, Form, Rows
+from avtorch.inference.priors import Joint, LogNormalPrior, default_actuation_prior
+
+
+class WindowedEstimator(ABC):
+    """An estimator that works on the rows of the excited windows and remembers tensors, one entry a vehicle.
+
+    Args:
+        form: what is measured; the belief has its parameters.
+        actuation_prior: of ``(T_L [s], K_L [-])`` before the first excited window.
+        kept: draws per vehicle that a belief carries.
+
+    Raises:
+        InputError: for fewer than two draws or one vehicle.
+    """
+
+    def __init__(
+        self,
+        form: Form,
+        *,
+        vehicles: int = 1,
+        actuation_prior: LogNormalPrior | None = None,
+        kept: int = 1000,
+        seed: int = 0,
+    ) -> None:
+        if kept < 2 or vehicles < 1:
+            raise InputError(f"kept, vehicles: found {kept}, {vehicles}, need 2 or more draws and 1 or more vehicles")
+        self.form, self.kept, self.vehicles = form, kept, vehicles
+        self.actuation_prior = default_actuation_prior() if actuation_prior is None else actuation_prior
+        self.generator = torch.Generator().manual_seed(seed)
+        prior = Joint(self.actuation_prior, form.noise_prior)
+        self.belief = Belief.of_prior(form.names, prior, kept, vehicles, self.generator)
+        self._memory: dict[str, Tensor] = {}
+
+    def take(self, rows: Rows, evidence: Evidence) -> Belief:
+        """Take in one window of every vehicle; those that are not excited keep their belief."""
+        index = evidence.excited.nonzero().squeeze(-1)
+        if len(index):
+            excited = {name: rows[name][index] for name in ("usable", *self.form.columns)}
+            found, settled = self._learn({"time": rows["time"], **excited}, index)
+            self.belief = self.belief.updated(evidence.excited, index, found, settled)
+        else:
+            self.belief = self.belief.unused(evidence.excited)
+        return self.belief
+
+    @abstractmethod
+    def _learn(self, rows: Rows, index: Tensor) -> tuple[Summary, Tensor]:
+        """From the rows of the vehicles ``index``, their summary and where it may be used, ``(vehicle,)`` bool."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on equal to the bit; plain tensors and names."""
+        memory = {name: value.clone() for name, value in self._memory.items()}
+        return {**self.belief.state_dict(), "memory": memory, "generator": self.generator.get_state()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from :meth:`state_dict`.
+
+        Raises:
+            InputError: if it was saved by an estimator of other parameters or vehicles.
+        """
+        saved = (tuple(state["names"]), len(state["mean"]), set(state.get("memory", ())))
+        own = (self.belief.names, self.vehicles, set(self._memory))
+        if saved != own:
+            raise InputError(f"state: (names, vehicles, memory) were {saved} when it was saved, here they are {own}")
+        self.belief = Belief.from_state(state)
+        self._memory = {name: value.clone() for name, value in state["memory"].items()}
+        self.generator.set_state(state["generator"])

@@ -1,0 +1,103 @@
+"""Posteriors of second-order lags, in speed and in location, from measured acceleration: six sums, as for Eq. 4.
+
+One derivative below the GLVD the measured one is the acceleration, which every car has; no jerk is needed. Speed or
+location are taken as exact beside it, as the acceleration is in Eq. 4. Both lags are linear in two coefficients of two
+columns, so that the sums of :class:`~avtorch.inference.jerk.JerkStatistics` hold all that a window says.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from avtorch.inference.jerk import JerkDensity, JerkStatistics
+from avtorch.inference.planes import as_planes
+from avtorch.inference.priors import HalfNormalPrior, Joint, LogNormalPrior, Prior
+
+
+def _log_normal(median: tuple[float, float], log_sd: tuple[float, float]) -> LogNormalPrior:
+    return LogNormalPrior(torch.tensor(median, dtype=torch.float64), torch.tensor(log_sd, dtype=torch.float64))
+
+
+def default_speed_lag_prior() -> LogNormalPrior:
+    """Of ``(T_V [s], K_V [-])``; 90 % of the lags lie in 0.16 to 1.6 s, around the delays recorded on cars on sale."""
+    return _log_normal((0.5, 1.0), (0.7, 0.3))
+
+
+def default_position_lag_prior() -> LogNormalPrior:
+    """Of ``(T_P [s], zeta [-])``; around critical damping, with overshoot not excluded."""
+    return _log_normal((0.7, 1.0), (0.7, 0.5))
+
+
+def default_accel_noise_prior() -> HalfNormalPrior:
+    """Of ``sigma`` [m/s²], the noise on the acceleration."""
+    return HalfNormalPrior(torch.tensor([1.0], dtype=torch.float64))
+
+
+class SpeedLagDensity(JerkDensity):
+    """Posterior of ``(T_V [s], K_V [-], sigma [m/s²])``: ``accel ~ Normal((K_V v_cmd - v)/T_V, sigma^2)``.
+
+    It is Eq. 4 with speed, speed command and acceleration in the places of acceleration, command and jerk.
+    """
+
+    names = ("T_V", "K_V", "sigma")
+
+    def __init__(self, statistics: JerkStatistics, prior: Prior | None = None) -> None:
+        """``statistics`` by :meth:`sums`."""
+        default = Joint(default_speed_lag_prior(), default_accel_noise_prior())
+        super().__init__(statistics, default if prior is None else prior)
+
+    @staticmethod
+    def sums(v: Tensor, v_cmd: Tensor, accel: Tensor, mask: Tensor | None = None) -> JerkStatistics:
+        """Of speed and speed command [m/s] and acceleration [m/s²], each ``(window, time)``."""
+        return JerkStatistics.from_samples(v, v_cmd, accel, mask)
+
+    def select(self, index: Tensor) -> SpeedLagDensity:
+        """The windows named by ``index``."""
+        return SpeedLagDensity(self.statistics.select(index), self.prior.select(index))
+
+
+class PositionLagDensity(JerkDensity):
+    """Posterior of ``(T_P [s], zeta [-], sigma [m/s²])``: ``accel ~ Normal(error/T_P² - 2 zeta v/T_P, sigma^2)``."""
+
+    names = ("T_P", "zeta", "sigma")
+
+    def __init__(self, statistics: JerkStatistics, prior: Prior | None = None) -> None:
+        """``statistics`` by :meth:`sums`."""
+        default = Joint(default_position_lag_prior(), default_accel_noise_prior())
+        super().__init__(statistics, default if prior is None else prior)
+
+    @staticmethod
+    def sums(error: Tensor, v: Tensor, accel: Tensor, mask: Tensor | None = None) -> JerkStatistics:
+        """Of ``x_cmd - x`` [m], speed [m/s] and acceleration [m/s²], each ``(window, time)``."""
+        return JerkStatistics.from_samples(v, error, accel, mask)
+
+    def select(self, index: Tensor) -> PositionLagDensity:
+        """The windows named by ``index``."""
+        return PositionLagDensity(self.statistics.select(index), self.prior.select(index))
+
+    @staticmethod
+    def _scaled_coefficients(z: Tensor) -> Tensor:
+        """``(1, 2 zeta/T, 1/T^2) / sigma``."""
+        log_T, log_zeta, log_sigma = z.unbind(-1)
+        return torch.stack([-log_sigma, math.log(2) + log_zeta - log_T - log_sigma, -2 * log_T - log_sigma], -1).exp()
+
+    def score(self, z: Tensor) -> Tensor:
+        """Gradient of :meth:`log_prob` in ``z``, in closed form."""
+        scaled = self._scaled_coefficients(z)
+        # by the logarithms of the three coefficients; the form is half the chi2
+        one, damped, pulled = (-2 * torch.einsum("wij,...wj->...wi", self._half_form, scaled) * scaled).unbind(-1)
+        by_sigma = -(one + damped + pulled) - self.statistics.n
+        return as_planes(-damped - 2 * pulled, damped, by_sigma).add_(self.prior.score(z))
+
+    def initial(self) -> Tensor:
+        """Least squares where it gives positive coefficients in a plausible range, else the prior's centre."""
+        damped, pulled, residual_sd = self.statistics.least_squares()
+        center = self.prior.center().expand(self.windows, 3)
+        T = pulled.rsqrt()
+        zeta = 0.5 * damped * T
+        plausible = (T > 0.01) & (T < 20) & (zeta > 0.02) & (zeta < 20)
+        T, zeta = torch.where(plausible, T, center[:, 0].exp()), torch.where(plausible, zeta, center[:, 1].exp())
+        return torch.stack([T, zeta, residual_sd.clamp(1e-6, 1e6)], -1).log()
