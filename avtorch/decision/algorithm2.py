@@ -9,7 +9,7 @@
                         2. gains:     |k_s'| > |k_s|, |k_v'| > |k_v|, |k_a'| > |k_a|
 
 The print leaves the new values open; `PAPER_TIME_GAP` and `PAPER_GAINS` are those of its experiment, which calm the car
-without making it string stable when the lower level passes the demand through (SPEC section 2). The print checks the
+without making it string stable when the lower level passes the demand through. The print checks the
 estimates themselves, with the time gap and gains in force, not what the updated lower level would make of them.
 """
 

@@ -35,11 +35,18 @@ class Gaussian(NamedTuple):
     cov: Tensor
 
     @staticmethod
-    def of_draws(T_L: Tensor, K_L: Tensor, *, inflation: float | Tensor = 1.0) -> Gaussian:
+    def of_draws(
+        T_L: Tensor,
+        K_L: Tensor,
+        *,
+        inflation: float | Tensor = 1.0,
+        unevenness: tuple[float, float] = (0.0, 0.0),
+    ) -> Gaussian:
         """Moments of (log T_L, log K_L) over the last dimension, T_L [s] and K_L [-] of shape (..., draw).
 
         `inflation` multiplies the standard deviations: the measured ratio of window-to-window spread to posterior SD,
-        for logs on which the posterior is known to be too narrow.
+        for logs on which the posterior is known to be too narrow. `unevenness` is what a sound vehicle's T_L and K_L
+        scatter from window to window anyway, SDs as shares of the value; its square is added to the variances.
         """
         if T_L.shape[-1] < 3:
             raise InputError(f"T_L: found {T_L.shape[-1]} draws, need at least 3 for a covariance")
@@ -48,7 +55,7 @@ class Gaussian(NamedTuple):
         centred = z - mean.unsqueeze(-2)
         cov = centred.mT @ centred / (z.shape[-2] - 1)
         # A floor far below any posterior keeps a degenerate cloud (all draws alike) invertible.
-        floor = torch.eye(2, dtype=z.dtype, device=z.device) * 1e-12
+        floor = torch.diag(torch.tensor([1e-12 + u * u for u in unevenness], dtype=z.dtype, device=z.device))
         return Gaussian(mean, cov * inflation**2 + floor)
 
     def combine(self, other: Gaussian) -> Gaussian:

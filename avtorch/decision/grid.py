@@ -7,6 +7,7 @@ Grid, relative to the driver's default and to the setting in force:
   effort T_hat K_d / (K_hat T_d).
 - time gap: the one in force, the default, and the driver's settings that are longer than the default.
 - gains: those in force, the default's, and a stated list of triples, calibrated beforehand.
+- feed-forward: the gain in force, the default's, and where the vehicle hears its leader a stated list of gains.
 
 Intrusiveness is a number without unit; one is what updating the lower level costs. What nobody in the car notices
 costs least; what the driver sees on the dashboard or the engineer has to re-approve costs more; both together cost
@@ -16,16 +17,19 @@ more than the sum:
     lower level kept though known wrong     3    (the paper: update at a minimum)
     time gap longer than the default        1.5  + 3 (gap / default - 1)
     gains differ from the default           2    + sum over gains of |log2(ratio)|, for k_a of 1 - k_a
+    feed-forward differs from the default   1.5  + |k_f - default|
     both time gap and gains differ          2    more
     anything differs from what is in force  1    (do not intervene for a trifle)
 
-so that 1 -> 1.6 s costs 3.3, 1 -> 2.5 s costs 6, doubling k_v costs 3. The lower level alone comes first (about 2 to
+so that 1 -> 1.6 s costs 3.3, 1 -> 2.5 s costs 6, doubling k_v costs 3, and k_f 0 -> 0.5 costs 2: nobody in the car
+notices and no road is lost, but the car then leans on a radio link. The lower level alone comes first (about 2 to
 3.7), then with it one step of the gap or a mild change of gains, then the longest gap or a strong change of gains, then
 gap and gains. All weights are parameters.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import product
@@ -58,6 +62,8 @@ class Intrusiveness:
     gains: float = 2.0
     gains_change: float = 1.0
     both: float = 2.0
+    link: float = 1.5
+    link_gain: float = 1.0
     switch: float = 1.0
     margin: float = 4.0
 
@@ -70,6 +76,7 @@ class Intrusiveness:
         k = torch.cat([k[..., :2], 1.0 - k[..., 2:]], dim=-1)
         k0 = torch.cat([k0[..., :2], 1.0 - k0[..., 2:]], dim=-1)
         # A gain of zero or below has no ratio; the smallest stands in, so that it counts as a large change.
+        fed = (setting.feedforward - default.feedforward).abs()
         octaves = (k.clamp_min(1e-3) / k0.clamp_min(1e-3)).log2().abs().sum(dim=-1)
         return (
             self.update * lower
@@ -80,6 +87,8 @@ class Intrusiveness:
             + self.gains * (octaves > 1e-9)
             + self.gains_change * octaves
             + self.both * ((longer > 1e-9) & (octaves > 1e-9))
+            + self.link * (fed > 1e-9)
+            + self.link_gain * fed
         )
 
 
@@ -99,27 +108,33 @@ class Grid:
     """A finite set of settings (see the module's text).
 
     time_gaps [s]; gains: triples; targets: positions of T_d between the default's target lag (0) and the estimated lag
-    (1); allowed: strategies out of {1, 2, 3} that may be used. gains_of_gap: for a controller whose gains follow from
-    its time gap (an MPC's equivalent gains): (time gap [s]) -> triple; Strategy 3 is then not on offer. Raises
+    (1); feedforward: gains k_f on the leader's acceleration, none where nothing is heard of it; allowed: strategies out
+    of {1, 2, 3, 4} that may be used. gains_of_gap: for a controller whose gains follow from
+    its time gap (an MPC's equivalent gains): (time gap [s]) -> triple; Strategies 3 and 4 are then not on offer. Raises
     `InputError` for an empty or impossible grid.
     """
 
     time_gaps: Sequence[float] = DRIVER_TIME_GAPS
     gains: Sequence[Sequence[float]] = GAINS_GRID
     targets: Sequence[float] = (0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0)
-    allowed: frozenset[int] = frozenset({1, 2, 3})
+    feedforward: Sequence[float] = ()
+    allowed: frozenset[int] = frozenset({1, 2, 3, 4})
     gains_of_gap: Callable[[float], Sequence[float]] | None = None
     intrusiveness: Intrusiveness = field(default_factory=Intrusiveness)
 
     def __post_init__(self) -> None:
-        if not self.allowed <= {1, 2, 3}:
-            raise InputError(f"allowed: found {sorted(self.allowed)}, need some of 1, 2, 3")
+        if not self.allowed <= {1, 2, 3, 4}:
+            raise InputError(f"allowed: found {sorted(self.allowed)}, need some of 1, 2, 3, 4")
         if any(not gap > 0.0 for gap in self.time_gaps):
             raise InputError(f"time_gaps: found {tuple(self.time_gaps)}, need numbers above 0")
         if any(not 0.0 <= t <= 1.0 for t in self.targets):
             raise InputError(f"targets: found {tuple(self.targets)}, need numbers from 0 to 1")
         if any(len(k) != 3 for k in self.gains):
             raise InputError("gains: need triples (k_s, k_v, k_a)")
+        if any(not math.isfinite(k) for k in self.feedforward):
+            raise InputError(f"feedforward: found {tuple(self.feedforward)}, need finite numbers")
+        if self.feedforward and self.gains_of_gap is not None:
+            raise InputError("feedforward: a controller whose gains follow from its time gap takes none")
 
     def candidates(
         self, T_L: Tensor, K_L: Tensor, *, current: Setting, default: Setting, model_wrong: Tensor
@@ -156,19 +171,28 @@ class Grid:
         if self.gains_of_gap is not None:
             other[:, 1:] = False
 
-        lower, gap, gain = (
-            i.reshape(-1)
-            for i in torch.meshgrid(*(torch.arange(x.shape[1]) for x in (T_d, gaps, gains)), indexing="ij")
+        links = self.feedforward if 4 in self.allowed else ()
+        fed = [current.feedforward[:, None], default.feedforward[:, None], _listed(links, scenarios)]
+        feedforward = torch.cat(fed, dim=1)
+        heard = torch.ones_like(feedforward, dtype=torch.bool)
+        for i in range(2):
+            heard[:, i + 1 :] &= (feedforward[:, i + 1 :] - feedforward[:, i, None]).abs() > 1e-9
+
+        axes = (T_d, gaps, gains, feedforward)
+        lower, gap, gain, link = (
+            i.reshape(-1) for i in torch.meshgrid(*(torch.arange(x.shape[1]) for x in axes), indexing="ij")
         )
         k = gains[:, gain]
         if self.gains_of_gap is not None:
             follow = [[list(self.gains_of_gap(g)) for g in row] for row in gaps.tolist()]
             k = torch.tensor(follow, dtype=torch.float64)[:, gap]
-        setting = Setting(T_hat[:, lower], K_hat[:, lower], T_d[:, lower], K_d[:, lower], gaps[:, gap], k)
+        setting = Setting(
+            T_hat[:, lower], K_hat[:, lower], T_d[:, lower], K_d[:, lower], gaps[:, gap], k, feedforward[:, link]
+        )
         priced_default = column if self.gains_of_gap is None else column.replace(gains=k)
         cost = self.intrusiveness(setting, priced_default, model_wrong[:, None] & (lower == 0))
         cost = cost + self.intrusiveness.switch * setting.differs(current[:, None])
-        on_offer = fresh[:, lower] & offered[:, gap] & other[:, gain]
+        on_offer = fresh[:, lower] & offered[:, gap] & other[:, gain] & heard[:, link]
         return Candidates(setting, torch.where(on_offer, cost, torch.inf))
 
 

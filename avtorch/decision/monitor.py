@@ -3,7 +3,7 @@
 Detectors, each reported by its own name:
 
 - `stability` (default): under the belief and the setting in force the loop is probably not string stable. It takes
-  precedence over all others (paper, Strategy 1; SPEC section 4).
+  precedence over all others (paper, Strategy 1).
 - `accepted_change` (default): the paper's rule, estimate outside accepted value ± (0.2 s, 0.15), made honest: the
   posterior mean must be outside *and* the posterior must be sure of it. The accepted value moves by `accept`.
 - `kl`, `hellinger`, `w2`: divergence from a baseline posterior beyond chance at a stated false-alarm rate.
@@ -33,6 +33,7 @@ DETECTORS = ("stability", "accepted_change", *DIVERGENCES, *CHARTS)
 """All detectors, in order of precedence."""
 
 DEFAULT_DETECTORS = ("stability", "accepted_change")
+"""The detectors that alert unless told otherwise."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,11 @@ class Monitor:
     where P(string stable) or P(locally stable) is below it; a little below the 0.95 a new setting must reach, so that
     a sufficient setting is not put in question again by the next window's scatter. false_alarm_rate: of each divergence
     detector, per excited window. arl: in-control average run length of each chart [excited windows]. inflation: ratio
-    of window-to-window spread to posterior SD, 1 for an honest posterior. dead_time [s]: of the vehicle, number or
-    (scenario,). Raises `InputError` for unknown detectors and numbers out of range.
+    of window-to-window spread to posterior SD, 1 for an honest posterior. unevenness: SDs, as shares of T_L and K_L, by
+    which a sound vehicle differs from window to window anyway: divergences and charts without it alarm on any car that
+    is not GLVD to a per cent (0.1 and 0.03 kept them quiet, docs/detectors.md). dead_time [s]: of the vehicle, number
+    or (scenario,). link_delay [s]: of the leader's acceleration where it is fed forward. Raises `InputError` for
+    unknown detectors and numbers out of range.
     """
 
     def __init__(
@@ -109,7 +113,9 @@ class Monitor:
         false_alarm_rate: float = 0.002,
         arl: float = 500.0,
         inflation: float = 1.0,
+        unevenness: tuple[float, float] = (0.0, 0.0),
         dead_time: float | Tensor = 0.0,
+        link_delay: float = 0.0,
     ) -> None:
         unknown = [name for name in detectors if name not in DETECTORS]
         if unknown or not detectors:
@@ -125,6 +131,8 @@ class Monitor:
             raise InputError(f"change: found {change}, need two numbers above 0")
         if not inflation >= 1.0:
             raise InputError(f"inflation: found {inflation}, need 1 or more")
+        if len(unevenness) != 2 or not all(u >= 0.0 for u in unevenness):
+            raise InputError(f"unevenness: found {unevenness}, need two numbers of 0 or more")
         if scenarios < 1:
             raise InputError(f"scenarios: found {scenarios}, need 1 or more")
         self.detectors = tuple(name for name in DETECTORS if name in detectors)
@@ -134,7 +142,9 @@ class Monitor:
         self.stability_level = stability_level
         self.false_alarm_rate = false_alarm_rate
         self.inflation = inflation
+        self.unevenness = unevenness
         self.dead_time = dead_time
+        self.link_delay = link_delay
         first, second = (torch.as_tensor(a, dtype=torch.float64).expand(scenarios).clone() for a in accepted)
         self.accepted = (first, second)
         self._charts = {name: Chart(name, scenarios, arl) for name in CHARTS if name in self.detectors}
@@ -158,8 +168,8 @@ class Monitor:
             raise InputError(f"excited: found {tuple(excited.shape)}, need ({self.scenarios},)")
         T_L, K_L = T_L.to(torch.float64), K_L.to(torch.float64)
         mean = (T_L.mean(dim=-1), K_L.mean(dim=-1))
-        window = Gaussian.of_draws(T_L, K_L, inflation=self.inflation)
-        p_string = setting.p_string_stable(T_L, K_L, dead_time=self.dead_time)
+        window = self._gaussian(T_L, K_L)
+        p_string = setting.p_string_stable(T_L, K_L, dead_time=self.dead_time, link_delay=self.link_delay)
         p_local = setting.p_locally_stable(T_L, K_L, dead_time=self.dead_time)
 
         alerts: dict[str, Tensor] = {}
@@ -214,7 +224,7 @@ class Monitor:
 
     def set_baseline(self, T_L: Tensor, K_L: Tensor) -> None:
         """A baseline posterior from elsewhere (an earlier drive, knowledge): draws (scenario, draw) or (draw,)."""
-        given = Gaussian.of_draws(T_L.to(torch.float64), K_L.to(torch.float64), inflation=self.inflation)
+        given = self._gaussian(T_L.to(torch.float64), K_L.to(torch.float64))
         self._baseline = Gaussian(given.mean.expand(self.scenarios, 2), given.cov.expand(self.scenarios, 2, 2))
         self._has_baseline = torch.ones(self.scenarios, dtype=torch.bool)
 
@@ -240,6 +250,9 @@ class Monitor:
         self._has_baseline = state["has_baseline"].clone()
         for name, chart in self._charts.items():
             chart.load_state_dict(state["charts"][name])
+
+    def _gaussian(self, T_L: Tensor, K_L: Tensor) -> Gaussian:
+        return Gaussian.of_draws(T_L, K_L, inflation=self.inflation, unevenness=self.unevenness)
 
     def _accepted_change(self, T_L: Tensor, K_L: Tensor, mean: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         """(alarm, probability of being outside) (scenario,): for T_L or K_L, whichever of those outside is surer."""

@@ -115,11 +115,13 @@ def replay(
     standstill: float = 5.0,
     ramp_rate: float = RAMP_RATE,
     delay: float = 0.0,
+    link_delay: float = 0.0,
     dt: float = 0.05,
 ) -> Prediction:
     """Run `setting` (scenario, candidate) through `history` with the vehicle T_L [s], K_L [-] (scenario,).
 
-    The time gap leaves `time_gap_now` (scenario,) after `delay` [s] at `ramp_rate` [s/s]. Limits [m/s²] are numbers or
+    The time gap leaves `time_gap_now` (scenario,) after `delay` [s] at `ramp_rate` [s/s]; the leader's acceleration is
+    heard `link_delay` [s] late. Limits [m/s²] are numbers or
     (scenario,). The step is the logged one or a multiple of it, at most `dt` [s] and a sixth of the lag: a command held
     for longer would shake a fast car with a strong k_a, which the real loop does not.
     """
@@ -137,6 +139,7 @@ def replay(
             standstill=standstill,
             ramp_rate=ramp_rate,
             delay=delay,
+            link_delay=link_delay,
         )
         if len(rows) == setting.shape[0]:
             return seen
@@ -158,6 +161,7 @@ def _replay_at(
     standstill: float,
     ramp_rate: float,
     delay: float,
+    link_delay: float,
 ) -> Prediction:
     """`replay` at the step of `past`."""
     scenarios, candidates = setting.shape
@@ -167,6 +171,7 @@ def _replay_at(
         scenarios=scenarios,
         spacing0=past.spacing.clamp_min(0.1),
         speed0=past.speed.clamp_min(0.0),
+        link_delay=link_delay,
     )
     parts = []
     each = max(1, _ROWS // scenarios)

@@ -1,7 +1,8 @@
 """The whole setting of a car-following controller, for many scenarios at once, and how it is changed.
 
 Strategy 1 changes the model in the lower level, Strategy 2 the time gap, Strategy 3 the gains of the upper level
-(paper, Section 4). Formulas live in `avtorch.vehicle`; this file only carries the numbers to them.
+(paper, Section 4), and Strategy 4 the feed-forward gain of a vehicle that hears its leader (an option that the paper
+names). Formulas live in `avtorch.vehicle`; this file only carries the numbers to them.
 """
 
 from __future__ import annotations
@@ -18,12 +19,13 @@ from avtorch.errors import InputError
 from avtorch.vehicle import stability
 from avtorch.vehicle.controllers import NOMINAL_GAINS, LinearController
 from avtorch.vehicle.lower_level import LowerLevel
+from avtorch.vehicle.stability.conditions import Conditions, Form
 from avtorch.vehicle.time_gap import RAMP_RATE
 
 Number = float | Tensor
 
 DRIVER_TIME_GAPS = (1.0, 1.6, 2.5)
-"""Time gaps [s] a driver can choose from in commercial adaptive cruise control (paper, Section 4.5; SPEC section 4)."""
+"""Time gaps [s] a driver can choose from in commercial adaptive cruise control (paper, Section 4.5)."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,9 @@ class Setting:
     """Everything the strategies may change; each number (scenario,), gains (scenario, 3); any batch shape will do.
 
     `T_hat` [s], `K_hat` [-]: model in the lower level; `T_d` [s], `K_d` [-]: the actuation it imitates; `time_gap` [s];
-    `gains` (k_s [1/s²], k_v [1/s], k_a [-]). Plain numbers are broadcast. Raises `InputError` for values that are not
-    positive (gains: not finite) or shapes that do not go together.
+    `gains` (k_s [1/s²], k_v [1/s], k_a [-]); `feedforward` k_f [-] on the leader's acceleration, 0 without a link.
+    Plain numbers are broadcast. Raises `InputError` for values that are not positive (gains, feedforward: not finite)
+    or shapes that do not go together.
     """
 
     T_hat: Tensor
@@ -41,6 +44,7 @@ class Setting:
     K_d: Tensor
     time_gap: Tensor
     gains: Tensor
+    feedforward: Tensor
 
     def __init__(
         self,
@@ -50,6 +54,7 @@ class Setting:
         K_d: Number = 1.0,
         time_gap: Number = 1.0,
         gains: Sequence[float] | Tensor = NOMINAL_GAINS,
+        feedforward: Number = 0.0,
         *,
         scenarios: int | None = None,
     ) -> None:
@@ -59,18 +64,22 @@ class Setting:
             bad = ~(torch.isfinite(value) & (value > 0.0))
             if bool(bad.any()):
                 raise InputError(f"{name}: found {float(value[bad].reshape(-1)[0])}, need a finite number above 0")
+        k_f = torch.as_tensor(feedforward, dtype=torch.float64)
+        if not bool(torch.isfinite(k_f).all()):
+            raise InputError(f"feedforward: found {float(k_f[~torch.isfinite(k_f)][0])}, need a finite number")
         k = torch.as_tensor(gains, dtype=torch.float64)
         if k.ndim == 0 or k.shape[-1] != 3 or not bool(torch.isfinite(k).all()):
             raise InputError(f"gains: found {tuple(k.shape)} values, need finite (k_s, k_v, k_a) on the last dimension")
         try:
             shape = torch.broadcast_shapes(
-                *(v.shape for v in parts.values()), k.shape[:-1], (1,) if scenarios is None else (scenarios,)
+                *(v.shape for v in parts.values()), k.shape[:-1], k_f.shape, (1,) if scenarios is None else (scenarios,)
             )
         except RuntimeError as error:
             raise InputError(f"setting: shapes do not broadcast ({error})") from error
         for name, value in parts.items():
             object.__setattr__(self, name, value.expand(shape))
         object.__setattr__(self, "gains", k.expand(*shape, 3))
+        object.__setattr__(self, "feedforward", k_f.expand(shape))
 
     @property
     def shape(self) -> torch.Size:
@@ -108,38 +117,56 @@ class Setting:
         """Command effort T_hat K_d / (K_hat T_d) [-], (scenario,)."""
         return self.lower_level().amplification()
 
-    def controller(self, *, standstill: Number = 5.0, feedforward: Number = 0.0) -> LinearController:
+    def controller(self, *, standstill: Number = 5.0) -> LinearController:
         """The upper level of this setting with its time gap already reached."""
-        return LinearController(self.gains, self.time_gap, standstill, feedforward)
+        return LinearController(self.gains, self.time_gap, standstill, self.feedforward)
 
     def retarget(self, controller: Any, *, at: float, rate: float = RAMP_RATE) -> Any:
-        """`controller` moved to this setting from time `at` [s] on; gains at once, the time gap at `rate` [s/s]."""
+        """`controller` moved to this setting from time `at` [s] on; all at once, but the time gap at `rate` [s/s]."""
         if isinstance(controller, LinearController):
-            return controller.retargeted(at=at, time_gap=self.time_gap, gains=self.gains, rate=rate)
+            return controller.retargeted(
+                at=at, time_gap=self.time_gap, gains=self.gains, feedforward=self.feedforward, rate=rate
+            )
         return controller.retargeted(at=at, time_gap=float(self.time_gap.reshape(-1)[0]), rate=rate)
 
     def effective(self, T_L: Tensor, K_L: Tensor) -> tuple[Tensor, Tensor]:
-        """(T_e, K_e) the unclipped loop behaves as with draws of the plant (scenario, draw) (SPEC section 1)."""
+        """(T_e, K_e) the unclipped loop behaves as with draws of the plant (scenario, draw)."""
         return self._over_draws().lower_level().effective(T_L, K_L)
 
-    def p_string_stable(self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0) -> Tensor:
+    def p_string_stable(self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0, link_delay: Number = 0.0) -> Tensor:
         """P(string stable) (scenario,) under draws of the plant (scenario, draw), exact and through (T_e, K_e).
 
-        Fields (scenario, candidate) go with draws (scenario, 1, draw). `dead_time` [s] is a number or of the shape of
-        the fields.
+        Fields (scenario, candidate) go with draws (scenario, 1, draw). `dead_time` [s], and `link_delay` [s] of the
+        leader's acceleration, are numbers or of the shape of the fields.
         """
         T_e, K_e = self.effective(T_L, K_L)
-        return stability.p_string_stable(T_e, K_e, self.time_gap, self.gains, dead_time=_per_draw(dead_time))
+        return stability.p_string_stable(
+            T_e,
+            K_e,
+            self.time_gap,
+            self.gains,
+            dead_time=_per_draw(dead_time),
+            feedforward=self.feedforward,
+            feedforward_delay=link_delay,
+        )
 
     def p_locally_stable(self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0) -> Tensor:
         """As `p_string_stable`, of disturbances dying out at all."""
         T_e, K_e = self.effective(T_L, K_L)
         return stability.p_locally_stable(T_e, K_e, self.time_gap, self.gains, dead_time=_per_draw(dead_time))
 
-    def peak_gain(self, T_L: Number, K_L: Number, *, dead_time: Number = 0.0) -> Tensor:
+    def peak_gain(self, T_L: Number, K_L: Number, *, dead_time: Number = 0.0, link_delay: Number = 0.0) -> Tensor:
         """Peak gain (scenario,) at one plant a scenario, through (T_e, K_e): the judge of a choice, at the truth."""
         T_e, K_e = self.lower_level().effective(T_L, K_L)
-        return stability.peak_gain(T_e, K_e, self.time_gap, self.gains, dead_time=dead_time)
+        return stability.peak_gain(
+            T_e,
+            K_e,
+            self.time_gap,
+            self.gains,
+            dead_time=dead_time,
+            feedforward=self.feedforward,
+            feedforward_delay=link_delay,
+        )
 
     def lower_differs(self, other: Setting) -> Tensor:
         """Whether the lower levels send different commands; shapes broadcast. A renamed model is no difference."""
@@ -150,8 +177,8 @@ class Setting:
         )
 
     def strategies(self, default: Setting) -> list[set[int]]:
-        """Which strategies lead from `default` here, one set out of {1, 2, 3} per scenario (of a flat batch)."""
-        flags = torch.stack(self._differences(default), dim=-1).expand(*self.shape, 3)
+        """Which strategies lead from `default` here, one set out of {1, 2, 3, 4} per scenario (of a flat batch)."""
+        flags = torch.stack(self._differences(default), dim=-1).expand(*self.shape, 4)
         return [{i + 1 for i, on in enumerate(row) if on} for row in flags.tolist()]
 
     def differs(self, other: Setting) -> Tensor:
@@ -160,10 +187,11 @@ class Setting:
 
     def _differences(self, other: Setting) -> list[Tensor]:
         lower, gap = self.lower_differs(other), _differs(self.time_gap, other.time_gap)
-        return list(torch.broadcast_tensors(lower, gap, _differs(self.gains, other.gains).any(dim=-1)))
+        gains, link = _differs(self.gains, other.gains).any(dim=-1), _differs(self.feedforward, other.feedforward)
+        return list(torch.broadcast_tensors(lower, gap, gains, link))
 
     def as_dict(self, scenario: int = 0) -> dict[str, Any]:
-        """One scenario's setting as in `run.json`: T_hat, K_hat, time_gap_s, gains, and the lower level's target."""
+        """One scenario's setting as in `run.json`: T_hat, K_hat, time_gap_s, gains, the lower level's target, k_f."""
         return {
             "T_hat": float(self.T_hat[scenario]),
             "K_hat": float(self.K_hat[scenario]),
@@ -171,6 +199,7 @@ class Setting:
             "gains": [float(k) for k in self.gains[scenario]],
             "T_d": float(self.T_d[scenario]),
             "K_d": float(self.K_d[scenario]),
+            "feedforward": float(self.feedforward[scenario]),
         }
 
     def _over_draws(self) -> Setting:
@@ -184,7 +213,7 @@ class DesignBounds:
     """A box of actuation (scenario,) for a robust controller: `T_L` [s] and `K_L` [-] as (lower, upper) pairs.
 
     The paper's further option (Section 4): instead of the handbook's [0.1, 0.4] s and [0.7, 1] the box is what the
-    posterior holds likely. `stability.local_conditions` and `string_conditions` take the pairs as they are.
+    posterior holds likely; `recheck` judges the design over it.
     """
 
     T_L: tuple[Tensor, Tensor]
@@ -208,6 +237,19 @@ class DesignBounds:
             return low, high
 
         return DesignBounds(pair(T_L), pair(K_L))
+
+    def recheck(
+        self, time_gap: Number, gains: Sequence[float] | Tensor, *, form: Form = "rigorous"
+    ) -> tuple[Conditions, Conditions]:
+        """Eq. 2 (local) and Eq. 3 (string, sufficient) of the robust design over this box, margins (scenario, line).
+
+        `form` as in `stability.string_conditions`: "print" is the paper's. Of the vehicle itself; where the lower
+        level inverts a model, make the box of `setting.effective(T_L, K_L)`.
+        """
+        return (
+            stability.local_conditions(self.T_L, self.K_L, time_gap, gains, form=form),
+            stability.string_conditions(self.T_L, self.K_L, time_gap, gains, form=form),
+        )
 
 
 def _per_draw(number: Number) -> Number:

@@ -84,6 +84,7 @@ class Strategist:
     grid: what is on offer. required: P(string stable) to reach. most_clipped: share of commands. draws: of the
     posterior, used in the search (the figures reported use all that are given). dead_time [s]: of the vehicle.
     driver_delay [s]: where above zero the time gap is not set but asked for, and the driver needs that long.
+    link_delay [s]: age of the leader's acceleration where it is heard (a grid with `feedforward`).
     Raises `InputError` for numbers out of range.
     """
 
@@ -93,6 +94,7 @@ class Strategist:
     draws: int = 256
     dead_time: float = 0.0
     driver_delay: float = 0.0
+    link_delay: float = 0.0
     ramp_rate: float = RAMP_RATE
     standstill: float = 5.0
 
@@ -103,8 +105,13 @@ class Strategist:
                 raise InputError(f"{name}: found {value}, need a number between 0 and 1")
         if self.draws < 20:
             raise InputError(f"draws: found {self.draws}, need 20 or more")
-        if not self.driver_delay >= 0.0:
-            raise InputError(f"driver_delay: found {self.driver_delay} s, need 0 or more")
+        for name in ("driver_delay", "link_delay"):
+            if not getattr(self, name) >= 0.0:
+                raise InputError(f"{name}: found {getattr(self, name)} s, need 0 or more")
+
+    def probability(self, setting: Setting, T_L: Tensor, K_L: Tensor) -> Tensor:
+        """P(string stable) of a setting under draws, with this vehicle's dead time and link."""
+        return setting.p_string_stable(T_L, K_L, dead_time=self.dead_time, link_delay=self.link_delay)
 
     @torch.no_grad()
     def decide(
@@ -149,7 +156,8 @@ class Strategist:
         pick, sufficient = search.run()
         rows = torch.arange(scenarios)
         chosen = search.candidates.setting[rows, pick]
-        p = chosen.p_string_stable(T_L, K_L, dead_time=self.dead_time)
+        p = self.probability(chosen, T_L, K_L)
+        deaf = p if not bool(chosen.feedforward.any()) else self.probability(chosen.replace(feedforward=0.0), T_L, K_L)
         longer = chosen.time_gap > current.time_gap + 1e-9
         asked = longer & (self.driver_delay > 0.0)
         interim = chosen.replace(time_gap=torch.where(asked, current.time_gap, chosen.time_gap))
@@ -161,16 +169,16 @@ class Strategist:
             setting=chosen,
             sufficient=sufficient,
             p_string_stable=p,
-            p_robust=chosen.p_string_stable(*_widened(T_L, K_L), dead_time=self.dead_time),
+            p_robust=self.probability(chosen, *_widened(T_L, K_L)),
             intrusiveness=search.candidates.cost[rows, pick],
             predicted=predicted,
             strategies=strategies,
             changes=chosen.differs(current),
             why=_sentences(
-                chosen, current, default, strategies, sufficient, p, predicted, asked, self, history.seconds
+                chosen, current, default, strategies, sufficient, (p, deaf), predicted, asked, self, history.seconds
             ),
             interim=interim,
-            p_interim=interim.p_string_stable(T_L, K_L, dead_time=self.dead_time),
+            p_interim=self.probability(interim, T_L, K_L),
             driver_delay_s=asked * self.driver_delay,
         )
 
@@ -283,7 +291,7 @@ class _Search:
         """P(string stable) of the pairs (scenario r, candidate c), from every n-th draw."""
         T, K = (x[:, :: max(1, every)] for x in belief)
         parts = [
-            self.candidates.setting[i, j].p_string_stable(T[i], K[i], dead_time=self.rules.dead_time)
+            self.rules.probability(self.candidates.setting[i, j], T[i], K[i])
             for i, j in zip(r.split(_PAIRS), c.split(_PAIRS), strict=True)
             if len(i)
         ]
@@ -309,6 +317,7 @@ class _Search:
             standstill=self.rules.standstill,
             ramp_rate=self.rules.ramp_rate,
             delay=self.rules.driver_delay,
+            link_delay=self.rules.link_delay,
         )
         if self.predictions is None:
             self.predictions = seen.map(lambda x: torch.full(self.p.shape, torch.nan, dtype=torch.float64))
@@ -343,7 +352,7 @@ def _sentences(
     default: Setting,
     strategies: list[set[int]],
     sufficient: Tensor,
-    p: Tensor,
+    p_and_deaf: tuple[Tensor, Tensor],
     predicted: Prediction,
     asked: Tensor,
     rules: Strategist,
@@ -351,6 +360,7 @@ def _sentences(
 ) -> list[str]:
     """One sentence a scenario, as a person would say it."""
     out = []
+    p, deaf = p_and_deaf
     for i, used in enumerate(strategies):
         now, was = chosen.as_dict(i), current.as_dict(i)
         steps = []
@@ -363,6 +373,9 @@ def _sentences(
             steps.append(f"{verb} {now['time_gap_s']:g} s instead of {float(default.time_gap[i]):g} s")
         if 3 in used:
             steps.append("gains " + ", ".join(f"{k:g}" for k in now["gains"]))
+        if 4 in used:
+            lost = f"P(string stable) {float(deaf[i]):.2f} if the link is lost"
+            steps.append(f"leader's acceleration fed forward with k_f {now['feedforward']:g} ({lost})")
         what = "; ".join(steps) if steps else "default setting"
         if now == was:
             what = f"setting in force stays ({what})"

@@ -95,7 +95,8 @@ class Supervisor:
         self.setting = read_setting(loop) if setting is None else _for_scenarios(setting, n)
         if monitor is None:
             dead_time = 0.0 if strategist is None else strategist.dead_time
-            monitor = Monitor(n, accepted=(self.setting.T_hat, self.setting.K_hat), dead_time=dead_time)
+            accepted = (self.setting.T_hat, self.setting.K_hat)
+            monitor = Monitor(n, accepted=accepted, dead_time=dead_time, link_delay=loop.link_delay)
         self.watch = Watch(stream, monitor)
         self.default = self.setting
         self.strategist = strategist
@@ -205,7 +206,9 @@ class Supervisor:
             if not bool(changed[j]):
                 continue
             chosen = decision.setting[j : j + 1]
-            gain = None if truth is None else float(chosen.peak_gain(truth[0][i], truth[1][i])[0])
+            gain = None
+            if truth is not None:
+                gain = float(chosen.peak_gain(truth[0][i], truth[1][i], link_delay=loop.link_delay)[0])
             waits = int(self._due[i]) - loop.steps_done if int(self._due[i]) < _NEVER else 0
             actions[i].append(
                 Action(
@@ -235,7 +238,7 @@ class Supervisor:
         T_L, K_L = (watched.window.belief.draws[..., i].mT for i in range(2))
         dead_time = self.watch.monitor.dead_time
         soon = torch.minimum(
-            self._ordered.p_string_stable(T_L, K_L, dead_time=dead_time),
+            self._ordered.p_string_stable(T_L, K_L, dead_time=dead_time, link_delay=self.loop.link_delay),
             self._ordered.p_locally_stable(T_L, K_L, dead_time=dead_time),
         )
         return torch.where(waiting, soon, p)
@@ -283,7 +286,8 @@ def read_setting(loop: ClosedLoop) -> Setting:
     if gains is None or not hasattr(controller, "time_gap"):
         raise InputError("controller: tells no gains and time_gap; give the setting to be judged by")
     gap = controller.time_gap  # type: ignore[attr-defined]
-    return Setting(lower.T_hat, lower.K_hat, lower.T_d, lower.K_d, gap, gains, scenarios=loop.scenarios)
+    k_f = getattr(controller, "feedforward", 0.0)
+    return Setting(lower.T_hat, lower.K_hat, lower.T_d, lower.K_d, gap, gains, k_f, scenarios=loop.scenarios)
 
 
 def _truth(loop: ClosedLoop) -> tuple[Tensor, Tensor] | None:
@@ -312,8 +316,14 @@ def _for_scenarios(setting: Setting, n: int) -> Setting:
 def _check_reach(strategist: Strategist, loop: ClosedLoop) -> None:
     """Refuse a strategist that may choose what the controller cannot do: the choice would be reported, not made."""
     controller, grid = loop.controller, strategist.grid
+    if 4 in grid.allowed and grid.feedforward and abs(strategist.link_delay - loop.link_delay) > 1e-9:
+        raise InputError(
+            f"strategist: found link_delay {strategist.link_delay:g} s, but the loop's link takes {loop.link_delay:g} s"
+        )
     if isinstance(controller, LinearController) or grid.allowed <= {1}:
         return
+    if 4 in grid.allowed and grid.feedforward:
+        raise InputError("strategist: may feed the leader's acceleration forward, which this controller does not take")
     if not hasattr(controller, "retargeted"):
         raise InputError("strategist: may change time gap or gains, which this controller does not take; allow only 1")
     if grid.gains_of_gap is None:

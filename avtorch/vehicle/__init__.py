@@ -1,5 +1,6 @@
 """What moves: the GLVD, controllers, closed loop and platoons, leaders, performance; stability in its own package."""
 
+from avtorch.vehicle.black_box import Linearised, linearise, measured_gain
 from avtorch.vehicle.block import Block, Trajectory
 from avtorch.vehicle.controllers import NOMINAL_GAINS, Controller, FollowerState, LinearController
 from avtorch.vehicle.glvd import GLVD, exact_motion, glvd_jerk, glvd_rollout, glvd_step
@@ -9,6 +10,7 @@ from avtorch.vehicle.lower_level import LowerLevel
 from avtorch.vehicle.mpc import MPC
 from avtorch.vehicle.performance import Performance, equilibrium_throughput, performance
 from avtorch.vehicle.plant import GLVDPlant, Plant
+from avtorch.vehicle.second_order import PositionLag, SpeedLag
 from avtorch.vehicle.time_gap import RAMP_RATE, TimeGap
 
 __all__ = [
@@ -23,9 +25,12 @@ __all__ = [
     "GLVDPlant",
     "Leader",
     "LinearController",
+    "Linearised",
     "LowerLevel",
     "Performance",
     "Plant",
+    "PositionLag",
+    "SpeedLag",
     "TimeGap",
     "Trajectory",
     "equilibrium_throughput",
@@ -33,6 +38,8 @@ __all__ = [
     "glvd_jerk",
     "glvd_rollout",
     "glvd_step",
+    "linearise",
+    "measured_gain",
     "performance",
     "simulate",
 ]

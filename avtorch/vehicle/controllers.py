@@ -19,6 +19,7 @@ from avtorch.vehicle.arguments import Number, checked
 from avtorch.vehicle.time_gap import RAMP_RATE, TimeGap
 
 NOMINAL_GAINS = (1.5, 1.5, -0.8)
+"""Gains (k_s [1/s²], k_v [1/s], k_a [-]) of the upper level unless told otherwise."""
 
 
 class FollowerState(NamedTuple):
@@ -36,11 +37,12 @@ class FollowerState(NamedTuple):
 
 
 Controller = Callable[[FollowerState], Tensor]
+"""Takes what a follower sees, returns the demanded acceleration [m/s²]."""
 
 
 @dataclass(frozen=True)
 class LinearController:
-    """Constant-time-gap law `u = k_s Δs + k_v Δv + k_a a + k_f a_lead` (SPEC section 1), demanded acceleration [m/s²].
+    """Constant-time-gap law `u = k_s Δs + k_v Δv + k_a a + k_f a_lead`, demanded acceleration [m/s²].
 
     `Δs = spacing - (time_gap speed + standstill)`, `Δv = lead_speed - speed`.
 
@@ -92,14 +94,19 @@ class LinearController:
         at: float,
         time_gap: Number | None = None,
         gains: Sequence[float] | Tensor | None = None,
+        feedforward: Number | None = None,
         rate: float = RAMP_RATE,
     ) -> LinearController:
         """The same controller with new settings from time `at` [s] on; the gap moves there at `rate` [s/s].
 
         It starts from the gap in force at `at`, so a ramp may be retargeted midway. `at` later than the time of the
-        call is a driver's compliance delay (gains change at once).
+        call is a driver's compliance delay (gains and feed-forward change at once).
         """
-        changed = dataclasses.replace(self, gains=self.gains if gains is None else gains)
+        changed = dataclasses.replace(
+            self,
+            gains=self.gains if gains is None else gains,
+            feedforward=self.feedforward if feedforward is None else feedforward,
+        )
         if time_gap is None:
             return changed
         ramp = TimeGap(target=time_gap, start=self.time_gap_at(at), since=at, rate=rate)

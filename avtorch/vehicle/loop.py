@@ -36,11 +36,16 @@ class ClosedLoop:
 
     Args:
         leader: its `dt` must be the loop's.
-        controller: any callable on `FollowerState`. lower_level: the command sent. plant: see `plant.py`.
-        dt: step [s], None for the leader's. scenarios: how many. vehicles: None for a single follower.
+        controller: any callable on `FollowerState`.
+        lower_level: the command sent.
+        plant: a `Plant`, or a function with the arguments of its `step`.
+        dt: step [s], None for the leader's.
+        scenarios: how many.
+        vehicles: None for a single follower.
         seeds: of the jerk noise, one per scenario; an int s means s, s+1, …; None means 0, 1, ….
         spacing0: [m], None for the controller's equilibrium at the leader's first speed (5 m + 1 s where it does not
-            tell a time gap). speed0: [m/s], None for the leader's first speed.
+            tell a time gap).
+        speed0: [m/s], None for the leader's first speed.
         link_delay: [s], age of the leader's acceleration that the controller sees (a radio link; rounded to steps).
 
     Raises `InputError` for bad arguments, and from `advance` where the leader ends before the block does.
@@ -96,6 +101,11 @@ class ClosedLoop:
     def time(self) -> float:
         """Time of the next row [s]."""
         return self.steps_done * self.dt
+
+    @property
+    def link_delay(self) -> float:
+        """Age of the leader's acceleration that the controller sees [s], in whole steps."""
+        return self._link_steps * self.dt
 
     @property
     def collided(self) -> Tensor:

@@ -1,6 +1,6 @@
 """The lower level: turns the demanded acceleration into the command sent, by inverting a model of the actuator.
 
-SPEC section 1: with a model `(T_hat, K_hat)` and a target `(T_d, K_d)` it sends
+With a model `(T_hat, K_hat)` and a target `(T_d, K_d)` it sends
 
     u_cmd = (T_hat / K_hat) [ (1/T_hat - 1/T_d) a + (K_d / T_d) u ]
 
@@ -80,7 +80,7 @@ class LowerLevel:
         return self._on_demand
 
     def effective(self, T_L: Number, K_L: Number) -> tuple[Tensor, Tensor]:
-        """`(T_e [s], K_e [-])` the loop behaves as, unclipped, with a plant `(T_L, K_L)` (SPEC section 1); broadcasts.
+        """`(T_e [s], K_e [-])` the loop behaves as, unclipped, with a plant `(T_L, K_L)`; broadcasts.
 
         `1/T_e = 1/T - r (1/T_hat - 1/T_d)`, `r = K T_hat / (T K_hat)`. Where the model promises more than the plant
         has, `1/T_e` can be zero or negative: the inner loop is then itself unstable and `T_e` comes back infinite or

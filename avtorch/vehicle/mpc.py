@@ -37,9 +37,12 @@ class MPC:
     """Controller `mpc(state) -> demanded acceleration (..., scenario)` [m/s²].
 
     Args:
-        time_gap: [s]. standstill: [m]. horizon, step: [s]; 4 s at 0.2 s by default: several times the loop's slowest
-            time constant, in steps shorter than the actuator's lag.
-        T, K: internal model of the actuator. accel_min, accel_max: the box [m/s²].
+        time_gap: [s].
+        standstill: [m].
+        horizon, step: [s]; 4 s at 0.2 s by default: several times the loop's slowest time constant, in steps shorter
+            than the actuator's lag.
+        T, K: internal model of the actuator, [s] and [-].
+        accel_min, accel_max: the box [m/s²].
         weights: (q_s [1/m²], q_v [s²/m²], q_a [s⁴/m²], r [s⁴/m²]); the default puts a spacing error of 1 m, a speed
             difference of 1 m/s and a demand of 1 m/s² level.
 

@@ -1,4 +1,4 @@
-"""How a run went: the measures of SPEC section 4, by scenario."""
+"""How a run went: comfort, safety, stability and throughput, by scenario."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ COMFORT_ACCEL, COMFORT_JERK = 2.0, 2.5
 #: Road load per unit mass of a mid-size car: rolling 0.01 g, and rho c_d A / (2 m) = 1.2 * 0.65 / (2 * 1500).
 ROLLING_MPS2, AERO_PER_M = 0.0981, 2.6e-4
 
+#: Braking for the safe spacing: both cars at most 6 m/s², the lower level's limit; the follower half a second later.
+BRAKING_MPS2, REACTION_S = 6.0, 0.5
+
 VEHICLE_LENGTH_M = 4.5
 
 
@@ -29,7 +32,9 @@ class Performance:
       follower amplifies. NaN behind a leader at constant speed. In a platoon against the vehicle in front; the
       product over the vehicles is tail against head.
     - `min_spacing_m`: zero or less means a collision. `min_ttc_s`: least spacing / closing speed over rows that close
-      in; infinite if none does, 0 after a collision.
+      in; infinite if none does, 0 after a collision. `safe_share`: rows from which the follower could still stop behind
+      a leader who brakes at 6 m/s², if it does so itself half a second later (Shalev-Shwartz et al. 2017, without the
+      acceleration meanwhile).
     - `jerk_rms_mps3`: of the instantaneous jerk, noise included. `clipped_share`: rows whose command hit the limits.
     - `comfort_share`: rows within 2 m/s² and 2.5 m/s³. `energy_jpkgm`: positive traction work per kg and metre driven
       (acceleration, rolling, air; no recuperation). `throughput_vph`: vehicles an hour at equilibrium at the mean speed
@@ -40,6 +45,7 @@ class Performance:
     accel_rms_ratio: Tensor
     min_spacing_m: Tensor
     min_ttc_s: Tensor
+    safe_share: Tensor
     jerk_rms_mps3: Tensor
     clipped_share: Tensor
     comfort_share: Tensor
@@ -66,6 +72,7 @@ def performance(
     dt = float(run.time[1] - run.time[0]) if len(run.time) > 1 else math.nan
     closing = v - lead_v
     ttc = torch.where(closing > 0, run.spacing / torch.where(closing > 0, closing, 1.0), math.inf)
+    needed = REACTION_S * v + torch.clamp(v * v - lead_v * lead_v, min=0.0) / (2.0 * BRAKING_MPS2)
     traction = torch.clamp(a + ROLLING_MPS2 + AERO_PER_M * v * v, min=0.0) * v
     mean = lead_v.mean(-1)
     flow = torch.full_like(mean, math.nan)
@@ -77,6 +84,7 @@ def performance(
         accel_rms_ratio=_rms(a) / _moving(_rms(lead_a)),
         min_spacing_m=run.spacing.amin(-1),
         min_ttc_s=ttc.amin(-1).clamp(min=0.0),
+        safe_share=(run.spacing >= needed).to(v.dtype).mean(-1),
         jerk_rms_mps3=_rms(run.jerk),
         clipped_share=run.clipped.to(v.dtype).mean(-1),
         comfort_share=calm.to(v.dtype).mean(-1),

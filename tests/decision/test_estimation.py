@@ -1,10 +1,12 @@
 """`estimate` on logs of a known vehicle: what it recovers, what it leaves out, and what it refuses."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
-from avtorch.decision import Monitor, Setting, estimate
+from avtorch.decision import Estimates, Monitor, Setting, estimate
 from avtorch.errors import InputError
 from avtorch.inference.sampler import SamplerSettings
 from avtorch.io import Log
@@ -12,6 +14,7 @@ from avtorch.results import estimates_answer
 from avtorch.vehicle import GLVDPlant, Leader, simulate
 
 COLUMNS = ("time", "accel_cmd", "accel", "speed", "jerk", "engaged", "segment")
+YES = torch.ones(1, dtype=torch.bool)
 QUICK = SamplerSettings(chains=32, draws=30)
 
 
@@ -167,6 +170,21 @@ def test_progress_is_told_in_rows(healthy):
     assert [done for done, _ in seen] == [1000, 2000, 2800]
 
 
+def test_windows_that_know_little_do_not_pass_for_spread(rotating_seed):
+    rng = np.random.default_rng(rotating_seed)
+    windows = 400
+    for stretch in (1.0, 2.0):
+        sds = np.exp(rng.uniform(np.log(0.003), np.log(0.3), windows))
+        means = 0.4 + stretch * sds * rng.standard_normal(windows)
+        beliefs = [
+            SimpleNamespace(stat=lambda _, m=m, s=s: {"mean": m, "sd": s}, excited=YES, converged=YES)
+            for m, s in zip(means.tolist(), sds.tolist(), strict=True)
+        ]
+        made = Estimates([SimpleNamespace(window=SimpleNamespace(belief=b)) for b in beliefs], 0.0, "jerk", None, None)
+        # the root of a chi-square over its degrees of freedom
+        assert made.spread_ratio("T_L") == pytest.approx(stretch, rel=5 / np.sqrt(2 * (windows - 1)))
+
+
 def test_the_seed_decides(healthy):
     one, again, other = (estimate(healthy, seed=s) for s in (3, 3, 4))
     for a, b in zip(one.windows, again.windows, strict=True):
@@ -288,3 +306,19 @@ def test_a_window_as_long_as_the_log_is_taken(healthy):
     """Two thousand rows at 0.01 s span 19.99 s, and are 20 s of log."""
     (only,) = estimate(healthy, window=20.0, settings=QUICK).windows
     assert int(only.window.n[0]) == int(healthy.usable.sum())
+
+
+@pytest.mark.parametrize("estimator", ["map", "rls", "ekf", "ukf"])
+def test_other_estimators_answer_in_the_same_terms(estimator, healthy):
+    found = estimate(healthy, estimator=estimator)
+    answer = estimates_answer(found)
+    assert answer["estimator"] == estimator
+    last = answer["windows"][-1]
+    for name, truth in (("T_L", 0.5), ("K_L", 0.9)):
+        assert last[name]["q05"] < last[name]["mean"] < last[name]["q95"]
+        assert abs(last[name]["mean"] - truth) < 5 * last[name]["sd"]
+
+
+def test_an_unknown_estimator_is_refused(healthy):
+    with pytest.raises(InputError, match="sgld, map, rls, ekf, ukf"):
+        estimate(healthy, estimator="oracle")

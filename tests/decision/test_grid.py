@@ -105,7 +105,7 @@ def test_gains_that_follow_from_the_gap_are_no_strategy():
 
 
 @pytest.mark.parametrize(
-    "bad", [{"allowed": frozenset({4})}, {"time_gaps": (0.0,)}, {"targets": (2.0,)}, {"gains": ((1.0, 2.0),)}]
+    "bad", [{"allowed": frozenset({5})}, {"time_gaps": (0.0,)}, {"targets": (2.0,)}, {"gains": ((1.0, 2.0),)}]
 )
 def test_impossible_grids_are_refused(bad):
     with pytest.raises(InputError, match=next(iter(bad))):

@@ -149,6 +149,19 @@ def test_a_baseline_may_come_from_elsewhere_and_inflation_quiets():
         assert bool(monitor.update(*cloud([0.4], [1.0], sd=0.05), yes(), Setting()).any[0]) is alarmed
 
 
+def test_a_vehicle_that_swings_by_a_few_per_cent_is_quiet_only_where_it_may():
+    """A gain that swings by 2 % with a belief ten times as narrow: an alarm to whoever takes the belief at its word."""
+    for unevenness, alarmed in (((0.0, 0.0), True), ((0.1, 0.03), False)):
+        monitor = Monitor(1, detectors=[*DIVERGENCES, *CHARTS], unevenness=unevenness)
+        seen = False
+        for i in range(30):
+            swing = 1.0 + 0.02 * math.sin(i / 2.4)
+            seen |= bool(monitor.update(*cloud([0.3], [swing], sd=0.004, seed=i), yes(), Setting()).any[0])
+        assert seen is alarmed
+        found = monitor.update(*cloud([0.6], [0.8], sd=0.004), yes(), Setting())
+        assert "hellinger" in found.names()
+
+
 def test_dead_time_counts_in_the_stability_verdict():
     quick = cloud([0.3], [1.0])
     assert not bool(Monitor(1).update(*quick, yes(), Setting()).any[0])
@@ -165,6 +178,7 @@ def test_dead_time_counts_in_the_stability_verdict():
         {"false_alarm_rate": 2.0},
         {"change": (0.2, 0.0)},
         {"inflation": 0.5},
+        {"unevenness": (0.1, -0.1)},
         {"scenarios": 0},
         {"detectors": ["ewma"], "arl": 0.5},
     ],

@@ -92,6 +92,26 @@ def test_design_bounds_hold_their_coverage(rotating_seed):
         DesignBounds.of_belief(T, K, coverage=1.0)
 
 
+def test_the_robust_design_is_rechecked_over_the_posteriors_box():
+    one = torch.ones(1, dtype=torch.float64)
+    handbook = DesignBounds((0.1 * one, 0.4 * one), (0.7 * one, one))
+    for form in ("print", "rigorous"):
+        local, string = handbook.recheck(1.0, (1.5, 1.5, -0.8), form=form)
+        assert local.holds.tolist() == string.holds.tolist() == [True]
+    z = torch.randn(2, 1, 2000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    T, K = 1.5 * torch.exp(0.03 * z[0]), 0.5 * torch.exp(0.02 * z[1])
+    after = DesignBounds.of_belief(T, K)
+    # Eq. 3 is only sufficient, and its first line falls with the gap: it refuses what the exact verdict passes
+    for gap in (1.0, 2.5):
+        local, string = after.recheck(gap, (1.5, 1.5, -0.8), form="print")
+        assert local.holds.tolist() == [True]
+        assert string.holds.tolist() == [False]
+    assert float(Setting(time_gap=2.5).p_string_stable(T, K)) == 1.0
+    passes = after.recheck(1.6, (1.5, 4.0, -5.0))
+    assert all(bool(c.holds) for c in passes)
+    assert float(Setting(time_gap=1.6, gains=(1.5, 4.0, -5.0)).p_string_stable(T, K)) == 1.0
+
+
 @pytest.mark.parametrize(
     "bad",
     [

@@ -42,6 +42,18 @@ def test_values_on_known_series():
     assert p.throughput_vph.item() == pytest.approx(3600 * 20 / (20 + 5 + 4.5))
 
 
+def test_safe_spacing_is_what_it_takes_to_stop():
+    still = torch.zeros(1, 4000, dtype=F64)
+    # 20 m/s behind 16 m/s: half a second, then 20² / 12 m against 16² / 12 m
+    needed = 0.5 * 20 + (400 - 256) / 12
+    for spacing, share in ((needed + 0.01, 1.0), (needed - 0.01, 0.0)):
+        seen = performance(block(speed=still + 20, lead_speed=still + 16, spacing=still + spacing))
+        assert seen.safe_share.item() == share
+    # a leader who is faster stops later: only the reaction counts
+    assert performance(block(speed=still + 20, lead_speed=still + 30, spacing=still + 10.01)).safe_share.item() == 1.0
+    assert performance(block(speed=still + 20, lead_speed=still + 30, spacing=still + 9.99)).safe_share.item() == 0.0
+
+
 def test_comfort_counts_rows_beyond_either_bound():
     assert performance(
         block(jerk=5 * torch.sin(torch.arange(4000, dtype=F64) * math.pi / 200)[None])

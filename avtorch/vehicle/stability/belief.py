@@ -32,10 +32,11 @@ class StabilityBelief:
 
     p_locally_stable, p_string_stable: shares of the draws. error: their Monte Carlo standard error at most, as if the
     draws were independent (Agresti-Coull, so it is no zero at a share of 0 or 1). margins: intervals of
-      local [1/s]: (1/K - k_a) g - T k_s / K, the last line of Eq. 2 (> 0 stable), without dead time;
-      B [-] and C_over_K [1/s^2]: the lines of Eq. 3, without dead time;
-      dead_time [s]: how much more dead time the loop bears before it is locally unstable, counted from the one it has;
-      peak_gain [-]: with dead time; inf where locally unstable.
+
+    - local [1/s]: `(1/K - k_a) g - T k_s / K`, the last line of Eq. 2 (> 0 stable), without dead time;
+    - B [-] and C_over_K [1/s^2]: the lines of Eq. 3, without dead time;
+    - dead_time [s]: how much more dead time the loop bears before it is locally unstable, counted from the one it has;
+    - peak_gain [-]: with dead time; inf where locally unstable.
     """
 
     p_locally_stable: Tensor

@@ -1,10 +1,10 @@
-"""Stability of the loop around any linear chain: dead time, a second pole, a late sensor, drag (SPEC section 2).
+"""Stability of the loop around any linear chain: dead time, a second pole, a late sensor, drag.
 
 With `P` from command to acceleration, `S` from acceleration to its reading, a drag `d` and a lower level that sends
 `alpha` times the reading plus `beta` times what the upper level asks, the loop is
 
     F(s) = (1 - alpha P S) s (s + d) + beta P (k_s + g s - k_a S s^2),    g = k_s tau + k_v
-    V / V_lead = beta P (k_s + k_v s) / F
+    V / V_lead = beta P (k_s + k_v s + k_f s^2 exp(-s theta_f)) / F
 
 `P` and `S` are stable and fade at high frequencies, so `F / (s + 1)^2` goes to 1 and its phase along the imaginary axis
 counts the growing modes (the argument principle). Everything is told on a grid of frequencies.
@@ -75,13 +75,16 @@ def chain_verdict(
     *,
     inner: Tensor | float = 0.0,
     forward: Tensor | float = 1.0,
+    feedforward: Tensor | float = 0.0,
+    feedforward_delay: float = 0.0,
 ) -> ChainVerdict:
     """Of a linear controller around `chain`, batches that broadcast with each other.
 
     `time_gap` (...) [s], `gains` (..., 3); the lower level sends `inner` times the sensed acceleration plus `forward`
-    times what the upper level asks, (...) (0 and 1: it passes that through).
+    times what the upper level asks, (...) (0 and 1: it passes that through). `feedforward` k_f (...) [-] acts on the
+    leader's acceleration `feedforward_delay` [s] ago.
     """
-    loop, asked = _loop(chain, time_gap, gains, inner, forward)
+    loop, asked = _loop(chain, time_gap, gains, inner, forward, feedforward, feedforward_delay)
     gain = asked.abs() / loop.abs().clamp_min(1e-300)
     local = _growing(loop / (1j * chain.omega + 1) ** 2) < 0.5
     # pushed the right way at rest
@@ -97,14 +100,22 @@ def chain_gain(
     *,
     inner: Tensor | float = 0.0,
     forward: Tensor | float = 1.0,
+    feedforward: Tensor | float = 0.0,
+    feedforward_delay: float = 0.0,
 ) -> Tensor:
-    """|V / V_lead| (..., frequency), arguments as in `chain_verdict`; formal where the loop is locally unstable."""
-    loop, asked = _loop(chain, time_gap, gains, inner, forward)
+    """`|V / V_lead|` (..., frequency), arguments as in `chain_verdict`; formal where the loop is locally unstable."""
+    loop, asked = _loop(chain, time_gap, gains, inner, forward, feedforward, feedforward_delay)
     return asked.abs() / loop.abs().clamp_min(1e-300)
 
 
 def _loop(
-    chain: Chain, time_gap: Tensor, gains: Tensor, inner: Tensor | float, forward: Tensor | float
+    chain: Chain,
+    time_gap: Tensor,
+    gains: Tensor,
+    inner: Tensor | float,
+    forward: Tensor | float,
+    feedforward: Tensor | float,
+    feedforward_delay: float,
 ) -> tuple[Tensor, Tensor]:
     """F and the numerator of V / V_lead, (..., frequency)."""
     s = 1j * chain.omega
@@ -113,7 +124,8 @@ def _loop(
     alpha, beta = (torch.as_tensor(x, dtype=torch.float64)[..., None] for x in (inner, forward))
     own = (1 - alpha * chain.motion * chain.sensed) * s * (s + chain.drag[..., None])
     loop = own + beta * chain.motion * (ks + g * s - ka * chain.sensed * s**2)
-    return loop, beta * chain.motion * (ks + kv * s)
+    kf = torch.as_tensor(feedforward, dtype=torch.float64)[..., None]
+    return loop, beta * chain.motion * (ks + kv * s + kf * s**2 * torch.exp(-s * feedforward_delay))
 
 
 def _growing(curve: Tensor) -> Tensor:

@@ -59,7 +59,7 @@ def local_conditions(
 def string_conditions(
     T_L: PointOrBox, K_L: PointOrBox, time_gap: Value, gains: Gains, *, form: Form = "rigorous"
 ) -> Conditions:
-    """Eq. 3 over the box T_L x K_L (arguments as in `local_conditions`): sufficient for |G| <= 1, not necessary.
+    """Eq. 3 over the box T_L x K_L (arguments as in `local_conditions`): sufficient for `|G| <= 1`, not necessary.
 
     form="print": the three printed lines, K^u in the last term of both squares. form="rigorous": the least value over
     the box of B = (1 - K k_a)^2 - 2 T K g, linear in T_L and a convex quadratic in K_L whose vertex may lie inside, and

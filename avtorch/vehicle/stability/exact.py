@@ -14,7 +14,7 @@ ROUNDINGS = 16
 def string_margins(
     T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, feedforward: Value = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """(B, C) of SPEC section 2: |G|^2 <= 1 at omega iff T^2 omega^4 + B omega^2 + C >= 0.
+    """(B, C) of the exact string condition: `|G|^2` <= 1 at omega iff `T^2 omega^4 + B omega^2 + C >= 0`.
 
     B = (1 - K k_a)^2 - 2 T K g [-] is Eq. 3's first line at one point, C / K [1/s^2] its last. With a feed-forward gain
     (no communication delay) B loses K^2 k_f^2 and C gains 2 K^2 k_s k_f. -inf where the actuation is no vehicle.
@@ -28,7 +28,7 @@ def string_margins(
 def string_margin(T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, feedforward: Value = 0.0) -> Tensor:
     """The least of T^2 x^2 + B x + C over x = omega^2 >= 0: the gain condition holds iff it is >= 0.
 
-    One number for both cases of SPEC section 2: C where B >= 0, else C - B^2 / (4 T^2). No word on local stability.
+    One number for both cases of the exact condition: C where B >= 0, else C - B^2 / (4 T^2). Not about local stability.
     """
     s = read_setting(T_L, K_L, time_gap, gains, feedforward=feedforward)
     B, C = coefficients(s)
@@ -46,7 +46,7 @@ def coefficients(s: Setting) -> tuple[Tensor, Tensor]:
 
 
 def gain_condition(s: Setting) -> Tensor:
-    """|G| <= 1 at every omega, without dead time: C >= 0 and (B >= 0 or B^2 <= 4 T^2 C), to rounding."""
+    """`|G| <= 1` at every omega, without dead time: C >= 0 and (B >= 0 or B^2 <= 4 T^2 C), to rounding."""
     B, C = coefficients(s)
     eps = ROUNDINGS * torch.finfo(C.dtype).eps
     slack = eps * (

@@ -19,7 +19,7 @@ class Setting:
     """A loop around `A (T s + 1) = K exp(-theta s) u`, every field a tensor that broadcasts with the others.
 
     `valid` is False where the actuation is no vehicle: T_L < 0, K_L <= 0 or anything not finite. Such entries come from
-    a lower level whose inverted model makes the loop unstable (effective T_L infinite or negative, SPEC section 1) and
+    a lower level whose inverted model makes the loop unstable (effective T_L infinite or negative) and
     carry harmless stand-in numbers so that nothing turns into NaN, and every verdict on them is "unstable".
     T_L = 0, the paper's ideal actuator, is valid and means the limit from above.
     """
@@ -37,7 +37,7 @@ class Setting:
 
     @property
     def g(self) -> Tensor:
-        """Total speed gain g = k_s tau + k_v [1/s] (SPEC section 2)."""
+        """Total speed gain g = k_s tau + k_v [1/s]."""
         return self.ks * self.tau + self.kv
 
     @property

@@ -19,7 +19,7 @@ def transfer_function(
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
 ) -> Tensor:
-    """G(j omega) = V / V_lead, complex, of the shape that omega [rad/s] and the setting broadcast to (SPEC section 2).
+    """G(j omega) = V / V_lead, complex, of the shape that omega [rad/s] and the setting broadcast to.
 
     With E = exp(-j omega theta): G = K E (k_f s^2 E_f + k_v s + k_s) / (T s^3 + s^2 + K E (-k_a s^2 + g s + k_s)).
     Formal where the loop is locally unstable; 0 where the actuation is no vehicle (T_L < 0, K_L <= 0, not finite).
@@ -46,7 +46,7 @@ def gain(
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
 ) -> Tensor:
-    """|G(j omega)| [-], as `transfer_function`."""
+    """`|G(j omega)|` [-], as `transfer_function`."""
     w = as_tensor(omega, [omega, T_L, K_L, time_gap, gains], "omega")
     s = read_setting(
         T_L, K_L, time_gap, gains, dead_time=dead_time, feedforward=feedforward, feedforward_delay=feedforward_delay
@@ -56,7 +56,7 @@ def gain(
 
 
 def magnitude(s: Setting, omega: Tensor) -> Tensor:
-    """|G(j omega)| of a setting."""
+    """`|G(j omega)|` of a setting."""
     return torch.hypot(*_numerator(s, omega)) / torch.hypot(*_denominator(s, omega))
 
 

@@ -16,7 +16,7 @@ def local_stable(T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, dead_
     """True where disturbances die out: Eq. 2 at one point, or a Nyquist count where dead_time [s] > 0.
 
     T_L [s], K_L [-], time_gap [s] and dead_time broadcast with the leading dimensions of gains (..., 3) =
-    (k_s [1/s^2], k_v [1/s], k_a [-]); returns bool of that shape. Exact both ways (SPEC section 2). Feed-forward has no
+    (k_s [1/s^2], k_v [1/s], k_a [-]); returns bool of that shape. Exact both ways. Feed-forward has no
     part in it. T_L < 0, K_L <= 0, infinite or NaN (a lower level that inverts itself unstable) is not stable.
     """
     s = read_setting(T_L, K_L, time_gap, gains, dead_time=dead_time)
@@ -33,9 +33,9 @@ def string_stable(
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
 ) -> Tensor:
-    """True where the loop is locally stable and |G(j omega)| <= 1 at every omega; arguments as in `local_stable`.
+    """True where the loop is locally stable and `|G(j omega)| <= 1` at every omega; arguments as in `local_stable`.
 
-    Without dead time in closed form (SPEC section 2: B and C); with it, or with a feed-forward gain k_f [-] on the
+    Without dead time in closed form (the signs of B and C); with it, or with a feed-forward gain k_f [-] on the
     leader's acceleration that is itself delayed [s], by frequency sweep. The only tolerance is rounding: a few tens of
     machine epsilons of the terms summed, so a loop exactly on the boundary counts as stable.
     """
@@ -55,12 +55,12 @@ def peak_gain(
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
 ) -> Tensor:
-    """Supremum of |G(j omega)| over omega > 0 [-].
+    """Supremum of `|G(j omega)|` over omega > 0 [-].
 
     1 where string stable (G -> 1 as omega -> 0), inf where locally unstable.
     Arguments as in `string_stable`. Without dead time the peak's frequency is the root of a cubic, else it is swept and
     refined. Differentiable once in every argument where finite: the peak moves, but at a maximum that is of second
-    order, so the derivative is that of |G| at the peak's frequency (0 where string stable).
+    order, so the derivative is that of `|G|` at the peak's frequency (0 where string stable).
     """
     s = read_setting(
         T_L, K_L, time_gap, gains, dead_time=dead_time, feedforward=feedforward, feedforward_delay=feedforward_delay
@@ -78,9 +78,9 @@ def peak_frequency(
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
 ) -> Tensor:
-    """Frequency [rad/s] of the largest |G(j omega)|; 0 where string stable, for the supremum then lies at omega -> 0.
+    """Frequency [rad/s] of the largest `|G(j omega)|`; 0 where string stable, for the supremum then lies at omega -> 0.
 
-    Arguments as in `string_stable`. Where the loop is locally unstable it is the largest formal |G| on the axis (near
+    Arguments as in `string_stable`. Where the loop is locally unstable it is the largest formal `|G|` on the axis (near
     the growing oscillation, if barely unstable); 0 where the actuation is no vehicle. Carries no gradient.
     """
     s = read_setting(

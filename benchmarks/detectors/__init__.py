@@ -1,0 +1,1 @@
+"""Detectors side by side: delay against false alarms, all judging the same beliefs."""

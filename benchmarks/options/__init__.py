@@ -1,0 +1,1 @@
+"""What the paper names and leaves open, each option with its figures (docs/options.md)."""
