@@ -62,6 +62,7 @@ def estimates_answer(estimates: Estimates) -> dict[str, Any]:
         "windows": [window_entry(w) for w in estimates.windows],
         "seconds_per_window": estimates.seconds_per_window,
         "form": estimates.form,
+        "estimator": estimates.estimator,
         "excited_share": estimates.excited_share,
         "spread_over_sd": {name: estimates.spread_ratio(name) for name in ("T_L", "K_L")},
         "alerts": alert_entries(estimates.windows),

@@ -209,6 +209,8 @@ REFUSED = {
     "window longer than the log": ["estimate", "LOG", "--window", "100", *OUT],
     "unknown form": ["estimate", "LOG", "--form", "guess", *OUT],
     "unknown mode": ["estimate", "LOG", "--mode", "hope", *OUT],
+    "unknown estimator": ["estimate", "LOG", "--estimator", "magic", *OUT],
+    "mode without priors": ["estimate", "LOG", "--estimator", "rls", "--mode", "posterior", *OUT],
     "map without a name": ["estimate", "LOG", "--map", "accel", *OUT],
     "map of no signal": ["estimate", "LOG", "--map", "force=F", *OUT],
     "unknown unit": ["estimate", "LOG", "--unit", "speed=furlong", *OUT],

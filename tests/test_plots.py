@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import matplotlib as mpl
 import numpy as np
@@ -168,6 +170,28 @@ def test_style_of_the_reader_is_left_alone() -> None:
     before = dict(mpl.rcParams)
     plots.probability_figure(WINDOWS)
     assert dict(mpl.rcParams) == before
+
+
+def test_shown_in_a_script_a_figure_is_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "new" / "a.png"
+    plots.show(Figure(), path)
+    assert path.read_bytes()[:4] == b"\x89PNG"
+    assert capsys.readouterr().out == f"picture: {path}\n"
+
+
+@pytest.mark.parametrize("kernel", [True, False])
+def test_shown_in_a_notebook_a_figure_is_below_its_cell(
+    kernel: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[tuple[bytes, int]] = []
+    shell = SimpleNamespace(kernel=None) if kernel else SimpleNamespace()
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    display = SimpleNamespace(Image=lambda data, width: (data, width), display=shown.append)
+    monkeypatch.setitem(sys.modules, "IPython.display", display)
+    plots.show(Figure(figsize=(6, 3)), tmp_path / "a.png")
+    # a terminal's shell shows no pictures
+    assert (tmp_path / "a.png").exists() is not kernel
+    assert [(data[:4], width) for data, width in shown] == ([(b"\x89PNG", 600)] if kernel else [])
 
 
 def test_save_refuses_a_folder(tmp_path: Path) -> None:

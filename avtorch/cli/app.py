@@ -15,6 +15,7 @@ from avtorch.cli.blindtest import blindtest
 from avtorch.cli.compare import compare
 from avtorch.cli.diagnose import diagnose
 from avtorch.cli.estimate import estimate
+from avtorch.cli.paper import paper
 from avtorch.cli.run import run
 from avtorch.cli.stability import stability
 from avtorch.cli.validate import validate
@@ -34,6 +35,7 @@ app.command(compare)
 app.command(stability)
 app.command(validate)
 app.command(blindtest)
+app.command(paper)
 
 
 def main(tokens: Sequence[str] | None = None) -> int:

@@ -38,9 +38,12 @@ def compare(
     ] = None,
     out: Annotated[Path | None, Parameter(name="--out", group=OUTPUT, help="Folder for comparison.json.")] = None,
     map: Annotated[
-        list[str] | None, Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN; repeatable.")
+        list[str] | None,
+        Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
     ] = None,
-    unit: Annotated[list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT; repeatable.")] = None,
+    unit: Annotated[
+        list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable.")
+    ] = None,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:

@@ -41,9 +41,12 @@ def diagnose(
         Path, Parameter(name="--out", group=OUTPUT, help="Folder for the answer and the repaired simulator.")
     ],
     map: Annotated[
-        list[str] | None, Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN; repeatable.")
+        list[str] | None,
+        Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
     ] = None,
-    unit: Annotated[list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT; repeatable.")] = None,
+    unit: Annotated[
+        list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable.")
+    ] = None,
     stamp: Annotated[
         list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
     ] = None,

@@ -21,6 +21,7 @@ from avtorch.cli.arguments import (
     three_gains,
 )
 from avtorch.cli.talk import Talk, write_answer
+from avtorch.errors import InputError
 
 
 def estimate(
@@ -29,9 +30,12 @@ def estimate(
     window: Annotated[float, Parameter(help="Length of a window [s].")] = 2.0,
     out: Out,
     map: Annotated[
-        list[str] | None, Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN; repeatable.")
+        list[str] | None,
+        Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
     ] = None,
-    unit: Annotated[list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT; repeatable.")] = None,
+    unit: Annotated[
+        list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable.")
+    ] = None,
     stamp: Annotated[
         list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
     ] = None,
@@ -39,8 +43,13 @@ def estimate(
         Literal["auto", "jerk", "latent"],
         Parameter(help="Likelihood: of measured jerk, or of noisy acceleration and speed."),
     ] = "auto",
+    estimator: Annotated[
+        Literal["sgld", "map", "rls", "ekf", "ukf"],
+        Parameter(help="SGLD, posterior mode, recursive least squares, extended or unscented Kalman filter."),
+    ] = "sgld",
     mode: Annotated[
-        Literal["lambda", "posterior", "forgetting"], Parameter(help="How a posterior becomes the next prior.")
+        Literal["lambda", "posterior", "forgetting"],
+        Parameter(help="How a posterior becomes the next prior (sgld and map)."),
     ] = "lambda",
     tau: TimeGap = 1.0,
     gains: Gains = "1.5,1.5,-0.8",
@@ -63,6 +72,8 @@ def estimate(
     k = three_gains("--gains", gains)
     free_folder(out)
     seed_number(seed)
+    if mode != "lambda" and estimator not in ("sgld", "map"):
+        raise InputError(f"--mode: has no meaning with --estimator {estimator}, which hands no prior on; leave it out")
 
     from avtorch.decision.estimation import estimate as work
     from avtorch.decision.settings import Setting
@@ -74,7 +85,9 @@ def estimate(
     talk.notes(f"{drive.name}", check(drive).notes)
     setting = Setting(time_gap=tau, gains=k, scenarios=1)
     with talk.progress("Estimating") as step:
-        found = work(drive, window, form=form, setting=setting, mode=mode, seed=seed, progress=step)
+        options: dict[str, Any] = {"mode": mode} if estimator in ("sgld", "map") else {}
+        options |= {"form": form, "setting": setting, "seed": seed}
+        found = work(drive, window, estimator=estimator, progress=step, **options)
     answer = estimates_answer(found)
 
     from avtorch import plots
@@ -98,7 +111,8 @@ def estimates_note(answer: Mapping[str, Any]) -> str:
     lost = len(excited) - len(used)
     count = f"{len(excited)} of {len(windows)} windows excited"
     if lost:
-        count += f", {lost} of them not used, as their chains did not settle"
+        what = "their chains" if answer.get("estimator", "sgld") == "sgld" else "the estimates"
+        count += f", {lost} of them not used, as {what} did not settle"
     if not used:
         return f"{count}; the belief is still the first prior."
     last = used[-1]

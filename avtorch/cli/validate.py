@@ -40,9 +40,12 @@ def validate(
     chains: Annotated[int | None, Parameter(converter=whole_number, help="SGLD chains per window.")] = None,
     draws: Annotated[int | None, Parameter(converter=whole_number, help="Draws kept of each chain.")] = None,
     map: Annotated[
-        list[str] | None, Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN; repeatable.")
+        list[str] | None,
+        Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
     ] = None,
-    unit: Annotated[list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT; repeatable.")] = None,
+    unit: Annotated[
+        list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable.")
+    ] = None,
     stamp: Annotated[
         list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
     ] = None,

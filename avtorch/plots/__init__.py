@@ -9,14 +9,17 @@ from avtorch.plots.figures import (
     region_figure,
     stability_figure,
 )
+from avtorch.plots.over_detectors import operating_curve, operating_figure
+from avtorch.plots.over_gaps import gap_figure, gap_peak, gap_probability, gap_throughput
 from avtorch.plots.over_plane import gain_curve, region, setting_region, verdict_legend, verdict_map
 from avtorch.plots.over_posteriors import agreement_scatter, exact_density, joint_cloud, marginals
 from avtorch.plots.over_ranks import ecdf_difference, ecdf_of, pooled_rank_counts, rank_band, rank_plot
 from avtorch.plots.over_time import belief_band, data_quality, events, motion, string_probability
 from avtorch.plots.over_verdicts import confusion, confusion_figure
+from avtorch.plots.paper_figures import paper_pictures
 from avtorch.plots.posterior_figures import validation_figures
 from avtorch.plots.signatures import effect_signature, signature_figure
-from avtorch.plots.style import STYLE, save
+from avtorch.plots.style import STYLE, save, show
 
 __all__ = [
     "STYLE",
@@ -33,11 +36,18 @@ __all__ = [
     "events",
     "exact_density",
     "gain_curve",
+    "gap_figure",
+    "gap_peak",
+    "gap_probability",
+    "gap_throughput",
     "joint_cloud",
     "marginals",
     "motion",
     "motion_figure",
+    "operating_curve",
+    "operating_figure",
     "overview_figure",
+    "paper_pictures",
     "pooled_rank_counts",
     "probability_figure",
     "rank_band",
@@ -46,6 +56,7 @@ __all__ = [
     "region_figure",
     "save",
     "setting_region",
+    "show",
     "signature_figure",
     "stability_figure",
     "string_probability",

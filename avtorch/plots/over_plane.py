@@ -111,7 +111,7 @@ def setting_region(
 
 
 def gain_curve(ax: Axes, omega: ArrayLike, gain: ArrayLike, *, peak: tuple[float, float] | None = None) -> Axes:
-    """|G(jω)| from the leader's speed to the follower's over frequency [rad/s]; above one, disturbances grow."""
+    """`|G(jω)|` from the leader's speed to the follower's over frequency [rad/s]; above one, disturbances grow."""
     omega, gain = np.asarray(omega), np.asarray(gain)
     ax.fill_between(omega, 1.0, gain, where=gain > 1, color=ORANGE, alpha=0.3, linewidth=0)
     ax.axhline(1.0, color=GREY, linewidth=1.0, linestyle=":")

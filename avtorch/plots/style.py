@@ -1,4 +1,4 @@
-"""The look of every picture, and how one is saved.
+"""The look of every picture, and how one is saved or shown.
 
 One palette (Okabe and Ito's, safe for colour-blind readers) and one meaning a colour: blue is what avtorch believes or
 did, vermillion what happens without it, black is the truth, green an action, orange an alert.
@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import io
 import os
+import sys
 from collections.abc import Callable
 from functools import wraps
+from importlib import import_module
 from pathlib import Path
 from typing import Any, ParamSpec
 
@@ -47,6 +49,7 @@ STYLE: Any = {
     "ytick.labelcolor": BLACK,
     "hatch.linewidth": 0.6,
 }
+"""The look of all pictures, as matplotlib's rcParams."""
 
 LABELS = {
     "T_L": "actuation lag $T_L$ [s]",
@@ -98,9 +101,29 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Write a figure as PNG, whole or not at all."""
+    picture = _png(figure)
+    with atomic(path, binary=True) as stream:
+        stream.write(picture)
+    return Path(path)
+
+
+def show(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Show a figure where one looks: below the cell in a notebook; elsewhere it is saved at `path`, which is printed.
+
+    Raises `InputError` where the file cannot be written.
+    """
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    # the shell of a terminal has no kernel, and no pictures
+    if shell is None or not hasattr(shell, "kernel"):
+        print(f"picture: {save(figure, path)}")
+        return
+    display = import_module("IPython.display")
+    # the file's pixels at the figure's size, so that it is sharp on any screen
+    display.display(display.Image(_png(figure), width=round(figure.get_figwidth() * STYLE["figure.dpi"])))
+
+
+def _png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     with mpl.rc_context(STYLE):
         figure.savefig(buffer, format="png")
-    with atomic(path, binary=True) as stream:
-        stream.write(buffer.getvalue())
-    return Path(path)
+    return buffer.getvalue()

@@ -1,0 +1,107 @@
+"""The paper's drive: a vehicle that changes at 26 s and is set anew at 28 s, for settings and seeds side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from avtorch.decision.settings import Setting
+from avtorch.vehicle import ClosedLoop, GLVDPlant, Leader
+from avtorch.vehicle.block import Block
+
+HEALTHY, CHANGED = (0.3, 1.0), (1.5, 0.5)
+"""(T_L [s], K_L [-]) before and after the change (paper, Table 1 and Section 4)."""
+
+ESTIMATED = (1.33, 0.64)
+"""What the paper estimates after it, and puts into its lower level (Section 4, Strategy 1)."""
+
+CHANGE_S, ACT_S = 26.0, 28.0
+
+NOISE = 0.1
+"""Jerk noise [m/s³]; the paper gives none (SPEC section 1)."""
+
+Progress = Callable[[float], None]
+"""Told the share of an experiment that is done, 0 to 1."""
+
+
+def noise_seeds(seed: int, count: int) -> list[int]:
+    """`count` seeds of jerk noise, none shared by two neighbouring `seed`s."""
+    return [(seed * 1_000_003 + i) % 2**62 for i in range(count)]
+
+
+def change(loop: ClosedLoop) -> None:
+    """What happens to the vehicle at 26 s."""
+    loop.plant = GLVDPlant(*CHANGED, sigma=NOISE)
+
+
+def drive(
+    leader: Leader,
+    settings: Setting,
+    *,
+    seeds: int,
+    seed: int,
+    duration: float,
+    vehicles: int | None = None,
+    noise: float = NOISE,
+    progress: Progress | None = None,
+) -> Block:
+    """Every one of `settings` (setting,) put in force at 28 s, under the same `seeds` noises; the vehicle of Table 1
+    before.
+
+    The time gap moves there at the loop's own rate, gains and lower level at once. Returns rows (setting, seed, time),
+    with `vehicles` (setting, seed, vehicle, time).
+    """
+    count = len(settings.time_gap)
+    each: Setting = settings[torch.arange(count).repeat_interleave(seeds)]
+    loop = ClosedLoop(
+        leader,
+        plant=GLVDPlant(*HEALTHY, sigma=noise),
+        scenarios=count * seeds,
+        seeds=noise_seeds(seed, seeds) * count,
+        vehicles=vehicles,
+    )
+    blocks = [_advance(loop, CHANGE_S, duration, progress)]
+    loop.plant = GLVDPlant(*CHANGED, sigma=noise)
+    blocks.append(_advance(loop, ACT_S, duration, progress))
+    loop.controller = each.retarget(loop.controller, at=ACT_S)
+    loop.lower_level = each.lower_level()
+    blocks.append(_advance(loop, duration, duration, progress))
+    whole = Block.concatenate(blocks)
+    rows = {name: x.unflatten(0, (count, seeds)) for name, x in vars(whole).items() if name != "time"}
+    return Block(whole.time, **rows)
+
+
+def stacked(settings: list[Setting]) -> Setting:
+    """Settings of shape (1,) as one of shape (setting,)."""
+    parts: dict[str, Any] = {name: torch.cat([getattr(s, name) for s in settings]) for name in vars(settings[0])}
+    return Setting(**parts)
+
+
+def rows_from(run: Block, start: float, end: float | None = None) -> Block:
+    """The rows from `start` to `end` [s]."""
+    first = int(torch.searchsorted(run.time, start - 1e-6))
+    last = len(run.time) if end is None else int(torch.searchsorted(run.time, end - 1e-6))
+    return run[first:last]
+
+
+def rms_about_mean(x: Tensor) -> Tensor:
+    """Root mean square about the mean over time, the last dimension."""
+    return (x - x.mean(-1, keepdim=True)).square().mean(-1).sqrt()
+
+
+def rms(x: Tensor) -> Tensor:
+    """Root mean square over time, the last dimension."""
+    return x.square().mean(-1).sqrt()
+
+
+def _advance(loop: ClosedLoop, until: float, duration: float, progress: Progress | None) -> Block:
+    """To `until` [s], in pieces so that progress can be told."""
+    end, blocks = round(until / loop.dt), []
+    while loop.steps_done < end:
+        blocks.append(loop.advance(min(1000, end - loop.steps_done)))
+        if progress is not None:
+            progress(loop.time / duration)
+    return Block.concatenate(blocks)

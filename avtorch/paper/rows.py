@@ -1,0 +1,99 @@
+"""A row of the reproduction: what the paper says, what came out here, and a verdict by a rule that is stated once.
+
+Rules, in the order in which a figure meets them; an interval is the 90 % one:
+
+- `error`: the paper's one error against the median over runs. *better*: the interval of the median lies below it;
+  *same*: the interval holds it; else *not reproduced*.
+- `sign`: the paper says a quantity lies above (or below) a value. *same*: so does the whole interval.
+- `share`: the paper says something happens. *same*: it does in at least 95 % of runs (or of whatever is counted).
+- `within`: the paper's word holds where the figure lies between two bounds. *same*: it does.
+
+*better* is also said of a setting that does what the print's own, of the same strategy, fails to do (`strategies`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+Verdict = Literal["same", "better", "not reproduced"]
+
+MOST = 0.95
+"""A thing that the paper says happens must happen in this share of runs."""
+
+_RESAMPLED = 1000
+
+
+@dataclass(frozen=True)
+class Row:
+    """`paper` and `ours` are numbers or a few words; `interval` is 90 %, None where nothing is random."""
+
+    name: str
+    setting: str
+    quantity: str
+    paper: float | str
+    ours: float | str
+    interval: tuple[float, float] | None
+    verdict: Verdict
+    why: str
+
+    def as_dict(self) -> dict[str, Any]:
+        out = asdict(self)
+        return out | {"interval": None if self.interval is None else list(self.interval)}
+
+
+def error(paper: float, interval: tuple[float, float]) -> Verdict:
+    """See the module's text."""
+    if interval[1] < paper:
+        return "better"
+    return "same" if interval[0] <= paper else "not reproduced"
+
+
+def sign(found: float | tuple[float, float], *, above: float | None = None, below: float | None = None) -> Verdict:
+    """See the module's text; `found` is an interval, or a number where nothing is random."""
+    low, high = found if isinstance(found, tuple) else (found, found)
+    return "same" if (above is None or low > above) and (below is None or high < below) else "not reproduced"
+
+
+def share(value: float, least: float = MOST) -> Verdict:
+    """See the module's text."""
+    return "same" if value >= least - 1e-9 else "not reproduced"
+
+
+def within(value: float, low: float, high: float) -> Verdict:
+    """See the module's text."""
+    return "same" if low <= value <= high else "not reproduced"
+
+
+def middle(values: Tensor, dim: int = -1) -> Tensor:
+    """The median over `dim`; of an even number of runs the mean of the two in the middle."""
+    return torch.quantile(values.double(), 0.5, dim=dim)
+
+
+def spread(values: Tensor) -> tuple[float, float]:
+    """Where the middle 90 % of the runs lie, `values` (run,)."""
+    low, high = torch.quantile(values.double(), torch.tensor([0.05, 0.95], dtype=torch.float64)).tolist()
+    return low, high
+
+
+def resampled(runs: int, seed: int, times: int = _RESAMPLED) -> Tensor:
+    """Runs drawn with replacement, (times, run): the bootstrap behind every interval of a median or share.
+
+    Whole runs are drawn, for what happens within one shares its noise.
+    """
+    return torch.randint(runs, (times, runs), generator=torch.Generator().manual_seed(seed))
+
+
+def median_interval(values: Tensor, seed: int) -> tuple[float, float]:
+    """90 % interval of the median of `values` (run,)."""
+    return spread(middle(values[resampled(len(values), seed)]))
+
+
+def listed(numbers: Sequence[float]) -> str:
+    """`0.1, 0.2 and 0.3`."""
+    told = [f"{x:g}" for x in numbers]
+    return told[0] if len(told) == 1 else ", ".join(told[:-1]) + " and " + told[-1]
