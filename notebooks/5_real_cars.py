@@ -1,0 +1,140 @@
+# %% [markdown]
+# # Real cars
+#
+# Nobody outside a car maker knows what the controller of a production car demands. You will see how much its speed, its
+# gap and the speed of the car in front tell all the same: how it follows, whether a line of such cars calms a
+# disturbance or makes it grow, and what of that is conditional on what. Then comes a car whose commands *are* known, a
+# test vehicle on three laps, and a diagnosis that declines to blame.
+#
+# The recordings belong to others and are not part of the project, but they are public: OpenACC by the European
+# Commission's Joint Research Centre (its data catalogue has it, GitHub's `yinglonghe/C2ART-OPT` the platoons on
+# AstaZero) and the laps of GitHub's `MPC-Berkeley/genesis_path_follower`. Put their files into folders
+# `openacc_astazero` and `genesis`, the laps as CSV with the columns `time`, `accel_cmd` and `speed`, and let
+# `AVTORCH_DATA` name the folder of both. Without them every cell runs and says what it lacks.
+
+# %%
+import os
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+import avtorch
+from avtorch import plots
+from avtorch.follower import diagnose_follower
+from avtorch.io import read_following
+from avtorch.plots import over_diagnosis, over_followers
+
+mpl.rcParams.update(plots.STYLE)
+OUT = Path("out/notebooks/5_real_cars")
+DATA = Path(os.environ["AVTORCH_DATA"]) if os.environ.get("AVTORCH_DATA") else None
+PLATOON = "openacc_astazero/ASta_040719_platoon7.csv"
+LAPS = [f"genesis/lap{k}.csv" for k in (1, 2, 3)]
+
+
+def there(*names: str) -> bool:
+    """Whether the recordings are at hand; says what is missing."""
+    missing = [name for name in names if DATA is None or not (DATA / name).exists()]
+    if missing:
+        print("not shown, for want of", ", ".join(missing), "in the folder that AVTORCH_DATA names")
+    return not missing
+
+
+# %% [markdown]
+# ## A platoon of five
+#
+# Four cars follow a leader around a proving ground, each on its own adaptive cruise control, for a quarter of an hour.
+
+# %%
+cars, logs = [], []
+if there(PLATOON):
+    logs = [read_following(DATA / PLATOON, vehicle=number) for number in (2, 3, 4, 5)]
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    ax = figure.subplots()
+    ax.plot(logs[0].time, logs[0].lead_speed, color="0.5", label="leader")
+    for k, log in enumerate(logs):
+        ax.plot(log.time, log.speed, color=mpl.colormaps["viridis"](k / 4), linewidth=1, label=f"vehicle {k + 2}")
+    start = float(logs[0].time[0])
+    ax.set(xlabel="time [s]", ylabel="speed [m/s]", xlim=(start + 300, start + 480), ylim=(5, 37))
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, 1.18), ncols=5)
+    plots.show(figure, OUT / "platoon.png")
+
+# %% [markdown]
+# Three minutes of it: whenever the leader changes its speed, each car overshoots a little more than the one in front.
+#
+# A law of following is fitted to one half of each drive and judged on the other: driven by its leader alone, the loop
+# has to find the car's speed over a minute.
+
+# %%
+for log in logs:
+    found = diagnose_follower(log, cause=False)
+    own = found.loops[found.law.name]
+    cars.append(found)
+    print(f"{found.name.split(', ')[-1]}, {found.law.name.replace('_', ' ')}:")
+    print(f"  speed off by {own.speed:.2f} m/s (a car that keeps its speed: {found.keeps_speed:.1f})")
+    print(f"  passes on {own.amplified:.2f} of its leader's motion, its loop {own.amplified_simulated:.2f};", end=" ")
+    print(f"P(string stable) {found.usual.p_string_stable:.2f}")
+
+# %%
+if cars:
+    plots.show(over_followers.followers_figure(cars), OUT / "followers.png")
+
+# %% [markdown]
+# From left: the time gap that each car keeps, how long it takes from what it sees to what it does, and the peak gain.
+# They follow at little more than a second and take about as long to answer, and so they pass on more than they get: all
+# peak gains are above one. What the simulated loops amplify is what the cars amplify.
+#
+# All this is conditional on the form of the law, and is about controller and car together. The slopes of the road,
+# which is surveyed, hardly show in these speeds, because the lower level of a production car holds what is demanded
+# uphill and down: from a follower's speed nobody can recover the road. [Real cars](../docs/real-cars.md) has the
+# figures, for 55 drives.
+#
+# ## A car whose commands are known
+#
+# Three laps of one test vehicle with the demanded acceleration and the speed, no accelerometer. Four effects are
+# candidates here, so that it does not take long; each lap is judged by what the other two fitted. The same question is
+# asked twice: as it is, and with `unknown` ruled out. The fits are kept in a file between the two, and the second time
+# only the odds are new.
+
+# %%
+if there(*LAPS):
+    laps = [avtorch.Log.read(DATA / name) for name in LAPS]
+    among = ["brake_throttle_asymmetry", "constant_resistance", "dead_time", "second_order_actuator"]
+    with TemporaryDirectory() as folder:
+        kept = Path(folder) / "fits.json"
+        as_it_is = avtorch.diagnose(laps, effects=among, pairs=False, checkpoint=kept)
+        told = avtorch.diagnose(laps, effects=among, pairs=False, checkpoint=kept, prior={"unknown": 0})
+    print(f"as it is: {as_it_is.verdict.name}, probability {as_it_is.winner.probability:.2f}")
+    print(f"if it must be one of these: {told.verdict.name}, probability {told.winner.probability:.2f}", end="; ")
+    print(", ".join(f"{name} {q.mean:.2f} ({q.q05:.2f} to {q.q95:.2f})" for name, q in told.winner.parameters.items()))
+
+# %% [markdown]
+# The measured speed trembles at 8 to 20 Hz as no effect of the table makes it, so the honest answer is `unknown`: the
+# diagnosis blames nothing. Made to choose, it takes brakes that are stronger than the engine.
+
+# %%
+if there(*LAPS) and told.shrinkage is not None:
+    plots.show(over_diagnosis.shrinkage_figure(told), OUT / "laps.png")
+    for metric, words in (
+        ("rollout_rmse_speed", "ten seconds"),
+        ("rollout_rmse_speed_whole", "a whole lap"),
+        ("closed_loop_rmse_speed", "a drive behind a leader"),
+    ):
+        moved = told.shrinkage.by_metric[metric]
+        print(f"speed over {words}: off by {moved.before:.2g} m/s, with the effect {moved.after:.2g}", end="")
+        closed = moved.closed
+        print("" if closed is None else f"; closed {closed.mean:.0%} ({closed.q05:.0%} to {closed.q95:.0%})")
+
+# %% [markdown]
+# On the lap that was held out the effect helps over ten seconds. Over a whole lap the interval reaches from worse than
+# nothing to most of the gap, and behind a leader there is hardly a gap to close: three laps of a minute say that
+# something of the kind is there, not what it is worth. With all effects as candidates, not four, even that is less
+# sure.
+#
+# ## Try this
+#
+# - Other drives: `ASta_040719_platoon8.csv`, or the ZalaZONE files of OpenACC. Which cars are calm?
+# - `diagnose_follower(log)` without `cause=False` also asks what the plain loop lacks.
+# - `avtorch.diagnose(laps)` tries all effects, alone and in pairs. Is the answer the same?
+# - Your own car: `avtorch diagnose drive.csv --follower` for a log without commands, `avtorch diagnose drive.csv` with.
