@@ -68,8 +68,6 @@ def test_readme_names_only_what_exists() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     for target in re.findall(r"\]\(([^)#:]+)\)", text):
         assert (ROOT / target).exists(), target
-    for folder in re.findall(r"^\| `([^`]+)` \|", text, re.M):
-        assert (ROOT / folder).exists(), folder
 
 
 def test_readme_example_is_python_that_runs_on_the_public_face() -> None:

@@ -1,0 +1,117 @@
+"""Pages are written for a code host, as plain Markdown with relative links. Here the site learns to follow them.
+
+A link to a file of `../avtorch` leads to its listing on the site, a link to a package to its page of the reference, and
+one to `../README.md` or `../notebooks/README.md` to the copy made here. Which pages there are, and in what order, is
+said here too.
+"""
+
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import reference
+from reference import FOLDER
+from sphinx.application import Sphinx
+from sphinx.errors import ExtensionError
+
+# Pages that are not named here follow, in the order of the alphabet.
+FIRST = (
+    "Start here <built/readme>",
+    "built/notebooks",
+    "monitoring",
+    "diagnosis",
+    "compare",
+    "followers",
+    "own-effect",
+    "reference",
+)
+
+# Pages that lie outside: their folder beside the root, and what they are called here.
+OUTSIDE = {"": "readme.md", "notebooks/": "notebooks.md"}
+
+TREE = "\n\n```{{toctree}}\n:hidden:\n:glob:\n\n{}\n```\n"
+TREES = {
+    "index": TREE.format("\n".join([*FIRST, "*"])),
+    "reference": TREE.format(f"{FOLDER}/commands\n{FOLDER}/avtorch*"),
+}
+
+LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)#\s]+)")
+
+
+def outside(app: Sphinx) -> None:
+    """READMEs as pages: their links are those of their folders."""
+    root, made = Path(app.srcdir).parent, Path(app.srcdir) / FOLDER
+    made.mkdir(exist_ok=True)
+    for folder, page in OUTSIDE.items():
+        text = (root / folder / "README.md").read_text(encoding="utf-8")
+        text = LINK.sub(lambda m, folder=folder: f"../../{folder}{m[1]}", text)
+        target = made / page
+        if not target.exists() or target.read_text(encoding="utf-8") != text:
+            target.write_text(text, encoding="utf-8")
+
+
+def read(app: Sphinx, docname: str, content: list[str]) -> None:
+    """A page's text as the site needs it."""
+    if app.env.doc2path(docname).suffix != ".md":
+        return
+    up = "../" * docname.count("/")
+    content[0] = LINK.sub(lambda m: on_site(m[1], up), content[0]) + TREES.get(docname, "")
+
+
+def on_site(link: str, up: str) -> str:
+    readme = re.fullmatch(r"(?:\.\./)+(notebooks/)?README\.md(#.*)?", link)
+    if readme:
+        return f"{up}{FOLDER}/{OUTSIDE[readme[1] or '']}{readme[2] or ''}"
+    found = re.fullmatch(r"(?:\.\./)+(avtorch(?:/\w+)*)(/|\.py)?", link)
+    if not found:
+        return link
+    module = found[1].removesuffix("/__init__")
+    if found[2] != ".py" or module != found[1]:
+        page = "commands" if module == "avtorch/cli" else module.replace("/", ".")
+        return f"{up}{FOLDER}/{page}.rst"
+    # other files are handed out as they are
+    return f"source:{up}_modules/{module}.html" if module.replace("/", ".") in reference.listed() else link
+
+
+class Page(HTMLParser):
+    """Where a built page leads, and which marks it has."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.links: set[str] = set()
+        self.marks: set[str] = set()
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name == "id" and value:
+                self.marks.add(value)
+            elif name in ("href", "src") and value and not urlsplit(value).scheme:
+                self.links.add(value)
+
+
+def check(app: Sphinx, fault: Exception | None) -> None:
+    """Every link between the built pages leads somewhere."""
+    if fault is not None or app.builder.name != "html":
+        return
+    pages = {path: Page(path) for path in Path(app.outdir).rglob("*.html")}
+    dead = []
+    for path, page in pages.items():
+        for link in page.links:
+            parts = urlsplit(link)
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            mark = unquote(parts.fragment)
+            if not target.exists() or (mark and target in pages and mark not in pages[target].marks):
+                dead.append(f"{path.relative_to(app.outdir)}: {link}")
+    if dead:
+        raise ExtensionError("links that lead nowhere:\n" + "\n".join(sorted(dead)))
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    app.connect("builder-inited", outside)
+    app.connect("source-read", read)
+    app.connect("build-finished", check)
+    return {"parallel_read_safe": True}
