@@ -14,7 +14,9 @@ is still pulled to the past by its prior. Sufficient settings are searched in or
 ends when nothing left could be better; where it ends without one, every setting that reaches `required` has been
 replayed. The one with the best P(string stable) is then taken, out of those that clip at most five points more than
 the setting in force would have and would have collided no harder (a leader who asks for more than the car has clips
-every setting); among equals intrusiveness is weighed against clipping. `sufficient` says that it is not.
+every setting). Where P says little, mostly as it is 0 for all, the peak gain of the belief's mean decides: a swing that
+grows 1.3 times a car is better than one that grows fivefold. Among equals intrusiveness is weighed against clipping.
+`sufficient` says that it is not.
 """
 
 from __future__ import annotations
@@ -35,6 +37,8 @@ from avtorch.vehicle.time_gap import RAMP_RATE
 _JUDGED = 48
 _REPLAYED = 512
 _PAIRS = 1024
+_GAIN_PRICE = 0.05  # where none will do, a peak gain that is e times as large weighs as much as this P(string stable)
+_HIGHEST_GAIN = 1e3  # a loop that is not even locally stable has no peak; it is worse than any that has
 _CLIPPING_PRICE = 10.0  # where none will do, ten points of clipped commands weigh as much as a lower-level update
 _SCREEN = 12
 
@@ -251,19 +255,27 @@ class _Search:
         in_force = torch.zeros_like(cost, dtype=torch.bool)
         in_force[:, 0] = True
         rest = torch.isfinite(cost) & ~self.replayed[lost]
-        self._replay(lost, rest, torch.where(in_force, -torch.inf, -self.p[lost].nan_to_num(0.0) + 1e-6 * cost), 16)
+        worth = self.p[lost].clamp_max(self.rules.required) - _GAIN_PRICE * self._log_peak_gain(lost)
+        self._replay(lost, rest, torch.where(in_force, -torch.inf, -worth.nan_to_num(0.0) + 1e-6 * cost), 16)
         assert self.predictions is not None
         clipped, nearest = self.predictions.clipped_share[lost], self.predictions.min_spacing_m[lost]
         bearable = clipped <= clipped[:, :1] + self.rules.most_clipped
         no_closer = nearest >= nearest[:, :1].clamp_max(1e-9)
         judged = self.replayed[lost] & torch.isfinite(self.p[lost])
         eligible = in_force | (judged & bearable & no_closer)
-        # P first, as far as it is required; among equals intrusiveness and clipping are weighed against each other.
+        # Among equals intrusiveness and clipping are weighed against each other.
         # An amplified demand that is clipped most of the time is bang-bang control: clipping costs by the doubling.
         doublings = self.candidates.setting[lost].amplification().log2().clamp_min(0.0)
         price = self.total[lost] + _CLIPPING_PRICE * clipped * (1.0 + doublings)
-        score = self.p[lost].clamp_max(self.rules.required) - 1e-4 * price
-        return torch.where(eligible, score, -torch.inf).argmax(dim=1)
+        return torch.where(eligible, worth - 1e-4 * price, -torch.inf).argmax(dim=1)
+
+    def _log_peak_gain(self, rows: Tensor) -> Tensor:
+        """log of the peak gain at the belief's mean, (row, candidate), 0 where no frequency is amplified."""
+        setting = self.candidates.setting[rows]
+        gain = setting.peak_gain(
+            self.T[rows, None], self.K[rows, None], dead_time=self.rules.dead_time, link_delay=self.rules.link_delay
+        )
+        return gain.nan_to_num(torch.inf).clamp(1.0, _HIGHEST_GAIN).log()
 
     def prediction(self, pick: Tensor) -> Prediction:
         assert self.predictions is not None

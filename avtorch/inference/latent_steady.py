@@ -57,6 +57,12 @@ class EvenRows:
         return cls(lagged, used.to(u.dtype), used.sum(-1).to(u.dtype), dt, speed is not None, accel is not None)
 
 
+def _solved(A: Tensor, B: Tensor) -> Tensor:
+    """``A⁻¹ B``; NaN, and no error, where ``A`` has no inverse: far outside the posterior digits are lost."""
+    out, lost = torch.linalg.solve_ex(A, B)
+    return torch.where((lost != 0)[..., None, None], torch.nan, out)
+
+
 def _riccati_limit(phi: Tensor, H: Tensor, Q: Tensor, R: Tensor) -> Tensor:
     """The limit by structured doubling: the k-th step covers ``2^k`` rows, so a dozen reach any memory."""
     A, X = phi.mT, Q
@@ -64,11 +70,11 @@ def _riccati_limit(phi: Tensor, H: Tensor, Q: Tensor, R: Tensor) -> Tensor:
     n = Q.shape[-1]
     eye = torch.eye(n, dtype=Q.dtype, device=Q.device)
     for _ in range(40):
-        WA, WG = torch.linalg.solve(eye + G @ X, torch.cat((A, G), -1)).split(n, -1)
+        WA, WG = _solved(eye + G @ X, torch.cat((A, G), -1)).split(n, -1)
         added = A.mT @ X @ WA
         X = X + added
         # Convergence is quadratic: what comes after this is below round-off.
-        if bool((added.abs().amax((-2, -1)) <= 1e-9 * X.abs().amax((-2, -1))).all()):
+        if not bool((added.abs().amax((-2, -1)) > 1e-9 * X.abs().amax((-2, -1))).any()):  # NaN settles nothing
             break
         G = G + A @ WG @ A.mT
         A = A @ WA
@@ -88,14 +94,15 @@ class _Stationary(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, Tensor, Tensor]:
         phi, H, R, P = ctx.saved_tensors
         n = P.shape[-1]
-        K = P @ H.mT @ torch.linalg.inv(H @ P @ H.mT + R)
+        # H P Hᵀ + R is symmetric
+        K = _solved(H @ P @ H.mT + R, H @ P).mT
         push = phi @ K
         M = phi - push @ H
         # dP = M dP Mᵀ + ..., so the gradient solves G = Mᵀ G M + grad, here with rows of G in order.
         kron = (M.mT[..., :, None, :, None] * M.mT[..., None, :, None, :]).flatten(-4, -3).flatten(-2, -1)
         eye = torch.eye(n * n, dtype=P.dtype, device=P.device)
         grad = 0.5 * (grads[0] + grads[0].mT)
-        G = torch.linalg.solve(eye - kron, grad.flatten(-2)[..., None])[..., 0].unflatten(-1, (n, n))
+        G = _solved(eye - kron, grad.flatten(-2)[..., None])[..., 0].unflatten(-1, (n, n))
         return 2.0 * G @ phi @ (P - K @ H @ P), None, G, push.mT @ G @ push
 
 
@@ -165,7 +172,7 @@ def steady_log_likelihood(
     n, m = phi.shape[-1], H.shape[0]
 
     P = stationary_covariance(phi, H, Q, R)
-    # far outside the posterior the covariance may lose its digits; the log likelihood is then NaN there, no error
+    # far outside the posterior the covariance may lose its digits too
     root, lost = torch.linalg.cholesky_ex(H @ P @ H.mT + R)
     root = torch.where((lost > 0)[..., None, None], torch.nan, root)
     white = torch.linalg.inv(root)
@@ -200,7 +207,7 @@ def steady_log_likelihood(
     j = (far.mT @ (e @ seen)[..., None]).sum(-3)
     D = P0 - P
     inflated = torch.eye(n, dtype=D.dtype, device=D.device) + D @ J
-    gained = (j.mT @ torch.linalg.solve(inflated, D @ j))[..., 0, 0]
+    gained = (j.mT @ _solved(inflated, D @ j))[..., 0, 0]
     log_det = 2.0 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     misfit = e.square().sum((-2, -1))
     total = data.count * (log_det + m * math.log(2.0 * math.pi)) + misfit + torch.linalg.slogdet(inflated)[1] - gained

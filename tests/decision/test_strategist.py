@@ -145,6 +145,18 @@ def test_where_nothing_is_sufficient_it_is_said():
     assert float(decision.p_string_stable) >= 0.95
 
 
+def test_where_no_setting_is_string_stable_the_one_that_amplifies_least_is_taken():
+    """P is 0 for every gap of the list; a longer one still takes most of the growth away."""
+    only_gaps = Strategist(grid=Grid(allowed=frozenset({2}), time_gaps=(1.0, 1.6, 2.2)))
+    for in_force in (1.0, 2.2):
+        decision = decide([2.0], [0.4], strategist=only_gaps, current=Setting(time_gap=in_force), default=Setting())
+        assert decision.sufficient.tolist() == [False]
+        assert float(decision.p_string_stable) == 0.0
+        gain = [float(Setting(time_gap=gap).peak_gain(2.0, 0.4)) for gap in (1.0, 1.6, 2.2)]
+        assert gain == sorted(gain, reverse=True)
+        assert float(decision.setting.time_gap) == 2.2
+
+
 def test_a_sufficient_setting_in_force_stays():
     default = Setting()
     inverted = Setting(T_hat=1.0, K_hat=0.8, T_d=0.3)

@@ -10,12 +10,20 @@ from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
 
 from avtorch.errors import InputError
-from avtorch.inference.latent import LatentDensity, LatentWindow, default_noise_prior, even_rows, latent_names
+from avtorch.inference.latent import (
+    FINEST,
+    LatentDensity,
+    LatentWindow,
+    default_noise_prior,
+    even_rows,
+    latent_names,
+)
 from avtorch.inference.latent_filter import latent_log_likelihood
 from avtorch.inference.latent_model import ACCEL_SD0, SPEED_SD0, discretise
-from avtorch.inference.latent_steady import EvenRows, stationary_covariance, steady_log_likelihood
+from avtorch.inference.latent_steady import EvenRows, _solved, stationary_covariance, steady_log_likelihood
 from avtorch.inference.map import find_mode
 from avtorch.inference.priors import Joint, default_actuation_prior
+from avtorch.inference.sampler import SamplerSettings, sample
 
 T, K, Q, ROAD, SD, TIME, ACCEL, SPEED = 0.3, 0.9, 0.15, 0.02, 0.2, 1.5, 0.1, 0.03
 TRUTH = {"T_L": T, "K_L": K, "process_noise": Q, "road_noise": ROAD, "coloured_sd": SD, "coloured_time": TIME} | {
@@ -143,6 +151,33 @@ def test_stationary_covariance_solves_its_equation() -> None:
     torch.testing.assert_close(again, P, rtol=1e-11, atol=1e-16)
 
 
+def test_where_digits_are_lost_the_answer_is_nan_and_no_error() -> None:
+    A = torch.stack((torch.eye(2, dtype=torch.float64), f64(1, 2, 2, 4).reshape(2, 2)))
+    out = _solved(A, torch.ones(2, 2, 1, dtype=torch.float64))
+    torch.testing.assert_close(out[0, :, 0], f64(1, 1))
+    assert bool(out[1].isnan().all())
+
+
+def test_a_log_simulated_without_noise_is_told_to_the_finest_sensor() -> None:
+    """Its likelihood grows without end as the noise parameters fall, unless sensors have a finest step."""
+    dt, rows = 0.05, 101
+    u = f64(*([1.0] * 30 + [-1.0] * 41 + [0.5] * 30))
+    a, v = [0.0], [20.0]
+    for k in range(rows - 1):
+        decay = math.exp(-dt / T)
+        a.append(decay * a[-1] + K * (1 - decay) * float(u[k]))
+        v.append(v[-1] + K * float(u[k]) * dt + (a[-2] - K * float(u[k])) * T * (1 - decay))
+    time = torch.arange(rows, dtype=torch.float64) * dt
+    density = LatentDensity(LatentWindow(*(x[None] for x in (time, u, f64(*a), f64(*v), time >= 0))))
+    quiet = SamplerSettings(chains=16, draws=40, burn_in=20, attempts=1)
+    found = sample(density, quiet, generator=torch.Generator().manual_seed(0))
+    away = (found.mean[0, :2] - f64(T, K)).abs() / found.sd[0, :2]
+    assert bool((away < 5.0).all())
+    # a hundred rows, each read to 1e-4 m/s² while the command is of order one, cannot tell a ratio better than this
+    assert bool((found.sd[0, :2] > 0.1 * FINEST / math.sqrt(rows)).all())
+    assert bool((found.sd[0, :2] < 0.01).all())
+
+
 def _gradient_case(generator: torch.Generator) -> tuple[Tensor, tuple[Tensor, ...]]:
     time, u, a, v = record(7, generator, jitter=0.5, dt=0.1)
     # sensor noise of order one: finite differences of 1/noise² at 0.03 err by more than gradcheck allows
@@ -237,6 +272,7 @@ def test_density_adds_prior_and_runs_and_keeps_leading_dimensions(rotating_seed:
     density = LatentDensity(LatentWindow(time, data.u, None, data.speed, mask))
     z = density.initial() + 0.1 * torch.randn(4, 3, 2, len(density.names), generator=generator, dtype=torch.float64)
     p = dict(zip(density.names, z.exp().unbind(-1), strict=True))
+    p["speed_noise"] = torch.hypot(p["speed_noise"], f64(FINEST))
     assert data.speed is not None
     pieces = ((0, slice(0, 120)), (0, slice(120, 200)), (1, slice(0, 50)), (1, slice(60, 200)))
     expected = torch.zeros(4, 3, 2, dtype=torch.float64)
@@ -256,9 +292,8 @@ def test_uneven_rows_take_the_filter_and_rounded_stamps_do_not() -> None:
     assert even_rows(rounded) is not None
     assert even_rows(uneven) is None
     density = LatentDensity(uneven)
-    exact = latent_log_likelihood(
-        T, K, Q, SD, TIME, uneven.time, uneven.u, speed=uneven.speed, speed_noise=SPEED, road_noise=ROAD
-    )
+    noise = {"speed_noise": math.hypot(SPEED, FINEST), "road_noise": ROAD}
+    exact = latent_log_likelihood(T, K, Q, SD, TIME, uneven.time, uneven.u, speed=uneven.speed, **noise)
     z = f64(*(TRUTH[name] for name in density.names)).log()[None]
     torch.testing.assert_close(density.log_likelihood(z), exact, rtol=1e-12, atol=0.0)
 

@@ -51,7 +51,7 @@ def test_parameters_are_found_within_their_own_bars(
         here, there = (_log_posterior(n, record, errors, priors, T_L) for n in (fit.noise, truth))
         deeper.append(here - there)
     # twice this is a chi-squared of six, whatever the posterior's shape: beyond 50 once in 10⁸ fits
-    assert 0 <= min(deeper)
+    assert min(deeper) >= 0
     assert max(deeper) < 25
     # sds are of squared scores, right to some 10 %; the mode of a parameter hardly seen is the prior's. Where only the
     # speed is seen, process and force can trade places: two modes, and the bars are of one. Hence no more than four.
