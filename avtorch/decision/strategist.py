@@ -28,6 +28,7 @@ import torch
 from torch import Tensor
 
 from avtorch.decision.grid import Candidates, Grid
+from avtorch.decision.reasons import sentences
 from avtorch.decision.replay import History, Prediction, replay
 from avtorch.decision.settings import Number, Setting
 from avtorch.errors import InputError
@@ -178,8 +179,17 @@ class Strategist:
             predicted=predicted,
             strategies=strategies,
             changes=chosen.differs(current),
-            why=_sentences(
-                chosen, current, default, strategies, sufficient, (p, deaf), predicted, asked, self, history.seconds
+            why=sentences(
+                chosen,
+                current=current,
+                default=default,
+                strategies=strategies,
+                sufficient=sufficient,
+                p_string_stable=p,
+                p_deaf=deaf,
+                predicted=predicted,
+                asked=asked,
+                seconds=history.seconds,
             ),
             interim=interim,
             p_interim=self.probability(interim, T_L, K_L),
@@ -356,46 +366,3 @@ def _widened(T_L: Tensor, K_L: Tensor) -> tuple[Tensor, Tensor]:
         return (2.0 * z - z.mean(dim=-1, keepdim=True)).exp()
 
     return twice(T_L), twice(K_L)
-
-
-def _sentences(
-    chosen: Setting,
-    current: Setting,
-    default: Setting,
-    strategies: list[set[int]],
-    sufficient: Tensor,
-    p_and_deaf: tuple[Tensor, Tensor],
-    predicted: Prediction,
-    asked: Tensor,
-    rules: Strategist,
-    seconds: float,
-) -> list[str]:
-    """One sentence a scenario, as a person would say it."""
-    out = []
-    p, deaf = p_and_deaf
-    for i, used in enumerate(strategies):
-        now, was = chosen.as_dict(i), current.as_dict(i)
-        steps = []
-        if 1 in used:
-            steps.append(
-                f"lower level models T {now['T_hat']:.2f} s, K {now['K_hat']:.2f} and aims at {now['T_d']:.2f} s"
-            )
-        if 2 in used:
-            verb = "driver asked for a time gap of" if bool(asked[i]) else "time gap"
-            steps.append(f"{verb} {now['time_gap_s']:g} s instead of {float(default.time_gap[i]):g} s")
-        if 3 in used:
-            steps.append("gains " + ", ".join(f"{k:g}" for k in now["gains"]))
-        if 4 in used:
-            lost = f"P(string stable) {float(deaf[i]):.2f} if the link is lost"
-            steps.append(f"leader's acceleration fed forward with k_f {now['feedforward']:g} ({lost})")
-        what = "; ".join(steps) if steps else "default setting"
-        if now == was:
-            what = f"setting in force stays ({what})"
-        clipped = 100.0 * float(predicted.clipped_share[i])
-        past = f"{clipped:.1f} % of commands clipped in a replay of the past {seconds:.0f} s"
-        result = f"P(string stable) {float(p[i]):.2f}, {past}"
-        if bool(sufficient[i]):
-            out.append(f"least intrusive sufficient setting: {what} ({result})")
-        else:
-            out.append(f"no setting of the grid is sufficient, the best is taken: {what} ({result})")
-    return out
