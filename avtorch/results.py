@@ -66,7 +66,11 @@ def estimates_answer(estimates: Estimates) -> dict[str, Any]:
         "excited_share": estimates.excited_share,
         "spread_over_sd": {name: estimates.spread_ratio(name) for name in ("T_L", "K_L")},
         "alerts": alert_entries(estimates.windows),
-        "assumed": {"time_gap_s": float(setting.time_gap[0]), "gains": setting.gains[0].tolist()},
+        "assumed": {
+            "time_gap_s": float(setting.time_gap[0]),
+            "gains": setting.gains[0].tolist(),
+            "accepted": dict(zip(("T_L", "K_L"), estimates.accepted, strict=True)),
+        },
         "quality": estimates.quality.to_dict(),
     }
 

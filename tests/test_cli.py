@@ -114,7 +114,7 @@ def test_quiet_is_quiet_and_a_seed_repeats(drive: Path, tmp_path: Path, capsys: 
 def test_windows_that_did_not_settle_are_told_apart() -> None:
     def window(*, excited: bool, used: bool) -> dict:
         stat = {"mean": 0.3, "sd": 0.01, "q05": 0.28, "q95": 0.32}
-        return {"excited": excited, "used": used, "T_L": stat, "K_L": stat}
+        return {"excited": excited, "used": used, "T_L": stat, "K_L": stat, "alerts": []}
 
     good, lost, calm = (
         window(excited=True, used=True),
@@ -217,6 +217,9 @@ REFUSED = {
     "text in a number": ["estimate", "BROKEN", *OUT],
     "negative seed": ["estimate", "LOG", "--seed=-1", *OUT],
     "seed no whole number": ["estimate", "LOG", "--seed", "1.5", *OUT],
+    "accepted of one": ["estimate", "LOG", "--accepted", "0.4", *OUT],
+    "accepted below zero": ["estimate", "LOG", "--accepted=-0.4,1", *OUT],
+    "accepted text": ["estimate", "LOG", "--accepted", "0.4,x", *OUT],
     "estimate without a gap": ["estimate", "LOG", "--tau", "0", *OUT],
     "change after the end": ["run", "--change-at", "90", *OUT],
     "change before the start": ["run", "--change-at=-1", *OUT],
@@ -283,6 +286,38 @@ def test_an_older_answer_is_not_left_beside_newer_pictures(
     assert main(arguments) == 130
     assert capsys.readouterr().err == "avtorch: interrupted; no answer was written\n"
     assert not (tmp_path / "stability.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["estimate"], "LOG: missing; needs a file, see avtorch estimate --help"),
+        (["compare", "before.csv"], "AFTER: missing; needs a file, see avtorch compare --help"),
+        (["run"], "--out: missing; needs a folder for the answer and the pictures, such as --out out/run"),
+        (["blindtest", "--out", "here"], "--n: missing; see avtorch blindtest --help"),
+    ],
+    ids=lambda x: x[0] if isinstance(x, list) else "",
+)
+def test_what_is_missing_is_named(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    assert capsys.readouterr().err == f"avtorch: {said}\n"
+
+
+def test_a_sound_car_of_other_values_is_accepted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """At (0.5 s, 0.8) every window is away from the default (0.3 s, 1.0); named as sound, none is."""
+    run = simulate(Leader.default(start=48.0), plant=GLVDPlant(0.5, 0.8, 0.05), duration=10.0)
+    run.log().write(tmp_path / "sound.csv")
+    alerts = {}
+    for values in ("0.3,1.0", "0.5,0.8"):
+        out = tmp_path / values
+        assert main(["estimate", str(tmp_path / "sound.csv"), "--accepted", values, "--out", str(out)]) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        answer = json.loads((out / "estimates.json").read_text(encoding="utf-8"))
+        assert list(answer["assumed"]["accepted"].values()) == [float(x) for x in values.split(",")]
+        alerts[values] = [a for a in answer["alerts"] if a["detector"] == "accepted_change"]
+        assert ("say so with --accepted" in said) == bool(alerts[values])
+    assert len(alerts["0.3,1.0"]) >= 2
+    assert alerts["0.5,0.8"] == []
 
 
 def test_a_process_ends_with_the_code() -> None:

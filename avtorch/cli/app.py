@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, MissingArgumentError
 
 from avtorch import __version__
 from avtorch.cli.blindtest import blindtest
@@ -38,13 +38,27 @@ app.command(blindtest)
 app.command(paper)
 
 
+def _missing(fault: MissingArgumentError) -> str:
+    """What is missing, and an example; the parser only says that something is."""
+    command = " ".join(fault.command_chain or ())
+    argument = fault.argument
+    if argument is None or argument.tokens:
+        return str(fault)
+    if argument.name == "--out":
+        return f"--out: missing; needs a folder for the answer and the pictures, such as --out out/{command}"
+    if argument.index is not None:
+        return f"{argument.name.lstrip('-').upper()}: missing; needs a file, see avtorch {command} --help"
+    return f"{argument.name}: missing; see avtorch {command} --help"
+
+
 def main(tokens: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0, 2 for bad input (one line on stderr), 130 when interrupted."""
     try:
         app(tokens, exit_on_error=False, print_error=False)
     except (InputError, CycloptsError) as fault:
         # one line, whatever the parser's own message looks like
-        print("avtorch: " + " ".join(str(fault).split()), file=sys.stderr)
+        said = _missing(fault) if isinstance(fault, MissingArgumentError) else str(fault)
+        print("avtorch: " + " ".join(said.split()), file=sys.stderr)
         return 2
     except KeyboardInterrupt as stop:
         print(f"avtorch: interrupted; {str(stop) or 'no answer was written'}", file=sys.stderr)

@@ -57,6 +57,16 @@ def three_gains(name: str, text: str) -> tuple[float, float, float]:
     return values[0], values[1], values[2]
 
 
+def positive_pair(name: str, text: str, of: str, example: str) -> tuple[float, float]:
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 2 or not all(math.isfinite(x) and x > 0 for x in values):
+        raise InputError(f"{name}: found {text!r}, needs two numbers {of} above 0 such as {example}")
+    return values[0], values[1]
+
+
 def two_axes(text: str) -> tuple[str, str]:
     known = ("k_s", "k_v", "k_a", "tau", "T", "K")
     names = tuple(part.strip() for part in text.split(","))

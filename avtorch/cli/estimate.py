@@ -17,6 +17,7 @@ from avtorch.cli.arguments import (
     TimeGap,
     free_folder,
     positive,
+    positive_pair,
     seed_number,
     three_gains,
 )
@@ -53,6 +54,9 @@ def estimate(
     ] = "lambda",
     tau: TimeGap = 1.0,
     gains: Gains = "1.5,1.5,-0.8",
+    accepted: Annotated[
+        str, Parameter(help="T_L,K_L of the car as it should be, which accepted_change compares with [s, -].")
+    ] = "0.3,1.0",
     seed: Seed = 0,
     json: Json = False,
     quiet: Quiet = False,
@@ -70,12 +74,14 @@ def estimate(
     positive("--window", window, "s")
     positive("--tau", tau, "s")
     k = three_gains("--gains", gains)
+    sound = positive_pair("--accepted", accepted, "T_L,K_L", "0.3,1.0")
     free_folder(out)
     seed_number(seed)
     if mode != "lambda" and estimator not in ("sgld", "map"):
         raise InputError(f"--mode: has no meaning with --estimator {estimator}, which hands no prior on; leave it out")
 
     from avtorch.decision.estimation import estimate as work
+    from avtorch.decision.monitor import Monitor
     from avtorch.decision.settings import Setting
     from avtorch.io import Log, check
     from avtorch.results import estimates_answer
@@ -86,7 +92,7 @@ def estimate(
     setting = Setting(time_gap=tau, gains=k, scenarios=1)
     with talk.progress("Estimating") as step:
         options: dict[str, Any] = {"mode": mode} if estimator in ("sgld", "map") else {}
-        options |= {"form": form, "setting": setting, "seed": seed}
+        options |= {"form": form, "setting": setting, "monitor": Monitor(accepted=sound), "seed": seed}
         found = work(drive, window, estimator=estimator, progress=step, **options)
     answer = estimates_answer(found)
 
@@ -107,7 +113,8 @@ def estimates_note(answer: Mapping[str, Any]) -> str:
     windows = answer["windows"]
     excited, used = ([w for w in windows if w[key]] for key in ("excited", "used"))
     if not excited:
-        return f"{len(windows)} windows, none excited: the belief is still the first prior."
+        longer = "a longer --window holds more" if len(windows) > 1 else "a livelier drive is needed"
+        return f"{len(windows)} windows, none excited: the belief is still the first prior; {longer}."
     lost = len(excited) - len(used)
     count = f"{len(excited)} of {len(windows)} windows excited"
     if lost:
@@ -119,4 +126,6 @@ def estimates_note(answer: Mapping[str, Any]) -> str:
     text = ", ".join(f"{name} {last[name]['mean']:.3f} ± {last[name]['sd']:.3f}" for name in ("T_L", "K_L"))
     spread = [f"{name} {x:.1f}" for name, x in answer["spread_over_sd"].items() if x is not None]
     told = f" Spread from window to window over posterior SD: {', '.join(spread)}." if spread else ""
+    if all("accepted_change" in w["alerts"] for w in used):
+        told += " All of them are away from what is accepted: if the car is sound so, say so with --accepted T_L,K_L."
     return f"{count}; the last {'used' if lost else 'of them'} says {text}.{told}"

@@ -33,7 +33,7 @@ class Estimates:
 
     `windows` in the order of the log; `seconds_per_window` of computing; `form` "jerk" or "latent"; `quality` of the
     log, looked at first; `setting` under which P(string stable) was asked: a log does not tell its controller;
-    `estimator` by name.
+    `estimator` by name; `accepted` (T_L [s], K_L [-]) of a sound car, with which `accepted_change` compares.
     """
 
     windows: list[WatchedWindow]
@@ -42,6 +42,7 @@ class Estimates:
     quality: Quality
     setting: Setting
     estimator: str = "sgld"
+    accepted: tuple[float, float] = (0.3, 1.0)
 
     @property
     def excited_share(self) -> float:
@@ -132,7 +133,8 @@ def estimate(
         windows += [_on_the_logs_clock(w, ahead) for w in seen]
     seconds = (clock.perf_counter() - begun) / max(len(windows), 1)
     name = "jerk" if isinstance(chosen, JerkForm) else "latent"
-    return Estimates(windows, seconds, name, quality, setting, estimator)
+    T, K = (float(x[0]) for x in watch.monitor.accepted)
+    return Estimates(windows, seconds, name, quality, setting, estimator, (T, K))
 
 
 def _on_the_logs_clock(watched: WatchedWindow, ahead: float) -> WatchedWindow:

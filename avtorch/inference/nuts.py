@@ -11,11 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
-import pyro
-import pyro.distributions as dist
 import torch
-from pyro.infer import MCMC, NUTS
-from pyro.infer.mcmc.util import initialize_model
 from torch import Tensor
 from torch.distributions.constraints import Constraint
 
@@ -26,6 +22,14 @@ from avtorch.inference.map import find_mode
 from avtorch.inference.posterior import Posterior, nested_rhat
 from avtorch.inference.priors import HalfNormalPrior, Joint, LogNormalPrior, LogSpaceNormal, Prior, QuadrantNormal
 from avtorch.vehicle.glvd import glvd_jerk
+
+try:
+    import pyro
+    import pyro.distributions as dist
+    from pyro.infer import MCMC, NUTS
+    from pyro.infer.mcmc.util import initialize_model
+except ImportError as missing:
+    raise ImportError("avtorch.inference.nuts: needs Pyro; pip install 'avtorch[nuts]'") from missing
 
 
 class _WithPrior(SelectableDensity, Protocol):

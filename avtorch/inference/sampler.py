@@ -136,7 +136,7 @@ def sample(
             new = index[fresh]
             strayed[new] = _strayed(part, where, coordinates, w)[fresh]
             apart[new] = ~(nested_rhat(w).amax(-1) <= limit)[fresh]  # NaN is trouble, too
-            stuck[new] = pace[new] > STUCK
+            stuck[new] = (pace[new] > STUCK) | _too_wide(where, settings, pace[index], times)[fresh]
             values = constrained(density, coordinates.z(w))
             draws[:, :, new] = values if len(new) == len(index) else values[:, :, fresh]
         pace = 2 * pace
@@ -181,6 +181,18 @@ def _why(mode_found: bool, strayed: bool, apart: bool, stuck: bool) -> str:
     if strayed:
         return "chains left the posterior, also with the shortest step tried"
     return "chains disagree, also with the shortest step tried" if apart else ""
+
+
+def _too_wide(mode: Mode, settings: SamplerSettings, pace: Tensor, times: float) -> Tensor:
+    """Where the burn-in is too short for the widest direction of a space left unwhitened, ``(window,)`` bool.
+
+    Along a direction of SD ``s`` a step forgets ``h/(2 s^2)`` of what was; chains that begin at the mode reach 99 % of
+    an SD after two such times. They agree with each other all the way, which R-hat takes for success.
+    """
+    if settings.whitening == "full":
+        return torch.zeros_like(pace, dtype=torch.bool)
+    widest = Coordinates.of(mode, settings.whitening).widest(mode)
+    return settings.slower(times).burn_in < 2 * (2 / settings.step) * pace * widest.square()
 
 
 def _longer(pace: Tensor) -> Tensor:

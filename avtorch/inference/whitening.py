@@ -47,6 +47,11 @@ class Coordinates:
         """A gradient in ``z`` as one in ``w``."""
         return lower_transposed_times(self.lower, score)
 
+    def widest(self, mode: Mode) -> Tensor:
+        """Largest SD that the Laplace approximation has along any direction of ``w``, ``(window,)``; 1 if whitened."""
+        seen = torch.linalg.solve_triangular(self.lower, mode.scale, upper=False)
+        return torch.linalg.matrix_norm(seen, ord=2)
+
     def slowed(self, pace: Tensor) -> Coordinates:
         """A step ``h/pace`` in ``w`` is a step ``h`` in these; ``pace`` ``(window,)``."""
         return Coordinates(self.mode, self.lower / pace.sqrt()[:, None, None])

@@ -109,7 +109,11 @@ def overview_figure(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     target: float = 0.95,
 ) -> Figure:
-    """A run at one glance: acceleration, belief about lag and gain, P(string stable)."""
+    """A run at one glance: acceleration, belief about lag and gain, P(string stable).
+
+    `answer` is `run.json`, or `avtorch.results.run_answer` of a `SupervisedRun` and the same drive without action;
+    `time` [s] (time,) and `traces` of `motion`. `truth`: by name, (from [s], value) pairs; `bounds`: design bounds.
+    """
     figure = Figure(figsize=(9, 8.4), layout="constrained")
     axes = figure.subplots(4, 1, sharex=True)
     for ax in axes:

@@ -217,6 +217,26 @@ def test_a_step_that_is_too_long_is_halved_for_the_window_that_needs_it(rotating
     assert posterior.draws[:, :, 0].equal(once.draws[:, :, 0])
 
 
+@pytest.mark.parametrize("whitening", ["none", "diagonal"])
+def test_a_walk_too_short_for_a_space_left_unwhitened_is_said(whitening, make_windows, rotating_seed):
+    """Chains that begin at the mode agree with each other long before they have reached the posterior's width."""
+    density = JerkDensity(make_windows(rotating_seed, [0.3, 1.0, 2.0]).statistics)
+    exact = quadrature(density, find_mode(density))[1]
+    short = SamplerSettings(whitening=whitening, attempts=1)
+    found = sample(density, short, generator=torch.Generator().manual_seed(rotating_seed))
+    ratio = found.sd / exact
+    assert (float(ratio.min()) < 0.8) == (whitening == "none")  # one scale a parameter is enough here
+    assert bool(found.converged.any()) == (whitening == "diagonal")
+    for w in range(density.windows):
+        assert not bool(found.converged[w]) or float(ratio[w].min()) > 0.9
+        assert bool(found.converged[w]) or found.why[w]
+    # as many steps as the widest direction takes are enough, and are taken for enough
+    mode = find_mode(density)
+    widest = Coordinates.of(mode, whitening).widest(mode)
+    assert float(widest.min()) > 1.0
+    torch.testing.assert_close(Coordinates.of(mode).widest(mode), torch.ones(3, dtype=torch.float64))
+
+
 @pytest.mark.parametrize("wall", [1e4, math.nan, math.inf, -3.0])
 def test_divergence_is_said(wall, rotating_seed):
     """Far too steep, undefined, a cliff, or falling to minus infinity: not converged, and the neighbour is."""

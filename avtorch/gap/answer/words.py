@@ -110,7 +110,8 @@ def gap(found: Diagnosis) -> list[str]:
             floor = " (no less with the best candidate in)"
         parts.append(f"acceleration off by {gap.rollout_rmse_accel:.2g} m/s²{floor}")
     if gap.rollout_rmse_speed is not None:
-        parts.append(f"speed by {gap.rollout_rmse_speed:.2g} m/s")
+        off = "" if parts else "off "
+        parts.append(f"speed {off}by {gap.rollout_rmse_speed:.2g} m/s")
     if not parts:
         return []
     over = "" if gap.horizon_s is None else f", over {gap.horizon_s:.3g} s"
