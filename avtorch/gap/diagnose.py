@@ -27,6 +27,7 @@ from avtorch.gap.heldout.held_out import held_out
 from avtorch.gap.heldout.shown import Shown
 from avtorch.gap.heldout.shrink import shrinkage
 from avtorch.gap.heldout.where import where
+from avtorch.gap.likelihood.as_read import as_read
 from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.gap.search.found import Found, Race
 from avtorch.gap.search.search import Search
@@ -66,6 +67,8 @@ def diagnose(
         each = [replace(log, accel_kind=accel_kind) for log in each]
     if posterior not in ("laplace", "sgld"):
         raise InputError(f"posterior: found {posterior!r}, needs 'laplace' or 'sgld'")
+    read = [as_read(log) for log in each]
+    each, noise_added = [log for log, _ in read], dict.fromkeys(note for _, note in read if note)
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
     race = Search(
@@ -84,7 +87,9 @@ def diagnose(
         draws = _draws(winner, seed)
         told = _told(winner, race, chances[winner.name], draws)
         candidates = [told if c.name == winner.name else c for c in candidates]
-    noted = () if race.complete else ("The budget ended the search before all candidates were tried.",)
+    noted = tuple(noise_added)
+    if not race.complete:
+        noted += ("The budget ended the search before all candidates were tried.",)
     if draws is not None and draws.method != "sgld":
         noted += (f"The parameters' posterior is by {draws.method}: {draws.why}.",)
     if apart.note is not None:

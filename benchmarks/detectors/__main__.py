@@ -104,9 +104,9 @@ def main() -> None:
         print(f"  {title}: " + ", ".join(told))
     if options.out is not None:
         curves = {
-            "against healthy runs": (kept, "healthy"),
-            "against uneven runs": (kept, "uneven"),
-            "against uneven runs, unevenness granted": (tolerant, "uneven"),
+            "healthy runs": (kept, "healthy"),
+            "uneven runs": (kept, "uneven"),
+            "uneven runs, granted": (tolerant, "uneven"),
         }
         drawn = {title: {n: curve(n, r[kind], r["drift"]) for n in DETECTORS} for title, (r, kind) in curves.items()}
         write(options.out, {"leader": leader.name, "tables": tables, "curves": drawn, "default": DEFAULT})
