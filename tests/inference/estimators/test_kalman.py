@@ -14,7 +14,7 @@ from avtorch.inference.estimators import JointEKF, JointUKF
 from avtorch.inference.estimators.jerk_state import JerkState
 from avtorch.inference.estimators.latent_state import LatentState
 from avtorch.inference.estimators.state_model import Row, State
-from avtorch.inference.latent import LatentDensity
+from avtorch.inference.latent import FINEST, LatentDensity
 from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.latent_window import LatentWindow
 from avtorch.inference.priors import Joint, LogNormalPrior, default_jerk_noise_prior
@@ -137,7 +137,10 @@ def test_known_parameters_give_the_latent_form_s_likelihood(signals, rotating_se
     window = LatentWindow(
         time.expand(2, n), u, *(columns[s] if s in signals else None for s in ("accel", "speed")), usable
     )
-    values = torch.tensor([0.6, 0.8, *(ekf.noise[name] for name in form.names[2:])], dtype=F64)
+    # what no sensor reads finer than comes on top in the latent form
+    below = {name: (FINEST if name in ("accel_noise", "speed_noise") else 0.0) for name in form.names[2:]}
+    noise = [math.sqrt(ekf.noise[name] ** 2 - least**2) for name, least in below.items()]
+    values = torch.tensor([0.6, 0.8, *noise], dtype=F64)
     exact = LatentDensity(window).log_likelihood(values.log().expand(2, -1))
     torch.testing.assert_close(likelihood, exact, rtol=1e-8, atol=0)
 
