@@ -186,6 +186,7 @@ for ax, (name, setting) in zip(
         ax.plot(line.time, v, color=mpl.colormaps["viridis"](k / 6), label={0: "first car", 5: "sixth car"}.get(k))
     ax.set(xlabel="time [s]", title=name)
     ax.legend(loc="upper left")
+figure.axes[0].set_ylabel("speed [m/s]")
 plots.show(figure, OUT / "traffic.png")
 print("the sixth car slows by", ", ".join(f"{dip:.2f} m/s ({name})" for name, dip in dips.items()))
 

@@ -39,7 +39,7 @@ ax = figure.subplots()
 ax.plot(log.time, log.accel, color="#0072B2", linewidth=0.8, label="measured")
 ax.step(log.time, log.accel_cmd, color="0.3", linewidth=0.9, where="post", label="command")
 ax.set(xlabel="time [s]", ylabel="acceleration [m/s²]")
-ax.legend(loc="upper right")
+ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
 plots.show(figure, OUT / "log.png")
 
 # %% [markdown]
@@ -124,7 +124,7 @@ else:
     ax.plot(run.time, run.accel, color="#0072B2", linewidth=0.8, label="measured")
     ax.step(m.time, m.command, color="0.3", linewidth=0.9, where="post", label=f"command: {m.name}")
     ax.set(xlabel="time [s]", ylabel="acceleration [m/s²]")
-    ax.legend(loc="upper right")
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
     plots.show(figure, OUT / "manoeuvre.png")
     both = avtorch.diagnose([log, second])
     print(both.verdict.why)
