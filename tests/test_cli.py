@@ -126,6 +126,11 @@ def test_windows_that_did_not_settle_are_told_apart() -> None:
     assert note.startswith("2 of 3 windows excited, 1 of them not used")
     note = estimates_note({"windows": [lost, calm], "spread_over_sd": ratio})
     assert "first prior" in note
+    away = {**good, "alerts": ["accepted_change"]}
+    assert "say so with --accepted" in estimates_note({"windows": [away], "spread_over_sd": ratio})
+    note = estimates_note({"windows": [away] * 3, "spread_over_sd": {"T_L": 2.3, "K_L": 0.9}})
+    assert "avtorch diagnose" in note
+    assert "--accepted" not in note
     assert estimates_note({"windows": [good, calm], "spread_over_sd": ratio}).startswith("1 of 2 windows excited; the")
 
 

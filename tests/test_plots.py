@@ -216,6 +216,15 @@ def test_an_alarm_that_goes_on_is_marked_where_it_begins_and_where_it_is_acted_u
     assert [line.get_xdata()[0] for line in wide] == [2.0, 6.0]
 
 
+def test_a_second_detector_is_marked_while_the_first_goes_on() -> None:
+    windows = [{**window(t), "alerts": ["accepted_change"]} for t in (0.0, 2.0, 4.0)]
+    windows[2]["alerts"] = ["stability", "accepted_change"]
+    alerts = [{"time_s": w["end_s"], "detector": name, "why": "x"} for w in windows for name in w["alerts"]]
+    figure = plots.probability_figure(windows, answer={"windows": windows, "alerts": alerts})
+    wide = [line for line in figure.axes[0].lines if line.get_linewidth() == 5]
+    assert [line.get_xdata()[0] for line in wide] == [2.0, 6.0]
+
+
 def test_a_collision_is_named_in_the_spacing() -> None:
     for spacing, told in ((np.linspace(5.0, -3.0, len(TIME)), 1), (np.full_like(TIME, 5.0), 0)):
         ax = plots.motion(axes(), TIME, {"without action": spacing}, quantity="spacing")

@@ -89,6 +89,8 @@ def estimate(
     talk = Talk(json=json, quiet=quiet)
     drive = Log.read(log, map=map, unit=unit, stamp=stamp)
     talk.notes(f"{drive.name}", check(drive).notes)
+    if form == "latent" or drive.jerk is None or drive.accel is None:
+        talk.sentence("Jerk is not measured: the latent form takes seconds a window; --estimator map takes a third.")
     setting = Setting(time_gap=tau, gains=k, scenarios=1)
     with talk.progress("Estimating") as step:
         options: dict[str, Any] = {"mode": mode} if estimator in ("sgld", "map") else {}
@@ -106,6 +108,10 @@ def estimate(
     talk.windows(answer["windows"])
     talk.summary(answer, estimates_note(answer))
     talk.done(out, answer)
+
+
+UNEXPLAINED = 1.5
+"""Spread of windows over their SDs (`Estimates.spread_ratio`) above which one lag and one gain are not the log's."""
 
 
 def estimates_note(answer: Mapping[str, Any]) -> str:
@@ -126,6 +132,8 @@ def estimates_note(answer: Mapping[str, Any]) -> str:
     text = ", ".join(f"{name} {last[name]['mean']:.3f} ± {last[name]['sd']:.3f}" for name in ("T_L", "K_L"))
     spread = [f"{name} {x:.1f}" for name, x in answer["spread_over_sd"].items() if x is not None]
     told = f" Spread from window to window over posterior SD: {', '.join(spread)}." if spread else ""
-    if all("accepted_change" in w["alerts"] for w in used):
+    if any((x or 0.0) > UNEXPLAINED for x in answer["spread_over_sd"].values()):
+        told += " Lag and gain alone do not explain this log, or they changed: avtorch diagnose says what may."
+    elif all("accepted_change" in w["alerts"] for w in used):
         told += " All of them are away from what is accepted: if the car is sound so, say so with --accepted T_L,K_L."
     return f"{count}; the last {'used' if lost else 'of them'} says {text}.{told}"

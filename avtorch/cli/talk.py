@@ -49,6 +49,10 @@ class Talk:
             self.out.print(f"  {note}", markup=False)
         self.out.print()
 
+    def sentence(self, text: str) -> None:
+        self.out.print(text, markup=False)
+        self.out.print()
+
     def windows(self, windows: Sequence[Mapping[str, Any]], most: int = 60) -> None:
         table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
         for name in ("time [s]", "rows", "T_L [s]", "90 %", "K_L", "90 %", "P", ""):
@@ -78,7 +82,7 @@ class Talk:
             first.setdefault(alert["detector"], alert)
         for name, alert in first.items():
             count = sum(a["detector"] == name for a in answer["alerts"])
-            again = f" (and {count - 1} windows more)" if count > 1 else ""
+            again = f" (and {count - 1} window{'s' * (count > 2)} more)" if count > 1 else ""
             told = f"{alert['time_s']:.1f} s  {name}: {alert['why']}{again}"
             self.out.print(told, style="yellow", markup=False)
 

@@ -156,11 +156,14 @@ def stability_figure(
 
 
 def _events_of(ax: Axes, answer: Mapping[str, Any]) -> Axes:
-    """Mark an answer's events; of an alarm that goes on over many windows only the first and those acted upon."""
+    """Mark an answer's events; of a detector's alarm that goes on over many windows only the first and those acted
+    upon."""
     windows = answer.get("windows") or []
-    went_on = {b["end_s"] for a, b in pairwise(windows) if a["alerts"] and b["alerts"]}
+    went_on = {(b["end_s"], name) for a, b in pairwise(windows) for name in set(a["alerts"]) & set(b["alerts"])}
     answered = {a["time_s"] for a in answer.get("actions") or ()}
-    alerts = [a for a in answer.get("alerts") or () if a["time_s"] not in went_on - answered]
+    alerts = [
+        a for a in answer.get("alerts") or () if a["time_s"] in answered or (a["time_s"], a["detector"]) not in went_on
+    ]
     change = (answer.get("change") or {}).get("time_s")
     return events(ax, change_s=change, alerts=alerts, actions=answer.get("actions") or ())
 

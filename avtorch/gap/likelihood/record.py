@@ -129,7 +129,8 @@ class Record:
         source, target, stretch, length = _places(columns["use"], dt)
         if len(source) < 10 / dt:
             raise InputError(
-                f"{', '.join(names)}: {len(source) * dt:.1f} s of usable driving (moving, engaged), needs 10 s or more"
+                f"{', '.join(names)}: {len(source) * dt:.1f} s of usable driving (moving, engaged, "
+                "2 s into each drive), needs 10 s or more"
             )
 
         def whole(name: str) -> Float | None:
