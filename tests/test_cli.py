@@ -222,6 +222,8 @@ REFUSED = {
     "text in a number": ["estimate", "BROKEN", *OUT],
     "negative seed": ["estimate", "LOG", "--seed=-1", *OUT],
     "seed no whole number": ["estimate", "LOG", "--seed", "1.5", *OUT],
+    "dead time negative": ["estimate", "LOG", "--dead-time=-0.1", *OUT],
+    "dead time beyond the window": ["estimate", "LOG", "--dead-time", "3", *OUT],
     "accepted of one": ["estimate", "LOG", "--accepted", "0.4", *OUT],
     "accepted below zero": ["estimate", "LOG", "--accepted=-0.4,1", *OUT],
     "accepted text": ["estimate", "LOG", "--accepted", "0.4,x", *OUT],

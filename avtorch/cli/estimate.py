@@ -16,6 +16,7 @@ from avtorch.cli.arguments import (
     Seed,
     TimeGap,
     free_folder,
+    not_negative,
     positive,
     positive_pair,
     seed_number,
@@ -57,6 +58,7 @@ def estimate(
     accepted: Annotated[
         str, Parameter(help="T_L,K_L of the car as it should be, which accepted_change compares with [s, -].")
     ] = "0.3,1.0",
+    dead_time: Annotated[float, Parameter(help="Dead time of the car [s], if known: avtorch diagnose tells it.")] = 0.0,
     seed: Seed = 0,
     json: Json = False,
     quiet: Quiet = False,
@@ -75,6 +77,7 @@ def estimate(
     positive("--tau", tau, "s")
     k = three_gains("--gains", gains)
     sound = positive_pair("--accepted", accepted, "T_L,K_L", "0.3,1.0")
+    not_negative("--dead-time", dead_time, "s")
     free_folder(out)
     seed_number(seed)
     if mode != "lambda" and estimator not in ("sgld", "map"):
@@ -94,7 +97,8 @@ def estimate(
     setting = Setting(time_gap=tau, gains=k, scenarios=1)
     with talk.progress("Estimating") as step:
         options: dict[str, Any] = {"mode": mode} if estimator in ("sgld", "map") else {}
-        options |= {"form": form, "setting": setting, "monitor": Monitor(accepted=sound), "seed": seed}
+        options |= {"form": form, "setting": setting, "dead_time": dead_time, "seed": seed}
+        options["monitor"] = Monitor(accepted=sound, dead_time=dead_time)
         found = work(drive, window, estimator=estimator, progress=step, **options)
     answer = estimates_answer(found)
 
@@ -133,7 +137,8 @@ def estimates_note(answer: Mapping[str, Any]) -> str:
     spread = [f"{name} {x:.1f}" for name, x in answer["spread_over_sd"].items() if x is not None]
     told = f" Spread from window to window over posterior SD: {', '.join(spread)}." if spread else ""
     if any((x or 0.0) > UNEXPLAINED for x in answer["spread_over_sd"].values()):
-        told += " Lag and gain alone do not explain this log, or they changed: avtorch diagnose says what may."
+        told += " Lag and gain alone do not explain this log, or they changed: avtorch diagnose says what may"
+        told += " (a dead time goes into --dead-time)."
     elif all("accepted_change" in w["alerts"] for w in used):
         told += " All of them are away from what is accepted: if the car is sound so, say so with --accepted T_L,K_L."
     return f"{count}; the last {'used' if lost else 'of them'} says {text}.{told}"

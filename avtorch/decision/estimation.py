@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any, Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from avtorch.decision.monitor import Monitor
 from avtorch.decision.settings import Setting
@@ -21,6 +23,7 @@ from avtorch.inference.stream import BeliefStream
 from avtorch.io.log import Log
 from avtorch.io.quality import Quality, check
 
+Array = NDArray[Any]
 FormName = Literal["auto", "jerk", "latent"]
 
 LEAST_ROWS = 10
@@ -33,7 +36,8 @@ class Estimates:
 
     `windows` in the order of the log; `seconds_per_window` of computing; `form` "jerk" or "latent"; `quality` of the
     log, looked at first; `setting` under which P(string stable) was asked: a log does not tell its controller;
-    `estimator` by name; `accepted` (T_L [s], K_L [-]) of a sound car, with which `accepted_change` compares.
+    `estimator` by name; `accepted` (T_L [s], K_L [-]) of a sound car, with which `accepted_change` compares;
+    `dead_time` [s] that commands were given.
     """
 
     windows: list[WatchedWindow]
@@ -43,6 +47,7 @@ class Estimates:
     setting: Setting
     estimator: str = "sgld"
     accepted: tuple[float, float] = (0.3, 1.0)
+    dead_time: float = 0.0
 
     @property
     def excited_share(self) -> float:
@@ -73,6 +78,7 @@ def estimate(
     estimator: str = "sgld",
     setting: Setting | None = None,
     monitor: Monitor | None = None,
+    dead_time: float = 0.0,
     progress: Callable[[int, int], None] | None = None,
     seed: int = 0,
     **inference: Any,
@@ -87,6 +93,9 @@ def estimate(
     `estimator`: "sgld" samples each window's posterior, "map" takes its mode and curvature, "rls" is recursive least
     squares (measured jerk only), "ekf" and "ukf" are joint Kalman filters. Further keywords are the estimator's own
     (`mode`, `lam`, `settings`, ...; see `avtorch.inference.estimators.make_estimator`).
+
+    `dead_time` [s] of the vehicle, where it is known (`avtorch.diagnose` tells it): commands act so much later, and
+    the first rows of a segment, whose commands are not in the log, are masked. The default monitor judges with it.
 
     Raises `InputError` for a log without accel_cmd, a form whose columns it lacks, a window longer than the log, or an
     estimator that is not known or cannot take the form.
@@ -103,14 +112,19 @@ def estimate(
     # a window of rows spans one step less than its length
     if window > longest + 1.5 / log.rate_hz:
         raise InputError(f"window: found {window:g} s, needs at most {longest:g} s, the longest segment of {log.name}")
+    if not (math.isfinite(dead_time) and 0.0 <= dead_time < window):
+        raise InputError(f"dead_time: found {dead_time:g} s, needs 0 or more and less than the window, {window:g} s")
     quality = check(log)
+    monitor = Monitor(dead_time=dead_time) if monitor is None else monitor
     setting = Setting() if setting is None else setting
     if setting.shape != (1,):
         raise InputError(f"setting: found shape {tuple(setting.shape)}, needs one, (1,), for one log")
     options = {"estimator": estimator, "seed": seed, **inference}
     watch = Watch(BeliefStream(window=window, form=chosen, gap=float("inf"), **options), monitor)
-    usable = torch.from_numpy(log.usable)
+    command, known = _delayed(log, dead_time)
+    usable = torch.from_numpy(log.usable & known)
     signals = {name: torch.from_numpy(getattr(log, name)) for name in chosen.columns}
+    signals["accel_cmd"] = torch.from_numpy(command)
     windows: list[WatchedWindow] = []
     begun = clock.perf_counter()
     last, ahead = -torch.inf, 0.0
@@ -134,7 +148,30 @@ def estimate(
     seconds = (clock.perf_counter() - begun) / max(len(windows), 1)
     name = "jerk" if isinstance(chosen, JerkForm) else "latent"
     T, K = (float(x[0]) for x in watch.monitor.accepted)
-    return Estimates(windows, seconds, name, quality, setting, estimator, (T, K))
+    return Estimates(windows, seconds, name, quality, setting, estimator, (T, K), dead_time)
+
+
+def _delayed(log: Log, dead_time: float) -> tuple[Array, Array]:
+    """The command that acts in each row's interval, (time,) [m/s²], and whether the log holds it.
+
+    A command is held from its row to the next; where the switch falls inside an interval, its mean acts.
+    """
+    command = np.asarray(log.accel_cmd, np.float64)
+    known = np.ones(log.rows, dtype=bool)
+    if dead_time == 0.0:
+        return command, known
+    out = command.copy()
+    for part in log.segments():
+        time, u = log.time[part], command[part]
+        step = np.diff(time, append=2 * time[-1] - time[-2] if len(time) > 1 else time[-1] + 1.0)
+        edges = np.append(time, time[-1] + step[-1])
+        sent = np.concatenate([[0.0], np.cumsum(u * step)])
+        begin, end = time - dead_time, edges[1:] - dead_time
+        # before the first row the first command is taken to have acted, and the rows are masked
+        held = [np.where(t < time[0], u[0] * (t - time[0]), np.interp(t, edges, sent)) for t in (begin, end)]
+        out[part] = (held[1] - held[0]) / step
+        known[part] = begin >= time[0] - 1e-9
+    return out, known
 
 
 def _on_the_logs_clock(watched: WatchedWindow, ahead: float) -> WatchedWindow:

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from avtorch.decision import Estimates, Monitor, Setting, estimate
+from avtorch.decision.estimation import _delayed
 from avtorch.errors import InputError
 from avtorch.inference.sampler import SamplerSettings
 from avtorch.io import Log
@@ -322,3 +323,45 @@ def test_other_estimators_answer_in_the_same_terms(estimator, healthy):
 def test_an_unknown_estimator_is_refused(healthy):
     with pytest.raises(InputError, match="sgld, map, rls, ekf, ukf"):
         estimate(healthy, estimator="oracle")
+
+
+def test_a_known_dead_time_is_taken_out(rotating_seed):
+    """Commands that were sent 0.2 s earlier: without saying so the lag is too long, with it right, and P knows it."""
+    late = 20
+    log = drive(0.5, 0.9, seed=rotating_seed, seconds=16.0)
+    sent = columns(log)
+    sent["accel_cmd"] = np.append(sent["accel_cmd"][late:], np.repeat(sent["accel_cmd"][-1], late))
+    early = Log.from_arrays(**sent)
+    told = estimate(early, dead_time=0.2, mode="posterior")
+    blind = estimate(early, mode="posterior")
+    plain = estimate(log, mode="posterior")
+    assert told.dead_time == 0.2
+    away = {}
+    for name, found in (("told", told), ("blind", blind)):
+        belief = found.windows[-1].window.belief
+        away[name] = float(((belief.mean[0, :2] - torch.tensor([0.5, 0.9])).abs() / belief.sd[0, :2]).max())
+    assert away["told"] < 5
+    assert away["blind"] > 8
+    for ours, theirs in zip(told.windows[1:], plain.windows[1:], strict=True):
+        assert ours.window.n[0] == theirs.window.n[0]  # the start alone is masked
+    # the same car with a delay in its loop is no more string stable than without
+    assert float(told.windows[-1].report.p_string_stable[0]) <= float(plain.windows[-1].report.p_string_stable[0])
+    assert estimates_answer(told)["assumed"]["dead_time_s"] == 0.2
+
+
+def test_a_dead_time_between_rows_takes_the_mean_of_what_acts():
+    time = np.arange(6) * 0.1
+    log = Log.from_arrays(time=time, accel_cmd=[0.0, 1.0, 1.0, 3.0, 3.0, 3.0], speed=20 + time)
+    command, known = _delayed(log, 0.05)
+    np.testing.assert_allclose(command, [0.0, 0.5, 1.0, 2.0, 3.0, 3.0], atol=1e-12)
+    assert known.tolist() == [False, True, True, True, True, True]
+    command, known = _delayed(log, 0.2)
+    np.testing.assert_allclose(command, [0.0, 0.0, 0.0, 1.0, 1.0, 3.0], atol=1e-12)
+    assert known.tolist() == [False, False, True, True, True, True]
+    assert _delayed(log, 0.0)[0].tolist() == [0.0, 1.0, 1.0, 3.0, 3.0, 3.0]
+
+
+@pytest.mark.parametrize("seconds", [-0.1, 2.0, float("nan")])
+def test_a_dead_time_out_of_range_is_refused(healthy, seconds):
+    with pytest.raises(InputError, match="dead_time: found"):
+        estimate(healthy, dead_time=seconds)
