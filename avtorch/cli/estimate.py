@@ -92,8 +92,8 @@ def estimate(
     talk = Talk(json=json, quiet=quiet)
     drive = Log.read(log, map=map, unit=unit, stamp=stamp)
     talk.notes(f"{drive.name}", check(drive).notes)
-    if form == "latent" or drive.jerk is None or drive.accel is None:
-        talk.sentence("Jerk is not measured: the latent form takes seconds a window; --estimator map takes a third.")
+    if estimator == "sgld" and (form == "latent" or drive.jerk is None or drive.accel is None):
+        talk.sentence("The latent form, which needs no jerk, takes seconds a window; --estimator map takes a third.")
     setting = Setting(time_gap=tau, gains=k, scenarios=1)
     with talk.progress("Estimating") as step:
         options: dict[str, Any] = {"mode": mode} if estimator in ("sgld", "map") else {}
