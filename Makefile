@@ -1,4 +1,5 @@
-# Two commands on a fresh machine: `make demo` and `make test`.
+# Two commands on a fresh machine: `make demo` and `make test`. `make test-all` adds the slow tests,
+# `make fuzz` tries 100,000 damaged inputs (about half an hour).
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -12,7 +13,10 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constr
 export OMP_NUM_THREADS ?= 1
 export MKL_NUM_THREADS ?= 1
 
-.PHONY: demo test lint docs clean
+# Inputs of the fuzzer's nightly mode.
+FUZZ ?= 100000
+
+.PHONY: demo test test-all fuzz lint docs clean
 
 demo: $(VENV)/.installed
 	$(BIN)/avtorch run --out out/demo
@@ -21,7 +25,16 @@ demo: $(VENV)/.installed
 	@ls out/demo/*.png | sed 's/^/  /'
 
 test: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -n $(JOBS) -m "not slow" $(PYTEST_ARGS)
+
+test-all: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n $(JOBS) $(PYTEST_ARGS)
+
+# Parquet in a process of its own: should pyarrow end or corrupt it, the other targets are still tried.
+fuzz: $(VENV)/.installed-dev
+	status=0; for which in "not parquet" parquet; do \
+	  AVTORCH_FUZZ=$(FUZZ) $(BIN)/python -m pytest tests/fuzz -k "$$which" $(PYTEST_ARGS) || status=1; \
+	done; exit $$status
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -1,10 +1,60 @@
-"""The one error a user meets for bad input."""
+"""The one error a user meets for bad input, and how foreign text stands in it."""
 
 from __future__ import annotations
+
+import unicodedata
+from collections.abc import Iterable
+
+_LONGEST = 1000  # characters of a message
+_NAME, _NAMES = 24, 12  # characters of a name in a list, and names
 
 
 class InputError(ValueError):
     """Bad input, told in one line: the argument, or the file, row and column; what was found; what would be right.
 
-    The command line prints the message to stderr and exits with code 2.
+    Whatever text a file brought into the message, it stays one printable line of at most 1000 characters. The command
+    line prints it to stderr and exits with code 2.
     """
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(printable(str(message), _LONGEST))
+
+
+def printable(text: str, most: int | None = None) -> str:
+    """`text` with every control character escaped, and with its middle left out where it has over `most` characters.
+
+    Escaped are line ends, terminal sequences, marks that turn the direction of writing, and halves of surrogate pairs:
+    all that Unicode does not count as printable, but for the widths of a space.
+    """
+    if most is not None and len(text) > most:
+        text = _shortened(text, most)
+    if not text.isprintable():
+        shown = (c if c.isprintable() or unicodedata.category(c) == "Zs" else _escape(c) for c in text)
+        text = "".join(shown)
+        if most is not None and len(text) > most:
+            text = _shortened(text, most)
+    return text
+
+
+def quoted(text: str, most: int = 40) -> str:
+    """`text` in quotation marks, escaped and shortened, with the number of characters left out behind it."""
+    if len(text) <= most:
+        return repr(text)
+    return f"{text[:most]!r}... ({len(text) - most} more characters)"
+
+
+def listed(names: Iterable[str]) -> str:
+    """The first dozen of `names`, escaped and shortened, and the number of the rest."""
+    all_ = list(names)
+    shown = ", ".join(printable(name, _NAME) for name in all_[:_NAMES])
+    rest = len(all_) - _NAMES
+    return f"{shown} and {rest} more" if rest > 0 else shown
+
+
+def _shortened(text: str, most: int) -> str:
+    half = (most - 3) // 2
+    return f"{text[:half]}...{text[-half:]}"
+
+
+def _escape(c: str) -> str:
+    return c.encode("unicode_escape").decode("ascii")

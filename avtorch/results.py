@@ -55,10 +55,14 @@ def alert_entries(watched: Sequence[WatchedWindow], scenario: int = 0) -> list[d
 
 
 def estimates_answer(estimates: Estimates) -> dict[str, Any]:
-    """`estimates.json`: the windows of a log, and beside them what the quality check saw and what was assumed."""
+    """`estimates.json`: the windows of a log, and beside them what the quality check saw and what was assumed.
+
+    Times are on the log's own clock; `epoch_s` is its first row's.
+    """
     setting = estimates.setting
     return {
         "schema": "avtorch.estimates/1",
+        "epoch_s": estimates.quality.epoch_s,
         "windows": [window_entry(w) for w in estimates.windows],
         "seconds_per_window": estimates.seconds_per_window,
         "form": estimates.form,

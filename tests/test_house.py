@@ -82,7 +82,6 @@ def test_readme_example_is_python_that_runs_on_the_public_face() -> None:
             assert hasattr(avtorch, name), name
 
 
-@pytest.mark.slow
 def test_readme_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
     for block in re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S):
         exec(compile(block, "README.md", "exec"), {})

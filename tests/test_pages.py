@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
@@ -13,6 +14,7 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = ("diagnosis.md", "blindtest.md", "compare.md", "followers.md", "paper.md")
 ALL = [DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))]
 CODE = [p.name for p in ALL[1:] if "```python" in p.read_text(encoding="utf-8") and p.name != "own-effect.md"]
+SLOW = ("blindtest.md", "diagnosis.md")
 COMMANDS = {"diagnosis.md": "diagnose", "followers.md": "diagnose"}
 
 
@@ -21,8 +23,7 @@ def blocks(page: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.S | re.M)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", CODE)
+@pytest.mark.parametrize("page", [pytest.param(p, marks=pytest.mark.slow if p in SLOW else []) for p in CODE])
 def test_code_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict = {"__name__": "page"}
@@ -49,6 +50,16 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert other.exists(), target
         titles = re.findall(r"^#+ (.*)$", other.read_text(encoding="utf-8"), re.M) if mark else []
         assert not mark or mark[1:] in [re.sub(r"[^\w\- ]", "", t.lower()).replace(" ", "-") for t in titles], mark
+
+
+@pytest.mark.parametrize("page", ALL, ids=lambda page: page.name)
+def test_tests_that_are_named_exist(page: Path) -> None:
+    """A promise is worth the test that holds avtorch to it."""
+    named = re.findall(r"\b(tests/[\w/]+\.py)(?:::(\w+))?", page.read_text(encoding="utf-8"))
+    assert named or page.name != "trust.md"
+    for path, name in named:
+        there = ast.parse((DOCS.parent / path).read_text(encoding="utf-8")).body
+        assert not name or name in [x.name for x in there if isinstance(x, ast.FunctionDef)], f"{path}::{name}"
 
 
 def test_reference_names_only_what_exists() -> None:

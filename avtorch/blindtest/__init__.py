@@ -6,6 +6,7 @@ from avtorch.blindtest.cases import draw_case, draw_cases
 from avtorch.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, Family, family
 from avtorch.blindtest.deck import MIX
 from avtorch.blindtest.drives import DURATIONS_S, MANOEUVRES, RATES_HZ, Drive, Recorded, draw_drive
+from avtorch.blindtest.in_front import IN_FRONT, put_in_front
 from avtorch.blindtest.score import score
 from avtorch.blindtest.vehicle import Run, simulate
 from avtorch.blindtest.visibility import TIERS, Oracle, Sight, sight, tier_of
@@ -14,6 +15,7 @@ __all__ = [
     "CALIBRATION",
     "DURATIONS_S",
     "EFFECTS",
+    "IN_FRONT",
     "MANOEUVRES",
     "MIX",
     "RATES_HZ",
@@ -32,6 +34,7 @@ __all__ = [
     "draw_cases",
     "draw_drive",
     "family",
+    "put_in_front",
     "score",
     "sight",
     "simulate",

@@ -165,7 +165,7 @@ class Oracle:
 
 
 def oracles(run: Run, fitted: Sight, *, foretold: bool) -> dict[str, Oracle]:
-    """`rollout_rmse_accel` [m/s²] and `rollout_rmse_speed` [m/s, over 10 s from a measured speed], by metric.
+    """`rollout_rmse_accel` [m/s²] and `rollout_rmse_speed` [m/s], over 10 s from a measured value, by metric.
 
     Of rows that move, from 2 s on. `foretold`: False where the cause decides by chance what the car does with its
     command (lost messages), so that knowing it helps no rollout. Gusts and outliers are left to the floor, whose share
@@ -174,14 +174,16 @@ def oracles(run: Run, fitted: Sight, *, foretold: bool) -> dict[str, Oracle]:
     dt = float(run.time[1] - run.time[0])
     judged = (run.true_speed >= _MOVING_MPS) & (run.time >= run.time[0] + _SETTLED_S)
     unit_a, unit_v = exact_gain(run.command, dt, fitted.T_L)
-    before_a = _rms(run.accel - fitted.K_L * unit_a, judged)
+    # what an acceleration began with dies away with the lag
+    keeps = float(np.exp(-dt / fitted.T_L))
+    before_a = _from_all_starts(run.accel - fitted.K_L * unit_a, judged, dt, keeps)
     before_v = _from_all_starts(run.speed - fitted.K_L * unit_v, judged, dt)
     if not foretold:
         return {
             "rollout_rmse_accel": Oracle(before_a, before_a, before_a),
             "rollout_rmse_speed": Oracle(before_v, before_v, before_v),
         }
-    floor_a = _rms(run.noise_accel + run.chance_accel + run.felt_accel, judged)
+    floor_a = _from_all_starts(run.noise_accel + run.chance_accel + run.felt_accel, judged, dt, keeps)
     floor_v = _from_all_starts(run.noise_speed + run.drift_speed + run.chance_speed, judged, dt)
     return {
         "rollout_rmse_accel": Oracle(before_a, floor_a, floor_a),
@@ -189,12 +191,9 @@ def oracles(run: Run, fitted: Sight, *, foretold: bool) -> dict[str, Oracle]:
     }
 
 
-def _rms(error: Float, rows: Bool) -> float:
-    return float(np.sqrt(np.mean(error[rows] ** 2))) if rows.any() else 0.0
-
-
-def _from_all_starts(error: Float, rows: Bool, dt: float) -> float:
-    """RMS of a speed's error over rollouts of up to 10 s, begun at a measured speed at every one of the `rows`.
+def _from_all_starts(error: Float, rows: Bool, dt: float, keeps: float = 1.0) -> float:
+    """RMS of the error over rollouts of up to 10 s, begun at a measured value at every one of the `rows`, of which a
+    share `keeps` is left after each.
 
     A minute has six rollouts one after another, and what noise does to the speeds that they begin at would decide.
     """
@@ -205,9 +204,18 @@ def _from_all_starts(error: Float, rows: Bool, dt: float) -> float:
         if end - begin >= shortest:
             e = error[begin:end]
             at = np.arange(len(e)) + 1
-            since = np.maximum(at - length, 0)
-            once, twice = (np.concatenate([[0.0], np.cumsum(e**power)]) for power in (1, 2))
-            mean, square = ((x[at] - x[since]) / (at - since) for x in (once, twice))
+            starts = np.minimum(at, length)
+            mean, square = (_faded(e**power, length, keeps**power) / starts for power in (1, 2))
             squares += float((e**2 - 2 * e * mean + square).sum())
             count += len(e)
     return float(np.sqrt(squares / count)) if count else 0.0
+
+
+def _faded(x: Float, length: int, keeps: float) -> Float:
+    """Sums over the last `length` rows, each times `keeps` to the power of its age."""
+    if keeps == 1.0:
+        total = np.concatenate([[0.0], np.cumsum(x)])
+        at = np.arange(len(x)) + 1
+        return total[at] - total[np.maximum(at - length, 0)]
+    felt = min(length, len(x), 1 + int(np.log(1e-9) / np.log(keeps)))
+    return np.convolve(x, keeps ** np.arange(felt))[: len(x)]

@@ -15,11 +15,12 @@ from avtorch.cli.blindtest import blindtest
 from avtorch.cli.compare import compare
 from avtorch.cli.diagnose import diagnose
 from avtorch.cli.estimate import estimate
+from avtorch.cli.out_folder import alone_in_out
 from avtorch.cli.paper import paper
 from avtorch.cli.run import run
 from avtorch.cli.stability import stability
 from avtorch.cli.validate import validate
-from avtorch.errors import InputError
+from avtorch.errors import InputError, printable
 
 app = App(
     name="avtorch",
@@ -28,14 +29,8 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
-app.command(run)
-app.command(estimate)
-app.command(diagnose)
-app.command(compare)
-app.command(stability)
-app.command(validate)
-app.command(blindtest)
-app.command(paper)
+for _command in (run, estimate, diagnose, compare, stability, validate, blindtest, paper):
+    app.command(alone_in_out(_command))
 
 
 def _missing(fault: MissingArgumentError) -> str:
@@ -56,11 +51,17 @@ def main(tokens: Sequence[str] | None = None) -> int:
     try:
         app(tokens, exit_on_error=False, print_error=False)
     except (InputError, CycloptsError) as fault:
-        # one line, whatever the parser's own message looks like
+        # one line, whatever the parser's own message looks like and recites
         said = _missing(fault) if isinstance(fault, MissingArgumentError) else str(fault)
-        print("avtorch: " + " ".join(said.split()), file=sys.stderr)
+        most = None if isinstance(fault, InputError) else 400
+        print("avtorch: " + printable(" ".join(said.split()), most), file=sys.stderr)
+        return 2
+    except OSError as fault:
+        # a file system that fails where no command expects it to
+        where = f"{fault.filename}: " if fault.filename else ""
+        print("avtorch: " + printable(" ".join(f"{where}{fault.strerror or fault}".split())), file=sys.stderr)
         return 2
     except KeyboardInterrupt as stop:
-        print(f"avtorch: interrupted; {str(stop) or 'no answer was written'}", file=sys.stderr)
+        print(f"avtorch: interrupted; {printable(str(stop)) or 'no answer was written'}", file=sys.stderr)
         return 130
     return 0

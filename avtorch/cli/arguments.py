@@ -9,7 +9,8 @@ from typing import Annotated, Any
 
 from cyclopts import Group, Parameter, Token
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, quoted
+from avtorch.numeral import numeral
 
 OUTPUT = Group("Output", sort_key=9)
 
@@ -49,21 +50,21 @@ def seed_number(seed: int) -> None:
 
 def three_gains(name: str, text: str) -> tuple[float, float, float]:
     try:
-        values = tuple(float(part) for part in text.split(","))
+        values = tuple(numeral(part.strip()) for part in text.split(","))
     except ValueError:
         values = ()
     if len(values) != 3 or not all(map(math.isfinite, values)):
-        raise InputError(f"{name}: found {text!r}, needs three numbers k_s,k_v,k_a such as 1.5,1.5,-0.8")
+        raise InputError(f"{name}: found {quoted(text)}, needs three numbers k_s,k_v,k_a such as 1.5,1.5,-0.8")
     return values[0], values[1], values[2]
 
 
 def positive_pair(name: str, text: str, of: str, example: str) -> tuple[float, float]:
     try:
-        values = tuple(float(part) for part in text.split(","))
+        values = tuple(numeral(part.strip()) for part in text.split(","))
     except ValueError:
         values = ()
     if len(values) != 2 or not all(math.isfinite(x) and x > 0 for x in values):
-        raise InputError(f"{name}: found {text!r}, needs two numbers {of} above 0 such as {example}")
+        raise InputError(f"{name}: found {quoted(text)}, needs two numbers {of} above 0 such as {example}")
     return values[0], values[1]
 
 
@@ -71,12 +72,19 @@ def two_axes(text: str) -> tuple[str, str]:
     known = ("k_s", "k_v", "k_a", "tau", "T", "K")
     names = tuple(part.strip() for part in text.split(","))
     if len(names) != 2 or names[0] == names[1] or not set(names) <= set(known):
-        raise InputError(f"--plane: found {text!r}, needs two different names out of {', '.join(known)} such as tau,T")
+        raise InputError(
+            f"--plane: found {quoted(text)}, needs two different names out of {', '.join(known)} such as tau,T"
+        )
     return names[0], names[1]
 
 
-def free_folder(out: Path) -> None:
-    """Refuse a place that cannot become a folder before any work is done; nothing is made yet."""
+def free_folder(out: Path, *, without: str | None = None) -> None:
+    """Refuse a place that cannot become a folder before any work is done; nothing is made yet.
+
+    `without`: an answer that may not be there already, since its pictures have names that this one's have too.
+    """
+    if without is not None and (out / without).exists():
+        raise InputError(f"--out: {out} holds {without}, and pictures of the same names; needs another folder")
     for place in (out, *out.parents):
         if place.exists():
             if not place.is_dir():
@@ -88,9 +96,9 @@ def free_folder(out: Path) -> None:
 def limits_pair(name: str, text: str) -> tuple[float, float]:
     """Two numbers, the first below zero and the second above."""
     try:
-        values = tuple(float(part) for part in text.split(","))
+        values = tuple(numeral(part.strip()) for part in text.split(","))
     except ValueError:
         values = ()
     if len(values) != 2 or not all(map(math.isfinite, values)) or not values[0] < 0 < values[1]:
-        raise InputError(f"{name}: found {text!r}, needs MIN,MAX [m/s²] below and above 0, such as -6,4")
+        raise InputError(f"{name}: found {quoted(text)}, needs MIN,MAX [m/s²] below and above 0, such as -6,4")
     return values[0], values[1]

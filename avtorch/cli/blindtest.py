@@ -49,7 +49,14 @@ def blindtest(
     try:
         with talk.progress(f"{n} cases") as step:
             answer = trial.run_trial(
-                n, seed, out, answerers=answerers, workers=workers, signals=witnesses, progress=step
+                n,
+                seed,
+                out,
+                answerers=answerers,
+                workers=workers,
+                signals=witnesses,
+                progress=step,
+                publish=False,  # together with the picture
             )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"answers so far are kept in {out}, --resume goes on") from None

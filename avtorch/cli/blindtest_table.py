@@ -48,7 +48,7 @@ def blindtest_table(answer: Mapping[str, Any]) -> Table:
 
 
 def blindtest_notes(answer: Mapping[str, Any]) -> list[str]:
-    """How many cases there were, and who gave no answer."""
+    """How many cases there were, who gave no answer, and which answers were damaged."""
     counts = answer["counts"]
     singles = sum(counts["top1"].values())
     notes = [
@@ -58,7 +58,7 @@ def blindtest_notes(answer: Mapping[str, Any]) -> list[str]:
     for name, one in {answer["answerer"]: answer, **answer["baselines"]}.items():
         if one["failed"]:
             notes.append(f"{name} gave no answer to {one['failed']}: {one['failures'][0]}")
-    return notes
+    return [*notes, *answer.get("notes", ())]
 
 
 def _at(answer: Mapping[str, Any], path: str) -> Any:

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 _ROWS = {
     "T_L": "lag T_L [s]",
     "K_L": "gain K_L [-]",
-    "rollout_rmse_accel": "off in acceleration [m/s²]",
-    "rollout_rmse_speed": "off in speed, 10 s [m/s]",
+    "rollout_rmse_accel": "off in acceleration, {horizon} s [m/s²]",
+    "rollout_rmse_speed": "off in speed, {horizon} s [m/s]",
 }
 
 
@@ -64,18 +64,21 @@ def compare(
         raise InputError("--baseline-after: found without two simulators; needs --baseline and --baseline-after given")
 
     from avtorch.gap.compare import compare as work
-    from avtorch.io import Log, check, write_json
+    from avtorch.io import Log, answer_set, check, write_json
 
     talk = Talk(json=json, quiet=quiet)
     logs = [Log.read(path, map=map, unit=unit) for path in (before, after)]
     for path, log in zip((before, after), logs, strict=True):
         if not log.usable.any():
-            raise InputError(f"{path}: has no row to use; all are driven by hand (engaged 0) or at standstill")
+            raise InputError(
+                f"{path}: has no row to use; all are driven by hand (engaged 0), within 2 s after, or at standstill"
+            )
         talk.notes(log.name, check(log).notes)
     with talk.waiting("fitting both drives"):
         told = work(*logs, baseline=simulator, baseline_after=other)
     if out is not None:
-        write_json(out / "comparison.json", told.to_dict())
+        with answer_set(out, ("comparison.json",)) as staged:
+            write_json(staged / "comparison.json", told.to_dict())
     if talk.json:
         import json as text
 
@@ -94,7 +97,8 @@ def _table(told: Comparison) -> Table:
     for name in ("before", "after", "after / before (90 %)"):
         table.add_column(name, justify="right", no_wrap=True)
     for name, moved in {**told.car, **told.gap}.items():
-        table.add_row(escape(_ROWS.get(name, name)), *_cells(moved))
+        row = _ROWS.get(name, name).format(horizon=f"{told.horizon_s:.3g}")
+        table.add_row(escape(row), *_cells(moved))
     return table
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from difflib import get_close_matches
@@ -18,10 +18,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, positive, seed_number
 from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.cli.follower import follow, refuse
-from avtorch.cli.resume import FITS, same_work
+from avtorch.cli.resume import FITS, begin_anew
 from avtorch.cli.simulator import read_simulator
 from avtorch.cli.talk import Talk
-from avtorch.errors import InputError
+from avtorch.errors import InputError, quoted
+from avtorch.numeral import numeral
 
 if TYPE_CHECKING:
     from avtorch.experiment import Limits
@@ -77,12 +78,18 @@ def diagnose(
     ] = None,
     event: Annotated[int | None, Parameter(group=FOLLOWER, help="Which event of an NGSIM file.")] = None,
     resume: Annotated[bool, Parameter(help="Go on from an interrupted run in --out, or begin anew.")] = True,
-    speed_min: Annotated[float, Parameter(group=TRACK, help="Slowest of the next experiment [m/s].")] = 1.0,
-    speed_max: Annotated[float, Parameter(group=TRACK, help="Fastest [m/s].")] = 30.0,
-    accel_min: Annotated[float, Parameter(group=TRACK, help="Hardest braking [m/s²], below 0.")] = -3.0,
-    accel_max: Annotated[float, Parameter(group=TRACK, help="Hardest push [m/s²].")] = 2.0,
-    road: Annotated[float, Parameter(group=TRACK, help="Length of the road [m].")] = 2000.0,
-    seconds: Annotated[float, Parameter(group=TRACK, help="Duration [s].")] = 60.0,
+    speed_min: Annotated[
+        float | None, Parameter(group=TRACK, help="Slowest of the next experiment [m/s]; default: as in the log.")
+    ] = None,
+    speed_max: Annotated[float | None, Parameter(group=TRACK, help="Fastest [m/s]; default: as in the log.")] = None,
+    accel_min: Annotated[
+        float | None, Parameter(group=TRACK, help="Hardest braking [m/s²], below 0; default: as in the log.")
+    ] = None,
+    accel_max: Annotated[
+        float | None, Parameter(group=TRACK, help="Hardest push [m/s²]; default: as in the log.")
+    ] = None,
+    road: Annotated[float | None, Parameter(group=TRACK, help="Length of the road [m]; default: 2000.")] = None,
+    seconds: Annotated[float | None, Parameter(group=TRACK, help="Duration [s]; default: 60.")] = None,
     seed: Seed = 0,
     json: Json = False,
     quiet: Quiet = False,
@@ -102,7 +109,14 @@ def diagnose(
         positive("--budget", budget, "s")
     seed_number(seed)
     free_folder(out)
-    limits = _limits(speed_min, speed_max, accel_min, accel_max, road, seconds)
+    track = {
+        "speed_min": speed_min,
+        "speed_max": speed_max,
+        "accel_min": accel_min,
+        "accel_max": accel_max,
+        "road": road,
+        "seconds": seconds,
+    }
     chosen = _effects(effects)
     weights = _prior(prior or ())
     simulator = read_simulator("--baseline", baseline)
@@ -113,7 +127,8 @@ def diagnose(
     if follower:
         usual = {"accel_kind": accel_kind == "kinematic", "no_pairs": pairs, "posterior": posterior == "sgld"}
         idle = {"baseline": simulator, "prior": weights, "budget": budget is not None}
-        refuse(logs, limits, **idle, **{option: not default for option, default in usual.items()})
+        idle |= {option: not default for option, default in usual.items()}
+        refuse(logs, **idle, **{option: value is not None for option, value in track.items()})
         source = {"map": map, "unit": unit, "stamp": stamp, "vehicle": vehicle, "event": event}
         with _progress(talk, None) as step:
             follow(talk, logs[0], out, source=source, law=law, effects=chosen, seed=seed, step=step)
@@ -125,15 +140,9 @@ def diagnose(
     for path, drive in zip(logs, drives, strict=True):
         _usable(path, drive, accel_kind)
         _judged(chosen or (), path, drive)
-    settings = {
-        "--baseline": "glvd" if simulator is None else simulator.to_toml(),
-        "--accel-kind": accel_kind,
-        "--effects": chosen,
-        "--pairs": pairs,
-        "--posterior": posterior,
-        "--seed": seed,
-    }
-    same_work(out, drives, settings, resume=resume)
+    limits = _limits(drives, track)
+    if not resume:
+        begin_anew(out)
     quality = []
     for drive in drives:
         noted = check(drive).notes
@@ -166,6 +175,8 @@ def diagnose(
 
     told = setting_for(found, [x for drive in drives if drive.accel_cmd is not None for x in drive.accel_cmd])
     from avtorch.experiment import next_experiment, write_table
+    from avtorch.gap.answer.diagnosis import DIAGNOSIS_FILES
+    from avtorch.io import answer_set
     from avtorch.report import write_report
 
     notes = found.notes
@@ -179,9 +190,9 @@ def diagnose(
         setting=None if told is None else told.to_dict(),
         next_experiment=None if ahead is None else ahead.to_dict(),
     )
-    table = write_table(ahead, out)
-    written = [*found.write(out), *table, *write_exports(found.plant, out)]
-    written.append(write_report(found, out, quality=quality, experiment=ahead))
+    with answer_set(out, DIAGNOSIS_FILES) as staged:
+        written = [*found.write(staged), *write_table(ahead, staged), *write_exports(found.plant, staged)]
+        written.append(write_report(found, staged, quality=quality, experiment=ahead))
     if talk.json:
         talk.done(out, found.to_dict())
         return
@@ -203,12 +214,13 @@ _FILES = {
 }
 
 
-def _limits(*given: float) -> Limits:
-    """Refused before the search where they allow nothing at all."""
+def _limits(drives: Sequence[Log], given: Mapping[str, float | None]) -> Limits:
+    """From the log where not given; what is given is refused before the search where it allows nothing at all."""
     from avtorch.experiment import Limits, library
+    from avtorch.gap.answer.diagnosis import LogFacts
 
-    limits = Limits(*given)
-    if not library(limits):
+    limits = Limits.of_log(LogFacts.of(drives), **given)
+    if any(x is not None for x in given.values()) and not library(limits):
         raise InputError(
             "--speed-min, --speed-max, --accel-min, --accel-max, --road, --seconds: found limits that no manoeuvre of "
             "the library keeps to; needs more speed, effort, road or time"
@@ -220,10 +232,10 @@ def _known(option: str, name: str, more: Sequence[str] = ()) -> str:
     from avtorch.gap import EFFECTS
 
     if name not in EFFECTS and name not in more:
-        near = get_close_matches(name, [*EFFECTS, *more], n=1) or [x for x in EFFECTS if name and name in x]
+        near = get_close_matches(name[:60], [*EFFECTS, *more], n=1) or [x for x in EFFECTS if name and name in x]
         hint = f"; perhaps {near[0]}" if near else f", such as {', '.join(sorted(EFFECTS)[:3])}"
         needs = "".join(f"{x}, " for x in more) + ("or " if more else "")
-        raise InputError(f"{option}: found {name!r}, needs {needs}an effect's name{hint}")
+        raise InputError(f"{option}: found {quoted(name)}, needs {needs}an effect's name{hint}")
     return name
 
 
@@ -232,7 +244,7 @@ def _effects(text: str | None) -> list[str] | None:
         return None
     names = [_known("--effects", part.strip()) for part in text.split(",")]
     if len(set(names)) < len(names):
-        raise InputError(f"--effects: found {text!r}, needs each name once")
+        raise InputError(f"--effects: found {quoted(text)}, needs each name once")
     return names
 
 
@@ -241,11 +253,13 @@ def _prior(given: Sequence[str]) -> dict[str, float]:
     for item in given:
         name, equals, value = (x.strip() for x in item.partition("="))
         try:
-            weight = float(value)
+            weight = numeral(value)
         except ValueError:
             weight = math.nan
         if not equals or not (math.isfinite(weight) and weight >= 0):
-            raise InputError(f"--prior: found {item!r}, needs NAME=WEIGHT with a number of 0 or more, such as none=5")
+            raise InputError(
+                f"--prior: found {quoted(item)}, needs NAME=WEIGHT with a number of 0 or more, such as none=5"
+            )
         if _known("--prior", name, CAUSES) in weights:
             raise InputError(f"--prior: found {name} twice, needs each name once")
         weights[name] = weight
@@ -254,7 +268,9 @@ def _prior(given: Sequence[str]) -> dict[str, float]:
 
 def _usable(path: Path, drive: Log, accel_kind: str) -> None:
     if not drive.usable.any():
-        raise InputError(f"{path}: has no row to use; all are driven by hand (engaged 0) or at standstill")
+        raise InputError(
+            f"{path}: has no row to use; all are driven by hand (engaged 0), within 2 s after, or at standstill"
+        )
     if accel_kind == "specific-force" and drive.accel is None:
         raise InputError(f"--accel-kind: found specific-force, but {path} has no accel")
 

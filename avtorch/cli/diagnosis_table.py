@@ -20,11 +20,15 @@ _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 
 def diagnosis_headline(found: Diagnosis) -> list[str]:
-    """The verdict as one sentence, and below it the diagnosis' own reason."""
+    """The verdict as one sentence, what is implausible of it, and below it the diagnosis' own reason."""
     from avtorch.gap.answer.words import headline
 
-    style = {"unknown": "bold yellow", "none": "bold green"}.get(found.verdict.name, "bold cyan")
-    return [f"[{style}]{escape(headline(found))}[/]", f"[dim]{escape(found.verdict.why)}[/]"]
+    odd = found.winner.implausible
+    style = (
+        "bold yellow" if odd else {"unknown": "bold yellow", "none": "bold green"}.get(found.verdict.name, "bold cyan")
+    )
+    lines = [f"[{style}]{escape(headline(found))}[/]", *(f"[yellow]{escape(line)}[/]" for line in odd)]
+    return [*lines, f"[dim]{escape(found.verdict.why)}[/]"]
 
 
 def diagnosis_table(found: Diagnosis) -> Table:
@@ -43,6 +47,7 @@ def diagnosis_table(found: Diagnosis) -> Table:
         gain = round(c.log_evidence or 0.0)
         nats = "" if c.log_evidence is None else f"{gain:+d}" if gain else "0"
         lines = [_parameter(name, c, q) for name, q in c.parameters.items()]
+        lines += ["physically implausible"] if c.implausible and c.name != "unknown" else []
         name = c.name.replace("+", " +\n")
         table.add_row(
             escape(name), f"{number(c.probability)} {bar(c.probability)}", nats, "\n".join(lines), style=style

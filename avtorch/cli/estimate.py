@@ -78,7 +78,7 @@ def estimate(
     k = three_gains("--gains", gains)
     sound = positive_pair("--accepted", accepted, "T_L,K_L", "0.3,1.0")
     not_negative("--dead-time", dead_time, "s")
-    free_folder(out)
+    free_folder(out, without="run.json")
     seed_number(seed)
     if mode != "lambda" and estimator not in ("sgld", "map"):
         raise InputError(f"--mode: has no meaning with --estimator {estimator}, which hands no prior on; leave it out")
@@ -87,6 +87,7 @@ def estimate(
     from avtorch.decision.monitor import Monitor
     from avtorch.decision.settings import Setting
     from avtorch.io import Log, check
+    from avtorch.io.clock import from_start
     from avtorch.results import estimates_answer
 
     talk = Talk(json=json, quiet=quiet)
@@ -109,8 +110,9 @@ def estimate(
         "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
     }
     write_answer(out, "estimates.json", answer, pictures)
-    talk.windows(answer["windows"])
-    talk.summary(answer, estimates_note(answer))
+    shown = answer | {key: from_start(answer[key], answer["epoch_s"]) for key in ("windows", "alerts")}
+    talk.windows(shown["windows"])
+    talk.summary(shown, estimates_note(answer))
     talk.done(out, answer)
 
 

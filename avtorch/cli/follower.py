@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.markup import escape
 from rich.table import Table
@@ -14,17 +14,12 @@ from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError
 
-if TYPE_CHECKING:
-    from avtorch.experiment import Limits
 
-
-def refuse(logs: Sequence[Path], limits: Limits, **given: object) -> None:
-    """Raise `InputError` for what has no meaning for a follower: more logs, `limits` set, an option `given`."""
+def refuse(logs: Sequence[Path], **given: object) -> None:
+    """Raise `InputError` for what has no meaning for a follower: more logs, an option `given`."""
     if len(logs) > 1:
         raise InputError(f"--follower: found {len(logs)} logs, needs one at a time")
-    usual = type(limits)()
-    track = {f.name: getattr(limits, f.name) != getattr(usual, f.name) for f in fields(limits)}
-    for option, value in (given | track).items():
+    for option, value in given.items():
         if value:
             raise InputError(f"--{option.replace('_', '-')}: has no meaning with --follower")
 
@@ -44,10 +39,10 @@ def follow(
 
     `source`: keywords of `read_following`.
     """
-    from avtorch.experiment import write_table
     from avtorch.follower import diagnose_follower
     from avtorch.follower.words import loop_lines
-    from avtorch.io import check, read_following, write_json
+    from avtorch.gap.answer.diagnosis import DIAGNOSIS_FILES
+    from avtorch.io import answer_set, check, read_following, write_json
     from avtorch.remedy import write_exports
     from avtorch.report import write_report
 
@@ -59,11 +54,11 @@ def follow(
     assert gap is not None
     gap = replace(gap, notes=(*gap.notes, *found.conditional))
     lines = loop_lines(found)
-    # what an earlier diagnosis left in the folder is not this one's
-    written = [*gap.write(out), *write_table(None, out), *write_exports(gap.plant, out)]
     answer = replace(found, diagnosis=gap).to_dict()
-    write_json(out / "diagnosis.json", answer)
-    written.append(write_report(gap, out, quality=noted, sections={"The loop": lines}))
+    with answer_set(out, DIAGNOSIS_FILES) as staged:
+        written = [*gap.write(staged), *write_exports(gap.plant, staged)]
+        write_json(staged / "diagnosis.json", answer)
+        written.append(write_report(gap, staged, quality=noted, sections={"The loop": lines}))
     if talk.json:
         talk.done(out, answer)
         return

@@ -74,7 +74,7 @@ def run(
     not_negative("--change-at", change_at, "s")
     low, high = limits_pair("--limits", limits)
     seed_number(seed)
-    free_folder(out)
+    free_folder(out, without="estimates.json")
     if controller == "mpc" and strategy == "3":
         raise InputError("--strategy: found 3 with --controller mpc, needs auto, 1, 2 or none")
     if leader is None and (vehicle is not None or event is not None):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import os
 from typing import TYPE_CHECKING
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, quoted
 
 if TYPE_CHECKING:
     from avtorch.gap import GapPlant
@@ -20,17 +20,16 @@ def read_simulator(option: str, text: str) -> GapPlant | None:
 
     if text.strip().lower() == "glvd":
         return None
-    if text.endswith(".toml") and not Path(text).is_file():
-        raise InputError(f"{option} {text!r}: no such file; needs a TOML file, or effects such as dead_time=0.2")
+    shown = f"{option} {quoted(text, 80)}"
+    if text.endswith(".toml") and not os.path.lexists(text):
+        raise InputError(f"{shown}: no such file; needs a TOML file, or effects such as dead_time=0.2")
     try:
-        simulator = plant(baseline=Path(text) if text.endswith(".toml") or Path(text).is_file() else text)
+        simulator = plant(baseline=text)
     except InputError as fault:
-        raise InputError(f"{option} {text!r}: {fault}") from None
+        raise InputError(f"{shown}: {fault}") from None
     known = simulator.parameters()
     for name, value in simulator.values().items():
         # the ends of an interval are a drive's, which is not known yet
         if known[name].constraint != "interval" and known[name].unconstrain(value).isnan().any():
-            raise InputError(
-                f"{option} {text!r}: {name} is {value.tolist():g}, needs a {known[name].constraint} number"
-            )
+            raise InputError(f"{shown}: {name} is {value.tolist():g}, needs a {known[name].constraint} number")
     return simulator

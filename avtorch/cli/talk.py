@@ -8,10 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+
+from avtorch.cli.terminal import SafeConsole
 
 
 class Talk:
@@ -19,8 +20,8 @@ class Talk:
 
     def __init__(self, *, json: bool, quiet: bool) -> None:
         self.json, self.silent = json and not quiet, quiet or json
-        self.out = Console(quiet=self.silent, highlight=False)
-        self.err = Console(stderr=True, quiet=self.silent, highlight=False)
+        self.out = SafeConsole(quiet=self.silent, highlight=False)
+        self.err = SafeConsole(stderr=True, quiet=self.silent, highlight=False)
 
     @contextmanager
     def progress(self, what: str) -> Iterator[Callable[[float, float], None]]:
@@ -142,8 +143,8 @@ class Talk:
         if self.json:
             print(json.dumps(answer, default=lambda x: x.tolist()))
             return
-        names = ", ".join(sorted(p.name for p in out.iterdir() if p.suffix in (".json", ".png")))
-        self.out.print(f"\nWritten to [bold]{out}[/bold]: {names}", soft_wrap=True)
+        names = ", ".join(sorted(p.name for p in out.iterdir() if p.suffix in (".json", ".png") and p.is_file()))
+        self.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {escape(names)}", soft_wrap=True)
 
 
 _MEASURES = {
@@ -169,12 +170,19 @@ def _yes(verdict: bool) -> str:
     return "[bold green]yes[/bold green]" if verdict else "[bold red]no[/bold red]"
 
 
-def write_answer(out: Path, name: str, answer: Mapping[str, Any], pictures: Mapping[str, Callable[[], Any]]) -> None:
-    """Write the pictures, then the answer: while `name` is missing, what lies in the folder is not whole."""
-    from avtorch.io import write_json
+def write_answer(
+    out: Path,
+    name: str,
+    answer: Mapping[str, Any],
+    pictures: Mapping[str, Callable[[], Any]],
+    *,
+    also: Sequence[str] = (),
+) -> None:
+    """Publish the answer and its pictures as one set; `also`: what an earlier answer of the kind may have written."""
+    from avtorch.io import answer_set, write_json
     from avtorch.plots import save
 
-    (out / name).unlink(missing_ok=True)
-    for file, draw in pictures.items():
-        save(draw(), out / file)
-    write_json(out / name, answer)
+    with answer_set(out, list(dict.fromkeys([name, *pictures, *also]))) as staged:
+        for file, draw in pictures.items():
+            save(draw(), staged / file)
+        write_json(staged / name, answer)

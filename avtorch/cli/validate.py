@@ -17,6 +17,9 @@ from avtorch.errors import InputError
 if TYPE_CHECKING:
     from arviz import InferenceData
 
+#: NetCDF for ArviZ.
+EXPORTS = ("sgld.nc", "nuts.nc", "quadrature.nc")
+
 #: Synthetic windows if no number is given.
 SYNTHETIC = 200
 
@@ -79,7 +82,7 @@ def validate(
     from avtorch.validation.validate import check_installed
 
     check_installed()
-    from avtorch.io import Log, check
+    from avtorch.io import Log, answer_set, check
     from avtorch.results import validation_answer
     from avtorch.validation import synthetic_windows, windows_of_log
     from avtorch.validation import validate as work
@@ -99,23 +102,25 @@ def validate(
 
     from avtorch import plots
 
-    (out / "validation.json").unlink(missing_ok=True)
-    written = export(out, found.to_arviz())
-    write_answer(out, "validation.json", answer, plots.validation_figures(found))
+    groups = found.to_arviz()
+    with answer_set(out, ("validation.json", *plots.VALIDATION_PICTURES, *EXPORTS)) as staged:
+        export(staged, groups)
+        write_answer(staged, "validation.json", answer, plots.validation_figures(found))
     talk.out.print(validation_table(answer))
     for note in validation_notes(answer):
         talk.out.print(note, style="dim", markup=False)
     told = f"\n{answer['verdict']}: {answer['why']}"
     talk.out.print(told, style="bold green" if found.verdict.agree else "bold red", markup=False)
     talk.done(out, answer)
-    talk.out.print(f"For ArviZ: {', '.join(f'{name}.nc' for name in written)}", markup=False)
+    talk.out.print(f"For ArviZ: {', '.join(f'{name}.nc' for name in groups)}", markup=False)
 
 
-def export(out: Path, groups: Mapping[str, InferenceData]) -> list[str]:
-    """Write each as NetCDF, `NAME.nc`, and remove those of an earlier run that this one has not; returns the names."""
-    out.mkdir(parents=True, exist_ok=True)
-    for name in ("sgld", "nuts", "quadrature"):
-        (out / f"{name}.nc").unlink(missing_ok=True)
-        if name in groups:
-            groups[name].to_netcdf(str(out / f"{name}.nc"))
-    return list(groups)
+def export(out: Path, groups: Mapping[str, InferenceData]) -> None:
+    """Write each as NetCDF, `NAME.nc`. Raises `InputError` where that fails."""
+    for name, group in groups.items():
+        path = out / f"{name}.nc"
+        try:
+            group.to_netcdf(str(path))
+        except (OSError, RuntimeError) as fault:  # what the libraries of NetCDF raise for a full disk
+            told = getattr(fault, "strerror", None) or str(fault)
+            raise InputError(f"{path}: cannot be written ({told})") from None

@@ -87,28 +87,33 @@ def estimate(
 
     `form`: "jerk" needs measured jerk and accel (Eq. 4); "latent" takes accel and/or speed with their noise;
     "auto" is "jerk" where the log has both. Windows lie on a grid that starts afresh with each segment of the log; the
-    last of a segment may be short. Rows at standstill or with `engaged` 0 are masked. `progress(done, of)` is called
-    with rows.
+    last of a segment may be short. Rows at standstill, with `engaged` 0 and in the 2 s after a return to `engaged` are
+    masked; nothing is filtered through them. `progress(done, of)` is called with rows.
 
     `estimator`: "sgld" samples each window's posterior, "map" takes its mode and curvature, "rls" is recursive least
     squares (measured jerk only), "ekf" and "ukf" are joint Kalman filters. Further keywords are the estimator's own
     (`mode`, `lam`, `settings`, ...; see `avtorch.inference.estimators.make_estimator`).
 
     `dead_time` [s] of the vehicle, where it is known (`avtorch.diagnose` tells it): commands act so much later, and
-    the first rows of a segment, whose commands are not in the log, are masked. The default monitor judges with it.
+    the first rows of a drive, whose commands are not in the log or were not obeyed, are masked. The default monitor
+    judges with it.
 
-    Raises `InputError` for a log without accel_cmd, a form whose columns it lacks, a window longer than the log, or an
-    estimator that is not known or cannot take the form.
+    Raises `InputError` for a log without accel_cmd or without any row that counts, a form whose columns it lacks, a
+    window longer than the log, or an estimator that is not known or cannot take the form.
     """
     if log.accel_cmd is None:
         raise InputError(f"{log.name}: has no accel_cmd; T_L and K_L need the demanded acceleration")
+    if not log.usable.any():
+        raise InputError(
+            f"{log.name}: has no row to use; all are driven by hand (engaged 0), within 2 s after, or at standstill"
+        )
     chosen = _form(log, form)
     if not window > 0:
         raise InputError(f"window: found {window:g} s, needs a number above 0")
     if window * log.rate_hz < LEAST_ROWS:
         least = LEAST_ROWS / log.rate_hz
         raise InputError(f"window: found {window:g} s, needs {least:g} s or more, {LEAST_ROWS} rows of {log.name}")
-    longest = max(float(log.time[part][-1] - log.time[part][0]) for part in log.segments())
+    longest = max(float(log.elapsed[part][-1] - log.elapsed[part][0]) for part in log.segments())
     # a window of rows spans one step less than its length
     if window > longest + 1.5 / log.rate_hz:
         raise InputError(f"window: found {window:g} s, needs at most {longest:g} s, the longest segment of {log.name}")
@@ -119,7 +124,8 @@ def estimate(
     setting = Setting() if setting is None else setting
     if setting.shape != (1,):
         raise InputError(f"setting: found shape {tuple(setting.shape)}, needs one, (1,), for one log")
-    options = {"estimator": estimator, "seed": seed, **inference}
+    # the log's units were checked as a whole when it was read
+    options = {"estimator": estimator, "seed": seed, "check_units": False, **inference}
     watch = Watch(BeliefStream(window=window, form=chosen, gap=float("inf"), **options), monitor)
     command, known = _delayed(log, dead_time)
     usable = torch.from_numpy(log.usable & known)
@@ -129,7 +135,7 @@ def estimate(
     begun = clock.perf_counter()
     last, ahead = -torch.inf, 0.0
     for part in log.segments():
-        time = torch.from_numpy(log.time[part])
+        time = torch.from_numpy(log.elapsed[part])
         # a segment's clock may start anew, the stream's must go on
         if float(time[0]) + ahead <= last:
             ahead = last + window - float(time[0])
@@ -144,7 +150,7 @@ def estimate(
             if progress is not None:
                 progress(part.start + min(first + 1000, len(time)), log.rows)
         seen += watch.flush(setting)
-        windows += [_on_the_logs_clock(w, ahead) for w in seen]
+        windows += [_on_the_logs_clock(w, ahead + float(log.elapsed[part.start] - log.time[part.start])) for w in seen]
     seconds = (clock.perf_counter() - begun) / max(len(windows), 1)
     name = "jerk" if isinstance(chosen, JerkForm) else "latent"
     T, K = (float(x[0]) for x in watch.monitor.accepted)
@@ -152,7 +158,7 @@ def estimate(
 
 
 def _delayed(log: Log, dead_time: float) -> tuple[Array, Array]:
-    """The command that acts in each row's interval, (time,) [m/s²], and whether the log holds it.
+    """The command that acts in each row's interval, (time,) [m/s²], and whether the log holds it and it was obeyed.
 
     A command is held from its row to the next; where the switch falls inside an interval, its mean acts.
     """
@@ -161,8 +167,8 @@ def _delayed(log: Log, dead_time: float) -> tuple[Array, Array]:
     if dead_time == 0.0:
         return command, known
     out = command.copy()
-    for part in log.segments():
-        time, u = log.time[part], command[part]
+    for part in log.drives():
+        time, u = log.elapsed[part], command[part]
         step = np.diff(time, append=2 * time[-1] - time[-2] if len(time) > 1 else time[-1] + 1.0)
         edges = np.append(time, time[-1] + step[-1])
         sent = np.concatenate([[0.0], np.cumsum(u * step)])

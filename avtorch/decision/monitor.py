@@ -28,6 +28,7 @@ from avtorch.decision.charts import CHARTS, Chart
 from avtorch.decision.divergence import DIVERGENCES, Gaussian, divergence, divergence_p_value, innovation
 from avtorch.decision.settings import Setting
 from avtorch.errors import InputError
+from avtorch.inference.state import shaped_as
 
 DETECTORS = ("stability", "accepted_change", *DIVERGENCES, *CHARTS)
 """All detectors, in order of precedence."""
@@ -240,9 +241,12 @@ class Monitor:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume to the bit. Raises `InputError` where the state is of other charts or scenarios."""
-        if set(state["charts"]) != set(self._charts) or state["has_baseline"].shape != (self.scenarios,):
-            raise InputError("state: of a monitor with other charts or another number of scenarios")
+        """Resume to the bit.
+
+        Raises `InputError`, and stays as it was, where the state is of other charts or scenarios, or has other shapes
+        or types than a monitor saves, or numbers that are not finite.
+        """
+        shaped_as(self.state_dict(), state, "state: monitor")
         self.accepted = (state["accepted"][0].clone(), state["accepted"][1].clone())
         self._mean = (state["mean"][0].clone(), state["mean"][1].clone())
         self._baseline = Gaussian(*(t.clone() for t in state["baseline"]))

@@ -42,10 +42,12 @@ class Watch:
         setting: Setting,
         *,
         usable: Tensor | None = None,
+        engaged: Tensor | None = None,
         until: float | None = None,
     ) -> list[WatchedWindow]:
         """Rows in, watched windows out; arguments as `BeliefStream.feed`, `setting` is in force over these rows."""
-        return [self._watch(w, setting) for w in self.stream.feed(time, columns, usable=usable, until=until)]
+        windows = self.stream.feed(time, columns, usable=usable, engaged=engaged, until=until)
+        return [self._watch(w, setting) for w in windows]
 
     def flush(self, setting: Setting) -> list[WatchedWindow]:
         """Close the open window early (the drive ends or a gap follows)."""
@@ -62,6 +64,13 @@ class Watch:
         return {"stream": self.stream.state_dict(), "monitor": self.monitor.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from `state_dict`; raises `InputError` where it is another watch's."""
+        """Go on from `state_dict`; raises `InputError` where it is another watch's, and then stays as it was."""
+        if not isinstance(state, dict) or set(state) != {"stream", "monitor"}:
+            raise InputError("state: is not a watch's; needs stream and monitor")
+        before = self.stream.state_dict()
         self.stream.load_state_dict(state["stream"])
-        self.monitor.load_state_dict(state["monitor"])
+        try:
+            self.monitor.load_state_dict(state["monitor"])
+        except InputError:
+            self.stream.load_state_dict(before)
+            raise

@@ -24,6 +24,10 @@ _BEFORE_S, _AFTER_S = 3.0, 2.0
 _SPEEDS = (0.2, 0.5, 0.8)  # of the span between slowest and fastest
 _SHORTEST_HOLD_S = 1.5
 _GAIN_MPS = 4.0  # by one push of a pedal
+# where speeds span little [m/s]: commands [m/s²] and what a push gains [m/s], as shares of that span, that leave room
+_PARTS_PER_S = 1 / 6
+_SWEPT_PER_S = 0.06  # of a sweep that begins at 0.05 Hz
+_PUSH = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +90,10 @@ def library(limits: Limits | None = None, *, rate_hz: float = 20.0) -> tuple[Man
 def _all(limits: Limits, rate_hz: float) -> Iterator[Manoeuvre]:
     low = max(limits.speed_min, 0.5)
     span, push, brake = limits.speed_max - low, limits.accel_max, -limits.accel_min
-    both = min(push, brake)
+    both = min(push, brake, _PARTS_PER_S * span)
+    gain, swept = min(_GAIN_MPS, _PUSH * span), min(0.5 * both, _SWEPT_PER_S * span)
+    step = min(1.0, _PUSH * span)
+    digits = 0 if span >= 10 else 1
     time = np.arange(math.floor(limits.seconds * rate_hz + 1e-9) + 1) / rate_hz
     whole = float(time[-1]) - _BEFORE_S - _AFTER_S
 
@@ -97,15 +104,15 @@ def _all(limits: Limits, rate_hz: float) -> Iterator[Manoeuvre]:
 
     for share in _SPEEDS:
         v = low + share * span
-        at = f"at {v:.0f} m/s"
+        at = f"at {v:.{digits}f} m/s"
         for size in (0.25 * both, both):
             for hold in (2.0, 5.0):
                 name = f"steps of {size:.2g} m/s² held {hold:g} s {at}"
                 yield from made(name, v, lambda t, a=size, h=hold: _steps(t, a, h), 4 * hold)
-        period = 3 * _GAIN_MPS * (1 / push + 1 / brake) + 2.0
+        period = 3 * gain * (1 / push + 1 / brake) + 2.0
         name = f"pedals to {push:.2g} and {-brake:.2g} m/s² {at}"
-        yield from made(name, v, lambda t: _pedals(t, push, brake), period)
-        yield from made(f"sweep of {0.5 * both:.2g} m/s², 0.05 to 2 Hz, {at}", v, lambda t: _sweep(t, 0.5 * both))
+        yield from made(name, v, lambda t: _pedals(t, push, brake, gain), period)
+        yield from made(f"sweep of {swept:.2g} m/s², 0.05 to 2 Hz, {at}", v, lambda t: _sweep(t, swept))
         yield from made(f"small reversals {at}", v, lambda t: _reversals(t, whole), 6.0)
         for slope in (0.4, 1.5):
             name = f"ramps of {slope:g} m/s³ {at}"
@@ -113,14 +120,14 @@ def _all(limits: Limits, rate_hz: float) -> Iterator[Manoeuvre]:
     for size in (0.3 * both, 0.7 * both):
         for top in (0.5, 0.75, 0.98):
             v = low + top * span
-            each = (v - low - 1) / 3 / size
+            each = (v - low - step) / 3 / size
             rest = whole / 6 - each
             if rest >= _SHORTEST_HOLD_S:
-                name = f"holds at speeds from {low + 1:.0f} to {v:.0f} m/s, {size:.2g} m/s² between"
-                yield from made(name, low + 1, lambda t, a=size, e=each, r=rest: _holds(t, a, e, r))
+                name = f"holds at speeds from {low + step:.{digits}f} to {v:.{digits}f} m/s, {size:.2g} m/s² between"
+                yield from made(name, low + step, lambda t, a=size, e=each, r=rest: _holds(t, a, e, r))
     for size in (0.5 * both, both):
         name = f"slow and go, {size:.2g} m/s²"
-        yield from made(name, low + 0.5, lambda t, a=size: _slow_and_go(t, a), 2 * _GAIN_MPS * 2 / size + 5.0)
+        yield from made(name, low + 0.5 * step, lambda t, a=size: _slow_and_go(t, a, gain), 2 * gain * 2 / size + 5.0)
 
 
 def _made(name: str, time: Float, start: float, pattern: Pattern, lasts: float) -> Manoeuvre:
@@ -138,9 +145,9 @@ def _steps(t: Float, size: float, hold: float) -> Float:
     return size * np.array([1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0, 0.0])[(t / hold + 1e-9).astype(int) % 8]
 
 
-def _pedals(t: Float, push: float, brake: float) -> Float:
+def _pedals(t: Float, push: float, brake: float, gain: float) -> Float:
     """The whole of one pedal after the whole of the other, then half of each, as long as gives back the speed."""
-    on, off = _GAIN_MPS / push, _GAIN_MPS / brake
+    on, off = gain / push, gain / brake
     ends = np.cumsum([on, off, 1.0, 2 * off, 2 * on, 1.0])
     levels = np.array([push, -brake, 0.0, -0.5 * brake, 0.5 * push, 0.0])
     return levels[_stage(t, ends)]
@@ -167,9 +174,9 @@ def _holds(t: Float, size: float, each: float, rest: float) -> Float:
     return np.array([size, 0.0] * 3 + [-size, 0.0] * 3)[_stage(t, np.cumsum([each, rest] * 6))]
 
 
-def _slow_and_go(t: Float, size: float) -> Float:
+def _slow_and_go(t: Float, size: float, gain: float) -> Float:
     """From walking pace up and back, and some seconds of rolling."""
-    each = 2 * _GAIN_MPS / size
+    each = 2 * gain / size
     return np.array([size, 0.0, -size, 0.0])[_stage(t, np.cumsum([each, 1.0, each, 4.0]))]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,12 @@ from avtorch.experiment.limits import Limits
 from avtorch.experiment.manoeuvres import Manoeuvre, library
 from avtorch.gap.answer.contender import Contender
 from avtorch.gap.answer.diagnosis import Diagnosis
+from avtorch.gap.likelihood.record import grouped
 from avtorch.io import atomic
 
 _RATE_HZ = 20.0
 _DRAWS = 32
+_TURNS = 3  # of trimming what a manoeuvre changes the speed by
 _SURE = 12.0
 """Log odds [nats] of the worst pair that are enough: more than a real car's differing from every model can cost."""
 _FAINT = 0.1  # of what there is to learn
@@ -31,7 +33,8 @@ class Experiment:
     """Drive `manoeuvre` next: it `separates` those causes.
 
     `information`: what is to be expected of it; `entropy` [nats]: how much is unknown of the cause. `every`: the same
-    of all manoeuvres within the limits. `untold`: what no manoeuvre tells apart with these signals. `why`: a sentence.
+    of all manoeuvres within the `limits`. `untold`: what no manoeuvre tells apart with these signals.
+    `why`: a sentence.
     """
 
     manoeuvre: Manoeuvre
@@ -41,6 +44,7 @@ class Experiment:
     every: Mapping[str, Information] = field(repr=False)
     untold: tuple[str, ...] = ()
     why: str = ""
+    limits: Limits = field(default_factory=Limits)
 
     def to_dict(self) -> dict[str, Any]:
         """The object `next_experiment` of `diagnosis.json`."""
@@ -54,6 +58,7 @@ class Experiment:
             "metres": self.manoeuvre.metres,
             "start_speed_mps": float(self.manoeuvre.speed[0]),
             "untold": list(self.untold),
+            "limits": asdict(self.limits),
             "why": self.why,
         }
 
@@ -61,18 +66,18 @@ class Experiment:
 def next_experiment(found: Diagnosis, limits: Limits | None = None, *, seed: int = 0) -> Experiment | None:
     """The manoeuvre out of the library that tells the diagnosis' `contenders` apart; None where nothing is confused.
 
-    Start it at its first expected speed, on a level road if there is one. Raises `InputError` where the limits allow
-    no manoeuvre at all.
+    Start it at its first expected speed, on a level road if there is one. `limits` default to what the car did in the
+    log (`Limits.of_log`). Raises `InputError` where the limits allow no manoeuvre at all.
     """
     rivals = list(found.contenders)
     if len(rivals) < 2:
         return None
     witnesses = tuple(name for name in ("accel", "speed") if name in found.log.signals)
-    group = max(1, int(found.log.rate_hz / _RATE_HZ + 1e-6))
-    given = Limits() if limits is None else limits
+    group = grouped(found.log.rate_hz, _RATE_HZ)
+    given = Limits.of_log(found.log) if limits is None else limits
     offers = _expected(rivals[0], library(given, rate_hz=found.log.rate_hz / group), given)
     if not offers:
-        raise InputError("limits: no manoeuvre of the library keeps to them; needs more speed, road or time")
+        raise InputError(f"limits: no manoeuvre of the library keeps to {given}; needs more speed, road or time")
     weights = np.array([max(found.probability(r.name), 1e-3) for r in rivals])
     weights = weights / weights.sum()
     entropy = float(-(weights * np.log(weights)).sum())
@@ -89,6 +94,7 @@ def next_experiment(found: Diagnosis, limits: Limits | None = None, *, seed: int
         every={m.name: i for m, i in zip(offers, judged, strict=True)},
         untold=untold,
         why=_sentence(offers[best], names, judged[best], entropy, untold, witnesses),
+        limits=given,
     )
 
 
@@ -113,15 +119,18 @@ def write_table(experiment: Experiment | None, folder: str | PathLike[str]) -> l
 def _expected(first: Contender, manoeuvres: tuple[Manoeuvre, ...], limits: Limits) -> list[Manoeuvre]:
     """With the speeds that the likeliest cause foretells, trimmed so that they come back; those within the limits."""
     offers = list(manoeuvres)
-    for last in (False, True):
+    K_L = float(np.mean(first.belief["K_L"]))
+    for turn in range(_TURNS + 1):
         if not offers:
             return []
         speeds = responses(first, offers, slice(None)).speed.mean(1).numpy()
-        K_L = float(np.mean(first.belief["K_L"]))
-        if last:
-            offers = [m.expecting(m.speed[0] + v - v[0]) for m, v in zip(offers, speeds, strict=True)]
-        else:
+        speeds = [m.speed[0] + v - v[0] for m, v in zip(offers, speeds, strict=True)]
+        if turn < _TURNS:
+            # what depends on speed is asked of the speed that will be driven once the change is made up for
+            level = [v - (v[-1] - v[0]) * np.linspace(0.0, 1.0, len(v)) for v in speeds]
             offers = [m.trimmed(-float(v[-1] - v[0]) / K_L) for m, v in zip(offers, speeds, strict=True)]
+            speeds = level
+        offers = [m.expecting(v) for m, v in zip(offers, speeds, strict=True)]
     return [m for m in offers if m.within(limits)]
 
 

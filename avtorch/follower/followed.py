@@ -22,7 +22,7 @@ from avtorch.gap.chain.drive import Drive
 from avtorch.gap.chain.plant import GapPlant, plant
 from avtorch.gap.effects import DeadTime
 from avtorch.gap.likelihood.candidate import Candidate, Coordinate
-from avtorch.gap.likelihood.record import Record, rolled
+from avtorch.gap.likelihood.record import Record
 from avtorch.io import Log
 
 Float = NDArray[np.float64]
@@ -83,7 +83,7 @@ def followed(log: Log, law: Law, *, dead_time: bool = True) -> Followed:
             raise InputError(f"{log.name}: has no {name}, which a follower needs (with {', '.join(NEEDED)})")
     record = Record.of(replace(log, accel=None, accel_cmd=np.zeros(log.rows)))
     whole = seen_in(log)
-    rows = list(rolled(log, record.group))
+    rows = [cut.rows for cut in record.cuts]
     seen = tuple(Seen(*(x[part] for x in whole)) for part in rows)
     kinds = (DeadTime,) if dead_time else ()
     return Followed(record, kinds, plant([]), law=law, seen=seen, begins=tuple(part.start for part in rows))

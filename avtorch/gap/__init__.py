@@ -1,6 +1,7 @@
 """What the simulator lacks: effects along the chain command, actuator, body, sensor, and plants made of them."""
 
 from avtorch.gap import effects
+from avtorch.gap.chain.domain import Domain
 from avtorch.gap.chain.drive import Drive, Response
 from avtorch.gap.chain.effect import EFFECTS, PLACES, Effect, NoiseChange, Row, effect_class, register
 from avtorch.gap.chain.parameter import Parameter
@@ -42,6 +43,7 @@ __all__ = [
     "ConstantResistance",
     "DeadBand",
     "DeadTime",
+    "Domain",
     "Drive",
     "DrivelineOscillation",
     "Effect",

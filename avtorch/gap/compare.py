@@ -5,6 +5,8 @@ told by blocks of the drives, each of which pulls at the estimate its own way (t
 than the posterior has it. So what the model lacks, and the manoeuvre brings out more or less, counts as spread and not
 as a change.
 
+Where they differ, a later answer of the car is tried as a rival account (`delay_rival`): it looks like a longer lag.
+
 The simulator: rollout errors over both sets, and their ratio over blocks drawn anew.
 """
 
@@ -20,12 +22,13 @@ from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 from avtorch.errors import InputError
-from avtorch.gap.answer.comparison import Comparison, Moved, Telling
+from avtorch.gap.answer.comparison import Comparison, LaterAnswer, Moved, Telling
 from avtorch.gap.answer.diagnosis import LogFacts
 from avtorch.gap.answer.quantity import Quantity
 from avtorch.gap.chain.plant import GapPlant, plant
+from avtorch.gap.delay_rival import WithDelay, later_answer
 from avtorch.gap.heldout.parts import blocks_of
-from avtorch.gap.heldout.rollout_errors import USUAL, Measure, products
+from avtorch.gap.heldout.rollout_errors import HORIZON_S, Measure, products, reached
 from avtorch.gap.likelihood.fit import directions
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.search.found import Found
@@ -86,9 +89,11 @@ def compare(
     }
     simulators = [p if b is not None else _as_fitted(one.found) for p, b in zip(plants, given, strict=True)]
     same = all(x is y or _alike(x, y) for x, y in zip(*sides, strict=False)) and len(sides[0]) == len(sides[1])
-    gap = _gaps(fitted, simulators, same=same)
+    horizon = _horizon(fitted)
+    gap = _gaps(fitted, simulators, horizon, same=same)
     telling = _telling(gap)
     changed = p_value < level
+    later = later_answer(*(WithDelay.of(x.search, x.found) for x in fitted), level=level) if changed else None
     return Comparison(
         before=LogFacts.of(sides[0]),
         after=LogFacts.of(sides[1]),
@@ -97,7 +102,9 @@ def compare(
         p_value=p_value,
         changed=changed,
         simulator=telling,
-        why=_sentence(car, p_value, changed, telling, same=same),
+        why=_sentence(car, p_value, telling, later, same=same),
+        later=later,
+        horizon_s=horizon,
     )
 
 
@@ -105,6 +112,7 @@ def compare(
 class _Side:
     """One set of drives: `mean` and `covariance` of ln T_L and ln K_L, from so many `blocks`."""
 
+    search: Search = field(repr=False)
     found: Found
     mean: Float
     covariance: Float = field(repr=False)
@@ -112,11 +120,12 @@ class _Side:
 
     @classmethod
     def of(cls, logs: Sequence[Log], base: GapPlant, which: str) -> _Side:
-        found = Search(logs, base, effects=[], pairs=False).run().none
+        search = Search(logs, base, effects=[], pairs=False)
+        found = search.run().none
         record = found.candidate.record
         blocks = blocks_of(record)
         if len(blocks) < _LEAST:
-            raise InputError(f"{which}: {len(blocks)} blocks of 10 s of usable driving, needs {_LEAST} or more")
+            raise InputError(f"{which}: found {len(blocks)} blocks of 10 s of usable driving, needs {_LEAST} or more")
         columns = directions(found.candidate, found.white, found.z).reshape(len(found.z), -1)
         # how each parameter moves the errors: less of the rollout
         pulls = -columns * found.white(found.errors).ravel()
@@ -133,7 +142,7 @@ class _Side:
         step = 1e-4
         each = found.candidate.values(found.z + step * np.eye(len(found.z)))
         slope = np.stack([(np.log(each[name].numpy()) - here[i]) / step for i, name in enumerate(_CAR)])
-        return cls(found, here, slope @ spread @ slope.T, len(blocks))
+        return cls(search, found, here, slope @ spread @ slope.T, len(blocks))
 
 
 def _as_fitted(found: Found) -> GapPlant:
@@ -147,7 +156,13 @@ def _alike(one: Log, two: Log) -> bool:
     return all(a is b if a is None or b is None else np.array_equal(a, b) for a, b in signals)
 
 
-def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], *, same: bool) -> dict[str, Moved]:
+def _horizon(sides: Sequence[_Side]) -> float:
+    """The longest rollouts [s], up to `HORIZON_S`, that the stretches of either side hold: errors grow with it."""
+    records = [side.found.candidate.record for side in sides]
+    return min(reached(Measure(r.witnesses[0], HORIZON_S), r) or HORIZON_S for r in records)
+
+
+def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float, *, same: bool) -> dict[str, Moved]:
     """Blocks are drawn alike for both sides where these are the `same` drives."""
     drawn = []
     for i, (side, simulator) in enumerate(zip(sides, simulators, strict=True)):
@@ -155,7 +170,7 @@ def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], *, same: bool)
         record = side.found.candidate.record
         errors = record.measured - _rolled(record, simulator)
         blocks = blocks_of(record)
-        squares = _squares(record, errors, blocks, float(simulator.T_L))
+        squares = _squares(record, errors, blocks, float(simulator.T_L), horizon)
         rows = np.array([(b.stop - b.start) * record.group for b in blocks], float)
         weights = rng.multinomial(len(blocks), np.full(len(blocks), 1 / len(blocks)), size=_DRAWS)
         weights = np.concatenate([np.ones((1, len(blocks))), weights])
@@ -167,16 +182,20 @@ def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], *, same: bool)
 
 
 def _rolled(record: Record, simulator: GapPlant) -> Float:
-    responses = [simulator.prepared(drive).response(drive) for drive in record.drives]
+    responses = []
+    for drives in record.segments:
+        own = simulator.prepared(*drives)
+        responses += [own.response(drive) for drive in drives]
     seen = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
     return np.stack([record.seen(seen[name]) for name in record.witnesses])
 
 
-def _squares(record: Record, errors: Float, blocks: Sequence[slice], lag: float) -> dict[str, Float]:
+def _squares(record: Record, errors: Float, blocks: Sequence[slice], lag: float, horizon: float) -> dict[str, Float]:
+    """Under the names of the whole `HORIZON_S`, whatever of it the drives hold."""
     out = {}
     for witness in record.witnesses:
-        measure = Measure(witness, USUAL[witness])
-        out[measure.name] = products(measure, record, errors[None], blocks, lag)[:, 0, 0]
+        squares = products(Measure(witness, horizon), record, errors[None], blocks, lag)
+        out[Measure(witness, HORIZON_S).name] = squares[:, 0, 0]
     return out
 
 
@@ -200,7 +219,9 @@ def _telling(gap: Mapping[str, Moved]) -> Telling:
     return "closer" if closer else "farther"
 
 
-def _sentence(car: Mapping[str, Moved], p_value: float, changed: bool, telling: Telling, *, same: bool) -> str:
+def _sentence(
+    car: Mapping[str, Moved], p_value: float, telling: Telling, later: LaterAnswer | None, *, same: bool
+) -> str:
     if same:
         of_two = {"closer": "The second simulator is closer", "farther": "The second simulator is farther from it"}
         return f"One drive, two simulators. {of_two.get(telling, 'Neither simulator is measurably closer to it')}."
@@ -208,10 +229,29 @@ def _sentence(car: Mapping[str, Moved], p_value: float, changed: bool, telling: 
     for name, unit in (("T_L", " s"), ("K_L", "")):
         m = car[name]
         parts.append(f"{name} {m.before.mean:.2f} to {m.after.mean:.2f}{unit}")
-    first = "The car has changed" if changed else "No change of the car shows"
+    first = _account(", ".join(parts), f"p = {p_value:.2g}", later)
     words = {
         "closer": "the drives after are closer to the simulator",
         "farther": "the drives after are farther from the simulator",
         "no telling": "how close the simulator is has not changed measurably",
     }
-    return f"{first}: {', '.join(parts)} (p = {p_value:.2g}); {words[telling]}."
+    return f"{first}; {words[telling]}."
+
+
+def _account(numbers: str, chance: str, later: LaterAnswer | None) -> str:
+    """What is said of the car: the numbers of lag and gain explain the change only where a delay does not."""
+    if later is None:
+        return f"No change of the car shows: {numbers} ({chance})"
+    delays = " to ".join(f"{max(q.mean, 0.0):.2f}" for q in (later.before, later.after))
+    if later.account == "lag and gain":
+        more = f"a later answer alone does not explain it (p = {later.p_dead_time:.2g})"
+        return f"The car has changed: {numbers} ({chance}); {more}"
+    if later.account == "cannot be told":
+        return (
+            f"The car has changed ({chance}), but these drives do not tell lag and gain ({numbers}) from a later "
+            f"answer (dead time {delays} s, p = {later.p_dead_time:.2g})"
+        )
+    return (
+        f"The car has changed ({chance}), but lag and gain do not explain it (p = {later.p_lag_gain:.2g}): where a "
+        f"dead time is fitted as well, it goes from {delays} s, and without one they would be {numbers}"
+    )

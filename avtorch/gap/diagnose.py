@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from os import PathLike
-from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from avtorch.errors import InputError
+from avtorch.gap.answer import delays, words
 from avtorch.gap.answer import posterior as posteriors
 from avtorch.gap.answer.aliases import Told
 from avtorch.gap.answer.contender import contenders
 from avtorch.gap.answer.diagnosis import Diagnosis, LogFacts
-from avtorch.gap.answer.misfit import gap_facts
 from avtorch.gap.answer.odds import favourite, probabilities
+from avtorch.gap.answer.plausible import implausible
 from avtorch.gap.answer.posterior import Draws
 from avtorch.gap.answer.remainder import Remainder, remainder
 from avtorch.gap.answer.remaining import remaining
@@ -24,11 +26,12 @@ from avtorch.gap.answer.verdict import Candidate, verdict_of
 from avtorch.gap.chain.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.chain.plant import GapPlant, plant
 from avtorch.gap.heldout.held_out import held_out
+from avtorch.gap.heldout.misfit import gap_facts
 from avtorch.gap.heldout.shown import Shown
 from avtorch.gap.heldout.shrink import shrinkage
 from avtorch.gap.heldout.where import where
 from avtorch.gap.likelihood.as_read import as_read
-from avtorch.gap.search.checkpoint import Checkpoint
+from avtorch.gap.likelihood.record import Record
 from avtorch.gap.search.found import Found, Race
 from avtorch.gap.search.search import Search
 from avtorch.io import Log
@@ -46,19 +49,21 @@ def diagnose(
     budget_s: float | None = None,
     seed: int = 0,
     progress: Callable[[str, int, int], None] | None = None,
-    checkpoint: Path | None = None,
+    checkpoint: str | PathLike[str] | None = None,
 ) -> Diagnosis:
     """Name the effect, or the two, that `baseline` lacks on these drives of one car.
 
     Args: `baseline`: the user's simulator (default: bare GLVD); its effects keep their values, `T_L` and `K_L` are
     fitted. `prior`: weights over causes, see `odds.probabilities`. `effects`: candidates, by name or class (default:
     all registered). `pairs`: also try two at once. `posterior` of the verdict's parameters: by SGLD, or Laplace's
-    approximation. `budget_s`: after so many seconds no new candidate is begun, and `complete` is False.
+    approximation. `budget_s`: after so many seconds no new candidate is begun, `complete` is False and the verdict
+    provisional: `scope` has what was tried, and only from that is the verdict told apart.
     `accel_kind`: whether `accel` is dv/dt or an accelerometer's reading (default: as the logs say).
     `progress(what, done, of)` is told of each step. `checkpoint`: a file in which fits are kept, and from which a
-    search of the same logs and settings goes on.
+    search of the same logs and settings goes on, to the same answer.
 
-    Raises `InputError` for a log without `accel_cmd`, without 10 s of usable driving, or for wrong arguments.
+    Raises `InputError` for a log without `accel_cmd`, without 10 s of usable driving, for wrong arguments, or for a
+    `checkpoint` that is damaged or of other logs or settings.
     """
     each = [logs] if isinstance(logs, Log) else list(logs)
     if accel_kind is not None:
@@ -72,24 +77,39 @@ def diagnose(
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
     race = Search(
-        each, base, effects=kinds, pairs=pairs, budget_s=budget_s, progress=progress, checkpoint=Checkpoint(checkpoint)
+        each, base, effects=kinds, pairs=pairs, budget_s=budget_s, progress=progress, checkpoint=checkpoint
     ).run()
     top = favourite(race.found)
     apart = Told.of(race, kinds, prior)
     chances = apart.shared(probabilities(race.found, _left(top, race), prior))
-    candidates = [_told(f, race, chances[f.name]) for f in race.found]
-    candidates.append(Candidate("unknown", chances["unknown"], None, {}, {}, None))
+    untold = delays.untold(race.found)
+    chances = delays.shared(chances, untold)
+    candidates = [_told(f, race, chances[f.name], kinds) for f in race.found]
+    # of what is unknown there is no model but the bare baseline
+    bare = implausible({}, moved(race.none))
+    candidates.append(Candidate("unknown", chances["unknown"], None, {}, {}, None, bare))
     candidates += apart.mirrored(candidates, chances)
-    verdict = verdict_of(candidates, aliases=apart.alias_set)
+    known = "known effect" if race.complete and race.scope.whole else "effect tried"
+    verdict = verdict_of(
+        candidates,
+        aliases=lambda c: delays.joined(apart.alias_set(c), untold),
+        why=delays.why(chances, untold),
+        known=known,
+    )
     winner = next((f for f in race.found if f.name == verdict.name), None)
     draws = None
-    if winner is not None and winner.candidate.size and winner.name != "none" and posterior == "sgld":
+    one_mode = winner is not None and (winner.delays is None or len(winner.delays.lengths) == 1)
+    if winner is not None and winner.candidate.size and winner.name != "none" and posterior == "sgld" and one_mode:
         draws = _draws(winner, seed)
-        told = _told(winner, race, chances[winner.name], draws)
+        told = _told(winner, race, chances[winner.name], kinds, draws)
         candidates = [told if c.name == winner.name else c for c in candidates]
     noted = tuple(noise_added)
     if not race.complete:
-        noted += ("The budget ended the search before all candidates were tried.",)
+        noted += ("The budget ended the search before all candidates were tried: the verdict is provisional.",)
+    noted += tuple(words.untried(race.scope))
+    noted += tuple(delays.notes(race.found, verdict))
+    if posterior == "sgld" and not one_mode and winner is not None:
+        noted += ("The parameters' posterior is by laplace: it has several modes, between which no chain would walk.",)
     if draws is not None and draws.method != "sgld":
         noted += (f"The parameters' posterior is by {draws.method}: {draws.why}.",)
     if apart.note is not None:
@@ -106,18 +126,23 @@ def diagnose(
         gap=gap_facts(race, top, detected=chances["none"] < 0.5, p_value=shown.p_value),
         candidates=tuple(candidates),
         verdict=verdict,
-        onset_s=onset,
+        onset_s=None if onset is None else onset.stamp_s,
+        onset_from_start_s=None if onset is None else onset.from_start_s,
+        onset_log=0 if onset is None else onset.log,
         plant=repaired(winner, base, draws) if named and winner is not None else None,
         simulator=repaired(race.none, base),
         belief=belief(winner if named and winner is not None else race.none, draws if named else None),
         assumed=belief(race.none),
         draws=drawn(winner, draws) if draws is not None and winner is not None else None,
-        where=() if verdict.name == "none" else where(shown, onset_s=onset, lag=race.none.values["T_L"]),
+        where=()
+        if verdict.name == "none"
+        else where(shown, onset_s=None if onset is None else onset.from_start_s, lag=race.none.values["T_L"]),
         shrinkage=shrinkage(held) if held is not None and named else None,
         contenders=contenders(race, verdict),
         traces=_traces(race, winner, shown),
         remaining=remaining(candidates, verdict, base),
         complete=race.complete,
+        scope=race.scope,
         notes=noted,
     )
 
@@ -125,7 +150,7 @@ def diagnose(
 def _left(top: Found, race: Race) -> Remainder:
     """What the favourite leaves over, less what lost messages explain row by row."""
     measured = race.record.measured
-    explained = top.losses.evidence if top.losses else 0.0
+    explained = (top.losses.evidence if top.losses else 0.0) + (top.by_chance.explained if top.by_chance else 0.0)
     return remainder(top.white, top.errors, measured - top.errors, explained=explained)
 
 
@@ -149,24 +174,50 @@ def _draws(found: Found, seed: int) -> Draws:
     return posteriors.posterior(found, seed=seed)
 
 
-def _told(found: Found, race: Race, probability: float, draws: Draws | None = None) -> Candidate:
+def _told(
+    found: Found, race: Race, probability: float, kinds: Sequence[type[Effect]], draws: Draws | None = None
+) -> Candidate:
     """A candidate as the answer lists it; parameters only where they bear on anything."""
     gain = float(found.log_evidence - race.none.log_evidence)
-    if found.name == "none" or probability < 1e-4:
+    if found.name == "none":
+        return Candidate("none", probability, gain, {}, {}, None, implausible({}, moved(found)))
+    if probability < 1e-4:
         return Candidate(found.name, probability, gain, {}, {}, None)
-    return Candidate(
-        found.name, probability, gain, reported(found, draws), moved(found, draws), _onset(found, race)
-    )  # fmt: skip
+    parameters, base = reported(found, draws), moved(found, draws)
+    own = [kind for kind in kinds if kind.name in found.name.split("+")]
+    odd = implausible(parameters, base, own)
+    onset = _onset(found, race)
+    began = None if onset is None else onset.stamp_s
+    return Candidate(found.name, probability, gain, parameters, base, began, odd)
 
 
-def _onset(found: Found | None, race: Race) -> float | None:
-    """On the log's own time axis [s]; of a change of gain the moment of the change."""
+@dataclass(frozen=True)
+class _Onset:
+    """A moment of log number `log`: `stamp_s` on its own clock, `from_start_s` from its first row [s]."""
+
+    stamp_s: float
+    from_start_s: float
+    log: int
+
+    @classmethod
+    def at(cls, record: Record, row: int, time: float | None = None) -> _Onset:
+        """Of a counted `row`, or at `time` [s from the start], which lies near it."""
+        place = record.source[row]
+        start = float(record.time[place]) if time is None else time
+        stamp = float(record.stamp[place]) if time is None else start + float(record.stamp[place] - record.time[place])
+        return cls(stamp, start, int(record.log[place]))
+
+
+def _onset(found: Found | None, race: Race) -> _Onset | None:
+    """Of a change of gain the moment of the change."""
     if found is None:
         return None
     if found.name == "gain_change":
-        return float(found.values["gain_change.change_s"])
+        change = float(found.values["gain_change.change_s"])
+        row = int(np.abs(race.record.time[race.record.source] - change).argmin())
+        return _Onset.at(race.record, row, change)
     if found.name == "outliers" and found.tails is not None and found.tails.onset is not None:
-        return float(race.raw.time[race.raw.source[found.tails.onset]])
+        return _Onset.at(race.raw, found.tails.onset)
     if found.name == "command_hold" and found.losses is not None and found.losses.onset is not None:
-        return float(race.raw.time[race.raw.source[found.losses.onset]])
-    return None if found.began is None else float(race.record.time[race.record.source[found.began]])
+        return _Onset.at(race.raw, found.losses.onset)
+    return None if found.began is None else _Onset.at(race.record, found.began)

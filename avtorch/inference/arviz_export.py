@@ -29,8 +29,9 @@ def to_arviz(posterior: Posterior, *, window: int | None = None) -> InferenceDat
     """The draws as ``arviz.InferenceData``: one variable a parameter, with its unit in ``attrs["units"]``.
 
     Dimensions are ``(chain, draw, window)``, or ``(chain, draw)`` if one ``window`` is asked for. Which windows
-    converged is in the group's ``attrs["converged"]``, as 0 or 1. ArviZ 1.x has ``xarray.DataTree`` in place of
-    ``InferenceData``: ``DataTree.from_dict({"posterior": to_arviz(p).posterior})`` carries over.
+    converged is in the group's ``attrs["converged"]``, as 0 or 1, beside the ``pareto_k`` of each. ArviZ 1.x has
+    ``xarray.DataTree`` in place of ``InferenceData``: ``DataTree.from_dict({"posterior": to_arviz(p).posterior})``
+    carries over.
 
     Raises:
         InputError: for a window that the posterior does not have.
@@ -53,6 +54,7 @@ def to_arviz(posterior: Posterior, *, window: int | None = None) -> InferenceDat
         for name in posterior.names
     }
     flags = posterior.converged[kept].int().reshape(-1).tolist()
-    attributes = {"converged": flags, "inference_library": "avtorch"}
+    k = posterior.pareto_k[kept].reshape(-1).tolist()
+    attributes = {"converged": flags, "pareto_k": k, "inference_library": "avtorch"}
     data = xarray.Dataset(variables, coords={dim: range(size) for dim, size in sizes.items()}, attrs=attributes)
     return arviz.InferenceData(posterior=data)

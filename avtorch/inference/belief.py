@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from avtorch.errors import InputError
 from avtorch.inference.posterior import sorted_quantile
 from avtorch.inference.priors import Prior
+from avtorch.inference.state import shaped_as
 
 Z90 = 1.6448536269514722
 """The standard normal's 95 % quantile: 90 % lie within this many SDs."""
@@ -50,7 +52,7 @@ class Belief:
         draws: ``(draw, vehicle, parameter)``.
         excited: ``(vehicle,)`` bool; where false the window was not used and the rest is carried over unchanged.
         converged: ``(vehicle,)`` bool; false where the window was excited but its chains did not settle: carried over,
-            too.
+            too. In the latent form it says only that the chains agree (see `Posterior`).
     """
 
     names: tuple[str, ...]
@@ -88,11 +90,22 @@ class Belief:
         keys = ("mean", "sd", "q05", "q95", "draws", "excited", "converged")
         return {"names": list(self.names), **{key: getattr(self, key) for key in keys}}
 
-    @classmethod
-    def from_state(cls, state: dict[str, Any]) -> Belief:
-        """The inverse of :meth:`state_dict`; what else the state holds is left."""
-        keys = ("mean", "sd", "q05", "q95", "draws", "excited", "converged")
-        return cls(tuple(state["names"]), **{key: state[key].clone() for key in keys})
+    def taken_from(self, state: dict[str, Any]) -> Belief:
+        """The inverse of :meth:`state_dict`, for the same parameters, vehicles and draws; what else is there is left.
+
+        Raises:
+            InputError: for other shapes or types, or numbers that no belief has.
+        """
+        own = self.state_dict()
+        shaped_as(own, {key: state[key] for key in own if key in state}, "state")
+        if state["names"] != own["names"]:
+            raise InputError(f"state: found the parameters {state['names']}, needs {own['names']}")
+        read = {key: state[key].clone() for key in own if key != "names"}
+        if any(bool((read[key] < 0).any()) for key in ("mean", "sd", "q05", "q95", "draws")):
+            raise InputError("state: holds a parameter or a standard deviation below 0")
+        if bool((read["q05"] > read["q95"]).any()):
+            raise InputError("state: q05: lies above q95")
+        return Belief(self.names, **read)
 
     @classmethod
     def of_prior(cls, names: tuple[str, ...], prior: Prior, kept: int, vehicles: int, g: torch.Generator) -> Belief:

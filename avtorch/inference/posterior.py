@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from avtorch.inference.exactness import Exactness
+
 
 @dataclass(frozen=True)
 class Posterior:
@@ -15,14 +17,17 @@ class Posterior:
     Attributes:
         names: parameter names, in the order of the last dimension.
         draws: shape ``(chain, draw, window, parameter)``, in the parameters' own units.
-        converged: ``(window,)`` bool; false where the chains left the posterior or disagree: draws not to be used.
+        converged: ``(window,)`` bool; false where the draws are not shown to follow the density: not to be used. Where
+            nobody compared (``exactness`` is None, as in the latent form) it says only that the chains agree.
         why: a reason for every window that did not converge, ``""`` for the others; empty if nobody said.
+        exactness: moments of the draws against those of the exact density, or None where nobody compared them.
     """
 
     names: tuple[str, ...]
     draws: Tensor
     converged: Tensor
     why: tuple[str, ...] = ()
+    exactness: Exactness | None = None
 
     def __getitem__(self, name: str) -> Tensor:
         """Draws of one parameter, shape ``(chain, draw, window)``."""
@@ -42,6 +47,29 @@ class Posterior:
     def sd(self) -> Tensor:
         """Posterior standard deviations, ``(window, parameter)``."""
         return self.flat.std(0)
+
+    @property
+    def rhat(self) -> Tensor:
+        """Nested R-hat (:func:`nested_rhat`), ``(window, parameter)``."""
+        return nested_rhat(self.draws)
+
+    @property
+    def ess_bulk(self) -> Tensor:
+        """Effective draws behind the bulk, from their ranks, ``(window, parameter)``."""
+        return effective(normal_scores(self.draws))
+
+    @property
+    def ess_tail(self) -> Tensor:
+        """Effective draws behind the 5 % or the 95 % quantile, whichever are fewer, ``(window, parameter)``."""
+        below = (effective((self.draws <= self.quantile(q)).to(self.draws)) for q in (0.05, 0.95))
+        return torch.minimum(*below)
+
+    @property
+    def pareto_k(self) -> Tensor:
+        """Shape of the tail of ``density / normal fit`` over the fit, ``(window,)``; NaN where it was not computed."""
+        if self.exactness is None:
+            return self.draws.new_full((self.draws.shape[2],), torch.nan)
+        return self.exactness.pareto_k
 
     def quantile(self, q: float) -> Tensor:
         """Posterior quantiles, ``(window, parameter)``."""
@@ -82,3 +110,22 @@ def nested_rhat(draws: Tensor, groups: int = 8) -> Tensor:
     within = (torch.cat(squares) - mean.square()).mean(0)
     between = mean.var(0)
     return (1 + between / within.clamp_min(torch.finfo(draws.dtype).tiny)).sqrt()
+
+
+def normal_scores(draws: Tensor) -> Tensor:
+    """Each number's normal quantile by its rank among all chains' and draws', shape of ``draws``; ties as they come."""
+    flat = draws.flatten(0, 1)
+    rank = flat.argsort(0).argsort(0) + 1
+    return torch.special.ndtri((rank - 0.375) / (len(flat) + 0.25)).unflatten(0, draws.shape[:2])
+
+
+def effective(values: Tensor) -> Tensor:
+    """How many independent values ``(chain, draw, ...)`` would know the mean as well; returns the remaining shape.
+
+    By the means of independent chains, each cut into pieces where there are fewer than sixteen: short chains say little
+    about their own autocorrelation. NaN where all values are alike, as nothing can be known then.
+    """
+    chains, draws = values.shape[:2]
+    pieces = max(1, min(draws // 2, -(-16 // chains)))
+    means = values[:, : draws // pieces * pieces].unflatten(1, (pieces, -1)).mean(2).flatten(0, 1)
+    return values.flatten(0, 1).var(0) * len(means) / means.var(0)

@@ -13,6 +13,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from avtorch.errors import InputError
 from avtorch.inference.density import Density, ScoredDensity, SelectableDensity, SubsampledDensity, constrained
+from avtorch.inference.exactness import Exactness, compare
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.planes import empty_planes
 from avtorch.inference.posterior import Posterior, nested_rhat
@@ -55,9 +56,12 @@ class SamplerSettings:
         schedule: makes a learning-rate scheduler from the optimizer, or ``None`` for a constant step.
         longest: how many times as many steps a skewed window gets at most; a low value saves time where a step is dear,
             and leaves the most skewed windows short of mixing.
-        attempts: how often a window whose chains diverge or disagree is run again with half the step.
+        attempts: how often a window whose chains diverge, disagree or miss the density is run again with half the step.
         whitening: ``"full"``, or for comparison ``"diagonal"`` or ``"none"`` (see :class:`Coordinates`).
         optimizer: makes another optimizer than SGLD from ``(parameters, step, generator)``.
+        compare: hold the draws against the exact density (:mod:`avtorch.inference.exactness`), whatever made them: a
+            minibatch, a schedule, another optimizer. Without, ``converged`` says no more than that chains agree with
+            each other; for a density too dear to evaluate at some hundred points.
     """
 
     chains: int = 1024
@@ -73,6 +77,7 @@ class SamplerSettings:
     attempts: int = 4
     whitening: Whitening = "full"
     optimizer: MakeOptimizer | None = None
+    compare: bool = True
 
     def __post_init__(self) -> None:
         for name, least in (("chains", 1), ("draws", 4), ("burn_in", 0), ("thinning", 1), ("attempts", 1)):
@@ -109,9 +114,10 @@ def sample(
 ) -> Posterior:
     """Draws from the posterior of every window (Algorithm 1).
 
-    A window whose chains leave the finite numbers or the posterior, or end with a nested R-hat above ``rhat_max``, is
-    sampled again, with half the step and, up to ``longest``, twice the steps; one that never settles comes back with
-    ``converged`` false and the reason in ``why``.
+    A window whose chains leave the finite numbers or the posterior, end with a nested R-hat above ``rhat_max``, or do
+    not follow the exact density in mean, SD and tails (:mod:`avtorch.inference.exactness`), is sampled again, with half
+    the step and, up to ``longest``, twice the steps; one that never settles, or of which this cannot be shown, comes
+    back with ``converged`` false and the reason in ``why``.
 
     Args:
         density: the target.
@@ -123,11 +129,12 @@ def sample(
     # all draws of a parameter of a window behind one another, as its summaries read them
     draws = torch.empty(*mode.z.shape, settings.chains, settings.draws, dtype=mode.z.dtype).permute(2, 3, 0, 1)
     strayed, apart, stuck = (torch.zeros_like(mode.converged) for _ in range(3))
+    found = Exactness.unknown(*mode.z.shape)
     # chains that agree still differ by chance: eight groups cut into halves of this many draws each
     members = max(1, settings.chains // 8) * (settings.draws // 2)
     limit = (rhat_max**2 + 4 / members) ** 0.5
     open_ = torch.arange(density.windows)
-    for _ in range(settings.attempts):
+    for attempt in range(settings.attempts):
         for index in _batches(density, open_, pace, settings.chains):
             part, where = _select(density, index), mode.select(index)
             times = float(_longer(pace[index]).amax())
@@ -137,15 +144,24 @@ def sample(
             strayed[new] = _strayed(part, where, coordinates, w)[fresh]
             apart[new] = ~(nested_rhat(w).amax(-1) <= limit)[fresh]  # NaN is trouble, too
             stuck[new] = (pace[new] > STUCK) | _too_wide(where, settings, pace[index], times)[fresh]
-            values = constrained(density, coordinates.z(w))
+            z = coordinates.z(w)
+            values = constrained(density, z)
             draws[:, :, new] = values if len(new) == len(index) else values[:, :, fresh]
+            if settings.compare:
+                found = found.put(index, compare(part, z), fresh)
         pace = 2 * pace
-        open_ = (strayed | apart).nonzero().squeeze(-1)
+        again = strayed | apart
+        if settings.compare:
+            # a second walk may reach what the first did not; where it changed nothing, half its step will not either
+            again |= ~found.holds() if attempt == 0 else ~(found.holds() | found.hopeless())
+        open_ = again.nonzero().squeeze(-1)
         if not len(open_):
             break
-    flags = zip(mode.converged.tolist(), strayed.tolist(), apart.tolist(), stuck.tolist(), strict=True)
+    off = found.why(density.names) if settings.compare else [""] * density.windows
+    flags = zip(mode.converged.tolist(), strayed.tolist(), apart.tolist(), stuck.tolist(), off, strict=True)
     why = tuple(_why(*flag) for flag in flags)
-    return Posterior(density.names, draws, torch.tensor([not reason for reason in why]), why)
+    settled = torch.tensor([not reason for reason in why])
+    return Posterior(density.names, draws, settled, why, found if settings.compare else None)
 
 
 def _adapted(
@@ -173,14 +189,14 @@ def _adapted(
     return fitted, fitted_pace
 
 
-def _why(mode_found: bool, strayed: bool, apart: bool, stuck: bool) -> str:
+def _why(mode_found: bool, strayed: bool, apart: bool, stuck: bool, off: str) -> str:
     if not mode_found:
         return "the search for the posterior's mode did not end at a maximum"
     if stuck:
         return "the posterior is so uneven that the longest walk would not cross it"
     if strayed:
         return "chains left the posterior, also with the shortest step tried"
-    return "chains disagree, also with the shortest step tried" if apart else ""
+    return "chains disagree, also with the shortest step tried" if apart else off
 
 
 def _too_wide(mode: Mode, settings: SamplerSettings, pace: Tensor, times: float) -> Tensor:

@@ -23,6 +23,7 @@ from avtorch.inference.priors import (
     default_jerk_noise_prior,
 )
 from avtorch.inference.sampler import SamplerSettings, sample
+from avtorch.inference.state import about, generator_of, shaped_as
 
 Mode = Literal["lambda", "posterior", "forgetting"]
 
@@ -142,15 +143,20 @@ class SequentialInference:
         """Go on from :meth:`state_dict`.
 
         Raises:
-            InputError: if it was saved by a loop of another mode or other parameters.
+            InputError: if it was saved by a loop of another mode or other parameters, or has other shapes, types or
+                numbers than a loop saves; it then stays as it was.
         """
-        saved = (state["mode"], tuple(state["names"]), len(state["mean"]))
-        own = (self.mode, self.belief.names, len(self.belief.mean))
+        saved = about(state, "mode")
+        own = about(self.state_dict(), "mode")
         if saved != own:
             raise InputError(f"state: (mode, names, vehicles) were {saved} when it was saved, here they are {own}")
-        self.belief = Belief.from_state(state)
+        shaped_as(self.state_dict(), state, "state")
+        belief, generator = self.belief.taken_from(state), generator_of(state["generator"], "state.generator")
+        if bool((state["cov_z"].diagonal(dim1=-2, dim2=-1) < 0).any()):
+            raise InputError("state: cov_z: holds a variance below 0")
+        self.belief = belief
         self._started, self._mean_z, self._cov_z = (state[key].clone() for key in ("started", "mean_z", "cov_z"))
-        self.generator.set_state(state["generator"])
+        self.generator.set_state(generator.get_state())
 
 
 def _thin(draws: Tensor, count: int) -> Tensor:

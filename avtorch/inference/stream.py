@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,6 +16,12 @@ from avtorch.errors import InputError
 from avtorch.inference.belief import Belief
 from avtorch.inference.estimators.choose import make_estimator
 from avtorch.inference.evidence import Form, JerkForm
+from avtorch.inference.stream_state import check_clock, read_state, with_checksum, without_checksum, write_state
+from avtorch.inference.stream_units import StreamUnits
+from avtorch.io.clock import ROUNDING_S, decimals
+from avtorch.io.engagement import settled
+
+_LONGEST_S = 1e6  # rows this far from the first are still told apart as finely as it is
 
 
 @dataclass(frozen=True)
@@ -21,7 +29,7 @@ class Window:
     """One window of every vehicle, and what is believed after it.
 
     Attributes:
-        start_s, end_s: its bounds on the log's own clock [s]; a row belongs to it if ``start_s <= time < end_s``.
+        start_s, end_s: its bounds on the clock of the rows [s]; a row belongs to it if ``start_s <= time < end_s``.
         n: usable rows, ``(vehicle,)``.
         belief: see :class:`Belief`; the window was used where ``belief.excited`` and
             ``belief.converged`` hold.
@@ -42,6 +50,8 @@ class BeliefStream:
         window: length [s].
         form: which density; :class:`JerkForm` by default.
         gap: a step between rows longer than this [s] ends the window early; the next starts with the next row.
+        check_units: refuse rows whose columns contradict each other in unit or sign
+            (:mod:`avtorch.inference.stream_units`); false where they are known to be right.
         estimator: a name of :data:`~avtorch.inference.estimators.ESTIMATORS`.
         **inference: the estimator's options, for ``"sgld"`` those of
             :class:`~avtorch.inference.sequential.SequentialInference` (``mode``, ``lam``, ``settings``, ``seed`` ...).
@@ -57,6 +67,7 @@ class BeliefStream:
         form: Form | None = None,
         gap: float = 0.5,
         vehicles: int = 1,
+        check_units: bool = True,
         estimator: str = "sgld",
         **inference: Any,
     ) -> None:
@@ -68,35 +79,61 @@ class BeliefStream:
         self.form: Form = JerkForm() if form is None else form
         self.estimator = estimator
         self.inference = make_estimator(estimator, self.form, vehicles=vehicles, **inference)
+        self._units = StreamUnits(self.form.columns, vehicles) if check_units else None
         self._rows: dict[str, Tensor] = self._empty()
         self._origin: float | None = None  # start of the first window since the last gap
         self._index = 0  # windows closed since then
         self._last: float | None = None  # time of the last row
+        self._driven: list[float | None] = [None] * vehicles  # when a driver was last in charge
+        self._epoch: float | None = None  # the first row's time; the others are counted from it
 
     def feed(
-        self, time: Tensor, columns: Mapping[str, Tensor], *, usable: Tensor | None = None, until: float | None = None
+        self,
+        time: Tensor,
+        columns: Mapping[str, Tensor],
+        *,
+        usable: Tensor | None = None,
+        engaged: Tensor | None = None,
+        until: float | None = None,
     ) -> list[Window]:
         """Take in rows; return the windows they complete.
 
         Args:
             time: ``(time,)`` [s], increasing, after every row fed before.
             columns: the form's columns, each ``(vehicle, time)`` or ``(time,)``; others are left out.
-            usable: ``(vehicle, time)`` bool; false masks a row (a driver overrides, standstill).
+            usable: ``(vehicle, time)`` bool; false masks a row (standstill).
+            engaged: ``(vehicle, time)`` bool, or 0 and 1; false masks a row in which a driver is in charge, and those
+                of the :data:`~avtorch.io.engagement.SETTLE_S` after it, in which the car's state is not known.
             until: the clock, if it is known to be ahead of the last row: a window that ends by then is closed.
 
         Raises:
-            InputError: for time that does not increase, a column that is missing or of another shape, or a usable row
-                that is not finite. Nothing of the block is then taken in.
+            InputError: for time that does not increase, a column that is missing or of another shape, a usable row that
+                is not finite, or ``engaged`` other than 0 and 1. Nothing of the block is then taken in. Also where the
+                last 10 to 40 s prove that a column has another unit or sign: then the belief is moreover what it was
+                before them.
         """
+        time = torch.atleast_1d(torch.as_tensor(time, dtype=torch.float64))
+        epoch = self._epoch
+        if epoch is None and time.ndim == 1 and len(time) and bool(time[0].isfinite()):
+            epoch = float(time[0])
+        usable, driven = self._since_driven(self._since(time, epoch), usable, engaged)
         block = self._checked(time, columns, usable)
-        time = block["time"]
+        time = block["time"] = self._since(time, epoch)
         before = torch.empty(0) if self._last is None else torch.tensor([self._last], dtype=torch.float64)
         steps = torch.cat([before, time]).diff()
         if bool((steps <= 0).any()):
             late = int((steps <= 0).nonzero()[0, 0]) + len(time) - len(steps)
-            raise InputError(f"time: does not increase at {float(time[late]):g} s")
-        if len(time) and self._origin is not None and float(time[0]) < self._end() - self.window - 1e-6:
-            raise InputError(f"time: a row at {float(time[0]):g} s, but the window it belongs to is closed already")
+            raise InputError(f"time: does not increase at {_moment(float(time[late]), epoch)}")
+        if len(time) and self._origin is not None and float(time[0]) < self._end() - self.window - ROUNDING_S:
+            at = _moment(float(time[0]), epoch)
+            raise InputError(f"time: a row at {at}, but the window it belongs to is closed already")
+        with self._whole_or_nothing():
+            self._driven, self._epoch = driven, epoch
+            return self._take(block, steps, until)
+
+    def _take(self, block: dict[str, Tensor], steps: Tensor, until: float | None) -> list[Window]:
+        """Rows that are in order, split where ``steps`` between them are gaps."""
+        time = block["time"]
         windows: list[Window] = []
         pieces = [*((steps > self.gap).nonzero().squeeze(-1) + (len(time) - len(steps))).tolist(), len(time)]
         first = 0
@@ -104,15 +141,61 @@ class BeliefStream:
             if last > first:
                 windows += self._append({name: value[..., first:last] for name, value in block.items()})
             if last < len(time):
-                windows += self.flush()
+                windows += self._flush()
             first = last
-        return windows + (self._close_until(until) if until is not None else [])
+        if until is None or self._epoch is None:
+            return windows
+        clock = self._since(torch.tensor([until], dtype=torch.float64), self._epoch)
+        return windows + self._close_until(float(clock[0]))
+
+    @contextmanager
+    def _whole_or_nothing(self) -> Iterator[None]:
+        """Rows that prove a unit wrong leave the stream as it was before them, and the belief before their stretch."""
+        before = self._rows, self._origin, self._index, self._last, self._driven, self._epoch
+        try:
+            yield
+        except InputError:
+            self._rows, self._origin, self._index, self._last, self._driven, self._epoch = before
+            if self._units is not None and self._units.before is not None:
+                self.inference.load_state_dict(self._units.before)
+                self._units.clear()
+            raise
 
     def flush(self) -> list[Window]:
-        """Close the open window early, if it has any rows, and start afresh with the next row."""
+        """Close the open window early, if it has any rows, and start afresh with the next row.
+
+        Raises:
+            InputError: as :meth:`feed` for units and signs.
+        """
+        with self._whole_or_nothing():
+            return self._flush()
+
+    def _flush(self) -> list[Window]:
         windows = [self._close(early=True)] if len(self._rows["time"]) else []
         self._origin, self._index = None, 0
         return windows
+
+    def _since_driven(
+        self, time: Tensor, usable: Tensor | None, engaged: Tensor | None
+    ) -> tuple[Tensor | None, list[float | None]]:
+        """What of ``usable`` is left, and when a driver was last in charge of each vehicle."""
+        if engaged is None and not any(x is not None for x in self._driven):
+            return usable, self._driven
+        if time.ndim != 1:
+            return usable, self._driven  # which is refused in a moment
+        shape = (self.vehicles, len(time))
+        own = torch.ones(shape) if engaged is None else torch.atleast_2d(torch.as_tensor(engaged))
+        if own.shape not in (shape, (1, shape[1])):
+            raise InputError(f"engaged: of shape {tuple(own.shape)}, needs {shape} (vehicle, time) or ({shape[1]},)")
+        on = own.bool().expand(shape)
+        odd = (own != 0) & (own != 1)
+        if bool(odd.any()):
+            raise InputError(f"engaged: found {float(own[odd][0]):g}, needs 0 (driver) or 1 (engaged)")
+        before = np.array([-np.inf if x is None else x for x in self._driven])
+        rests, last = settled(time.numpy(), on.numpy(), before)
+        counts = on & torch.from_numpy(rests)
+        driven = [float(x) if np.isfinite(x) else None for x in last]
+        return counts if usable is None else counts & torch.as_tensor(usable, dtype=torch.bool), driven
 
     def _checked(self, time: Tensor, columns: Mapping[str, Tensor], usable: Tensor | None) -> dict[str, Tensor]:
         """The block as ``(time,)`` times and ``(vehicle, time)`` columns, or an InputError."""
@@ -136,7 +219,9 @@ class BeliefStream:
             # a masked row may hold anything
             bad = block["usable"] & ~block[name].isfinite()
             if bool(bad.any()):
-                raise InputError(f"{name}: not finite at {float(time[bad.any(0)][0]):g} s, in a row that is not masked")
+                raise InputError(
+                    f"{name}: not finite at {float(time[bad.any(0)][0]):.15g} s, in a row that is not masked"
+                )
         return block
 
     def _append(self, block: dict[str, Tensor]) -> list[Window]:
@@ -148,7 +233,7 @@ class BeliefStream:
         first = 0
         while first < len(time):
             # with the first row of the next window this one is known to be complete
-            last = min(int((time < self._end() - 1e-6).sum()) + 1, len(time))
+            last = min(int((time < self._end() - ROUNDING_S).sum()) + 1, len(time))
             self._rows = {name: torch.cat([self._rows[name], block[name][..., first:last]], -1) for name in block}
             self._last = float(time[last - 1])
             windows += self._close_until(self._last)
@@ -158,7 +243,7 @@ class BeliefStream:
     def _close_until(self, clock: float) -> list[Window]:
         windows = []
         # round-off in a clock that counts 0.01 s must not push a row over a window's end
-        while self._origin is not None and clock >= self._end() - 1e-6:
+        while self._origin is not None and clock >= self._end() - ROUNDING_S:
             windows.append(self._close())
         return windows
 
@@ -168,7 +253,7 @@ class BeliefStream:
 
     def _close(self, *, early: bool = False) -> Window:
         start, end = self._end() - self.window, self._end()
-        count = int((self._rows["time"] < end - 1e-6).sum())
+        count = int((self._rows["time"] < end - ROUNDING_S).sum())
         rows = {name: value[..., :count] for name, value in self._rows.items()}
         self._rows = {name: value[..., count:].clone() for name, value in self._rows.items()}
         steps = rows["time"].diff()
@@ -176,10 +261,20 @@ class BeliefStream:
         if early:
             # what lies behind the last row's own step belongs to no window
             end = min(end, float(rows["time"][-1]) + (self.window / full))
+        if self._units is not None:
+            self._units.take(rows, self.inference.state_dict())
         evidence = self.form.evidence(rows, full)
         belief = self.inference.take(rows, evidence)
         self._index += 1
-        return Window(start, end, evidence.n, belief)
+        clock = 0.0 if self._epoch is None else self._epoch
+        return Window(start + clock, end + clock, evidence.n, belief)
+
+    @staticmethod
+    def _since(time: Tensor, epoch: float | None) -> Tensor:
+        """Seconds from `epoch`, the same for a row whatever block it comes in: near 1.7e9 a float64 is 2.4e-7 s off."""
+        if epoch is None:
+            return time
+        return torch.from_numpy(np.round(time.numpy() - epoch, decimals(abs(epoch) + _LONGEST_S)))
 
     def _empty(self) -> dict[str, Tensor]:
         rows = {name: torch.empty(self.vehicles, 0, dtype=torch.float64) for name in self.form.columns}
@@ -187,32 +282,72 @@ class BeliefStream:
         return {"time": torch.empty(0, dtype=torch.float64), "usable": usable, **rows}
 
     def state_dict(self) -> dict[str, Any]:
-        """The open window's rows and the belief: all that a resumed stream needs to go on equal to the bit."""
+        """The open window's rows and the belief: all that a resumed stream needs to go on equal to the bit.
+
+        Under ``sha256`` it carries its own checksum.
+        """
         clock = {"origin": self._origin, "index": self._index, "last": self._last, "window": self.window}
-        own = {"estimator": self.estimator, "inference": self.inference.state_dict()}
-        return {"rows": dict(self._rows), **clock, **own}
+        clock["driven"] = list(self._driven)
+        clock["epoch"] = self._epoch
+        own = {"estimator": self.estimator, "form": type(self.form).__name__, "vehicles": self.vehicles}
+        own["units"] = None if self._units is None else self._units.state_dict()
+        return with_checksum({"rows": dict(self._rows), **clock, **own, "inference": self.inference.state_dict()})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state_dict`.
+        """Go on from :meth:`state_dict`. Where it is refused, the stream stays as it was.
 
         Raises:
-            InputError: if it was saved by a stream of another window length, form or estimator.
+            InputError: if it was saved by a stream of another window length, form, estimator or number of vehicles, or
+                was changed since: by its checksum, shapes, types, numbers that are not finite, times out of order.
         """
-        # states older than the choice of an estimator are SGLD's
-        if state.get("estimator", "sgld") != self.estimator:
-            raise InputError(f"state: saved by the estimator {state['estimator']!r}, not {self.estimator!r}")
-        if state["window"] != self.window:
-            raise InputError(f"state: saved with a window of {state['window']} s, not {self.window} s")
-        if set(state["rows"]) != set(self._rows):
-            raise InputError(f"state: saved with the columns {sorted(state['rows'])}, not {sorted(self._rows)}")
-        self.inference.load_state_dict(state["inference"])
+        state = without_checksum(state)
+        own = {"estimator": self.estimator, "form": type(self.form).__name__, "window": self.window}
+        for name, value in {**own, "vehicles": self.vehicles}.items():
+            if type(state.get(name)) is not type(value) or state[name] != value:
+                said = "by the estimator" if name == "estimator" else f"with {name}"
+                raise InputError(f"state: saved {said} {str(state.get(name))[:40]!r}, not {value!r}")
+        if set(state) != {"rows", "epoch", "origin", "index", "last", "driven", "inference", "vehicles", "units", *own}:
+            raise InputError(f"state: holds {', '.join(sorted(map(str, state)))[:200]}, not what a stream saves")
+        check_clock(state, columns=self._rows, vehicles=self.vehicles)
+        stretch = StreamUnits(self.form.columns, self.vehicles)
+        if state["units"] is not None:
+            stretch.load_state_dict(state["units"])
+        present = self.inference.state_dict()
+        try:
+            if stretch.before is not None:  # only to see that it could be gone back to
+                self.inference.load_state_dict(stretch.before)
+            self.inference.load_state_dict(state["inference"])
+        except InputError:
+            self.inference.load_state_dict(present)
+            raise
+        if self._units is not None:
+            self._units = stretch
         self._rows = {name: value.clone() for name, value in state["rows"].items()}
         self._origin, self._index, self._last = state["origin"], state["index"], state["last"]
+        self._driven = list(state["driven"])
+        self._epoch = state["epoch"]
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write :meth:`state_dict` to a file."""
-        torch.save(self.state_dict(), path)
+        """Write :meth:`state_dict` to a file, with a checksum, so that it is whole or as it was before.
+
+        Raises:
+            InputError: where the place cannot be written, or is a symlink, a folder or a device.
+        """
+        write_state(path, self.state_dict())
 
     def load(self, path: str | PathLike[str]) -> None:
-        """Read what :meth:`save` wrote; only tensors and plain values are read, no code is run."""
-        self.load_state_dict(torch.load(path, weights_only=True))
+        """Read what :meth:`save` wrote; only tensors and plain values are read, no code is run.
+
+        Raises:
+            InputError: that names the file, for anything else; the stream then stays as it was.
+        """
+        state = read_state(path)
+        try:
+            self.load_state_dict(state)
+        except InputError as fault:
+            raise InputError(f"{path}: {fault}") from None
+
+
+def _moment(time: float, epoch: float | None) -> str:
+    """A row's time [s] for people: from the first row on, unless the clock itself counts from there."""
+    return f"{time:g} s" if not epoch else f"{time:g} s from the first row ({epoch + time:.15g} s)"

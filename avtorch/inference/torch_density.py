@@ -70,13 +70,15 @@ class TorchDensity:
         return torch.stack([t(x) for t, x in zip(self._maps, z.unbind(-1), strict=True)], -1)
 
     def log_prob(self, z: Tensor) -> Tensor:
-        """Log density of ``z`` ``(..., 1, parameter)``, Jacobian counted; returns ``(..., 1)``."""
-        free = z.unbind(-1)
+        """Log density of ``z`` ``(..., 1, parameter)``, Jacobian counted; returns ``(..., 1)``, NaN where ``z`` is."""
+        # torch's distributions raise at the first NaN: one chain that diverges must not end the others
+        lost = z.isnan().any(-1)
+        free = torch.where(lost[..., None], torch.zeros((), dtype=z.dtype), z).unbind(-1)
         values = [t(x) for t, x in zip(self._maps, free, strict=True)]
         log_density = self.log_density(dict(zip(self.names, values, strict=True)))
         for t, x, y in zip(self._maps, free, values, strict=True):
             log_density = log_density + t.log_abs_det_jacobian(x, y)
-        return log_density
+        return torch.where(lost, torch.nan, log_density)
 
     def initial(self) -> Tensor:
         """``(1, parameter)``."""

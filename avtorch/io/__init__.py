@@ -1,24 +1,36 @@
 """Logs and their checks, recorded leaders, answers for machines."""
 
+from avtorch.io.answer_set import answer_set
 from avtorch.io.answers import write_json
 from avtorch.io.atomic import atomic
+from avtorch.io.fingerprint import fingerprint
+from avtorch.io.folder_lock import sole_use
 from avtorch.io.following import read_following
 from avtorch.io.log import STANDSTILL_MPS, Log
 from avtorch.io.merge import held
 from avtorch.io.quality import Gap, Quality, check
 from avtorch.io.raw_leader import RawLeader
 from avtorch.io.recordings import read_leader
+from avtorch.io.sealed import Damaged, Sealed, read_sealed, read_sealed_bytes, write_sealed
 
 __all__ = [
     "STANDSTILL_MPS",
+    "Damaged",
     "Gap",
     "Log",
     "Quality",
     "RawLeader",
+    "Sealed",
+    "answer_set",
     "atomic",
     "check",
+    "fingerprint",
     "held",
     "read_following",
     "read_leader",
+    "read_sealed",
+    "read_sealed_bytes",
+    "sole_use",
     "write_json",
+    "write_sealed",
 ]

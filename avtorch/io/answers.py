@@ -5,23 +5,39 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 from collections.abc import Mapping
 from typing import Any
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, printable
 from avtorch.io.atomic import atomic
+
+_NOT_PLAIN = re.compile(r"[^ -~\n]")
 
 
 def write_json(path: str | os.PathLike[str], obj: Any) -> None:
     """Write ``obj`` as indented UTF-8 JSON, atomically.
 
     Takes dicts with string keys, lists, tuples, strings, numbers, booleans and None, and whatever has ``tolist`` (NumPy
-    arrays and scalars, tensors). Raises InputError, naming the key, for NaN, infinity or a foreign type; nothing is
-    written then, and an earlier file stays.
+    arrays and scalars, tensors). Control characters and others that cannot be seen are escaped. Raises InputError,
+    naming the key, for NaN, infinity or a foreign type; nothing is written then, and an earlier file stays.
     """
-    text = json.dumps(_plain(obj, "$"), indent=1, ensure_ascii=False, allow_nan=False)
+    text = json_text(obj)
     with atomic(path) as stream:
         stream.write(text + "\n")
+
+
+def json_text(obj: Any, *, indent: int | None = 1, ascii_only: bool = False) -> str:
+    """``obj`` as strict JSON; takes and refuses what :func:`write_json` does."""
+    text = json.dumps(_plain(obj, "$"), indent=indent, ensure_ascii=ascii_only, allow_nan=False)
+    # what no screen shows can only be in a string, where JSON has an escape for it
+    return _NOT_PLAIN.sub(lambda found: _seen(found[0]), text)
+
+
+def _seen(c: str) -> str:
+    if printable(c) == c:
+        return c
+    return f"\\u{ord(c):04x}" if ord(c) < 0x10000 else json.dumps(c)[1:-1]
 
 
 def _plain(x: Any, where: str) -> Any:

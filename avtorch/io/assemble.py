@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, listed, printable, quoted
+from avtorch.io.clock import clock_words, since, since_start
 from avtorch.io.mapping import SIGNALS, SignalMap
 from avtorch.io.merge import held
 from avtorch.io.segments import gap_limit, median_step
@@ -19,6 +20,8 @@ from avtorch.io.units import to_si
 from avtorch.io.validity import check_range, check_rate, check_time
 
 Float = NDArray[np.float64]
+
+_NAME = 40  # characters of the longest column name that may be a signal's, mistyped
 
 
 @dataclass(frozen=True)
@@ -63,15 +66,20 @@ def assemble(table: Table, mapping: SignalMap, *, folder: Path, following: bool)
     drive = signals.get("segment", np.zeros(len(time)))
     clock = mapping.column.get("time", "time")
     check_time(time, np.diff(drive) == 0, _place(table, "time", clock))
-    time_step = median_step(time, np.diff(drive) == 0)
+    # gaps are not known yet: drives by the log's own column, whose numbers may be of any size
+    elapsed = since_start(time, np.concatenate([[0], np.cumsum(np.diff(drive) != 0)]))
+    time_step = median_step(elapsed, np.diff(drive) == 0)
     check_rate(time_step, f"{source}: column {clock!r}")
 
     remarks: list[str] = []
     keep = np.ones(len(time), bool)
     for signal, (stamps, values) in arrivals.items():
-        signals[signal], age = held(time, stamps, values)
+        largest = max(float(np.abs(x).max()) for x in (time, stamps))
+        origin = float(time[0])
+        ticks, sent = (since(x, origin, largest=largest) for x in (time, stamps))
+        signals[signal], age = held(ticks, sent, values)
         # a value that is long overdue is no longer what the car does: those rows make a gap. States only tell changes.
-        limit = gap_limit(float(np.median(np.diff(stamps)))) if len(stamps) > 1 else np.inf
+        limit = gap_limit(float(np.median(np.diff(sent)))) if len(sent) > 1 else np.inf
         limit = np.inf if signal in ("engaged", "segment") else limit + time_step / 2
         stale = (age > limit) | np.isinf(age)
         if stale.any():
@@ -81,17 +89,16 @@ def assemble(table: Table, mapping: SignalMap, *, folder: Path, following: bool)
     if keep.sum() < 2:
         raise InputError(
             f"{source}: the signals with time stamps of their own ({', '.join(arrivals)}) share {int(keep.sum())} rows "
-            f"with the log's clock ({time[0]:.6g} to {time[-1]:.6g} s); at least two are needed"
+            f"with the log's clock ({elapsed[-1]:.6g} s from {clock_words(float(time[0]))}); at least two are needed"
         )
     signals = {signal: values[keep] for signal, values in signals.items()}
-    time = signals["time"]
-    fresh = np.diff(time) > gap_limit(time_step)
+    fresh = np.diff(elapsed[keep]) > gap_limit(time_step)
     if "segment" in signals:
         fresh |= np.diff(signals["segment"]) != 0
     segment = np.concatenate([[0], np.cumsum(fresh)]).astype(np.int64)
     used = {mapping.column.get(signal, signal) for signal in SIGNALS if signal not in mapping.elsewhere}
     used |= set(mapping.stamp.values())
-    ignored = tuple(name for name in table.names if name not in used)
+    ignored = tuple(printable(name, 200) for name in table.names if name not in used)
     return Assembled(signals, segment, ignored, tuple(remarks))
 
 
@@ -102,8 +109,8 @@ def _require(table: Table, mapping: SignalMap, following: bool) -> None:
     for option in (mapping.column, mapping.stamp):
         for signal, column in option.items():
             if column not in table.names and signal not in mapping.elsewhere:
-                there_are = ", ".join(table.names)
-                raise InputError(f"{table.source}: column {column!r} ({signal}) is missing; columns: {there_are}")
+                there_are = listed(table.names)
+                raise InputError(f"{table.source}: column {quoted(column)} ({signal}) is missing; columns: {there_are}")
     needed = ("time", "spacing", "lead_speed") if following and not there("accel_cmd") else ("time", "accel_cmd")
     for signal in needed:
         if not there(signal):
@@ -121,10 +128,10 @@ def _require(table: Table, mapping: SignalMap, following: bool) -> None:
 
 def _advice(signal: str, names: Iterable[str]) -> str:
     # a column that is a signal already goes by its own name: a measured `accel` is no command
-    plain = {name.strip().lower(): name for name in names if name not in SIGNALS}
+    plain = {name.strip().lower(): name for name in names if name not in SIGNALS and len(name) <= _NAME}
     close = difflib.get_close_matches(signal, plain, n=1, cutoff=0.6)
-    name = f"{plain[close[0]]!r}" if close else "NAME"
-    return f"columns: {', '.join(names)}; `--map {signal}={name}` if it goes by another name"
+    name = quoted(plain[close[0]]) if close else "NAME"
+    return f"columns: {listed(names)}; `--map {signal}={name}` if it goes by another name"
 
 
 def _place(table: Table, signal: str, column: str, rows: NDArray | None = None) -> Callable[[int], str]:
@@ -159,12 +166,27 @@ def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tupl
 def _from_elsewhere(signal: str, mapping: SignalMap, folder: Path) -> tuple[Float, Float]:
     """Arrivals of a signal that lies in a file of its own, beside the log."""
     there = mapping.elsewhere[signal]
-    table = read_table(folder / there.file)
     column = there.column or mapping.column.get(signal, signal)
+    table = read_table(_within(folder, there.file, signal), wanted=lambda names: {column, there.time})
+    for name in (column, there.time):  # what else is in a file that only the mapping names is not for messages
+        if name not in table.names:
+            raise InputError(f"{table.source}: column {quoted(name)} ({signal}) is missing")
     values, stamps = table.numbers(column), table.numbers(there.time)
     unit = there.time_unit or mapping.unit.get("time")
     rows = np.arange(len(values))
     return _arrivals(table, signal, column, there.time, values, stamps, rows, unit, mapping.unit.get(signal))
+
+
+def _within(folder: Path, file: str, signal: str) -> Path:
+    """The place of a file that a mapping names. A mapping may come from anybody: it reaches into no other folder."""
+    try:
+        there = (folder / file).resolve()
+        inside = there.is_relative_to(folder.resolve()) and not Path(file).is_absolute()
+    except (OSError, ValueError, RuntimeError):  # too long, with a zero byte in it, or links in a circle
+        inside, there = False, folder
+    if not inside:
+        raise InputError(f"[signals.{signal}] file: found {quoted(file)}, needs a file in the log's folder or below")
+    return folder / file
 
 
 def _arrivals(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
@@ -20,17 +20,21 @@ def atomic(path: str | os.PathLike[str], *, binary: bool = False) -> Iterator[IO
     Raises InputError where the place cannot be written.
     """
     target = Path(path)
-    if target.is_dir():
-        raise InputError(f"{target}: is a directory; the name of a file is needed")
     try:
+        if target.is_dir():
+            raise InputError(f"{target}: is a directory; the name of a file is needed")
         target.parent.mkdir(parents=True, exist_ok=True)
         # same folder, hence same file system: only there is the rename atomic
         handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
     except OSError as fault:
         raise InputError(f"{target}: cannot be written ({fault.strerror or fault})") from None
     try:
-        # newline="" keeps line ends as given, so that a log has the same bytes on every system
-        opened = os.fdopen(handle, "wb") if binary else os.fdopen(handle, "w", encoding="utf-8", newline="")
+        try:
+            # newline="" keeps line ends as given, so that a log has the same bytes on every system
+            opened = os.fdopen(handle, "wb") if binary else os.fdopen(handle, "w", encoding="utf-8", newline="")
+        except BaseException:
+            os.close(handle)
+            raise
         with opened as stream:
             yield stream
             stream.flush()
@@ -40,7 +44,8 @@ def atomic(path: str | os.PathLike[str], *, binary: bool = False) -> Iterator[IO
         os.chmod(name, 0o666 & ~mask)  # mkstemp makes it private; an answer is as readable as any other file
         os.replace(name, target)
     except BaseException as fault:
-        Path(name).unlink(missing_ok=True)
+        with suppress(OSError):  # what failed first is what is to be said
+            os.unlink(name)
         if isinstance(fault, OSError):
             raise InputError(f"{target}: cannot be written ({fault.strerror or fault})") from None
         raise

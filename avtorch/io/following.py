@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, listed
 from avtorch.io import i24, openacc
 from avtorch.io.log import Log
 from avtorch.io.mapping import Pairs
+from avtorch.io.recorded_columns import recorded
 from avtorch.io.tables import Table, read_table
 
 Float = NDArray[np.float64]
@@ -39,7 +40,7 @@ def read_following(
     InputError for a vehicle or event that is not there or follows nobody, for a gap that is not the speeds', for an
     option without a meaning, and as ``Log.read`` does.
     """
-    table = read_table(path, header="Time")
+    table = read_table(path, header="Time", wanted=recorded)
     names = set(table.names)
     columns: dict[str, object] = {"map": map or None, "unit": unit or None, "stamp": stamp or None}
     if any(n.startswith("SpeedDoppler") for n in names):
@@ -77,7 +78,7 @@ def _chosen(source: str, vehicle: int | None, followers: list[int]) -> int:
     if vehicle is None:
         return followers[0]
     if vehicle not in followers:
-        told = ", ".join(f"{n}" for n in followers)
+        told = listed(map(str, followers))
         raise InputError(f"{source}: vehicle {vehicle} follows nobody in it; followers: {told}")
     return vehicle
 

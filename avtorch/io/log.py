@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from avtorch.errors import InputError
 from avtorch.io.assemble import assemble
 from avtorch.io.atomic import atomic
+from avtorch.io.clock import since_start
+from avtorch.io.engagement import settled
 from avtorch.io.mapping import SIGNALS, Pairs, SignalMap, pairs, read_mapping
 from avtorch.io.segments import median_step, stretches
 from avtorch.io.standstill import standing
@@ -33,7 +35,8 @@ AccelKind = Literal["kinematic", "specific-force"]
 class Log:
     """A drive. Every signal is ``(time,)``, float64, in SI units, or None where the log does not have it.
 
-    ``time`` [s]; ``accel_cmd`` [m/s^2], the command sent, held until the next row (None only in a car-following log);
+    ``time`` [s], on the recorder's own clock (``elapsed``: from the log's start); ``accel_cmd`` [m/s^2], the command
+    sent, held until the next row (None only in a car-following log);
     ``accel`` [m/s^2] and ``speed`` [m/s], at least one of them; ``jerk`` [m/s^3]; ``engaged`` (bool, all true where the
     log does not tell); ``spacing`` [m, bumper to bumper]; ``lead_speed`` [m/s]; ``lead_accel`` [m/s^2]; ``grade`` [-];
     ``segment`` (int from 0; rises at each gap and each new value of the log's own column, where time may start anew).
@@ -78,8 +81,9 @@ class Log:
 
         Raises InputError, one line that names file, row (of data, from 1) and line (of the file) and column.
         """
-        table = read_table(path)
         mapping = read_mapping(path, map=map, unit=unit, stamp=stamp)
+        wanted = {mapping.column.get(signal, signal) for signal in SIGNALS} | set(mapping.stamp.values())
+        table = read_table(path, wanted=lambda names: wanted)
         return cls._of(table, mapping, folder=Path(path).parent, following=following)
 
     @classmethod
@@ -91,7 +95,12 @@ class Log:
                 raise InputError(f"{name}: {key!r} is no signal; signals: {', '.join(SIGNALS)}")
             if values is None:
                 continue
-            array = np.asarray(values)
+            try:
+                array = np.asarray(values.filled(np.nan) if isinstance(values, np.ma.MaskedArray) else values)
+            except (TypeError, ValueError, RuntimeError):
+                raise InputError(
+                    f"{name}: {key} is no array of numbers; one value per row, (time,), is needed"
+                ) from None
             if array.ndim != 1:
                 raise InputError(f"{name}: {key} has shape {array.shape}; one value per row, (time,), is needed")
             given[key] = array if array.dtype.kind in "fiu" else array.tolist()
@@ -117,7 +126,7 @@ class Log:
             accel_kind="kinematic",
         )
         motion = {name: getattr(log, name) for name in ("accel_cmd", "accel", "speed", "lead_speed")}
-        check_units(table.source, time, stretches(log.usable, log.segment), **motion)
+        check_units(table.source, log.elapsed, stretches(log.usable, log.segment), **motion)
         return log
 
     def write(self, path: str | os.PathLike[str]) -> None:
@@ -148,14 +157,25 @@ class Log:
         return len(self.time)
 
     @property
+    def epoch_s(self) -> float:
+        """The first row's ``time`` [s]: what ``elapsed`` is counted from."""
+        return float(self.time[0])
+
+    @cached_property
+    def elapsed(self) -> Float:
+        """Seconds from the log's start, ``(time,)``: what every computation uses, free of what rounding does to stamps
+        as large as Unix time (`avtorch.io.clock`)."""
+        return since_start(self.time, self.segment)
+
+    @property
     def seconds(self) -> float:
         """Time recorded, gaps left out [s]."""
-        return float(sum(self.time[part][-1] - self.time[part][0] for part in self.segments()))
+        return float(sum(self.elapsed[part][-1] - self.elapsed[part][0] for part in self.segments()))
 
     @property
     def rate_hz(self) -> float:
         """Rows per second, by the median step inside segments."""
-        return 1 / median_step(self.time, np.diff(self.segment) == 0)
+        return 1 / median_step(self.elapsed, np.diff(self.segment) == 0)
 
     @cached_property
     def moving(self) -> NDArray[np.bool_]:
@@ -165,22 +185,41 @@ class Log:
         moving = np.ones(self.rows, bool)
         if self.accel is None or self.accel_cmd is None:
             return moving
-        for part in self.segments():
+        for part in self.drives():
             if part.stop - part.start > 1:
-                step = float(np.median(np.diff(self.time[part])))
+                step = float(np.median(np.diff(self.elapsed[part])))
                 moving[part] = ~standing(self.accel_cmd[part], self.accel[part], step, STANDSTILL_MPS)
         return moving
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """Rows that belief may use, ``(time,)``: engaged and not at standstill."""
-        return self.engaged & self.moving
+        """Rows that belief may use, ``(time,)``: engaged, settled since the driver let go, and not at standstill."""
+        return self.engaged & self.settled & self.moving
+
+    @cached_property
+    def settled(self) -> NDArray[np.bool_]:
+        """Rows ``(time,)`` that do not follow so closely on a return to ``engaged`` that the car's state is unknown."""
+        out = np.ones(self.rows, bool)
+        if self.engaged.all():
+            return out
+        for part in self.segments():
+            # a drive that begins where the last one was left to the driver begins with a return
+            driven = part.start > 0 and not self.engaged[part.start - 1]
+            since = self.elapsed[part.start] if driven else -np.inf
+            out[part] = settled(self.elapsed[part], self.engaged[part], since)[0]
+        return out
 
     def segments(self) -> list[slice]:
-        """The separate drives, as slices of rows; between two of them lies a gap or a new value of ``segment``."""
+        """What was recorded in one piece, as slices of rows; between two lies a gap or a new value of ``segment``."""
         cuts = np.flatnonzero(np.diff(self.segment)) + 1
         edges = [0, *cuts.tolist(), self.rows]
         return [slice(a, b) for a, b in pairwise(edges)]
+
+    def drives(self) -> list[slice]:
+        """The parts of segments in which the command was obeyed, as slices of rows; each return to ``engaged`` begins
+        one. Nothing may be rolled out, filtered or differenced from one into the next.
+        """
+        return stretches(self.engaged, self.segment)
 
     def __getitem__(self, part: slice) -> Log:
         """The rows of a slice, as a log that keeps its segment numbers."""

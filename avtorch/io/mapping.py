@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, printable, quoted
+from avtorch.io.opening import place
+from avtorch.io.toml import read_toml
 from avtorch.io.units import to_si
 
 SIGNALS = (
@@ -46,18 +47,27 @@ def read_mapping(
     arguments, each a dict or a sequence of ``SIGNAL=VALUE``.
 
     The TOML file has the tables ``[map]`` (signal = "column"), ``[unit]`` (signal = "km/h"), ``[stamp]`` (signal = "its
-    own time column") and ``[signals.NAME]`` (``file``, ``time``, ``column``, ``time_unit``: a signal in another file).
-    Raises InputError for a signal, unit, table or key that is not known.
+    own time column") and ``[signals.NAME]`` (``file``, ``time``, ``column``, ``time_unit``: a signal in another file,
+    which lies in the log's folder or below). It is a regular file of up to 1 MB, no link. Raises InputError for another
+    kind of file, and for a signal, unit, table or key that is not known.
     """
-    beside = Path(path).with_suffix(".toml")
-    # a log that is called x.toml itself has no file beside it
-    told = _read_toml(beside) if beside != Path(path) and beside.is_file() else SignalMap()
+    beside = _beside(Path(path))
+    told = SignalMap() if beside is None else _read_toml(beside)
     return SignalMap(
         column=_distinct({**told.column, **pairs("map", map)}),
         unit={**told.unit, **_units(pairs("unit", unit), "")},
         stamp={**told.stamp, **_stamps(pairs("stamp", stamp), "")},
         elsewhere=told.elsewhere,
     )
+
+
+def _beside(log: Path) -> Path | None:
+    """The mapping file of a log, where there is one; a log that is called x.toml itself has none."""
+    try:
+        beside = log.with_suffix(".toml")
+        return beside if beside != log and os.path.lexists(beside) else None
+    except (OSError, ValueError):  # the log has no name that a file beside it could share
+        return None
 
 
 def pairs(option: str, given: Pairs) -> dict[str, str]:
@@ -73,13 +83,15 @@ def pairs(option: str, given: Pairs) -> dict[str, str]:
         for text in given:
             name, mark, value = str(text).partition("=")
             if not mark or not name.strip() or not value.strip():
-                raise InputError(f"{option}: {text!r} is not of the form SIGNAL=VALUE, such as {_EXAMPLE[option]}")
+                raise InputError(
+                    f"{option}: {quoted(str(text))} is not of the form SIGNAL=VALUE, such as {_EXAMPLE[option]}"
+                )
             items.append((name.strip(), value.strip()))
     answer: dict[str, str] = {}
     for name, value in items:
-        _known(name, f"{option} {name}={value}")
+        _known(name, f"{option} {printable(name, 40)}={printable(value, 40)}")
         if answer.get(name, value) != value:
-            raise InputError(f"{option} {name}: given as {answer[name]!r} and as {value!r}; once is enough")
+            raise InputError(f"{option} {name}: given as {quoted(answer[name])} and as {quoted(value)}; once is enough")
         answer[name] = value
     return answer
 
@@ -89,7 +101,7 @@ _EXAMPLE = {"map": "accel=CAN.ACC_X", "unit": "speed=km/h", "stamp": "speed=GPS_
 
 def _known(name: str, where: str) -> None:
     if name not in SIGNALS:
-        raise InputError(f"{where}: {name!r} is no signal; signals: {', '.join(SIGNALS)}")
+        raise InputError(f"{where}: {quoted(name)} is no signal; signals: {', '.join(SIGNALS)}")
 
 
 def _units(units: dict[str, str], where: str) -> dict[str, str]:
@@ -103,9 +115,8 @@ def _units(units: dict[str, str], where: str) -> dict[str, str]:
 
 def _stamps(stamps: dict[str, str], where: str) -> dict[str, str]:
     if "time" in stamps:
-        raise InputError(
-            f"{where}stamp time={stamps['time']}: time is the clock itself; only other signals are stamped"
-        )
+        given = f"stamp time={printable(stamps['time'], 40)}"
+        raise InputError(f"{where}{given}: time is the clock itself; only other signals are stamped")
     return stamps
 
 
@@ -113,22 +124,21 @@ def _distinct(columns: dict[str, str]) -> dict[str, str]:
     seen: dict[str, str] = {}
     for signal, column in columns.items():
         if column in seen:
-            raise InputError(f"map {signal}={column}: column {column!r} is already mapped to {seen[column]}")
+            raise InputError(
+                f"map {signal}={printable(column, 40)}: column {quoted(column)} is already mapped to {seen[column]}"
+            )
         seen[column] = signal
     return columns
 
 
 def _read_toml(file: Path) -> SignalMap:
-    try:
-        told = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as fault:
-        raise InputError(f"{file}: is no readable TOML ({str(fault).splitlines()[0]})") from None
+    told = read_toml(file, links=False)
+    here = f"{place(file)}: "
     for name, table in told.items():
         if name not in ("map", "unit", "stamp", "signals"):
-            raise InputError(f"{file}: table [{name}] is not known; tables: map, unit, stamp, signals")
+            raise InputError(f"{here}table [{printable(name, 40)}] is not known; tables: map, unit, stamp, signals")
         if not isinstance(table, dict):
-            raise InputError(f"{file}: {name} is no table; write [{name}] and its lines below")
-    here = f"{file}: "
+            raise InputError(f"{here}{name} is no table; write [{name}] and its lines below")
     try:
         column, unit, stamp = (pairs(name, _texts(told.get(name, {}), name)) for name in ("map", "unit", "stamp"))
         elsewhere = {name: _elsewhere(name, table) for name, table in told.get("signals", {}).items()}
@@ -141,17 +151,25 @@ def _texts(table: dict[str, Any], name: str) -> dict[str, str]:
     for key, value in table.items():
         if isinstance(value, bool) or not isinstance(value, (str, int, float)):
             # the commonest cause: map.accel = ... with a dot in an unquoted key
-            raise InputError(f"[{name}] {key}: is a {type(value).__name__}; a text is needed")
-    return {key: str(value) for key, value in table.items()}
+            raise InputError(f"[{name}] {printable(key, 40)}: is a {type(value).__name__}; a text is needed")
+    return {key: _text(name, key, value) for key, value in table.items()}
+
+
+def _text(table: str, key: str, value: str | float) -> str:
+    try:
+        return str(value)
+    except ValueError:  # a whole number of thousands of digits
+        raise InputError(f"[{table}] {printable(key, 40)}: is too large a number; a text is needed") from None
 
 
 def _elsewhere(name: str, table: Any) -> Elsewhere:
-    _known(name, f"[signals.{name}]")
+    here = f"[signals.{printable(name, 40)}]"
+    _known(name, here)
     if name == "time" or not isinstance(table, dict) or "file" not in table:
-        raise InputError(f"[signals.{name}]: needs `file` (and may have `time`, `column`, `time_unit`), for a signal")
+        raise InputError(f"{here}: needs `file` (and may have `time`, `column`, `time_unit`), for a signal")
     for key, value in table.items():
         if key not in ("file", "time", "column", "time_unit") or not isinstance(value, str):
-            raise InputError(f"[signals.{name}] {key}: not known, or no text; keys: file, time, column, time_unit")
+            raise InputError(f"{here} {printable(key, 40)}: not known, or no text; keys: file, time, column, time_unit")
     if "time_unit" in table:
         to_si("time", table["time_unit"])
     return Elsewhere(**table)

@@ -106,7 +106,13 @@ def _event(table: Table, numbers: NDArray, event: int) -> RawLeader:
         )
     part = slice(int(rows[0]), int(rows[-1]) + 1)
     lines = None if table.lines is None else table.lines[part]
-    piece = Table(table.source, table.names, tuple(cells[part] for cells in table.cells), lines, first=part.start)
+    piece = Table(
+        table.source,
+        table.names,
+        tuple(None if cells is None else cells[part] for cells in table.cells),
+        lines,
+        first=part.start,
+    )
     leader = checked(
         piece,
         piece.numbers("time"),

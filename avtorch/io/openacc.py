@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 from collections.abc import Iterable
+from itertools import islice
 from pathlib import Path
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, listed, printable
 from avtorch.io.raw_leader import RawLeader, checked
 from avtorch.io.tables import Table, read_bytes, text_of
 
 
 def numbered(stem: str, names: Iterable[str]) -> list[int]:
     """The vehicle numbers of the columns ``stem`` + number, rising; numbers can skip."""
-    found = (re.fullmatch(rf"{stem}(\d+)", name) for name in names)
+    found = (re.fullmatch(rf"{stem}([0-9]{{1,6}})", name) for name in names)
     return sorted(int(match[1]) for match in found if match)
 
 
@@ -63,16 +65,22 @@ def zalazone(table: Table, vehicle: int | None = None, order: tuple[str, ...] = 
 
 def vehicle_order(path: Path) -> tuple[str, ...]:
     """The makes that the header lines of a ZalaZONE file list, first the leader; empty where they list none."""
-    for row in csv.reader(text_of(path, read_bytes(path)).splitlines()[:10]):
+    for line in islice(io.StringIO(text_of(path, read_bytes(path)), newline=""), 10):
+        try:
+            row = next(csv.reader([line]), [])
+        except csv.Error:  # no line of makes
+            continue
         if row and row[0] == "Vehicle_order":
-            return tuple(cell for cell in row[1:] if cell)
+            return tuple(printable(cell, 40) for cell in row[1:] if cell)
     return ()
 
 
 def _choose(table: Table, stem: str, vehicle: int | None) -> int:
     there = numbered(stem, table.names)
+    if not there:
+        raise InputError(f"{table.source}: found no column {stem}1, {stem}2, ...; needs one for each vehicle")
     if vehicle is None:
         return there[0]
     if vehicle not in there:
-        raise InputError(f"{table.source}: vehicle {vehicle} is not in it; vehicles: {', '.join(map(str, there))}")
+        raise InputError(f"{table.source}: vehicle {vehicle} is not in it; vehicles: {listed(map(str, there))}")
     return vehicle

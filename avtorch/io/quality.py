@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avtorch.errors import listed
+from avtorch.io.clock import clock_words
 from avtorch.io.consistency import scale_between
+from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import Log
 from avtorch.io.segments import median_step, stretches
 from avtorch.io.validity import command_scale
@@ -29,9 +32,11 @@ class Gap:
 class Quality:
     """What a log is worth.
 
-    ``jitter``: 95 % point of the deviation of a step from the median one, as its share [-]; ``late_rows``: steps over
-    1.5 median ones that are no gap; ``masked_rows``: rows not usable, of which ``driver_rows`` not engaged and
-    ``standstill_rows`` below 0.3 m/s or, without speed, taken for it; ``notes``: all of it in sentences.
+    ``epoch_s``: time of the first row [s], from which ``notes`` count; ``jitter``: 95 % point of the deviation of a
+    step from the median one, as its share [-]; ``late_rows``: steps over 1.5 median ones that are no gap;
+    ``masked_rows``: rows not usable, of which ``driver_rows`` not engaged, ``settling_rows`` within 2 s of one of
+    ``returns`` to engaged and ``standstill_rows`` below 0.3 m/s or, without speed, taken for it; ``notes``: all of it
+    in sentences.
     """
 
     rows: int
@@ -44,10 +49,13 @@ class Quality:
     masked_rows: int
     driver_rows: int
     standstill_rows: int
+    returns: int
+    settling_rows: int
     constant: tuple[str, ...]
     missing: tuple[str, ...]
     doubtful_units: tuple[str, ...]
     notes: tuple[str, ...]
+    epoch_s: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
         """For a JSON answer."""
@@ -57,24 +65,29 @@ class Quality:
 def check(log: Log) -> Quality:
     """Look a log over. Takes any valid `Log` and raises nothing."""
     same = np.diff(log.segment) == 0
-    step = median_step(log.time, same)
-    steps = np.diff(log.time)[same]
+    step = median_step(log.elapsed, same)
+    steps = np.diff(log.elapsed)[same]
     jitter = float(np.quantile(np.abs(steps - step), 0.95) / step) if len(steps) else 0.0
     late = int((steps > 1.5 * step).sum())
+    apart = np.round(np.diff(log.time), 6)  # where the clock was set anew, as it says
     gaps = tuple(
-        Gap(int(row) + 1, float(log.time[row]), float(log.time[row + 1] - log.time[row]))
+        Gap(int(row) + 1, float(log.time[row]), float(apart[row]))
         for row in np.flatnonzero(~same)
-        if log.time[row + 1] - log.time[row] > 1.5 * step
+        if apart[row] > 1.5 * step
     )
     present = {name: getattr(log, name) for name in SIGNALS if getattr(log, name) is not None}
     constant = tuple(name for name, values in present.items() if np.ptp(values) == 0)
     missing = tuple(name for name in ("accel_cmd", "accel", "speed") if name not in present)
     doubtful = tuple(_doubtful_units(log))
     driver, still = int((~log.engaged).sum()), int((~log.moving).sum())
+    returns = int((np.diff(log.engaged.astype(int)) == 1).sum())
+    settling = int((log.engaged & ~log.settled).sum())
     masked = int((~log.usable).sum())
     segments = len(log.segments())
 
     notes = [f"{log.rows} rows, {log.seconds:.1f} s in {segments} segment{'s' * (segments != 1)}, {log.rate_hz:.4g} Hz"]
+    if log.epoch_s != 0:
+        notes.append(f"times are shown from the log's start, at {clock_words(log.epoch_s)}")
     if jitter > 0.1:
         notes.append(
             f"time jitters: steps differ from {step:.4g} s by up to {100 * jitter:.0f} % (95 % of them by less)"
@@ -82,13 +95,19 @@ def check(log: Log) -> Quality:
     if late:
         notes.append(f"{late} step{'s' * (late != 1)} longer than 1.5 median ones: rows were lost, too few for a gap")
     for gap in gaps[:5]:
-        notes.append(f"gap of {gap.seconds:.3g} s after row {gap.row} (time {gap.start_s:.6g} s): a new segment starts")
+        at = f"row {gap.row} ({log.elapsed[gap.row - 1]:.6g} s from the start)"
+        notes.append(f"gap of {gap.seconds:.3g} s after {at}: a new segment starts")
     if len(gaps) > 5:
         notes.append(f"{len(gaps) - 5} more gaps, each the start of a new segment")
     if segments - 1 > len(gaps):
         notes.append(f"{segments - 1 - len(gaps)} new segments by the log's own segment column")
     if driver:
         notes.append(f"{driver} rows masked: not engaged")
+    if returns:
+        notes.append(
+            f"{returns} return{'s' * (returns != 1)} to engaged: each starts a drive anew, {settling * step:.1f} s "
+            f"masked in which the car settles ({SETTLE_S:g} s after each)"
+        )
     if still:
         how = "below 0.3 m/s" if log.speed is not None else "braked, yet not slowing"
         notes.append(f"{still} rows masked: standstill ({how})")
@@ -100,12 +119,13 @@ def check(log: Log) -> Quality:
     notes.extend(doubtful)
     notes.extend(_disagreements(log))
     if log.ignored:
-        notes.append(f"columns ignored: {', '.join(log.ignored)}")
+        notes.append(f"columns ignored: {listed(log.ignored)}")
     notes.extend(log.remarks)
     return Quality(
         rows=log.rows, seconds=log.seconds, segments=segments, rate_hz=log.rate_hz, jitter=jitter, late_rows=late,
-        gaps=gaps, masked_rows=masked, driver_rows=driver, standstill_rows=still, constant=constant, missing=missing,
-        doubtful_units=doubtful, notes=tuple(notes),
+        gaps=gaps, masked_rows=masked, driver_rows=driver, standstill_rows=still, returns=returns,
+        settling_rows=settling, constant=constant, missing=missing,
+        doubtful_units=doubtful, notes=tuple(notes), epoch_s=log.epoch_s,
     )  # fmt: skip
 
 
@@ -144,11 +164,11 @@ def _doubtful_units(log: Log) -> list[str]:
         if top > 60 or middle > 45:
             notes.append(f"speed reaches {top:.3g} m/s (median {middle:.3g}): could it be km/h? `--unit speed=km/h`")
     if log.speed is not None and log.accel is not None:
-        found = scale_between(log.time, parts, log.speed, log.accel)
+        found = scale_between(log.elapsed, parts, log.speed, log.accel)
         if found is not None and found.correlation > 0.9 and not 0.8 <= found.slope <= 1.25:
             notes.append(f"speed changes {found.slope:.3g} times what accel says: a unit or a sensor's scale is off")
     if log.accel_cmd is not None:
-        found = command_scale(log.time, parts, log.speed, log.accel, log.accel_cmd)
+        found = command_scale(log.elapsed, parts, log.speed, log.accel, log.accel_cmd)
         if found is not None and found.correlation > 0.9 and not 0.2 <= found.slope <= 1.5:
             witness = "speed" if log.speed is not None else "accel"
             notes.append(
@@ -159,7 +179,7 @@ def _doubtful_units(log: Log) -> list[str]:
         if 0 < top < 0.6:
             notes.append(f"accel and accel_cmd stay below {top:.2g}: calm, or in g? Without speed nothing can tell")
     if log.jerk is not None and log.accel is not None:
-        found = scale_between(log.time, parts, log.accel, log.jerk)
+        found = scale_between(log.elapsed, parts, log.accel, log.jerk)
         if found is not None and found.correlation > 0.9 and not 0.5 <= found.slope <= 2:
             notes.append(f"accel changes {found.slope:.3g} times what jerk says: a unit is off")
     if log.lead_speed is not None and log.speed is not None:
@@ -172,7 +192,7 @@ def _doubtful_units(log: Log) -> list[str]:
 def _disagreements(log: Log) -> list[str]:
     if log.speed is None or log.accel is None:
         return []
-    found = scale_between(log.time, stretches(log.usable, log.segment), log.speed, log.accel)
+    found = scale_between(log.elapsed, stretches(log.usable, log.segment), log.speed, log.accel)
     # 0.5 m/s in a second is well above what noise and grade do
     if found is None or found.change < 0.5 or found.correlation >= 0.5:
         return []

@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, listed
 from avtorch.io import i24, ngsim, openacc
 from avtorch.io.mapping import Pairs, pairs
 from avtorch.io.raw_leader import RawLeader, checked
+from avtorch.io.recorded_columns import recorded
 from avtorch.io.tables import Table, read_table
 from avtorch.io.units import to_si
 
@@ -28,7 +29,9 @@ def read_leader(
     form. A recording is cut to its longest stretch without empty speeds or steps over 1.5 s; ``note`` says so.
     Raises InputError for a file of no known form, a vehicle or event that is not in it, and bad values.
     """
-    table = read_table(path, header="Time")
+    table = read_table(path, header="Time", wanted=recorded)
+    if not table.rows:
+        raise InputError(f"{table.source}: found a header but no rows; needs a recording")
     names = set(table.names)
     form, read = "plain", None
     if "SpeedDoppler1" in names or any(n.startswith("SpeedDoppler") for n in names):
@@ -59,7 +62,7 @@ def _plain(table: Table, unit: Pairs) -> RawLeader:
     if "time" not in table.names or speed is None:
         raise InputError(
             f"{table.source}: is no leader file; it needs columns time and speed, or the form of OpenACC, NGSIM or "
-            f"I-24; columns: {', '.join(table.names)}"
+            f"I-24; columns: {listed(table.names)}"
         )
     units = pairs("unit", unit)
     names = {"time": "time", "speed": speed}

@@ -7,6 +7,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from avtorch.io.clock import ROUNDING_S
+
 GAP_STEPS = 3.0
 GAP_SECONDS = 0.1
 """A step longer than both GAP_STEPS median steps and GAP_SECONDS is a gap: what is shorter is jitter or a lost row."""
@@ -27,5 +29,8 @@ def median_step(time: NDArray[np.float64], same_drive: NDArray[np.bool_]) -> flo
 
 
 def gap_limit(step: float) -> float:
-    """The longest time between two rows [s] that is no gap, at a median ``step`` [s]."""
-    return max(GAP_STEPS * step, GAP_SECONDS)
+    """The longest time between two rows [s] that is no gap, at a median ``step`` [s].
+
+    A little more than the bound: two rows lost at 30 Hz make 0.1 s, give or take the rounding of the stamps.
+    """
+    return max(GAP_STEPS * step, GAP_SECONDS) + ROUNDING_S

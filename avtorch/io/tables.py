@@ -3,22 +3,35 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import os
-from collections.abc import Sequence
+import re
+from array import array
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, listed, quoted
+from avtorch.io.opening import place, read_regular
+from avtorch.io.size import MOST_BYTES, MOST_CELLS, MOST_COLUMNS
+from avtorch.numeral import numeral
+
+_MOST_CHARACTERS = 1_000_000  # of one row
+_LINES_AHEAD = 100  # in which a header that other lines precede is looked for
+
+Wanted = Callable[[tuple[str, ...]], Collection[str]]
+"""From the names of a file's columns to those that are to be read."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Named columns of one file, cells not yet read as numbers.
+    """Named columns of one file, cells not yet read as numbers; None for a column that nobody wanted.
 
     Rows are told to people as ``row 3 (line 4)``: the third row of data, and the line an editor shows. A Parquet file
     and arrays have no lines.
@@ -26,18 +39,21 @@ class Table:
 
     source: str
     names: tuple[str, ...]
-    cells: tuple[Sequence[Any] | NDArray, ...]
+    cells: tuple[Sequence[Any] | NDArray | None, ...]
     lines: Sequence[int] | None = None
     first: int = 0  # rows of the file before this part of it
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "source", place(self.source))
+
     @property
     def rows(self) -> int:
-        return len(self.cells[0]) if self.cells else 0
+        return next((len(cells) for cells in self.cells if cells is not None), 0)
 
     def where(self, row: int, column: str) -> str:
         """The place of a cell in words; ``row`` counts from 0."""
         line = f" (line {self.lines[row]})" if self.lines is not None else ""
-        return f"{self.source}: row {self.first + row + 1}{line}, column {column!r}"
+        return f"{self.source}: row {self.first + row + 1}{line}, column {quoted(column)}"
 
     def numbers(self, column: str, *, empty_is_nan: bool = False) -> NDArray[np.float64]:
         """A column as float64, ``(row,)``.
@@ -47,8 +63,10 @@ class Table:
         count = self.names.count(column)
         if count != 1:
             what = "is missing" if count == 0 else f"occurs {count} times"
-            raise InputError(f"{self.source}: column {column!r} {what}; columns: {', '.join(self.names)}")
+            raise InputError(f"{self.source}: column {quoted(column)} {what}; columns: {listed(self.names)}")
         cells = self.cells[self.names.index(column)]
+        if cells is None:
+            raise KeyError(f"column {column!r} was not among the wanted ones")
         if isinstance(cells, np.ndarray):
             values = np.asarray(cells, dtype=np.float64)
             empty = np.zeros(len(values), dtype=bool)
@@ -57,8 +75,7 @@ class Table:
         bad = ~np.isfinite(values) & ~empty
         if bad.any():
             row = int(np.argmax(bad))
-            found = values[row]
-            word = "NaN" if math.isnan(found) else "infinite"
+            word = "NaN" if math.isnan(values[row]) else "infinite"
             raise InputError(f"{self.where(row, column)}: is {word}; a finite number is needed")
         return values
 
@@ -67,112 +84,186 @@ class Table:
         empty = np.zeros(len(cells), dtype=bool)
         for row, cell in enumerate(cells):
             try:
-                values[row] = float(cell)
-                # Python reads 1_000 as a number; no recorder writes that
-                if isinstance(cell, str) and "_" in cell:
-                    raise ValueError
+                values[row] = numeral(cell) if isinstance(cell, str) else _number(cell)
             except (TypeError, ValueError):
                 if cell is None or (isinstance(cell, str) and not cell.strip()):
                     if empty_is_nan:
                         values[row], empty[row] = math.nan, True
                         continue
                     raise InputError(f"{self.where(row, column)}: is empty; a number is needed") from None
-                hint = ""
-                if isinstance(cell, str) and cell.count(",") == 1 and cell.replace(",", "").lstrip("+-").isdigit():
-                    hint = " with a decimal point"
-                text = str(cell)
-                shown = text if len(text) <= 30 else text[:27] + "..."
-                place = self.where(row, column)
-                raise InputError(f"{place}: {shown!r} is no number; a number{hint} is needed") from None
+                raise InputError(f"{self.where(row, column)}: {_no_number(cell)}") from None
         return values, empty
 
 
-def read_table(path: str | os.PathLike[str], *, header: str | None = None) -> Table:
-    """Read a CSV (UTF-8, comma) or Parquet file.
+def _number(cell: Any) -> float:
+    """A cell that is no text: a whole number may be too large, and bytes are text that nobody decoded."""
+    if isinstance(cell, (bytes, bytearray)):
+        raise TypeError
+    try:
+        return float(cell)
+    except OverflowError:
+        return math.inf
+
+
+def _no_number(cell: Any) -> str:
+    if not isinstance(cell, str):
+        return f"a {type(cell).__name__} is no number; a number is needed"
+    hint = ""
+    if cell.count(",") == 1 and cell.replace(",", "").lstrip("+-").isdigit():
+        hint = " with a decimal point"
+    return f"{quoted(cell, 30)} is no number; a number{hint} is needed"
+
+
+def read_table(path: str | os.PathLike[str], *, header: str | None = None, wanted: Wanted | None = None) -> Table:
+    """Read a CSV (UTF-8, comma) or Parquet file, of the columns only those that are `wanted` (default: all).
 
     ``header`` names the first cell of the header line where other lines come before it. Unnamed columns get the name
-    ``(unnamed 1)`` by position. Raises InputError for what is no such file: missing, a directory, empty, binary,
-    another separator, no header, a row with too few or too many cells.
+    ``(unnamed 1)`` by position. Lines end at ``\\n``, ``\\r\\n`` or ``\\r`` and nowhere else. Numbers are decimal, with
+    ASCII digits and a point. Raises InputError for what is no such file: missing, no regular file, empty, binary,
+    another separator, no header, a row with too few or too many cells, and beyond 512 MiB, 10,000 columns, 1,000,000
+    characters in a row, or 20 million cells in the wanted columns.
     """
     file = Path(path)
     raw = read_bytes(file)
     if raw[:4] == b"PAR1":
-        return _parquet(file)
+        from avtorch.io.parquet import read_parquet
+
+        names, cells = read_parquet(raw, place(file), wanted)
+        return Table(place(file), names, cells)
     if file.suffix.lower() in (".parquet", ".pq"):
-        raise InputError(f"{file}: named as Parquet but its content is not; write it anew, or name it .csv")
-    return _csv(file, text_of(file, raw), header)
+        raise InputError(f"{place(file)}: named as Parquet but its content is not; write it anew, or name it .csv")
+    return _csv(place(file), text_of(file, raw), header, wanted)
 
 
 def read_bytes(file: Path) -> bytes:
     """The content of a file; InputError where there is none."""
-    if file.is_dir():
-        raise InputError(f"{file}: is a directory; a CSV or Parquet file is needed")
-    try:
-        raw = file.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{file}: no such file") from None
-    except (OSError, ValueError) as fault:
-        raise InputError(f"{file}: cannot be read ({getattr(fault, 'strerror', None) or fault})") from None
+    raw = read_regular(file, most=MOST_BYTES, need="a CSV or Parquet file")
     if not raw.strip():
-        raise InputError(f"{file}: is empty; a header line and rows are needed")
+        raise InputError(f"{place(file)}: is empty; a header line and rows are needed")
     return raw
 
 
 def text_of(file: Path, raw: bytes) -> str:
     """UTF-8 text, with or without a byte order mark; InputError for anything else."""
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        raise InputError(f"{file}: is UTF-16 text; UTF-8 is needed")
+        raise InputError(f"{place(file)}: is UTF-16 text; UTF-8 is needed")
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as fault:
-        line = raw[: fault.start].count(b"\n") + 1
+        # after a byte order mark the codec counts from behind it
+        start = fault.start + (3 if raw.startswith(b"\xef\xbb\xbf") and len(fault.object) < len(raw) else 0)
         raise InputError(
-            f"{file}: line {line}, byte {fault.start + 1}: is not UTF-8 text; a CSV or Parquet file is needed"
+            f"{place(file)}: line {_line(raw[:start])}, byte {start + 1}: is not UTF-8 text; "
+            "a CSV or Parquet file is needed"
         ) from None
     if "\0" in text:
-        line = text[: text.index("\0")].count("\n") + 1
-        raise InputError(f"{file}: line {line}: holds a zero byte, so it is binary; a CSV or Parquet file is needed")
+        line = _line(raw[: raw.index(b"\0")])
+        raise InputError(
+            f"{place(file)}: line {line}: holds a zero byte, so it is binary; a CSV or Parquet file is needed"
+        )
     return text
 
 
-def _csv(file: Path, text: str, header: str | None) -> Table:
-    # splitlines would also break at form feeds and other rare characters; the csv module wants the line ends kept
-    reader = csv.reader(text.splitlines(keepends=True), strict=True)
-    rows: list[list[str]] = []
-    lines: list[int] = []
-    try:
-        for row in reader:
-            rows.append(row)
-            lines.append(reader.line_num)
-    except csv.Error as fault:
-        raise InputError(f"{file}: line {reader.line_num}: cannot be split into cells ({fault})") from None
-    while rows and not any(cell.strip() for cell in rows[-1]):  # an editor's empty lines at the end
-        rows.pop()
-        lines.pop()
-    start = 0
-    if header is not None:
-        start = next((i for i, row in enumerate(rows) if row and row[0].strip() == header), 0)
-    head = [cell if cell.strip() else f"(unnamed {i + 1})" for i, cell in enumerate(rows[start])]
-    _refuse_odd_header(file, head, lines[start])
-    rows, lines = rows[start + 1 :], lines[start + 1 :]
-    for row, line in zip(rows, lines, strict=True):
-        if len(row) != len(head):
-            number = lines.index(line) + 1
-            found = f"has {len(row)} cells where the header has {len(head)}" if row else "is empty"
-            raise InputError(f"{file}: row {number} (line {line}): {found}")
-    columns = tuple(zip(*rows, strict=True)) if rows else tuple(() for _ in head)
-    return Table(str(file), tuple(head), columns, lines)
+def _line(before: bytes) -> int:
+    return len(re.findall(rb"\r\n|\r|\n", before)) + 1
 
 
-def _refuse_odd_header(file: Path, head: list[str], line: int) -> None:
+class _Lines:
+    """Lines with their ends, cut nowhere else than at those; counts the characters of a row that is not complete."""
+
+    def __init__(self, source: str, text: str) -> None:
+        self.source, self.open = source, 0
+        self._lines = io.StringIO(text, newline="")
+
+    def __iter__(self) -> Iterator[str]:
+        for line in self._lines:
+            self.open += len(line)
+            if self.open > _MOST_CHARACTERS:
+                raise InputError(
+                    f"{self.source}: a row has more than {_MOST_CHARACTERS:,} characters; a CSV file is needed"
+                )
+            yield line
+
+
+def _csv(source: str, text: str, header: str | None, wanted: Wanted | None) -> Table:
+    rows = _rows(source, text)
+    names, rows = _header(source, rows, header)
+    chosen = set(names if wanted is None else wanted(names))
+    kept = [i for i, name in enumerate(names) if name in chosen]
+    columns: list[list[str]] = [[] for _ in kept]
+    lines, blank = array("q"), array("q")
+    wrong: tuple[int, int] | None = None  # cells and line of the first blank row of another width
+    for row, line in rows:
+        if (len(lines) + len(blank) + 1) * max(1, len(kept)) > MOST_CELLS:
+            many = f"{MOST_CELLS // max(1, len(kept)):,} rows of {len(kept)} columns that are read"
+            raise InputError(f"{source}: has more than {many}; split it")
+        if not any(cell.strip() for cell in row):  # an editor leaves empty lines at the end; elsewhere they are wrong
+            blank.append(line)
+            wrong = wrong or ((len(row), line) if len(row) != len(names) else None)
+            continue
+        if wrong is not None or len(row) != len(names):
+            cells, at = wrong or (len(row), line)
+            number = len(lines) + (blank.index(at) if wrong else len(blank)) + 1
+            found = f"has {cells} cells where the header has {len(names)}" if cells else "is empty"
+            raise InputError(f"{source}: row {number} (line {at}): {found}")
+        for i, column in zip(kept, columns, strict=True):
+            if blank:
+                column.extend([""] * len(blank))
+            column.append(row[i])
+        lines.extend(blank)
+        lines.append(line)
+        blank = array("q")
+    read = dict(zip(kept, columns, strict=True))
+    return Table(source, names, tuple(read.get(i) for i in range(len(names))), lines)
+
+
+def _rows(source: str, text: str) -> Iterator[tuple[list[str], int]]:
+    """Rows of cells, each with the number of its first line."""
+    lines = _Lines(source, text)
+    reader = csv.reader(lines, strict=True)
+    first = 1
+    while True:
+        try:
+            row = next(reader, None)
+        except csv.Error as fault:
+            raise InputError(f"{source}: line {first}: cannot be split into cells ({fault})") from None
+        if row is None:
+            return
+        yield row, first
+        first, lines.open = reader.line_num + 1, 0
+
+
+def _header(
+    source: str, rows: Iterator[tuple[list[str], int]], first_cell: str | None
+) -> tuple[tuple[str, ...], Iterator[tuple[list[str], int]]]:
+    """Names of the columns, and the rows of data below them."""
+    ahead = list(islice(rows, 1 if first_cell is None else _LINES_AHEAD))
+    if not ahead:
+        raise InputError(f"{source}: is empty; a header line and rows are needed")
+    start = next((i for i, (row, _) in enumerate(ahead) if row and row[0].strip() == first_cell), 0)
+    head, line = ahead[start]
+    if not any(cell.strip() for cell in head):
+        raise InputError(f"{source}: line {line}: is empty; the header line with the column names is needed")
+    if len(head) > MOST_COLUMNS:
+        raise InputError(f"{source}: line {line}: has {len(head):,} columns; needs {MOST_COLUMNS:,} at most")
+    _refuse_odd_header(source, head, line)
+    names = tuple(cell if cell.strip() else f"(unnamed {i + 1})" for i, cell in enumerate(head))
+    return names, chain(ahead[start + 1 :], rows)
+
+
+def _refuse_odd_header(source: str, head: list[str], line: int) -> None:
+    if re.match(r"\s*(\{|\[\s*[\[{\"0-9-])", head[0]):
+        raise InputError(f"{source}: line {line}: looks like JSON; a CSV or Parquet file is needed")
     if len(head) == 1:
         for mark, word in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
             if mark in head[0]:
-                raise InputError(f"{file}: line {line}: cells are separated by {word}; commas are needed")
+                raise InputError(f"{source}: line {line}: cells are separated by {word}; commas are needed")
         if len(head[0].split()) > 1:
-            raise InputError(f"{file}: line {line}: cells are separated by spaces; commas are needed")
+            raise InputError(f"{source}: line {line}: cells are separated by spaces; commas are needed")
     if all(_is_number(name) for name in head):
-        raise InputError(f"{file}: line {line}: holds numbers; the first line must be the header with the column names")
+        raise InputError(
+            f"{source}: line {line}: holds numbers; the first line must be the header with the column names"
+        )
 
 
 def _is_number(text: str) -> bool:
@@ -181,32 +272,3 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _parquet(file: Path) -> Table:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        data = pq.read_table(file)
-    except (pa.ArrowException, OSError, ValueError) as fault:
-        reason = str(fault).splitlines()[0] if str(fault) else type(fault).__name__
-        raise InputError(f"{file}: damaged Parquet file ({reason})") from None
-    cells: list[Sequence[Any] | NDArray] = []
-    for column in data.columns:
-        kind = column.type
-        if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
-            cells.append(_seconds(column))
-        elif column.null_count == 0 and (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-            cells.append(np.asarray(column.to_numpy(), dtype=np.float64))
-        else:  # text, booleans, decimals and empty cells go through the same careful reading as a CSV
-            cells.append(column.to_pylist())
-    return Table(str(file), tuple(data.column_names), tuple(cells))
-
-
-def _seconds(column: Any) -> Sequence[Any]:
-    """A Parquet time stamp brings its own unit: seconds since its epoch, the same for every column of the file."""
-    import pyarrow as pa
-
-    ticks = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[column.type.unit]
-    return [None if x is None else x / ticks for x in column.cast(pa.int64()).to_pylist()]

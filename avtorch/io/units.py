@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, printable
+from avtorch.numeral import numeral
 
 GRAVITY = 9.80665  # m/s^2, the standard value: "g" as a unit is defined by it
 _MILE = 1609.344
@@ -49,9 +50,9 @@ def to_si(signal: str, unit: str) -> Callable[[NDArray], NDArray]:
 
     Raises InputError for a signal that has no unit and for a unit that is not known for this signal.
     """
-    known = _UNITS.get(signal)
+    known, shown = _UNITS.get(signal), f"{signal}={printable(unit, 40)}"
     if known is None:
-        raise InputError(f"unit {signal}={unit}: {signal} takes no unit; signals with one: {', '.join(_UNITS)}")
+        raise InputError(f"unit {shown}: {signal} takes no unit; signals with one: {', '.join(_UNITS)}")
     name = unit.strip().replace("²", "2").replace("³", "3").replace("^", "").replace("**", "").replace("µ", "u")
     name = name.replace("μ", "u").replace("°", "deg")
     if name in known:
@@ -59,12 +60,12 @@ def to_si(signal: str, unit: str) -> Callable[[NDArray], NDArray]:
     if signal == "grade" and name in _ANGLE:
         return _ANGLE[name]
     try:
-        factor = float(name)
+        factor = numeral(name)
     except ValueError:
         factor = math.nan
-    if not math.isfinite(factor) or factor == 0:
+    if not 1e-12 <= abs(factor) <= 1e12:  # NaN, too
         also = (*known, *(_ANGLE if signal == "grade" else ()))
-        raise InputError(f"unit {signal}={unit}: not known for {signal}; known: {', '.join(also)}, or a factor to SI")
+        raise InputError(f"unit {shown}: not known for {signal}; known: {', '.join(also)}, or a factor to SI")
     return _scaled(factor)
 
 

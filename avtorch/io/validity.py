@@ -77,12 +77,17 @@ def check_time(time: NDArray, same_drive: NDArray, where: Callable[[int], str]) 
     bad = (np.diff(time) <= 0) & same_drive
     if bad.any():
         row = int(np.argmax(bad)) + 1
-        what = "repeats" if time[row] == time[row - 1] else f"goes back from {time[row - 1]:.10g} s to"
-        raise InputError(f"{where(row)}: {what} {time[row]:.10g} s; time must rise from row to row")
+        what = "repeats" if time[row] == time[row - 1] else f"goes back from {time[row - 1]:.16g} s to"
+        raise InputError(f"{where(row)}: {what} {time[row]:.16g} s; time must rise from row to row")
 
 
 def check_rate(step: float, where: str) -> None:
     """Raise InputError for a median ``step`` [s] outside 10 to 200 Hz, saying so where it looks like ms, us or ns."""
+    if not step > 0:
+        raise InputError(
+            f"{where}: found stamps so far from zero, or from each other, that float64 does not tell rows apart; needs "
+            "stamps within 1e9 s of the first"
+        )
     rate = 1 / step
     if not RATE_HZ[0] * (1 - _RATE_SLACK) <= rate <= RATE_HZ[1] * (1 + _RATE_SLACK):
         hint = ""
@@ -96,24 +101,37 @@ def check_rate(step: float, where: str) -> None:
 
 # how far two signals of one motion may differ in scale before their units are certainly not the same: recordings exist
 # whose acceleration is 1.8 times the derivative of their speed; an actuator that gives 2.5 times the demand does not
-_WITNESS = (0.45, 2.2)
+WITNESS = (0.45, 2.2)
 _COMMAND = (0.02, 2.5)
 _SURE = 0.9
 
-_SPEED_FACTORS = {"km/h": 3.6, "mph": 3600 / 1609.344, "ft/s": 1 / 0.3048, "cm/s": 100.0, "mm/s": 1000.0}
-_ACCEL_FACTORS = {"g": GRAVITY, "cm/s2": 0.01, "mm/s2": 0.001, "ft/s2": 0.3048, "km/h/s": 1 / 3.6}
+SPEED_FACTORS = {"km/h": 3.6, "mph": 3600 / 1609.344, "ft/s": 1 / 0.3048, "cm/s": 100.0, "mm/s": 1000.0}
+ACCEL_FACTORS = {"g": GRAVITY, "cm/s2": 0.01, "mm/s2": 0.001, "ft/s2": 0.3048, "km/h/s": 1 / 3.6}
+
+
+_DELAYS_S = tuple(np.arange(0, 1.01, 0.1))
+_LATER_S = tuple(np.arange(1.1, 2.51, 0.1))
 
 
 def command_scale(
     time: NDArray, parts: Sequence[slice], speed: NDArray | None, accel: NDArray | None, u: NDArray
 ) -> Scale | None:
-    """How the motion follows the command ``u``: from speed where it is known, else from the integrated acceleration."""
+    """How the motion follows the command ``u``: from speed where it is known, else from the integrated acceleration.
+
+    Of a command that comes back with the other sign after half a period, a late answer and a turned one look alike: an
+    answer against the command counts only where none with it, by up to 2.5 s of delay and lag, is as clear.
+    """
     if speed is None:
         assert accel is not None
         level = np.concatenate([[0.0], np.cumsum(0.5 * (accel[1:] + accel[:-1]) * np.clip(np.diff(time), 0, 1))])
     else:
         level = speed
-    return scale_between(time, parts, level, u, delays=tuple(np.arange(0, 1.01, 0.1)))
+    found = scale_between(time, parts, level, u, delays=_DELAYS_S)
+    if found is not None and found.slope < 0 and found.correlation <= -_SURE:
+        later = scale_between(time, parts, level, u, delays=_LATER_S)
+        if later is not None and later.slope > 0 and later.correlation >= _SURE:
+            return later
+    return found
 
 
 def check_units(
@@ -131,9 +149,9 @@ def check_units(
     """
     if speed is not None and accel is not None:
         found = scale_between(time, parts, speed, accel)
-        options = {f"speed={unit}": factor for unit, factor in _SPEED_FACTORS.items()}
-        options |= {f"accel={unit}": factor for unit, factor in _ACCEL_FACTORS.items()}
-        _refuse_scale(source, "speed", "accel", found, _WITNESS, options, "accel=-1")
+        options = {f"speed={unit}": factor for unit, factor in SPEED_FACTORS.items()}
+        options |= {f"accel={unit}": factor for unit, factor in ACCEL_FACTORS.items()}
+        _refuse_scale(source, "speed", "accel", found, WITNESS, options, "accel=-1")
     if accel_cmd is not None:
         found = command_scale(time, parts, speed, accel, accel_cmd)
         options = {"accel_cmd=g": GRAVITY, "accel_cmd=cm/s2": 0.01}

@@ -25,7 +25,7 @@ def ten_windows(
     """
     runs = len(T_L)
     loop = ClosedLoop(leader, plant=GLVDPlant(T_L, K_L, sigma=NOISE), scenarios=runs, seeds=noise_seeds(seed, runs))
-    stream = BeliefStream(window=WINDOW_S, vehicles=runs, seed=seed)
+    stream = BeliefStream(window=WINDOW_S, vehicles=runs, seed=seed, check_units=False)
     windows: list[Window] = []
     asked: list[Tensor] = []
     while loop.time < SWEEP_S - 1e-9:

@@ -16,13 +16,15 @@ from avtorch.plots.over_posteriors import agreement_scatter, exact_density, join
 from avtorch.plots.over_ranks import ecdf_difference, ecdf_of, pooled_rank_counts, rank_band, rank_plot
 from avtorch.plots.over_time import belief_band, data_quality, events, motion, string_probability
 from avtorch.plots.over_verdicts import confusion, confusion_figure
-from avtorch.plots.paper_figures import paper_pictures
-from avtorch.plots.posterior_figures import validation_figures
+from avtorch.plots.paper_figures import PAPER_PICTURES, paper_pictures
+from avtorch.plots.posterior_figures import VALIDATION_PICTURES, validation_figures
 from avtorch.plots.signatures import effect_signature, signature_figure
 from avtorch.plots.style import STYLE, save, show
 
 __all__ = [
+    "PAPER_PICTURES",
     "STYLE",
+    "VALIDATION_PICTURES",
     "agreement_scatter",
     "belief_band",
     "belief_figure",

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from avtorch.io import Log
+from avtorch.io.clock import from_start, time_label
 from avtorch.plots.over_plane import gain_curve, region, setting_region, verdict_legend
 from avtorch.plots.over_time import Steps, Windows, belief_band, data_quality, events, motion, string_probability
 from avtorch.plots.style import GREEN, GREY, VERMILLION, styled
@@ -42,7 +43,12 @@ def belief_figure(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     log: Log | None = None,
 ) -> Figure:
-    """Posterior bands of T_L and K_L over time; with a `log`, the quality of its rows below them."""
+    """Posterior bands of T_L and K_L over time; with a `log`, the quality of its rows below them.
+
+    Times are drawn from the log's start, which the answer's `epoch_s` or the `log` tells.
+    """
+    epoch_s = log.epoch_s if log is not None else (answer or {}).get("epoch_s", 0.0)
+    recorded, windows, answer = windows, from_start(windows, epoch_s), _from_start(answer, epoch_s)
     rows = 2 + (log is not None)
     figure = Figure(figsize=(9, 5.8 if log is None else 6.8), layout="constrained")
     heights = [3, 3, 1.3][:rows]
@@ -51,8 +57,8 @@ def belief_figure(
         _events_of(ax, answer or {})
         belief_band(ax, windows, name, truth=(truth or {}).get(name), bounds=(bounds or {}).get(name))
     if log is not None:
-        data_quality(axes[-1], log, windows)
-    axes[-1].set_xlabel("time [s]")
+        data_quality(axes[-1], log, recorded)
+    axes[-1].set_xlabel(time_label(epoch_s))
     _legend_above(figure, *axes[:2])
     return figure
 
@@ -60,6 +66,8 @@ def belief_figure(
 @styled
 def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = None, target: float = 0.95) -> Figure:
     """P(string stable) over time, with alerts and actions; each action says what it set."""
+    epoch_s = (answer or {}).get("epoch_s", 0.0)
+    windows, answer = from_start(windows, epoch_s), _from_start(answer, epoch_s)
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     ax = figure.subplots()
     string_probability(_events_of(ax, answer or {}), windows, target=target)
@@ -67,7 +75,7 @@ def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = N
         names = " + ".join(str(s) for s in action["strategies"]) or "none"
         ax.annotate(f"strategy {names}", (action["time_s"], 0.04 + 0.09 * (i % 4)), (4, 0), textcoords="offset points",
                     color=GREEN, fontsize=9)  # fmt: skip
-    ax.set_xlabel("time [s]")
+    ax.set_xlabel(time_label(epoch_s))
     _legend_above(figure, ax)
     return figure
 
@@ -153,6 +161,12 @@ def stability_figure(
     if title:
         figure.suptitle(title, fontsize=10, color=GREY)
     return figure
+
+
+def _from_start(answer: Mapping[str, Any] | None, epoch_s: float) -> dict[str, Any]:
+    """An answer whose windows, alerts and actions are counted from the log's start."""
+    lists = ("windows", "alerts", "actions")
+    return {k: from_start(v, epoch_s) if k in lists and v else v for k, v in (answer or {}).items()}
 
 
 def _events_of(ax: Axes, answer: Mapping[str, Any]) -> Axes:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from avtorch.errors import InputError
 from avtorch.gap.answer.diagnosis import Diagnosis
 from avtorch.gap.answer.where import UNITS, Axis
+from avtorch.io.clock import time_label
 from avtorch.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILLION, styled
 from avtorch.vehicle.stability import Chain, chain_gain
 
@@ -45,7 +46,10 @@ def gap_on_the_road(ax: Axes, found: Diagnosis, *, seconds: float = _SECONDS) ->
         ax.plot(
             time, traces.after[k][inside] + offset[1], color=BLUE, label=f"with {' and '.join(found.verdict.names)}"
         )
-    ax.set(xlabel="time [s]", ylabel=_NAMES[traces.witnesses[k]])
+    ax.set(
+        xlabel=time_label(found.log.epochs_s[0] if len(found.log.epochs_s) == 1 else 0.0),
+        ylabel=_NAMES[traces.witnesses[k]],
+    )
     ax.margins(x=0)
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, 1.14), ncols=3)
     return ax
@@ -86,7 +90,8 @@ def where_it_lies(ax: Axes, found: Diagnosis, axis: Axis) -> Axes:
         ax.stairs(does / does.sum(), edges, color=BLUE, lw=1.6, label="the effect")
     for part in found.where:
         if part.axis == axis and not isinstance(part.begin, str) and not isinstance(part.end, str):
-            ax.axvspan(part.begin, part.end, color=ORANGE, alpha=0.18, lw=0, label="named part")
+            away = found.log.epochs_s[0] if axis == "time" else 0.0
+            ax.axvspan(part.begin - away, part.end - away, color=ORANGE, alpha=0.18, lw=0, label="named part")
     ax.set(xlabel=f"{axis} [{UNITS[axis]}]", ylabel="share", ylim=(0, None))
     ax.margins(x=0)
     return ax
@@ -127,15 +132,14 @@ def shrinkage(ax: Axes, found: Diagnosis, witness: str) -> Axes:
     )
     for label, values, colour, marker in lines:
         ax.plot(at, values, color=colour, marker=marker, lw=1.2, ms=7, label=label)
-    ax.set_xticks(at, ["0.5 s", "2 s", "10 s", "whole drive"])
+    ax.set_xticks(at, ["whole drive" if c.horizon_s is None else f"{c.horizon_s:.3g} s" for c in each])
     ax.set(xlabel="rollout over", ylabel=f"off in {_NAMES[witness]}")
     ax.set_ylim(0, None)
     return ax
 
 
 def _metric(witness: str, horizon: str) -> str:
-    usual = {"accel": "whole", "speed": "10s"}[witness]
-    return f"rollout_rmse_{witness}" + ("" if horizon == usual else f"_{horizon}")
+    return f"rollout_rmse_{witness}" + ("" if horizon == "10s" else f"_{horizon}")
 
 
 def loop_gain(ax: Axes, chains: Mapping[str, tuple[Chain, dict]], *, colours: Mapping[str, str] | None = None) -> Axes:

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
 from avtorch.io import Log
+from avtorch.io.clock import from_start
 from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, LABELS, ORANGE, SKY, VERMILLION
 
 _TRACES = {
@@ -114,9 +115,14 @@ def events(
 
 
 def data_quality(ax: Axes, log: Log, windows: Windows = ()) -> Axes:
-    """Which rows of a log serve: recorded, masked (driver, standstill); and which windows were excited."""
+    """Which rows of a log serve: recorded, masked (driver, standstill); and which windows were excited.
+
+    Times are drawn from the log's start; `windows` are on its own clock, as answers have them.
+    """
+    windows = from_start(windows, log.epoch_s)
     step = 1 / log.rate_hz
-    recorded = [(log.time[s][0], log.time[s][-1] - log.time[s][0] + step) for s in log.segments()]
+    time = log.elapsed
+    recorded = [(time[s][0], time[s][-1] - time[s][0] + step) for s in log.segments()]
     lanes = [
         ("recorded", recorded, GREY),
         ("driver in charge", _runs(log, ~log.engaged, step), VERMILLION),
@@ -128,7 +134,7 @@ def data_quality(ax: Axes, log: Log, windows: Windows = ()) -> Axes:
     ax.set_yticks(range(len(lanes)), [name for name, _, _ in lanes])
     ax.set_ylim(len(lanes) - 0.4, -0.6)
     ax.grid(False, axis="y")
-    return _span(ax, log.time[[0, -1]])
+    return _span(ax, time[[0, -1]])
 
 
 def _used(window: Mapping[str, Any]) -> bool:
@@ -163,7 +169,7 @@ def _runs(log: Log, mask: np.ndarray, step: float) -> list[tuple[float, float]]:
     """Spans `(start, length)` [s] of the rows where `mask` holds."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [
-        (float(log.time[a]), float(log.time[b - 1] - log.time[a]) + step)
+        (float(log.elapsed[a]), float(log.elapsed[b - 1] - log.elapsed[a]) + step)
         for a, b in zip(edges[::2], edges[1::2], strict=True)
     ]
 

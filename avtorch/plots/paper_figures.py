@@ -70,9 +70,8 @@ def paper_pictures(found: Mapping[str, Any]) -> dict[str, Callable[[], Figure]]:
     pictures: dict[str, Callable[[], Figure]] = {}
     for name, one in found.items():
         if name == "strategies":
-            pictures["strategies_acceleration.png"] = lambda one=one: strategy_figure(one, "accel")
-            pictures["strategies_speed.png"] = lambda one=one: strategy_figure(one, "speed")
-            pictures["strategies_verdict.png"] = lambda one=one: strategy_verdict_figure(one)
+            for shown, draw in _STRATEGIES.items():
+                pictures[f"strategies_{shown}.png"] = lambda one=one, draw=draw: draw(one)
         else:
             pictures[f"{name}.png"] = lambda one=one, draw=_DRAWN[name]: draw(one)
     return pictures
@@ -242,6 +241,16 @@ _DRAWN: Mapping[str, Callable[[Any], Figure]] = {
     "gains": gains_figure,
     "platoon": platoon_figure,
 }
+
+_STRATEGIES: Mapping[str, Callable[[Strategies], Figure]] = {
+    "acceleration": lambda one: strategy_figure(one, "accel"),
+    "speed": lambda one: strategy_figure(one, "speed"),
+    "verdict": lambda one: strategy_verdict_figure(one),
+}
+
+
+PAPER_PICTURES = (*(f"{name}.png" for name in _DRAWN), *(f"strategies_{x}.png" for x in _STRATEGIES))
+"""Every file that `paper_pictures` may name."""
 
 
 def _windows(one: Watched, scenario: int = 0) -> list[dict[str, Any]]:

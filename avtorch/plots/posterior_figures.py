@@ -29,6 +29,10 @@ METHOD = {"nuts": "NUTS", "quadrature": "quadrature"}
 Place = Literal["outside upper center", "outside lower center"]
 
 
+VALIDATION_PICTURES = ("marginals.png", "joint.png", "ranks.png", "agreement.png", "ecdf.png")
+"""Every file that `validation_figures` may name."""
+
+
 def validation_figures(validation: Validation) -> dict[str, Callable[[], Figure]]:
     """The figures of a validation, by the name of the file that each is for; a figure is made when called."""
     shown = Shown(validation)

@@ -13,7 +13,7 @@ from os import PathLike
 from pathlib import Path
 
 from avtorch.gap import GapPlant
-from avtorch.io import atomic
+from avtorch.io import answer_set, atomic
 
 
 @dataclass(frozen=True)
@@ -65,20 +65,17 @@ def to_openpilot(plant: GapPlant) -> Exported:
 
 
 def write_exports(plant: GapPlant | None, folder: str | PathLike[str]) -> list[Path]:
-    """Write `plant.autoware.yaml` and `plant.openpilot.yaml`; returns the files. None: earlier ones go.
+    """Publish `plant.autoware.yaml` and `plant.openpilot.yaml` together; returns the files. None: earlier ones go.
 
     Raises `InputError` where the folder cannot be written.
     """
-    written = []
-    for name, told in (("autoware", to_autoware), ("openpilot", to_openpilot)):
-        path = Path(folder) / f"plant.{name}.yaml"
-        if plant is None:
-            path.unlink(missing_ok=True)
-            continue
-        with atomic(path) as stream:
-            stream.write(told(plant).to_text())
-        written.append(path)
-    return written
+    tools = {"plant.autoware.yaml": to_autoware, "plant.openpilot.yaml": to_openpilot}
+    with answer_set(folder, list(tools)) as staged:
+        for name, export in tools.items():
+            if plant is not None:
+                with atomic(staged / name) as stream:
+                    stream.write(export(plant).to_text())
+    return [] if plant is None else [Path(folder) / name for name in tools]
 
 
 def _unsaid(plant: GapPlant, told: set[str]) -> tuple[str, ...]:

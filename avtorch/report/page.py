@@ -16,6 +16,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from avtorch import __version__
+from avtorch.errors import printable
 from avtorch.experiment import Experiment
 from avtorch.gap.answer import words
 from avtorch.gap.answer.diagnosis import Diagnosis, Quantity
@@ -26,13 +27,13 @@ from avtorch.plots.over_diagnosis import road_figure, shrinkage_figure, where_fi
 from avtorch.plots.over_experiment import experiment_figure
 
 _METRICS = {
-    "rollout_rmse_accel_0.5s": "acceleration, 0.5 s [m/s²]",
-    "rollout_rmse_accel_2s": "acceleration, 2 s [m/s²]",
-    "rollout_rmse_accel_10s": "acceleration, 10 s [m/s²]",
-    "rollout_rmse_accel": "acceleration, whole drive [m/s²]",
-    "rollout_rmse_speed_0.5s": "speed, 0.5 s [m/s]",
-    "rollout_rmse_speed_2s": "speed, 2 s [m/s]",
-    "rollout_rmse_speed": "speed, 10 s [m/s]",
+    "rollout_rmse_accel_0.5s": "acceleration, {horizon} s [m/s²]",
+    "rollout_rmse_accel_2s": "acceleration, {horizon} s [m/s²]",
+    "rollout_rmse_accel": "acceleration, {horizon} s [m/s²]",
+    "rollout_rmse_accel_whole": "acceleration, whole drive [m/s²]",
+    "rollout_rmse_speed_0.5s": "speed, {horizon} s [m/s]",
+    "rollout_rmse_speed_2s": "speed, {horizon} s [m/s]",
+    "rollout_rmse_speed": "speed, {horizon} s [m/s]",
     "rollout_rmse_speed_whole": "speed, whole drive [m/s]",
     "closed_loop_rmse_speed": "speed, closed loop [m/s]",
     "closed_loop_rmse_spacing": "spacing, closed loop [m]",
@@ -52,16 +53,21 @@ def report_html(
     `quality`: what was noted of the data when it was read, a line each. `experiment`: what to drive next, for a picture
     of it. `sections`: what else there is to say after the verdict, lines by title.
     """
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, finalize=_seen, trim_blocks=True, lstrip_blocks=True
+    )
     template = environment.from_string(files("avtorch.report").joinpath("template.html").read_text(encoding="utf-8"))
     return template.render(
         found=found,
         log=found.log,
         headline=words.headline(found),
+        odd=found.winner.implausible,
         lead=[found.verdict.why, words.aliases(found), *words.onset(found)],
-        tone={"unknown": "amber", "none": "green"}.get(found.verdict.name, "blue"),
+        tone="amber"
+        if found.winner.implausible
+        else {"unknown": "amber", "none": "green"}.get(found.verdict.name, "blue"),
         where=words.where(found),
-        parts=[_part(w) for w in found.where],
+        parts=[_part(found, w) for w in found.where],
         gap=[*words.gap(found), *words.moved(found), *words.remains(found)],
         candidates=[_candidate(found, c) for c in found.candidates[:10]],
         shrinkage=words.shrinkage(found),
@@ -75,6 +81,11 @@ def report_html(
         version=__version__,
         pictures=_pictures(found, experiment),
     )
+
+
+def _seen(value: Any) -> Any:
+    """Text of a page, its control characters escaped; markup of our own, the pictures, as it is."""
+    return value if isinstance(value, Markup) or not isinstance(value, str) else printable(value)
 
 
 def write_report(
@@ -125,6 +136,7 @@ def _candidate(found: Diagnosis, c: Any) -> Mapping[str, Any]:
     for key, q in c.parameters.items():
         unit = unit_of(key)
         parameters.append(f"{words_of(key.rpartition('.')[2])} {_number(q)}{'' if unit == '-' else ' ' + unit}")
+    parameters += ["physically implausible"] if c.implausible and c.name != "unknown" else []
     return {
         "name": c.name.replace("+", " + "),
         "probability": words.number(c.probability),
@@ -135,9 +147,17 @@ def _candidate(found: Diagnosis, c: Any) -> Mapping[str, Any]:
     }
 
 
-def _part(part: Any) -> Mapping[str, str]:
+def _part(found: Diagnosis, part: Any) -> Mapping[str, str]:
     unit = UNITS[part.axis]
+    if part.axis == "time":
+        begin, end = (t - found.log.epochs_s[0] for t in (part.begin, part.end))
+        ends = f"{begin:.1f} to {end:.1f} s from the log's start"
+        return _told(part, ends)
     ends = part.begin if part.axis == "signal" else f"{part.begin:.3g} to {part.end:.3g} {unit}"
+    return _told(part, ends)
+
+
+def _told(part: Any, ends: str) -> Mapping[str, str]:
     return {"axis": part.axis, "ends": ends, "share": f"{100 * part.share:.0f} %", "q": _small(part.q_value)}
 
 
@@ -151,7 +171,7 @@ def _measures(found: Diagnosis) -> Sequence[Mapping[str, Any]]:
         return []
     return [
         {
-            "name": _METRICS.get(name, name),
+            "name": _METRICS.get(name, name).format(horizon=f"{c.horizon_s or 0:.3g}"),
             "before": f"{c.before:.3g}",
             "after": f"{c.after:.3g}",
             "floor": f"{c.floor:.3g}",

@@ -15,10 +15,13 @@ from typing import Any, Literal
 from avtorch.blindtest import MIX
 from avtorch.blindtest.cases import SIGNALS
 from avtorch.errors import InputError
-from avtorch.io import write_json
+from avtorch.io import answer_set, sole_use, write_json
 from avtorch.trial.folder import TrialFolder
 from avtorch.trial.tally import tally
 from avtorch.trial.work import Answerer, Task, begin_worker, work
+
+BLINDTEST_FILES = ("blindtest.json", "confusion.png")
+"""The score and its picture; truths and answers are kept beside them."""
 
 
 def run_trial(
@@ -33,9 +36,12 @@ def run_trial(
     outside: Literal["sealed", "calibration"] = "sealed",
     keep_logs: bool = False,
     progress: Callable[[int, int], None] | None = None,
+    publish: bool = True,
     **draw_options: Any,
 ) -> dict[str, Any]:
     """Let `answerers` answer cases 0 to `n - 1` of the set `seed`; write and return `out/blindtest.json`.
+
+    An earlier one stays until the new one is there, and its picture goes with it.
 
     The first answerer is judged, the others stand under `baselines` with the same keys. Answers and truths are kept in
     `out` as they come (`avtorch.trial.folder`); a rerun, also with more cases or another answerer, answers only what is
@@ -50,19 +56,48 @@ def run_trial(
         signals: the witnesses in the logs, in which a cause must show.
         keep_logs: keep `out/logs/NAME.csv`, so that a rerun need not draw the cases again.
         progress: is told (cases done, of).
+        publish: False returns the answer and leaves `out/blindtest.json`, whatever it is, to the caller.
 
-    Raises `InputError` for a folder with another trial's settings and for arguments out of range.
+    An answer that is damaged is asked for again, and `notes` of what is returned names it; a truth that is damaged is
+    refused.
+
+    Raises `InputError` for a folder with another trial's settings or in use by another process, for files of it that
+    are damaged or another case's, and for arguments out of range.
     """
     names = list(answerers)
     _check(n, seed, names, workers, signals)
+    with sole_use(out, work="a blind test"):
+        found = _run(n, seed, Path(out), answerers, workers, mix, signals, outside, keep_logs, progress, draw_options)
+        if publish:
+            with answer_set(out, BLINDTEST_FILES) as staged:
+                write_json(staged / "blindtest.json", found)
+    return found
+
+
+def _run(
+    n: int,
+    seed: int,
+    out: Path,
+    answerers: Mapping[str, Answerer],
+    workers: int,
+    mix: Mapping[str, float] | None,
+    signals: Sequence[str],
+    outside: str,
+    keep_logs: bool,
+    progress: Callable[[int, int], None] | None,
+    draw_options: Mapping[str, Any],
+) -> dict[str, Any]:
+    names = list(answerers)
     shares = dict(MIX if mix is None else mix)
     settings = {"seed": seed, "signals": [s for s in SIGNALS if s in signals], "outside": outside}
     settings |= {"mix": shares, "draw": {key: draw_options[key] for key in sorted(draw_options)}}
-    folder = TrialFolder(Path(out))
+    folder = TrialFolder(out)
     settings = folder.settle(settings)
+    state = [folder.missing(i, names) for i in range(n)]
     tasks = [
         Task(
             root=folder.root,
+            settings=settings,
             index=i,
             seed=seed,
             missing=missing,
@@ -71,11 +106,9 @@ def run_trial(
             options={"mix": shares, "outside": outside, **draw_options},
             keep_logs=keep_logs,
         )
-        for i in range(n)
-        if (missing := folder.missing(i, names))
+        for i, (missing, _) in enumerate(state)
+        if missing
     ]
-    # what lies there is not the whole of it while cases are missing
-    (folder.root / "blindtest.json").unlink(missing_ok=True)
     done = n - len(tasks)
     if progress:
         progress(done, n)
@@ -83,9 +116,7 @@ def run_trial(
         done += 1
         if progress:
             progress(done, n)
-    found = tally(folder, n, names, settings)
-    write_json(folder.root / "blindtest.json", found)
-    return found
+    return tally(folder, n, names, settings) | {"notes": [note for _, damaged in state for note in damaged]}
 
 
 def _check(n: int, seed: int, names: Sequence[str], workers: int, signals: Sequence[str]) -> None:

@@ -14,7 +14,8 @@ from typing import Any
 from avtorch.blindtest import draw_case
 from avtorch.blindtest.answers import read
 from avtorch.errors import InputError
-from avtorch.io import Log, write_json
+from avtorch.io import Log
+from avtorch.io.answers import json_text
 from avtorch.trial.folder import TrialFolder
 
 Answerer = Callable[[Log], dict[str, Any]]
@@ -25,10 +26,12 @@ Answerer = Callable[[Log], dict[str, Any]]
 class Task:
     """A case to answer: `index` in the set `seed`, the names of those who are `missing`, and how it is drawn.
 
-    With more than one process the `answerers` are pickled: functions of a module, not lambdas.
+    `settings` are the trial's, as `TrialFolder.settle` returned them. With more than one process the `answerers` are
+    pickled: functions of a module, not lambdas.
     """
 
     root: Path
+    settings: Mapping[str, Any]
     index: int
     seed: int
     missing: tuple[str, ...]
@@ -40,13 +43,15 @@ class Task:
 
 def work(task: Task) -> int:
     """Answer a case and keep what was said; returns its index."""
-    folder = TrialFolder(task.root)
+    folder = TrialFolder(task.root, task.settings)
     log = folder.kept_log(task.index, task.signals)
     if log is None:
         case = draw_case(task.index, task.seed, signals=task.signals, **task.options)
+        kept = None
         if task.keep_logs:
             case.log().write(folder.log_path(task.index))
-        folder.keep_truth(case)
+            kept = folder.log_path(task.index).read_bytes()
+        folder.keep_truth(case, log=kept)
         log = case.log(signals=task.signals)
     truth = folder.truth(task.index)
     for name in task.missing:
@@ -56,7 +61,6 @@ def work(task: Task) -> int:
 
 def _answer(folder: TrialFolder, name: str, task: Task, log: Log, truth: Mapping[str, Any]) -> None:
     """One answer, with what it cost; a failure is an answer too, and its message is kept."""
-    path = folder.answer_path(name, task.index)
     answer: dict[str, Any] | None = None
     fault = ""
     wall, cpu = time.perf_counter(), time.process_time()
@@ -68,11 +72,11 @@ def _answer(folder: TrialFolder, name: str, task: Task, log: Log, truth: Mapping
     if answer is not None:
         try:
             read(truth, answer)  # the scorer must be able to read it
-            write_json(path, {"answer": answer, "error": None, **spent})
-            return
+            json_text(answer)
         except (InputError, KeyError, TypeError, ValueError) as error:
-            fault = f"the answer is not of avtorch.diagnosis/1: {type(error).__name__}: {error}"
-    write_json(path, {"answer": None, "error": fault, **spent})
+            answer, fault = None, f"the answer is not of avtorch.diagnosis/1: {type(error).__name__}: {error}"
+    # a disk that is full is no fault of the answer's
+    folder.keep_answer(name, task.index, answer, error=fault if answer is None else None, **spent)
 
 
 def begin_worker() -> None:

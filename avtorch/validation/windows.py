@@ -16,6 +16,7 @@ from avtorch.inference.jerk import JerkDensity, JerkStatistics
 from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
 from avtorch.inference.sampler import SamplerSettings
+from avtorch.io.clock import ROUNDING_S
 from avtorch.io.log import Log
 from avtorch.io.us06 import US06_SPEED_MPS
 from avtorch.validation.simulation import simulate
@@ -140,7 +141,9 @@ def windows_of_log(log: Log, *, window: float = 2.0, count: int | None = None) -
     evidence = form.evidence(_padded(log, form, spans), window * log.rate_hz)
     prior = Joint(default_actuation_prior(), form.noise_prior)
     start = torch.tensor([s for s, _ in spans], dtype=torch.float64)
-    last = torch.tensor([float(log.time[rows.stop - 1]) for _, rows in spans], dtype=torch.float64)
+    # from the log's start to its own clock, which a segment may start anew
+    clock = torch.from_numpy(log.time - log.elapsed)[[rows.start for _, rows in spans]]
+    last = torch.tensor([float(log.elapsed[rows.stop - 1]) for _, rows in spans], dtype=torch.float64)
     return Windows(
         name=log.name,
         form="jerk" if measured else "latent",
@@ -148,8 +151,8 @@ def windows_of_log(log: Log, *, window: float = 2.0, count: int | None = None) -
         n=evidence.n,
         excited=evidence.excited,
         truth=None,
-        start_s=start,
-        end_s=torch.minimum(start + window, last + 1 / log.rate_hz),
+        start_s=(start + clock).round(decimals=9),
+        end_s=(torch.minimum(start + window, last + 1 / log.rate_hz) + clock).round(decimals=9),
         sampler=form.sampler,
     )
 
@@ -216,13 +219,13 @@ def _generator(count: int, seed: int) -> torch.Generator:
 
 
 def _spans(log: Log, window: float) -> list[tuple[float, slice]]:
-    """Start [s] and rows of every window with enough usable rows."""
+    """Start [s from the log's start] and rows of every window with enough usable rows."""
     spans = []
     usable = torch.from_numpy(log.usable)
     for part in log.segments():
-        time = torch.from_numpy(log.time[part])
+        time = torch.from_numpy(log.elapsed[part])
         # round-off in a clock that counts 0.01 s must not push a row over a window's end
-        number = ((time - time[0] + 1e-6) / window).floor().long()
+        number = ((time - time[0] + ROUNDING_S) / window).floor().long()
         which, rows = number.unique_consecutive(return_counts=True)
         first = part.start
         for k, n in zip(which.tolist(), rows.tolist(), strict=True):
@@ -238,7 +241,8 @@ def _padded(log: Log, form: Form, spans: list[tuple[float, slice]]) -> dict[str,
     index = torch.stack([torch.arange(longest) + rows.start for _, rows in spans])
     inside = index < torch.tensor([rows.stop for _, rows in spans])[:, None]
     index = torch.where(inside, index, index[:, :1])
-    rows = {name: torch.from_numpy(getattr(log, name))[index] for name in (*form.columns, "time")}
+    signals = {name: getattr(log, name) for name in form.columns} | {"time": log.elapsed}
+    rows = {name: torch.from_numpy(signal)[index] for name, signal in signals.items()}
     last = torch.where(inside, rows["time"], -torch.inf).amax(-1, keepdim=True)
     later = last + (torch.arange(longest) + 1) / log.rate_hz
     return {

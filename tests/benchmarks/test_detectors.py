@@ -29,6 +29,7 @@ def clouds(seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return draws[..., 0], draws[..., 1], used
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unevenness", [(0.0, 0.0), (0.1, 0.03)])
 def test_first_alarms_are_the_monitors(rotating_seed: int, unevenness: tuple[float, float]) -> None:
     T, K, used = clouds(rotating_seed)

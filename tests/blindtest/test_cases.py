@@ -117,6 +117,7 @@ def test_tier_on_request(tier: str) -> None:
         draw_case(0, 1, tiers=("loud",))
 
 
+@pytest.mark.slow
 def test_a_cause_shows_in_the_witnesses_that_are_logged() -> None:
     some = ("sensor_bias", "outliers", "backlash")
     for case in draw_cases(3, 1, mix={"single": 1.0}, effects=some, seconds=60.0, signals=("speed",)):

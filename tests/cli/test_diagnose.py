@@ -8,8 +8,9 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,9 @@ from avtorch.cli.diagnosis_table import bar, diagnosis_headline, diagnosis_notes
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, DeadTime, GapPlant, plant
 from avtorch.gap.answer.diagnosis import Candidate, Diagnosis, GapFacts, LogFacts, Quantity, near, verdict_of
+from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.search.checkpoint import Checkpoint, Kept, Start, read_fits
+from avtorch.gap.search.fitted_work import fitted_work
 from avtorch.io import Log
 
 ROWS = 600
@@ -54,7 +58,7 @@ def answer(logs: Sequence[Log], candidates: tuple[Candidate, ...] = CANDIDATES, 
 
 
 class Search:
-    """Stands in for `avtorch.gap.diagnose`: remembers what it was given, keeps a fit, answers."""
+    """Stands in for `avtorch.gap.diagnose`: remembers what it was given, keeps fits as it does, answers."""
 
     def __init__(self) -> None:
         self.calls: list[dict[str, Any]] = []
@@ -62,14 +66,19 @@ class Search:
         self.more: dict[str, Any] = {}
 
     def diagnose(self, logs: list[Log], *, checkpoint: Path, progress: Callable, **given: Any) -> Diagnosis:
-        before = json.loads(checkpoint.read_text(encoding="utf-8")) if checkpoint.exists() else []
-        self.calls.append({"logs": logs, "fits_before": len(before), **given})
-        for k in range(len(before), 4):
+        base = given["baseline"] or plant()
+        kinds = [EFFECTS[name] for name in given["effects"] or EFFECTS]
+        each = [replace(log, accel_kind=given["accel_kind"]) for log in logs]
+        work = fitted_work(each, base, kinds, pairs=given["pairs"])
+        kept = Checkpoint(checkpoint, work)
+        before = len(read_fits(checkpoint, work)) if checkpoint.exists() else 0
+        self.calls.append({"logs": logs, "fits_before": before, **given})
+        for k in range(before, 4):
             if k == self.interrupted_after:
                 raise KeyboardInterrupt
             progress("single effects", k, 4)
-            checkpoint.parent.mkdir(parents=True, exist_ok=True)
-            checkpoint.write_text(json.dumps([*range(k + 1)]), encoding="utf-8")
+            start = Start(SimpleNamespace(name=f"effect_{k}"), None, f"{k:064x}")  # type: ignore[arg-type]
+            kept.keep(start, Kept(np.zeros(2), NoiseModel(), 0.0))
         return answer(logs, **self.more)
 
 
@@ -208,8 +217,9 @@ def test_interrupted_then_on_again(
     assert "the same command goes on from there" in told
     assert not (out / "diagnosis.json").exists()
     search.interrupted_after = None
-    # neither the budget nor the prior over causes belongs to the fits
-    assert main(["diagnose", drive, "--budget", "9", "--prior", "none=2", "--quiet", "--out", str(out)]) == 0
+    # neither the budget nor the prior over causes belongs to the fits, nor how the posterior is drawn
+    more = ["--budget", "9", "--prior", "none=2", "--seed", "3", "--posterior", "laplace"]
+    assert main(["diagnose", drive, *more, "--quiet", "--out", str(out)]) == 0
     assert [call["fits_before"] for call in search.calls] == [0, 2]
     assert (out / "diagnosis.json").exists()
 
@@ -225,11 +235,10 @@ def test_interrupted_before_anything_was_kept(
 @pytest.mark.parametrize(
     ("options", "fault"),
     [
-        (["--seed", "3"], "begun with --seed 0;"),
-        (["--accel-kind", "specific-force"], "begun with --accel-kind kinematic;"),
-        (["--baseline", "dead_time=0.1"], "begun with --baseline glvd;"),
-        (["--effects", "gust"], "begun with --effects at its default;"),
-        (["--no-pairs"], "begun with --pairs;"),
+        (["--accel-kind", "specific-force"], "begun with accel_kind kinematic;"),
+        (["--baseline", "dead_time=0.1"], "begun with baseline T_L=0.3, K_L=1;"),
+        (["--effects", "gust"], "begun with effects "),
+        (["--no-pairs"], "begun with pairs True;"),
     ],
 )
 def test_fits_of_other_settings_are_not_taken(
@@ -246,7 +255,7 @@ def test_fits_of_other_settings_are_not_taken(
     told = capsys.readouterr().err
     assert told.count("\n") == 1
     assert fault in told
-    assert "--no-resume to begin anew" in told
+    assert "remove it to begin anew (avtorch diagnose --no-resume), or use another folder" in told
     assert main(["diagnose", drive, *options, "--quiet", "--no-resume", "--out", out]) == 0
     assert [call["fits_before"] for call in search.calls] == [0, 0]
 
@@ -267,14 +276,33 @@ def test_fits_of_other_logs_are_not_taken(
     assert search.calls[-1]["fits_before"] == 4
 
 
-def test_a_note_that_cannot_be_read(
+def test_fits_that_cannot_be_believed(
     search: Search, drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Damaged, of an earlier avtorch, or no file at all: one line, and --no-resume begins anew where it may."""
     out = tmp_path / "o"
     assert main(["diagnose", drive, "--quiet", "--out", str(out)]) == 0
-    (out / "fits_of.json").write_text('{"logs": 3}', encoding="utf-8")
+    whole, answer_before = (out / "fits.json").read_bytes(), (out / "diagnosis.json").read_bytes()
+    for content in (whole[:-9], whole.replace(b"0.0", b"0.1", 1), b'{"fits": []}', b"", b"\xff"):
+        (out / "fits.json").write_bytes(content)
+        (out / "fits_of.json").write_text("{}", encoding="utf-8")
+        assert main(["diagnose", drive, "--quiet", "--out", str(out)]) == 2
+        told = capsys.readouterr().err
+        assert told.count("\n") == 1
+        assert f"{out / 'fits.json'}: is damaged" in told
+        assert "--no-resume" in told
+        assert (out / "diagnosis.json").read_bytes() == answer_before
+    assert main(["diagnose", drive, "--no-resume", "--quiet", "--out", str(out)]) == 0
+    assert not (out / "fits_of.json").exists()
+    (out / "fits.json").unlink()
+    (out / "fits.json").symlink_to(tmp_path / "elsewhere")
     assert main(["diagnose", drive, "--quiet", "--out", str(out)]) == 2
-    assert "fits_of.json, which cannot be read" in capsys.readouterr().err
+    assert "fits.json: is a symlink" in capsys.readouterr().err
+    assert main(["diagnose", drive, "--no-resume", "--quiet", "--out", str(out)]) == 0
+    (out / "fits.json").unlink()
+    (out / "fits.json").mkdir()
+    assert main(["diagnose", drive, "--no-resume", "--quiet", "--out", str(out)]) == 2
+    assert "fits.json cannot be removed (Is a directory); needs another folder" in capsys.readouterr().err
 
 
 # --- bad input
@@ -306,7 +334,8 @@ def test_a_note_that_cannot_be_read(
         (["--posterior", "nuts"], "--posterior"),
         (["--unit", "speed=furlong"], "furlong"),
         (["--map", "speed=NOPE"], "NOPE"),
-        (["--speed-min", "20", "--road", "150"], "--road, --seconds: found limits that no manoeuvre"),
+        (["--speed-min", "20", "--speed-max", "30", "--road", "150"], "--road, --seconds: found limits that no man"),
+        (["--speed-min", "90"], "m/s (from the log, where not given), needs 0 or more, and 1.5 m/s between them"),
     ],
 )
 def test_bad_arguments(
@@ -438,7 +467,7 @@ def test_notes(logs: list[Log]) -> None:
     assert told[1] == "Onset: at 132.4 s of the log's time."
     assert told[2] == "The baseline, fitted without and with it: T_L 0.52 → 0.31 s, K_L 1.02 → 0.99."
     assert told[3] == (
-        "Gap of the simulator as it is, over 5 s: acceleration off by 0.21 m/s² (0.05 is left at best), "
+        "Gap of the simulator as it is, in rollouts of 5 s: acceleration off by 0.21 m/s² (0.05 is left at best), "
         "speed by 0.9 m/s."
     )
     assert told[4] == "Once dead_time is in, what remains: aerodynamic_drag 0.897, none 0.100."

@@ -103,7 +103,6 @@ def test_clipping_rules_out_what_would_win_on_paper():
     assert bool(weak.sufficient[0])
 
 
-@pytest.mark.slow
 def test_all_strategies_occur_and_hold_at_the_truth():
     T, K = torch.cartesian_prod(torch.tensor([0.1, 0.6, 1.0, 1.5, 2.0]), torch.tensor([0.4, 0.6, 0.8, 1.1])).double().T
     used = set()

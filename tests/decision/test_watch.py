@@ -1,5 +1,7 @@
 """Watch: belief and monitor as one, in step, and resumed to the bit."""
 
+import copy
+
 import pytest
 import torch
 
@@ -84,7 +86,6 @@ def test_windows_are_watched_under_the_setting_they_were_fed_with(uncut):
     assert first[1] == []
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("save_at", [1, 3, 7, 9, 11])
 def test_a_resumed_watch_goes_on_to_the_bit(blocks, uncut, save_at, tmp_path):
     """Saved between any two blocks, in the midst of a window or not, to a file that holds no code, into a fresh watch
@@ -159,3 +160,26 @@ def test_a_watch_of_another_kind_is_refused():
         Watch(BeliefStream(window=1.0, vehicles=2), Monitor(2, detectors=DETECTORS)).load_state_dict(state)
     with pytest.raises(InputError, match="state"):
         Watch(BeliefStream(vehicles=3), Monitor(3, detectors=DETECTORS)).load_state_dict(state)
+
+
+def test_a_refused_state_leaves_the_whole_watch_as_it_was(blocks):
+    """A monitor's state that is not sound takes the stream's with it."""
+    state = drive(make(), blocks[:2])[0].state_dict()
+    changes = [
+        lambda s: s.pop("monitor"),
+        lambda s: s.update(monitor=None),
+        lambda s: s["monitor"].pop("mean"),
+        lambda s: s["monitor"]["mean"].__setitem__(0, s["monitor"]["mean"][0] * torch.nan),
+        lambda s: s["monitor"].update(has_baseline=torch.zeros(3, dtype=torch.bool)),
+        lambda s: s["monitor"]["charts"].popitem(),
+    ]
+    for change in changes:
+        other = copy.deepcopy(state)
+        change(other)
+        watch = make(seed=9)
+        before = flat(watch.state_dict())
+        with pytest.raises(InputError, match=r"^state: "):
+            watch.load_state_dict(other)
+        after = flat(watch.state_dict())
+        assert before.keys() == after.keys()
+        assert all(torch.equal(v, after[k]) if torch.is_tensor(v) else v == after[k] for k, v in before.items())

@@ -16,7 +16,8 @@ from avtorch.gap import Effect, plant
 from avtorch.gap.answer.contender import Contender
 from avtorch.gap.answer.diagnosis import Diagnosis, GapFacts, LogFacts
 from avtorch.gap.answer.verdict import Candidate, verdict_of
-from avtorch.gap.effects import ConstantResistance, DeadBand, GainChange, RoadGrade, SensorBias
+from avtorch.gap.answer.words import to_drive
+from avtorch.gap.effects import AerodynamicDrag, ConstantResistance, DeadBand, GainChange, RoadGrade, SensorBias
 from avtorch.gap.likelihood.noise_draws import noise_draws
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
@@ -97,6 +98,7 @@ def test_a_resistance_and_a_bias_differ_in_the_speed_alone(rotating_seed: int) -
     assert alone.nats < 0.05
 
 
+@pytest.mark.slow
 def test_of_what_surely_tells_the_gentlest_is_driven(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     found = left([contender([], rng=rng), contender([DeadBand(0.1)], rng=rng)], [0.6, 0.3])
@@ -149,6 +151,7 @@ def test_a_gain_that_has_changed_stays_changed(rotating_seed: int) -> None:
     np.testing.assert_allclose(accel, 0.7 * plain, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_table_is_written_and_an_old_one_goes(tmp_path: Path, rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     told = next_experiment(left([contender([], rng=rng), contender([DeadBand(0.1)], rng=rng)], [0.6, 0.3]))
@@ -159,6 +162,32 @@ def test_the_table_is_written_and_an_old_one_goes(tmp_path: Path, rotating_seed:
     np.testing.assert_allclose([float(r["accel_cmd"]) for r in rows], told.manoeuvre.command, rtol=1e-5, atol=1e-9)
     assert write_table(None, tmp_path) == []
     assert not path.exists()
+
+
+def test_a_slow_car_is_offered_what_it_can_drive(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    found = left([contender([], rng=rng), contender([SensorBias(0.3)], rng=rng)], [0.6, 0.3])
+    slow = replace(found.log, speeds=(0.4, 3.5), commands=(-1.3, 4.9))
+    told = next_experiment(replace(found, log=slow))
+    assert told is not None
+    assert 0.2 <= told.manoeuvre.speed.min() < told.manoeuvre.speed.max() <= 3.5 * 1.05
+    answer = told.to_dict()
+    assert answer["limits"]["source"] == "from the log"
+    assert answer["limits"]["speed_max"] == pytest.approx(3.655)
+    (line,) = to_drive(replace(found, next_experiment=answer))
+    assert "Limits, from the log: 0.24 to 3.66 m/s, -1.6 to 5.21 m/s²." in line
+
+
+def test_drag_on_a_fast_road_leaves_manoeuvres_that_come_back(rotating_seed: int) -> None:
+    """What drag takes depends on the speed that is left once it is made up for."""
+    rng = np.random.default_rng(rotating_seed)
+    rivals = [contender([AerodynamicDrag(2.7e-4)], rng=rng), contender([ConstantResistance(0.2)], rng=rng)]
+    limits = Limits(23, 29.6, -1.3, 1.3)
+    told = next_experiment(left(rivals, [0.6, 0.3]), limits)
+    assert told is not None
+    assert len(told.every) > 0.5 * len(library(limits))
+    speed = responses(rivals[0], [told.manoeuvre], slice(None)).speed.mean((0, 1)).numpy()
+    assert abs(speed[-1] - speed[0]) < 0.3
 
 
 def test_nothing_confused_needs_no_experiment(rotating_seed: int) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -36,15 +36,33 @@ def leader(seconds: float, rng: np.random.Generator) -> Leader:
     return Leader(time, position, speed, accel, DT)
 
 
-def controller(law: Law, values: dict[str, float]) -> Callable[[FollowerState], torch.Tensor]:
+def controller(
+    law: Law, values: dict[str, float], overrides: Sequence[tuple[float, float]] = ()
+) -> Callable[[FollowerState], torch.Tensor]:
+    """The law; in `overrides` (begin, end) [s] a driver brakes, and the law asks for more as the gap opens."""
     own = {k: torch.tensor(v, dtype=torch.float64) for k, v in values.items()}
-    return lambda s: law.command(own, Seen(s.spacing, s.speed, s.lead_speed))
+
+    def command(s: FollowerState) -> torch.Tensor:
+        asked = law.command(own, Seen(s.spacing, s.speed, s.lead_speed))
+        driven = any(begin <= s.time < end for begin, end in overrides)
+        return torch.full_like(asked, -0.6) if driven else asked
+
+    return command
 
 
 def followed_log(
-    name: str, values: dict[str, float], *, seconds: float, rng: np.random.Generator, noise: float = 0.15
+    name: str,
+    values: dict[str, float],
+    *,
+    seconds: float,
+    rng: np.random.Generator,
+    noise: float = 0.15,
+    overrides: Sequence[tuple[float, float]] = (),
 ) -> Log:
-    """What a follower would log, without its commands: jerk noise `noise` [m/s³], sensors' noise on both signals."""
+    """What a follower would log, without its commands: jerk noise `noise` [m/s³], sensors' noise on both signals.
+
+    `overrides`: as of `controller`, with `engaged` 0 there.
+    """
     law = LAWS[name]
     ahead = leader(seconds, rng)
     v0 = float(ahead.speed[0])
@@ -52,7 +70,7 @@ def followed_log(
     car = plant([DeadTime(DELAY)], T_L=T_L, K_L=1.0, sigma=noise)
     loop = ClosedLoop(
         ahead,
-        controller(law, values),
+        controller(law, values, overrides),
         plant=car,
         speed0=v0,
         spacing0=start,
@@ -61,11 +79,15 @@ def followed_log(
     )
     block = loop.advance(len(ahead.time) - 1)
     rows = len(block.time)
+    driven = np.zeros(rows, bool)
+    for begin, end in overrides:
+        driven |= ((block.time >= begin) & (block.time < end)).numpy()
     return Log.from_arrays(
         name=f"{name} drive",
         time=block.time.numpy(),
         speed=block.speed[0].numpy() + 0.01 * rng.standard_normal(rows),
         spacing=block.spacing[0].numpy() + 0.02 * rng.standard_normal(rows),
         lead_speed=ahead.speed[:rows].numpy() + 0.01 * rng.standard_normal(rows),
+        engaged=(~driven).astype(float),
         following=True,
     )

@@ -1,15 +1,21 @@
 """Two drives of one car, and of two."""
 
 import json
+from functools import partial
+from io import StringIO
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import avtorch
+from avtorch.cli.compare import _table
 from avtorch.errors import InputError
-from avtorch.gap import DeadTime, plant
+from avtorch.gap import DeadTime, GapPlant, plant
+from avtorch.gap.delay_rival import WithDelay, later_answer
 from avtorch.io import Log
 from tests.gap.records import QUIET, log_of
+from tests.overridden import taken_over
 
 
 def _drive(rng: np.random.Generator, *, seconds: float = 120.0, **of: float) -> Log:
@@ -28,6 +34,56 @@ def test_a_slower_car_is_told_and_by_how_much(rotating_seed: int) -> None:
     json.dumps(told.to_dict(), allow_nan=False)
 
 
+CHANGES = {
+    "delay": ({"delay": 0.15}, "not lag and gain"),
+    "lag": ({"T_L": 0.56}, "lag and gain"),
+    "gain": ({"K_L": 0.72}, "lag and gain"),
+}
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.12])
+@pytest.mark.parametrize("what", CHANGES)
+def test_a_later_answer_is_not_taken_for_lag_and_gain(what: str, delay: float, rotating_seed: int) -> None:
+    """Only the delay, the lag or the gain has changed, of a car that had a delay before or had none."""
+    rng = np.random.default_rng(rotating_seed)
+
+    def car(T_L: float = 0.4, K_L: float = 0.9, **more: float) -> GapPlant:
+        late = delay + more.get("delay", 0.0)
+        return plant([DeadTime(late)] if late else [], T_L=T_L, K_L=K_L)
+
+    change, account = CHANGES[what]
+    told = avtorch.compare(*(log_of(x, seconds=90.0, rng=rng, noise=QUIET) for x in (car(), car(**change))))
+    assert told.changed
+    assert told.later is not None
+    # of the true account the chance is uniform: below 0.01 in 1 of 100, and drawn again then; the other one is far off
+    assert told.later.account == account
+    gone = told.later.difference
+    assert abs(gone.mean - change.get("delay", 0.0)) < 5 * gone.sd
+    if what == "delay":
+        assert "lag and gain do not explain it" in told.why
+        assert told.later.p_lag_gain < 1e-3 < told.later.p_dead_time
+    else:
+        assert told.why.startswith("The car has changed: T_L ")
+        assert told.later.p_dead_time < 1e-3 < told.later.p_lag_gain
+    answer = told.to_dict()["explained"]
+    assert answer["account"] == account
+    json.dumps(answer, allow_nan=False)
+
+
+def test_what_cannot_be_told_is_not(rotating_seed: int) -> None:
+    """Where either account would do, neither is given."""
+    numbers = np.random.default_rng(rotating_seed).normal(scale=0.01, size=(2, 3))
+    spread = np.diag([0.1, 0.1, 0.05]) ** 2
+    one, two = (WithDelay(x, spread, 9) for x in numbers)
+    told = later_answer(one, two, level=0.04)
+    assert told.account == "cannot be told"
+    far = later_answer(one, WithDelay(two.mean + np.array([1.0, 0.0, 0.0]), spread, 9), level=0.04)
+    assert far.account == "lag and gain"
+    # both have changed: lag and gain alone do not explain it either
+    both = later_answer(one, WithDelay(two.mean + np.array([1.0, 0.0, 0.5]), spread, 9), level=0.04)
+    assert both.account == "not lag and gain"
+
+
 @pytest.mark.slow
 def test_one_car_stays_one_car(rotating_seed: int) -> None:
     """With a delay that the model lacks: what it lacks is spread, and no change."""
@@ -44,6 +100,8 @@ def test_two_simulators_on_one_drive(rotating_seed: int) -> None:
     log = _drive(np.random.default_rng(rotating_seed), T_L=0.4, K_L=0.9)
     told = avtorch.compare(log, log, baseline=plant(T_L=0.2, K_L=0.8), baseline_after=plant(T_L=0.4, K_L=0.9))
     assert told.p_value == pytest.approx(1.0)
+    assert told.later is None
+    assert told.to_dict()["explained"] is None
     assert told.car["K_L"].ratio.mean == pytest.approx(1.0)
     assert told.simulator == "closer"
     assert "second simulator is closer" in told.why
@@ -51,10 +109,31 @@ def test_two_simulators_on_one_drive(rotating_seed: int) -> None:
     assert turned.simulator == "farther"
 
 
+def test_rollouts_of_both_sides_last_as_long_as_they_are_said_to(rotating_seed: int) -> None:
+    """Between overrides every 8 s no rollout lasts 10 s, and errors grow with how long they do: once those of 6 s were
+    called 10 s, and held against 10 s of a drive without overrides."""
+    rng = np.random.default_rng(rotating_seed)
+    weak = partial(taken_over, seconds=90.0, rng=rng, brake_gain_ratio=0.7)
+    often, never = weak(overrides=[(8.0 + 9 * k, 10.0 + 9 * k) for k in range(9)]), weak(overrides=())
+    simulator = plant(T_L=0.35, K_L=1.0)
+    told, whole = (avtorch.compare(x, never, baseline=simulator) for x in (often, never))
+    # the first stretch has 8 s, of which two settle the car
+    assert told.horizon_s == pytest.approx(6.0, abs=0.06)
+    assert told.to_dict()["horizon_s"] == told.horizon_s
+    assert whole.horizon_s == 10.0
+    # the speed lost by braking less adds up
+    assert told.gap["rollout_rmse_speed"].after.mean < whole.gap["rollout_rmse_speed"].after.mean
+    table = Console(width=100, record=True, file=StringIO())
+    table.print(_table(told))
+    shown = table.export_text()
+    assert "off in speed, 6 s [m/s]" in shown
+    assert "10 s" not in shown
+
+
 def test_wrong_input_is_told() -> None:
     rng = np.random.default_rng(0)
     long = _drive(rng, seconds=60.0)
-    with pytest.raises(InputError, match="after: 3 blocks"):
+    with pytest.raises(InputError, match="after: found 3 blocks"):
         avtorch.compare(long, _drive(rng, seconds=36.0))
     with pytest.raises(InputError, match="level"):
         avtorch.compare(long, long, level=0.0)

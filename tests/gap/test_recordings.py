@@ -150,8 +150,9 @@ def driven(lap: Log, effects: dict[str, dict[str, float]], seed: int) -> Log:
     return Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("effect", EFFECTS)
+@pytest.mark.parametrize(
+    "effect", [pytest.param(e, marks=[] if e.startswith("sensor") else pytest.mark.slow) for e in EFFECTS]
+)
 def test_an_effect_injected_into_a_recording_is_named(laps: dict[int, Log], effect: str) -> None:
     # one seed of five that were tried on the three laps; all were named, the delay by 17 to 48 nats over none
     given = EFFECTS[effect]
@@ -163,7 +164,6 @@ def test_an_effect_injected_into_a_recording_is_named(laps: dict[int, Log], effe
     assert abs(told.mean - value) < 4 * told.sd + 0.05 * abs(value)
 
 
-@pytest.mark.slow
 def test_nothing_injected_nothing_named(laps: dict[int, Log]) -> None:
     answer = avtorch.diagnose(driven(laps[2], {}, seed=2), pairs=False)
     assert answer.verdict.names == ("none",)

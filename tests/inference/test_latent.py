@@ -158,6 +158,7 @@ def test_where_digits_are_lost_the_answer_is_nan_and_no_error() -> None:
     assert bool(out[1].isnan().all())
 
 
+@pytest.mark.slow
 def test_a_log_simulated_without_noise_is_told_to_the_finest_sensor() -> None:
     """Its likelihood grows without end as the noise parameters fall, unless sensors have a finest step."""
     dt, rows = 0.05, 101
@@ -185,6 +186,7 @@ def _gradient_case(generator: torch.Generator) -> tuple[Tensor, tuple[Tensor, ..
     return time, tuple(x.requires_grad_() for x in (*values, u, a, v))
 
 
+@pytest.mark.slow
 def test_filter_gradients(rotating_seed: int) -> None:
     time, inputs = _gradient_case(torch.Generator().manual_seed(rotating_seed))
 
@@ -244,6 +246,7 @@ def simulate(rows: int, generator: torch.Generator, windows: int) -> LatentWindo
     return LatentWindow(time, u[:, :rows], None, v, torch.ones_like(v, dtype=torch.bool))
 
 
+@pytest.mark.slow
 def test_mode_finds_the_truth_within_its_laplace_bars(rotating_seed: int) -> None:
     data = simulate(3000, torch.Generator().manual_seed(rotating_seed), windows=4)
     mode = find_mode(LatentDensity(data))

@@ -151,6 +151,7 @@ def test_mass_without_end_is_flagged() -> None:
     assert found.edge[0] > 0.1
 
 
+@pytest.mark.slow
 def test_sampler_agrees_on_cars(make_windows, rotating_seed: int) -> None:
     """Algorithm 1 is held to quadrature, and quadrature to a grid twice as fine."""
     w = make_windows(rotating_seed, [0.05, 0.4, 3.0], T=[0.3, 1.5, 0.1], K=[1.0, 0.5, 0.8])

@@ -82,6 +82,7 @@ def test_sample_by_sample_equals_one_block(drive):
     assert_same(expected, windows)
 
 
+@pytest.mark.slow
 def test_memory_is_bounded(drive):
     """After an hour of rows the state is as large as after the first window, and what a block brings is not kept."""
     stream = new(vehicles=1)
@@ -217,3 +218,47 @@ def test_a_state_of_another_stream_is_refused():
     for options in ({"window": 5.0}, {"vehicles": 3}, {"mode": "posterior"}):
         with pytest.raises(InputError, match=r"^state: "):
             new(**options).load_state_dict(state)
+
+
+@settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.integers(0, 1000), max_size=8), st.integers(0, 8))
+def test_a_driver_masks_his_rows_and_the_settling_after_them(drive, tmp_path_factory, cuts, save_at):
+    """One vehicle of two is taken over: what it holds then and in the 2 s after may be anything, however it is cut."""
+    time, columns = block(drive, slice(None))
+    engaged = torch.ones(2, 1000, dtype=torch.bool)
+    engaged[0, 250:420] = False
+    usable = engaged.clone()
+    usable[0, 250:620] = False
+    expected = new().feed(time, columns, usable=usable, until=10.0)
+    assert [int(w.n[0]) for w in expected] == [200, 50, 0, 180, 200]
+    garbled = {n: torch.where(usable, c, torch.nan) for n, c in columns.items()}
+    stream, windows = new(), []
+    for k, (first, last) in enumerate(pairwise([0, *sorted(cuts), 1000])):
+        part = slice(first, last)
+        # who says nothing of a driver while none is in charge need not: the settling goes on
+        on = None if bool(engaged[:, part].all()) else engaged[:, part]
+        windows += stream.feed(time[part], {n: c[:, part] for n, c in garbled.items()}, engaged=on)
+        if k == save_at:
+            path = tmp_path_factory.mktemp("state") / "stream.pt"
+            stream.save(path)
+            stream = new(seed=99)
+            stream.load(path)
+    assert_same(expected, windows + stream.feed(time[:0], {n: c[:, :0] for n, c in columns.items()}, until=10.0))
+
+
+def test_a_driver_is_told_by_vehicle_and_row(drive):
+    time, columns = block(drive, slice(0, 10))
+    with pytest.raises(InputError, match=r"engaged: of shape \(2, 9\), needs \(2, 10\)"):
+        new().feed(time, columns, engaged=torch.ones(2, 9, dtype=torch.bool))
+    # what is neither 0 nor 1 once counted as engaged
+    for odd in (0.5, float("nan"), -1.0):
+        with pytest.raises(InputError, match=r"engaged: found .*, needs 0 \(driver\) or 1"):
+            new().feed(time, columns, engaged=torch.full((2, 10), odd))
+    stream = new()
+    broken = {n: torch.full_like(c, torch.nan) for n, c in columns.items()}
+    with pytest.raises(InputError, match="not finite"):
+        stream.feed(time, broken, engaged=torch.tensor([[False], [True]]).expand(2, 10))
+    # nothing of a block that is refused is taken in, the driver neither
+    stream.feed(time, columns)
+    (window,) = stream.flush()
+    assert window.n.tolist() == [10, 10]

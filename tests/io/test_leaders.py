@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -210,3 +211,20 @@ def test_the_platoons_as_following_logs(data_dir):
             seen = check(Log.read(path, map=names, following=True))
             assert seen.doubtful_units == ()
             assert seen.standstill_rows > 0
+
+
+def test_a_platoon_without_a_vehicle_is_refused(tmp_path: Path) -> None:
+    """Found by the fuzzer: a column that is called as those of vehicles are, and bears no number."""
+    path = tmp_path / "platoon.csv"
+    path.write_text("Time,SpeedDoppler\n0.0,1.0\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"platoon.csv: found no column SpeedDoppler1"):
+        read_leader(path)
+
+
+@pytest.mark.parametrize("event", [None, 1])
+def test_a_recording_of_no_rows_is_refused(tmp_path: Path, event: int | None) -> None:
+    """Found by the fuzzer."""
+    path = tmp_path / "events.csv"
+    path.write_text("event,time,spacing,speed,lead_speed\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"events.csv: found a header but no rows"):
+        read_leader(path, event=event)

@@ -137,6 +137,11 @@ def test_gaps_and_new_values_of_segment_cut_the_drive():
     log = Log.from_arrays(**(GOOD | {"time": fresh, "segment": drives}))
     assert [s.start for s in log.segments()] == [0, 500, 1000]
     assert log.segment.tolist() == np.repeat([0, 1, 2], [500, 500, n - 1000]).tolist()
+    # such as a time stamp in nanoseconds or a hash: numbers that no int64 holds, and neighbours in float64
+    for large in (2.0**63, 1e300):
+        named = np.where(drives == drives[0], large, np.nextafter(large, np.inf))
+        log = Log.from_arrays(**(GOOD | {"time": fresh, "segment": named}))
+        assert [s.start for s in log.segments()] == (np.flatnonzero(np.diff(named, prepend=np.nan) != 0)).tolist()
     with pytest.raises(InputError, match="row 501, column 'time': goes back"):
         Log.from_arrays(**(GOOD | {"time": fresh}))
 
@@ -149,15 +154,17 @@ def test_masks():
     engaged[200:230] = 0
     log = Log.from_arrays(time=GOOD["time"], accel_cmd=GOOD["accel_cmd"], speed=speed, engaged=engaged)
     expected = np.ones(n, bool)
-    expected[:50] = expected[200:230] = False
+    # a driver's rows, and the two seconds at 50 Hz after them
+    expected[:50] = expected[200:330] = False
     np.testing.assert_array_equal(log.usable, expected)
     seen = check(log)
-    assert (seen.masked_rows, seen.driver_rows, seen.standstill_rows) == (80, 30, 50)
+    assert (seen.masked_rows, seen.driver_rows, seen.settling_rows, seen.standstill_rows) == (180, 30, 100, 50)
     without = Log.from_arrays(time=GOOD["time"], accel_cmd=GOOD["accel_cmd"], accel=GOOD["accel"])
     assert without.usable.all()
     part = log[100:300]
     assert part.rows == 200
-    assert part.usable.sum() == 170
+    # a hundred before the driver's thirty, and seventy that settle
+    assert part.usable.sum() == 100
 
 
 @given(st.data())

@@ -46,6 +46,7 @@ def test_counts_and_slopes_by_hand() -> None:
     assert (known.verdict, "T_L 0.2 s: too few" in known.why) == ("not reproduced", True)
 
 
+@pytest.mark.slow
 def test_a_small_sweep_covers_and_knows(rotating_seed: int) -> None:
     found = estimation(Leaders.read(), seeds=2, seed=rotating_seed)
     assert [s.truth.shape for s in found.sweeps] == [(15, 2)]

@@ -15,7 +15,6 @@ def found() -> Platoon:
     return platoon(Leaders.read(), seeds=2, seed=7)
 
 
-@pytest.mark.slow
 def test_rows_and_measures(found: Platoon) -> None:
     assert found.run.speed.shape[1:3] == (2, VEHICLES)
     ratio = found.against_leader("speed", PASSED_S)
@@ -29,7 +28,6 @@ def test_rows_and_measures(found: Platoon) -> None:
     assert float(found.peak[0]) == pytest.approx(2.2445, abs=5e-5)
 
 
-@pytest.mark.slow
 def test_collisions_are_told(found: Platoon) -> None:
     hit = (found.run.spacing <= 0).flatten(1).any(-1)
     for i, name in enumerate(found.names):

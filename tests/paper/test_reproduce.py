@@ -8,6 +8,7 @@ from avtorch.errors import InputError
 from avtorch.paper import EXPERIMENTS, reproduce
 
 
+@pytest.mark.slow
 def test_equal_by_seed_and_only_by_seed() -> None:
     told: list[tuple[float, float]] = []
     first, again, other = (

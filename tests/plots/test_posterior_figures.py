@@ -69,6 +69,7 @@ def nothing_runs_out(figure: Figure) -> None:
         assert box.x1 <= figure.bbox.x1 + 2, text
 
 
+@pytest.mark.slow
 def test_figures_of_a_validation(validation: Validation) -> None:
     figures = plots.validation_figures(validation)
     assert set(figures) == FILES
@@ -76,6 +77,7 @@ def test_figures_of_a_validation(validation: Validation) -> None:
         nothing_runs_out(make())
 
 
+@pytest.mark.slow
 def test_windows_shown_go_from_wide_to_narrow(validation: Validation) -> None:
     figure = plots.validation_figures(validation)["joint.png"]()
     titles = [ax.get_title("left").split("\n") for ax in figure.axes]
@@ -100,6 +102,7 @@ def test_ecdf_figure_counts_windows_and_sees_a_shift(validation: Validation) -> 
     assert titles[1] == f"SGLD, $K_L$: 0 of {settled} inside"
 
 
+@pytest.mark.slow
 def test_without_quadrature_nuts_is_the_reference(validation: Validation) -> None:
     index = validation.nuts_index
     alone = dataclasses.replace(

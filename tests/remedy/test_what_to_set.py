@@ -41,6 +41,7 @@ def test_a_weak_actuator_as_the_exact_verdict_has_it(rotating_seed: int) -> None
     assert told.clipped <= 0.05
 
 
+@pytest.mark.slow
 def test_a_dead_time_is_not_a_lag(rotating_seed: int) -> None:
     belief = _belief(rotating_seed, 0.3, 1.0, dead_time__delay_s=0.4)
     told = what_to_set(plant([DeadTime(0.4)], T_L=0.3, K_L=1.0), belief)

@@ -102,3 +102,10 @@ def test_a_place_that_cannot_be_written(found: Diagnosis, tmp_path: Path) -> Non
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="file"):
         write_report(found, tmp_path / "file")
+
+
+def test_a_name_steers_no_browser_and_no_terminal(found: Diagnosis) -> None:
+    steer = "lap\x1b[2J\u202egpj\x9b\udc80.csv"
+    text = report_html(replace(found, log=replace(found.log, name=steer)), quality=[f"columns ignored: {steer}"])
+    assert text.count(r"lap\x1b[2J\u202egpj\x9b\udc80.csv") >= 2
+    assert text.replace("\n", "").isprintable()

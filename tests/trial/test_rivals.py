@@ -55,6 +55,7 @@ def test_fit_of_a_plain_car_is_where_it_should_be(rotating_seed: int) -> None:
     assert np.sqrt(fit.sizes) == pytest.approx([car.process_sd, car.accel_sd, car.speed_sd], rel=0.35)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RIVALS)
 @pytest.mark.parametrize("signals", [("accel", "speed"), ("accel",), ("speed",)])
 def test_answers_are_of_the_schema(name: str, signals: tuple[str, ...]) -> None:

@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from avtorch.errors import InputError
-from avtorch.io import Log
+from avtorch.io import Log, read_sealed, write_sealed
 from avtorch.trial import reply, run_trial
+from avtorch.trial.folder import TRUTH
 from avtorch.trial.rivals import random_guess
 
 SHORT = {"seconds": 60.0, "tiers": ("easy",)}
@@ -32,6 +33,7 @@ class Asked:
         return reply(log, {"none": 1.0}, why="always")
 
 
+@pytest.mark.slow
 def test_answers_are_kept_and_only_missing_ones_are_asked_for(tmp_path: Path) -> None:
     first, steps = Asked(), []
     found = run_trial(6, 4, tmp_path, answerers={"says_none": first}, progress=lambda *s: steps.append(s), **SHORT)
@@ -62,8 +64,9 @@ def test_other_settings_need_another_folder(tmp_path: Path) -> None:
         run_trial(1, 4, tmp_path, answerers={"says_none": Asked()}, signals=("speed",), **SHORT)
     # a vehicle that has changed makes another case of the same number
     truth = tmp_path / "truth" / "case_00000.json"
-    told = json.loads(truth.read_text(encoding="utf-8"))
-    truth.write_text(json.dumps(told | {"visibility": 1.0}), encoding="utf-8")
+    told = read_sealed(truth, schema=TRUTH)
+    told.content["truth"]["visibility"] = 1.0
+    write_sealed(truth, told.content, schema=TRUTH, of=told.of)
     with pytest.raises(InputError, match="comes out otherwise"):
         run_trial(1, 4, tmp_path, answerers={"other": Asked()}, **SHORT)
 

@@ -103,6 +103,7 @@ def test_amplitudes_span_their_range(rotating_seed):
     assert 2.0 < reach.max() < 3.0 + 1e-9
 
 
+@pytest.mark.slow
 def test_windows_are_calibrated_and_the_stretched_are_not(rotating_seed):
     assert sbc(300, seed=rotating_seed).p_value > CHANCE
     # an SD too wide by 1.4 puts the spread's statistic of each parameter six sigma off at 300
@@ -129,7 +130,9 @@ def test_sgld_and_quadrature_see_the_same_windows(rotating_seed):
     assert exact.ranks.tolist() == (exact.below * 100).long().tolist()
 
 
-@pytest.mark.parametrize("mode", ["posterior", "lambda", "forgetting"])
+@pytest.mark.parametrize(
+    "mode", ["posterior", *(pytest.param(m, marks=pytest.mark.slow) for m in ("lambda", "forgetting"))]
+)
 def test_the_loop_is_calibrated(mode, rotating_seed):
     found = sbc_loop(120, windows=3, mode=mode, amplitude=1.0, seed=rotating_seed)
     assert len(found) == 3
@@ -144,6 +147,7 @@ def test_windows_that_are_not_excited_are_not_ranked(rotating_seed):
         assert 0 < calibration.replications + calibration.dropped < 60
 
 
+@pytest.mark.slow
 def test_a_prior_that_claims_too_much_is_seen(rotating_seed):
     """A truth that stays, and a ``lambda`` that puts it within 0.01 of the last mean, whose own SD is more."""
     found = sbc_loop(200, windows=2, mode="lambda", lam=1e-4, truth="constant", amplitude=0.3, seed=rotating_seed)

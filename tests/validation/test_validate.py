@@ -118,6 +118,7 @@ def test_draws_of_a_quadrature_have_its_moments(windows: Windows, exact: Quadrat
     assert float((correlation(draws) - correlation(other)).abs().max()) < 5 * math.sqrt(3.5 / 20_000) * 1.2
 
 
+@pytest.mark.slow
 def test_reference_of_weak_windows_takes_the_finer_grid() -> None:
     found = synthetic_windows(8, seed=0)
     usual = integrate(found.density, nodes=NODES[0])

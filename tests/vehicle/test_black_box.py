@@ -62,6 +62,7 @@ def test_what_is_measured_is_the_transfer_function(k_f: float, delay: float) -> 
     assert torch.allclose(seen, said, rtol=5e-4)
 
 
+@pytest.mark.slow
 def test_a_black_box_is_judged_by_its_slopes_for_small_motions_only() -> None:
     law = linearise(network, 25.0)
     omega = torch.tensor([0.8], dtype=torch.float64)

@@ -49,7 +49,6 @@ STATES = [
 ]
 
 
-@pytest.mark.slow
 def test_plan_against_an_independent_solver():
     mpc = MPC(weights=(1.0, 0.5, 0.2, 1.0), T=0.5, K=0.8)
     plans = mpc.plan(torch.tensor(STATES, dtype=F64))

@@ -18,6 +18,7 @@ from avtorch.vehicle.stability import (
 NOMINAL = torch.tensor([1.5, 1.5, -0.8], dtype=torch.float64)
 
 
+@pytest.mark.slow
 def test_as_the_exact_verdicts_of_glvd_with_dead_time(rotating_seed: int) -> None:
     generator = torch.Generator().manual_seed(rotating_seed)
 

@@ -84,7 +84,6 @@ def test_nyquist_count_against_the_roots(rotating_seed):
     assert torch.equal(got[clear], (roots < 0)[clear])
 
 
-@pytest.mark.slow
 def test_nyquist_count_against_the_argument_of_the_characteristic(rotating_seed):
     """Mikhailov: stable iff arg F(j omega) of F = T s^3 + s^2 + K E q turns by 3 pi / 2 from omega = 0 to infinity."""
     T, K, tau, gains, theta = random_delayed(2000, rotating_seed)
@@ -111,7 +110,6 @@ def test_nyquist_count_against_the_argument_of_the_characteristic(rotating_seed)
     assert torch.equal(got[clear], stable[clear])
 
 
-@pytest.mark.slow
 def test_peak_gain_against_a_finer_sweep(rotating_seed):
     T, K, tau, gains, theta = random_delayed(2000, rotating_seed)
     peak = stability.peak_gain(T, K, tau, gains, dead_time=theta)

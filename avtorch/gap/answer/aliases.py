@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from avtorch.gap.answer.plausible import implausible
 from avtorch.gap.answer.verdict import ALIAS_RATIO, Candidate, candidate_name, near
 from avtorch.gap.chain.effect import EFFECTS, Effect
 from avtorch.gap.likelihood.witnesses import judged
@@ -122,13 +123,14 @@ class Told:
     among: tuple[type[Effect], ...]
     prior: Mapping[str, float] = field(default_factory=dict)
     specific_force: bool = False
+    complete: bool = True
 
     @classmethod
     def of(cls, race: Race, among: Iterable[type[Effect]], prior: Mapping[str, float] | None = None) -> Told:
         """From a search."""
         values = {f.name: f.values for f in race.found}
         specific = race.record.accel_kind == "specific-force"
-        return cls(race.record.witnesses, values, tuple(among), dict(prior or {}), specific)
+        return cls(race.record.witnesses, values, tuple(among), dict(prior or {}), specific, race.complete)
 
     def shared(self, chances: Mapping[str, float]) -> dict[str, float]:
         """Probabilities by name in which exact aliases share what they have together, by the prior's weights (equal
@@ -152,9 +154,8 @@ class Told:
         out = []
         for name in sorted(set(chances) - known):
             source = next(c for c in candidates if name in self._group(c.name))
-            out.append(
-                Candidate(name, chances[name], source.log_evidence, moved=source.moved, onset_s=source.onset_s)
-            )  # fmt: skip
+            own = {"moved": source.moved, "implausible": implausible({}, source.moved), "onset_s": source.onset_s}
+            out.append(Candidate(name, chances[name], source.log_evidence, **own))
         return out
 
     def alias_set(self, candidates: Sequence[Candidate]) -> tuple[str, ...]:
@@ -167,6 +168,8 @@ class Told:
         first = max(candidates, key=lambda c: c.probability).name
         like = lookalikes(first, self.witnesses, self.values.get(first), specific_force=self.specific_force)
         more = [*sorted(self._group(first)), *sorted(n for n in like if self._allowed(n))]
+        if not self.complete:
+            more.append("unknown")  # any candidate that the budget left untried
         return tuple(dict.fromkeys([*names, *more]))
 
     @property

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.gap.answer.odds import CHANCE
 from avtorch.gap.answer.reported import belief
 from avtorch.gap.answer.verdict import Verdict
 from avtorch.gap.chain.plant import GapPlant
@@ -63,13 +62,13 @@ def contenders(race: Race, verdict: Verdict) -> tuple[Contender, ...]:
     if (len(names) < 2 and len(verdict.alias_set) > 1) or verdict.abstained:
         others = [f.name for f in race.found if f.name not in names]
         # what differs by chance alone foretells the same
-        names = _apart([*names, *others])[: len(names) + _STAND_IN]
+        names = _apart([by_name[name] for name in [*names, *others]])[: len(names) + _STAND_IN]
     return tuple(Contender.of(by_name[name]) for name in names[:_MOST])
 
 
-def _apart(names: Sequence[str]) -> list[str]:
-    """The names whose rollouts differ from those of every earlier one."""
+def _apart(found: Sequence[Found]) -> list[str]:
+    """Names of the finds whose rollouts differ from those of every earlier one."""
     out: dict[frozenset[str], str] = {}
-    for name in names:
-        out.setdefault(frozenset(name.split("+")) - CHANCE - {"none"}, name)
+    for f in found:
+        out.setdefault(frozenset(e.name for e in f.candidate.effects), f.name)
     return list(out.values())

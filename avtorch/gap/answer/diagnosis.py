@@ -20,15 +20,26 @@ from avtorch.gap.answer.quantity import Quantity, unit_of
 from avtorch.gap.answer.repeats import Repeats
 from avtorch.gap.answer.shrinkage import Closed, Shrinkage
 from avtorch.gap.answer.traces import Traces
-from avtorch.gap.answer.verdict import Candidate, Verdict, candidate_name, listed, near, plain, verdict_of
+from avtorch.gap.answer.verdict import (
+    Candidate,
+    Verdict,
+    candidate_name,
+    listed,
+    near,
+    plain,
+    plausibility,
+    verdict_of,
+)
 from avtorch.gap.answer.where import Where
 from avtorch.gap.chain.plant import GapPlant
-from avtorch.io import Log, atomic, write_json
+from avtorch.gap.search.found import Scope
+from avtorch.io import Log, answer_set, atomic, write_json
 
 if TYPE_CHECKING:
     from arviz import InferenceData
 
 __all__ = [
+    "DIAGNOSIS_FILES",
     "Candidate",
     "Closed",
     "Diagnosis",
@@ -43,6 +54,16 @@ __all__ = [
     "verdict_of",
 ]
 
+DIAGNOSIS_FILES = (
+    "diagnosis.json",
+    "plant.toml",
+    "plant.autoware.yaml",
+    "plant.openpilot.yaml",
+    "manoeuvre.csv",
+    "report.html",
+)
+"""Every file that a diagnosis may consist of."""
+
 SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead_accel", "grade")
 
 
@@ -50,7 +71,9 @@ SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead
 class LogFacts:
     """What was looked at: usable or not, all `rows`; `seconds` without gaps; `signals` in any of the logs.
 
-    `name`: the logs' own, files without their folders, which are nobody's business where an answer is read.
+    `name`: the logs' own, files without their folders, which are nobody's business where an answer is read. Of rows
+    that count: `speeds` [m/s], all but the slowest and the fastest hundredth, `commands` [m/s²], all; None: not there.
+    `epochs_s`: when each log starts, on its own clock [s].
     """
 
     rows: int
@@ -59,6 +82,9 @@ class LogFacts:
     rate_hz: float
     signals: tuple[str, ...] = ()
     name: str = "log"
+    speeds: tuple[float, float] | None = None
+    commands: tuple[float, float] | None = None
+    epochs_s: tuple[float, ...] = (0.0,)
 
     @classmethod
     def of(cls, logs: Log | Sequence[Log]) -> LogFacts:
@@ -72,11 +98,26 @@ class LogFacts:
             rate_hz=math.fsum(log.rate_hz * log.seconds for log in all_) / seconds,
             signals=tuple(name for name in SIGNALS if any(getattr(log, name) is not None for log in all_)),
             name=", ".join(Path(log.name).name or log.name for log in all_),
+            speeds=_driven(all_, "speed", 0.01),
+            commands=_driven(all_, "accel_cmd", 0.0),
+            epochs_s=tuple(log.epoch_s for log in all_),
         )
 
     def to_dict(self) -> dict[str, Any]:
         given = {"rows": self.rows, "segments": self.segments, "seconds": self.seconds, "rate_hz": self.rate_hz}
-        return given | {"signals": list(self.signals), "name": self.name}
+        driven = {"speeds_mps": self.speeds, "commands_mps2": self.commands}
+        told = {name: None if ends is None else list(ends) for name, ends in driven.items()}
+        return given | {"signals": list(self.signals), "name": self.name, "epochs_s": list(self.epochs_s)} | told
+
+
+def _driven(logs: Sequence[Log], signal: str, apart: float) -> tuple[float, float] | None:
+    """Where the usable rows of a signal lie, a share `apart` of them at either end left out."""
+    rows = [values[log.usable] for log in logs if (values := getattr(log, signal)) is not None]
+    joined = np.concatenate(rows) if rows else np.zeros(0)
+    if not len(joined):
+        return None
+    low, high = np.quantile(joined, (apart, 1 - apart))
+    return float(low), float(high)
 
 
 @dataclass(frozen=True)
@@ -128,7 +169,10 @@ class Diagnosis:
     - `contenders`: the alias set as far as it was fitted, with what it takes to foretell another drive
     - `next_experiment`, `setting`: objects as in `diagnosis.json`, None where nobody asked
     - `remaining`: with the default baseline, the candidates for what is left once `dead_time` is in
-    - `complete` False: the budget ended the search
+    - `onset_s`: when the effect set in, on the own clock of log number `onset_log`; `onset_from_start_s`: from its
+      first row, as a `gain_change` counts in `plant`
+    - `complete` False: the budget ended the search; `scope`: what it tried, None where nobody says. Where that is not
+      all, probabilities are over what was tried, and `unknown` is a cause that was not
 
     Raises `InputError` where verdict and candidates do not agree.
     """
@@ -152,9 +196,14 @@ class Diagnosis:
     next_experiment: Mapping[str, Any] | None = None
     setting: Mapping[str, Any] | None = None
     complete: bool = True
+    scope: Scope | None = None
     notes: tuple[str, ...] = ()
+    onset_from_start_s: float | None = None
+    onset_log: int = 0
 
     def __post_init__(self) -> None:
+        if self.onset_s is not None and self.onset_from_start_s is None:
+            object.__setattr__(self, "onset_from_start_s", self.onset_s - self.log.epochs_s[self.onset_log])
         object.__setattr__(self, "candidates", listed(self.candidates))
         said = self.verdict.name
         if self.probability(said) < self.candidates[0].probability - 1e-12:
@@ -164,7 +213,14 @@ class Diagnosis:
 
     def __str__(self) -> str:
         """The sentences of the terminal, one a line."""
-        told = [words.headline(self), self.verdict.why, words.aliases(self), *words.onset(self), *words.where(self)]
+        told = [
+            words.headline(self),
+            *self.winner.implausible,
+            self.verdict.why,
+            words.aliases(self),
+            *words.onset(self),
+            *words.where(self),
+        ]
         told += [*words.moved(self), *words.gap(self), *words.shrinkage(self), *words.to_set(self)]
         return "\n".join([*told, *words.to_drive(self), *words.remains(self), *self.notes])
 
@@ -182,8 +238,9 @@ class Diagnosis:
         return next((c.probability for c in self.candidates if c.name == name), 0.0)
 
     def to_dict(self) -> dict[str, Any]:
-        """The object of `diagnosis.json`; beside the schema's keys `moved` and `onset_s` of each effect, `setting`,
-        `remaining`, `complete` and `notes`.
+        """The object of `diagnosis.json`; beside the schema's keys `moved`, `onset_s`, `plausible` and `plausibility`
+        of each effect, the last two of the verdict, `onset_from_start_s`, `setting`, `remaining`, `complete`,
+        `not_tried` (`effects` by name; `pairs`, of which "all", "some" or "none" were tried) and `notes`.
         """
         return {
             "schema": "avtorch.diagnosis/1",
@@ -192,40 +249,41 @@ class Diagnosis:
             "gap": self.gap.to_dict(),
             "where": [w.to_dict() for w in self.where],
             "onset_s": self.onset_s,
+            "onset_from_start_s": self.onset_from_start_s,
             "effects": [c.to_dict() for c in self.candidates],
-            "verdict": self.verdict.to_dict(),
+            "verdict": self.verdict.to_dict() | plausibility(self.winner.implausible),
             "shrinkage": None if self.shrinkage is None else self.shrinkage.to_dict(),
             "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),
             "setting": None if self.setting is None else dict(self.setting),
             "remaining": None if self.remaining is None else [c.to_dict() for c in self.remaining],
             "complete": self.complete,
+            "not_tried": None if self.scope is None else self.scope.to_dict(),
             "notes": list(self.notes),
         }
 
     def write(self, folder: str | PathLike[str]) -> list[Path]:
-        """Write `plant.toml` (where there is a plant), then `diagnosis.json`; returns the files.
+        """Publish `diagnosis.json` and, where there is a plant, `plant.toml` at the same moment; returns the files.
 
         The plant's effects act from the start, also where the log shows them from an onset on; a comment in
         `plant.toml` then says so (a `gain_change` has its moment among its parameters).
-        An earlier answer in the folder goes first: while `diagnosis.json` is missing, what lies there is not whole.
-        Raises `InputError` where the folder cannot be written or a number is not finite.
+        All files of an earlier diagnosis in the folder go at that moment, its page, exports and manoeuvre too: write
+        these after it, or all of them within one `avtorch.io.answer_set(folder, DIAGNOSIS_FILES)`. Raises `InputError`
+        where the folder cannot be written or a number is not finite; the earlier diagnosis then stays.
         """
-        answer, repaired = Path(folder) / "diagnosis.json", Path(folder) / "plant.toml"
-        text = None if self.plant is None else self._late() + self.plant.to_toml()
-        for path in (answer, repaired):
-            path.unlink(missing_ok=True)
-        if text is not None:
-            with atomic(repaired) as stream:
-                stream.write(text)
-        write_json(answer, self.to_dict())
-        return [answer] if text is None else [answer, repaired]
+        names = ["diagnosis.json"] if self.plant is None else ["diagnosis.json", "plant.toml"]
+        with answer_set(folder, DIAGNOSIS_FILES) as staged:
+            if self.plant is not None:
+                with atomic(staged / "plant.toml") as stream:
+                    stream.write(self._late() + self.plant.to_toml())
+            write_json(staged / "diagnosis.json", self.to_dict())
+        return [Path(folder) / name for name in names]
 
     def _late(self) -> str:
         """A comment for `plant.toml` where the effects set in within the log."""
         late = " and ".join(name for name in self.verdict.names if name != "gain_change")
         if self.onset_s is None or not late:
             return ""
-        return f"# In the log {late} from {self.onset_s:.6g} s on (the log's own time); in this plant from the start.\n"
+        return f"# In the log {late} from {words.moment(self)} on; in this plant from the start.\n"
 
     def to_arviz(self) -> InferenceData:
         """The winner's draws as `arviz.InferenceData`, one variable (chain, draw) a parameter, its unit in `attrs`.

@@ -138,7 +138,7 @@ class RolloutDensity:
 
     @cached_property
     def _without(self) -> GapPlant:
-        return plant([], baseline=self.candidate.baseline).prepared(self.candidate.record.drives[0])
+        return plant([], baseline=self.candidate.baseline).prepared(*self.candidate.record.segments[0])
 
     def _rolled(self, z: Tensor) -> Tensor:
         """What the witnesses would have seen, (column, witness, counted, group)."""

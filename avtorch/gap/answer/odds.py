@@ -26,7 +26,7 @@ from avtorch.gap.answer.remainder import Remainder
 from avtorch.gap.search.found import Found
 
 CHANCE = frozenset({"gust", "outliers", "command_hold"})
-"""Effects that chance decides: a second one of these has a price of its own."""
+"""Effects that chance decides, beside any of the user's: a second one of these has a price of its own."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,8 @@ EFFECT = Price(3.89)
 SECOND = Price(10.5, 0.092)
 SECOND_BY_CHANCE = Price(6.77, 0.359)
 UNIT, UNIT_SHARE, POWER = 2.64, 0.114, 4.01
+
+_ROUND_OFF = 1e-6  # nats, of sums of up to some 1e9 of them
 
 UNKNOWN: Mapping[str, float] = {
     "constant": 0.543,
@@ -86,20 +88,23 @@ def probabilities(
 
 
 def favourite(found: Sequence[Found]) -> Found:
-    """The most probable of the named candidates."""
+    """The most probable of the named candidates; of those that differ by round-off the plainest."""
     worth = _worth(found)
-    return max(found, key=lambda f: worth[f.name])
+    best = max(worth.values())
+    tied = [f for f in found if worth[f.name] >= best - _ROUND_OFF]
+    return min(tied, key=lambda f: (f.name != "none", f.name.count("+"), -worth[f.name]))
 
 
 def prices(found: Sequence[Found]) -> dict[str, float]:
     """What each candidate has to gain over none before it counts for anything [nats]."""
     gained = {f.name: f.log_evidence - _none(found).log_evidence for f in found}
+    by_chance = {f.name for f in found if CHANCE & set(f.name.split("+")) or f.by_chance is not None}
     paid = {}
     for name in gained:
         parts = name.split("+")
         paid[name] = 0.0 if name == "none" else EFFECT.of(0.0)
         if len(parts) > 1:
-            price = SECOND_BY_CHANCE if CHANCE & set(parts) else SECOND
+            price = SECOND_BY_CHANCE if name in by_chance else SECOND
             paid[name] += price.of(max(gained.get(part, 0.0) for part in parts))
     return paid
 

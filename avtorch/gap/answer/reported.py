@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -16,6 +17,7 @@ from avtorch.gap.answer.quantity import Quantity
 from avtorch.gap.chain.effect import Effect
 from avtorch.gap.chain.plant import GapPlant, plant
 from avtorch.gap.effects import CommandHold, Gust, Outliers, RoadGrade
+from avtorch.gap.likelihood.candidate import Coordinate
 
 if TYPE_CHECKING:
     from avtorch.gap.answer.posterior import Draws
@@ -88,13 +90,20 @@ def repaired(found: Found, baseline: GapPlant | None = None, draws: Draws | None
         effects.append(Outliers(told["outliers.fraction"], told["outliers.scale"], noise_sd=float(own_sd)))
     if "command_hold.hold_fraction" in told:
         effects.append(CommandHold(told["command_hold.hold_fraction"]))
+    if found.by_chance is not None:
+        chance = found.by_chance.law.at(found.by_chance.z)
+        given = {key.partition(".")[2]: x for key, x in told.items() if key.startswith(f"{chance.name}.")}
+        effects.append(_plain(chance.replaced(given)))
+    process_sd = noise.process_sd
+    if found.by_chance is not None and found.by_chance.process_sd is not None:
+        process_sd = found.by_chance.process_sd
     return plant(
         effects,
         baseline=found.candidate.baseline if baseline is None else baseline,
         T_L=means["T_L"],
         K_L=means["K_L"],
         # the stationary spread of white jerk noise through a lag
-        sigma=float(noise.process_sd * np.sqrt(2 / noise.process_time)),
+        sigma=float(process_sd * np.sqrt(2 / noise.process_time)),
     )
 
 
@@ -104,8 +113,15 @@ def _values(found: Found, draws: Draws | None) -> dict[str, Float]:
         rests = {c.key for c in found.candidate.coordinates if c.parameter.of_onset and found.onset is None}
         centre = found.candidate.values(np.zeros((1, len(found.z))))
         return {k: np.full_like(x, float(centre[k])) if k in rests else x for k, x in draws.values.items()}
-    noise = np.random.default_rng(0).standard_normal((_LAPLACE, len(found.z)))
-    z = np.clip(found.z + noise @ root(found.covariance).numpy().T, -8.0, 8.0)
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((_LAPLACE, len(found.z)))
+    if found.delays is None:
+        z = found.z + noise @ root(found.covariance).numpy().T
+    else:  # each mode by its share
+        mode = rng.choice(len(found.delays.shares), _LAPLACE, p=found.delays.shares / found.delays.shares.sum())
+        roots = np.stack([root(c).numpy() for c in found.delays.covariances])
+        z = found.delays.z[mode] + np.einsum("dij,dj->di", roots[mode], noise)
+    z = np.clip(z, -8.0, 8.0)
     return {key: x.numpy() for key, x in found.candidate.values(found.candidate.held(z, found.onset)).items()}
 
 
@@ -142,11 +158,11 @@ def _random(found: Found) -> dict[str, tuple[float, float, Link]]:
     """Mean, sd and link of the random effects' parameters, by `effect.parameter`."""
     out: dict[str, tuple[float, float, Link]] = {}
     names = found.name.split("+")
-    if "gust" in names:
+    if "gust" in names and found.gust:
         noise, sds = found.noise.noise, found.noise.sds
         out["gust.sd_mps2"] = (float(np.log(noise.force_sd)), sds["force_sd"], torch.exp)
         out["gust.time_constant_s"] = (float(np.log(noise.force_time)), sds["force_time"], torch.exp)
-    if "outliers" in names and found.tails is not None:
+    if "outliers" in names and found.tails is not None and found.by_chance is None:
         tails = found.tails
         fraction = float(np.log(max(tails.fraction, 1e-9)))
         out["outliers.fraction"] = (fraction, tails.sds[0], lambda x: x.exp().clamp_max(0.5))
@@ -154,7 +170,16 @@ def _random(found: Found) -> dict[str, tuple[float, float, Link]]:
     if "command_hold" in names and found.losses is not None:
         p = float(np.clip(found.losses.fraction, 1e-6, 1 - 1e-6))
         out["command_hold.hold_fraction"] = (float(np.log(p / (1 - p))), found.losses.sd, torch.sigmoid)
+    if found.by_chance is not None:
+        law, sds = found.by_chance.law, np.sqrt(np.diag(found.by_chance.covariance))
+        for c, z, sd in zip(law.coordinates, found.by_chance.z.tolist(), sds.tolist(), strict=True):
+            if c.parameter.reported:
+                out[c.key] = (z, sd, partial(_valued, c))
     return out
+
+
+def _valued(coordinate: Coordinate, z: Tensor) -> Tensor:
+    return coordinate.parameter.constrain(coordinate.wider * z)
 
 
 def _named(found: Found, by_effect: dict[str, T]) -> dict[str, T]:

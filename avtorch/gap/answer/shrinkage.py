@@ -15,16 +15,20 @@ class Closed:
 
     `closed`: (before - after) / (before - floor), None where there is next to nothing to close. Rollout errors are root
     mean squares [m/s², m/s]; densities are mean log densities of a row [nats], of which more is better.
+
+    `horizon_s`: seconds that the rollouts last, None for those of whole drives and for densities.
     """
 
     before: float
     after: float
     floor: float
     closed: Quantity | None
+    horizon_s: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         closed = None if self.closed is None else self.closed.to_dict()
-        return {"before": self.before, "after": self.after, "floor": self.floor, "closed": closed}
+        told = {"before": self.before, "after": self.after, "floor": self.floor, "closed": closed}
+        return told | {"horizon_s": self.horizon_s}
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """Rows that count, averaged to some 20 Hz. Accelerations [m/s²], speed [m/s], on the log's own `time` [s].
+    """Rows that count, averaged to some 20 Hz. Accelerations [m/s²], speed [m/s], `time` [s] from their log's start.
 
     `command` (row,); `measured`, `before`, `after` (witness, row): what the log shows, and rollouts over whole drives
     of the fitted simulator without and with the effect (equal where nothing was named). `does` (row,) [nats]: what the

@@ -27,7 +27,8 @@ class Candidate:
 
     `log_evidence` [nats] relative to `none`, free of the prior over causes; None for `unknown`. `parameters` by the
     table's names, those of a pair as `effect.parameter`; `moved`: the baseline's `T_L` [s] and `K_L` [-] with this
-    candidate in. `onset_s` on the log's own time; None where the effect was there from the start.
+    candidate in. `onset_s` on the log's own clock; None where the effect was there from the start. `implausible`:
+    a sentence for each parameter outside what is physically possible (`plausible.implausible`).
     """
 
     name: str
@@ -36,6 +37,7 @@ class Candidate:
     parameters: Mapping[str, Quantity] = field(default_factory=dict)
     moved: Mapping[str, Quantity] = field(default_factory=dict)
     onset_s: float | None = None
+    implausible: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.name != candidate_name(self.name):
@@ -57,7 +59,13 @@ class Candidate:
             "parameters": plain(self.parameters),
             "moved": plain(self.moved),
             "onset_s": self.onset_s,
+            **plausibility(self.implausible),
         }
+
+
+def plausibility(implausible: Sequence[str]) -> dict[str, Any]:
+    """The keys `plausible` and, where it is not, `plausibility`: why not."""
+    return {"plausible": not implausible, "plausibility": " ".join(implausible) or None}
 
 
 def listed(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
@@ -133,26 +141,28 @@ def verdict_of(
     *,
     aliases: Callable[[Sequence[Candidate]], Iterable[str]] | None = None,
     why: str | None = None,
+    known: str = "known effect",
 ) -> Verdict:
     """The most probable candidate.
 
     `aliases` says which names cannot be told apart (the verdict's is put in front; default `near(ALIAS_RATIO)`);
-    `why` defaults to a sentence on evidence and runner-up.
+    `why` defaults to a sentence on evidence and runner-up, in which `known` is what was tried.
     """
     ranked = listed(candidates)
     first = ranked[0]
     others = [name for name in map(candidate_name, (aliases or near(ALIAS_RATIO))(ranked)) if name != first.name]
     names = first.effects or (first.name,)
-    return Verdict(names, (first.name, *dict.fromkeys(others)), first.name == "unknown", why or _why(ranked))
+    return Verdict(names, (first.name, *dict.fromkeys(others)), first.name == "unknown", why or _why(ranked, known))
 
 
-def _why(ranked: Sequence[Candidate]) -> str:
+def _why(ranked: Sequence[Candidate], known: str) -> str:
     first, second = ranked[0], ranked[1]
     rival = f"next is {second.name} with probability {second.probability:.3g}"
     if first.name == "none":
-        return f"No effect explains the log better than the baseline does; {rival}."
+        which = "effect" if known == "known effect" else known
+        return f"No {which} explains the log better than the baseline does; {rival}."
     if first.name == "unknown":
-        return f"No known effect leaves a remainder that could be noise; {rival}."
+        return f"No {known} leaves a remainder that could be noise; {rival}."
     gain = "" if first.log_evidence is None else f" explains the log {first.log_evidence:.0f} nats better than none and"
     return f"{first.name}{gain} has probability {first.probability:.3g}; {rival}."
 

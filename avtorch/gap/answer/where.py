@@ -14,9 +14,9 @@ UNITS: dict[Axis, str] = {"time": "s", "speed": "m/s", "command": "m/s²", "freq
 class Where:
     """A part of the gap: `begin` to `end` on an `axis`, with its `share` of what the cause does to the log.
 
-    Times are the log's own [s], the others [m/s, m/s², Hz]; of the axis `signal` both are `"actuation"` (the car moves
-    otherwise) or `"sensing"` (the accelerometer shows it otherwise). `q_value`: the false-discovery rate at which all
-    parts with one as small are named.
+    Times are on the log's own clock [s], the others [m/s, m/s², Hz]; of the axis `signal` both are `"actuation"` (the
+    car moves otherwise) or `"sensing"` (the accelerometer shows it otherwise).
+    `q_value`: the false-discovery rate at which all parts with one as small are named.
     """
 
     axis: Axis

@@ -21,9 +21,10 @@ class Drive:
 
     A row's command acts from its time until the next row's. `accel0` (...) [m/s²] is the car's acceleration at the
     first row; None: the actuator has settled at the first command. Before the first row the first command acted.
-    `dt` (time,) are the steps (the last one repeats), `position` (..., time) [m] the speed integrated by trapezoids;
-    `uniform` says whether all steps are the same. `specific_force`: what is measured as acceleration, `accel0` too, is
-    an accelerometer's reading, which feels every force but gravity: a slope's pull is in the speed alone.
+    `dt` (time,) are the steps (the last one repeats), `position` (..., time) [m] the speed integrated by trapezoids
+    from `position0` (...) [m] on; `uniform` says whether all steps are the same. `specific_force`: what is measured as
+    acceleration, `accel0` too, is an accelerometer's reading, which feels every force but gravity: a slope's pull is in
+    the speed alone.
 
     Raises `InputError` for shapes that do not fit, time that does not rise, or values that are not finite.
     """
@@ -33,6 +34,7 @@ class Drive:
     speed: Tensor | None = None
     accel0: Number | None = None
     specific_force: bool = False
+    position0: Number = 0.0
     dt: Tensor = field(init=False)
     uniform: bool = field(init=False)
     position: Tensor | None = field(init=False)
@@ -53,7 +55,8 @@ class Drive:
         position = None
         if speed is not None:
             rows = 0.5 * (speed[..., 1:] + speed[..., :-1]) * (dt if uniform else dt[:-1])
-            position = torch.cat([torch.zeros_like(speed[..., :1]), rows.cumsum(-1)], -1)
+            start = checked("position0", self.position0, unit="m")[..., None]
+            position = start + torch.cat([torch.zeros_like(speed[..., :1]), rows.cumsum(-1)], -1)
         values = {
             "time": time,
             "command": command,
@@ -68,7 +71,11 @@ class Drive:
 
     @classmethod
     def from_log(cls, log: Log, segment: int = 0, *, settled: bool = False) -> Drive:
-        """One segment of a log; starts at the measured acceleration, if there is one, unless `settled`.
+        """One segment of a log, its time from the log's start.
+
+        It begins at the measured acceleration, if there is one, unless `settled`.
+
+        Rows with `engaged` 0 are in it: their commands act in the response, though the car did not obey them.
 
         Raises `InputError` for a segment that is not there or a log without `accel_cmd`.
         """
@@ -79,7 +86,7 @@ class Drive:
             raise InputError(f"segment: found {segment} with fewer than two rows, needs one of the log's")
         speed = None if log.speed is None else torch.as_tensor(log.speed[rows])
         accel0 = None if log.accel is None or settled else float(log.accel[rows][0])
-        time, command = torch.as_tensor(log.time[rows]), torch.as_tensor(log.accel_cmd[rows])
+        time, command = torch.as_tensor(log.elapsed[rows]), torch.as_tensor(log.accel_cmd[rows])
         return cls(time, command, speed, accel0, log.accel_kind == "specific-force")
 
 

@@ -25,13 +25,17 @@ from typing import Any, ClassVar, Literal, Self, TypeVar
 import torch
 from torch import Tensor
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, quoted
+from avtorch.gap.chain.domain import Domain
 from avtorch.gap.chain.parameter import Parameter
-from avtorch.vehicle.arguments import tensor
+from avtorch.vehicle.arguments import Number, tensor
 
 Place = Literal["command", "actuator", "body", "sensor"]
 PLACES: tuple[Place, ...] = ("command", "actuator", "body", "sensor")
 """Places in the chain, in its order."""
+
+_LARGEST = 1e12  # of a number in a text whose domain nobody said
+_NAME = 60  # characters of a name that may be an effect's, mistyped
 
 
 @dataclass(frozen=True)
@@ -73,13 +77,16 @@ class NoiseChange:
     `force_sd` [m/s²] and `force_time` [s]: a coloured (Ornstein-Uhlenbeck) acceleration of the body, in both
     witnesses. `tail_fraction` of the accelerometer's samples has `tail_scale` times its standard deviation more.
     `command_variance` (..., time) [(m/s²)²]: mean square of what the command acting in a row differs from the one
-    logged there, its errors independent between changes of the command.
+    logged there, independent from row to row.
+
+    By this a diagnosis finds the effect: its parameters are fitted with those of the candidate and of the noise, by
+    the likelihood under the changed noise. A candidate says one of the three: a force, tails, or a command's variance.
     """
 
-    force_sd: Tensor | None = None
-    force_time: Tensor | None = None
-    tail_fraction: Tensor | None = None
-    tail_scale: Tensor | None = None
+    force_sd: Number | None = None
+    force_time: Number | None = None
+    tail_fraction: Number | None = None
+    tail_scale: Number | None = None
     command_variance: Tensor | None = None
 
 
@@ -87,7 +94,10 @@ class NoiseChange:
 class Effect:
     """Base of all effects; see the module for the hooks. `order` sorts effects at the same place.
 
-    `gravity`: a force of the body that an accelerometer does not feel (see `Drive.specific_force`).
+    `gravity`: a force of the body that an accelerometer does not feel (see `Drive.specific_force`). `derived`: what
+    `report` names in place of coordinates that are not reported, with typical and possible ranges. `shift`: the
+    parameter [s], if there is one, by which it makes commands late and does nothing else. `settings`: what fields that
+    are no parameters may hold in a text; a field without a domain takes any single finite number.
     """
 
     name: ClassVar[str]
@@ -95,11 +105,14 @@ class Effect:
     meaning: ClassVar[str]
     equation: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
+    settings: ClassVar[tuple[Domain, ...]] = ()
     order: ClassVar[int] = 0
     memory: ClassVar[bool] = False
     random: ClassVar[bool] = False
     needs_speed: ClassVar[bool] = False
     gravity: ClassVar[bool] = False
+    derived: ClassVar[tuple[Parameter, ...]] = ()
+    shift: ClassVar[str | None] = None
 
     # the hook ------------------------------------------------------------------------------------------------------
     def apply(self, x: Tensor, row: Row) -> Any:
@@ -128,7 +141,10 @@ class Effect:
 
     # around it -----------------------------------------------------------------------------------------------------
     def noise(self, u: Tensor) -> NoiseChange | None:
-        """What it adds to the noise model under commands `u` (..., time); None for a deterministic effect."""
+        """What it adds to the noise model under commands `u` (..., time): a random effect's evidence is found by it.
+
+        None for a deterministic effect.
+        """
         return None
 
     def coordinates(self) -> tuple[Parameter, ...]:
@@ -161,7 +177,7 @@ class Effect:
         known = {f.name for f in fields(self)}
         for name in values:
             if name not in known:
-                raise InputError(f"{self.name}: found {name!r}, needs one of {', '.join(sorted(known))}")
+                raise InputError(f"{self.name}: found {quoted(name)}, needs one of {', '.join(sorted(known))}")
         return replace(self, **values)
 
     @classmethod
@@ -170,12 +186,18 @@ class Effect:
         return cls(**{p.name: p.neutral for p in cls.parameters if p.neutral is not None})
 
     @classmethod
+    def domains(cls) -> dict[str, Domain]:
+        """What each field may hold in a text, and each other name that `of` takes."""
+        anything = {f.name: Domain(f.name, -_LARGEST, _LARGEST) for f in fields(cls)}
+        return anything | {p.name: Domain.of(p) for p in cls.parameters} | {s.name: s for s in cls.settings}
+
+    @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:
         """From parameters as the answer names them. Raises `InputError` for other names."""
         known = {f.name for f in fields(cls)}
         for name in values:
             if name not in known:
-                raise InputError(f"{cls.name}: found {name!r}, needs one of {', '.join(sorted(known))}")
+                raise InputError(f"{cls.name}: found {quoted(name)}, needs one of {', '.join(sorted(known))}")
         return cls(**values)
 
 
@@ -213,7 +235,7 @@ def effect_class(name: str, more: Iterable[type[Effect]] = ()) -> type[Effect]:
     """The effect called `name`, among those registered and `more`. Raises `InputError` if there is none."""
     known = {**EFFECTS, **{cls.name: cls for cls in more}}
     if name not in known:
-        close = get_close_matches(name, known, n=1)
+        close = get_close_matches(name[:_NAME], known, n=1)
         need = f"an effect's name; perhaps {close[0]}" if close else f"one of {', '.join(sorted(known))}"
-        raise InputError(f"effect: found {name!r}, needs {need}")
+        raise InputError(f"effect: found {quoted(name)}, needs {need}")
     return known[name]

@@ -19,6 +19,7 @@ Constraint = Literal["real", "positive", "negative", "unit", "interval"]
 
 _CENTRAL_80 = 1.2815515655446004  # normal quantile of 0.9
 _LOG_2PI = math.log(2 * math.pi)
+_AS_FAR = 3.0  # times the typical range, where an effect does not say what is possible
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class Parameter:
     `reported` False: a coordinate that the table of effects does not name, fitted and kept out of the answer.
     `size`: 1, or the length of a vector-valued coordinate, then on its last dimension. `of_onset`: one that can only be
     told where an effect sets in during a drive, and rests at its prior's centre elsewhere.
+    `possible`: what physics allows at all; an answer that lies wholly outside says so, with the reason `beyond` ("wind
+    and road do not do this"). Default: three times the typical range, on the link's scale.
 
     Raises `InputError` for a range that is empty or outside the constraint.
     """
@@ -43,6 +46,8 @@ class Parameter:
     reported: bool = True
     size: int = 1
     of_onset: bool = False
+    possible: tuple[float, float] | None = None
+    beyond: str = ""
 
     def __post_init__(self) -> None:
         if not self.low < self.high:
@@ -50,6 +55,8 @@ class Parameter:
         ends = [self._link(torch.tensor(x, dtype=torch.float64)) for x in (self.low, self.high)]
         if self.constraint != "interval" and not all(math.isfinite(x) for x in ends):
             raise InputError(f"{self.name}: {self.low:g} to {self.high:g} is not within {self.constraint!r}")
+        if self.possible is not None and not self.possible[0] < self.possible[1]:
+            raise InputError(f"{self.name}: found possible={self.possible!r}, needs low < high")
 
     @property
     def location(self) -> float:
@@ -63,6 +70,17 @@ class Parameter:
             return 1.0
         low, high = self._ends()
         return abs(high - low) / (2 * _CENTRAL_80)
+
+    @property
+    def physical(self) -> tuple[float, float]:
+        """Least and greatest value that physics allows: `possible`, or what stands in for it."""
+        if self.possible is not None:
+            return self.possible
+        if self.constraint == "interval":
+            return self.low, self.high
+        z = _AS_FAR * _CENTRAL_80 * torch.tensor([-1.0, 1.0], dtype=torch.float64)
+        low, high = sorted(self.constrain(z).tolist())
+        return low, high
 
     def _ends(self) -> tuple[float, float]:
         low, high = (float(self._link(torch.tensor(x, dtype=torch.float64))) for x in (self.low, self.high))

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from typing import Any
 
@@ -26,10 +26,24 @@ from avtorch.vehicle.arguments import Number, checked, tensor
 from avtorch.vehicle.plant import Motion
 
 BASELINE = (
-    Parameter("T_L", "s", None, 0.3 * 0.408, 0.3 * 2.452),  # log-normal, median 0.3, log sd 0.7
-    Parameter("K_L", "-", None, 0.681, 1.469),  # log-normal, median 1, log sd 0.3
+    Parameter(  # log-normal, median 0.3, log sd 0.7
+        "T_L",
+        "s",
+        None,
+        0.3 * 0.408,
+        0.3 * 2.452,
+        possible=(0.02, 5.0),
+        beyond="no actuator is that quick or that slow",
+    ),
+    Parameter(  # log-normal, median 1, log sd 0.3
+        "K_L", "-", None, 0.681, 1.469, possible=(0.3, 3.5), beyond="no actuator makes that of a command in m/s²"
+    ),
 )
-"""Parameters of the baseline, with their priors."""
+"""Parameters of the baseline, with their priors.
+
+Possible are lags from an electric motor's torque control with its driveline (some 20 ms) to a laden truck's engine and
+air brakes (seconds), and gains as far from 1 as a truck's mass changes between empty and laden (some three times).
+"""
 
 
 class GapPlant:
@@ -84,10 +98,14 @@ class GapPlant:
         effects = [e.replaced(own[e.name]) if own[e.name] else e for e in self.effects]
         return GapPlant(effects, **base, sigma=self.sigma, seed=self.seed)
 
-    def prepared(self, drive: Drive) -> GapPlant:
-        """The plant with the settings that effects take from a drive (mean speed, span, length of the road)."""
-        flat = [None if x is None else x.reshape(-1, x.shape[-1])[0] for x in (drive.speed, drive.position)]
-        effects = [e.prepared(drive.time, *flat) for e in self.effects]
+    def prepared(self, *drives: Drive) -> GapPlant:
+        """The plant with the settings that effects take from a drive (mean speed, span, length of the road).
+
+        Several: parts of one drive, in order.
+        """
+        flat = [_joined([getattr(d, name) for d in drives]) for name in ("speed", "position")]
+        time = torch.cat([d.time for d in drives])
+        effects = [e.prepared(time, *flat) for e in self.effects]
         return GapPlant(effects, T_L=self.T_L, K_L=self.K_L, sigma=self.sigma, seed=self.seed)
 
     def report(self) -> dict[str, dict[str, Tensor]]:
@@ -183,6 +201,12 @@ def plant(
         sigma=base.sigma if sigma is None else sigma,
         seed=seed,
     )
+
+
+def _joined(parts: Sequence[Tensor | None]) -> Tensor | None:
+    """The first of each part's (..., time), one after another, (time,)."""
+    flat = [x.reshape(-1, x.shape[-1])[0] for x in parts if x is not None]
+    return torch.cat(flat) if flat else None
 
 
 def _from(told: Described) -> GapPlant:

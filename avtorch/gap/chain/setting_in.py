@@ -46,7 +46,10 @@ def response_from(
 
 def _part(drive: Drive, rows: slice) -> Drive:
     speed = None if drive.speed is None else drive.speed[..., rows]
-    return replace(drive, time=drive.time[rows], command=drive.command[..., rows], speed=speed)
+    position0 = 0.0 if drive.position is None else drive.position[..., rows][..., 0]
+    return replace(
+        drive, time=drive.time[rows], command=drive.command[..., rows], speed=speed, position0=position0
+    )  # fmt: skip
 
 
 def _joined(before: Tensor, after: Tensor, row: int) -> Tensor:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import tomllib
+import math
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from os import PathLike
@@ -11,11 +12,23 @@ from typing import Any
 
 from torch import Tensor
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, quoted
+from avtorch.gap.chain.domain import Domain
 from avtorch.gap.chain.effect import Effect, effect_class
+from avtorch.io.opening import place
+from avtorch.io.toml import parse_toml, read_toml
+from avtorch.numeral import numeral
 from avtorch.vehicle.arguments import tensor
 
-_BASELINE = ("T_L", "K_L", "sigma")
+_BASELINE = (
+    Domain("T_L", 1e-4, 1e3, "s", kind="positive"),
+    Domain("K_L", 1e-4, 1e3, neutral=0.0, kind="positive"),
+    Domain("sigma", 0.0, 1e3, "m/s³"),
+)
+_DOMAINS = {domain.name: domain for domain in _BASELINE}
+"""What the values of the baseline may be."""
+
+_LONGEST = 10_000  # characters of a plant in words
 
 
 @dataclass(frozen=True)
@@ -33,28 +46,33 @@ def described(text: str, more: Iterable[type[Effect]] = ()) -> Described:
     without a value takes its typical ones.
     """
     if "\n" in text or "[" in text:
-        try:
-            return _of(tomllib.loads(text), more)
-        except tomllib.TOMLDecodeError as error:
-            raise InputError(f"plant: no TOML ({error})") from None
+        return _of(parse_toml(text, "plant"), more)
+    if len(text) > _LONGEST:
+        raise InputError(f"plant: found {len(text):,} characters, needs {_LONGEST:,} at most, or a TOML file")
     tables: dict[str, Any] = {}
     for item in filter(None, (x.strip() for x in text.split(","))):
         key, equals, value = (x.strip() for x in item.partition("="))
         if key.lower() == "glvd" and not equals:
             continue
-        number = None
-        if equals:
-            try:
-                number = float(value)
-            except ValueError:
-                raise InputError(f"plant: found {item!r}, needs a number after '='") from None
-        if key in _BASELINE and number is not None:
-            tables[key] = number
+        name, dot, parameter = key.partition(".")
+        if not equals:
+            known = effect_class(name, more).name if not dot else name
+            if known in tables or dot:
+                raise InputError(f"plant: found {quoted(item)}, needs an effect's name, once, or NAME=NUMBER")
+            tables[known] = {}
             continue
-        name, _, parameter = key.partition(".")
-        table = tables.setdefault(name, {})
-        if number is not None:
-            table[parameter or _first(effect_class(name, more))] = number
+        try:
+            number = numeral(value)
+        except ValueError:
+            raise InputError(f"plant: found {quoted(item)}, needs a number after '='") from None
+        if key in _DOMAINS:
+            table, parameter = tables, key
+        else:
+            first = _first(effect_class(name, more))
+            table, parameter = tables.setdefault(name, {}), parameter if dot else first
+        if parameter in table:
+            raise InputError(f"plant: found {quoted(item)} besides another value, needs one")
+        table[parameter] = number
     return _of(tables, more)
 
 
@@ -69,14 +87,13 @@ def names_a_file(text: str) -> bool:
 
 
 def read_file(path: str | PathLike[str], more: Iterable[type[Effect]] = ()) -> Described:
-    """From a TOML file. Raises `InputError` where it cannot be read."""
+    """From a TOML file of up to 1 MB. Raises `InputError` where it cannot be read."""
+    if not os.path.lexists(path):
+        raise InputError(f"plant: {place(path)}: no such file; needs a TOML file, or effects such as dead_time=0.2")
     try:
-        text = Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError(f"plant: {path}: no such file; needs a TOML file, or effects such as dead_time=0.2") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"plant: {path} cannot be read ({error})") from None
-    return described(text + "\n", more)
+        return _of(read_toml(path), more)
+    except InputError as fault:
+        raise InputError(f"plant: {fault}") from None
 
 
 def to_toml(effects: Iterable[Effect], baseline: Mapping[str, Any]) -> str:
@@ -98,34 +115,31 @@ def _number(name: str, value: Any) -> str:
             raise InputError(f"{name}: found shape {tuple(value.shape)}, needs a single value for a text")
         value = value.tolist()
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(repr(float(x)) for x in value) + "]"
-    return repr(value if isinstance(value, int) else float(value))
+        return "[" + ", ".join(_number(name, x) for x in value) + "]"
+    if isinstance(value, int) and not isinstance(value, bool):
+        return repr(value)
+    value = float(value)
+    if math.isnan(value):
+        raise InputError(f"{name}: found nan, needs a number for a text")
+    return repr(value)
 
 
 def _of(tables: Mapping[str, Any], more: Iterable[type[Effect]]) -> Described:
     baseline: dict[str, float] = {}
     effects = []
     for name, value in tables.items():
-        if name in _BASELINE:
-            if not isinstance(value, int | float):
-                raise InputError(f"{name}: found {value!r}, needs a number")
-            baseline[name] = float(value)
-        elif isinstance(value, Mapping):
-            effects.append(effect_class(name, more).of({k: _value(name, k, v) for k, v in value.items()}))
-        elif isinstance(value, int | float):
-            cls = effect_class(name, more)
-            effects.append(cls.of({_first(cls): float(value)}))
-        else:
-            raise InputError(f"{name}: found {value!r}, needs a table of parameters")
+        if name in _DOMAINS:
+            baseline[name] = _DOMAINS[name].value(name, value)
+            continue
+        cls = effect_class(name, more)
+        table = value if isinstance(value, Mapping) else {_first(cls): value}
+        domains = cls.domains()
+        # a name that is not known goes on as it is: the effect refuses it and says what it knows
+        given = {key: domains[key].value(f"{name}.{key}", x) if key in domains else x for key, x in table.items()}
+        if "profile" in given:
+            given["profile"] = tensor(given["profile"])
+        effects.append(cls.of(given))
     return Described(baseline, effects)
-
-
-def _value(effect: str, key: str, value: Any) -> Any:
-    if isinstance(value, list) and all(isinstance(x, int | float) for x in value):
-        return tensor(value) if key == "profile" else tuple(float(x) for x in value)
-    if not isinstance(value, int | float):
-        raise InputError(f"{effect}.{key}: found {value!r}, needs a number")
-    return value
 
 
 def _first(cls: type[Effect]) -> str:

@@ -14,7 +14,10 @@ from avtorch.vehicle.arguments import Number, tensor
 @register
 @dataclass(frozen=True)
 class AerodynamicDrag(Effect):
-    """`-drag_per_m (v + wind_mps)²`, against the wind met; neutral at 0. The head wind is fitted along."""
+    """`-drag_per_m (v + wind_mps)²`, against the wind met; neutral at 0. The head wind is fitted along.
+
+    Possible up to 3e-3 1/m, a cyclist's; a car has 2 to 6e-4 (half of rho c_d A / m).
+    """
 
     drag_per_m: Number = 3.5e-4
     wind_mps: Number = 0.0
@@ -25,7 +28,9 @@ class AerodynamicDrag(Effect):
     meaning = "air resistance that the lower level does not make up for"
     equation = "-c (v + w)²"
     parameters = (
-        Parameter("drag_per_m", "1/m", 0.0, 2e-4, 6e-4),
+        Parameter(
+            "drag_per_m", "1/m", 0.0, 2e-4, 6e-4, possible=(0.0, 3e-3), beyond="air does not hold a car like that"
+        ),
         Parameter("wind_mps", "m/s", None, -4.0, 4.0, "real", reported=False),
     )
 

@@ -20,6 +20,8 @@ class Backlash(Effect):
 
     Each row clamps the last output to `u ± half width`. Clamps compose to a clamp, so whole drives are scanned in
     blocks; which rows moved is then known, and the output of those is `u ± half width`, to be differentiated.
+
+    Possible up to 1 m/s²: more play than that is no play of a driveline or pedal.
     """
 
     half_width_mps2: Number = 0.08
@@ -30,7 +32,11 @@ class Backlash(Effect):
     memory = True
     meaning = "a play is crossed whenever the command turns back"
     equation = "y = max(u - beta, min(u + beta, y of the row before))"
-    parameters = (Parameter("half_width_mps2", "m/s²", 0.0, 0.02, 0.3),)
+    parameters = (
+        Parameter(
+            "half_width_mps2", "m/s²", 0.0, 0.02, 0.3, possible=(0.0, 1.0), beyond="no driveline has that much play"
+        ),
+    )
 
     def start(self, x: Tensor, row: Row) -> Tensor:
         return x

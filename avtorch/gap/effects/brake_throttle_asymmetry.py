@@ -15,7 +15,10 @@ from avtorch.vehicle.arguments import Number, tensor
 @register
 @dataclass(frozen=True)
 class BrakeThrottleAsymmetry(Effect):
-    """Gain and lag times `brake_gain_ratio`, `brake_lag_ratio` where the command is negative; neutral at 1, 1."""
+    """Gain and lag times `brake_gain_ratio`, `brake_lag_ratio` where the command is negative; neutral at 1, 1.
+
+    Possible are five times either way for the gain and ten times for the lag, as between air brakes and a motor.
+    """
 
     brake_gain_ratio: Number = 0.7
     brake_lag_ratio: Number = 2.0
@@ -25,8 +28,12 @@ class BrakeThrottleAsymmetry(Effect):
     meaning = "gain and lag under braking differ from those under drive"
     equation = "K_L, T_L times ratios where u < 0"
     parameters = (
-        Parameter("brake_gain_ratio", "-", 1.0, 0.5, 0.9),
-        Parameter("brake_lag_ratio", "-", 1.0, 1.3, 3.0),
+        Parameter(
+            "brake_gain_ratio", "-", 1.0, 0.5, 0.9, possible=(0.2, 5.0), beyond="brake and drive do not differ so"
+        ),
+        Parameter(
+            "brake_lag_ratio", "-", 1.0, 1.3, 3.0, possible=(0.1, 10.0), beyond="brake and drive do not differ so"
+        ),
     )
 
     def apply(self, x: Tensor, row: Row) -> tuple[Tensor, Tensor]:

@@ -21,6 +21,8 @@ class CommandHold(Effect):
     """Each row's command is lost with probability `hold_fraction`, the last one that arrived acts on; neutral at 0.
 
     Random: its deterministic response is none, its mark is the noise of the command, large where the command moves.
+
+    Possible up to 0.6: a link that drops more is a slower link, which no chance decides.
     """
 
     hold_fraction: Number = 0.07
@@ -31,7 +33,11 @@ class CommandHold(Effect):
     random = True
     meaning = "messages are lost and the last command acts on"
     equation = "u of the last row that arrived"
-    parameters = (Parameter("hold_fraction", "-", 0.0, 0.02, 0.2, "unit"),)
+    parameters = (
+        Parameter(
+            "hold_fraction", "-", 0.0, 0.02, 0.2, "unit", possible=(0.0, 0.6), beyond="no link loses so many messages"
+        ),
+    )
 
     def start(self, x: Tensor, row: Row) -> Tensor:
         return x

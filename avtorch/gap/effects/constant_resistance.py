@@ -15,7 +15,10 @@ from avtorch.vehicle.arguments import Number, tensor
 @register
 @dataclass(frozen=True)
 class ConstantResistance(Effect):
-    """`-resistance_mps2` while the car moves, which it does wherever no speed was measured; neutral at 0."""
+    """`-resistance_mps2` while the car moves, which it does wherever no speed was measured; neutral at 0.
+
+    Possible up to 3.5 m/s²: loose sand, or a motor that brakes as soon as the pedal is let go.
+    """
 
     resistance_mps2: Number = 0.12
 
@@ -23,7 +26,17 @@ class ConstantResistance(Effect):
     place = "body"
     meaning = "the same deceleration at every speed"
     equation = "-r while moving"
-    parameters = (Parameter("resistance_mps2", "m/s²", 0.0, 0.05, 0.3),)
+    parameters = (
+        Parameter(
+            "resistance_mps2",
+            "m/s²",
+            0.0,
+            0.05,
+            0.3,
+            possible=(0.0, 3.5),
+            beyond="nothing holds a moving car like that",
+        ),
+    )
 
     def apply(self, x: Tensor, row: Row) -> Tensor:
         force = -tensor(self.resistance_mps2)

@@ -14,7 +14,10 @@ from avtorch.vehicle.arguments import Number, tensor
 @register
 @dataclass(frozen=True)
 class DeadBand(Effect):
-    """Soft threshold of `|u|` at `half_width_mps2`; neutral at 0."""
+    """Soft threshold of `|u|` at `half_width_mps2`; neutral at 0.
+
+    Possible up to 1 m/s², an eighth of what brakes can do.
+    """
 
     half_width_mps2: Number = 0.08
 
@@ -23,7 +26,9 @@ class DeadBand(Effect):
     order = 2
     meaning = "commands within a band do nothing, larger ones arrive short by its half width"
     equation = "sign(u) max(|u| - delta, 0)"
-    parameters = (Parameter("half_width_mps2", "m/s²", 0.0, 0.02, 0.3),)
+    parameters = (
+        Parameter("half_width_mps2", "m/s²", 0.0, 0.02, 0.3, possible=(0.0, 1.0), beyond="no pedal ignores that much"),
+    )
 
     def apply(self, x: Tensor, row: Row) -> Tensor:
         width = tensor(self.half_width_mps2)

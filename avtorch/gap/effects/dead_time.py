@@ -20,6 +20,8 @@ class DeadTime(Effect):
 
     A held command that arrives late switches within a step. So the hook returns two commands and the time for which
     the older one still acts, and the actuator integrates both parts exactly. Always last among the command's effects.
+
+    Possible up to 1.5 s: a radio link of 0.5 s and the air brakes of a long truck, one after the other.
     """
 
     delay_s: Number = 0.16
@@ -28,9 +30,10 @@ class DeadTime(Effect):
     place = "command"
     order = 9
     memory = True
+    shift = "delay_s"
     meaning = "the command acts after a delay"
     equation = "u(t - tau)"
-    parameters = (Parameter("delay_s", "s", 0.0, 0.05, 0.5),)
+    parameters = (Parameter("delay_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.5), beyond="no command takes that long"),)
 
     def start(self, x: Tensor, row: Row) -> list[Tensor]:
         return [x]

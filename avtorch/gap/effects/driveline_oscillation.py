@@ -25,6 +25,8 @@ class DrivelineOscillation(Effect):
     A step of the actuator by 1 m/s² rings with `amplitude` [m/s²]. Where in the driveline the mode sits decides on
     its phase, so a quadrature part is fitted along; the answer names the length of both. Over a step the mean jerk
     is held, and the mode is integrated exactly, at any damping (above 1 it creeps back and does not ring).
+
+    Possible are 0.3 to 15 Hz (shuffle of trucks to that of small cars), and a ring of twice the step at most.
     """
 
     frequency_hz: Number = 2.2
@@ -38,8 +40,10 @@ class DrivelineOscillation(Effect):
     meaning = "changes of the drive make the driveline ring"
     equation = "amplitude y,  y'' + 2 zeta omega y' + omega² y = omega da/dt"
     parameters = (
-        Parameter("frequency_hz", "Hz", None, 1.0, 5.0),
-        Parameter("amplitude", "-", 0.0, -0.5, 0.5, "real"),
+        Parameter("frequency_hz", "Hz", None, 1.0, 5.0, possible=(0.3, 15.0), beyond="no driveline rings there"),
+        Parameter(
+            "amplitude", "-", 0.0, -0.5, 0.5, "real", possible=(-2.0, 2.0), beyond="no driveline rings so loudly"
+        ),
         Parameter("quadrature", "-", 0.0, -0.5, 0.5, "real", reported=False),
         Parameter("mode_damping", "-", None, 0.03, 0.2, reported=False),
     )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Self
 
 import torch
 from torch import Tensor
 
+from avtorch.gap.chain.domain import Domain
 from avtorch.gap.chain.effect import Effect, Row, register
 from avtorch.gap.chain.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
@@ -20,6 +22,8 @@ class GainChange(Effect):
 
     A row takes the mean over its step, so the response is differentiable in the time of the change. The drive's
     span, `earliest_s … latest_s`, is the prior of that time.
+
+    Possible are five times either way: the payload of a truck, brakes that fade. The moment may be any.
     """
 
     gain_ratio: Number = 0.75
@@ -33,9 +37,14 @@ class GainChange(Effect):
     meaning = "from some moment on the car gives another share of what is asked"
     equation = "K_L (1 + (ratio - 1) clip((t - t_change) / ramp, 0, 1))"
     parameters = (
-        Parameter("gain_ratio", "-", 1.0, 0.65, 1.4),
-        Parameter("change_s", "s", None, 0.0, 60.0, "interval"),
+        Parameter("gain_ratio", "-", 1.0, 0.65, 1.4, possible=(0.2, 5.0), beyond="payload and fading brakes do less"),
+        Parameter("change_s", "s", None, 0.0, 60.0, "interval", possible=(-math.inf, math.inf)),
         Parameter("ramp_s", "s", None, 0.5, 60.0, reported=False),
+    )
+    settings = (
+        Domain("ramp_s", 0.0, 1e6, "s"),
+        Domain("earliest_s", -1e12, 1e12, "s"),
+        Domain("latest_s", -1e12, 1e12, "s"),
     )
 
     def apply(self, x: Tensor, row: Row) -> tuple[Tensor, float]:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from avtorch.gap.chain.domain import Domain
 from avtorch.gap.chain.effect import Effect, Row, register
 from avtorch.gap.chain.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
@@ -25,6 +26,8 @@ class GearShift(Effect):
     Neutral at depth 0. Without `speeds` they are those of a gearbox of even steps: `first_mps`, each next one
     `gear_ratio` times the last. The crossing is found between rows, and a row loses
     by the part of its step that lies in the interruption, so the response is differentiable in duration and speeds.
+
+    Possible is an interruption of 0.02 s (two clutches) to 2.5 s (an automated gearbox of a truck).
     """
 
     depth: Number = 0.7
@@ -41,10 +44,11 @@ class GearShift(Effect):
     equation = "K_L (1 - depth) for duration after each upshift, where u > 0"
     parameters = (
         Parameter("depth", "-", 0.0, 0.3, 0.95, "unit"),
-        Parameter("duration_s", "s", None, 0.1, 0.6),
+        Parameter("duration_s", "s", None, 0.1, 0.6, possible=(0.02, 2.5), beyond="no gearbox shifts like that"),
         Parameter("first_mps", "m/s", None, 3.0, 7.0, reported=False),
         Parameter("gear_ratio", "-", None, 1.3, 1.8, reported=False),
     )
+    settings = (Domain("speeds", 0.1, 150.0, "m/s", most=16, rising=True),)
 
     def start(self, x: Tensor, row: Row) -> list[tuple[Tensor, Tensor, Tensor]]:
         """Of each shift: speed a row ago, whether above, start of the last interruption."""

@@ -20,6 +20,9 @@ class Gust(Effect):
     """Ornstein-Uhlenbeck acceleration of standard deviation `sd_mps2` and `time_constant_s`, stationary; neutral at 0.
 
     Random: its deterministic response is none; the noise model gains this force in both witnesses.
+
+    Possible up to 0.6 m/s², the pull of slopes of 6 % (root mean square) that nobody knows of; a storm's wind of 10 m/s
+    SD does 0.2 m/s² at 30 m/s. Faster than 0.2 s it is vibration, slower than a minute a drift.
     """
 
     sd_mps2: Number = 0.2
@@ -32,8 +35,10 @@ class Gust(Effect):
     meaning = "wind and road push the car at random, for seconds"
     equation = "df = -f / tau dt + sd sqrt(2 / tau) dW"
     parameters = (
-        Parameter("sd_mps2", "m/s²", 0.0, 0.1, 0.4),
-        Parameter("time_constant_s", "s", None, 1.0, 5.0),
+        Parameter("sd_mps2", "m/s²", 0.0, 0.1, 0.4, possible=(0.0, 0.6), beyond="wind and road do not do this"),
+        Parameter(
+            "time_constant_s", "s", None, 1.0, 5.0, possible=(0.2, 60.0), beyond="wind and road change otherwise"
+        ),
     )
 
     def start(self, x: Tensor, row: Row) -> Any:

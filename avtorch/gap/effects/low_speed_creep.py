@@ -18,7 +18,10 @@ _FADES_OVER = 0.5  # [m/s]
 @register
 @dataclass(frozen=True)
 class LowSpeedCreep(Effect):
-    """`creep_mps2` below about 3 m/s, fading smoothly there; neutral at 0."""
+    """`creep_mps2` below about 3 m/s, fading smoothly there; neutral at 0.
+
+    Possible up to 1.5 m/s²: a converter's whole torque at rest.
+    """
 
     creep_mps2: Number = 0.22
 
@@ -27,7 +30,9 @@ class LowSpeedCreep(Effect):
     needs_speed = True
     meaning = "the car is pushed forward at walking speed"
     equation = "creep / (1 + exp((v - 3) / 0.5))"
-    parameters = (Parameter("creep_mps2", "m/s²", 0.0, 0.1, 0.5),)
+    parameters = (
+        Parameter("creep_mps2", "m/s²", 0.0, 0.1, 0.5, possible=(0.0, 1.5), beyond="no car creeps like that"),
+    )
 
     def apply(self, x: Tensor, row: Row) -> Tensor:
         return tensor(self.creep_mps2) * torch.sigmoid((_FADES_AT - row.speed) / _FADES_OVER)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from avtorch.gap.chain.domain import Domain
 from avtorch.gap.chain.effect import Effect, NoiseChange, Row, register
 from avtorch.gap.chain.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
@@ -19,6 +20,8 @@ class Outliers(Effect):
 
     Random: its deterministic response is none; the accelerometer's noise gains heavy tails, in units of its own
     standard deviation. `noise_sd` matters to the simulator only.
+
+    Possible up to 0.3 of the samples: more are no outliers but the noise's own shape; and from twice the noise on.
     """
 
     fraction: Number = 0.016
@@ -32,9 +35,12 @@ class Outliers(Effect):
     meaning = "single samples of the accelerometer are far off"
     equation = "a + scale sigma e, with probability fraction"
     parameters = (
-        Parameter("fraction", "-", 0.0, 0.005, 0.05, "unit"),
-        Parameter("scale", "sigma", None, 5.0, 10.0),
+        Parameter(
+            "fraction", "-", 0.0, 0.005, 0.05, "unit", possible=(0.0, 0.3), beyond="so many are no single samples"
+        ),
+        Parameter("scale", "sigma", None, 5.0, 10.0, possible=(2.0, 1000.0), beyond="outliers are not of that size"),
     )
+    settings = (Domain("noise_sd", 0.0, 100.0, "m/s²"),)
 
     def apply(self, x: Tensor, row: Row) -> Tensor:
         if row.normal is None:

@@ -17,6 +17,8 @@ class RateLimit(Effect):
     """`|da/dt|` of the actuator at most `jerk_max_mps3`; neutral at infinity.
 
     Behind a second-order actuator the set-point `K u` is slewed instead: what limits the one limits the other.
+
+    Possible are 0.1 m/s³, ten seconds to a gentle push, to 50 m/s³, an emergency brake.
     """
 
     jerk_max_mps3: Number = 1.4
@@ -26,7 +28,17 @@ class RateLimit(Effect):
     order = 2
     meaning = "the actuator's jerk is bounded"
     equation = "da/dt = (K u - a) / T_L within ± jerk_max"
-    parameters = (Parameter("jerk_max_mps3", "m/s³", float("inf"), 0.5, 4.0),)
+    parameters = (
+        Parameter(
+            "jerk_max_mps3",
+            "m/s³",
+            float("inf"),
+            0.5,
+            4.0,
+            possible=(0.1, 50.0),
+            beyond="no actuator is bound like that",
+        ),
+    )
 
     def apply(self, x: Tensor, row: Row) -> tuple[float, float]:
         return 1.0, 1.0  # the bound is the actuator's own affair, see `actuator.py`

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from avtorch.gap.chain.domain import Domain
 from avtorch.gap.chain.effect import Effect, Row, register
 from avtorch.gap.chain.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
@@ -28,6 +29,8 @@ class RoadGrade(Effect):
     Cubic B-splines every `knot_m` [m] carry it; `profile` (..., knots) holds their coefficients, a priori independent
     standard normals (the correlation is put in here), linear in the response as far as the sine is: a likelihood may
     integrate them out by the `columns`. Where `profile` is None the slope is 0, or drawn, where drives are sampled.
+
+    Possible up to 0.2 over a drive: the steepest streets there are reach 0.35.
     """
 
     grade_rms: Number = 0.03
@@ -41,7 +44,12 @@ class RoadGrade(Effect):
     gravity = True
     meaning = "hills that the log does not know of"
     equation = "-g sin(slope(x)), slope a smooth random function of position"
-    parameters = (Parameter("grade_rms", "-", 0.0, 0.02, 0.06),)
+    parameters = (Parameter("grade_rms", "-", 0.0, 0.02, 0.06, possible=(0.0, 0.2), beyond="no road is that steep"),)
+    settings = (
+        Domain("profile", -100.0, 100.0, least=4, most=4096),
+        Domain("knots", 4, 4096, whole=True),
+        Domain("knot_m", 10.0, 10_000.0, "m"),
+    )
 
     def apply(self, x: Tensor, row: Row) -> Tensor:
         position = row.position

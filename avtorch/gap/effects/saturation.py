@@ -15,7 +15,10 @@ from avtorch.vehicle.arguments import Number, tensor
 @register
 @dataclass(frozen=True)
 class Saturation(Effect):
-    """`K u` clipped to `accel_min_mps2 … accel_max_mps2`; neutral at -inf and inf."""
+    """`K u` clipped to `accel_min_mps2 … accel_max_mps2`; neutral at -inf and inf.
+
+    Possible are 0.1 m/s² (a truck's drive) and -0.3 m/s² (a motor's drag) to 12 m/s², what tyres hold.
+    """
 
     accel_max_mps2: Number = 1.25
     accel_min_mps2: Number = -2.5
@@ -26,8 +29,19 @@ class Saturation(Effect):
     meaning = "demands beyond what drive or brakes can give are cut"
     equation = "K u within [a_min, a_max]"
     parameters = (
-        Parameter("accel_max_mps2", "m/s²", float("inf"), 0.8, 2.0),
-        Parameter("accel_min_mps2", "m/s²", float("-inf"), -4.0, -1.5, "negative"),
+        Parameter(
+            "accel_max_mps2", "m/s²", float("inf"), 0.8, 2.0, possible=(0.1, 12.0), beyond="no drive is cut there"
+        ),
+        Parameter(
+            "accel_min_mps2",
+            "m/s²",
+            float("-inf"),
+            -4.0,
+            -1.5,
+            "negative",
+            possible=(-12.0, -0.3),
+            beyond="no brakes are cut there",
+        ),
     )
 
     def apply(self, x: Tensor, row: Row) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
+from avtorch.gap.chain.domain import Domain
 from avtorch.gap.chain.effect import Effect, Row, register
 from avtorch.gap.chain.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
@@ -25,6 +26,8 @@ class SecondOrderActuator(Effect):
     and `damping_ratio = T_L / (2 tau)`. With `damping_ratio` given, `plant` sets `T_L` to `2 zeta tau`; from then on
     `T_L` tells the damping, and the effect in the plant has no `damping_ratio` of its own. Where it sets in during a
     drive, `T_L` is the lag until then and `lag_ratio` times it that from then on.
+
+    Possible are 0.5 to 60 rad/s, a swing of 12 s to one of 0.1 s, damped by 0.03 to 5.
     """
 
     inverse_frequency_s: Number = 1 / 6
@@ -40,6 +43,13 @@ class SecondOrderActuator(Effect):
         Parameter("inverse_frequency_s", "s", 0.0, 1 / 12, 1 / 3, reported=False),
         Parameter("lag_ratio", "-", 1.0, 0.65, 1 / 0.65, reported=False, of_onset=True),
     )
+    derived = (
+        Parameter(
+            "natural_frequency_radps", "rad/s", None, 3.0, 12.0, possible=(0.5, 60.0), beyond="no actuator swings there"
+        ),
+        Parameter("damping_ratio", "-", None, 0.2, 0.9, possible=(0.03, 5.0), beyond="no actuator is damped like that"),
+    )
+    settings = (Domain("natural_frequency_radps", 1e-3, 1e5, "rad/s"), Domain("damping_ratio", 1e-3, 1e3))
 
     def apply(self, x: Tensor, row: Row) -> tuple[float, Tensor]:
         return 1.0, tensor(self.lag_ratio)  # the second derivative is the actuator's own affair, see `actuator.py`

@@ -14,7 +14,10 @@ from avtorch.vehicle.arguments import Number, tensor
 @register
 @dataclass(frozen=True)
 class SensorBias(Effect):
-    """`bias_mps2` on top of the measured acceleration; neutral at 0."""
+    """`bias_mps2` on top of the measured acceleration; neutral at 0.
+
+    Possible up to 1 m/s² either way, an accelerometer that is tilted by 6 degrees.
+    """
 
     bias_mps2: Number = 0.12
 
@@ -23,7 +26,18 @@ class SensorBias(Effect):
     order = 2
     meaning = "the accelerometer shows a constant offset"
     equation = "a + b"
-    parameters = (Parameter("bias_mps2", "m/s²", 0.0, -0.25, 0.25, "real"),)
+    parameters = (
+        Parameter(
+            "bias_mps2",
+            "m/s²",
+            0.0,
+            -0.25,
+            0.25,
+            "real",
+            possible=(-1.0, 1.0),
+            beyond="no accelerometer is off like that",
+        ),
+    )
 
     def apply(self, x: Tensor, row: Row) -> Tensor:
         return x + tensor(self.bias_mps2)

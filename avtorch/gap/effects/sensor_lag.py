@@ -20,6 +20,8 @@ class SensorLag(Effect):
     """First-order filter of time constant `lag_s` on the measured acceleration; neutral at 0.
 
     Exact for an acceleration that is linear between rows.
+
+    Possible up to 1 s: an accelerometer answers within milliseconds, and no filter on a vehicle bus is slower.
     """
 
     lag_s: Number = 0.16
@@ -29,7 +31,7 @@ class SensorLag(Effect):
     memory = True
     meaning = "the accelerometer shows what happened a little earlier"
     equation = "s' = (a - s) / lag"
-    parameters = (Parameter("lag_s", "s", 0.0, 0.05, 0.5),)
+    parameters = (Parameter("lag_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.0), beyond="no accelerometer is that late"),)
 
     def start(self, x: Tensor, row: Row) -> Any:
         return x, x, None

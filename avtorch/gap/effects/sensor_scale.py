@@ -14,7 +14,10 @@ from avtorch.vehicle.arguments import Number, tensor
 @register
 @dataclass(frozen=True)
 class SensorScale(Effect):
-    """The measured acceleration times `scale`; neutral at 1."""
+    """The measured acceleration times `scale`; neutral at 1.
+
+    Possible are half to twice the truth; beyond that it is another unit.
+    """
 
     scale: Number = 1.12
 
@@ -23,7 +26,9 @@ class SensorScale(Effect):
     order = 1
     meaning = "the accelerometer shows too much or too little"
     equation = "scale a"
-    parameters = (Parameter("scale", "-", 1.0, 0.83, 1.2),)
+    parameters = (
+        Parameter("scale", "-", 1.0, 0.83, 1.2, possible=(0.5, 2.0), beyond="no accelerometer is off like that"),
+    )
 
     def apply(self, x: Tensor, row: Row) -> Tensor:
         return tensor(self.scale) * x

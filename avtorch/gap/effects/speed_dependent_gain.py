@@ -7,6 +7,7 @@ from typing import Self
 
 from torch import Tensor
 
+from avtorch.gap.chain.domain import Domain
 from avtorch.gap.chain.effect import Effect, Row, register
 from avtorch.gap.chain.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
@@ -21,6 +22,8 @@ class SpeedDependentGain(Effect):
 
     `pivot` [-]: the speed, as a share of the mean one, at which nothing changes. It bears on K_L alone as long as the
     effect was always there, and is 1 then.
+
+    Possible up to 2 either way, where nothing of the gain is left at half or one and a half times the mean speed.
     """
 
     gain_slope: Number = 0.3
@@ -33,9 +36,12 @@ class SpeedDependentGain(Effect):
     meaning = "the realised share of the command depends on speed"
     equation = "K_L (1 + slope (v - v_mean) / v_mean)"
     parameters = (
-        Parameter("gain_slope", "-", 0.0, -0.4, 0.4, "real"),
+        Parameter(
+            "gain_slope", "-", 0.0, -0.4, 0.4, "real", possible=(-2.0, 2.0), beyond="no gain depends on speed so"
+        ),
         Parameter("pivot", "-", None, 0.6, 1 / 0.6, reported=False, of_onset=True),
     )
+    settings = (Domain("mean_speed", 0.1, 150.0, "m/s"),)
 
     def apply(self, x: Tensor, row: Row) -> tuple[Tensor, float]:
         away = row.speed / (tensor(self.mean_speed) * tensor(self.pivot)) - 1

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.gap.answer.odds import CHANCE, prices
+from avtorch.gap.answer.odds import prices
 from avtorch.gap.chain.effect import EFFECTS, Effect
 from avtorch.gap.heldout.chance_gains import chance_gains
 from avtorch.gap.heldout.flexible import Flexible
@@ -120,7 +120,7 @@ def held_out(
         chosen=float(np.mean(chosen)),
         sham=sham,
         by_drives=bool(drives_apart(record)),
-        by_chance=set(verdict.name.split("+")) <= CHANCE,
+        by_chance=verdict.name != "none" and not verdict.candidate.effects,
     )
 
 
@@ -140,7 +140,8 @@ def _foretold(refit: Refit, part: Part) -> Float:
 
 
 def _chance_evidence(found: Found) -> float:
-    return (found.tails.evidence if found.tails else 0.0) + (found.losses.evidence if found.losses else 0.0)
+    own = found.by_chance.explained if found.by_chance else 0.0
+    return own + (found.tails.evidence if found.tails else 0.0) + (found.losses.evidence if found.losses else 0.0)
 
 
 def _sham(verdict: Found, taken: set[str], witnesses: tuple[str, ...]) -> type[Effect] | None:

@@ -54,7 +54,7 @@ def parted(record: Record, *, apart_s: float = 3.0, parts: int = PARTS) -> tuple
 
 def drives_apart(record: Record, parts: int = PARTS) -> list[set[int]]:
     """Numbers of the drives that judge together, about equal shares of the rows; empty where drives are too few."""
-    sizes = np.bincount(_drive_of(record), minlength=len(record.drives))
+    sizes = np.bincount(_drive_of(record), minlength=len(record.segments))
     there = [int(k) for k in np.argsort(-sizes, kind="stable") if sizes[k] > 0]
     if len(there) < _DRIVES or sizes.max() > 0.5 * record.rows:
         return []
@@ -66,10 +66,10 @@ def drives_apart(record: Record, parts: int = PARTS) -> list[set[int]]:
 
 
 def _drive_of(record: Record) -> NDArray[np.int64]:
-    """Number of each counted row's drive."""
+    """Number of the segment that each counted row is of."""
     each = 1 if record.coarse is record.drives else record.group
     ends = np.cumsum([len(d.time) * each // record.group for d in record.coarse])
-    return np.searchsorted(ends, record.source, side="right")
+    return np.asarray(record.segment)[np.searchsorted(ends, record.source, side="right")]
 
 
 def blocks_of(record: Record) -> list[slice]:

@@ -25,9 +25,10 @@ from avtorch.gap.likelihood.record import Record
 
 Float = NDArray[np.float64]
 
-HORIZONS_S = (0.5, 2.0, 10.0)
-USUAL = {"accel": None, "speed": 10.0}
-"""Horizon by witness that goes without saying: the speed of a whole drive's rollout wanders off whatever the model."""
+HORIZON_S = 10.0
+"""The horizon of all that has no other in its name, of both witnesses: the speed of a whole drive's rollout wanders off
+whatever the model."""
+HORIZONS_S = (0.5, 2.0, HORIZON_S)
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,7 @@ class Measure:
 
     @property
     def name(self) -> str:
-        usual = USUAL[self.witness]
-        over = "" if self.horizon_s == usual else "_whole" if self.horizon_s is None else f"_{self.horizon_s:g}s"
+        over = {HORIZON_S: "", None: "_whole"}.get(self.horizon_s, f"_{self.horizon_s or 0:g}s")
         return f"rollout_rmse_{self.witness}{over}"
 
     def products(self, x: Float, blocks: Sequence[slice], dt: float, lag: float) -> Float:
@@ -97,6 +97,22 @@ def products(
             within = [slice((blocks[j].start - begin) * group, (blocks[j].stop - begin) * group) for j in own]
             out[own] = measure.products(rows, within, record.dt / group, lag)
     return out
+
+
+def rms(measure: Measure, record: Record, errors: Float, lag: float) -> float:
+    """Root mean square of a long rollout's `errors` (witness, counted, group) by a measure, over all rows that count;
+    `lag` [s]."""
+    edges = [*record.starts.tolist(), record.rows]
+    total = products(measure, record, errors[None], [slice(a, b) for a, b in pairwise(edges)], lag).sum()
+    return float(np.sqrt(total / (record.rows * record.group)))
+
+
+def reached(measure: Measure | LoopMeasure, record: Record) -> float | None:
+    """Seconds that rollouts of a measure last at most, which no stretch outlasts; None: as long as the stretches."""
+    if measure.horizon_s is None or not np.isfinite(measure.horizon_s):
+        return None
+    longest = int(np.diff([*record.starts.tolist(), record.rows]).max()) * record.dt
+    return min(measure.horizon_s, longest)
 
 
 def measures(witnesses: Iterable[str]) -> tuple[Measure, ...]:

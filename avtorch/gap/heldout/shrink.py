@@ -9,7 +9,7 @@ their own spread (Student's t).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from avtorch.gap.answer.quantity import Quantity
 from avtorch.gap.answer.shrinkage import Closed, Shrinkage
 from avtorch.gap.heldout.floor import drawn, expected
 from avtorch.gap.heldout.held_out import HeldOut
-from avtorch.gap.heldout.rollout_errors import USUAL
+from avtorch.gap.heldout.rollout_errors import HORIZON_S, reached
 
 Float = NDArray[np.float64]
 
@@ -49,8 +49,9 @@ def shrinkage(held: HeldOut) -> Shrinkage:
     floors = _floors(nats, best - expected(form), best - drawn(form, z), rng, better=1)
     told[DENSITY] = _Told(nats, floors, held.rows, again, better=1)
 
-    by_metric = {name: one.closed for name, one in told.items()}
-    usual = [m.name for m in kinds if m.horizon_s == USUAL[m.witness]]
+    spans = {m.name: reached(m, held.record) for m in kinds}
+    by_metric = {name: replace(one.closed, horizon_s=spans.get(name)) for name, one in told.items()}
+    usual = [m.name for m in kinds if m.horizon_s == HORIZON_S]
     shows = {name: by_metric[name].before / max(by_metric[name].floor, 1e-12) for name in usual}
     metric = max(shows, key=lambda name: shows[name])
     if held.by_chance or shows[metric] < _TELLS:

@@ -26,11 +26,22 @@ _RATE = 0.05  # of false discoveries
 
 
 def where(shown: Shown, *, onset_s: float | None, lag: float) -> tuple[Where, ...]:
-    """The parts, the surest first. `onset_s`: when the cause set in, on the log's time; `lag` [s] of the actuator."""
-    parts = [*_stretches(shown, onset_s, lag), *_signals(shown), *_band(shown)]
+    """The parts, the surest first. `onset_s`: when the cause set in, from the start; `lag` [s] of the actuator."""
+    parts: list[Part] = [*_stretches(shown, onset_s, lag), *_signals(shown), *_band(shown)]
     q_values = _q_values([gain - shown.paid for *_, gain in parts])
+    parts = [(axis, *_stamps(shown, axis, a, b), share, gain) for axis, a, b, share, gain in parts]
     named = [Where(axis, a, b, share, q) for (axis, a, b, share, _), q in zip(parts, q_values, strict=True)]
     return tuple(sorted((w for w in named if w.q_value <= _RATE), key=lambda w: w.q_value))
+
+
+def _stamps(shown: Shown, axis: Axis, begin: float | str, end: float | str) -> tuple[float | str, float | str]:
+    """Both ends; times from the log's start become times on the log's own clock."""
+    if axis != "time" or isinstance(begin, str) or isinstance(end, str):
+        return begin, end
+    record = shown.record
+    time, stamp = record.time[record.source], record.stamp[record.source]
+    first, last = (int(np.abs(time - t).argmin()) for t in (begin, end))
+    return begin + float(stamp[first] - time[first]), end + float(stamp[last] - time[last])
 
 
 Part = tuple[Axis, float | str, float | str, float, float]
@@ -40,7 +51,7 @@ Part = tuple[Axis, float | str, float | str, float, float]
 def _stretches(shown: Shown, onset_s: float | None, lag: float) -> Iterator[Part]:
     record, does = shown.record, shown.does
     time = record.time[record.source]
-    one_clock = bool((np.diff(time) > 0).all())
+    one_clock = bool((np.diff(time) > 0).all()) and len(np.unique(record.log)) == 1
     if onset_s is not None and one_clock:
         # what chance decides (glitches, lost messages) has an onset, and nothing that is known beforehand
         since_then = does if does.any() else np.ones(len(time))

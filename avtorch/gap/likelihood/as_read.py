@@ -51,10 +51,10 @@ def as_read(log: Log) -> tuple[Log, str | None]:
 
 
 def _force(log: Log, rng: np.random.Generator) -> tuple[Float, Float]:
-    """An Ornstein-Uhlenbeck force [m/s²] and the speed [m/s] that it gains, (time,), anew in each stretch."""
+    """An Ornstein-Uhlenbeck force [m/s²] and the speed [m/s] that it gains, (time,), anew in each drive."""
     force, gained = np.zeros(log.rows), np.zeros(log.rows)
-    for part in log.segments():
-        dt = np.diff(log.time[part], append=log.time[part][-1])
+    for part in _drives(log):
+        dt = np.diff(log.elapsed[part], append=log.elapsed[part][-1])
         keep = np.exp(-float(np.median(dt)) / QUIET.force_time)
         kicks = QUIET.force_sd * np.sqrt(1 - keep**2) * rng.standard_normal(len(dt))
         kicks[0] = QUIET.force_sd * rng.standard_normal()
@@ -63,11 +63,16 @@ def _force(log: Log, rng: np.random.Generator) -> tuple[Float, Float]:
     return force, gained
 
 
+def _drives(log: Log) -> list[slice]:
+    """Those long enough to tell noise by: `engaged` may come and go with every row."""
+    return [part for part in log.drives() if part.stop - part.start > 3]
+
+
 def _scatter(log: Log, signal: Float) -> float:
     """SD of white noise that would bend `signal` from row to row as much as it is bent in a fifth of them or more.
 
     Half of them would do, but for signals that were interpolated from few rows: those bend at each of the few only.
     """
-    together = np.concatenate([np.abs(np.diff(signal[part], n=3)) for part in log.segments()])
+    together = np.concatenate([np.abs(np.diff(signal[part], n=3)) for part in _drives(log)] or [[]])
     # four fifths of a normal's absolute values are below this; the norm of (1, -3, 3, -1)
     return float(np.quantile(together, 0.8)) / 1.2816 / np.sqrt(20.0) if len(together) else np.inf

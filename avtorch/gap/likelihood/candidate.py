@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -70,11 +71,11 @@ class Candidate:
 
     @cached_property
     def plant(self) -> GapPlant:
-        return plant(list(self.effects), baseline=self.baseline).prepared(self.record.drives[0])
+        return plant(list(self.effects), baseline=self.baseline).prepared(*self.record.segments[0])
 
     @cached_property
     def _without(self) -> GapPlant:
-        return plant([], baseline=self.baseline).prepared(self.record.drives[0])
+        return plant([], baseline=self.baseline).prepared(*self.record.segments[0])
 
     @cached_property
     def coordinates(self) -> tuple[Coordinate, ...]:
@@ -150,7 +151,7 @@ class Candidate:
     def grade_columns(self) -> Float | None:
         """Rollouts (knot, witness, counted, group) per unit of each coefficient of the slope at `grade_rms` 1.
 
-        Every drive has coefficients of its own: where one began on the other's road is not known.
+        Every segment has coefficients of its own: where one began on the other's road is not known.
         """
         if not self._roads:
             return None
@@ -168,11 +169,12 @@ class Candidate:
         return _MEANS[self.record]
 
     def _columns(self, drives: Sequence[Drive], *, coarse: bool) -> Float:
-        forces = [road.columns(_position(drive)).T for road, drive in zip(self._roads, drives, strict=True)]
-        knots = [len(force) for force in forces]
-        apart = [(0, 0, sum(knots[:i]), sum(knots[i + 1 :])) for i in range(len(knots))]
-        padded = [torch.nn.functional.pad(f, a) for f, a in zip(forces, apart, strict=True)]
-        return self._seen_forces(drives, padded, coarse=coarse)
+        knots = sum(road.knots for road in self._roads)
+        forces = []
+        for drive, road, own in zip(drives, *self._places, strict=True):
+            force = road.columns(_position(drive)).T
+            forces.append(torch.nn.functional.pad(force, (0, 0, own.start, knots - own.stop)))
+        return self._seen_forces(drives, forces, coarse=coarse)
 
     def grade_response(self, coefficients: Float) -> Float:
         """What a slope of `coefficients` (knot,) does, (witness, counted, group)."""
@@ -183,11 +185,17 @@ class Candidate:
     def _each_road(
         self, drives: Sequence[Drive], coefficients: Float
     ) -> Iterator[tuple[RoadGrade, Drive, torch.Tensor]]:
-        """Each drive with its road and its part of `coefficients` (..., knot)."""
-        first = 0
-        for road, drive in zip(self._roads, drives, strict=True):
-            yield road, drive, torch.as_tensor(coefficients[..., first : first + road.knots])
-            first += road.knots
+        """Each drive with its road and that road's part of `coefficients` (..., knot)."""
+        for drive, road, own in zip(drives, *self._places, strict=True):
+            yield road, drive, torch.as_tensor(coefficients[..., own])
+
+    @property
+    def _places(self) -> tuple[list[RoadGrade], list[slice]]:
+        """Of each drive the road, and where its coefficients stand among those of all roads."""
+        ends = np.cumsum([0, *(road.knots for road in self._roads)]).tolist()
+        own = [slice(*part) for part in pairwise(ends)]
+        numbers = self.record.segment
+        return [self._roads[n] for n in numbers], [own[n] for n in numbers]
 
     def _seen_forces(self, drives: Sequence[Drive], forces: Sequence[torch.Tensor], *, coarse: bool) -> Float:
         """Forces (column, time) of each drive as both witnesses see them, (column, witness, counted, group)."""
@@ -202,11 +210,15 @@ class Candidate:
 
     @cached_property
     def _roads(self) -> list[RoadGrade]:
-        """The slope with as many knots as each drive's road needs; empty where it is none of the effects."""
+        """The slope with as many knots as each segment's road needs; empty where it is none of the effects."""
         grade = next((e for e in self.plant.effects if isinstance(e, RoadGrade)), None)
         if grade is None or RoadGrade not in self.effects or self.record.speed is None:
             return []
-        return [grade.prepared(drive.time, drive.speed, _position(drive)) for drive in self.record.drives]
+        made = []
+        for drives in self.record.segments:
+            positions = torch.cat([_position(drive) for drive in drives])
+            made.append(grade.prepared(drives[0].time, drives[0].speed, positions))
+        return made
 
     def grade_along(self, coefficients: Float) -> Float:
         """Root mean square of the slope along all drives, (column,), for coefficients (column, knot)."""

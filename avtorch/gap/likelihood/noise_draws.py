@@ -26,7 +26,7 @@ def noise_draws(
     pushed = rng.standard_normal((rows, count, len(move))) @ root.T
     for k in range(1, rows):
         state[k] = state[k - 1] @ move.T + pushed[k]
-    accel = state[..., 3] if noise.sensor_lag > 0 else state[..., 1] + state[..., 2]
+    accel = state[..., -1] if noise.sensor_lag > 0 else state[..., 1:].sum(-1)
     clean = {"accel": noise.sensor_scale * accel, "speed": state[..., 0]}
     sds = {"accel": noise.accel_sd, "speed": noise.speed_sd}
     return np.stack([clean[w].T + sds[w] * rng.standard_normal((count, rows)) for w in witnesses], 1)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from avtorch.gap.likelihood.earlier import earlier, whitener
 from avtorch.gap.likelihood.noise_model import NAMES, NoiseModel
+from avtorch.gap.likelihood.random_law import RandomLaw
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitener import Whitener
 
@@ -39,6 +40,7 @@ GUST: dict[str, Prior] = {
 }
 """Priors where the coloured force is the cause."""
 
+_LAW_END = 4.0  # prior standard deviations of a random effect's parameter
 _STEP = 1e-3
 _LONGEST = 1.5  # of a step, in prior standard deviations
 _TRIES = 8  # of a step, each shorter; far from the mode squared scores are no information at all
@@ -48,13 +50,16 @@ _TRIES = 8  # of a step, each shorter; far from the mode squared scores are no i
 class NoiseFit:
     """`noise` at its mode; `log_prior` there with Laplace's term: what it adds to a log evidence.
 
-    `rows` (counted,): log likelihood of each row; `sds` of the logarithms, by name.
+    `rows` (counted,): log likelihood of each row; `sds` of the logarithms, by name. `law_z` (coordinate,),
+    `law_covariance`: of a random effect's force that was fitted with it.
     """
 
     noise: NoiseModel
     log_prior: float
     rows: Float = field(repr=False)
     sds: Mapping[str, float] = field(repr=False)
+    law_z: Float | None = field(default=None, repr=False)
+    law_covariance: Float | None = field(default=None, repr=False)
 
 
 def fit_noise(
@@ -67,26 +72,34 @@ def fit_noise(
     onset: int | None = None,
     gust_onset: int | None = None,
     iterations: int = 6,
+    law: RandomLaw | None = None,
+    law_z: Float | None = None,
 ) -> NoiseFit:
     """Mode of the noise's parameters given the errors (witness, counted, group) of a rollout; `T_L` [s].
 
     Errors of groups' means come with group 1. Before `onset` the sensor reads plainly, before `gust_onset` the force is
-    calm.
+    calm. `law`: of a random effect whose force is fitted as well, from `law_z` (coordinate,) on.
     """
     means = np.array([priors[n][0] for n in NAMES])
     means[NAMES.index("process_time")] += np.log(T_L)
     sds, ends = (np.array([priors[n][k] for n in NAMES]) for k in (1, 2))
+    size, extra = len(NAMES), 0 if law is None else law.size
+    ends = np.concatenate([ends, np.full(extra, _LAW_END)])
 
     onsets = {"onset": onset, "gust_onset": gust_onset}
 
     def model(z: Float) -> NoiseModel:
-        return replace(start, **{n: float(x) for n, x in zip(NAMES, np.exp(means + sds * z), strict=True)})
+        own = {n: float(x) for n, x in zip(NAMES, np.exp(means + sds * z[:size]), strict=True)}
+        # nothing of a force would leave its state without a use
+        more = {} if law is None else {k: max(x, 1e-6) for k, x in law.force(z[size:]).items()}
+        return replace(start, **own, **more)
 
     def white(z: Float) -> Whitener:
         return whitener(record, model(z), **onsets)
 
     begin = np.log([getattr(start, n) for n in NAMES])
-    z = np.clip((begin - means) / sds, -ends, ends)
+    z = np.concatenate([(begin - means) / sds, np.zeros(extra) if law_z is None else law_z])
+    z = np.clip(z, -ends, ends)
     rows = white(z).row_likelihoods(errors)
     value = float(rows.sum()) - 0.5 * float(z @ z)
     if not 0.5 < float((white(z)(errors) ** 2).mean()) < 2.0:
@@ -133,5 +146,9 @@ def fit_noise(
         if gained < 0.02:
             break
     log_prior = -0.5 * float(z @ z) - 0.5 * float(np.linalg.slogdet(information)[1])
-    spread = np.sqrt(np.diag(np.linalg.inv(information))) * sds
-    return NoiseFit(model(z), log_prior, rows, dict(zip(NAMES, spread.tolist(), strict=True)))
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
+    spread = np.sqrt(np.diag(covariance))[:size] * sds
+    named: dict[str, float] = dict(zip(NAMES, spread.tolist(), strict=True))
+    if law is None:
+        return NoiseFit(model(z), log_prior, rows, named)
+    return NoiseFit(model(z), log_prior, rows, named, z[size:], covariance[size:, size:])

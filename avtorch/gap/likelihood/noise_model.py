@@ -6,6 +6,8 @@ The error of a rollout is what no deterministic response foretells,
     p: white jerk noise through the actuator's lag, an Ornstein-Uhlenbeck process (sd, time constant)
     d: a slow coloured force, the nuisance of every candidate and the cause called `gust`, likewise
     accel measured = p + d + white,   speed measured = w + white
+
+A random effect of the user's may add a further force to `p + d`, of the same kind.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ NAMES = ("process_sd", "process_time", "force_sd", "force_time", "accel_sd", "sp
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """`process_sd`, `force_sd`, `accel_sd` [m/s²], `speed_sd` [m/s] (white, of single rows), times [s].
+    """`process_sd`, `force_sd`, `accel_sd` [m/s²], `speed_sd` [m/s] (white, of single rows), times [s]. `more_sd`,
+    `more_time`: of a random effect's force, none at 0.
 
     What the accelerometer makes of the car's random motion: `sensor_scale` [-] times it, late by a first-order
     `sensor_lag` [s].
@@ -36,6 +39,14 @@ class NoiseModel:
     speed_sd: float = 0.02
     sensor_scale: float = 1.0
     sensor_lag: float = 0.0
+    more_sd: float = 0.0
+    more_time: float = 1.0
+
+    @property
+    def forces(self) -> tuple[tuple[float, float], ...]:
+        """Standard deviations [m/s²] and times [s] of the random motion's parts."""
+        more = ((self.more_sd, self.more_time),) if self.more_sd > 0 else ()
+        return ((self.process_sd, self.process_time), (self.force_sd, self.force_time), *more)
 
     def replaced(self, **values: float) -> NoiseModel:
         return replace(self, **values)

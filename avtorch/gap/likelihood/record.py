@@ -1,9 +1,13 @@
 """What a diagnosis looks at: drives at one rate, their witnesses, and the stretches that count.
 
+A drive is what a segment of a log holds between two overrides: while a driver is in charge (`engaged` 0) nobody obeys
+the command, so no rollout runs through those rows and each return begins anew, at what is measured there. Of the rows
+in between only the measured speed is used, for how far the car has come along its road.
+
 Rows above some 20 Hz come in groups. A search may begin with `coarse` rollouts, of which only the groups' means are
 compared; what a candidate is worth is told at every row, since a controller feeds the noise of a row back into the
-command of the next, and means alone would take that for a lag. Rows at standstill or with a driver's foot in
-(`engaged` 0) do not count.
+command of the next, and means alone would take that for a lag. Rows at standstill do not count, but rollouts run on
+through them, as if the actuator went on obeying there and the ground held the car.
 """
 
 from __future__ import annotations
@@ -11,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,16 +25,26 @@ from torch import Tensor
 from avtorch.errors import InputError
 from avtorch.gap.chain.drive import Drive, Place
 from avtorch.io import Log
+from avtorch.io.clock import ROUNDING_S
+from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import AccelKind
 
 Float = NDArray[np.float64]
 
 RATE_HZ = 20.0
 """Rows are averaged as long as at least this many a second are left [Hz]."""
-_SETTLE_S = 2.0  # at a drive's start the actuator's state is not known; a few lags
 _SHORTEST_S = 2.0
 _FEW = 20_000  # rows of a log short enough to be rolled out in full wherever means would do
 _GAP_S = 5.0  # zeros between stretches, over which a filter forgets
+_FAR_M = 1000.0  # over which a road's slope is forgotten several times: further along lies another road
+
+
+class Cut(NamedTuple):
+    """Where a drive comes from: `log` and `segment` count from 0 over all logs, `rows` are the log's own."""
+
+    log: int
+    segment: int
+    rows: slice
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +52,19 @@ class Record:
     """Drives at the log's own rate, and where in one long array of rows averaged to `dt` [s] those stand that count.
 
     `accel`, `speed` (row, group): measured, over all drives' rows one after another; None: not in the log. `time`
-    (row,) [s], the log's own; `command` (row,), mean of a group. `source`, `target`: of every counted row its index in
-    these arrays and in the padded one of `length` rows that is filtered; `stretch` (counted,) numbers the stretches.
+    (row,) [s], from the start of its log; `stamp` (row,) [s] on that log's own clock, `log` (row,) its number;
+    `command` (row,), mean of a group. `source`, `target`: of every counted row its index in these arrays and in the
+    padded one of `length` rows that is filtered; `stretch` (counted,) numbers the stretches.
     `group`: rows averaged into one. `coarse` are drives of averaged commands; in a short log the drives themselves.
+    `cuts` tell where each drive comes from; those of one segment have one road, along which `position` runs on.
     """
 
     drives: tuple[Drive, ...]
+    cuts: tuple[Cut, ...]
     coarse: tuple[Drive, ...]
     time: Float
+    stamp: Float
+    log: NDArray[np.int64]
     accel: Float | None
     speed: Float | None
     command: Float
@@ -75,14 +95,25 @@ class Record:
         return np.flatnonzero(np.diff(self.stretch, prepend=-1))
 
     @classmethod
-    def of(cls, logs: Log | Iterable[Log], *, rate_hz: float = RATE_HZ) -> Record:
-        """From one or several logs of one car. Raises `InputError` where nothing of use is left."""
+    def of(cls, logs: Log | Iterable[Log], *, rate_hz: float = RATE_HZ, multiple: int = 1) -> Record:
+        """From one or several logs of one car; its drives have a `multiple` of rows, as those of a record
+        with groups of so many have. Raises `InputError` where nothing of use is left.
+        """
         each = [logs] if isinstance(logs, Log) else list(logs)
         if not each:
             raise InputError("logs: none given, needs one or more")
         drives: list[Drive] = []
+        cuts: list[Cut] = []
         coarse: list[Drive] = []
-        columns: dict[str, list[Float]] = {"time": [], "accel": [], "speed": [], "command": [], "use": []}
+        columns: dict[str, list[Float]] = {
+            "time": [],
+            "stamp": [],
+            "log": [],
+            "accel": [],
+            "speed": [],
+            "command": [],
+            "use": [],
+        }
         names = list(dict.fromkeys(log.name for log in each))
         if len({(log.accel is not None, log.speed is not None) for log in each}) > 1:
             raise InputError(f"logs: {', '.join(names)} have different witnesses; needs accel, speed or both in all")
@@ -94,43 +125,54 @@ class Record:
         if max(rates) > 1.02 * min(rates):
             told = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in each)
             raise InputError(f"logs: found rates of {told}; needs one rate in all, or one diagnosis each")
-        group = max(1, int(min(log.rate_hz for log in each) / rate_hz + 1e-6))
+        group = grouped(min(rates), rate_hz)
         steps = []
-        for log in each:
+        segments = 0
+        for number, log in enumerate(each):
             if log.accel_cmd is None:
                 raise InputError(f"{log.name}: has no accel_cmd, which the diagnosis needs")
-            for cut in rolled(log, group):
+            first_segment = segments - int(log.segment[0])
+            segments = first_segment + int(log.segment[-1]) + 1
+            for cut in rolled(log, max(group, multiple)):
+                begun = Cut(number, first_segment + int(log.segment[cut.start]), cut)
+                position0 = _position(log, drives, cuts, begun)
+                cuts.append(begun)
                 rows = (cut.stop - cut.start) // group
 
                 def mean(x: Float, cut: slice = cut, rows: int = rows) -> Float:
                     return x[cut].reshape(rows, group).mean(1)
 
-                time = log.time[cut][::group]
+                time = log.elapsed[cut][::group]
                 use = log.usable[cut].reshape(rows, group).all(1)
-                settled = time - time[0] >= _SETTLE_S
+                settled = time - time[0] >= SETTLE_S - ROUNDING_S
                 step = float(np.median(np.diff(time)))
                 steps.append(step)
                 speed = None if log.speed is None else mean(log.speed)
                 first = max(1, round(0.3 / step))
                 accel0 = None if log.accel is None else float(mean(log.accel)[:first].mean())
                 raw = log.speed if log.speed is None else log.speed[cut]
-                drives.append(_drive(log.time[cut], log.accel_cmd[cut], raw, accel0, specific))
+                drives.append(_drive(log.elapsed[cut], log.accel_cmd[cut], raw, accel0, specific, position0))
                 if group > 1:
-                    coarse.append(_drive(time, mean(log.accel_cmd), speed, accel0, specific))
+                    coarse.append(_drive(time, mean(log.accel_cmd), speed, accel0, specific, position0))
                 columns["time"].append(time)
+                columns["stamp"].append(log.time[cut][::group])
+                columns["log"].append(np.full(rows, number))
                 columns["command"].append(mean(log.accel_cmd))
                 columns["use"].append((use & settled).astype(float))
                 for name, x in (("accel", log.accel), ("speed", log.speed)):
                     if x is not None:
                         columns[name].append(x[cut].reshape(rows, group))
-        if not drives:
+        returns = sum(int((np.diff(log.engaged.astype(int)) == 1).sum()) for log in each)
+        if not drives and all(log.engaged.all() for log in each):
             raise InputError(f"{', '.join(names)}: no drive of two seconds or more, nothing to diagnose")
-        dt = float(np.median(steps))
+        dt = float(np.median(steps)) if drives else np.inf
         source, target, stretch, length = _places(columns["use"], dt)
-        if len(source) < 10 / dt:
+        if not drives or len(source) < 10 / dt:
+            seconds = len(source) * dt if drives else 0.0
+            each_return = f" and each of {returns} return{'s' * (returns != 1)} to engaged" if returns else ""
             raise InputError(
-                f"{', '.join(names)}: {len(source) * dt:.1f} s of usable driving (moving, engaged, "
-                "2 s into each drive), needs 10 s or more"
+                f"{', '.join(names)}: {seconds:.1f} s of usable driving (moving, engaged, "
+                f"2 s into each drive{each_return}), needs 10 s or more"
             )
 
         def whole(name: str) -> Float | None:
@@ -138,13 +180,14 @@ class Record:
 
         whole_drives = tuple(drives)
         few = group == 1 or sum(len(d.time) for d in drives) <= _FEW
-        time, command = whole("time"), whole("command")
-        assert time is not None
-        assert command is not None
+        time, stamp, command = (np.concatenate(columns[name]) for name in ("time", "stamp", "command"))
         return cls(
             drives=whole_drives,
+            cuts=tuple(cuts),
             coarse=whole_drives if few else tuple(coarse),
             time=time,
+            stamp=stamp,
+            log=np.concatenate(columns["log"]).astype(np.int64),
             accel=whole("accel"),
             speed=whole("speed"),
             command=command,
@@ -155,6 +198,21 @@ class Record:
             length=length,
             group=group,
         )
+
+    @cached_property
+    def segments(self) -> tuple[tuple[Drive, ...], ...]:
+        """The drives of each segment that has any, in order."""
+        numbers = dict.fromkeys(cut.segment for cut in self.cuts)
+        return tuple(
+            tuple(d for d, cut in zip(self.drives, self.cuts, strict=True) if cut.segment == number)
+            for number in numbers
+        )
+
+    @cached_property
+    def segment(self) -> tuple[int, ...]:
+        """Of each drive its segment's number among `segments`."""
+        numbers = {n: i for i, n in enumerate(dict.fromkeys(cut.segment for cut in self.cuts))}
+        return tuple(numbers[cut.segment] for cut in self.cuts)
 
     def only(self, rows: NDArray[np.bool_]) -> Record:
         """The same drives of which only these `rows` (counted,) still count, in stretches of 2 s or more.
@@ -204,17 +262,38 @@ class Record:
         return np.stack([x[self.source] for x in (self.accel, self.speed) if x is not None])
 
 
+def grouped(rate: float, least: float) -> int:
+    """Rows to be averaged into one, at `rate` [Hz], so that about `least` [Hz] are left.
+
+    Clocks are off by a little: the bound lies 2 % below the rates that recorders have, and not on one of them.
+    """
+    return max(1, int(1.02 * rate / least))
+
+
 def rolled(log: Log, group: int) -> Iterator[slice]:
-    """The rows of `log` that become a drive each: its segments of 40 groups or more, whole groups of them."""
-    for part in log.segments():
+    """The rows of `log` that become a drive each: its drives of 40 groups or more, whole groups of them."""
+    for part in log.drives():
         rows = (part.stop - part.start) // group
         if rows >= 2 * RATE_HZ:
             yield slice(part.start, part.start + rows * group)
 
 
-def _drive(time: Float, command: Float, speed: Float | None, accel0: float | None, specific: bool) -> Drive:
+def _drive(
+    time: Float, command: Float, speed: Float | None, accel0: float | None, specific: bool, position0: float
+) -> Drive:
     quiet = None if speed is None else torch.as_tensor(_quiet(speed, float(np.median(np.diff(time)))))
-    return Drive(torch.as_tensor(_even(time)), torch.as_tensor(command), quiet, accel0, specific)
+    return Drive(torch.as_tensor(_even(time)), torch.as_tensor(command), quiet, accel0, specific, position0)
+
+
+def _position(log: Log, drives: Sequence[Drive], cuts: Sequence[Cut], begun: Cut) -> float:
+    """Where along its segment's road [m] a drive begins, behind those so far: the car moves on under the driver."""
+    if log.speed is None or not cuts or cuts[-1].segment != begun.segment:
+        return 0.0
+    position = drives[-1].position
+    assert position is not None
+    between = slice(cuts[-1].rows.stop - 1, begun.rows.start + 1)
+    moved = np.trapezoid(np.maximum(log.speed[between], 0.0), log.elapsed[between])
+    return float(position[-1]) + min(float(moved), _FAR_M)
 
 
 def _even(time: Float) -> Float:

@@ -22,13 +22,14 @@ Filter = tuple[list[list[Float]], Float, float]
 def designed(noises: Sequence[NoiseModel], dt: float, witnesses: tuple[str, ...]) -> list[Filter]:
     """The steady Kalman filter from errors to innovations of unit covariance, for each noise model.
 
-    The models have a sensor's lag all of them, or none.
+    The models have a sensor's lag all of them, or none, and so with a further force.
     """
     pairs = [motion(n, dt) for n in noises]
     move, driven = np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])
     use = [i for i, name in enumerate(("accel", "speed")) if name in witnesses]
     keep = slice(0 if 1 in use else 1, move.shape[-1])
-    felt = [0, 0, 0, 1] if move.shape[-1] == 4 else [0, 1, 1]
+    states = move.shape[-1]
+    felt = [*[0] * (states - 1), 1] if noises[0].sensor_lag > 0 else [0, *[1] * (states - 1)]
     seen = np.array([[felt, [1, *[0] * (len(felt) - 1)]]] * len(noises), float)
     seen[:, 0] *= np.array([n.sensor_scale for n in noises])[:, None]
     see = seen[:, use][..., keep]
@@ -61,14 +62,16 @@ def designed(noises: Sequence[NoiseModel], dt: float, witnesses: tuple[str, ...]
 def motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
     """State (error of the speed, p, d) over `dt`: its transition and the covariance that is added, both exact.
 
-    Two Ornstein-Uhlenbeck processes and the integral of their sum. Behind a late sensor its reading is a fourth state.
+    Ornstein-Uhlenbeck processes (a third where a random effect adds one) and the integral of their sum. Behind a late
+    sensor its reading is one state more, the last.
     """
     if n.sensor_lag > 0:
         return _late_motion(n, dt)
-    move, driven = np.eye(3), np.zeros((3, 3))
+    size = 1 + len(n.forces)
+    move, driven = np.eye(size), np.zeros((size, size))
     # a hair of speed noise, or the error of the speed is known exactly
     driven[0, 0] = 1e-12 * dt
-    for i, sd, time in ((1, n.process_sd, n.process_time), (2, n.force_sd, n.force_time)):
+    for i, (sd, time) in enumerate(n.forces, start=1):
         lost = -np.expm1(-dt / time)
         move[i, i], move[0, i] = 1 - lost, time * lost
         driven[i, i] = sd**2 * lost * (2 - lost)
@@ -79,14 +82,15 @@ def motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
 
 def _late_motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
     """By van Loan's matrix exponential."""
-    drift = np.diag([0.0, -1 / n.process_time, -1 / n.force_time, -1 / n.sensor_lag])
-    drift[0, 1:3], drift[3, 1:3] = 1.0, 1 / n.sensor_lag
-    spectrum = np.diag([1e-12, 2 * n.process_sd**2 / n.process_time, 2 * n.force_sd**2 / n.force_time, 0.0])
+    size = 2 + len(n.forces)
+    drift = np.diag([0.0, *(-1 / time for _, time in n.forces), -1 / n.sensor_lag])
+    drift[0, 1:-1], drift[-1, 1:-1] = 1.0, 1 / n.sensor_lag
+    spectrum = np.diag([1e-12, *(2 * sd**2 / time for sd, time in n.forces), 0.0])
     # in halves of a step short enough for the growing half of the matrix, then doubled
     halves = max(0, int(np.ceil(np.log2(dt / n.sensor_lag))) + 1)
-    step = np.asarray(expm(np.block([[-drift, spectrum], [np.zeros((4, 4)), drift.T]]) * dt / 2**halves), float)
-    move = step[4:, 4:].T
-    driven = move @ step[:4, 4:]
+    step = np.asarray(expm(np.block([[-drift, spectrum], [np.zeros((size, size)), drift.T]]) * dt / 2**halves), float)
+    move = step[size:, size:].T
+    driven = move @ step[:size, size:]
     for _ in range(halves):
         driven = driven + move @ driven @ move.T
         move = move @ move

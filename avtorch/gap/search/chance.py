@@ -6,6 +6,7 @@ likelihood ratio of single rows, given the errors of a rollout.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -22,7 +23,8 @@ Float = NDArray[np.float64]
 class Tails:
     """Heavy tails: `evidence` [nats] over a normal distribution, `fraction`, `scale` with sds of their links.
 
-    `hit` (row,): rows more likely off than not. `ratios` (row,): log likelihood ratio of each row.
+    `hit` (row,): rows more likely off than not. `ratios` (row,): log likelihood ratio of each row. `z` (coordinate,),
+    `covariance`: of the law's own parameters.
     """
 
     evidence: float
@@ -32,8 +34,16 @@ class Tails:
     hit: NDArray[np.bool_]
     ratios: Float = field(repr=False)
     onset: int | None = None
+    z: Float | None = field(default=None, repr=False)
+    covariance: Float | None = field(default=None, repr=False)
+
+    @property
+    def plain(self) -> bool:
+        """Whether single rows are plainly glitches, and worth cleaning from the log."""
+        return self.evidence > _PLAIN and bool(self.hit.any())
 
 
+_PLAIN = 2.0  # nats over a normal distribution
 _TAIL_PRIOR = ((np.log(0.01), 1.5), (np.log(7.0), 0.4))
 
 
@@ -51,12 +61,25 @@ def _level(x: Float, size: int) -> Float:
     return np.asarray(np.interp(np.arange(len(x)), 0.5 * (ends[1:] + ends[:-1]), medians))
 
 
-def tails(errors: Float, dt: float, *, fits: NDArray[np.bool_] | None = None) -> Tails:
+def _outliers(z: Float) -> tuple[float, float]:
+    """`(fraction, scale)` of the effect `outliers`."""
+    fraction, scale = (float(np.exp(centre + sd * x)) for (centre, sd), x in zip(_TAIL_PRIOR, z, strict=True))
+    return min(fraction, 0.5), scale
+
+
+def tails(
+    errors: Float,
+    dt: float,
+    *,
+    fits: NDArray[np.bool_] | None = None,
+    law: Callable[[Float], tuple[float, float]] = _outliers,
+    size: int = 2,
+) -> Tails:
     """Outliers among accelerometer errors (row,), by their distance from the rows beside them.
 
     A row is held against the median of two before and two after it, which a single glitch does not move. The middle
     of these distances gives the size of the noise. `fits` (row,): rows by which fraction and scale are found, all if
-    not given.
+    not given. `law`: fraction and scale for `size` coordinates, standard normal a priori.
     """
     fits = np.ones(len(errors), bool) if fits is None else fits
     x = np.pad(errors, 2, mode="edge")
@@ -69,11 +92,7 @@ def tails(errors: Float, dt: float, *, fits: NDArray[np.bool_] | None = None) ->
     away = away / np.maximum(sd, rough)
 
     def ratios(z: Float) -> Float:
-        fraction, scale = (
-            np.exp(_TAIL_PRIOR[0][0] + _TAIL_PRIOR[0][1] * z[0]),
-            np.exp(_TAIL_PRIOR[1][0] + _TAIL_PRIOR[1][1] * z[1]),
-        )
-        fraction = min(fraction, 0.5)
+        fraction, scale = law(z)
         # in units of the distances' own sd, which is some 1.15 of the noise's
         wide = 1 + (scale / 1.15) ** 2
         gain = -0.5 * np.log(wide) + 0.5 * away**2 * (1 - 1 / wide)
@@ -82,29 +101,32 @@ def tails(errors: Float, dt: float, *, fits: NDArray[np.bool_] | None = None) ->
     def cost(z: Float) -> float:
         return -float(ratios(z)[fits].sum()) + 0.5 * float(z @ z)
 
-    best = min((minimize(cost, np.array([a, 0.0]), method="Nelder-Mead") for a in (-1.5, 0.5)), key=lambda m: m.fun)
-    z = best.x
+    begin = [np.eye(1, size)[0] * a for a in (-1.5, 0.5)] if size else []
+    found = [minimize(cost, at, method="Nelder-Mead") for at in begin]
+    z = min(found, key=lambda m: m.fun).x if found else np.zeros(0)
     per_row = ratios(z)
-    hessian = _hessian(cost, z)
-    evidence = -float(best.fun) - 0.5 * float(np.linalg.slogdet(hessian)[1])
-    sds = np.sqrt(np.diag(np.linalg.inv(hessian)))
-    fraction = float(min(np.exp(_TAIL_PRIOR[0][0] + _TAIL_PRIOR[0][1] * z[0]), 0.5))
-    scale = float(np.exp(_TAIL_PRIOR[1][0] + _TAIL_PRIOR[1][1] * z[1]))
+    hessian = hessian_of(cost, z)
+    evidence = -cost(z) - 0.5 * float(np.linalg.slogdet(hessian)[1])
+    covariance = np.asarray(np.linalg.inv(hessian), np.float64)
+    sds = np.sqrt(np.diag(covariance)) * [sd for _, sd in _TAIL_PRIOR] if law is _outliers else np.zeros(2)
+    fraction, scale = law(z)
     wide = 1 + (scale / 1.15) ** 2
-    hit = np.log(fraction) - np.log1p(-fraction) - 0.5 * np.log(wide) + 0.5 * away**2 * (1 - 1 / wide) > 0
+    hit = np.log(max(fraction, 1e-300)) - np.log1p(-fraction) - 0.5 * np.log(wide) + 0.5 * away**2 * (1 - 1 / wide) > 0
     onset, gained = onset_of(per_row, dt)
     return Tails(
         evidence=evidence + float(np.logaddexp(0.0, gained)) - float(np.log(2.0)),
         fraction=fraction,
         scale=scale,
-        sds=(float(sds[0] * _TAIL_PRIOR[0][1]), float(sds[1] * _TAIL_PRIOR[1][1])),
+        sds=(float(sds[0]), float(sds[1])),
         hit=hit & (np.abs(away) > 3.5),
         ratios=per_row,
         onset=onset if gained > 1 else None,
+        z=z,
+        covariance=covariance,
     )
 
 
-def _hessian(cost, z: Float, h: float = 0.05) -> Float:  # type: ignore[no-untyped-def]
+def hessian_of(cost, z: Float, h: float = 0.05) -> Float:  # type: ignore[no-untyped-def]
     size = len(z)
     out = np.empty((size, size))
     for i in range(size):

@@ -1,11 +1,18 @@
-"""Fits that are done, kept in a file, so that a search that was cut off goes on where it was."""
+"""Fits that are done, kept in a file, so that a search that was cut off goes on where it was.
+
+The file says what its fits are of: the logs' content and every setting that changes a fit. A fit is taken from it only
+where it began from the same place, to the bit: a search that took another way, as under a budget, makes its own.
+"""
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+import math
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +23,21 @@ from avtorch.gap.likelihood.earlier import whitener
 from avtorch.gap.likelihood.fit import finish
 from avtorch.gap.likelihood.noise_fit import NoiseFit
 from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.search.fitted_work import difference
 from avtorch.gap.search.found import Found
-from avtorch.io import write_json
+from avtorch.io import fingerprint, read_sealed, write_sealed
 
 Float = NDArray[np.float64]
+
+SCHEMA = "avtorch.fits/2"
+MOST = 16 * 2**20
+"""Bytes of a file of fits; a search makes some tens, of a few hundred bytes each."""
+
+REMEDY = "remove it to begin anew (avtorch diagnose --no-resume), or use another folder"
+
+_ENTRY = {"name", "onset", "inputs", "z", "noise", "log_prior"}
+_LARGEST = 64  # coordinates of a fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,40 +59,109 @@ class Kept:
         return Found.of(candidate, fit, noise, fit.log_evidence + self.log_prior, likelihood, onset)
 
 
-class Checkpoint:
-    """Fits in the order of a search, which is the same every time; `path` None: nothing is kept.
+@dataclass(frozen=True)
+class Start:
+    """Where a fit begins; `inputs` is the fingerprint of all that decides where it ends."""
 
-    Raises `InputError` for a file that is not one of its own.
+    candidate: Candidate
+    onset: int | None
+    inputs: str
+
+    @classmethod
+    def of(cls, candidate: Candidate, z: Float, noise: NoiseModel, onset: int | None, rounds: int) -> Start:
+        record = candidate.record
+        if record not in _RECORDS:
+            _RECORDS[record] = fingerprint(record)
+        return cls(candidate, onset, fingerprint(_RECORDS[record], candidate.name, z, noise, onset, rounds))
+
+
+_RECORDS: WeakKeyDictionary[Record, str] = WeakKeyDictionary()
+
+
+class Checkpoint:
+    """The fits of one search, `path` None: nothing is kept.
+
+    `work`: what they are fits of, from `fitted_work`. Raises `InputError` for a file that is damaged, that is none of
+    its own, or that was begun with other work, saying what differs.
     """
 
-    def __init__(self, path: Path | None) -> None:
-        self.path = path
-        self._done: list[dict[str, Any]] = []
-        self._turn = 0
-        if path is None or not path.exists():
-            return
-        try:
-            self._done = json.loads(path.read_text(encoding="utf-8"))["fits"]
-        except (ValueError, KeyError, TypeError):
-            raise InputError(f"{path}: is not a file of fits; remove it to begin anew") from None
+    def __init__(self, path: str | os.PathLike[str] | None, work: Mapping[str, Any] | None = None) -> None:
+        self.path, self.work = None if path is None else Path(path), dict(work or {})
+        self._done: dict[str, dict[str, Any]] = {}
+        # a symlink to nowhere is there, too
+        if self.path is not None and os.path.lexists(self.path):
+            self._done = {entry["inputs"]: entry for entry in read_fits(self.path, self.work)}
 
-    def next(self, name: str, onset: int | None) -> Kept | None:
-        """The next fit, if the file has it."""
-        if self._turn >= len(self._done):
+    def next(self, start: Start | None) -> Kept | None:
+        """The fit that begins so, if the file has it."""
+        entry = None if start is None else self._done.get(start.inputs)
+        if start is None or entry is None:
             return None
-        entry = self._done[self._turn]
-        if (entry.get("name"), entry.get("onset")) != (name, onset):
-            # the search took another way (a budget that ended earlier): what follows is made anew
-            self._done = self._done[: self._turn]
-            return None
-        self._turn += 1
-        noise = dict(entry["noise"])
-        return Kept(np.array(entry["z"]), NoiseModel(**noise), float(entry["log_prior"]))
+        own = (start.candidate.name, start.onset, start.candidate.size)
+        if (entry["name"], entry["onset"], len(entry["z"])) != own:
+            raise InputError(f"{self.path}: the fit of {entry['name']} is not of the place it names; {REMEDY}")
+        return Kept(np.array(entry["z"]), NoiseModel(**entry["noise"]), float(entry["log_prior"]))
 
-    def keep(self, name: str, onset: int | None, fit: Kept) -> None:
+    def start(self, candidate: Candidate, z: Float, noise: NoiseModel, onset: int | None, rounds: int) -> Start | None:
+        """Where a fit begins; None where nothing is kept."""
+        return None if self.path is None else Start.of(candidate, z, noise, onset, rounds)
+
+    def keep(self, start: Start | None, fit: Kept) -> None:
         """One more fit is done."""
-        entry = {"name": name, "onset": onset, "z": fit.z.tolist(), "noise": asdict(fit.noise)}
-        self._done.append(entry | {"log_prior": fit.log_prior})
-        self._turn = len(self._done)
-        if self.path is not None:
-            write_json(self.path, {"fits": self._done})
+        if self.path is None or start is None:
+            return
+        self._done[start.inputs] = {
+            "name": start.candidate.name,
+            "onset": start.onset,
+            "inputs": start.inputs,
+            "z": fit.z.tolist(),
+            "noise": asdict(fit.noise),
+            "log_prior": fit.log_prior,
+        }
+        write_sealed(self.path, {"fits": list(self._done.values())}, schema=SCHEMA, of=self.work)
+
+
+def read_fits(path: Path, work: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The entries of a file of fits, each checked in shape and type.
+
+    Raises `InputError` as `Checkpoint` does.
+    """
+    found = read_sealed(path, schema=SCHEMA, most=MOST, remedy=REMEDY)
+    other = difference(found.of, work)
+    if other is not None:
+        raise InputError(f"{path}: was begun with {other}; needs the same logs and settings, or {REMEDY}")
+    content = found.content
+    if not isinstance(content, dict) or set(content) != {"fits"} or not isinstance(content["fits"], list):
+        raise InputError(f"{path}: holds no list of fits; {REMEDY}")
+    for i, entry in enumerate(content["fits"]):
+        for wrong in _faults(entry):
+            raise InputError(f"{path}: fit {i}: {wrong}; {REMEDY}")
+    return content["fits"]
+
+
+def _faults(entry: Any) -> Iterable[str]:
+    """What is wrong with an entry."""
+    if not isinstance(entry, dict) or set(entry) != _ENTRY:
+        yield f"is no object of {', '.join(sorted(_ENTRY))}"
+        return
+    if not all(isinstance(entry[key], str) for key in ("name", "inputs")):
+        yield "name or inputs is no string"
+    onset = entry["onset"]
+    if onset is not None and (type(onset) is not int or not 0 <= onset < 2**53):
+        yield "onset is no row"
+    z = entry["z"]
+    if not isinstance(z, list) or len(z) > _LARGEST or not all(map(_is_number, z)):
+        yield f"z is no list of at most {_LARGEST} finite numbers"
+    noise, known = entry["noise"], {f.name for f in fields(NoiseModel)}
+    if not isinstance(noise, dict) or set(noise) != known or not all(map(_is_number, noise.values())):
+        yield f"noise is not {len(known)} finite numbers by name"
+    elif any(value < 0 for key, value in noise.items() if key.endswith(("_sd", "_lag"))):
+        yield "noise has a standard deviation or a lag below 0"
+    elif any(value <= 0 for key, value in noise.items() if key.endswith("_time")):
+        yield "noise has a time constant that is not above 0"
+    if not _is_number(entry["log_prior"]):
+        yield "log_prior is no finite number"
+
+
+def _is_number(x: Any) -> bool:
+    return type(x) in (int, float) and math.isfinite(x)

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from avtorch.gap.chain.effect import EFFECTS, Effect
 from avtorch.gap.likelihood.candidate import Candidate
 from avtorch.gap.likelihood.earlier import whitener
 from avtorch.gap.likelihood.fit import Fit
 from avtorch.gap.likelihood.noise_fit import NoiseFit
 from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.likelihood.random_law import RandomLaw
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.likelihood.witnesses import judged
 from avtorch.gap.search.chance import Tails
 from avtorch.gap.search.losses import Losses
 from avtorch.io import Log
@@ -24,11 +27,60 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
+class ByChance:
+    """A user's random effect as fitted: `law` at `z` (coordinate,) with this `covariance`.
+
+    `explained` [nats]: what it explains although the errors still show it; `process_sd` [m/s²]: of the jerk noise
+    beside it, where that was fitted anew.
+    """
+
+    law: RandomLaw
+    z: Float = field(repr=False)
+    covariance: Float = field(repr=False)
+    explained: float = 0.0
+    process_sd: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Delays:
+    """Delays that fit alike under a command that repeats itself after `period` [s], in order.
+
+    `lengths` (mode,) [s], their `shares` (mode,) of the posterior, `z` (mode, coordinate) and `covariances` at each.
+    `row`: the interval of the log's rows [s]. `gain` [nats]: of log likelihood over the find called `without`, which
+    has no delay.
+    """
+
+    period: float
+    row: float
+    lengths: Float
+    shares: Float
+    z: Float = field(repr=False)
+    covariances: Float = field(repr=False)
+    gain: float
+    without: str
+
+    @property
+    def none(self) -> float:
+        """Share of the posterior within a row of no delay, where a longer one fits alike."""
+        return float(self.shares[self.lengths < self.row].sum()) if len(self.lengths) > 1 else 0.0
+
+    @property
+    def untold(self) -> bool:
+        """Whether no delay at all does as well, within a row of the log or in the likelihood."""
+        return self.none > 0 or (self.gain < ALIKE and float(self.lengths.max()) > self.row)
+
+
+ALIKE = 4.0
+"""Nats of log likelihood by less of which two delays are not told apart."""
+
+
+@dataclass(frozen=True, eq=False)
 class Found:
     """A candidate fitted: `name`, `z` and parameter `values` at the mode, `log_evidence` [nats], `errors`.
 
     `onset`, `gust_onset`: counted rows from which its effects act and a gust blows, None: from the start. `tails`,
-    `losses`: what random effects among its names found.
+    `losses`: what random effects among its names found; `by_chance`: likewise, one of the user's. `delays`: all that
+    fit alike, under a command that repeats itself.
     """
 
     name: str
@@ -47,6 +99,13 @@ class Found:
     losses: Losses | None = field(default=None, repr=False)
     gust: bool = False
     gust_onset: int | None = None
+    delays: Delays | None = field(default=None, repr=False)
+    by_chance: ByChance | None = field(default=None, repr=False)
+
+    @property
+    def blown(self) -> bool:
+        """Whether a random force is among its causes, under whose noise weaker causes do not show."""
+        return self.gust or (self.by_chance is not None and self.by_chance.law.form == "force")
 
     @property
     def began(self) -> int | None:
@@ -85,15 +144,51 @@ class Found:
         )
 
 
+@dataclass(frozen=True)
+class Scope:
+    """What a search tried: names of single effects `scored` and `not_scored`, and which `pairs`.
+
+    `not_scored`: those that the budget kept out, and those that were not asked for. `pairs`: "all" that promised
+    anything, "some" before the budget ended, or "none".
+    """
+
+    scored: tuple[str, ...] = ()
+    not_scored: tuple[str, ...] = ()
+    pairs: Literal["all", "some", "none"] = "all"
+
+    @classmethod
+    def of(
+        cls,
+        effects: Sequence[type[Effect]],
+        tried: Collection[str],
+        witnesses: Collection[str],
+        pairs: Literal["all", "some", "none"],
+    ) -> Self:
+        """Of a search among `effects` that `tried` those names; only what a log with these `witnesses` could show."""
+        own = {e.name: e for e in effects}
+        kinds = own | {n: e for n, e in EFFECTS.items() if n not in own}
+        names = [n for n, e in kinds.items() if judged(e, witnesses)]
+        return cls(tuple(n for n in names if n in tried), tuple(n for n in names if n not in tried), pairs)
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing was left out."""
+        return not self.not_scored and self.pairs == "all"
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"effects": list(self.not_scored), "pairs": self.pairs}
+
+
 @dataclass(frozen=True, eq=False)
 class Race:
-    """All candidates found, most evidence first, and what they were found on."""
+    """All candidates found, most evidence first, and what they were found on. `complete` False: the budget ended it."""
 
     record: Record
     raw: Record
     logs: tuple[Log, ...]
     found: tuple[Found, ...]
     complete: bool
+    scope: Scope = Scope()
 
     @property
     def none(self) -> Found:
@@ -120,24 +215,19 @@ def merged(forms: Sequence[Found]) -> Found:
 
 def cleaned(logs: Sequence[Log], raw: Record, glitches: Tails) -> list[Log]:
     """The logs with glitches of the accelerometer put to the middle of the rows beside them."""
-    hit = raw.source[glitches.hit]
-    out, offset = [], 0
-    for log in logs:
+    hit, offset = raw.source[glitches.hit], 0
+    read = [None if log.accel is None else log.accel.copy() for log in logs]
+    for cut in raw.cuts:
+        accel, log = read[cut.log], logs[cut.log]
+        assert accel is not None
         assert log.accel is not None
-        accel = log.accel.copy()
-        rows = []
-        for part in log.segments():
-            size = part.stop - part.start
-            if size < 2 * 20:
-                continue
-            inside = hit[(hit >= offset) & (hit < offset + size)] - offset + part.start
-            rows.extend(inside.tolist())
-            offset += size
+        first, last = cut.rows.start, cut.rows.stop
+        rows = hit[(hit >= offset) & (hit < offset + last - first)] - offset + first
+        offset += last - first
         bad = np.zeros(len(accel), bool)
         bad[rows] = True
-        for r in rows:
-            near = [k for k in range(max(r - 3, 0), min(r + 4, len(accel))) if not bad[k]]
+        for r in rows.tolist():
+            near = [k for k in range(max(r - 3, first), min(r + 4, last)) if not bad[k]]
             if near:
                 accel[r] = np.median(log.accel[near])
-        out.append(replace(log, accel=accel))
-    return out
+    return [replace(log, accel=accel) for log, accel in zip(logs, read, strict=True)]

@@ -58,7 +58,9 @@ def _blown(base: Found, start: NoiseModel, lag: float, onset: int | None) -> Fou
     evidence = 0.0
     for _ in range(2):
         onsets = {"onset": base.onset, "gust_onset": onset}
-        fitted = fit_noise(record, errors, start, T_L=lag, priors=GUST, **onsets, iterations=6)
+        fitted = fit_noise(
+            record, errors, start, T_L=lag, priors=GUST, onset=base.onset, gust_onset=onset, iterations=6
+        )
         start = fitted.noise
         white = whitener(record, start, **onsets)
         z = modes(candidate, white, z[None], onset=base.onset, iterations=3)[0][0]

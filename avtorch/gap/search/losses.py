@@ -149,8 +149,8 @@ class Bank:
     @classmethod
     def of(cls, white: Whitener, error: Float, command: Float, T_L: float, K_L: float) -> Bank:
         record = white.record
-        image = _image(white, T_L, K_L)
-        move, push, see = _states(image)
+        image = image_of_row(white, T_L, K_L)
+        move, push, see = states_of(image)
         energy = np.cumsum((image**2).sum(0))
         warm = 8 + int(np.searchsorted(energy, 0.995 * energy[-1]))
         size = max(3 * warm, 120)
@@ -236,7 +236,7 @@ def _merged(weight: Float, path: Float, scale: Float) -> tuple[Float, Float]:
 _HEAVIER = np.triu(np.full((2 * _PATHS, 2 * _PATHS), 1e30))
 
 
-def _image(white: Whitener, T_L: float, K_L: float) -> Float:
+def image_of_row(white: Whitener, T_L: float, K_L: float) -> Float:
     """White errors (witness, time) of one row whose command is one unit larger than logged."""
     dt = white.record.dt
     length = 2 * max(16, round(6 * T_L / dt) + 8)
@@ -249,7 +249,7 @@ def _image(white: Whitener, T_L: float, K_L: float) -> Float:
     return white.response(np.stack([{"accel": accel, "speed": speed}[name] for name in white.record.witnesses]))
 
 
-def _states(image: Float) -> tuple[Float, Float, Float]:
+def states_of(image: Float) -> tuple[Float, Float, Float]:
     """A few states whose response to a unit pulse is `image` (witness, time): (move, push, see) of `Bank`.
 
     Singular vectors of the image's Hankel matrix (Kung 1978), in output-normal coordinates.

@@ -7,6 +7,7 @@ chance decides (gusts, outliers, lost messages) are judged on the errors that th
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -22,16 +23,20 @@ from avtorch.gap.likelihood.earlier import CALM, whitener
 from avtorch.gap.likelihood.fit import finish, left_over, modes
 from avtorch.gap.likelihood.noise_fit import fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.likelihood.random_law import Form, RandomLaw
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitener import Whitener
 from avtorch.gap.likelihood.witnesses import judged
 from avtorch.gap.search.chance import Tails, tails
 from avtorch.gap.search.checkpoint import Checkpoint, Kept
-from avtorch.gap.search.found import Found, Race, cleaned, merged, white_first
+from avtorch.gap.search.delays import all_delays
+from avtorch.gap.search.fitted_work import fitted_work
+from avtorch.gap.search.found import Found, Race, Scope, cleaned, merged, white_first
 from avtorch.gap.search.gusts import gust
 from avtorch.gap.search.losses import losses
 from avtorch.gap.search.onset import averaged, refined
 from avtorch.gap.search.pairing import Base, joint, swapped
+from avtorch.gap.search.random_effects import OWN_SEARCH, commanded, forced, glitched, users_own
 from avtorch.gap.search.raw_rows import raw_errors, raw_white
 from avtorch.gap.search.screening import ENOUGH, Look, closer, looks
 from avtorch.gap.search.starts import starts, traded
@@ -63,51 +68,67 @@ class Search:
         pairs: bool = True,
         budget_s: float | None = None,
         progress: Progress | None = None,
-        checkpoint: Checkpoint | None = None,
+        checkpoint: str | os.PathLike[str] | None = None,
     ) -> None:
         self.logs, self.baseline, self.pairs = tuple(logs), baseline, pairs
         self.effects = list(EFFECTS.values() if effects is None else effects)
         self.until = None if budget_s is None else time.monotonic() + budget_s
         self.progress = progress or (lambda what, done, of: None)
         self.complete = True
-        self.checkpoint = checkpoint or Checkpoint(None)
+        self._seen: set[str] = set()  # effects rolled out, also those whose evidence is not kept
+        self._paired = False
+        self._own = {OWN_SEARCH[e] for e in self.effects if e in OWN_SEARCH}
+        self._laws: dict[Form, list[RandomLaw]] = {"force": [], "tails": [], "command": []}
+        self._glitches: list[tuple[RandomLaw | None, Tails]] = []
+        work = None if checkpoint is None else fitted_work(self.logs, baseline, self.effects, pairs=pairs)
+        self.checkpoint = Checkpoint(checkpoint, work)
 
     # the whole ---------------------------------------------------------------------------------------------------
     def run(self) -> Race:
         glitches = None
         logs = self.logs
         record = Record.of(logs)
-        raw = Record.of(logs, rate_hz=1e9)
+        raw = Record.of(logs, rate_hz=1e9, multiple=record.group)
         none = self._none(record)
-        if self._has("outliers") and record.accel is not None:
+        self._laws = users_own(self.effects, raw, self.baseline)
+        with_tails = record.accel is not None and ("tails" in self._own or bool(self._laws["tails"]))
+        if with_tails:
             glitches = self._tails(raw, none)
-            if glitches.hit.any() and glitches.evidence > 2:
+            if glitches.plain:
                 logs = cleaned(logs, raw, glitches)
                 record = Record.of(logs)
                 none = self._none(record)
         found = self._deterministic(record, none)
-        if self._has("outliers") and record.accel is not None:
+        if with_tails:
             again = self._tails(raw, max(found, key=lambda f: f.log_evidence))
-            was = glitches is not None and glitches.evidence > 2 and bool(glitches.hit.any())
-            now = again.evidence > 2 and bool(again.hit.any())
             before = 0 if glitches is None else int(glitches.hit.sum())
-            if was != now or (now and abs(before - int(again.hit.sum())) > 0.3 * before + 3):
-                logs = cleaned(self.logs, raw, again) if now else self.logs
+            changed = (glitches is not None and glitches.plain) != again.plain
+            changed |= again.plain and abs(before - int(again.hit.sum())) > 0.3 * before + 3
+            if changed and not self._late():
+                logs = cleaned(self.logs, raw, again) if again.plain else self.logs
                 record = Record.of(logs)
                 none = self._none(record)
                 found = self._deterministic(record, none)
             glitches = again
-        if self._has("command_hold"):
-            found += self._held(Record.of(logs, rate_hz=1e9), found, none)
+        if "losses" in self._own and not self._late():
+            found += self._held(Record.of(logs, rate_hz=1e9, multiple=record.group), found, none)
+        for law in self._laws["command"]:
+            if not self._late():
+                rows = Record.of(logs, rate_hz=1e9, multiple=record.group)
+                found += [commanded(f, law, rows) for f in self._alone_and_best(found, none)]
         if glitches is not None:
-            found += self._glitched(found, glitches)
+            found += glitched(found, self._glitches, pairs=self._paired)
         best: dict[str, Found] = {}
         for f in sorted(found, key=lambda f: -f.log_evidence):
             best.setdefault(f.name, f)
-        return Race(record, raw, tuple(logs), tuple(best.values()), self.complete)
+        best = all_delays(record, best)
+        pairs = "none" if not self._paired else "all" if self.complete else "some"
+        scope = Scope.of(self.effects, {*best, *self._seen}, record.witnesses, pairs)
+        return Race(record, raw, tuple(logs), tuple(best.values()), self.complete, scope)
 
-    def _has(self, name: str) -> bool:
-        return any(e.name == name for e in self.effects)
+    def _blowing(self, on: Found) -> list[Found]:
+        """Every random force on top of a find."""
+        return [*([gust(on)] if "force" in self._own else []), *(forced(on, law) for law in self._laws["force"])]
 
     def _late(self) -> bool:
         if self.until is not None and time.monotonic() > self.until:
@@ -125,12 +146,20 @@ class Search:
         found, values = modes(candidate, white, z, iterations=6)
         return self._settled(candidate, found[values.argmax()], noise, rounds=6)
 
+    def with_effects(self, none: Found, kinds: Sequence[type[Effect]]) -> Found:
+        """`none` with effects of these kinds on top from the drives' start, with noise of its own."""
+        candidate = Candidate(none.candidate.record, tuple(kinds), self.baseline)
+        white = Whitener(candidate.record, none.noise.noise)
+        places, values = modes(candidate, white, starts(candidate, none.values), iterations=6, coarse=True)
+        return self._settled(candidate, places[values.argmax()], none.noise.noise)
+
     def _settled(
         self, candidate: Candidate, z: Float, noise: NoiseModel, *, onset: int | None = None, rounds: int = 2
     ) -> Found:
         """Parameters and noise in turn until both rest."""
         record = candidate.record
-        known = self.checkpoint.next(candidate.name, onset)
+        start = self.checkpoint.start(candidate, z, noise, onset, rounds)
+        known = self.checkpoint.next(start)
         if known is not None:
             return known.found(candidate, onset)
         # on averaged commands first, which is several times as fast and ends close by
@@ -155,7 +184,7 @@ class Search:
                     break
                 value = new
             z, noise = best
-        self.checkpoint.keep(candidate.name, onset, Kept(z, noise, log_prior))
+        self.checkpoint.keep(start, Kept(z, noise, log_prior))
         return Kept(z, noise, log_prior).found(candidate, onset)
 
     @staticmethod
@@ -187,23 +216,27 @@ class Search:
             found = looks(candidate, white, begin, onsets=kind.name != "gain_change", floor=coarse_floor)
             seen += [closer(look, white) for look in found]
         best: dict[str, float] = {}
+        self._seen |= {look.candidate.name for look in seen}
         for look in seen:
             best[look.candidate.name] = max(best.get(look.candidate.name, -np.inf), look.value)
         order = sorted(best, key=lambda n: -best[n])
         top = best[order[0]] - floor if order else 0.0
         lead = [n for n in order[:_SINGLES] if best[n] - floor > max(min(0.25 * top, top - 30), _LEAST)]
         found = [none]
-        if self._has("gust"):
-            found.append(gust(none))
+        if ("force" in self._own or self._laws["force"]) and not self._late():
+            found += self._blowing(none)
+        fitted = set()
         for i, name in enumerate(lead):
             self.progress("the best of them", i, len(lead))
             if self._late():
                 break
+            fitted.add(name)
             # a gust's noise is too quiet for causes that explain less
-            noise = max((f for f in found if not f.gust), key=lambda f: f.log_evidence).noise.noise
+            noise = max((f for f in found if not f.blown), key=lambda f: f.log_evidence).noise.noise
             found.append(self._refined([look for look in seen if look.candidate.name == name], noise))
-        found += self._left_behind([look for look in seen if look.candidate.name not in lead], white, none)
-        if self.pairs:
+        found += self._left_behind([look for look in seen if look.candidate.name not in fitted], white, none)
+        if self.pairs and not self._late():
+            self._paired = True
             found += self._pairs(record, kinds, found, none)
         return found
 
@@ -246,8 +279,8 @@ class Search:
         if not single or single[0].log_evidence < none.log_evidence + _LEAST:
             return []
         top = single[0].log_evidence - none.log_evidence
-        bases = [f for f in single if not f.gust and f.log_evidence - none.log_evidence > 0.2 * top][:_BASES]
-        made = {f.name: f for f in map(gust, bases[:2])} if self._has("gust") else {}
+        bases = [f for f in single if not f.blown and f.log_evidence - none.log_evidence > 0.2 * top][:_BASES]
+        made = {f.name: f for base in bases[:2] for f in self._blowing(base)}
         for base in bases[:2]:
             # what drifts slowly is a gust or a road, and the noise that was fitted without either hides the road
             name = "+".join(sorted([base.name, "gust"]))
@@ -260,10 +293,10 @@ class Search:
                 self._settle_pairs([look], 1, gusty.noise.noise.replaced(force_sd=CALM), made)
         # a gust's noise is too quiet for causes that explain less
         noise = (bases[0] if bases else none).noise.noise
-        if single[0].gust:
+        if single[0].blown:
             self._under(single[0], kinds, none, made)
         white = Whitener(record, noise)
-        alone = {f.name: f.values for f in single if not f.gust}
+        alone = {f.name: f.values for f in single if not f.blown}
         seen: dict[str, Look] = {}
         for i, base in enumerate(bases):
             self.progress("pairs", i, len(bases))
@@ -290,14 +323,15 @@ class Search:
         return list(made.values())
 
     def _under(self, blown: Found, kinds: Sequence[type[Effect]], none: Found, made: dict[str, Found]) -> None:
-        """Causes that show only once a gust's noise is in, each with the gust, added to `made`."""
+        """Causes that show only once a random force's noise is in, each with that force, added to `made`."""
         on = Base(none.candidate, none.z, none.values, none.onset, blown.white)
         for candidate, z in on.partners(kinds, {}, most=_BASES, least=_LEAST):
             if self._late():
                 break
             forms = looks(candidate, blown.white, z[None], onsets=candidate.name != "gain_change")
             look = max((closer(form, blown.white) for form in forms), key=lambda form: form.value)
-            both = gust(Kept(look.z, blown.noise.noise, 0.0).found(look.candidate, look.onset))
+            under = Kept(look.z, blown.noise.noise, 0.0).found(look.candidate, look.onset)
+            both = gust(under) if blown.by_chance is None else forced(under, blown.by_chance.law)
             if both.name not in made or made[both.name].log_evidence < both.log_evidence:
                 made[both.name] = both
 
@@ -335,28 +369,23 @@ class Search:
 
     # chance --------------------------------------------------------------------------------------------------------
     def _tails(self, raw: Record, of: Found) -> Tails:
-        errors = raw_errors(raw, of)
-        return tails(errors[0, :, 0], raw.dt)
+        """The best of all tails; `_glitches` are those of each effect, None for the one with a search of its own."""
+        errors = raw_errors(raw, of)[0, :, 0]
+        self._glitches = [(None, tails(errors, raw.dt))] if "tails" in self._own else []
+        for law in self._laws["tails"]:
+            self._glitches.append((law, tails(errors, raw.dt, law=law.tails, size=law.size)))
+        return max((found for _, found in self._glitches), key=lambda found: found.evidence)
 
-    def _glitched(self, found: list[Found], glitches: Tails) -> list[Found]:
-        """Every candidate with outliers besides, and outliers alone."""
-        out = []
-        for f in found:
-            names = [] if f.name == "none" else f.name.split("+")
-            if len(names) > 1 or "outliers" in names:
-                continue
-            name = "+".join(sorted([*names, "outliers"]))
-            out.append(replace(f, name=name, log_evidence=f.log_evidence + glitches.evidence, tails=glitches))
-        return out
+    def _alone_and_best(self, found: list[Found], none: Found) -> list[Found]:
+        """What errors of the command are tried on: they pass for a delay, so always on the bare baseline, too."""
+        alone = [f for f in found if f.name != "none" and "+" not in f.name and f.candidate.effects]
+        best = max(alone, key=lambda f: f.log_evidence, default=none)
+        return [none, best] if self._paired and best.log_evidence >= none.log_evidence + _LEAST else [none]
 
     def _held(self, raw: Record, found: list[Found], none: Found) -> list[Found]:
-        """Lost messages alone and on top of the best single effects."""
-        alone = [f for f in found if f.name != "none" and "+" not in f.name and not f.gust and f.tails is None]
-        best = max(alone, key=lambda f: f.log_evidence, default=none)
-        # lost messages pass for a delay, so they are always tried alone, too
-        bases = [none] if best.log_evidence < none.log_evidence + _LEAST else [none, best]
+        """Lost messages alone and, where pairs are tried, on top of the best single effect."""
         out = []
-        for f in bases:
+        for f in self._alone_and_best(found, none):
             errors = raw_errors(raw, f)
             white = raw_white(raw, f)
             lost = losses(white, errors, raw.command[raw.source], f.values["T_L"], f.values["K_L"])

@@ -12,6 +12,7 @@ from avtorch.errors import InputError
 from avtorch.inference.belief import Belief, Summary
 from avtorch.inference.evidence import Evidence, Form, Rows
 from avtorch.inference.priors import Joint, LogNormalPrior, default_actuation_prior
+from avtorch.inference.state import about, generator_of, shaped_as
 
 
 class WindowedEstimator(ABC):
@@ -68,12 +69,14 @@ class WindowedEstimator(ABC):
         """Go on from :meth:`state_dict`.
 
         Raises:
-            InputError: if it was saved by an estimator of other parameters or vehicles.
+            InputError: if it was saved by an estimator of other parameters or vehicles, or has other shapes, types or
+                numbers than it saves; it then stays as it was.
         """
-        saved = (tuple(state["names"]), len(state["mean"]), set(state.get("memory", ())))
-        own = (self.belief.names, self.vehicles, set(self._memory))
+        saved, own = about(state), about(self.state_dict())
         if saved != own:
-            raise InputError(f"state: (names, vehicles, memory) were {saved} when it was saved, here they are {own}")
-        self.belief = Belief.from_state(state)
+            raise InputError(f"state: (names, vehicles) were {saved} when it was saved, here they are {own}")
+        shaped_as(self.state_dict(), state, "state")
+        belief, generator = self.belief.taken_from(state), generator_of(state["generator"], "state.generator")
+        self.belief = belief
         self._memory = {name: value.clone() for name, value in state["memory"].items()}
-        self.generator.set_state(state["generator"])
+        self.generator.set_state(generator.get_state())

@@ -46,13 +46,13 @@ class Residuals:
         every = max(1, round(log.rate_hz / rate_hz))
         channels = tuple(name for name in ("accel", "speed") if getattr(log, name) is not None)
         drives, seen, valid, push = [], [], [], []
-        for part in log.segments():
+        for part in log.drives():
             count = (part.stop - part.start) // every
             if count < 3:
                 continue
             rows = slice(part.start, part.start + count * every)
             command = log.accel_cmd[rows].reshape(count, every)
-            time = np.ascontiguousarray(log.time[rows][::every])
+            time = np.ascontiguousarray(log.elapsed[rows][::every])
             accel, speed = (None if x is None else x[rows][::every].copy() for x in (log.accel, log.speed))
             fit = np.asarray(log.usable[rows].reshape(count, every).all(1))
             valid.append(fit & np.append(fit[1:], False) & _after(fit, round(_SETTLE_S * log.rate_hz / every)))

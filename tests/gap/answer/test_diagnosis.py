@@ -30,6 +30,7 @@ from avtorch.gap.answer.diagnosis import (
 )
 from avtorch.gap.answer.quantity import unit_of, words_of
 from avtorch.io import Log
+from tests.faulty_disk import visible
 
 ROOT = Path(__file__).resolve().parents[3]
 DELAY = {"delay_s": Quantity(0.2, 0.01, 0.18, 0.22)}
@@ -273,7 +274,19 @@ def test_written_files_read_back(tmp_path: Path) -> None:
     }
     # without a plant, that of an earlier answer does not stay
     assert [p.name for p in diagnosis(given).write(folder)] == ["diagnosis.json"]
-    assert [p.name for p in folder.iterdir()] == ["diagnosis.json"]
+    assert [p.name for p in folder.glob("[!.]*")] == ["diagnosis.json"]
+
+
+def test_an_onset_is_said_from_the_start_and_on_the_clock() -> None:
+    """Of a log that counts from 1970: `onset_s` stays on its clock, as the schema has it."""
+    of = candidates(dead_time=0.8, unknown=0.1, none=0.1)
+    log = replace(FACTS, epochs_s=(1_700_000_000.0,))
+    found = replace(diagnosis(of), log=log, onset_s=1_700_000_012.0)
+    clock = "1700000012 s, as Unix time 2023-11-14 22:13:32 UTC"
+    assert f"Onset: at 12.0 s from the log's start ({clock})." in str(found).splitlines()
+    assert found.to_dict()["onset_s"] == 1_700_000_012.0
+    assert found.to_dict()["onset_from_start_s"] == 12.0
+    assert found.to_dict()["log"]["epochs_s"] == [1_700_000_000.0]
 
 
 def test_a_plant_says_that_what_set_in_late_is_in_from_the_start(tmp_path: Path) -> None:
@@ -284,7 +297,7 @@ def test_a_plant_says_that_what_set_in_late_is_in_from_the_start(tmp_path: Path)
 
     late = written(132.4, aerodynamic_drag_and_dead_time=0.8)
     first, rest = late.split("\n", 1)
-    assert first.startswith("# In the log aerodynamic_drag and dead_time from 132.4 s on (the log's own time);")
+    assert first.startswith("# In the log aerodynamic_drag and dead_time from 132.4 s of the log's time on;")
     assert first.endswith(" in this plant from the start.")
     assert rest == plant([DeadTime(0.2)]).to_toml()
     assert GapPlant.from_toml(late).effects == (DeadTime(0.2),)
@@ -304,13 +317,21 @@ def test_plants_with_more_than_plain_numbers_are_written(effect: Saturation | Ro
         assert torch.equal(read[name], value), name
 
 
-def test_no_half_answer_is_left(tmp_path: Path) -> None:
+def test_an_answer_that_cannot_be_written_leaves_the_earlier_one(tmp_path: Path) -> None:
     given = candidates(dead_time=0.8, none=0.15, unknown=0.05)
-    diagnosis(given, plant=plant([DeadTime()])).write(tmp_path)
+    diagnosis(given, plant=plant([DeadTime(0.3)])).write(tmp_path)
+    before = visible(tmp_path)
     bad = diagnosis(given, plant=plant([DeadTime()]), next_experiment={"before": math.nan})
     with pytest.raises(InputError, match=r"next_experiment\.before"):
         bad.write(tmp_path)
-    assert not (tmp_path / "diagnosis.json").exists()
+    assert set(before) == {"diagnosis.json", "plant.toml"}
+    assert visible(tmp_path) == before
+
+
+def test_the_page_of_an_earlier_diagnosis_goes_with_it(tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text("of an earlier diagnosis", encoding="utf-8")
+    diagnosis(candidates(dead_time=0.8, none=0.15, unknown=0.05)).write(tmp_path)
+    assert set(visible(tmp_path)) == {"diagnosis.json"}
 
 
 def test_several_logs_are_counted_together() -> None:

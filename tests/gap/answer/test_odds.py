@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from avtorch.errors import InputError
@@ -41,6 +41,7 @@ def test_they_sum_to_one(dead_time: float, gust: float, pair: float, left: float
 
 
 @given(dead_time=nats, shift=st.floats(-1e4, 1e4))
+@example(dead_time=odds.EFFECT.fixed, shift=1.0)  # as probable as none but for round-off, on either side of it
 def test_only_differences_of_evidence_count(dead_time: float, shift: float) -> None:
     there = odds.probabilities(race(none=0.0, dead_time=dead_time), NOTHING)
     moved = odds.probabilities(race(none=shift, dead_time=dead_time + shift), NOTHING)

@@ -15,6 +15,25 @@ from tests.gap.records import log_of
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "own-effect.md"
 
 
+def test_the_random_effect_is_named_by_the_pages_own_code(capsys: pytest.CaptureFixture[str]) -> None:
+    before = dict(EFFECTS)
+    names: dict = {}
+    try:
+        for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S):
+            exec(compile(block, "own-effect.md", "exec", dont_inherit=True), names)
+    finally:
+        EFFECTS.clear()
+        EFFECTS.update(before)
+    assert capsys.readouterr().out.startswith("crosstalk explains the log")
+    found = names["found"]
+    assert found.verdict.names == ("crosstalk",)
+    # some 2000 nats, as the page says
+    assert 1000 < (found.winner.log_evidence or 0.0) < 4000
+    assert found.winner.parameters["share"].mean == pytest.approx(0.03, abs=0.012)
+    assert found.plant is not None
+    assert "[crosstalk]" in found.plant.to_toml()
+
+
 @pytest.fixture
 def trailer():
     """The page's first class; the registry is as before after the test."""

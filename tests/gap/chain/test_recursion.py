@@ -59,7 +59,7 @@ def test_pair_is_the_loop(steps: int, rotating_seed: int) -> None:
 
 # torch scripts its forward-mode formulas at their first use, and deprecates doing so
 @pytest.mark.filterwarnings("ignore:.torch.jit.script:DeprecationWarning")
-@pytest.mark.parametrize("steps", [6, 40])
+@pytest.mark.parametrize("steps", [6, pytest.param(40, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("constant", [False, True])
 def test_derivatives(steps: int, constant: bool) -> None:
     torch.manual_seed(0)
@@ -117,7 +117,6 @@ def test_newton_falls_back_to_stepping() -> None:
         assert float(x[0, k]) == pytest.approx(value, abs=1e-6)
 
 
-@pytest.mark.slow
 def test_scan_is_fast() -> None:
     alpha, beta, start = torch.rand(64, 30000, dtype=D), torch.randn(64, 30000, dtype=D), torch.zeros(64, dtype=D)
     scan(alpha, beta, start)

@@ -21,8 +21,9 @@ def _raced(effect: str, among: list, seed: int, **more):  # type: ignore[no-unty
     return case, race
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("effect", ["sensor_bias", "aerodynamic_drag", "dead_band"])
+@pytest.mark.parametrize(
+    "effect", ["sensor_bias", *(pytest.param(e, marks=pytest.mark.slow) for e in ("aerodynamic_drag", "dead_band"))]
+)
 def test_what_is_closed_is_what_one_who_knows_would_say(effect: str, rotating_seed: int) -> None:
     from avtorch.gap import AerodynamicDrag, DeadBand, SensorBias
 

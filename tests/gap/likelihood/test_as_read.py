@@ -21,6 +21,7 @@ def again(log: Log, **witnesses: np.ndarray | None) -> Log:
     return Log.from_arrays(time=log.time, accel_cmd=log.accel_cmd, **witnesses)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("decimals", [None, 3, 4])
 @pytest.mark.parametrize("sigma", [0.0, 0.1])
 def test_noise_is_added_where_there_is_none(decimals: int | None, sigma: float) -> None:
@@ -49,6 +50,7 @@ def test_noise_is_added_where_there_is_none(decimals: int | None, sigma: float) 
     assert abs(gained[-1] - (np.asarray(read.speed) - speed)[-1]) < off
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["accel", "speed"])
 def test_a_witness_with_noise_of_its_own_gets_none(name: str, rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
@@ -65,6 +67,7 @@ def test_a_witness_with_noise_of_its_own_gets_none(name: str, rotating_seed: int
     assert np.std(np.diff(added)) < 1e-3
 
 
+@pytest.mark.slow
 def test_what_was_interpolated_is_no_simulation(rotating_seed: int) -> None:
     """A sensor of 2 Hz, brought to 10 Hz by straight lines; and speed alone, which is left as it is."""
     rng = np.random.default_rng(rotating_seed)

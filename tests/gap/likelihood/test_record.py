@@ -107,7 +107,8 @@ def test_standstill_and_a_drivers_foot_do_not_count() -> None:
     speed = np.where((log.time >= 40) & (log.time < 43), 0.0, log.speed)
     record = Record.of(replace(log, engaged=engaged, speed=speed))
     assert record.group == 2
-    np.testing.assert_allclose(_stretches(record), [(2, 19.95), (24.5, 39.95), (43, 59.95)], atol=1e-6)
+    # after the driver let go the car settles anew; at rest it went on obeying
+    np.testing.assert_allclose(_stretches(record), [(2, 19.95), (26.5, 39.95), (43, 59.95)], atol=1e-6)
     # within a stretch rows follow each other, between two lies a gap
     steps = np.diff(record.target)
     assert (steps[np.diff(record.stretch) == 0] == 1).all()
@@ -116,24 +117,40 @@ def test_standstill_and_a_drivers_foot_do_not_count() -> None:
     padded = record.padded(np.ones((2, record.rows, record.group)))
     assert padded.shape == (2, record.length * record.group)
     assert padded.sum() == 2 * record.rows * record.group
-    # the whole drive is rolled out all the same: one drive
-    assert len(record.drives) == 1
+    # rollouts run on through the standstill, and not through the override
+    ends = [d.time[[0, -1]].tolist() for d in record.drives]
+    np.testing.assert_allclose(ends, [(0, 19.975), (24.5, 59.975)], atol=1e-6)
+    assert record.segment == (0, 0)
 
 
 def test_a_group_with_one_row_that_does_not_count_does_not_count() -> None:
     log = log_of(seconds=30.0, rate_hz=100)
+    assert log.speed is not None
+    speed = log.speed.copy()
+    speed[1503] = 0.0
+    record = Record.of(replace(log, speed=speed))
+    assert 300 not in record.source
+    assert {299, 301} <= set(record.source.tolist())
+
+
+def test_one_row_in_the_drivers_hand_ends_a_drive_at_whole_groups() -> None:
+    log = log_of(seconds=30.0, rate_hz=100)
     engaged = np.ones(log.rows, bool)
     engaged[1503] = False
     record = Record.of(replace(log, engaged=engaged))
-    assert 300 not in record.source
-    assert {299, 301} <= set(record.source.tolist())
+    assert [cut.rows for cut in record.cuts] == [slice(0, 1500), slice(1504, 2999)]
+    np.testing.assert_allclose(_stretches(record), [(2, 14.95), (17.04, 29.94)], atol=1e-6)
+    # single rows of the same drives stand where the groups say
+    raw = Record.of(replace(log, engaged=engaged), rate_hz=1e9, multiple=record.group)
+    np.testing.assert_allclose(raw.time[record.source * record.group], record.time[record.source])
+    assert set((record.source[:, None] * record.group + np.arange(record.group)).ravel()) <= set(raw.source)
 
 
 def test_short_stretches_are_left_out() -> None:
     log = log_of(seconds=40.0)
     engaged = (log.time < 20) | ((log.time >= 21) & (log.time < 22)) | (log.time >= 25)
     np.testing.assert_allclose(
-        _stretches(Record.of(replace(log, engaged=engaged))), [(2, 19.95), (25, 39.95)], atol=1e-6
+        _stretches(Record.of(replace(log, engaged=engaged))), [(2, 19.95), (27, 39.95)], atol=1e-6
     )
 
 

@@ -104,6 +104,7 @@ def test_lost_messages_are_found_where_the_command_steps(rate_hz: int, least: fl
     assert np.abs(away).max() < 5
 
 
+@pytest.mark.slow
 def test_a_command_that_also_drifts_hides_no_losses(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     found = [_found(_smooth(20, 400.0), 0.15, rng, 20) for _ in range(4)]

@@ -154,6 +154,7 @@ def _slope_that_sets_in(rng: np.random.Generator) -> tuple[float, float, Float]:
     return float(record.time[record.source[row]]) - 60.0, gain, np.diff(cut) / np.diff(exact)
 
 
+@pytest.mark.slow
 def test_a_slopes_onset_is_found_though_it_is_flat_before(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     late, gains, ratios = zip(*(_slope_that_sets_in(rng) for _ in range(7)), strict=True)

@@ -24,7 +24,6 @@ from avtorch.gap import (
     plant,
 )
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.gap.search.found import Found, Race
 from avtorch.gap.search.search import Search
 from avtorch.io import Log
@@ -56,7 +55,7 @@ def _log(
 
 
 def _search(log: Log, effects: Sequence[type[Effect]], path: Path | None = None, **options: object) -> Race:
-    return Search([log], plant(), effects=effects, checkpoint=Checkpoint(path), **options).run()  # type: ignore[arg-type]
+    return Search([log], plant(), effects=effects, checkpoint=path, **options).run()  # type: ignore[arg-type]
 
 
 def _evidence(race: Race) -> dict[str, float]:
@@ -66,7 +65,7 @@ def _evidence(race: Race) -> dict[str, float]:
 
 def _fitted(path: Path) -> list[str]:
     """What was fitted with noise of its own, in turn."""
-    return [entry["name"] for entry in json.loads(path.read_text(encoding="utf-8"))["fits"]]
+    return [entry["name"] for entry in json.loads(path.read_text(encoding="utf-8"))["content"]["fits"]]
 
 
 def _sound(race: Race) -> None:
@@ -145,7 +144,7 @@ def test_lost_messages_on_top_of_a_single_effect(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     effects = {"sensor_bias": {"bias_mps2": 0.2}, "command_hold": {"hold_fraction": 0.4}}
     log = _log(effects, int(rng.integers(2**31)), command=_steps(rng))
-    race = _search(log, [SensorBias, CommandHold], pairs=False)
+    race = _search(log, [SensorBias, CommandHold])
     _sound(race)
     names = {f.name: f for f in race.found}
     assert race.best.name == "command_hold+sensor_bias"
@@ -176,7 +175,7 @@ def test_lost_messages_alone(rotating_seed: int) -> None:
 def test_lost_messages_alone_are_judged_where_they_look_like_a_delay(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     log = _log({"command_hold": {"hold_fraction": 0.4}}, int(rng.integers(2**31)), command=_steps(rng))
-    race = _search(log, [DeadTime, CommandHold], pairs=False)
+    race = _search(log, [DeadTime, CommandHold])
     assert race.best.name in ("command_hold", "command_hold+dead_time")
     assert "command_hold" in {f.name for f in race.found}
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-
 import pytest
 import torch
 
@@ -62,17 +60,15 @@ def test_every_estimator_finds_the_vehicles_and_keeps_what_it_knows(name, drive)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_resume_is_equal_to_the_bit(name, drive):
+def test_resume_is_equal_to_the_bit(name, drive, tmp_path):
     time, columns, usable = drive
     straight = stream_of(name)
     expected = straight.feed(time, columns, usable=usable)[-1].belief
     first = stream_of(name)
     first.feed(time[:530], {k: v[:, :530] for k, v in columns.items()}, usable=usable[:, :530])
-    file = io.BytesIO()
-    first.save(file)  # pyright: ignore[reportArgumentType]
-    file.seek(0)
+    first.save(tmp_path / "state")
     second = stream_of(name, seed=77)
-    second.load(file)  # pyright: ignore[reportArgumentType]
+    second.load(tmp_path / "state")
     found = second.feed(time[530:], {k: v[:, 530:] for k, v in columns.items()}, usable=usable[:, 530:])[-1].belief
     for field in FIELDS:
         assert getattr(found, field).equal(getattr(expected, field)), field

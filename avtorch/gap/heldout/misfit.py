@@ -7,38 +7,36 @@ from numpy.typing import NDArray
 
 from avtorch.gap.answer.diagnosis import GapFacts
 from avtorch.gap.answer.repeats import repeats
+from avtorch.gap.heldout.rollout_errors import HORIZON_S, Measure, reached, rms
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.search.found import Found, Race
 
 Float = NDArray[np.float64]
-
-HORIZON_S = 5.0
-"""Seconds over which a rollout goes before it begins anew at the measured speed."""
 
 
 def gap_facts(race: Race, best: Found, *, detected: bool, p_value: float | None = None) -> GapFacts:
     """Root mean square errors of `race.none`, the fitted baseline, and as their floors those of `best` if smaller.
 
     (An effect may help the speed and cost the acceleration something, and the best of wrong ones may well.)
-    Rollouts of the acceleration are the whole drive's, which after some lags no longer know where they began; those of
-    the speed begin anew at the measured one every `HORIZON_S`. None where the log lacks the witness, and for the speed
-    where no stretch lasts that long.
+    Rollouts begin at what is measured, at every row, and last `HORIZON_S` or as long as the longest stretch: the same
+    measures as those of `shrinkage`, here over all rows that count. None where the log lacks the witness.
     """
     none, record = race.none, race.record
-    one, rollout = [], []
-    for f in (none, best):
-        if record.accel is not None:
-            one.append(_one_step(record, f.errors[0], f.values["T_L"]))
-            rollout.append(_size(f.errors[0]))
+    one, lag = [], none.values["T_L"]
+    if record.accel is not None:
+        one = [_one_step(record, f.errors[0], f.values["T_L"]) for f in (none, best)]
+    usual = {name: Measure(name, HORIZON_S) for name in record.witnesses}
+    rollout = {name: [rms(m, record, f.errors, lag) for f in (none, best)] for name, m in usual.items()}
+    accel, speed = (rollout.get(name, []) for name in ("accel", "speed"))
     return GapFacts(
         detected=detected,
         p_value=p_value,
         one_step_rmse=one[0] if one else None,
         one_step_floor=min(one, default=None),
-        rollout_rmse_accel=rollout[0] if rollout else None,
-        rollout_floor_accel=min(rollout, default=None),
-        rollout_rmse_speed=None if record.speed is None else _anew(record, none.errors[-1].mean(-1)),
-        horizon_s=HORIZON_S,
+        rollout_rmse_accel=accel[0] if accel else None,
+        rollout_floor_accel=min(accel, default=None),
+        rollout_rmse_speed=speed[0] if speed else None,
+        horizon_s=reached(usual[record.witnesses[0]], record),
         repeats=repeats(record),
     )
 
@@ -52,18 +50,6 @@ def _one_step(record: Record, errors: Float, lag: float) -> float:
     keep = float(np.exp(-record.dt / record.group / lag))
     steps = [x[1:] - keep * x[:-1] for x in map(np.ravel, _stretches(record, errors))]
     return _size(np.concatenate(steps))
-
-
-def _anew(record: Record, errors: Float) -> float | None:
-    """Of the speed, `errors` (counted,) of the whole drive's rollout begun anew every horizon."""
-    rows = round(HORIZON_S / record.dt)
-    parts = []
-    for x in _stretches(record, errors):
-        whole = len(x) // rows
-        blocks = x[: whole * rows].reshape(whole, rows)
-        parts.append((blocks - blocks[:, :1])[:, 1:].ravel())
-    joined = np.concatenate(parts)
-    return _size(joined) if len(joined) else None
 
 
 def _stretches(record: Record, values: Float) -> list[Float]:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from avtorch.gap import DeadTime
-from avtorch.gap.answer.misfit import HORIZON_S, gap_facts
+from avtorch.gap.heldout.misfit import gap_facts
+from avtorch.gap.heldout.rollout_errors import HORIZON_S
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.search.found import Found, Race
 from tests.gap.finds import found_of
@@ -40,17 +41,28 @@ def test_one_step_is_the_hold_from_the_measured_acceleration(rate_hz: int) -> No
     assert facts.one_step_floor == facts.one_step_rmse
 
 
-def test_speed_begins_anew_every_horizon() -> None:
+def test_rollouts_begin_anew_at_every_row() -> None:
     none = found_of([], noise=STILL, seconds=22.0)
     rows = none.candidate.record.rows
     dt = none.candidate.record.dt
-    # a rollout that lags behind by 0.1 m/s every second: as far off in every block, however long the drive
+    # a rollout that lags behind by 0.1 m/s every second: off by how long ago it began, which is any time up to 10 s
     errors = none.errors.copy()
     errors[-1] = 0.1 * dt * np.arange(rows)[:, None] + 7.0
     facts = gap_facts(race_of(replace(none, errors=errors)), none, detected=True)
-    steps = 0.1 * dt * np.arange(1, round(HORIZON_S / dt))
-    assert facts.rollout_rmse_speed == pytest.approx(np.sqrt((steps**2).mean()))
-    assert facts.horizon_s == HORIZON_S
+    ages = [dt * np.arange(min(k + 1, round(HORIZON_S / dt))) for k in range(rows)]
+    want = np.mean([((0.1 * age) ** 2).mean() for age in ages])
+    assert facts.rollout_rmse_speed == pytest.approx(np.sqrt(want))
+    assert facts.horizon_s == HORIZON_S == 10.0
+
+
+def test_a_short_stretch_is_its_own_horizon() -> None:
+    none = found_of([], noise=STILL, seconds=22.0)
+    record = none.candidate.record
+    halves = replace(record, stretch=(np.arange(record.rows) >= 160).astype(record.stretch.dtype) + record.stretch)
+    cut = replace(none, candidate=replace(none.candidate, record=halves.only(np.arange(record.rows) < 160)))
+    cut = replace(cut, errors=none.errors[:, :160])
+    facts = gap_facts(race_of(cut), cut, detected=True)
+    assert facts.horizon_s == pytest.approx(160 * record.dt)
 
 
 def test_a_late_car_shows_and_its_floor_is_the_noise() -> None:

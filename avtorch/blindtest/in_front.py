@@ -1,0 +1,255 @@
+"""An effect in front of a recorded car: the command is rewritten, every sample of the response stays real.
+
+A car with the log `(u, y)` is also, exactly, a car with the effect `E` in front of it and the log `(u', y)`, where
+`E(u') = u`. So a known effect meets a real response, its noise and its sensors, and the untouched log is the control:
+what a diagnosis says of the one and not of the other is what was put in, whatever else the car lacks.
+
+Effects of the command are inverted exactly. A force `f` on the body is what the car would have done without it,
+`u' = u - (f + T_L df/dt) / K_L` with the lag and gain of the car, which must be given. Effects of the accelerometer
+are put on its reading. Sizes are shares of what the log itself shows, so that size 1 is as plain in any car.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
+
+from avtorch.errors import InputError
+from avtorch.io import Log
+
+Float = NDArray[np.float64]
+Truth = dict[str, float]
+
+_MOVING_MPS = 0.3
+_SMOOTH_S = 0.3  # of the measured speed, before a force is made of it and differentiated
+_GRAVITY = 9.81
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """What an effect needs to know of the log: one array per signal, `T_L` [s], `K_L` [-], draws, size."""
+
+    log: Log
+    command: Float
+    T_L: float
+    K_L: float
+    size: float
+    rng: np.random.Generator
+
+    @property
+    def step(self) -> float:
+        return 1.0 / self.log.rate_hz
+
+    @property
+    def spread(self) -> float:
+        """SD of the command in usable rows [m/s²]."""
+        return float(self.command[self.log.usable].std())
+
+    @property
+    def speed(self) -> Float:
+        """Measured speed without most of its noise [m/s]."""
+        if self.log.speed is None:
+            raise InputError(f"{self.log.name}: has no speed, which this effect needs")
+        smooth = self.log.speed.copy()
+        for part in self.log.segments():
+            smooth[part] = gaussian_filter1d(smooth[part], _SMOOTH_S / self.step, mode="nearest")
+        return np.maximum(smooth, 0.0)
+
+    def along(self) -> Float:
+        """Distance from the start of each segment [m]."""
+        out = np.zeros(self.log.rows)
+        for part in self.log.segments():
+            v, t = self.speed[part], self.log.elapsed[part]
+            out[part] = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(t))])
+        return out
+
+    def pushed(self, force: Float) -> Log:
+        """The log of a car on which `force` (row,) [m/s²] acts besides."""
+        slope = np.zeros_like(force)
+        for part in self.log.segments():
+            if part.stop - part.start > 1:
+                slope[part] = np.gradient(force[part], self.log.elapsed[part])
+        return replace(self.log, accel_cmd=self.command - (force + self.T_L * slope) / self.K_L)
+
+
+def put_in_front(
+    log: Log, effect: str, *, T_L: float, K_L: float, size: float = 1.0, seed: int = 0
+) -> tuple[Log, Truth]:
+    """`log` as a car with `effect` besides would have written it, and the effect's parameters.
+
+    Args:
+        effect: a name of `IN_FRONT`.
+        T_L, K_L: lag [s] and gain [-] of the car, as fitted to the untouched log.
+        size: 1 is plain; see the functions below for what it scales.
+        seed: of what is drawn (moments, roads, gusts, glitches).
+
+    Raises `InputError` for an unknown effect, a log that lacks what it acts on, or a lag, gain or size out of range.
+    """
+    if effect not in IN_FRONT:
+        raise InputError(f"effect: found {effect!r}, needs one of {', '.join(IN_FRONT)}")
+    for name, value in (("T_L", T_L), ("K_L", K_L), ("size", size)):
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"{name}: found {value}, needs a finite number above 0")
+    if log.accel_cmd is None:
+        raise InputError(f"{log.name}: has no accel_cmd, in front of which an effect could be put")
+    bench = _Bench(log, log.accel_cmd, float(T_L), float(K_L), float(size), np.random.default_rng(seed))
+    return IN_FRONT[effect](bench)
+
+
+# --- effects of the command -------------------------------------------------------------------------------------------
+def _dead_time(x: _Bench) -> tuple[Log, Truth]:
+    """`u'(t) = u(t + delay)`, 0.3 s at size 1, in whole rows; the last rows, whose command is not known, go."""
+    rows = max(1, round(0.3 * x.size / x.step))
+    command, kept = x.command.copy(), np.ones(x.log.rows, bool)
+    for part in x.log.segments():
+        n = part.stop - part.start
+        command[part.start : part.stop - min(rows, n)] = x.command[part.start + min(rows, n) : part.stop]
+        kept[part.stop - min(rows, n) : part.stop] = False
+    return _rows(replace(x.log, accel_cmd=command), kept), {"delay_s": rows * x.step}
+
+
+def _dead_band(x: _Bench) -> tuple[Log, Truth]:
+    """`u' = u + w sign(u)`, w a quarter of the command's SD."""
+    w = 0.25 * x.size * x.spread
+    return replace(x.log, accel_cmd=x.command + w * np.sign(x.command)), {"half_width_mps2": w}
+
+
+def _backlash(x: _Bench) -> tuple[Log, Truth]:
+    """`u' = u + w sign(du/dt)`, w a fifth of the command's SD; where the command rests, the side it came from."""
+    w = 0.2 * x.size * x.spread
+    command = x.command.copy()
+    for part in x.log.segments():
+        side = np.sign(np.diff(x.command[part], prepend=x.command[part.start]))
+        last = np.maximum.accumulate(np.where(side != 0, np.arange(len(side)), 0))
+        command[part] += w * side[last]
+    return replace(x.log, accel_cmd=command), {"half_width_mps2": w}
+
+
+def _asymmetry(x: _Bench) -> tuple[Log, Truth]:
+    """Brakes with 0.65 of the gain."""
+    ratio = 0.65**x.size
+    return (
+        replace(x.log, accel_cmd=np.where(x.command < 0, x.command / ratio, x.command)),
+        {"brake_gain_ratio": ratio, "brake_lag_ratio": 1.0},
+    )
+
+
+# --- effects of the actuator's gain -----------------------------------------------------------------------------------
+def _gain_change(x: _Bench) -> tuple[Log, Truth]:
+    """The gain falls to 0.7 at a moment between 35 and 65 % of the drive."""
+    ratio = 0.7**x.size
+    first, last = float(x.log.elapsed[0]), float(x.log.elapsed[-1])
+    when = first + (last - first) * float(x.rng.uniform(0.35, 0.65))
+    command = np.where(x.log.elapsed >= when, x.command / ratio, x.command)
+    return replace(x.log, accel_cmd=command), {"gain_ratio": ratio, "change_s": when}
+
+
+def _speed_dependent_gain(x: _Bench) -> tuple[Log, Truth]:
+    """The gain rises or falls by half over one mean speed; nowhere below 0.3."""
+    v = x.speed
+    slope = 0.5 * x.size * (1 if x.rng.random() < 0.5 else -1)
+    mean = float(v[x.log.usable].mean())
+    gain = np.maximum(1 + slope * (v - mean) / mean, 0.3)
+    return replace(x.log, accel_cmd=x.command / gain), {"gain_slope": slope}
+
+
+# --- forces on the body -----------------------------------------------------------------------------------------------
+def _resistance(x: _Bench) -> tuple[Log, Truth]:
+    """A quarter of the command's SD, while moving."""
+    r = 0.25 * x.size * x.spread
+    force = np.full(x.log.rows, -r)
+    if x.log.speed is not None:
+        force[x.speed < _MOVING_MPS] = 0.0
+    return x.pushed(force), {"resistance_mps2": r}
+
+
+def _drag(x: _Bench) -> tuple[Log, Truth]:
+    """0.3 of the command's SD at the 90th percentile of speed."""
+    v = x.speed
+    c = 0.3 * x.size * x.spread / float(np.quantile(v[x.log.usable], 0.9)) ** 2
+    return x.pushed(-c * v**2), {"drag_per_m": c}
+
+
+def _grade(x: _Bench) -> tuple[Log, Truth]:
+    """A sine over the way, a sixth to a third of it long, with 0.35 of the command's SD in amplitude."""
+    way = x.along()
+    wave = float(way.max()) * float(x.rng.uniform(1 / 6, 1 / 3))
+    pull = 0.35 * x.size * x.spread
+    force = -pull * np.sin(2 * np.pi * (way / wave + float(x.rng.random())))
+    return x.pushed(force), {"grade_rms": float(np.sqrt(np.mean(force[x.log.usable] ** 2))) / _GRAVITY}
+
+
+def _gust(x: _Bench) -> tuple[Log, Truth]:
+    """A coloured force of 0.3 of the command's SD and 3 s."""
+    sd, keep = 0.3 * x.size * x.spread, float(np.exp(-x.step / 3.0))
+    kicks = x.rng.normal(size=x.log.rows) * sd * np.sqrt(1 - keep**2)
+    kicks[0] = x.rng.normal() * sd
+    return x.pushed(np.asarray(lfilter([1.0], [1.0, -keep], kicks))), {"sd_mps2": sd, "time_constant_s": 3.0}
+
+
+# --- effects of the accelerometer -------------------------------------------------------------------------------------
+def _accel(x: _Bench) -> Float:
+    if x.log.accel is None:
+        raise InputError(f"{x.log.name}: has no accel, on which this effect acts")
+    return x.log.accel
+
+
+def _sensor_bias(x: _Bench) -> tuple[Log, Truth]:
+    """A quarter of the reading's SD."""
+    a = _accel(x)
+    bias = 0.25 * x.size * float(a[x.log.usable].std())
+    return replace(x.log, accel=a + bias), {"bias_mps2": bias}
+
+
+def _sensor_scale(x: _Bench) -> tuple[Log, Truth]:
+    """1.2 of what it should read."""
+    scale = 1.2**x.size
+    return replace(x.log, accel=_accel(x) * scale), {"scale": scale}
+
+
+def _sensor_lag(x: _Bench) -> tuple[Log, Truth]:
+    """A first-order filter of 0.4 s."""
+    a, lag = _accel(x).copy(), 0.4 * x.size
+    keep = float(np.exp(-x.step / lag))
+    for part in x.log.segments():
+        a[part] = lfilter([1 - keep], [1.0, -keep], a[part], zi=[keep * a[part.start]])[0]
+    return replace(x.log, accel=a), {"lag_s": lag}
+
+
+def _outliers(x: _Bench) -> tuple[Log, Truth]:
+    """One row in fifty with twice the reading's SD on top."""
+    a = _accel(x)
+    sd = 2.0 * x.size * float(a[x.log.usable].std())
+    hit = x.rng.random(x.log.rows) < 0.02
+    return replace(x.log, accel=a + hit * x.rng.normal(0.0, sd, x.log.rows)), {"fraction": 0.02, "sd_mps2": sd}
+
+
+IN_FRONT: Mapping[str, Callable[[_Bench], tuple[Log, Truth]]] = {
+    "dead_time": _dead_time,
+    "dead_band": _dead_band,
+    "backlash": _backlash,
+    "brake_throttle_asymmetry": _asymmetry,
+    "gain_change": _gain_change,
+    "speed_dependent_gain": _speed_dependent_gain,
+    "constant_resistance": _resistance,
+    "aerodynamic_drag": _drag,
+    "road_grade": _grade,
+    "gust": _gust,
+    "sensor_bias": _sensor_bias,
+    "sensor_scale": _sensor_scale,
+    "sensor_lag": _sensor_lag,
+    "outliers": _outliers,
+}
+"""Effects that can be put in front of a recording, by name; the last four need `accel`."""
+
+
+def _rows(log: Log, kept: NDArray[np.bool_]) -> Log:
+    """The log with only the rows `kept` (row,)."""
+    columns = {name: value[kept] for name, value in vars(log).items() if isinstance(value, np.ndarray)}
+    columns = {name: value for name, value in columns.items() if name in log.__dataclass_fields__}
+    return replace(log, **columns)

@@ -1,0 +1,110 @@
+"""Do lag and gain explain what changed between two sets of drives, or would a later answer of the car do as well?
+
+A car that answers 0.15 s later looks to GLVD like one with a longer lag. So both sides are fitted with a dead time
+besides, and two accounts of the change are held against each other: only lag and gain differ (the dead time is one and
+the same), or only the dead time differs (lag and gain are the same). Each is what is asked of the difference of the two
+fits by Hotelling's test, whose spreads are told by blocks as those of `compare` are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import f as fisher
+from scipy.stats import t as student
+
+from avtorch.gap.answer.comparison import LaterAnswer
+from avtorch.gap.answer.quantity import Quantity
+from avtorch.gap.effects import DeadTime
+from avtorch.gap.heldout.parts import blocks_of
+from avtorch.gap.likelihood.fit import directions
+from avtorch.gap.search.found import Found
+from avtorch.gap.search.search import Search
+
+Float = NDArray[np.float64]
+
+_KEYS = ("T_L", "K_L", "dead_time.delay_s")
+_FELT_S = 0.03  # below it the delay's own scale, a logarithm, has no slope to go by
+
+
+@dataclass(frozen=True, eq=False)
+class WithDelay:
+    """One set of drives: `mean` and `covariance` of ln T_L, ln K_L and the dead time [s], from so many `blocks`."""
+
+    mean: Float
+    covariance: Float = field(repr=False)
+    blocks: int
+
+    @classmethod
+    def of(cls, search: Search, none: Found) -> WithDelay:
+        """With a dead time on top of what `search` found without any effect, in place of one of the baseline's."""
+        found = search.with_effects(none, [DeadTime])
+        candidate, record = found.candidate, found.candidate.record
+        keys = [c.key for c in candidate.coordinates]
+        here = found.z.copy()
+        delay = keys.index(_KEYS[2])
+        here[delay] = max(here[delay], candidate.coordinates[delay].z_of(_FELT_S))
+        columns = directions(candidate, found.white, here).reshape(len(here), -1)
+        # from the fit's own scales to logarithms and seconds
+        columns = np.stack(
+            [columns[keys.index(k)] / slope for k, slope in zip(_KEYS, _slopes(found, here), strict=True)]
+        )
+        white = found.white(found.errors).ravel()
+        inverse = np.linalg.inv(columns @ columns.T)
+        pulls = columns * white
+        by_row = pulls.reshape(len(_KEYS), len(record.witnesses), record.rows, record.group).sum((1, 3))
+        blocks = blocks_of(record)
+        scores = np.stack([by_row[:, b].sum(1) for b in blocks], 1)
+        values = [found.values[key] for key in _KEYS]
+        # a step that the prior and the scale's end at no delay have held back: an estimate that may be below 0
+        mean = np.array([np.log(values[0]), np.log(values[1]), values[2]]) + inverse @ scores.sum(1)
+        scores = scores - scores.mean(1, keepdims=True)
+        between = scores @ scores.T * len(blocks) / (len(blocks) - 1)
+        root = np.linalg.cholesky(inverse)
+        sizes, axes = np.linalg.eigh(root.T @ between @ root)
+        return cls(mean, root @ axes @ np.diag(np.maximum(sizes, 1.0)) @ axes.T @ root.T, len(blocks))
+
+
+def later_answer(before: WithDelay, after: WithDelay, *, level: float) -> LaterAnswer:
+    """The two accounts held against each other, rejected at `level` (`LaterAnswer`)."""
+    away, covariance = after.mean - before.mean, after.covariance + before.covariance
+    blocks = min(before.blocks, after.blocks)
+    same_delay, same_car = _chance(away, covariance, [2], blocks), _chance(away, covariance, [0, 1], blocks)
+    sure = float(student.ppf(0.95, blocks - 1))
+
+    def delay(mean: float, variance: float) -> Quantity:
+        sd = float(np.sqrt(variance))
+        return Quantity(mean, sd, mean - sure * sd, mean + sure * sd)
+
+    sides = [delay(float(x.mean[2]), float(x.covariance[2, 2])) for x in (before, after)]
+    return LaterAnswer(
+        before=sides[0],
+        after=sides[1],
+        difference=delay(float(away[2]), float(covariance[2, 2])),
+        p_lag_gain=same_delay,
+        p_dead_time=same_car,
+        level=level,
+    )
+
+
+def _chance(away: Float, covariance: Float, which: Sequence[int], blocks: int) -> float:
+    """Of a difference as large in these numbers, where they are the same (Hotelling)."""
+    part, count = away[list(which)], len(which)
+    square = float(part @ np.linalg.solve(covariance[np.ix_(which, which)], part))
+    return float(fisher.sf(square * (blocks - count) / (count * (blocks - 1)), count, blocks - count))
+
+
+def _slopes(found: Found, z: Float) -> list[float]:
+    """Of ln T_L, ln K_L and the dead time [s] by their own coordinates at `z`."""
+    step = 1e-4
+    keys = [c.key for c in found.candidate.coordinates]
+    each = found.candidate.values(z + step * np.vstack([np.zeros(len(z)), np.eye(len(z))]))
+    out = []
+    for key in _KEYS:
+        x = each[key].numpy()
+        x = x if key == _KEYS[2] else np.log(x)
+        out.append(float(x[1 + keys.index(key)] - x[0]) / step)
+    return out

@@ -1,0 +1,56 @@
+"""Random errors of the command whose variance an effect foretells: what they add to the likelihood of a rollout.
+
+An error in one row's command passes the actuator as that command does, so the white errors are white noise and the
+output of a small linear system that the command's errors drive. A Kalman filter of that system gives each row's
+density, given the rows before it. Stretches go side by side in chunks, each begun some rows earlier.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.search.losses import image_of_row, states_of
+
+Float = NDArray[np.float64]
+
+
+def rows_gained(white: Whitener, errors: Float, variance: Float, T_L: float, K_L: float) -> Float:
+    """Log likelihood ratio (counted,) of each row, commands with errors of this `variance` over commands as logged.
+
+    Args: `errors` (witness, counted, 1) of a rollout with `T_L` [s] and `K_L` at the log's own rate; `variance`
+    (counted,) [(m/s²)²], independent from row to row.
+    """
+    record = white.record
+    image = image_of_row(white, T_L, K_L)
+    move, push, see = states_of(image)
+    energy = np.cumsum((image**2).sum(0))
+    warm = 8 + int(np.searchsorted(energy, 0.995 * energy[-1]))
+    size = max(3 * warm, 120)
+    place, valid = [], []
+    for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
+        for begin in range(first, last, size):
+            rows = np.arange(begin - warm, begin + size)
+            place.append(rows.clip(first, last - 1))
+            valid.append((rows >= first) & (rows < last))
+    at, own = np.array(place), np.array(valid)
+    e = np.where(own, white(errors)[:, at, 0], 0.0)  # (witness, chunk, step)
+    driven = np.where(own, variance[at], 0.0)
+    one, pushed = np.eye(len(see)), np.outer(push, push)
+    state, spread = np.zeros((len(at), len(push))), np.zeros((len(at), len(push), len(push)))
+    out = np.zeros(at.shape)
+    for t in range(at.shape[1]):
+        left = e[:, :, t].T - state @ see.T
+        cross = spread @ see.T
+        inverse = np.linalg.inv(see @ cross + one)
+        gain = cross @ inverse
+        out[:, t] = 0.5 * (
+            (e[:, :, t] ** 2).sum(0) - np.einsum("cw,cwx,cx->c", left, inverse, left) + np.linalg.slogdet(inverse)[1]
+        )
+        state = (state + (gain @ left[..., None])[..., 0]) @ move.T
+        spread = move @ (spread - gain @ cross.mT) @ move.T + driven[:, t, None, None] * pushed
+    rows = np.zeros(record.rows)
+    kept = own[:, warm:]
+    rows[at[:, warm:][kept]] = out[:, warm:][kept]
+    return rows

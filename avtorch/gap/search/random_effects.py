@@ -1,0 +1,180 @@
+"""Random effects as candidates, by what their `noise` says: on top of what a find's rollout leaves over.
+
+Three have a search of their own (`OWN_SEARCH`), which also finds from when on they act. Any other is fitted by the
+likelihood whose noise its `noise` changes, over the whole drive: a force with the lag, the gain and the rest of the
+noise; errors of the command with the jerk noise that they resemble; tails row by row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from avtorch.gap.chain.effect import Effect
+from avtorch.gap.chain.plant import GapPlant
+from avtorch.gap.effects import CommandHold, Gust, Outliers
+from avtorch.gap.likelihood.earlier import whitener
+from avtorch.gap.likelihood.fit import finish, modes
+from avtorch.gap.likelihood.noise_fit import PRIORS, fit_noise
+from avtorch.gap.likelihood.random_law import Form, RandomLaw
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.likelihood.witnesses import judged
+from avtorch.gap.search.chance import Tails, hessian_of
+from avtorch.gap.search.command_errors import rows_gained
+from avtorch.gap.search.found import ByChance, Found
+from avtorch.gap.search.raw_rows import raw_errors, raw_white
+
+Float = NDArray[np.float64]
+
+OWN_SEARCH: Mapping[type[Effect], Literal["force", "tails", "losses"]] = {
+    Gust: "force",
+    Outliers: "tails",
+    CommandHold: "losses",
+}
+"""Random effects with a search of their own; a class derived from one of them is a user's like any other."""
+
+_TURNS = 4  # of parameters and noise
+_ENOUGH = 0.1  # nats
+_SIMPLEX = -0.7  # prior standard deviations, to begin with
+
+
+def users_own(effects: Sequence[type[Effect]], raw: Record, baseline: GapPlant) -> dict[Form, list[RandomLaw]]:
+    """Random effects without a search of their own, by what they do to the noise."""
+    laws: dict[Form, list[RandomLaw]] = {"force": [], "tails": [], "command": []}
+    for kind in effects:
+        if kind.random and kind not in OWN_SEARCH and judged(kind, raw.witnesses):
+            law = RandomLaw.of(kind, raw, baseline)
+            laws[law.form].append(law)
+    return laws
+
+
+def named(base: Found, law: RandomLaw) -> str:
+    """Of the base with the random effect on top."""
+    return "+".join(sorted([*([] if base.name == "none" else base.name.split("+")), law.name]))
+
+
+def forced(base: Found, law: RandomLaw) -> Found:
+    """A random force on top of `base`, fitted with the lag, the gain, the base's effects and all of the noise."""
+    candidate, record = base.candidate, base.candidate.record
+    best: Found | None = None
+    for begin in (0.0, -1.0):  # typical, and fainter
+        z, noise, errors = base.z, base.noise.noise, base.errors
+        law_z: Float = np.full(law.size, begin)
+        value = -np.inf
+        for _ in range(_TURNS):
+            lag = float(candidate.values(z[None])["T_L"][0])
+            fitted = fit_noise(record, errors, noise, T_L=lag, onset=base.onset, law=law, law_z=law_z)
+            assert fitted.law_z is not None
+            noise, law_z = fitted.noise, fitted.law_z
+            white = whitener(record, noise, onset=base.onset)
+            z = modes(candidate, white, z[None], onset=base.onset, iterations=3)[0][0]
+            fit = finish(candidate, white, z, base.onset)
+            errors = fit.errors
+            evidence = fit.log_evidence + fitted.log_prior
+            if evidence < value + _ENOUGH:
+                break
+            value = evidence
+        assert fitted.law_covariance is not None
+        found = replace(
+            base,
+            name=named(base, law),
+            z=z,
+            covariance=fit.covariance,
+            values={k: float(v) for k, v in candidate.values(z[None]).items()},
+            noise=fitted,
+            errors=errors,
+            grade_rms=fit.grade_rms,
+            profile=fit.profile,
+            log_evidence=evidence,
+            log_likelihood=float(white.row_likelihoods(errors).sum()),
+            by_chance=ByChance(law, law_z, fitted.law_covariance),
+        )
+        if best is None or found.log_evidence > best.log_evidence:
+            best = found
+    assert best is not None
+    return best
+
+
+def tailed(base: Found, law: RandomLaw, tails: Tails) -> Found:
+    """Tails on top of `base`."""
+    assert tails.z is not None
+    assert tails.covariance is not None
+    by_chance = ByChance(law, tails.z, tails.covariance)
+    evidence = base.log_evidence + tails.evidence
+    return replace(base, name=named(base, law), log_evidence=evidence, tails=tails, by_chance=by_chance)
+
+
+def glitched(found: Sequence[Found], glitches: Sequence[tuple[RandomLaw | None, Tails]], *, pairs: bool) -> list[Found]:
+    """Tails alone and, where pairs are tried, on top of every single effect."""
+    out = []
+    for f in found:
+        names = [] if f.name == "none" else f.name.split("+")
+        if len(names) > 1 or (names and not pairs):
+            continue
+        for law, seen in glitches:
+            name = "+".join(sorted([*names, "outliers"]))
+            plain = replace(f, name=name, log_evidence=f.log_evidence + seen.evidence, tails=seen)
+            if law is None:
+                out.append(plain)
+            elif f.by_chance is None:
+                out.append(tailed(f, law, seen))
+    return out
+
+
+def commanded(base: Found, law: RandomLaw, raw: Record) -> Found:
+    """Errors of the command on top of `base`, fitted with the size of the jerk noise, which passes the same lag."""
+    errors, plain = raw_errors(raw, base), raw_white(raw, base)
+    T_L, K_L = base.values["T_L"], base.values["K_L"]
+    _, spread, _ = PRIORS["process_sd"]
+    own = base.noise.noise.process_sd
+    centre = float(np.log(own) - PRIORS["process_sd"][0]) / spread
+    flat = float(plain.row_likelihoods(errors).sum())
+
+    def white(shift: float) -> Whitener:
+        return Whitener(raw, plain.noise.replaced(process_sd=own * float(np.exp(spread * shift))))
+
+    def without(x: Float) -> float:
+        return flat - float(white(x[0]).row_likelihoods(errors).sum()) + 0.5 * ((centre + x[0]) ** 2 - centre**2)
+
+    def cost(x: Float) -> float:
+        if abs(x[0]) > 3 or np.abs(x[1:]).max(initial=0.0) > 5:
+            return 1e9 * (1 + float(np.abs(x).max()))
+        variance = variance_of(law, x[1:], base, raw)
+        gained = float(rows_gained(white(x[0]), errors, variance, T_L, K_L).sum())
+        return without(x) - gained + 0.5 * float(x[1:] @ x[1:])
+
+    # towards less jerk noise, for which these errors were taken
+    begin = np.concatenate([[-0.3], np.zeros(law.size)])
+    simplex = begin + np.concatenate([np.zeros((1, len(begin))), _SIMPLEX * np.eye(len(begin))])
+    options = {"xatol": 0.02, "fatol": 0.05, "maxfev": 100 * (1 + law.size), "initial_simplex": simplex}
+    best = minimize(cost, begin, method="Nelder-Mead", options=options)
+    hessian = hessian_of(cost, best.x)
+    # the jerk noise pays for its size in the base already
+    curvature = max(float(hessian_of(without, np.zeros(1))[0, 0]), 1.0)
+    evidence = -float(best.fun) - 0.5 * float(np.linalg.slogdet(hessian)[1]) + 0.5 * float(np.log(curvature))
+    covariance = np.asarray(np.linalg.inv(hessian)[1:, 1:], np.float64)
+    sd = own * float(np.exp(spread * best.x[0]))
+    by_chance = ByChance(law, best.x[1:], covariance, explained=evidence, process_sd=sd)
+    return replace(base, name=named(base, law), log_evidence=base.log_evidence + evidence, by_chance=by_chance)
+
+
+def variance_of(law: RandomLaw, z: Float, base: Found, raw: Record) -> Float:
+    """Of the command's errors as they reach the actuator, (counted,) [(m/s²)²]: behind a delay of the base's, late."""
+    late = 0.0
+    for e in base.candidate.effects:
+        if e.shift is not None and law.effect.order <= e.order:
+            late += base.values[f"{e.name}.{e.shift}"]
+    parts, first = [], 0
+    whole = law.command_variance(z, raw.drives)
+    for drive in raw.drives:
+        own = whole[first : first + len(drive.time)]
+        rows = np.arange(len(own)) - round(late / raw.dt)
+        parts.append(own[rows.clip(0)])
+        first += len(own)
+    return np.concatenate(parts)[raw.source]

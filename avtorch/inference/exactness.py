@@ -1,0 +1,306 @@
+r"""Do the draws of a walk follow the density? Chains that agree with each other need not agree with the posterior.
+
+A constant step has a law of its own, and chains that all begin at the mode may not have reached the posterior's tails.
+The log density is exact and cheap, so it is asked: points are drawn from a proposal around the draws, a mixture of
+normals with the draws' mean and covariance and 1 to 15 times their SDs, and weighed by ``density / proposal``. If the
+ratios are reliable (Pareto-k, :mod:`avtorch.inference.pareto`), their weighted moments are the posterior's, with a
+Monte Carlo error that is known, and those of the draws are held against them. If they are not, the draws do not cover
+the density, or its shape is too far from a normal to be judged this way: then nothing is claimed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from avtorch.inference.density import Density, SelectableDensity
+from avtorch.inference.other_modes import missed_mass
+from avtorch.inference.pareto import RELIABLE, pareto_k
+from avtorch.inference.planes import from_planes, lower_times, to_planes
+
+MEAN_TOLERANCE, SD_TOLERANCE, TAIL_TOLERANCE = 0.1, 0.05, 0.003
+"""How far a mean may be off in SDs, an SD as a ratio, and the share of draws beyond TAIL as a probability."""
+TAIL = 3.0
+"""SDs of the draws, on either side, where the tail begins: a heavy one shows there long before it moves the SD."""
+RESOLUTION = 0.05
+"""A claim needs the density's moments to be known this well: standard error of a mean in SDs, of an SD as a ratio."""
+ERRORS = 3.0
+"""Monte Carlo standard errors of the draws that are let pass where they are more than the tolerance."""
+HEAVY = 1.0
+"""An SD's error counts up to so many of its mean's: 0.7 under a normal, 1 at a kurtosis of 5. Where it is more, a few
+far draws carry the SD, and those that are still missing make it too small rather than uncertain."""
+CERTAIN = 0.4
+"""Pareto-k up to which few points are enough; between this and RELIABLE a rare point may still matter."""
+#: SDs of the proposal's parts in the draws' SDs, and their shares; the wide ones look for what the draws miss.
+SCALES, SHARES = (1.0, 1.5, 3.0, 6.0, 15.0), (0.45, 0.27, 0.14, 0.09, 0.05)
+#: Points of a second look where the first leaves a doubt, as a multiple.
+AGAIN = 8
+#: Points times windows at once.
+BLOCK = 2**18
+
+
+@dataclass(frozen=True)
+class Exactness:
+    """The draws' moments against the exact density's, in the unconstrained coordinates ``z``.
+
+    Attributes:
+        pareto_k: shape of the importance ratios' tail, ``(window,)``; above 0.7 the rest is not reliable.
+        mean_shift: mean of the draws less that of the density, in SDs, ``(window, parameter)``.
+        sd_ratio: SD of the draws over that of the density, ``(window, parameter)``.
+        tail_excess: share of the draws beyond TAIL of their SDs less that of the density, ``(window, parameter)``.
+        mean_error, sd_error, tail_error: their Monte Carlo standard errors from the density's side.
+        draws_mean_error, draws_sd_error, draws_tail_error: the same from the draws' side.
+        missed: mass of another mode over that at the draws, ``(window,)``; 0 where none was found.
+    """
+
+    pareto_k: Tensor
+    mean_shift: Tensor
+    sd_ratio: Tensor
+    tail_excess: Tensor
+    mean_error: Tensor
+    sd_error: Tensor
+    tail_error: Tensor
+    draws_mean_error: Tensor
+    draws_sd_error: Tensor
+    draws_tail_error: Tensor
+    missed: Tensor
+
+    def known(self, resolution: float = RESOLUTION) -> Tensor:
+        """Where the density's moments are known well enough to compare with, ``(window,)`` bool."""
+        fine = (self.mean_error <= resolution) & (self.sd_error <= resolution)
+        return fine.all(-1) & (self.pareto_k < RELIABLE)
+
+    def beyond(self, errors: float = 1.0) -> Tensor:
+        """Where mean, SD or tail of the draws is off by more than tolerance or chance, ``(3, window, parameter)`` bool.
+
+        ``errors``: standard errors of the density's side that are let pass on top.
+        """
+        off = torch.stack([self.mean_shift.abs(), (self.sd_ratio - 1).abs(), self.tail_excess.abs()])
+        own_sd = torch.minimum(self.draws_sd_error, HEAVY * self.draws_mean_error)
+        own = torch.stack([self.draws_mean_error, own_sd, self.draws_tail_error])
+        other = torch.stack([self.mean_error, self.sd_error, self.tail_error])
+        tolerance = off.new_tensor([MEAN_TOLERANCE, SD_TOLERANCE, TAIL_TOLERANCE])[:, None, None]
+        return ~(off <= torch.maximum(tolerance, ERRORS * own) + errors * other)
+
+    def sure(self) -> Tensor:
+        """Where more points would hardly change the answer, ``(window,)`` bool."""
+        return self.known() & (self.pareto_k < CERTAIN) | self.hopeless()
+
+    def hopeless(self) -> Tensor:
+        """Where not even a mean of the ratios exists: the density is nothing like the draws, ``(window,)`` bool."""
+        return self.pareto_k > 1.0
+
+    def clear(self) -> Tensor:
+        """Where a first look leaves no doubt that the draws follow the density, ``(window,)`` bool."""
+        return self.known(2 * RESOLUTION) & (self.pareto_k < CERTAIN) & ~self.beyond().any(0).any(-1)
+
+    def holds(self) -> Tensor:
+        """Where the draws are shown to follow the density, ``(window,)`` bool."""
+        return (self.clear() | self.known() & ~self.beyond().any(0).any(-1)) & (self.missed == 0)
+
+    def why(self, names: tuple[str, ...]) -> list[str]:
+        """What is wrong with each window, ``""`` where the draws follow the density."""
+        reasons, holds = [], self.holds()
+        for w, (known, beyond) in enumerate(zip(self.known().tolist(), self.beyond().movedim(1, 0), strict=True)):
+            if bool(holds[w]):
+                reasons.append("")
+            elif float(self.missed[w]) > 0:
+                mass = f"{float(self.missed[w]):.3g} times the mass at the draws"
+                reasons.append(f"the density has another mode, which no chain has reached, of {mass}")
+            elif not known:
+                k = f"Pareto-k {float(self.pareto_k[w]):.2f}, needs {RELIABLE:g} or less"
+                k = k if float(self.pareto_k[w]) >= RELIABLE else "too few points count"
+                reasons.append(f"nothing shows that the draws follow the density, which is not like them ({k})")
+            else:
+                kind, i = divmod(int(beyond.flatten().int().argmax()), len(names))
+                off = (
+                    f"the mean of {names[i]} is {float(self.mean_shift[w, i]):+.2f} SDs off",
+                    f"the SD of {names[i]} is {float(self.sd_ratio[w, i]):.2f} of what it should be",
+                    f"the tails of {names[i]} hold {float(self.tail_excess[w, i]):+.3f} of probability too much",
+                )[kind]
+                reasons.append(f"the draws do not follow the density: in unconstrained coordinates {off}")
+        return reasons
+
+    def put(self, index: Tensor, other: Exactness, where: Tensor | None = None) -> Exactness:
+        """The same with the windows ``index`` taken from ``other``, or those of them where ``where`` is true."""
+        if where is None or bool(where.all()):
+            if len(index) == len(self.missed):
+                return other
+            where = torch.ones_like(index, dtype=torch.bool)
+        parts = {}
+        for name in self.__dataclass_fields__:
+            parts[name] = getattr(self, name).clone()
+            parts[name][index[where]] = getattr(other, name)[where]
+        return replace(self, **parts)
+
+    @classmethod
+    def unknown(cls, windows: int, parameters: int) -> Exactness:
+        """Nothing is known of any window: NaN throughout."""
+        each = torch.full((windows, parameters), torch.nan, dtype=torch.float64)
+        a, b, c, d, e, f, g, h, i = (each.clone() for _ in range(9))
+        return cls(each[:, 0].clone(), a, b, c, d, e, f, g, h, i, each[:, 0].clone())
+
+
+def compare(density: Density, z: Tensor) -> Exactness:
+    """Hold draws ``z`` ``(chain, draw, window, parameter)`` against their density.
+
+    A first look takes few points beside what the draws cost; the windows of which it leaves a doubt get about AGAIN
+    times as many, and those that it cannot tell by then as many times more. What holds is searched for other modes.
+    """
+    total = z.shape[0] * z.shape[1]
+    points = min(1024, max(256, total // 8))
+    closer = min(AGAIN * points, max(4 * points, total))
+    # a walk of few draws has a density that is dear
+    looks = (closer, AGAIN * closer) if total >= 4096 else (closer,)
+    everyone = torch.arange(z.shape[2])
+
+    def chosen(where: Tensor) -> Tensor:
+        if isinstance(density, SelectableDensity):
+            return everyone[where]
+        return everyone if bool(where.any()) else everyone[:0]
+
+    moments = Moments.of(z)
+    found = weighed(density, moments, points)
+    for count in looks:
+        # more points do not help where the ratios' tail is heavy beyond doubt
+        index = chosen(~(found.clear() if count == closer else found.clear() | found.sure()))
+        if len(index):
+            found = found.put(index, weighed(_picked(density, index), moments.select(index), count))
+    index = chosen(found.holds())
+    if len(index):
+        part = moments.select(index)
+        found.missed[index] = missed_mass(_picked(density, index), part.mean, part.lower)
+    return found
+
+
+def _picked(density: Density, index: Tensor) -> Density:
+    if isinstance(density, SelectableDensity) and len(index) < density.windows:
+        return density.select(index)
+    return density
+
+
+def exactness(density: Density, z: Tensor, points: int) -> Exactness:
+    """The same with ``points`` points, once."""
+    return weighed(density, Moments.of(z), points)
+
+
+class Moments(NamedTuple):
+    """Of draws: ``lower`` ``(window, parameter, parameter)``, the rest ``(window, parameter)``.
+
+    Attributes:
+        mean: in the units of ``z``.
+        lower: triangular root of the covariance.
+        share: of the draws beyond TAIL.
+        mean_error, sd_error: standard errors [SD, as a ratio] by the means of independent pieces: chains, cut where
+            there are fewer than sixteen.
+    """
+
+    mean: Tensor
+    lower: Tensor
+    share: Tensor
+    mean_error: Tensor
+    sd_error: Tensor
+
+    @classmethod
+    def of(cls, z: Tensor) -> Moments:
+        """Of draws ``(chain, draw, window, parameter)``."""
+        chains, draws = z.shape[:2]
+        pieces = max(1, min(draws // 2, -(-16 // chains)))
+        planes = to_planes(z.transpose(0, 1))  # (parameter, window, draw, chain), contiguous as the walk leaves it
+        mean = planes.mean((-2, -1))
+        centred = planes - mean[..., None, None]
+        flat = centred.flatten(2).movedim(0, 1)  # (window, parameter, draw x chain)
+        covariance = flat @ flat.mT / (flat.shape[-1] - 1)
+        lower, failed = torch.linalg.cholesky_ex(covariance.nan_to_num())
+        lower = torch.where((failed == 0)[:, None, None], lower, torch.nan)
+        variance = covariance.diagonal(dim1=-2, dim2=-1).mT  # (parameter, window)
+        square = centred.square()
+        share = (square > TAIL**2 * variance[..., None, None]).mean((-2, -1), dtype=z.dtype)
+        whole = draws // pieces * pieces
+        each, squares = (x[..., :whole, :].unflatten(2, (pieces, -1)).mean(3) for x in (centred, square))
+        root = (pieces * chains) ** 0.5
+        of_mean = each.flatten(2).std(-1) / variance.sqrt() / root
+        of_sd = 0.5 * squares.flatten(2).std(-1) / variance / root
+        return cls(mean.mT, lower, share.mT, of_mean.mT, of_sd.mT)
+
+    def select(self, index: Tensor) -> Moments:
+        """The windows named by ``index``."""
+        return self if len(index) == len(self.mean) else Moments(*(x[index] for x in self))
+
+
+def weighed(density: Density, moments: Moments, points: int) -> Exactness:
+    """Draws of these moments against their density: one call of its ``log_prob``, or a few where windows are many."""
+    mean, lower, share, mean_error, sd_error = moments
+    base, log_proposal = proposal(points, mean.shape[-1])
+    found = []
+    size = max(1, BLOCK // points) if isinstance(density, SelectableDensity) else len(mean)
+    for part in torch.arange(len(mean)).split(size):
+        found.append(_weighed(_picked(density, part), mean[part], lower[part], base, log_proposal))
+    k, m, variance, tail, m_error, v_error, tail_error = (torch.cat(x) for x in zip(*found, strict=True))
+    spread = variance.sqrt()
+    # chance of the tail's share from as many independent draws as the mean is worth
+    of_tail = (torch.maximum(share, tail) * mean_error.square()).sqrt()
+    errors = (m_error / spread, 0.5 * v_error / variance, tail_error)
+    return Exactness(
+        k, -m / spread, 1 / spread, share - tail, *errors, mean_error, sd_error, of_tail, torch.zeros_like(k)
+    )
+
+
+def _weighed(density: Density, mean: Tensor, lower: Tensor, base: Tensor, log_proposal: Tensor) -> tuple[Tensor, ...]:
+    """Pareto-k; weighted mean, variance and tail's share with their errors, in the draws' SDs about their mean."""
+    away = lower_times(lower, base[:, None].expand(-1, len(mean), -1))
+    with torch.no_grad():
+        log_ratio = log_density(density, away + mean) - log_proposal[:, None]
+    log_ratio = log_ratio.masked_fill(~(log_ratio < torch.inf), -torch.inf)
+    weight = log_ratio.softmax(0).nan_to_num()[..., None]
+    y = away / lower.square().sum(-1).sqrt()
+    out = (y.abs() > TAIL).to(y)
+    m, tail = (weight * torch.stack([y, out])).sum(1).unbind(0)
+    off = y - m
+    square = off.square()
+    variance = (weight * square).sum(0).clamp_min(1e-300)
+    terms = weight * torch.stack([off, square - variance, out - tail])
+    # point and mirror image count as one: their errors cancel in part
+    half = len(y) // 2
+    errors = (terms[:, :half] + terms[:, half:]).square_().sum(1).sqrt_()
+    return pareto_k(log_ratio), m, variance, tail, *errors.unbind(0)
+
+
+def log_density(density: Density, z: Tensor) -> Tensor:
+    """``log_prob`` of ``z`` ``(point, window, parameter)``, minus infinity where the density refuses to be asked.
+
+    Far out a user's function may leave the numbers that torch's distributions take, and they raise.
+    """
+    try:
+        value = density.log_prob(z)
+        return value.masked_fill(value.isnan(), -torch.inf)
+    except ValueError:
+        if len(z) == 1:
+            return torch.full(z.shape[:2], -torch.inf, dtype=z.dtype)
+        half = len(z) // 2
+        return torch.cat([log_density(density, z[:half]), log_density(density, z[half:])])
+
+
+@lru_cache(maxsize=32)
+def proposal(points: int, d: int) -> tuple[Tensor, Tensor]:
+    """Points ``(point, d)`` of a scale mixture of standard normals, mirrored, and their log density ``(point,)``.
+
+    The same for every window and every run: neither the walk's random numbers nor the number of windows matter.
+    """
+    half = points // 2
+    edges = (torch.arange(half, dtype=torch.float64) + 0.5) / half
+    kind = torch.bucketize(edges, torch.tensor(SHARES[:-1], dtype=torch.float64).cumsum(0))
+    scales = torch.tensor(SCALES, dtype=torch.float64)
+    normal = torch.randn(half, d, dtype=torch.float64, generator=torch.Generator().manual_seed(d))
+    x = normal * scales[kind, None]
+    x = torch.cat([x, -x])
+    square = x.square().sum(-1, keepdim=True)
+    share = torch.tensor(SHARES, dtype=torch.float64).log()
+    parts = share - 0.5 * square / scales.square() - d * scales.log() - 0.5 * d * math.log(2 * math.pi)
+    # the memory order in which the sums over points run
+    return from_planes(x.mT.contiguous()[:, None]).squeeze(1), parts.logsumexp(-1)

@@ -1,0 +1,246 @@
+"""Are the columns of a stream in their units and signs? Stretches of windows are checked as :mod:`avtorch.io.validity`
+checks a log: the change of a level over a span against the integral of its rate over the same span.
+
+A stretch begins with a window and ends when it has been found right, or after LONGEST seconds that say nothing. Where
+it is found wrong, none of its windows is believed. Where samples are cut into blocks does not matter: rows are looked
+at window by window.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.inference.evidence import Rows
+from avtorch.inference.jerk import JerkStatistics
+from avtorch.inference.state import tensor_as
+from avtorch.io.consistency import MIN_SPANS, SPANS_S
+from avtorch.io.units import GRAVITY
+from avtorch.io.validity import ACCEL_FACTORS, SPEED_FACTORS, WITNESS
+
+RATES = (("position", "speed"), ("speed", "accel"), ("accel", "jerk"))
+"""A level and its rate, of the columns that forms read."""
+COMMAND = (0.02, 3.5)
+"""Gains that are believed; a log's limit is lower, but ten seconds of a real race car came out at 3.2."""
+LOOKS_S = (9.5, 19.0, 38.0)
+"""Seconds of a stretch after which it is looked at; it is not kept for longer than the last."""
+DELAYS_S = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+"""Delays [s] of the response to a command that are tried."""
+STEP_S = 0.05
+"""Rows kept of a stretch are this far apart [s] or farther; integrals over them are made from all rows."""
+SURE = 0.95
+"""Correlation from which a scale is believed; a log, which is asked once and not every ten seconds, takes less."""
+BREAK_S = 2.0
+"""Time without rows [s] behind which a stretch begins anew."""
+SWAPPED = 8.0
+"""Standard errors by which both coefficients of the jerk must be negative, and nine tenths of it explained."""
+_HINTS = {
+    ("speed", "accel"): {f"speed is in {k}": v for k, v in SPEED_FACTORS.items()}
+    | {f"accel is in {k}": v for k, v in ACCEL_FACTORS.items()},
+    ("accel", "jerk"): {"accel is in g": 1 / GRAVITY, "accel is in cm/s2": 100.0, "jerk is in g/s": GRAVITY},
+    ("position", "speed"): {"speed is in km/h": 1 / 3.6, "position is in km": 0.001},
+    ("speed", "accel_cmd"): {"accel_cmd is in g": GRAVITY, "accel_cmd is in cm/s2": 0.01, "speed is in km/h": 3.6},
+    ("accel", "accel_cmd"): {"accel_cmd is in g": GRAVITY, "accel_cmd is in cm/s2": 0.01, "accel is in cm/s2": 100.0},
+}
+
+
+class Pair(NamedTuple):
+    """A level, or the integral of ``level`` if ``integrated``, that should change as the integral of ``rate`` does."""
+
+    level: str
+    rate: str
+    integrated: bool
+    limits: tuple[float, float]
+    delays: tuple[float, ...]
+
+
+class StreamUnits:
+    """The present stretch of a stream, and the belief before it.
+
+    Args:
+        columns: those of the form.
+        vehicles: how many.
+    """
+
+    def __init__(self, columns: tuple[str, ...], vehicles: int) -> None:
+        self.vehicles = vehicles
+        self.pairs = [Pair(a, b, False, WITNESS, (0.0,)) for a, b in RATES if a in columns and b in columns]
+        if "accel_cmd" in columns and ("speed" in columns or "accel" in columns):
+            level = "speed" if "speed" in columns else "accel"
+            self.pairs.append(Pair(level, "accel_cmd", level == "accel", COMMAND, DELAYS_S))
+        self.columns = tuple(dict.fromkeys(name for pair in self.pairs for name in (pair.level, pair.rate)))
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin a stretch with the next window."""
+        self.rows: dict[str, Tensor] = {}
+        self.sums: Tensor | None = None
+        self.looks = 0
+        self.before: dict[str, Any] | None = None
+
+    def take(self, rows: Rows, belief: dict[str, Any]) -> None:
+        """Take in a window of rows, which ``belief`` has not seen yet.
+
+        Raises:
+            InputError: that names columns and vehicle, where the stretch proves a unit or sign wrong.
+        """
+        if not self.pairs or not len(rows["time"]):
+            return
+        breaks = (rows["time"].diff() > BREAK_S).nonzero().squeeze(-1)
+        if len(breaks):
+            begin = int(breaks[-1]) + 1
+            rows = {name: value[..., begin:] for name, value in rows.items()}
+        if self.before is not None and (len(breaks) or float(rows["time"][0] - self.rows["time"][-1]) > BREAK_S):
+            self.clear()
+        if self.before is None:
+            self.before = belief
+        self._append(rows)
+        time = self.rows["time"]
+        if float(time[-1] - time[0]) < LOOKS_S[self.looks]:
+            return
+        self.looks += 1
+        sure = [self._judge(pair) for pair in self.pairs]
+        self._judge_swap()
+        if all(sure) or self.looks == len(LOOKS_S):
+            self.clear()
+
+    def _append(self, rows: Rows) -> None:
+        """Integrals over all rows, kept at every STEP_S of them."""
+        time, usable = rows["time"], rows["usable"]
+        if {"accel_cmd", "accel", "jerk"} <= set(self.columns):
+            statistics = JerkStatistics.from_samples(rows["accel"], rows["accel_cmd"], rows["jerk"], usable)
+            sums = torch.stack([getattr(statistics, name) for name in ("n", "jj", "aj", "uj", "aa", "au", "uu")])
+            self.sums = sums if self.sums is None else self.sums + sums
+        # a masked row may hold anything, also NaN
+        clean = {name: torch.where(usable, rows[name], 0.0) for name in self.columns}
+        last = {name: value[..., -1:] for name, value in self.rows.items()}
+        if last:
+            time = torch.cat([last["time"], time])
+            usable = torch.cat([last["usable"] > 0, usable], -1)
+            clean = {name: torch.cat([last[name], value], -1) for name, value in clean.items()}
+        steps = time.diff()
+        usual = steps.median() if len(steps) else torch.tensor(math.inf)
+        lost = ~(usable[:, 1:] & usable[:, :-1]) | (steps > torch.clamp(3 * usual, min=0.1))
+        new = {"time": time, "usable": usable.double(), **clean}
+        parts = {"lost": lost.double()}
+        parts |= {f"total {name}": 0.5 * (x[:, 1:] + x[:, :-1]) * steps for name, x in clean.items()}
+        for name, part in parts.items():
+            begin = last[name] if last else torch.zeros(len(usable), 1, dtype=torch.float64)
+            new[name] = torch.cat([begin, begin + part.cumsum(-1)], -1)
+        every = max(1, int(STEP_S / float(usual) + 1e-6)) if bool(usual > 0) else 1
+        # the last row always: the next window goes on from it
+        kept = torch.tensor(sorted({*range(1 if last else 0, len(time), every), len(time) - 1}))
+        self.rows = {
+            name: torch.cat([self.rows[name], value[..., kept]], -1) if last else value[..., kept]
+            for name, value in new.items()
+        }
+
+    def _judge(self, pair: Pair) -> bool:
+        """Whether the stretch is sure about ``pair`` for every vehicle; raises InputError where one has it wrong."""
+        found = [self._compare(pair, span) for span in SPANS_S]
+        slope, correlation = (torch.cat(x) for x in zip(*found, strict=True))  # (span x delay, vehicle)
+        # a periodic drive correlates as strongly, with the other sign, half a period off: the agreeing sign goes first
+        best = (correlation.abs() + (correlation > 0.5)).argmax(0, keepdim=True)
+        slope, correlation = slope.gather(0, best)[0], correlation.gather(0, best)[0]
+        sure = correlation.abs() >= SURE
+        wrong = sure & ~((slope >= pair.limits[0]) & (slope <= pair.limits[1]))
+        for v in wrong.nonzero().squeeze(-1).tolist():
+            moves = f"{pair.level} answers with" if pair.integrated else f"{pair.level} changes"
+            told = f"{moves} {float(slope[v]):.3g} times what {pair.rate} says"
+            if float(slope[v]) < 0:
+                raise self._refusal(v, pair.level, pair.rate, f"{told}, so one has the wrong sign")
+            hints = _HINTS[pair.level, pair.rate]
+            near = min(hints, key=lambda name: abs(math.log(float(slope[v]) / hints[name])))
+            raise self._refusal(v, pair.level, pair.rate, f"{told}, so their units differ; perhaps {near}")
+        return bool(sure.all())
+
+    def _compare(self, pair: Pair, span: float) -> tuple[Tensor, Tensor]:
+        """Slope and correlation of level on rate for every delay, ``(delay, vehicle)``; a correlation of 0: unknown."""
+        rows, time = self.rows, self.rows["time"]
+        starts = torch.arange(float(time[0]) + max(pair.delays), float(time[-1]) - span, span / 4, dtype=time.dtype)
+        delays = torch.tensor(pair.delays, dtype=time.dtype)[:, None]
+        if len(starts) < 2:
+            return torch.zeros(2, len(delays), self.vehicles, dtype=time.dtype).unbind(0)  # type: ignore[return-value]
+        level = rows[f"total {pair.level}" if pair.integrated else pair.level]
+        starts = starts.expand(len(delays), -1)
+
+        def change(x: Tensor, begin: Tensor, end: Tensor) -> Tensor:
+            return _at(time, x, end) - _at(time, x, begin)  # (vehicle, delay, start)
+
+        whole = change(rows["lost"], starts - delays, starts + span) < 0.5
+        x = change(rows[f"total {pair.rate}"], starts - delays, starts + span - delays)
+        y = change(level, starts, starts + span)
+        count = whole.sum(-1)
+
+        def mean(value: Tensor) -> Tensor:
+            return torch.where(whole, value, 0.0).sum(-1) / count.clamp_min(1)
+
+        x, y = x - mean(x)[..., None], y - mean(y)[..., None]
+        xx, xy, yy = mean(x.square()), mean(x * y), mean(y.square())
+        moves = (xx > 1e-12) & (yy > 1e-12) & (count >= 4 * MIN_SPANS - 4)
+        correlation = torch.where(moves, xy / (xx * yy).clamp_min(1e-300).sqrt(), 0.0)
+        # as in a log: the slope by which the two would be alike in size, its sign that of the correlation
+        slope = torch.where(moves, correlation * (yy / xx.clamp_min(1e-300)).sqrt(), 1.0)
+        return slope.mT, correlation.mT
+
+    def _judge_swap(self) -> None:
+        """Least squares of the jerk on ``(-accel, accel_cmd)``: a lag and gain that are both negative are swapped."""
+        if self.sums is None:
+            return
+        statistics = JerkStatistics(*self.sums)
+        lag, gain, noise = statistics.least_squares()
+        determinant = (statistics.aa * statistics.uu - statistics.au.square()).clamp_min(1e-300)
+        enough = noise.square() * statistics.n < 0.1 * statistics.jj
+        spread = noise / determinant.sqrt()
+        by_lag, by_gain = lag / (spread * statistics.uu.sqrt()), gain / (spread * statistics.aa.sqrt())
+        swapped = enough & (by_lag < -SWAPPED) & (by_gain < -SWAPPED)
+        for v in swapped.nonzero().squeeze(-1).tolist():
+            raise self._refusal(v, "accel", "accel_cmd", "accel leads accel_cmd, so the two may be swapped")
+
+    def _refusal(self, vehicle: int, one: str, other: str, told: str) -> InputError:
+        start, end = float(self.rows["time"][0]), float(self.rows["time"][-1])
+        which = f" of vehicle {vehicle}" if self.vehicles > 1 else ""
+        return InputError(
+            f"stream: columns {one!r} and {other!r}{which}, {start:.10g} to {end:.10g} s: {told}; nothing learnt in "
+            f"this time is kept"
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain tensors and numbers."""
+        return {"rows": dict(self.rows), "sums": self.sums, "looks": self.looks, "before": self.before}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from :meth:`state_dict`.
+
+        Raises:
+            InputError: for other columns, shapes, types or numbers than a stretch has.
+        """
+        if not isinstance(state, dict) or set(state) != {"rows", "sums", "looks", "before"}:
+            raise InputError("state: units: not what a stream saves")
+        rows, sums, looks, before = (state[key] for key in ("rows", "sums", "looks", "before"))
+        names = {"time", "usable", "lost", *self.columns, *(f"total {name}" for name in self.columns)}
+        if not isinstance(rows, dict) or (rows and set(rows) != names) or bool(rows) != (before is not None):
+            raise InputError(f"state: units: needs the rows {', '.join(sorted(names))}, or none")
+        if type(looks) is not int or not 0 <= looks < len(LOOKS_S):
+            raise InputError(f"state: units: looks: found {str(looks)[:40]}, needs a whole number from 0")
+        time = rows.get("time")
+        if rows and (type(time) is not Tensor or time.ndim != 1 or not len(time)):
+            raise InputError("state: units: rows.time: needs a tensor of shape (time,)")
+        for name, value in rows.items():
+            shape = (len(rows["time"]),) if name == "time" else (self.vehicles, len(rows["time"]))
+            tensor_as(value, torch.float64, shape, f"state: units: rows.{name}")
+        if sums is not None:
+            tensor_as(sums, torch.float64, (7, self.vehicles), "state: units: sums")
+        self.rows = {name: value.clone() for name, value in rows.items()}
+        self.sums, self.looks, self.before = sums, looks, before
+
+
+def _at(time: Tensor, x: Tensor, when: Tensor) -> Tensor:
+    """``x`` ``(vehicle, time)`` at ``when`` ``(...)``, linear between rows; returns ``(vehicle, ...)``."""
+    after = torch.searchsorted(time, when.contiguous()).clamp(1, len(time) - 1)
+    share = ((when - time[after - 1]) / (time[after] - time[after - 1])).clamp(0, 1)
+    return torch.lerp(x[:, after - 1], x[:, after], share.expand(len(x), *when.shape))

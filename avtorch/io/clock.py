@@ -1,0 +1,106 @@
+"""Time from the log's start: what every computation uses, so that where a clock begins to count changes no answer.
+
+A float64 near 1.7e9, the seconds since 1970, comes in steps of 2.4e-7 s: differences of such stamps are off by as much,
+and a clock of exactly 100 Hz shows steps of 0.0099999 and 0.0100002 s. Stamps this coarse still hold the decimals that
+the recorder wrote. So a difference from the first stamp is rounded to the decimals that the stamps resolve, which gives
+a recorder's microseconds back exactly, and rows that are even up to that rounding are made even.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+UNIX_S = (946_684_800.0, 4_102_444_800.0)
+"""Stamps in here may count seconds since 1970: the years 2000 to 2099."""
+ROUNDING_S = 1e-5
+"""More than rounding does to a difference of stamps [s], and less than any step between rows."""
+_FINEST = 12
+_ANOTHER_CLOCK_S = 1e6  # between two segments, some twelve days: the clock was set, not the car parked
+_SET_ANEW_S = 1.0
+_EVEN = 1e-9  # of a step: nobody sees it
+
+
+def decimals(largest: float) -> int:
+    """Decimals [of a second] that the difference of two stamps of up to `largest` [s] still tells.
+
+    Each stamp is rounded by half a step of float64, so the difference is off by up to a whole one: the nearest decimal
+    is the recorder's own where half a unit of it is more than that.
+    """
+    return min(_FINEST, math.floor(-math.log10(2.0 * float(np.spacing(max(abs(largest), 1.0))))))
+
+
+def since(stamps: Float, origin: float, *, largest: float | None = None) -> Float:
+    """`stamps` (row,) [s] as seconds from `origin`, free of the rounding of stamps of that size.
+
+    `largest`: size of the stamps where more are to be rounded alike. Stamps closer than the decimals tell are left
+    as the difference has them.
+    """
+    away = stamps - origin
+    if not len(stamps):
+        return away
+    size = max(float(np.abs(stamps).max()), abs(origin)) if largest is None else largest
+    told = np.round(away, decimals(size))
+    return away if bool(((np.diff(told) <= 0) & (np.diff(away) > 0)).any()) else told
+
+
+def since_start(stamps: Float, segment: NDArray[np.int64]) -> Float:
+    """Seconds (row,) from the first row of a log; `segment` (row,) numbers its drives, within each of which rows that
+    are even as far as the stamps tell become even.
+
+    A segment that starts more than `_ANOTHER_CLOCK_S` away has another clock: it goes on a second after the one before.
+    """
+    out = np.empty(len(stamps))
+    cuts = [0, *(np.flatnonzero(np.diff(segment)) + 1).tolist(), len(stamps)]
+    origin, ahead = (float(stamps[0]) if len(stamps) else 0.0), 0.0
+    for first, last in pairwise(cuts):
+        part = stamps[first:last]
+        if first == last:
+            continue
+        if first and abs(part[0] - stamps[first - 1]) > _ANOTHER_CLOCK_S:
+            origin, ahead = float(part[0]), float(out[first - 1]) + _SET_ANEW_S
+        size = max(float(np.abs(part).max()), abs(origin))
+        told = since(part, origin, largest=size)
+        out[first:last] = _even(told, 10.0 ** -decimals(size)) + ahead
+    return out
+
+
+def _even(time: Float, finest: float) -> Float:
+    """`time` (row,) on an even grid, some of whose rows may be lost, where it is off that only by its own rounding."""
+    steps = np.diff(time)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    if usual <= 0:
+        return time
+    number = np.concatenate([[0.0], np.cumsum(np.rint(steps / usual))])
+    step = (time[-1] - time[0]) / max(number[-1], 1.0)
+    even = time[0] + number * step
+    off = float(np.abs(even - time).max())
+    return even if _EVEN * usual < off <= finest else time
+
+
+def clock_words(stamp: float) -> str:
+    """A stamp [s] for people: the number, and the date that it is if it counts from 1970."""
+    number = f"{round(stamp, decimals(stamp)):.15g} s"
+    if not UNIX_S[0] <= stamp < UNIX_S[1]:
+        return number
+    date = datetime.fromtimestamp(math.floor(stamp), UTC)
+    return f"{number}, as Unix time {date:%Y-%m-%d %H:%M:%S} UTC"
+
+
+def from_start(entries: Sequence[Mapping[str, Any]], epoch_s: float) -> list[dict[str, Any]]:
+    """Windows or alerts of an answer, their `start_s`, `end_s` and `time_s` counted from a log's start at `epoch_s`."""
+    keys = ("start_s", "end_s", "time_s")
+    return [{**x, **{key: round(x[key] - epoch_s, decimals(epoch_s)) for key in keys if key in x}} for x in entries]
+
+
+def time_label(epoch_s: float) -> str:
+    """Of the time axis of a picture."""
+    return "time [s]" if epoch_s == 0 else f"time [s] from the log's start at {clock_words(epoch_s)}"

@@ -1,0 +1,79 @@
+"""Files from outside, opened with care: regular files only, of a bounded size, and one line for everything else."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+from avtorch.errors import InputError, printable
+
+_KINDS = {
+    stat.S_IFDIR: "a directory",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
+_PATH = 200  # characters of a path in a message
+
+
+def place(path: str | os.PathLike[str]) -> str:
+    """A path as messages, notes and answers show it: escaped, and cut in its middle beyond 200 characters."""
+    return printable(os.fspath(path), _PATH)
+
+
+def read_regular(path: str | os.PathLike[str], *, most: int, need: str, links: bool = True) -> bytes:
+    """The content of a regular file of up to `most` bytes; `need` says in messages what should lie there.
+
+    The checks look at the opened file, so it cannot be exchanged in between, and opening never waits: a pipe without a
+    writer, a device or a directory is refused at once. `links` False refuses a symbolic link too. Raises InputError.
+    """
+    shown = place(path)
+    # O_NONBLOCK: a pipe would wait for its writer; both flags are missing on Windows, where neither is needed
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+    if not links:
+        flags |= getattr(os, "O_NOFOLLOW", 0)
+    try:
+        handle = os.open(path, flags)
+    except FileNotFoundError:
+        raise InputError(f"{shown}: no such file") from None
+    except (OSError, ValueError) as fault:
+        raise InputError(f"{shown}: {_why(path, fault, links)}; {need} is needed") from None
+    try:
+        info = os.fstat(handle)
+        if not stat.S_ISREG(info.st_mode):
+            kind = _KINDS.get(stat.S_IFMT(info.st_mode), "no regular file")
+            raise InputError(f"{shown}: is {kind}; {need} is needed")
+        # some files of the system say that they hold nothing: what is read counts, not what is said
+        raw = b"" if info.st_size > most else _read(handle, most + 1)
+    except OSError as fault:
+        raise InputError(f"{shown}: cannot be read ({fault.strerror or type(fault).__name__})") from None
+    finally:
+        os.close(handle)
+    size = max(info.st_size, len(raw))
+    if size > most:
+        raise InputError(f"{shown}: has {size:,} bytes; needs {most:,} at most")
+    return raw
+
+
+def _read(handle: int, most: int) -> bytes:
+    """Up to `most` bytes, in pieces: asked for at once, they would be allocated at once."""
+    pieces, left = [], most
+    while left > 0 and (piece := os.read(handle, min(left, 2**20))):
+        pieces.append(piece)
+        left -= len(piece)
+    return b"".join(pieces)
+
+
+def _why(path: str | os.PathLike[str], fault: Exception, links: bool) -> str:
+    if isinstance(fault, OSError):
+        if not links and fault.errno == errno.ELOOP and Path(path).is_symlink():
+            return "is a symbolic link"
+        if fault.errno == errno.ENXIO:
+            return "is a socket or a device"
+        if fault.errno == errno.EISDIR or (fault.errno == errno.EACCES and Path(path).is_dir()):
+            return "is a directory"
+        return f"cannot be read ({fault.strerror or type(fault).__name__})"
+    return f"cannot be read ({printable(str(fault), 80)})"

@@ -1,0 +1,180 @@
+"""State files that are believed only if they are whole: a checksum, a schema, and what the content belongs to.
+
+A sealed file is JSON. Its first line holds the schema and the SHA-256 of everything else, so that the checksum is
+compared before anything is parsed:
+
+    {"schema": "avtorch.fits/2", "sha256": "9f…",
+     "of": {…},
+     "content": {…}
+    }
+
+With bytes as content, they follow after the second line. The checksum finds damage and careless edits; it is no
+signature, and whoever reads a file still checks the shape of its content.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import re
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+from avtorch.errors import InputError
+from avtorch.io.answers import json_text
+from avtorch.io.atomic import atomic
+
+MOST = 64 * 2**20
+"""A state file has no more bytes than this, unless its reader says otherwise."""
+
+REMEDY = "remove it, or use another folder"
+
+_FIRST = re.compile(rb'\{"schema": "([a-z0-9_./-]{1,80})", "sha256": "([0-9a-f]{64})",')
+
+
+class Damaged(InputError):
+    """A regular file whose content cannot be believed; what can be computed again may be."""
+
+
+class Sealed(NamedTuple):
+    """What a file belongs to (`of`), and its `content`: from JSON, or bytes."""
+
+    of: dict[str, Any]
+    content: Any
+
+
+def write_sealed(path: Path, content: Any, *, schema: str, of: Mapping[str, Any]) -> None:
+    """Write `content` (see `json_text` for what it may hold, or bytes) so that `path` is whole or as it was.
+
+    `of`: what it belongs to. Raises `InputError` where `path` cannot be written, or is a symlink, a folder, a device.
+    """
+    _free_or_regular(path)
+    if isinstance(content, bytes):
+        line = json_text({"of": of, "bytes": len(content)}, indent=None, ascii_only=True)
+        rest = line[1:].encode() + b"\n" + content
+    else:
+        # a file's name may hold what UTF-8 cannot say
+        rest = json_text({"of": of, "content": content}, ascii_only=True)[1:].lstrip().encode() + b"\n"
+    first = f'{{"schema": "{schema}", "sha256": "{_checksum(schema.encode(), rest)}",\n'
+    with atomic(path, binary=True) as stream:
+        stream.write(first.encode() + rest)
+
+
+def read_sealed(path: Path, *, schema: str, most: int = MOST, remedy: str = REMEDY) -> Sealed:
+    """Read what `write_sealed` wrote from JSON content.
+
+    `most`: bytes, above which the file is not read. `remedy`: what a user can do, the end of every message. Raises
+    `InputError` for what is no regular file, `Damaged` for anything but a file of this `schema` as it was written.
+    """
+    rest = _verified(path, schema, most, remedy)
+    found = _parsed(b"{" + rest, path, remedy)
+    if not isinstance(found, dict) or set(found) != {"of", "content"} or not isinstance(found["of"], dict):
+        _refuse(path, f"is no {schema} inside", remedy)
+    return Sealed(found["of"], found["content"])
+
+
+def read_sealed_bytes(path: Path, *, schema: str, most: int = MOST, remedy: str = REMEDY) -> Sealed:
+    """The same of a file with bytes as its content."""
+    line, _, content = _verified(path, schema, most, remedy).partition(b"\n")
+    found = _parsed(b"{" + line, path, remedy)
+    if not isinstance(found, dict) or set(found) != {"of", "bytes"} or not isinstance(found["of"], dict):
+        _refuse(path, f"is no {schema} inside", remedy)
+    if found["bytes"] != len(content):
+        _refuse(path, f"holds {len(content)} bytes, not the {str(found['bytes'])[:20]} it names", remedy)
+    return Sealed(found["of"], content)
+
+
+def regular_bytes(path: Path, most: int, *, remedy: str = REMEDY) -> bytes:
+    """All bytes of a regular file, at most `most` of them.
+
+    Raises `InputError` for a symlink, a folder, a FIFO, a device, a file that is missing, not readable or too large;
+    none of these is waited for or read.
+    """
+    try:
+        kind = os.lstat(path).st_mode
+        if not stat.S_ISREG(kind):
+            raise InputError(f"{path}: is {_kind(kind)}, needs a regular file; {remedy}")
+        # the file may have been exchanged since: the one that is open counts
+        flags = os.O_RDONLY | sum(
+            getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY")
+        )
+        with os.fdopen(os.open(path, flags), "rb") as stream:
+            facts = os.fstat(stream.fileno())
+            if not stat.S_ISREG(facts.st_mode):
+                raise InputError(f"{path}: is {_kind(facts.st_mode)}, needs a regular file; {remedy}")
+            # a read sets aside all that it is asked for: no more than the file says it has, and a byte to notice more
+            content = stream.read(facts.st_size + 1) if facts.st_size <= most else None
+            if content is not None and len(content) > facts.st_size:
+                raise InputError(f"{path}: grows while it is read, or says nothing of its size; {remedy}")
+    except (OSError, ValueError) as fault:
+        if isinstance(fault, InputError):
+            raise
+        told = fault.strerror if isinstance(fault, OSError) and fault.strerror else fault
+        raise InputError(f"{path}: cannot be read ({told}); {remedy}") from None
+    if content is None or len(content) > most:
+        _refuse(path, f"is larger than {most / 2**20:.0f} MiB, which no file of its kind is", remedy)
+    return content
+
+
+def _verified(path: Path, schema: str, most: int, remedy: str) -> bytes:
+    """What follows the first line, once the checksum is found right."""
+    first, newline, rest = regular_bytes(path, most, remedy=remedy).partition(b"\n")
+    match = _FIRST.fullmatch(first)
+    if not match or not newline:
+        _refuse(path, "is damaged, or from an earlier avtorch that wrote no checksum", remedy)
+    if _checksum(match[1], rest) != match[2].decode():
+        _refuse(path, "is damaged or was changed by hand: its checksum is not that of its content", remedy)
+    if match[1].decode() != schema:
+        _refuse(path, f"holds {match[1].decode()}, needs {schema}", remedy)
+    return rest
+
+
+def _checksum(schema: bytes, rest: bytes) -> str:
+    state = hashlib.sha256(schema + b"\n")
+    state.update(rest)
+    return state.hexdigest()
+
+
+def _parsed(text: bytes, path: Path, remedy: str) -> Any:
+    try:
+        return json.loads(
+            text.decode("utf-8"), parse_float=_finite, parse_constant=_finite, object_pairs_hook=_without_repeats
+        )
+    except (ValueError, RecursionError):
+        _refuse(path, "holds no JSON of finite numbers", remedy)
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(text)
+    return number
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a key twice")
+    return found
+
+
+def _free_or_regular(path: Path) -> None:
+    try:
+        kind = os.lstat(path).st_mode
+    except (OSError, ValueError):
+        return  # nothing there; whatever else is wrong, the writer says
+    if not stat.S_ISREG(kind):
+        raise InputError(f"{path}: is {_kind(kind)}, needs a regular file or a free name")
+
+
+def _kind(mode: int) -> str:
+    kinds = {stat.S_IFLNK: "a symlink", stat.S_IFDIR: "a folder", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
+    return kinds.get(stat.S_IFMT(mode), "a device")
+
+
+def _refuse(path: Path, what: str, remedy: str) -> NoReturn:
+    raise Damaged(f"{path}: {what}; {remedy}")

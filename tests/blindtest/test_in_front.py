@@ -1,0 +1,105 @@
+"""An effect in front of a recorded car: the simulator with the effect answers the new command as the car did the old.
+
+The effects of `avtorch.gap` share no code with the rewriting, so the two are held against each other.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from avtorch.blindtest.in_front import IN_FRONT, put_in_front
+from avtorch.errors import InputError
+from avtorch.gap import Drive, plant
+from avtorch.io import Log
+
+T_L, K_L, RATE = 0.4, 0.9, 100
+FORCES = ("constant_resistance", "aerodynamic_drag")
+COMMANDS = ("dead_time", "dead_band", "backlash", "brake_throttle_asymmetry", "gain_change", "speed_dependent_gain")
+
+
+def recorded(seconds: float = 60.0, speed0: float = 18.0) -> Log:
+    """A bare GLVD car, its command smooth enough that a force's slope is the slope between two rows."""
+    time = torch.arange(round(seconds * RATE), dtype=torch.float64) / RATE
+    command = 0.9 * torch.sin(0.5 * time) + 0.5 * torch.sin(1.3 * time + 1.0)
+    response = plant([], T_L=T_L, K_L=K_L).response(Drive(time, command, torch.full_like(time, speed0)))
+    return Log.from_arrays(
+        time=time.numpy(), accel_cmd=command.numpy(), accel=response.accel.numpy(), speed=response.speed.numpy()
+    )
+
+
+def answered(log: Log, described: str) -> np.ndarray:
+    """Acceleration of the simulator with an effect, its commands settled as the recorded car's were."""
+    drive = Drive(torch.as_tensor(log.time), torch.as_tensor(log.accel_cmd), torch.as_tensor(log.speed), log.accel[0])
+    car = plant([], baseline=described, T_L=T_L, K_L=K_L)
+    return car.prepared(drive).response(drive).accel.numpy()
+
+
+@pytest.mark.parametrize("effect", [*COMMANDS, *FORCES])
+def test_the_simulator_with_the_effect_answers_as_the_car_did(effect: str) -> None:
+    log = recorded()
+    changed, truth = put_in_front(log, effect, T_L=T_L, K_L=K_L, seed=3)
+    values = truth | ({"ramp_s": 1e-3} if effect == "gain_change" else {})
+    text = ", ".join(f"{effect}.{key}={value!r}" for key, value in values.items())
+    with_effect, without = answered(changed, text), answered(changed, f"{effect}={_neutral(effect)}")
+    settled = slice(5 * RATE, -RATE)
+    off = np.abs(with_effect - changed.accel)[settled]
+    there = np.abs(without - changed.accel)[settled]
+    # a force's slope is taken between rows and of a smoothed speed, a play's side where the command turns
+    assert np.sqrt(np.mean(off**2)) < 0.03 * np.sqrt(np.mean(there**2))
+
+
+def _neutral(effect: str) -> float:
+    from avtorch.gap.chain.effect import effect_class
+
+    return effect_class(effect).parameters[0].neutral
+
+
+@pytest.mark.parametrize("effect", IN_FRONT)
+def test_the_response_stays_real(effect: str) -> None:
+    log = recorded(30.0)
+    changed, truth = put_in_front(log, effect, T_L=T_L, K_L=K_L, seed=1)
+    assert truth
+    assert all(np.isfinite(list(truth.values())))
+    rows = changed.rows
+    np.testing.assert_array_equal(changed.time, log.time[:rows])
+    np.testing.assert_array_equal(changed.speed, log.speed[:rows])
+    sensor = effect.startswith("sensor") or effect == "outliers"
+    same = np.array_equal(changed.accel, log.accel[:rows]), np.array_equal(changed.accel_cmd, log.accel_cmd[:rows])
+    assert same == (not sensor, sensor)
+    again, _ = put_in_front(log, effect, T_L=T_L, K_L=K_L, seed=1)
+    np.testing.assert_array_equal(again.accel_cmd, changed.accel_cmd)
+    np.testing.assert_array_equal(again.accel, changed.accel)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [({"effect": "wings"}, "effect: found 'wings'"), ({"size": 0.0}, "size: found 0"), ({"T_L": np.nan}, "T_L: found")],
+)
+def test_what_it_refuses(change: dict, told: str) -> None:
+    arguments = {"effect": "dead_time", "T_L": T_L, "K_L": K_L} | change
+    with pytest.raises(InputError, match=told):
+        put_in_front(recorded(5.0), arguments.pop("effect"), **arguments)
+
+
+def test_a_log_without_the_signal_is_refused() -> None:
+    log = recorded(5.0)
+    bare = Log.from_arrays(time=log.time, accel_cmd=log.accel_cmd, accel=log.accel)
+    with pytest.raises(InputError, match="has no speed"):
+        put_in_front(bare, "aerodynamic_drag", T_L=T_L, K_L=K_L)
+    blind = Log.from_arrays(time=log.time, accel_cmd=log.accel_cmd, speed=log.speed)
+    with pytest.raises(InputError, match="has no accel,"):
+        put_in_front(blind, "sensor_bias", T_L=T_L, K_L=K_L)
+
+
+def test_on_a_recording(data_dir: Path) -> None:
+    log = Log.read(data_dir / "genesis" / "lap1.csv")
+    for effect in IN_FRONT:
+        if effect.startswith("sensor") or effect == "outliers":
+            continue
+        changed, _ = put_in_front(log, effect, T_L=0.3, K_L=0.95, size=0.8)
+        assert np.isfinite(changed.accel_cmd).all()
+        np.testing.assert_array_equal(changed.speed, log.speed[: changed.rows])

@@ -1,0 +1,58 @@
+"""`avtorch diagnose` from a file to the page with nothing stood in for: Unix time, overrides, a second run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avtorch.cli import main
+from avtorch.io import Log
+from tests.overridden import taken_over
+
+EPOCH = 1.7e9
+
+
+@pytest.fixture
+def drive(tmp_path: Path, rotating_seed: int) -> Path:
+    """50 s of a car 0.2 s late, stamped by a Unix clock; a driver acts against the command for 2 s of them."""
+    rng = np.random.default_rng(rotating_seed)
+    log = taken_over(seconds=50.0, overrides=[(24.0, 26.0)], rng=rng, delay_s=0.2)
+    path = tmp_path / "drive.csv"
+    columns = {"accel_cmd": log.accel_cmd, "accel": log.accel, "speed": log.speed, "engaged": log.engaged.astype(int)}
+    Log.from_arrays(time=log.time + EPOCH, **columns).write(path)
+    return path
+
+
+def test_from_a_file_to_the_page(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    command = [
+        "diagnose",
+        str(drive),
+        "--effects",
+        "dead_time,sensor_bias",
+        "--no-pairs",
+        "--posterior",
+        "laplace",
+        "--out",
+        str(out),
+    ]
+    assert main(command) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "2023-11-14" in told
+    assert "1 return to engaged" in told
+    assert "lacks dead_time" in told
+    answer = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
+    assert answer["verdict"]["names"] == ["dead_time"]
+    delay = next(e for e in answer["effects"] if e["name"] == "dead_time")["parameters"]["delay_s"]
+    # five standard errors
+    assert abs(delay["mean"] - 0.2) < 5 * delay["sd"]
+    assert answer["not_tried"]["pairs"] == "none"
+    assert "aerodynamic_drag" in answer["not_tried"]["effects"]
+    assert "dead_time" in (out / "report.html").read_text(encoding="utf-8")
+    # the same command again goes on from kept fits, to the same answer
+    before = (out / "diagnosis.json").read_bytes()
+    assert main([*command, "--quiet"]) == 0
+    assert (out / "diagnosis.json").read_bytes() == before

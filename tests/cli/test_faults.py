@@ -1,0 +1,323 @@
+"""Whatever fails while a command writes: its folder holds the whole earlier answer or the whole new one.
+
+What is computed and drawn is stood in for, so that a command runs in milliseconds and its writing can fail at every
+call; the reading of arguments, every check, and all that writes is the command's own. `of` names which of two answers
+the stand-ins give.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import avtorch.decision.estimation
+import avtorch.decision.supervisor
+import avtorch.experiment
+import avtorch.follower.words
+import avtorch.gap.compare
+import avtorch.paper
+import avtorch.plots.style
+import avtorch.report
+import avtorch.results
+import avtorch.trial.work
+import avtorch.validation
+import avtorch.vehicle.stability
+from avtorch import trial
+from avtorch.blindtest import draw_case
+from avtorch.cli import main
+from avtorch.gap import DeadTime, plant
+from tests.cli.test_diagnose import answer, columns, write
+from tests.faulty_disk import disk, fails, interrupts, tree, visible
+
+STATE = frozenset({"fits.json", "fits_of.json", "trial.json"})
+"""What is kept to go on with; it belongs to no answer."""
+
+
+class Command:
+    """A command with stand-ins for its work: the line that gives the `old` answer, and the one for the `new`."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        self.monkeypatch, self.tmp_path, self.out = monkeypatch, tmp_path, tmp_path / "out"
+        self.of = "old"
+        self.lines: dict[str, list[str]] = {}
+        for name in dir(avtorch.plots):
+            if name.endswith("_figure"):
+                self.stand_in(avtorch.plots, name, lambda *_, name=name, **__: f"{name} of {self.of}")
+        self.stand_in(avtorch.plots.style, "_png", lambda figure: figure.encode())
+        monkeypatch.setattr("os.fsync", lambda handle: None)
+
+    def stand_in(self, module: Any, name: str, function: Callable) -> None:
+        self.monkeypatch.setattr(module, name, function)
+
+    def once(self, module: Any, name: str) -> None:
+        """Compute each of the two answers once."""
+        function, kept = getattr(module, name), {}
+
+        def stand_in(*args: Any, **more: Any) -> Any:
+            if self.of not in kept:
+                kept[self.of] = function(*args, **more)
+            return kept[self.of]
+
+        self.stand_in(module, name, stand_in)
+
+    def run(self, which: str) -> int:
+        self.of = which
+        return main([*self.lines[which], "--quiet", "--out", str(self.out)])
+
+
+def stability(c: Command) -> None:
+    c.lines = {"old": ["stability"], "new": ["stability", "--T", "0.7"]}
+    c.once(avtorch.results, "stability_answer")
+    c.once(avtorch.vehicle.stability, "region")
+
+
+def run(c: Command) -> None:
+    line = ["run", "--duration", "4", "--change-at", "2", "--strategy", "none"]
+    c.lines = {"old": [*line, "--seed", "1"], "new": [*line, "--seed", "2"]}
+    c.once(avtorch.vehicle.Leader, "default")
+    c.once(avtorch.decision.supervisor.Supervisor, "run")
+
+
+def estimate(c: Command) -> None:
+    line = ["estimate", write(c.tmp_path / "drive.csv", **columns()), "--estimator", "map"]
+    c.lines = {"old": line, "new": [*line, "--tau", "1.2"]}
+    c.once(avtorch.decision.estimation, "estimate")
+
+
+def diagnose(c: Command) -> None:
+    """The new answer has a plant, the old one has a manoeuvre besides what both have."""
+    line = ["diagnose", write(c.tmp_path / "drive.csv", **columns())]
+    c.lines = {"old": line, "new": line}
+    given = {"old": {"plant": None}, "new": {"plant": plant([DeadTime(0.182)])}}
+    module = ModuleType("avtorch.gap.diagnose")
+    module.diagnose = lambda logs, **_: answer(logs, **given[c.of])  # type: ignore[attr-defined]
+    c.monkeypatch.setitem(sys.modules, "avtorch.gap.diagnose", module)
+    manoeuvre = SimpleNamespace(time=np.zeros(1), command=np.zeros(1), speed=np.zeros(1))
+    ahead = {"old": SimpleNamespace(manoeuvre=manoeuvre, to_dict=lambda: None), "new": None}
+    c.stand_in(avtorch.experiment, "next_experiment", lambda *_, **__: ahead[c.of])
+    c.stand_in(sys.modules["avtorch.report.page"], "report_html", lambda *_, **__: f"page of {c.of}")
+
+
+@dataclass(frozen=True)
+class Followed:
+    """As much of a follower's diagnosis as the command needs."""
+
+    of: str
+    diagnosis: Any
+    conditional: tuple[str, ...] = ()
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"of": self.of}
+
+
+def follower(c: Command) -> None:
+    time = columns()["time"]
+    signals = {"time": time, "speed": 15 + np.sin(time), "spacing": 30 - np.sin(time), "lead_speed": 15 + np.cos(time)}
+    line = ["diagnose", write(c.tmp_path / "follower.csv", **signals), "--follower"]
+    c.lines = {"old": line, "new": line}
+    given = {"old": {"plant": plant([DeadTime(0.182)])}, "new": {"plant": None}}
+    c.stand_in(avtorch.follower, "diagnose_follower", lambda log, **_: Followed(c.of, answer([log], **given[c.of])))
+    c.stand_in(avtorch.follower.words, "loop_lines", lambda found: [found.of])
+    c.stand_in(sys.modules["avtorch.report.page"], "report_html", lambda *_, **__: f"page of {c.of}")
+
+
+def comparison(c: Command) -> None:
+    log = write(c.tmp_path / "drive.csv", **columns())
+    c.lines = {of: ["compare", log, log] for of in ("old", "new")}
+    told = lambda *_, **__: SimpleNamespace(why=c.of, car={}, gap={}, to_dict=lambda: {"why": c.of})  # noqa: E731
+    c.stand_in(avtorch.gap.compare, "compare", told)
+
+
+class Netcdf:
+    """Written by a library that raises its own errors."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    def to_netcdf(self, path: str) -> None:
+        try:
+            Path(path).write_text(self.text, encoding="utf-8")
+        except OSError as fault:
+            raise RuntimeError(f"NetCDF: HDF error: {fault}") from None
+
+
+def validate(c: Command) -> None:
+    """The new answer has no quadrature, hence fewer files."""
+    c.lines = {of: ["validate", "--synthetic", "--windows", "1"] for of in ("old", "new")}
+    names = {"old": ("sgld", "nuts", "quadrature"), "new": ("sgld", "nuts")}
+    pictures = {"old": ("marginals.png", "ecdf.png"), "new": ("marginals.png",)}
+    told = SimpleNamespace(
+        to_arviz=lambda: {name: Netcdf(f"{name} of {c.of}") for name in names[c.of]},
+        verdict=SimpleNamespace(agree=True),
+    )
+    c.once(avtorch.validation, "synthetic_windows")
+    c.stand_in(sys.modules["avtorch.validation.validate"], "check_installed", lambda: None)
+    c.stand_in(avtorch.validation, "validate", lambda *_, **__: told)
+    c.stand_in(avtorch.results, "validation_answer", lambda _: {"verdict": "agree", "why": c.of})
+    c.stand_in(avtorch.plots, "validation_figures", lambda _: {x: lambda x=x: f"{x} of {c.of}" for x in pictures[c.of]})
+    for name in ("validation_table", "validation_notes"):
+        c.stand_in(sys.modules["avtorch.cli.validate"], name, lambda _: "")
+
+
+def paper(c: Command) -> None:
+    """The new answer is of one experiment only."""
+    c.lines = {"old": ["paper", "all"], "new": ["paper", "gains"]}
+    pictures = {"old": ("gains.png", "platoon.png", "strategies_speed.png"), "new": ("gains.png",)}
+    c.monkeypatch.delenv("AVTORCH_DATA", raising=False)
+    c.once(avtorch.vehicle.Leader, "default")
+    told = SimpleNamespace(answer=lambda: {"of": c.of, "leaders": {}}, found={})
+    c.stand_in(avtorch.paper, "reproduce", lambda *_, **__: told)
+    c.stand_in(avtorch.plots, "paper_pictures", lambda _: {x: lambda x=x: f"{x} of {c.of}" for x in pictures[c.of]})
+    for name in ("counts_table", "rows_table", "missed"):
+        c.stand_in(sys.modules["avtorch.cli.paper"], name, lambda _: "")
+
+
+def blindtest(c: Command) -> None:
+    """The new answer is of one case more, which is drawn, answered and kept on the way."""
+    line = ["blindtest", "--seed", "3", "--rivals", "none", "--resume", "--n"]
+    c.lines = {"old": [*line, "1"], "new": [*line, "2"]}
+    c.stand_in(trial, "avtorch", lambda log: trial.reply(log, {"none": 1.0}, why="always"))
+    c.stand_in(sys.modules["avtorch.blindtest.score"], "bootstrap", lambda *_, **__: None)
+    clock = SimpleNamespace(perf_counter=lambda: 0.0, process_time=lambda: 0.0)
+    c.monkeypatch.setattr(avtorch.trial.work, "time", clock)
+    cases = cache(lambda index: draw_case(index, 3, seconds=60.0))
+    c.stand_in(avtorch.trial.work, "draw_case", lambda index, *_, **__: cases(index))
+
+
+QUICK = [stability, comparison]
+COMMANDS = [*QUICK, run, estimate, diagnose, follower, validate, paper, blindtest]
+
+
+@pytest.fixture(
+    params=[pytest.param(c, marks=[] if c in QUICK else [pytest.mark.slow], id=c.__name__) for c in COMMANDS]
+)
+def command(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
+    """With the old answer in its folder, which is kept beside it to begin from again."""
+    made = Command(monkeypatch, tmp_path)
+    request.param(made)
+    assert made.run("old") == 0
+    shutil.copytree(made.out, tmp_path / "before", symlinks=True)
+    return made
+
+
+class Answers:
+    """What the folder holds before and after."""
+
+    def __init__(self, command: Command) -> None:
+        self.command = command
+        self.old = self.seen()
+        assert command.run("new") == 0
+        self.new = self.seen()
+        assert self.old
+        assert self.old != self.new
+        self.again()
+        self.followed: set[tuple] = set()
+
+    def seen(self) -> dict[str, str]:
+        return visible(self.command.out, besides=STATE)
+
+    def again(self) -> None:
+        shutil.rmtree(self.command.out)
+        shutil.copytree(self.command.tmp_path / "before", self.command.out, symlinks=True)
+
+    def follow(self) -> None:
+        """The next run needs nobody's help, from all that lies there now; what has been tried is not tried again."""
+        lies = tree(self.command.out)
+        if lies in self.followed:
+            return
+        self.followed.add(lies)
+        assert self.command.run("new") == 0
+        assert self.seen() == self.new
+
+
+@pytest.mark.parametrize("onwards", [False, True], ids=["one call fails", "all fail from there on"])
+def test_a_disk_that_fails_at_the_nth_call(command: Command, onwards: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    answers = Answers(command)
+    capsys.readouterr()
+    refused = 0
+    for n in range(1, 2000):
+        with disk(command.out, fails(n, onwards=onwards), reads=False) as calls:
+            code = command.run("new")
+        said = capsys.readouterr()
+        assert said.out == ""
+        if code == 0:
+            assert said.err == ""
+            assert answers.seen() == answers.new
+        else:
+            refused += 1
+            assert code == 2
+            assert said.err.startswith("avtorch: ")
+            assert said.err.count("\n") == 1
+            assert ".avtorch" not in said.err
+            assert answers.seen() == (answers.new if "is there" in said.err else answers.old)
+        answers.follow()
+        answers.again()
+        if len(calls) < n:
+            break
+    else:
+        raise AssertionError("the sweep has no end")
+    assert refused > 3
+
+
+def test_a_reader_at_any_moment_and_a_kill(command: Command) -> None:
+    """A process that is killed leaves what a reader sees at that moment; the next run must follow from it."""
+    answers, seen = Answers(command), []
+    killed = command.tmp_path / "killed"
+
+    def look(n: int, name: str) -> None:
+        seen.append(answers.seen())
+        shutil.copytree(command.out, killed / str(n), symlinks=True)
+
+    with disk(command.out, look, reads=False) as calls:
+        assert command.run("new") == 0
+    seen.append(answers.seen())
+    changes = [one for one, then in pairwise(seen) if one != then]
+    assert changes == [answers.old], "one moment at which everything changes"
+    assert seen[-1] == answers.new
+    for n in range(1, len(calls) + 1):
+        shutil.rmtree(command.out)
+        (killed / str(n)).rename(command.out)
+        answers.follow()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", [diagnose], indirect=True, ids=["diagnose"])
+def test_an_interruption_at_the_nth_call(command: Command, capsys: pytest.CaptureFixture[str]) -> None:
+    answers = Answers(command)
+    for n in range(1, 2000):
+        capsys.readouterr()
+        with disk(command.out, interrupts(n), reads=False) as calls:
+            code = command.run("new")
+        said = capsys.readouterr().err
+        assert code == (0 if said == "" else 130)
+        there = said == "" or "the new answer is in" in said
+        assert answers.seen() == (answers.new if there else answers.old)
+        answers.follow()
+        answers.again()
+        if len(calls) < n:
+            return
+    raise AssertionError("the sweep has no end")
+
+
+def test_two_answers_whose_pictures_have_the_same_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = write(tmp_path / "drive.csv", **columns())
+    for other, line in (("estimates.json", ["run"]), ("run.json", ["estimate", log])):
+        out = tmp_path / line[0]
+        out.mkdir()
+        (out / other).write_text("{}", encoding="utf-8")
+        assert main([*line, "--out", str(out)]) == 2
+        assert capsys.readouterr().err == (
+            f"avtorch: --out: {out} holds {other}, and pictures of the same names; needs another folder\n"
+        )
+        assert [p.name for p in out.iterdir()] == [other]

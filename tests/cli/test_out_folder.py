@@ -1,0 +1,118 @@
+"""One process at a time in `--out`, and two diagnoses in one folder, one of them interrupted."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from avtorch.cli import main
+from avtorch.cli.app import app
+from avtorch.cli.out_folder import alone_in_out
+from avtorch.gap.search.checkpoint import Checkpoint
+from avtorch.io import sole_use
+from tests.gap.search.test_checkpoint import drive
+
+COMMANDS = {"run", "estimate", "diagnose", "compare", "stability", "validate", "blindtest", "paper"}
+
+
+def test_every_command_that_writes_holds_its_folder() -> None:
+    commands = {name: app[name].default_command for name in app if not name.startswith("-")}
+    assert set(commands) == COMMANDS
+    for command in commands.values():
+        assert command is not None
+        assert command.__code__ is alone_in_out(lambda out: None).__code__
+        assert "out" in inspect.signature(command).parameters
+
+
+def test_a_second_process_is_told_of_the_first(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    line = [sys.executable, "-m", "avtorch.cli", "stability", "--quiet", "--out", str(out)]
+    with sole_use(out, work="avtorch diagnose"):
+        second = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert second.returncode == 2
+    assert second.stdout == ""
+    assert second.stderr.count("\n") == 1
+    assert f"avtorch: {out}: in use by avtorch diagnose (pid {os.getpid()} on " in second.stderr
+    assert "needs another folder" in second.stderr
+    assert not out.exists()
+
+
+def test_within_a_command_the_folder_is_held_and_free_after_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen: list[list[str]] = []
+
+    def command(*, out: Path | None, fails: bool = False) -> None:
+        seen.append([] if out is None else [p.name for p in out.iterdir()])
+        if fails:
+            raise KeyboardInterrupt
+
+    held = alone_in_out(command)
+    held(out=tmp_path / "out")
+    held(out=None)
+    with pytest.raises(KeyboardInterrupt):
+        held(out=tmp_path / "out", fails=True)
+    assert seen == [[".avtorch.lock"], [], [".avtorch.lock"]]
+    assert list(tmp_path.iterdir()) == []
+    assert capsys.readouterr() == ("", "")
+
+
+def test_where_there_are_no_locks_a_line_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import fcntl
+
+    def none(*_: Any) -> None:
+        raise OSError(38, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", none)
+    alone_in_out(lambda out: None)(out=tmp_path / "out")
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "has no locks; keep other runs out of this folder" in said
+
+
+@pytest.mark.slow
+def test_two_diagnoses_in_one_folder_do_not_mix(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One is interrupted, another is begun in its folder, the first goes on: it answers as if left alone."""
+    logs = []
+    for i, bias in enumerate((0.25, 0.1)):
+        logs.append(str(tmp_path / f"{i}.csv"))
+        drive(3 + i, bias=bias).write(logs[-1])
+    options = ["--effects", "sensor_bias,dead_time", "--no-pairs", "--posterior", "laplace", "--quiet", "--out"]
+    alone, shared = tmp_path / "alone", tmp_path / "shared"
+    assert main(["diagnose", logs[0], *options, str(alone)]) == 0
+    keep = Checkpoint.keep
+
+    def stopped(self: Checkpoint, *given: Any) -> None:
+        keep(self, *given)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoint, "keep", stopped)
+        assert main(["diagnose", logs[0], *options, str(shared)]) == 130
+    capsys.readouterr()
+    kept = (shared / "fits.json").read_bytes()
+    assert main(["diagnose", logs[1], *options, str(shared)]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert f"fits.json: was begun with other logs ({logs[0]}, 400 rows)" in told
+    assert (shared / "fits.json").read_bytes() == kept
+    assert main(["diagnose", logs[0], *options, str(shared)]) == 0
+    answers = [json.loads((folder / "diagnosis.json").read_text(encoding="utf-8")) for folder in (alone, shared)]
+    assert answers[0] == answers[1]
+    # and a file of fits that is copied over
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "fits.json").write_bytes(kept)
+    assert main(["diagnose", logs[1], *options, str(other)]) == 2
+    assert "was begun with other logs" in capsys.readouterr().err

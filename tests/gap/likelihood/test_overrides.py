@@ -1,0 +1,170 @@
+"""What a driver does in between says nothing of the car: not to the bit, but for how far it has come."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from avtorch.errors import InputError
+from avtorch.gap import plant
+from avtorch.gap.likelihood.as_read import as_read
+from avtorch.gap.likelihood.candidate import Candidate
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.search.chance import Tails
+from avtorch.gap.search.found import cleaned, white_first
+from avtorch.io import Log
+from tests.gap.records import log_of
+from tests.overridden import deleted
+
+Float = NDArray[np.float64]
+
+OVERRIDES = ((12.0, 15.0), (22.5, 22.6), (31.0, 36.2))
+
+
+def _driven(log: Log) -> Log:
+    taken = np.zeros(log.rows, bool)
+    for begin, end in OVERRIDES:
+        taken |= (log.time >= begin) & (log.time < end)
+    return replace(log, engaged=~taken)
+
+
+def _garbled(log: Log, names: tuple[str, ...], rng: np.random.Generator) -> Log:
+    """Other finite values of these signals wherever the driver is in charge."""
+    changed = {}
+    for name in names:
+        x = getattr(log, name).copy()
+        x[~log.engaged] = rng.uniform(0.0, 40.0, (~log.engaged).sum()) - (0.0 if name == "speed" else 20.0)
+        changed[name] = x
+    return replace(log, **changed)
+
+
+@pytest.mark.parametrize(
+    ("effects", "garbled", "witnesses"),
+    [
+        ("none", ("accel_cmd", "accel", "speed"), ("accel", "speed")),
+        ("brake_throttle_asymmetry+dead_time", ("accel_cmd", "accel", "speed"), ("accel", "speed")),
+        ("speed_dependent_gain", ("accel_cmd", "accel", "speed"), ("accel", "speed")),
+        ("dead_time", ("accel_cmd", "accel"), ("accel",)),
+        ("dead_time", ("accel_cmd", "speed"), ("speed",)),
+        # the road passes under the car whoever drives: its measured speed counts, all else does not
+        ("road_grade", ("accel_cmd", "accel"), ("accel", "speed")),
+    ],
+)
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=4, deadline=None)
+def test_a_drivers_rows_change_no_likelihood(
+    effects: str, garbled: tuple[str, ...], witnesses: tuple[str, ...], seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    log = _driven(log_of(seconds=50.0, rate_hz=40, rng=rng, witnesses=witnesses))
+    told = []
+    for one in (log, _garbled(log, garbled, rng)):
+        record = Record.of(as_read(one)[0])
+        candidate = Candidate.named(record, effects, plant())
+        z = np.linspace(-0.5, 0.5, candidate.size)[None]
+        white = Whitener(record, white_first(record))
+        errors = candidate.errors(z)
+        told.append((errors, white.log_likelihood(errors), candidate.rollouts(z, onset=record.rows // 2)))
+        if candidate.grade_columns is not None:
+            told[-1] += (candidate.grade_columns, candidate.grade_means)
+    for one, other in zip(*told, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_drives_are_those_of_a_log_without_the_drivers_rows() -> None:
+    log = _driven(log_of(seconds=50.0, rate_hz=40))
+    own, other = (Record.of(x) for x in (log, deleted(log)))
+    assert len(own.drives) == len(other.drives) == 4
+    assert own.segment == (0, 0, 0, 0)
+    assert other.segment == (0, 1, 2, 3)
+    np.testing.assert_array_equal(own.source, other.source)
+    np.testing.assert_array_equal(own.measured, other.measured)
+    candidates = [Candidate.named(r, "dead_time", plant()) for r in (own, other)]
+    z = np.zeros((1, 3))
+    np.testing.assert_array_equal(*(c.rollouts(z) for c in candidates))
+
+
+def test_the_road_runs_on_under_the_driver() -> None:
+    log = _driven(log_of(seconds=50.0, rate_hz=40))
+    assert log.speed is not None
+    record = Record.of(log)
+    travelled = np.concatenate([[0.0], np.cumsum(0.5 * (log.speed[1:] + log.speed[:-1]) * np.diff(log.time))])
+    for drive, cut in zip(record.drives, record.cuts, strict=True):
+        assert drive.position is not None
+        # smoothed speeds and measured ones differ by the noise of 0.05 m/s and less
+        np.testing.assert_allclose(drive.position.numpy(), travelled[cut.rows], atol=0.5)
+    grade = Candidate.named(record, "road_grade", plant())
+    assert grade.grade_columns is not None
+    # one road, as many knots as without the driver
+    whole = Candidate.named(Record.of(replace(log, engaged=np.ones(log.rows, bool))), "road_grade", plant())
+    assert whole.grade_columns is not None
+    assert abs(len(grade.grade_columns) - len(whole.grade_columns)) <= 1
+    # one slope acts alike on both sides of an override: each knot is felt in the drive where the car passes it
+    profile = np.sin(np.arange(len(grade.grade_columns)))
+    felt, of_whole = grade.grade_response(profile), whole.grade_response(profile[: len(whole.grade_columns)])
+    rows = np.isin(whole.record.time[whole.record.source], record.time[record.source])
+    rows_here = np.isin(record.time[record.source], whole.record.time[whole.record.source])
+    assert rows.sum() > 400
+    np.testing.assert_allclose(felt[0, rows_here], of_whole[0, rows], atol=0.02 * np.abs(felt[0]).max())
+
+
+def test_far_down_the_road_under_the_driver_lies_another_road() -> None:
+    """An hour by hand is not rolled out, and its knots are not carried."""
+    log = log_of(seconds=40.0)
+    time = np.where(log.time < 20, log.time, log.time + 3600)
+    taken = {n: getattr(log, n) for n in ("accel_cmd", "accel", "speed")}
+    by_hand = 20 + np.arange(72_000) / 20
+    at = int((log.time < 20).sum())
+    columns = {n: np.insert(x, at, np.full(len(by_hand), 20.0 if n == "speed" else 0.0)) for n, x in taken.items()}
+    engaged = np.insert(np.ones(log.rows), at, np.zeros(len(by_hand)))
+    long = Log.from_arrays(name="drive", time=np.insert(time, at, by_hand), engaged=engaged, **columns)
+    record = Record.of(long)
+    assert [len(d.time) for d in record.drives] == [400, 400]
+    first, second = (d.position for d in record.drives)
+    assert first is not None
+    assert second is not None
+    assert float(second[0] - first[-1]) == pytest.approx(1000.0)
+
+
+def test_glitches_are_put_right_where_they_are() -> None:
+    """Rows are counted over all drives, also where some are too short to be one or hold no whole groups."""
+    log = log_of(seconds=50.0, rate_hz=50)
+    assert log.accel is not None
+    engaged = np.ones(log.rows, bool)
+    for begin, end in ((611, 640), (655, 700), (1403, 1404)):
+        engaged[begin:end] = False
+    accel = log.accel.copy()
+    glitches = [300, 905, 1401, 2203]
+    accel[glitches] += 5.0
+    accel[~engaged] = 30.0
+    log = replace(log, engaged=engaged, accel=accel)
+    record = Record.of(log)
+    raw = Record.of(log, rate_hz=1e9, multiple=record.group)
+    rows = np.concatenate([np.arange(log.rows)[cut.rows] for cut in raw.cuts])[raw.source]
+    hit = np.isin(rows, glitches)
+    assert hit.sum() == len(glitches)
+    (clean,) = cleaned([log], raw, Tails(10.0, 0.01, 7.0, (1.0, 1.0), hit, np.zeros(raw.rows)))
+    assert clean.accel is not None
+    assert np.flatnonzero(clean.accel != accel).tolist() == glitches
+    # the driver's rows beside a glitch are no measure of the car
+    assert np.abs(clean.accel[glitches]).max() < 3
+
+
+@pytest.mark.parametrize("driven", [slice(None), slice(0, None, 2)], ids=["all by hand", "every other row"])
+def test_where_nothing_is_left_the_error_names_it(driven: slice) -> None:
+    log = log_of(seconds=30.0)
+    engaged = np.ones(log.rows, bool)
+    engaged[driven] = False
+    with pytest.raises(InputError) as told:
+        Record.of(replace(log, engaged=engaged))
+    assert str(told.value).startswith("drive: 0.0 s of usable driving")
+    if not engaged.any():
+        assert "return" not in str(told.value)
+    else:
+        assert "each of 300 returns to engaged" in str(told.value)

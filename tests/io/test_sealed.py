@@ -1,0 +1,162 @@
+"""Sealed files: read back as written, and refused in one line whatever else lies there."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from avtorch.errors import InputError
+from avtorch.io import Damaged, fingerprint, read_sealed, read_sealed_bytes, write_sealed
+
+SCHEMA = "avtorch.test/1"
+OF = {"logs": ["drive.csv"], "pairs": True}
+CONTENT = {
+    "fits": [{"name": "dead_time", "z": [0.1, -1e-300, 5e-324], "onset": None}, {"ü\udc80": "\u2028"}],
+    "n": 2**70,
+}
+
+
+def test_content_comes_back_to_the_bit(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "state.json"
+    write_sealed(path, CONTENT, schema=SCHEMA, of=OF)
+    assert read_sealed(path, schema=SCHEMA) == (OF, CONTENT)
+    # anyone can read it as JSON
+    assert json.loads(path.read_text(encoding="utf-8"))["content"] == CONTENT
+    write_sealed(path, b"{\n\x00\xff", schema=SCHEMA, of=OF)
+    assert read_sealed_bytes(path, schema=SCHEMA) == (OF, b"{\n\x00\xff")
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_every_byte_counts(tmp_path: Path, binary: bool) -> None:
+    """Each byte changed; and left out, doubled, or the last one that is left: none of it is read."""
+    path = tmp_path / "state"
+    content: Any = b"some bytes\n" if binary else {"T_L": 0.3, "rows": [1, 2]}
+    write_sealed(path, content, schema=SCHEMA, of={"a": 1})
+    whole = path.read_bytes()
+    read = read_sealed_bytes if binary else read_sealed
+    for i, byte in enumerate(whole):
+        more = [whole[:i] + whole[i + 1 :], whole[:i] + whole[i : i + 1] + whole[i:], whole[:i]]
+        for other in (whole[:i] + bytes([byte ^ 1]) + whole[i + 1 :], more[i % 3]):
+            path.write_bytes(other)
+            with pytest.raises(Damaged, match=r"^\S+state: .*; remove it, or use another folder$"):
+                read(path, schema=SCHEMA)
+
+
+def forged(body: bytes, schema: str = SCHEMA) -> bytes:
+    """A file with a right checksum over a `body` that the writer would not write."""
+    return (
+        b'{"schema": "%s", "sha256": "%s",\n'
+        % (
+            schema.encode(),
+            hashlib.sha256(schema.encode() + b"\n" + body).hexdigest().encode(),
+        )
+        + body
+    )
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"}",
+        b'"of": {}}',
+        b'"of": {}, "content": 1, "more": 2}',
+        b'"of": [], "content": 1}',
+        b'"of": {}, "content": NaN}',
+        b'"of": {}, "content": -Infinity}',
+        b'"of": {}, "content": 1e999}',
+        b'"of": {}, "content": 1, "content": 2}',
+        b'"of": {}, "content": ' + b"9" * 100_000 + b"}",
+        b'"of": {}, "content": ' + b"[" * 100_000 + b"]" * 100_000 + b"}",
+        b'"of": {}, "content": "\xff"}',
+        b'"of": {}, "content": 1} and more',
+    ],
+    ids=lambda body: body[:40].decode("latin-1"),
+)
+def test_a_right_checksum_over_nonsense_helps_nothing(tmp_path: Path, body: bytes) -> None:
+    path = tmp_path / "state"
+    path.write_bytes(forged(body))
+    with pytest.raises(Damaged):
+        read_sealed(path, schema=SCHEMA)
+    with pytest.raises(Damaged):
+        read_sealed_bytes(path, schema=SCHEMA)
+
+
+def test_another_schema_and_too_much_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "state"
+    write_sealed(path, CONTENT, schema="avtorch.other/1", of={})
+    with pytest.raises(Damaged, match=r"holds avtorch\.other/1, needs avtorch\.test/1"):
+        read_sealed(path, schema=SCHEMA)
+    with pytest.raises(Damaged, match="is larger than"):
+        read_sealed(path, schema="avtorch.other/1", most=100)
+    path.write_text(json.dumps({"fits": []}))
+    with pytest.raises(Damaged, match="from an earlier avtorch that wrote no checksum; do this"):
+        read_sealed(path, schema=SCHEMA, remedy="do this")
+
+
+def test_only_regular_files_are_read_or_replaced(tmp_path: Path) -> None:
+    """A FIFO would keep its reader waiting, a device would never end, a symlink leads elsewhere."""
+    real = tmp_path / "real"
+    write_sealed(real, CONTENT, schema=SCHEMA, of={})
+    before = real.read_bytes()
+    link, fifo, folder = tmp_path / "link", tmp_path / "fifo", tmp_path / "folder"
+    link.symlink_to(real)
+    os.mkfifo(fifo)
+    folder.mkdir()
+    for path, kind in ((link, "a symlink"), (fifo, "a FIFO"), (folder, "a folder"), (Path("/dev/zero"), "a device")):
+        with pytest.raises(InputError, match=f"{path.name}: is {kind}") as caught:
+            read_sealed(path, schema=SCHEMA)
+        assert not isinstance(caught.value, Damaged)
+        with pytest.raises(InputError, match=f"{path.name}: is {kind}"):
+            write_sealed(path, CONTENT, schema=SCHEMA, of={})
+    assert real.read_bytes() == before
+    for path in (tmp_path / "missing", tmp_path / ("x" * 300), tmp_path / "zero\0byte", real / "inside"):
+        with pytest.raises(InputError, match="cannot be read"):
+            read_sealed(path, schema=SCHEMA)
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace", "chmod"])
+def test_a_failed_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str) -> None:
+    path = tmp_path / "state"
+    write_sealed(path, 1, schema=SCHEMA, of={})
+    before = path.read_bytes()
+
+    def full(*_: Any, **__: Any) -> Any:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, call, full)
+    with pytest.raises(InputError, match="state: cannot be written"):
+        write_sealed(path, 2, schema=SCHEMA, of={})
+    monkeypatch.undo()
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["state"]
+    # what JSON cannot hold is refused before anything is written
+    with pytest.raises(InputError, match="finite"):
+        write_sealed(path, float("nan"), schema=SCHEMA, of={})
+    assert path.read_bytes() == before
+
+
+def test_fingerprints_are_equal_for_equal_values_only(fresh_seed: int) -> None:
+    rng = random.Random(fresh_seed)
+    x = np.array([rng.random() for _ in range(8)])
+    assert fingerprint(x, [1, None]) == fingerprint(x.copy(), (1, None))
+    assert fingerprint({"a": 1, "b": x}) == fingerprint({"b": x, "a": 1})
+    near = x.copy()
+    near[3] = np.nextafter(near[3], 2)
+    different = [
+        *(x, near, x.reshape(2, 4), x[:7], x.astype(np.float32), x.tolist(), [x], {"x": x}),
+        *(1, 1.0, True, "1", b"1", None, "None", [], {}, [1, 2], ["12"], ["1", "2"], [[1], 2], [1, [2]]),
+        *(0.0, -0.0, int, float, np.float64(3.0), np.int64(3), slice(1, 2), slice(1, 3), slice(1, 2, 1)),
+    ]
+    assert len({fingerprint(value) for value in different}) == len(different)
+    for value in (object(), np.array([object()]), {1, 2}, [lambda: 0]):
+        with pytest.raises(TypeError):
+            fingerprint(value)
