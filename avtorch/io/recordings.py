@@ -30,8 +30,6 @@ def read_leader(
     Raises InputError for a file of no known form, a vehicle or event that is not in it, and bad values.
     """
     table = read_table(path, header="Time", wanted=recorded)
-    if not table.rows:
-        raise InputError(f"{table.source}: found a header but no rows; needs a recording")
     names = set(table.names)
     form, read = "plain", None
     if "SpeedDoppler1" in names or any(n.startswith("SpeedDoppler") for n in names):
@@ -42,7 +40,14 @@ def read_leader(
         form = "NGSIM"
     elif {"Time", "Velocity"} <= names:
         form = "I-24"
+    elif not {"speed", "lead_speed"} & names or "time" not in names:
+        raise InputError(
+            f"{table.source}: is no leader file; it needs columns time and speed, or the form of OpenACC, NGSIM or "
+            f"I-24; columns: {listed(table.names)}"
+        )
     _refuse_idle(table.source, form, vehicle=vehicle, event=event, duration=duration, unit=unit)
+    if not table.rows:
+        raise InputError(f"{table.source}: found a header but no rows; needs a recording")
     if read is not None:
         return read(table, vehicle)
     if form == "NGSIM":
@@ -58,12 +63,7 @@ def _refuse_idle(source: str, form: str, **given: object) -> None:
 
 
 def _plain(table: Table, unit: Pairs) -> RawLeader:
-    speed = next((name for name in ("speed", "lead_speed") if name in table.names), None)
-    if "time" not in table.names or speed is None:
-        raise InputError(
-            f"{table.source}: is no leader file; it needs columns time and speed, or the form of OpenACC, NGSIM or "
-            f"I-24; columns: {listed(table.names)}"
-        )
+    speed = next(name for name in ("speed", "lead_speed") if name in table.names)
     units = pairs("unit", unit)
     names = {"time": "time", "speed": speed}
     if speed == "speed" and "accel" in table.names:
