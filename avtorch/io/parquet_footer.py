@@ -28,7 +28,7 @@ def uncompressed_sizes(raw: bytes) -> list[list[int]]:
     groups = _Footer(raw[begin:-8]).struct().get(_ROW_GROUPS, [])
     try:
         sizes = [[chunk[_META_DATA][_UNCOMPRESSED] for chunk in group[_COLUMNS]] for group in groups]
-    except (KeyError, TypeError, AttributeError):
+    except (LookupError, TypeError):  # a list may stand where a struct should, and a number where a list should
         raise ValueError("a row group does not say how large its columns are") from None
     if not all(type(size) is int for group in sizes for size in group):
         raise ValueError("a row group does not say how large its columns are")

@@ -453,3 +453,13 @@ def test_the_footers_sizes_are_those_that_pyarrow_reads(tmp_path: Path) -> None:
         parts = [metadata.row_group(g) for g in range(metadata.num_row_groups)]
         told = [[part.column(i).total_uncompressed_size for i in range(part.num_columns)] for part in parts]
         assert uncompressed_sizes(path.read_bytes()) == told
+
+
+@pytest.mark.parametrize("groups", [b"\x19\x05", b"\x19\x15\x02", b"\x1c\x00", b"\x15\x02"], ids=repr)
+def test_a_footer_of_another_shape_is_refused(groups: bytes) -> None:
+    """Row groups that are empty lists, lists of numbers, structs without columns, or numbers; the first was found by
+    the fuzzer as an IndexError."""
+    footer = b"\x49" + groups + b"\x00"  # FileMetaData with its field 4 alone, a list
+    raw = b"PAR1" + footer + len(footer).to_bytes(4, "little") + b"PAR1"
+    with pytest.raises(ValueError, match="a row group does not say how large its columns are"):
+        uncompressed_sizes(raw)
