@@ -77,7 +77,8 @@ def _even(time: Float, finest: float) -> Float:
     """`time` (row,) on an even grid, some of whose rows may be lost, where it is off that only by its own rounding."""
     steps = np.diff(time)
     usual = float(np.median(steps)) if len(steps) else 0.0
-    if usual <= 0:
+    # rows further apart than float64 counts steps lie on no grid
+    if usual <= 0 or time[-1] - time[0] > usual * 2**52:
         return time
     number = np.concatenate([[0.0], np.cumsum(np.rint(steps / usual))])
     step = (time[-1] - time[0]) / max(number[-1], 1.0)

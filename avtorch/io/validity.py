@@ -71,9 +71,19 @@ def _at_first(bad: NDArray, values: NDArray, where: Callable[[int], str], need: 
         raise InputError(f"{where(row)}: is {values[row]:.10g}; {need}")
 
 
+_BEYOND_CLOCKS = 1e24  # nanoseconds since 1970 read as seconds are 2e18, and `check_rate` says so
+
+
 def check_time(time: NDArray, same_drive: NDArray, where: Callable[[int], str]) -> None:
-    """Raise InputError where time repeats or goes back inside a drive; ``same_drive`` ``(time - 1,)`` is false where a
-    new value of ``segment`` lets it start anew."""
+    """Raise InputError where time repeats or goes back inside a drive, or where a stamp is beyond any clock's count;
+    ``same_drive`` ``(time - 1,)`` is false where a new value of ``segment`` lets it start anew."""
+    beyond = np.abs(time) > _BEYOND_CLOCKS
+    if beyond.any():
+        row = int(np.argmax(beyond))
+        raise InputError(
+            f"{where(row)}: found {time[row]:.4g} s, a stamp so far from zero that float64 does not tell rows apart; "
+            "needs stamps within 1e9 s of the first"
+        )
     bad = (np.diff(time) <= 0) & same_drive
     if bad.any():
         row = int(np.argmax(bad)) + 1

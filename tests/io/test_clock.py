@@ -119,5 +119,23 @@ def test_a_first_stamp_from_which_rows_are_not_told_apart_is_refused(first: floa
     """Found by the fuzzer: all steps after it are less than what float64 resolves there."""
     time = np.arange(200) / 20.0
     time[0] = first
-    with pytest.raises(InputError, match=r"^arrays: column 'time': found stamps so far"):
+    with pytest.raises(InputError, match=r"^arrays: (row 1, )?column 'time': found .* so far from"):
         Log.from_arrays(time=time, accel_cmd=np.sin(time), accel=np.sin(time - 0.2))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("row", "stamp"), [(199, 1e308), (0, -1e308), (100, 1e25)])
+def test_a_stamp_beyond_any_clock_is_refused_at_its_row(row: int, stamp: float) -> None:
+    """The first was found by the fuzzer as an overflow."""
+    time = np.arange(200) / 20.0
+    time[row] = stamp
+    with pytest.raises(InputError, match=rf"row {row + 1}, column 'time': found .* needs stamps within"):
+        Log.from_arrays(time=time, accel_cmd=np.sin(time), accel=np.sin(time - 0.2))
+
+
+@pytest.mark.filterwarnings("error")
+def test_steps_too_small_to_count_a_jump_in_are_refused_as_a_rate() -> None:
+    time = np.arange(200) * 1e-300
+    time[-1] = 1e20
+    with pytest.raises(InputError, match="rows come at"):
+        Log.from_arrays(time=time, accel_cmd=np.sin(time), accel=np.sin(time))

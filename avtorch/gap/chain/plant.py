@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, quoted
 from avtorch.gap.chain.drive import Drive, Response
 from avtorch.gap.chain.effect import Effect, NoiseChange
 from avtorch.gap.chain.order import in_order
@@ -186,7 +186,12 @@ def plant(
         base = baseline or GapPlant((), T_L=0.3, K_L=1.0, sigma=0.1)
     else:
         base = _from(read_file(baseline))
+    if isinstance(effects, str):
+        raise InputError(f"effects: found the text {quoted(effects)}; needs effects; plant(baseline=...) takes a text")
     own = [e() if isinstance(e, type) else e for e in effects]
+    for e in own:
+        if not isinstance(e, Effect):
+            raise InputError(f"effects: found {quoted(repr(e))}, needs effects, such as DeadTime(0.2)")
     kept = [e for e in base.effects if e.name not in {x.name for x in own}]
     for i, e in enumerate(own):
         own[i], implied = e.lag_apart()

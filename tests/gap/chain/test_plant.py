@@ -145,6 +145,12 @@ def test_text_round_trip_of_every_way_to_make_an_effect(cls: type[Effect]) -> No
             assert torch.equal(again.response(drive).accel_measured, car.response(drive).accel_measured)
 
 
+@pytest.mark.parametrize("effects", ["dead_time=0.2", ["dead_time"], [0.2], [int]])
+def test_effects_that_are_none_are_refused(effects: object) -> None:
+    with pytest.raises(InputError, match=r"effects: found .*; needs effects|effects: found .*, needs effects"):
+        plant(effects)  # pyright: ignore[reportArgumentType]
+
+
 def test_a_damping_ratio_sets_the_lag_once() -> None:
     given = gap.SecondOrderActuator(1 / 6, damping_ratio=0.4)
     car = plant([given])
