@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from avtorch.decision.strategist import Strategist
     from avtorch.decision.supervisor import Supervisor
     from avtorch.errors import InputError
-    from avtorch.gap.answer.diagnosis import Diagnosis
     from avtorch.gap.compare import compare
     from avtorch.gap.diagnose import diagnose
+    from avtorch.gap.result.diagnosis import Diagnosis
     from avtorch.inference import SGLD, BeliefStream, SequentialInference
     from avtorch.io import Log
     from avtorch.validation import Validation, validate
@@ -49,7 +49,7 @@ _HOME = {
     "avtorch.errors": ("InputError",),
     "avtorch.gap.compare": ("compare",),
     "avtorch.gap.diagnose": ("diagnose",),
-    "avtorch.gap.answer.diagnosis": ("Diagnosis",),
+    "avtorch.gap.result.diagnosis": ("Diagnosis",),
     "avtorch.inference": ("SGLD", "BeliefStream", "SequentialInference"),
     "avtorch.io": ("Log",),
     "avtorch.validation": ("Validation", "validate"),

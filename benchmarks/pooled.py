@@ -20,7 +20,7 @@ from avtorch.inference.priors import Joint, default_actuation_prior, default_jer
 from avtorch.inference.sampler import SamplerSettings
 from avtorch.validation.pooled import (
     MODES,
-    Comparison,
+    PooledComparison,
     Track,
     constant,
     drift,
@@ -43,7 +43,7 @@ def three(values: Tensor, form: str = "7.3f") -> str:
     return " ".join(f"{x:{form}}" for x in values.tolist())
 
 
-def row(label: str, found: Comparison) -> None:
+def row(label: str, found: PooledComparison) -> None:
     middle = found.sd_ratio.median(0).values
     rms, worst = found.shift.square().mean(0).sqrt(), found.shift.abs().quantile(0.95, dim=0)
     shares = 100 * found.covered.double().mean(0)
@@ -68,7 +68,7 @@ def stays(count: int, windows: int, seed: int) -> None:
         print(f"  amplitude {amplitude:g} m/s^2; pooled: 90 % coverage {three(shares, '.1f')}, grid error {worst:.1g}")
         for mode in MODES:
             track = follow(path, seen, mode=mode, seed=seed)
-            row(mode, Comparison.of(track, pooled))
+            row(mode, PooledComparison.of(track, pooled))
             if not bool(track.converged.all()):
                 print(f"    {int((~track.converged).sum())} windows not settled")
         free = truth_given_all(seen, shared_noise=False)
@@ -95,7 +95,7 @@ def carried(count: int, windows: int, seed: int) -> None:
             settings = SamplerSettings(chains=factor * default.chains)
             row(
                 f"{settings.chains} chains",
-                Comparison.of(follow(path, seen, mode="posterior", settings=settings), pooled),
+                PooledComparison.of(follow(path, seen, mode="posterior", settings=settings), pooled),
             )
 
 

@@ -24,8 +24,8 @@ from avtorch.errors import InputError
 from avtorch.follower import FollowerDiagnosis, diagnose_follower
 from avtorch.gap.effects import RoadGrade
 from avtorch.gap.effects.road_grade import GRAVITY
-from avtorch.gap.likelihood.fit import finish, modes
-from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.likelihood.gauss_newton import finish, modes
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.io import Log, read_following
 from avtorch.io.openacc import numbered
 from avtorch.io.tables import read_table
@@ -79,10 +79,10 @@ def slope_coefficient(found: FollowerDiagnosis, log: Log, grade: np.ndarray) -> 
     By regression of the loop's white errors on the white image of the slope's pull, law and plant held.
     """
     pull = -GRAVITY * grade
-    record, one = found.identified.candidate.record, found.identified
+    record, one = found.identified.hypothesis.record, found.identified
     steps = np.diff(log.time)
     gained = np.concatenate([[0.0], np.cumsum(0.5 * steps * (pull[1:] + pull[:-1]))])
-    white = Whitener(record, one.noise)
+    white = WhiteningFilter(record, one.noise)
     image = white(gained[record.source][None, :, None]).ravel()
     left = white(one.errors(record)).ravel()
     square = float(image @ image)
@@ -94,9 +94,9 @@ def slope_recovered(found: FollowerDiagnosis, grade: np.ndarray) -> dict[str, fl
 
     ``correlation``; ``rmse`` [-] about both means; ``zero``: the same of no slope at all.
     """
-    own = found.identified.candidate
+    own = found.identified.hypothesis
     candidate = replace(own, effects=(*own.effects, RoadGrade))
-    white = Whitener(own.record, found.identified.noise)
+    white = WhiteningFilter(own.record, found.identified.noise)
     z, _ = modes(candidate, white, found.identified.z[None])
     profile = finish(candidate, white, z[0]).profile
     assert profile is not None

@@ -18,7 +18,7 @@ from avtorch import plots
 from avtorch.blindtest import Recorded, draw_cases, simulate
 from avtorch.experiment import Limits, next_experiment
 from avtorch.gap import plant
-from avtorch.plots import over_diagnosis
+from avtorch.plots import diagnosis as over_diagnosis
 
 mpl.rcParams.update(plots.STYLE)
 OUT = Path("out/notebooks/4_diagnosing_a_gap")
@@ -178,7 +178,7 @@ else:
 #
 # ## Try this
 #
-# - `avtorch.diagnose(case.log(signals=["speed"]))`: one witness instead of two. What is no longer told apart?
+# - `avtorch.diagnose(case.log(signals=["speed"]))`: one channel instead of two. What is no longer told apart?
 # - `draw_cases(1, 2026, mix={"outside": 1.0}, seconds=60.0)`: a cause that is not in the table. Is it blamed on a name?
 # - `avtorch.diagnose(log, baseline="dead_time=0.2")`: a simulator that has a delay which the car has not. Is the answer
 #   the same?

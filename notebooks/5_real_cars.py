@@ -24,7 +24,8 @@ import avtorch
 from avtorch import plots
 from avtorch.follower import diagnose_follower
 from avtorch.io import read_following
-from avtorch.plots import over_diagnosis, over_followers
+from avtorch.plots import diagnosis as over_diagnosis
+from avtorch.plots import followers as over_followers
 
 mpl.rcParams.update(plots.STYLE)
 OUT = Path("out/notebooks/5_real_cars")

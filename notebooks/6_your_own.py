@@ -18,7 +18,8 @@ import avtorch
 from avtorch import plots
 from avtorch.decision import Grid, Setting, Strategist, SupervisedRun
 from avtorch.gap import EFFECTS, Drive, Effect, Parameter, Row, plant
-from avtorch.plots import effect_signature, over_diagnosis
+from avtorch.plots import diagnosis as over_diagnosis
+from avtorch.plots import effect_signature
 from avtorch.results import run_answer
 from avtorch.vehicle import FollowerState
 

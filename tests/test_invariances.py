@@ -27,7 +27,7 @@ import avtorch
 from avtorch.follower import diagnose_follower
 from avtorch.gap import AerodynamicDrag, DeadTime, Effect, GainChange, SecondOrderActuator, plant
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.search.found import Found
+from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
 from avtorch.inference import BeliefStream, SamplerSettings
 from avtorch.io import Log, check
@@ -445,7 +445,7 @@ def test_the_sign_of_everything_changes_no_estimate(drive: Log) -> None:
         assert torch.equal(some.excited, other.excited)
 
 
-def _fits(logs: Sequence[Log], *effects: type[Effect]) -> dict[str, Found]:
+def _fits(logs: Sequence[Log], *effects: type[Effect]) -> dict[str, FittedModel]:
     """What a diagnosis rests on: every candidate's fit, without what is held out and drawn afterwards."""
     return {found.name: found for found in Search(logs, plant(), effects=effects, pairs=False).run().found}
 

@@ -5,7 +5,7 @@ from avtorch.blindtest.case import Case, write
 from avtorch.blindtest.cases import draw_case, draw_cases
 from avtorch.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, Family, family
 from avtorch.blindtest.deck import MIX
-from avtorch.blindtest.drives import DURATIONS_S, MANOEUVRES, RATES_HZ, Drive, Recorded, draw_drive
+from avtorch.blindtest.drives import DURATIONS_S, MANOEUVRES, RATES_HZ, DrivePlan, Recorded, draw_drive
 from avtorch.blindtest.in_front import IN_FRONT, put_in_front
 from avtorch.blindtest.score import score
 from avtorch.blindtest.vehicle import Run, simulate
@@ -23,7 +23,7 @@ __all__ = [
     "TIERS",
     "Car",
     "Case",
-    "Drive",
+    "DrivePlan",
     "Family",
     "Oracle",
     "Recorded",

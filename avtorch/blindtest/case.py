@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from avtorch.blindtest.car import Car
 from avtorch.blindtest.catalogue import family
 from avtorch.blindtest.command import Parameters
-from avtorch.blindtest.drives import Drive
+from avtorch.blindtest.drives import DrivePlan
 from avtorch.blindtest.vehicle import Run
 from avtorch.blindtest.visibility import Oracle, Sight, exact_gain
 from avtorch.errors import InputError
@@ -49,7 +49,7 @@ class Case:
     visibility_each: Mapping[str, float]
     tier: str | None
     car: Car
-    drive: Drive
+    drive: DrivePlan
     run: Run
     refit: Sight
     oracles: Mapping[str, Oracle]
@@ -89,7 +89,7 @@ class Case:
         return parts
 
     def log(self, *, signals: Sequence[str] = ("accel", "speed")) -> Log:
-        """The log a diagnosis sees: `time`, `accel_cmd` and the witnesses in `signals`."""
+        """The log a diagnosis sees: `time`, `accel_cmd` and the channels in `signals`."""
         columns = {"accel": self.run.accel, "speed": self.run.speed}
         if not signals or set(signals) - columns.keys():
             raise InputError(f"signals: found {tuple(signals)}, needs accel, speed or both")

@@ -48,7 +48,7 @@ def draw_cases(
     Args: `mix`: shares of the kinds (default 25 % none, 40 % single, 20 % pair, 15 % outside), kept in every 20
     cases. `tiers` and `effects`: single cases run through all their combinations in random order; causes outside are
     drawn from all `tiers`. `outside`: which of the two groups of families outside the table. `seconds`, `manoeuvre`:
-    instead of drawing them. `signals`: the witnesses that the logs are to have, in which a cause must show. A cause
+    instead of drawing them. `signals`: the channels that the logs are to have, in which a cause must show. A cause
     that cannot show as asked on the drive drawn gets another drive; one that showed in none of ten gives way to another
     cause, or else its plainest drive stands, in the tier it has.
 

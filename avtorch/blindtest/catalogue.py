@@ -14,12 +14,12 @@ from typing import Literal
 import numpy as np
 
 from avtorch.blindtest.car import Car
-from avtorch.blindtest.drives import TYPICAL_SPEED_MPS, Drive, Manoeuvre
+from avtorch.blindtest.drives import TYPICAL_SPEED_MPS, DrivePlan, Manoeuvre
 from avtorch.errors import InputError
 
 Place = Literal["command", "actuator", "body", "sensor"]
 AtStrength = Callable[[float], dict[str, float]]
-Draw = Callable[[np.random.Generator, Car, Drive], AtStrength]
+Draw = Callable[[np.random.Generator, Car, DrivePlan], AtStrength]
 
 
 @dataclass(frozen=True)
@@ -50,47 +50,47 @@ def _fixed(**keys: float) -> Draw:
     return lambda rng, car, drive: lambda s: {key: value * s for key, value in keys.items()}
 
 
-def _saturation(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _saturation(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     high, low = rng.uniform(1.0, 1.8), -rng.uniform(1.5, 3.0)
     return lambda s: {"accel_max_mps2": high / s, "accel_min_mps2": low / s}
 
 
-def _asymmetry(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _asymmetry(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     gain, lag = rng.uniform(0.6, 0.85), rng.uniform(0.4, 1.3)
     return lambda s: {"brake_gain_ratio": gain**s, "brake_lag_ratio": 1 + lag * s}
 
 
-def _second_order(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _second_order(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     # the sum of both lags stays at T_L, so that strength 0 is the car itself
     zeta = rng.uniform(0.35, 0.75)
     omega = 2 * zeta / car.T_L
     return lambda s: {"natural_frequency_radps": omega / s, "damping_ratio": zeta / s}
 
 
-def _rate_limit(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _rate_limit(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     return lambda s: {"jerk_max_mps3": 1.5 / s}
 
 
-def _speed_lag(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _speed_lag(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     slope = 0.5 * _sign(rng)
     middle = TYPICAL_SPEED_MPS[drive.manoeuvre]
     return lambda s: {"lag_slope": slope * s, "reference_speed_mps": middle}
 
 
-def _speed_gain(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _speed_gain(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     slope = 0.28 * _sign(rng)
     middle = TYPICAL_SPEED_MPS[drive.manoeuvre]
     return lambda s: {"gain_slope": slope * s, "reference_speed_mps": middle}
 
 
-def _gain_change(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _gain_change(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     ratio = float(rng.choice([0.72, 1.3]))
     when = drive.seconds * rng.uniform(0.25, 0.75)
     takes = 0.2 if rng.random() < 0.5 else float(rng.uniform(0.05, 0.2)) * drive.seconds
     return lambda s: {"gain_ratio": ratio**s, "change_s": when, "takes_s": takes}
 
 
-def _gear_shift(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _gear_shift(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     lasts, first, ratio = rng.uniform(0.2, 0.5), rng.uniform(3.5, 6.0), rng.uniform(1.4, 1.7)
     return lambda s: {
         "depth": min(1.0, 0.7 * s),
@@ -100,92 +100,92 @@ def _gear_shift(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
     }
 
 
-def _driveline(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _driveline(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     hertz, zeta = rng.uniform(1.2, 4.5), rng.uniform(0.03, 0.1)
     return lambda s: {"frequency_hz": hertz, "amplitude": 1.0 * s, "damping_ratio": zeta}
 
 
-def _drag(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _drag(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     wind, swing, period = rng.uniform(-4, 4), rng.uniform(0, 1), rng.uniform(40, 120)
     return lambda s: {"drag_per_m": 4e-4 * s, "wind_mps": wind, "wind_swing_mps": swing, "wind_period_s": period}
 
 
-def _grade(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _grade(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     length = rng.uniform(80, 250)
     return lambda s: {"grade_rms": 0.03 * s, "length_m": length}
 
 
-def _creep(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _creep(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     ends = rng.uniform(2.8, 3.6)
     return lambda s: {"creep_mps2": 0.3 * s, "ends_mps": ends}
 
 
-def _gust(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _gust(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     memory = rng.uniform(1, 5)
     return lambda s: {"sd_mps2": 0.2 * s, "time_constant_s": memory}
 
 
-def _bias(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _bias(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     sign = _sign(rng)
     return lambda s: {"bias_mps2": 0.15 * sign * s}
 
 
-def _scale(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _scale(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     sign = _sign(rng)
     return lambda s: {"scale": 1 + 0.12 * sign * s}
 
 
-def _outliers(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _outliers(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     scale = rng.uniform(6, 11)
     return lambda s: {"fraction": 0.02 * s, "scale": scale}
 
 
-def _vibration(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _vibration(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     turns, idle = rng.uniform(1.5, 3.0), rng.uniform(10, 14) + 0.5 * drive.rate_hz
     return lambda s: {"amplitude_mps2": 0.1 * s, "turns_per_m": turns, "idle_hz": idle}
 
 
-def _blending(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _blending(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     regen, weaker = rng.uniform(0.2, 0.6), rng.uniform(0.15, 0.35)
     return lambda s: {"regen_mps2": regen, "hysteresis_mps2": 0.1 * s, "friction_gain": max(0.2, 1 - weaker * s)}
 
 
-def _clock(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _clock(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     reset = rng.uniform(8, 40)
     return lambda s: {"drift_s": 0.2 * s, "reset_s": reset}
 
 
-def _heat(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _heat(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     cool = rng.uniform(20, 60)
     return lambda s: {"loss_when_hot": 0.5 * s, "cooling_s": cool}
 
 
-def _curves(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _curves(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     quick = TYPICAL_SPEED_MPS[drive.manoeuvre]
     return lambda s: {"drag_at_3mps2": 0.3 * s, "reference_speed_mps": quick}
 
 
-def _abs(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _abs(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     above, hertz = rng.uniform(0.3, 1.0), rng.uniform(1.5, 5)
     return lambda s: {"depth": min(1.0, 0.4 * s), "threshold_mps2": above, "frequency_hz": hertz}
 
 
-def _jitter(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _jitter(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     period = rng.uniform(8, 30)
     return lambda s: {"swing_s": 0.3 * s, "period_s": period}
 
 
-def _turbo(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _turbo(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     spool = rng.uniform(1, 3)
     return lambda s: {"missing_share": min(0.95, 0.4 * s), "spool_s": spool}
 
 
-def _hunting(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _hunting(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     hertz = rng.uniform(0.15, 0.8)
     return lambda s: {"amplitude_mps2": 0.15 * s, "frequency_hz": hertz}
 
 
-def _pitch(rng: np.random.Generator, car: Car, drive: Drive) -> AtStrength:
+def _pitch(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
     hertz = rng.uniform(0.9, 1.8)
     return lambda s: {"amplitude": 1.0 * s, "frequency_hz": hertz}
 

@@ -25,7 +25,7 @@ ACCEL_MAX_MPS2, ACCEL_MIN_MPS2 = 2.0, -3.5
 
 
 @dataclass(frozen=True)
-class Drive:
+class DrivePlan:
     """A drive to be made: `manoeuvre`, `seconds`, `rate_hz` of the log, `seed` of what the road has in store.
 
     Raises `InputError` for an unknown manoeuvre.
@@ -53,9 +53,9 @@ class Drive:
         return _Follow(rng, (us06 if rng.random() < 0.4 else trip)(rng, self.seconds, dt), dt)
 
 
-def draw_drive(rng: np.random.Generator, *, seconds: float | None = None, manoeuvre: str | None = None) -> Drive:
+def draw_drive(rng: np.random.Generator, *, seconds: float | None = None, manoeuvre: str | None = None) -> DrivePlan:
     """A drive of any kind; `seconds` and `manoeuvre` narrow it."""
-    return Drive(
+    return DrivePlan(
         manoeuvre=MANOEUVRES[int(rng.integers(4))] if manoeuvre is None else manoeuvre,  # type: ignore[arg-type]
         seconds=float(rng.choice(DURATIONS_S)) if seconds is None else seconds,
         rate_hz=int(rng.choice(RATES_HZ)),

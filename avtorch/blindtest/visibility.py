@@ -3,7 +3,7 @@ r"""How plainly a log shows that something is amiss: rollout error over noise.
 GLVD, refitted to the noise-free drive (`T_L`, `K_L`), answers the logged command: over the whole drive for the
 acceleration, whose start is forgotten within a few lags; for the speed, from a new true start every 10 s (and after
 every standstill). With `e` what then remains between log and rollout, noise apart, and `n` the process and sensor
-noise itself, both RMS over the rows that move (speed of 0.3 m/s or more), the visibility in one witness is
+noise itself, both RMS over the rows that move (speed of 0.3 m/s or more), the visibility in one channel is
 
     sqrt(n² + e²) / n
 
@@ -52,7 +52,7 @@ def glvd_response(command: Float, dt: float, T_L: float, K_L: float) -> Float:
 
 @dataclass(frozen=True)
 class Sight:
-    """What a drive shows. `accel`, `speed`: visibility in one witness, 1 in one that is not logged; `T_L`, `K_L`: GLVD
+    """What a drive shows. `accel`, `speed`: visibility in one channel, 1 in one that is not logged; `T_L`, `K_L`: GLVD
     refitted to the drive."""
 
     accel: float
@@ -62,12 +62,12 @@ class Sight:
 
     @property
     def most(self) -> float:
-        """Visibility in the witness that shows more."""
+        """Visibility in the channel that shows more."""
         return max(self.accel, self.speed)
 
     @property
     def excess(self) -> float:
-        """`e / n` of that witness: grows about in proportion to the strength of the cause."""
+        """`e / n` of that channel: grows about in proportion to the strength of the cause."""
         return float(np.sqrt(max(self.most**2 - 1.0, 0.0)))
 
 
@@ -84,7 +84,7 @@ def chunks(run: Run) -> Iterator[slice]:
 
 
 class _Witnesses:
-    """Errors of a rollout in both witnesses, from the exact start of every stretch."""
+    """Errors of a rollout in both channels, from the exact start of every stretch."""
 
     def __init__(self, run: Run) -> None:
         self.moving = run.true_speed >= _MOVING_MPS
@@ -116,24 +116,24 @@ def exact_gain(command: Float, dt: float, T_L: float) -> tuple[Float, Float]:
 
 
 def sight(run: Run, signals: Sequence[str] = ("accel", "speed")) -> Sight:
-    """How plainly the drive differs from any GLVD in the witnesses `signals`; the head of this file says how."""
-    witness = _Witnesses(run)
+    """How plainly the drive differs from any GLVD in the channels `signals`; the head of this file says how."""
+    channel = _Witnesses(run)
     dt = float(run.time[1] - run.time[0])
     accel = run.accel - run.noise_accel
-    speed = witness.since_start(run.speed - run.noise_speed - run.drift_speed)
-    noise_a = max(witness.rms_accel(run.noise_accel), 1e-12)
-    noise_v = max(witness.rms_speed(run.noise_speed + witness.since_start(run.drift_speed)), 1e-12)
+    speed = channel.since_start(run.speed - run.noise_speed - run.drift_speed)
+    noise_a = max(channel.rms_accel(run.noise_accel), 1e-12)
+    noise_v = max(channel.rms_speed(run.noise_speed + channel.since_start(run.drift_speed)), 1e-12)
 
     def fit(log_lag: float) -> tuple[float, float, float, float]:
         unit_a, unit_v = exact_gain(run.command, dt, float(np.exp(log_lag)))
-        unit_v = witness.since_start(unit_v)
-        weigh_a = ("accel" in signals) * witness.moving / noise_a**2
-        weigh_v = ("speed" in signals) * witness.inside / noise_v**2
+        unit_v = channel.since_start(unit_v)
+        weigh_a = ("accel" in signals) * channel.moving / noise_a**2
+        weigh_v = ("speed" in signals) * channel.inside / noise_v**2
         top = float(np.sum(weigh_a * unit_a * accel) + np.sum(weigh_v * unit_v * speed))
         bottom = float(np.sum(weigh_a * unit_a**2) + np.sum(weigh_v * unit_v**2))
         gain = max(top / bottom, 0.0) if bottom > 0 else 1.0
-        e_a = ("accel" in signals) * witness.rms_accel(accel - gain * unit_a) / noise_a
-        e_v = ("speed" in signals) * witness.rms_speed(speed - gain * unit_v) / noise_v
+        e_a = ("accel" in signals) * channel.rms_accel(accel - gain * unit_a) / noise_a
+        e_v = ("speed" in signals) * channel.rms_speed(speed - gain * unit_v) / noise_v
         return e_a**2 + e_v**2, e_a, e_v, gain
 
     grid = np.linspace(np.log(_LAGS_S[0]), np.log(_LAGS_S[1]), 13)
@@ -147,7 +147,7 @@ def sight(run: Run, signals: Sequence[str] = ("accel", "speed")) -> Sight:
 
 @dataclass(frozen=True)
 class Oracle:
-    """Rollout errors (RMS) of one witness: of the refitted GLVD, and of a model that knows cause and parameters.
+    """Rollout errors (RMS) of one channel: of the refitted GLVD, and of a model that knows cause and parameters.
 
     `closed` is what knowing the cause closes of the gap, None where there is none to close (`before` within 10 % of
     `floor`).

@@ -45,7 +45,7 @@ def blindtest(
 
     answerers = {"avtorch": trial.avtorch, **trial.rivals(rivals)}
     talk = Talk(json=json, quiet=quiet)
-    witnesses = ("accel", "speed") if signals == "both" else (signals,)
+    channels = ("accel", "speed") if signals == "both" else (signals,)
     try:
         with talk.progress(f"{n} cases") as step:
             answer = trial.run_trial(
@@ -54,7 +54,7 @@ def blindtest(
                 out,
                 answerers=answerers,
                 workers=workers,
-                signals=witnesses,
+                signals=channels,
                 progress=step,
                 publish=False,  # together with the picture
             )

@@ -15,7 +15,7 @@ from avtorch.cli.talk import Talk
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
-    from avtorch.gap.answer.comparison import Comparison, Moved
+    from avtorch.gap.result.comparison import Comparison, Moved
 
 _ROWS = {
     "T_L": "lag T_L [s]",

@@ -175,7 +175,7 @@ def diagnose(
 
     told = setting_for(found, [x for drive in drives if drive.accel_cmd is not None for x in drive.accel_cmd])
     from avtorch.experiment import next_experiment, write_table
-    from avtorch.gap.answer.diagnosis import DIAGNOSIS_FILES
+    from avtorch.gap.result.diagnosis import DIAGNOSIS_FILES
     from avtorch.io import answer_set
     from avtorch.report import write_report
 
@@ -217,7 +217,7 @@ _FILES = {
 def _limits(drives: Sequence[Log], given: Mapping[str, float | None]) -> Limits:
     """From the log where not given; what is given is refused before the search where it allows nothing at all."""
     from avtorch.experiment import Limits, library
-    from avtorch.gap.answer.diagnosis import LogFacts
+    from avtorch.gap.result.diagnosis import LogFacts
 
     limits = Limits.of_log(LogFacts.of(drives), **given)
     if any(x is not None for x in given.values()) and not library(limits):

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from avtorch.gap.answer.diagnosis import Candidate, Diagnosis, Quantity
+    from avtorch.gap.result.diagnosis import Candidate, Diagnosis, Quantity
 
 ROWS = 8
 BAR = 8
@@ -21,7 +21,7 @@ _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 def diagnosis_headline(found: Diagnosis) -> list[str]:
     """The verdict as one sentence, what is implausible of it, and below it the diagnosis' own reason."""
-    from avtorch.gap.answer.words import headline
+    from avtorch.gap.result.text import headline
 
     odd = found.winner.implausible
     style = (
@@ -33,7 +33,7 @@ def diagnosis_headline(found: Diagnosis) -> list[str]:
 
 def diagnosis_table(found: Diagnosis) -> Table:
     """A row a candidate: probability, log evidence, parameters."""
-    from avtorch.gap.answer.words import number
+    from avtorch.gap.result.text import number
 
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("candidate", no_wrap=True)
@@ -60,7 +60,7 @@ def diagnosis_table(found: Diagnosis) -> Table:
 
 def diagnosis_notes(found: Diagnosis) -> list[str]:
     """What else there is to say, as lines with markup: alias set, onset, size of the gap, what remains, budget."""
-    from avtorch.gap.answer import words
+    from avtorch.gap.result import text as words
 
     told = [words.aliases(found), *words.onset(found), *words.where(found), *words.moved(found), *words.gap(found)]
     told += [*words.shrinkage(found), *words.to_set(found), *words.to_drive(found), *words.remains(found)]
@@ -89,7 +89,7 @@ def _shown(candidates: Iterable[Candidate]) -> tuple[list[Candidate], list[Candi
 
 
 def _parameter(key: str, candidate: Candidate, q: Quantity) -> str:
-    from avtorch.gap.answer.quantity import unit_of, words_of
+    from avtorch.gap.quantity import unit_of, words_of
 
     effect, _, own = key.rpartition(".")
     # a pair's parameters need the effect's name only where both have one of that name

@@ -41,7 +41,7 @@ def follow(
     """
     from avtorch.follower import diagnose_follower
     from avtorch.follower.words import loop_lines
-    from avtorch.gap.answer.diagnosis import DIAGNOSIS_FILES
+    from avtorch.gap.result.diagnosis import DIAGNOSIS_FILES
     from avtorch.io import answer_set, check, read_following, write_json
     from avtorch.remedy import write_exports
     from avtorch.report import write_report
@@ -75,7 +75,7 @@ def follow(
 
 
 def _table(parameters: Mapping[str, Any]) -> Table:
-    from avtorch.gap.answer.quantity import unit_of, words_of
+    from avtorch.gap.quantity import unit_of, words_of
 
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     for title in ("of the loop", "mean", "90 %"):

@@ -14,12 +14,12 @@ import torch
 from numpy.typing import NDArray
 
 from avtorch.experiment.manoeuvres import Manoeuvre
-from avtorch.gap.answer.contender import Contender
-from avtorch.gap.chain.drive import Drive, Response
 from avtorch.gap.effects import GainChange, RoadGrade
 from avtorch.gap.likelihood.noise_draws import noise_draws
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.result.predictive_model import PredictiveModel
+from avtorch.gap.simulator.drive import Drive, Response
 from avtorch.io import Log
 
 Float = NDArray[np.float64]
@@ -27,7 +27,7 @@ Float = NDArray[np.float64]
 _SLOWEST_MPS = 0.5
 
 
-def responses(contender: Contender, manoeuvres: Sequence[Manoeuvre], draws: slice) -> Response:
+def responses(contender: PredictiveModel, manoeuvres: Sequence[Manoeuvre], draws: slice) -> Response:
     """Rollouts (manoeuvre, draw, time) of manoeuvres of one length, at `draws` of what is believed."""
     command = torch.as_tensor(np.stack([m.command for m in manoeuvres]))[:, None]
     speed = torch.as_tensor(np.stack([np.maximum(m.speed, _SLOWEST_MPS) for m in manoeuvres]))[:, None]
@@ -43,15 +43,15 @@ def responses(contender: Contender, manoeuvres: Sequence[Manoeuvre], draws: slic
 
 
 @dataclass(frozen=True, eq=False)
-class Law:
-    """Of one manoeuvre by one contender: `mean` (witness, row), `spread` (direction, witness, row), and its noise."""
+class PredictiveLaw:
+    """Of one manoeuvre by one contender: `mean` (channel, row), `spread` (direction, channel, row), and its noise."""
 
-    white: Whitener = field(repr=False)
+    white: WhiteningFilter = field(repr=False)
     mean: Float = field(repr=False)
     spread: Float = field(repr=False)
 
     def log_density(self, measured: Float) -> Float:
-        """Of rows (draw, witness, row): (draw,) [nats]."""
+        """Of rows (draw, channel, row): (draw,) [nats]."""
         e = self._white(measured - self.mean)
         u = self._white(self.spread)
         constant = self.white.constant_of(coarse=False)
@@ -62,7 +62,7 @@ class Law:
         return constant - 0.5 * ((e**2).sum(-1) - (match * taken).sum(-1) + size)
 
     def _white(self, errors: Float) -> Float:
-        """(column, white row) of errors (column, witness, row)."""
+        """(column, white row) of errors (column, channel, row)."""
         if not len(errors):
             return np.zeros((0, 1))
         kept = errors[..., self.white.record.source, None]
@@ -70,49 +70,56 @@ class Law:
 
 
 @dataclass(frozen=True, eq=False)
-class Foretold:
-    """One contender on all manoeuvres: `rollouts` (manoeuvre, draw, witness, row), half of which make the laws and
+class Prediction:
+    """One contender on all manoeuvres: `rollouts` (manoeuvre, draw, channel, row), half of which make the laws and
     half the examples."""
 
-    contender: Contender
-    witnesses: tuple[str, ...]
+    contender: PredictiveModel
+    channels: tuple[str, ...]
     manoeuvres: Sequence[Manoeuvre] = field(repr=False)
     rollouts: Float = field(repr=False)
     group: int
 
     @classmethod
     def of(
-        cls, contender: Contender, manoeuvres: Sequence[Manoeuvre], witnesses: tuple[str, ...], group: int, draws: int
-    ) -> Foretold:
+        cls,
+        contender: PredictiveModel,
+        manoeuvres: Sequence[Manoeuvre],
+        channels: tuple[str, ...],
+        group: int,
+        draws: int,
+    ) -> Prediction:
         """With so many `draws`; rows of the manoeuvres are means of `group` rows of a log."""
         seen = responses(contender, manoeuvres, slice(0, draws))
         # parts that do not depend on the draw come without that dimension
         shape = (len(manoeuvres), draws, len(manoeuvres[0].time))
         parts = {"accel": seen.accel_measured, "speed": seen.speed}
-        stacked = torch.stack([parts[name].expand(shape) for name in witnesses], -2).numpy()
-        return cls(contender, witnesses, manoeuvres, stacked, group)
+        stacked = torch.stack([parts[name].expand(shape) for name in channels], -2).numpy()
+        return cls(contender, channels, manoeuvres, stacked, group)
 
-    def law(self, number: int) -> Law:
+    def law(self, number: int) -> PredictiveLaw:
         """Of manoeuvre `number`."""
         some = self.rollouts[number, ::2]
         mean = some.mean(0)
         spread = (some - mean) / np.sqrt(max(len(some) - 1, 1))
         road = self._road(number)
-        white = Whitener(_record(self.manoeuvres[number], self.witnesses), self.contender.noise.of_means(self.group))
-        return Law(white, mean, spread if road is None else np.concatenate([spread, road]))
+        white = WhiteningFilter(
+            _record(self.manoeuvres[number], self.channels), self.contender.noise.of_means(self.group)
+        )
+        return PredictiveLaw(white, mean, spread if road is None else np.concatenate([spread, road]))
 
     def examples(self, number: int, rng: np.random.Generator) -> Float:
-        """What would be measured, (draw, witness, row)."""
+        """What would be measured, (draw, channel, row)."""
         some = self.rollouts[number, 1::2]
         count, _, rows = some.shape
         time = self.manoeuvres[number].time
         noise = self.contender.noise.of_means(self.group)
-        seen = some + noise_draws(noise, rows, float(time[1] - time[0]), self.witnesses, count, rng)
+        seen = some + noise_draws(noise, rows, float(time[1] - time[0]), self.channels, count, rng)
         road = self._road(number)
         return seen if road is None else seen + np.einsum("dk,kwr->dwr", rng.standard_normal((count, len(road))), road)
 
     def _road(self, number: int) -> Float | None:
-        """Directions (knot, witness, row) in which an unknown slope moves what is measured."""
+        """Directions (knot, channel, row) in which an unknown slope moves what is measured."""
         size = self.contender.grade_rms
         if not size:
             return None
@@ -125,12 +132,12 @@ class Foretold:
         gained = np.cumsum(0.5 * step * (force[:, 1:] + force[:, :-1]), -1)
         speed = np.concatenate([np.zeros((len(force), 1)), gained], -1)
         accel = np.zeros_like(force) if self.contender.specific_force else force
-        return np.stack([{"accel": accel, "speed": speed}[name] for name in self.witnesses], 1)
+        return np.stack([{"accel": accel, "speed": speed}[name] for name in self.channels], 1)
 
 
-def _record(m: Manoeuvre, witnesses: tuple[str, ...]) -> Record:
+def _record(m: Manoeuvre, channels: tuple[str, ...]) -> Record:
     """Rows of a manoeuvre as a diagnosis would look at them."""
     speed = np.maximum(m.speed, _SLOWEST_MPS)
     given = {"accel": np.gradient(speed, m.time), "speed": speed}
-    log = Log.from_arrays(time=m.time, accel_cmd=m.command, **{name: given[name] for name in witnesses})
+    log = Log.from_arrays(time=m.time, accel_cmd=m.command, **{name: given[name] for name in channels})
     return Record.of(log, rate_hz=0.9 / float(m.time[1] - m.time[0]))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from avtorch.experiment.foretold import Foretold
+from avtorch.experiment.foretold import Prediction
 
 Float = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ class Information:
     margin: float
 
 
-def information(foretold: Sequence[Foretold], number: int, prior: Sequence[float], *, seed: int = 0) -> Information:
+def information(foretold: Sequence[Prediction], number: int, prior: Sequence[float], *, seed: int = 0) -> Information:
     """Of manoeuvre `number`, with causes a priori as probable as `prior` says, by examples of what would be measured.
 
     Every example is judged by the law of each cause.

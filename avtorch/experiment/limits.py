@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, fields
 
 from avtorch.errors import InputError
-from avtorch.gap.answer.diagnosis import LogFacts
+from avtorch.gap.result.diagnosis import LogFacts
 
 LEAST_SPAN_MPS = 1.5
 _LEAST_MPS2 = 0.3

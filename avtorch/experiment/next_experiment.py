@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from avtorch.errors import InputError
-from avtorch.experiment.foretold import Foretold, responses
+from avtorch.experiment.foretold import Prediction, responses
 from avtorch.experiment.information import Information, information
 from avtorch.experiment.limits import Limits
 from avtorch.experiment.manoeuvres import Manoeuvre, library
-from avtorch.gap.answer.contender import Contender
-from avtorch.gap.answer.diagnosis import Diagnosis
 from avtorch.gap.likelihood.record import grouped
+from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.io import atomic
 
 _RATE_HZ = 20.0
@@ -72,7 +72,7 @@ def next_experiment(found: Diagnosis, limits: Limits | None = None, *, seed: int
     rivals = list(found.contenders)
     if len(rivals) < 2:
         return None
-    witnesses = tuple(name for name in ("accel", "speed") if name in found.log.signals)
+    channels = tuple(name for name in ("accel", "speed") if name in found.log.signals)
     group = grouped(found.log.rate_hz, _RATE_HZ)
     given = Limits.of_log(found.log) if limits is None else limits
     offers = _expected(rivals[0], library(given, rate_hz=found.log.rate_hz / group), given)
@@ -81,7 +81,7 @@ def next_experiment(found: Diagnosis, limits: Limits | None = None, *, seed: int
     weights = np.array([max(found.probability(r.name), 1e-3) for r in rivals])
     weights = weights / weights.sum()
     entropy = float(-(weights * np.log(weights)).sum())
-    foretold = [Foretold.of(r, offers, witnesses, group, _DRAWS) for r in rivals]
+    foretold = [Prediction.of(r, offers, channels, group, _DRAWS) for r in rivals]
     judged = [information(foretold, i, weights.tolist(), seed=seed) for i in range(len(offers))]
     best = _chosen(offers, judged)
     names = tuple(r.name for r in rivals)
@@ -93,7 +93,7 @@ def next_experiment(found: Diagnosis, limits: Limits | None = None, *, seed: int
         entropy=entropy,
         every={m.name: i for m, i in zip(offers, judged, strict=True)},
         untold=untold,
-        why=_sentence(offers[best], names, judged[best], entropy, untold, witnesses),
+        why=_sentence(offers[best], names, judged[best], entropy, untold, channels),
         limits=given,
     )
 
@@ -116,7 +116,7 @@ def write_table(experiment: Experiment | None, folder: str | PathLike[str]) -> l
     return [path]
 
 
-def _expected(first: Contender, manoeuvres: tuple[Manoeuvre, ...], limits: Limits) -> list[Manoeuvre]:
+def _expected(first: PredictiveModel, manoeuvres: tuple[Manoeuvre, ...], limits: Limits) -> list[Manoeuvre]:
     """With the speeds that the likeliest cause foretells, trimmed so that they come back; those within the limits."""
     offers = list(manoeuvres)
     K_L = float(np.mean(first.belief["K_L"]))
@@ -148,7 +148,7 @@ def _sentence(
     told: Information,
     entropy: float,
     untold: tuple[str, ...],
-    witnesses: tuple[str, ...],
+    channels: tuple[str, ...],
 ) -> str:
     causes = ["no effect" if n == "none" else n.replace("+", " with ") for n in names]
     listing = " and ".join([", ".join(causes[:-1]), causes[-1]])
@@ -157,7 +157,7 @@ def _sentence(
     else:
         share = "over 0.99" if told.told > 0.99 else f"{told.told:.2f}"
         text = f"{m.name}, to tell apart {listing}; expected probability of the true one afterwards: {share}"
-    if untold and len(witnesses) == 1:
-        other = "speed" if witnesses == ("accel",) else "accel"
+    if untold and len(channels) == 1:
+        other = "speed" if channels == ("accel",) else "accel"
         text += f"; {', '.join(untold)} can only be told with {other} in the log as well"
     return text[0].upper() + text[1:] + "."

@@ -20,10 +20,10 @@ from avtorch.follower.followed import Followed, car_of, followed, seen_in
 from avtorch.follower.identify import Identified, identified, widened
 from avtorch.follower.laws import LAWS, Law, Seen, law_named, tensors
 from avtorch.follower.loop_stability import LoopStability, loop_stability
-from avtorch.gap.answer.diagnosis import Diagnosis
-from avtorch.gap.answer.quantity import Quantity
 from avtorch.gap.diagnose import diagnose
 from avtorch.gap.likelihood.record import Record
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.io import Log
 
 Float = NDArray[np.float64]

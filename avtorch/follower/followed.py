@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from avtorch.errors import InputError
 from avtorch.follower.laws import Law, Seen
-from avtorch.gap.chain.drive import Drive
-from avtorch.gap.chain.plant import GapPlant, plant
 from avtorch.gap.effects import DeadTime
-from avtorch.gap.likelihood.candidate import Candidate, Coordinate
+from avtorch.gap.likelihood.hypothesis import Coordinate, Hypothesis
 from avtorch.gap.likelihood.record import Record
+from avtorch.gap.simulator.drive import Drive
+from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log
 
 Float = NDArray[np.float64]
@@ -31,7 +31,7 @@ NEEDED = ("speed", "spacing", "lead_speed")
 
 
 @dataclass(frozen=True, eq=False)
-class Followed(Candidate):
+class Followed(Hypothesis):
     """`law` and a plant with `effects` over a record of speeds; `seen` of each drive, `begins`: its row of the log."""
 
     law: Law = field(kw_only=True)
@@ -75,7 +75,7 @@ class _Speed:
 def followed(log: Log, law: Law, *, dead_time: bool = True) -> Followed:
     """Of a car-following log; `dead_time` False: the plant is the bare GLVD.
 
-    Only its speed is a witness, as the acceleration of public recordings is that speed's derivative. Raises
+    Only its speed is a channel, as the acceleration of public recordings is that speed's derivative. Raises
     `InputError` for a log without speed, spacing and the leader's speed.
     """
     for name in NEEDED:

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.follower.followed import Followed
-from avtorch.gap.answer.joint import root
-from avtorch.gap.likelihood.fit import finish, left_over, modes
+from avtorch.gap.likelihood.gauss_newton import finish, modes, residuals
 from avtorch.gap.likelihood.noise_fit import GUST, fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.posterior.density import root
 
 Float = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ class Identified:
         return {k: x.numpy() for k, x in self.candidate.values(z).items()}
 
     def errors(self, record: Record) -> Float:
-        """Measured less rolled out (witness, counted, group) at the rows of `record`."""
+        """Measured less rolled out (channel, counted, group) at the rows of `record`."""
         return self.candidate.on(record).errors(self.z[None])[0]
 
 
@@ -65,10 +65,10 @@ def identified(candidate: Followed, record: Record | None = None, *, start: Iden
     noise, value = _START if start is None else start.noise, -np.inf
     z = _starts(own) if start is None else start.z[None]
     for _ in range(_TURNS):
-        white = Whitener(record, noise)
+        white = WhiteningFilter(record, noise)
         tried, worth = modes(own, white, z, iterations=12, enough=0.1)
         z = tried[[int(np.argmax(worth))]]
-        errors = left_over(own, white, z[0], coarse=False)
+        errors = residuals(own, white, z[0], coarse=False)
         lag = float(own.values(z)["T_L"][0])
         fitted = fit_noise(record, errors, noise, T_L=lag, priors=GUST, iterations=4)
         noise = fitted.noise
@@ -76,7 +76,7 @@ def identified(candidate: Followed, record: Record | None = None, *, start: Iden
         if new < value + 0.5:
             break
         value = new
-    fit = finish(own, Whitener(record, noise), z[0])
+    fit = finish(own, WhiteningFilter(record, noise), z[0])
     return Identified(candidate, fit.z, fit.covariance, noise, fit.log_evidence + fitted.log_prior)
 
 

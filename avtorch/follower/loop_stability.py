@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from avtorch.follower.laws import Law
-from avtorch.gap.answer.quantity import Quantity
+from avtorch.gap.quantity import Quantity
 from avtorch.vehicle.stability import chain_verdict, frequencies
 from avtorch.vehicle.stability.chain import actuator
 

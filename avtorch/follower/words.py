@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from avtorch.follower.diagnose_follower import FollowerDiagnosis
-from avtorch.gap.answer.quantity import Quantity
+from avtorch.gap.quantity import Quantity
 
 _SPOKEN = {"constant_time_gap": "a constant time gap", "intelligent_driver": "the Intelligent Driver Model"}
 

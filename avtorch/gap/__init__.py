@@ -1,12 +1,6 @@
 """What the simulator lacks: effects along the chain command, actuator, body, sensor, and plants made of them."""
 
 from avtorch.gap import effects
-from avtorch.gap.chain.domain import Domain
-from avtorch.gap.chain.drive import Drive, Response
-from avtorch.gap.chain.effect import EFFECTS, PLACES, Effect, NoiseChange, Row, effect_class, register
-from avtorch.gap.chain.parameter import Parameter
-from avtorch.gap.chain.plant import BASELINE, GapPlant, plant
-from avtorch.gap.chain.recursion import scan, scan_pair
 from avtorch.gap.effects import (
     AerodynamicDrag,
     Backlash,
@@ -31,6 +25,12 @@ from avtorch.gap.effects import (
     SpeedDependentGain,
     SpeedDependentLag,
 )
+from avtorch.gap.simulator.domain import Domain
+from avtorch.gap.simulator.drive import Drive, Response
+from avtorch.gap.simulator.effect import EFFECTS, PLACES, Effect, NoiseChange, Row, effect_class, register
+from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.plant import BASELINE, GapPlant, plant
+from avtorch.gap.simulator.recursion import scan, scan_pair
 
 __all__ = [
     "BASELINE",

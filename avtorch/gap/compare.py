@@ -22,17 +22,17 @@ from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 from avtorch.errors import InputError
-from avtorch.gap.answer.comparison import Comparison, LaterAnswer, Moved, Telling
-from avtorch.gap.answer.diagnosis import LogFacts
-from avtorch.gap.answer.quantity import Quantity
-from avtorch.gap.chain.plant import GapPlant, plant
+from avtorch.gap.crossval.folds import blocks_of
+from avtorch.gap.crossval.rollout_errors import HORIZON_S, Measure, products, reached
 from avtorch.gap.delay_rival import WithDelay, later_answer
-from avtorch.gap.heldout.parts import blocks_of
-from avtorch.gap.heldout.rollout_errors import HORIZON_S, Measure, products, reached
-from avtorch.gap.likelihood.fit import directions
+from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.search.found import Found
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.comparison import Comparison, LaterAnswer, Moved, Telling
+from avtorch.gap.result.diagnosis import LogFacts
+from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
+from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log
 
 Float = NDArray[np.float64]
@@ -59,7 +59,7 @@ def compare(
     and `K_L`; default: bare GLVD as the drives before fit it. Its effects keep their values in the fits of the car.
     `level`: chance at which drives of one car are said to differ.
 
-    Raises `InputError` for logs that cannot be diagnosed or hold less than 50 s, witnesses that differ, or a level out
+    Raises `InputError` for logs that cannot be diagnosed or hold less than 50 s, channels that differ, or a level out
     of range.
     """
     if not 0 < level < 1:
@@ -69,7 +69,7 @@ def compare(
     plants = [b if isinstance(b, GapPlant) else plant([], baseline=b) for b in given]
     fitted = [_Side.of(logs, plants[0], name) for logs, name in zip(sides, ("before", "after"), strict=True)]
     one, two = fitted
-    if one.found.candidate.record.witnesses != two.found.candidate.record.witnesses:
+    if one.found.hypothesis.record.channels != two.found.hypothesis.record.channels:
         raise InputError("before, after: have different witnesses; needs accel, speed or both in both")
     away = two.mean - one.mean
     covariance = one.covariance + two.covariance
@@ -113,7 +113,7 @@ class _Side:
     """One set of drives: `mean` and `covariance` of ln T_L and ln K_L, from so many `blocks`."""
 
     search: Search = field(repr=False)
-    found: Found
+    found: FittedModel
     mean: Float
     covariance: Float = field(repr=False)
     blocks: int
@@ -122,14 +122,14 @@ class _Side:
     def of(cls, logs: Sequence[Log], base: GapPlant, which: str) -> _Side:
         search = Search(logs, base, effects=[], pairs=False)
         found = search.run().none
-        record = found.candidate.record
+        record = found.hypothesis.record
         blocks = blocks_of(record)
         if len(blocks) < _LEAST:
             raise InputError(f"{which}: found {len(blocks)} blocks of 10 s of usable driving, needs {_LEAST} or more")
-        columns = directions(found.candidate, found.white, found.z).reshape(len(found.z), -1)
+        columns = whitened_jacobian(found.hypothesis, found.white, found.z).reshape(len(found.z), -1)
         # how each parameter moves the errors: less of the rollout
         pulls = -columns * found.white(found.errors).ravel()
-        shape = (len(found.z), len(record.witnesses), record.rows, record.group)
+        shape = (len(found.z), len(record.channels), record.rows, record.group)
         by_row = pulls.reshape(shape).sum((1, 3))
         scores = np.stack([by_row[:, b].sum(1) for b in blocks], 1)
         scores = scores - scores.mean(1, keepdims=True)
@@ -140,14 +140,14 @@ class _Side:
         spread = root @ axes @ np.diag(np.maximum(sizes, 1.0)) @ axes.T @ root.T
         here = np.array([np.log(found.values[name]) for name in _CAR])
         step = 1e-4
-        each = found.candidate.values(found.z + step * np.eye(len(found.z)))
+        each = found.hypothesis.values(found.z + step * np.eye(len(found.z)))
         slope = np.stack([(np.log(each[name].numpy()) - here[i]) / step for i, name in enumerate(_CAR)])
         return cls(search, found, here, slope @ spread @ slope.T, len(blocks))
 
 
-def _as_fitted(found: Found) -> GapPlant:
+def _as_fitted(found: FittedModel) -> GapPlant:
     values = {name: found.values[name] for name in _CAR}
-    return found.candidate.baseline.with_values(values)
+    return found.hypothesis.baseline.with_values(values)
 
 
 def _alike(one: Log, two: Log) -> bool:
@@ -158,8 +158,8 @@ def _alike(one: Log, two: Log) -> bool:
 
 def _horizon(sides: Sequence[_Side]) -> float:
     """The longest rollouts [s], up to `HORIZON_S`, that the stretches of either side hold: errors grow with it."""
-    records = [side.found.candidate.record for side in sides]
-    return min(reached(Measure(r.witnesses[0], HORIZON_S), r) or HORIZON_S for r in records)
+    records = [side.found.hypothesis.record for side in sides]
+    return min(reached(Measure(r.channels[0], HORIZON_S), r) or HORIZON_S for r in records)
 
 
 def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float, *, same: bool) -> dict[str, Moved]:
@@ -167,7 +167,7 @@ def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float
     drawn = []
     for i, (side, simulator) in enumerate(zip(sides, simulators, strict=True)):
         rng = np.random.default_rng(0 if same else i)
-        record = side.found.candidate.record
+        record = side.found.hypothesis.record
         errors = record.measured - _rolled(record, simulator)
         blocks = blocks_of(record)
         squares = _squares(record, errors, blocks, float(simulator.T_L), horizon)
@@ -187,15 +187,15 @@ def _rolled(record: Record, simulator: GapPlant) -> Float:
         own = simulator.prepared(*drives)
         responses += [own.response(drive) for drive in drives]
     seen = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
-    return np.stack([record.seen(seen[name]) for name in record.witnesses])
+    return np.stack([record.seen(seen[name]) for name in record.channels])
 
 
 def _squares(record: Record, errors: Float, blocks: Sequence[slice], lag: float, horizon: float) -> dict[str, Float]:
     """Under the names of the whole `HORIZON_S`, whatever of it the drives hold."""
     out = {}
-    for witness in record.witnesses:
-        squares = products(Measure(witness, horizon), record, errors[None], blocks, lag)
-        out[Measure(witness, HORIZON_S).name] = squares[:, 0, 0]
+    for channel in record.channels:
+        squares = products(Measure(channel, horizon), record, errors[None], blocks, lag)
+        out[Measure(channel, HORIZON_S).name] = squares[:, 0, 0]
     return out
 
 

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
-from avtorch.gap.answer.comparison import LaterAnswer
-from avtorch.gap.answer.quantity import Quantity
+from avtorch.gap.crossval.folds import blocks_of
 from avtorch.gap.effects import DeadTime
-from avtorch.gap.heldout.parts import blocks_of
-from avtorch.gap.likelihood.fit import directions
-from avtorch.gap.search.found import Found
+from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.comparison import LaterAnswer
+from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
 
 Float = NDArray[np.float64]
@@ -39,15 +39,15 @@ class WithDelay:
     blocks: int
 
     @classmethod
-    def of(cls, search: Search, none: Found) -> WithDelay:
+    def of(cls, search: Search, none: FittedModel) -> WithDelay:
         """With a dead time on top of what `search` found without any effect, in place of one of the baseline's."""
         found = search.with_effects(none, [DeadTime])
-        candidate, record = found.candidate, found.candidate.record
+        candidate, record = found.hypothesis, found.hypothesis.record
         keys = [c.key for c in candidate.coordinates]
         here = found.z.copy()
         delay = keys.index(_KEYS[2])
         here[delay] = max(here[delay], candidate.coordinates[delay].z_of(_FELT_S))
-        columns = directions(candidate, found.white, here).reshape(len(here), -1)
+        columns = whitened_jacobian(candidate, found.white, here).reshape(len(here), -1)
         # from the fit's own scales to logarithms and seconds
         columns = np.stack(
             [columns[keys.index(k)] / slope for k, slope in zip(_KEYS, _slopes(found, here), strict=True)]
@@ -55,7 +55,7 @@ class WithDelay:
         white = found.white(found.errors).ravel()
         inverse = np.linalg.inv(columns @ columns.T)
         pulls = columns * white
-        by_row = pulls.reshape(len(_KEYS), len(record.witnesses), record.rows, record.group).sum((1, 3))
+        by_row = pulls.reshape(len(_KEYS), len(record.channels), record.rows, record.group).sum((1, 3))
         blocks = blocks_of(record)
         scores = np.stack([by_row[:, b].sum(1) for b in blocks], 1)
         values = [found.values[key] for key in _KEYS]
@@ -97,11 +97,11 @@ def _chance(away: Float, covariance: Float, which: Sequence[int], blocks: int) -
     return float(fisher.sf(square * (blocks - count) / (count * (blocks - 1)), count, blocks - count))
 
 
-def _slopes(found: Found, z: Float) -> list[float]:
+def _slopes(found: FittedModel, z: Float) -> list[float]:
     """Of ln T_L, ln K_L and the dead time [s] by their own coordinates at `z`."""
     step = 1e-4
-    keys = [c.key for c in found.candidate.coordinates]
-    each = found.candidate.values(z + step * np.vstack([np.zeros(len(z)), np.eye(len(z))]))
+    keys = [c.key for c in found.hypothesis.coordinates]
+    each = found.hypothesis.values(z + step * np.vstack([np.zeros(len(z)), np.eye(len(z))]))
     out = []
     for key in _KEYS:
         x = each[key].numpy()

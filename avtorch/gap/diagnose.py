@@ -10,30 +10,31 @@ from typing import Literal
 import numpy as np
 
 from avtorch.errors import InputError
-from avtorch.gap.answer import delays, words
-from avtorch.gap.answer import posterior as posteriors
-from avtorch.gap.answer.aliases import Told
-from avtorch.gap.answer.contender import contenders
-from avtorch.gap.answer.diagnosis import Diagnosis, LogFacts
-from avtorch.gap.answer.odds import favourite, probabilities
-from avtorch.gap.answer.plausible import implausible
-from avtorch.gap.answer.posterior import Draws
-from avtorch.gap.answer.remainder import Remainder, remainder
-from avtorch.gap.answer.remaining import remaining
-from avtorch.gap.answer.reported import belief, drawn, moved, repaired, reported
-from avtorch.gap.answer.traces import Traces
-from avtorch.gap.answer.verdict import Candidate, verdict_of
-from avtorch.gap.chain.effect import EFFECTS, Effect, effect_class
-from avtorch.gap.chain.plant import GapPlant, plant
-from avtorch.gap.heldout.held_out import held_out
-from avtorch.gap.heldout.misfit import gap_facts
-from avtorch.gap.heldout.shown import Shown
-from avtorch.gap.heldout.shrink import shrinkage
-from avtorch.gap.heldout.where import where
-from avtorch.gap.likelihood.as_read import as_read
+from avtorch.gap.crossval.attribution import RowAttribution
+from avtorch.gap.crossval.cross_validate import cross_validate
+from avtorch.gap.crossval.gap_closed import gap_closed
+from avtorch.gap.crossval.localisation import localise
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.search.found import Found, Race
+from avtorch.gap.likelihood.sensor_noise_floor import with_sensor_noise
+from avtorch.gap.posterior import sample as posteriors
+from avtorch.gap.posterior.sample import Draws
+from avtorch.gap.posterior.summary import belief, drawn, moved, repaired, reported
+from avtorch.gap.result import text as words
+from avtorch.gap.result.diagnosis import Diagnosis, LogFacts
+from avtorch.gap.result.gap_size import gap_size
+from avtorch.gap.result.predictive_model import predictive_models
+from avtorch.gap.result.traces import Traces
+from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 from avtorch.gap.search.search import Search
+from avtorch.gap.selection import periodic_commands as delays
+from avtorch.gap.selection.adequacy import Adequacy, adequacy
+from avtorch.gap.selection.aliases import Identifiability
+from avtorch.gap.selection.given_dead_time import given_dead_time
+from avtorch.gap.selection.model_probabilities import favourite, model_probabilities
+from avtorch.gap.selection.plausibility import implausible
+from avtorch.gap.selection.verdict import Candidate, verdict_of
+from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
+from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log
 
 
@@ -72,7 +73,7 @@ def diagnose(
         each = [replace(log, accel_kind=accel_kind) for log in each]
     if posterior not in ("laplace", "sgld"):
         raise InputError(f"posterior: found {posterior!r}, needs 'laplace' or 'sgld'")
-    read = [as_read(log) for log in each]
+    read = [with_sensor_noise(log) for log in each]
     each, noise_added = [log for log, _ in read], dict.fromkeys(note for _, note in read if note)
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
@@ -80,8 +81,8 @@ def diagnose(
         each, base, effects=kinds, pairs=pairs, budget_s=budget_s, progress=progress, checkpoint=checkpoint
     ).run()
     top = favourite(race.found)
-    apart = Told.of(race, kinds, prior)
-    chances = apart.shared(probabilities(race.found, _left(top, race), prior))
+    apart = Identifiability.of(race, kinds, prior)
+    chances = apart.shared(model_probabilities(race.found, _left(top, race), prior))
     untold = delays.untold(race.found)
     chances = delays.shared(chances, untold)
     candidates = [_told(f, race, chances[f.name], kinds) for f in race.found]
@@ -99,7 +100,7 @@ def diagnose(
     winner = next((f for f in race.found if f.name == verdict.name), None)
     draws = None
     one_mode = winner is not None and (winner.delays is None or len(winner.delays.lengths) == 1)
-    if winner is not None and winner.candidate.size and winner.name != "none" and posterior == "sgld" and one_mode:
+    if winner is not None and winner.hypothesis.size and winner.name != "none" and posterior == "sgld" and one_mode:
         draws = _draws(winner, seed)
         told = _told(winner, race, chances[winner.name], kinds, draws)
         candidates = [told if c.name == winner.name else c for c in candidates]
@@ -118,12 +119,12 @@ def diagnose(
     # what is unknown sets in where the best of the named ones does
     onset = None if verdict.name == "none" else _onset(winner or top, race)
     alike = {part for name in verdict.alias_set for part in name.split("+")}
-    held = held_out(race, winner or top, blamed=named, alike=sorted(alike), progress=progress)
-    shown = Shown.of(race, winner or top)
+    held = cross_validate(race, winner or top, blamed=named, alike=sorted(alike), progress=progress)
+    shown = RowAttribution.of(race, winner or top)
     return Diagnosis(
         log=LogFacts.of(each),
         baseline=moved(race.none),
-        gap=gap_facts(race, top, detected=chances["none"] < 0.5, p_value=shown.p_value),
+        gap=gap_size(race, top, detected=chances["none"] < 0.5, p_value=shown.p_value),
         candidates=tuple(candidates),
         verdict=verdict,
         onset_s=None if onset is None else onset.stamp_s,
@@ -136,32 +137,32 @@ def diagnose(
         draws=drawn(winner, draws) if draws is not None and winner is not None else None,
         where=()
         if verdict.name == "none"
-        else where(shown, onset_s=None if onset is None else onset.from_start_s, lag=race.none.values["T_L"]),
-        shrinkage=shrinkage(held) if held is not None and named else None,
-        contenders=contenders(race, verdict),
+        else localise(shown, onset_s=None if onset is None else onset.from_start_s, lag=race.none.values["T_L"]),
+        shrinkage=gap_closed(held) if held is not None and named else None,
+        contenders=predictive_models(race, verdict),
         traces=_traces(race, winner, shown),
-        remaining=remaining(candidates, verdict, base),
+        remaining=given_dead_time(candidates, verdict, base),
         complete=race.complete,
         scope=race.scope,
         notes=noted,
     )
 
 
-def _left(top: Found, race: Race) -> Remainder:
+def _left(top: FittedModel, race: SearchResult) -> Adequacy:
     """What the favourite leaves over, less what lost messages explain row by row."""
     measured = race.record.measured
     explained = (top.losses.evidence if top.losses else 0.0) + (top.by_chance.explained if top.by_chance else 0.0)
-    return remainder(top.white, top.errors, measured - top.errors, explained=explained)
+    return adequacy(top.white, top.errors, measured - top.errors, explained=explained)
 
 
-def _traces(race: Race, winner: Found | None, shown: Shown) -> Traces:
+def _traces(race: SearchResult, winner: FittedModel | None, shown: RowAttribution) -> Traces:
     record = race.record
     measured = record.measured.mean(-1)
     after = race.none if winner is None else winner
     return Traces(
         time=record.time[record.source],
         command=record.command[record.source],
-        witnesses=record.witnesses,
+        channels=record.channels,
         measured=measured,
         before=measured - race.none.errors.mean(-1),
         after=measured - after.errors.mean(-1),
@@ -170,12 +171,16 @@ def _traces(race: Race, winner: Found | None, shown: Shown) -> Traces:
     )
 
 
-def _draws(found: Found, seed: int) -> Draws:
+def _draws(found: FittedModel, seed: int) -> Draws:
     return posteriors.posterior(found, seed=seed)
 
 
 def _told(
-    found: Found, race: Race, probability: float, kinds: Sequence[type[Effect]], draws: Draws | None = None
+    found: FittedModel,
+    race: SearchResult,
+    probability: float,
+    kinds: Sequence[type[Effect]],
+    draws: Draws | None = None,
 ) -> Candidate:
     """A candidate as the answer lists it; parameters only where they bear on anything."""
     gain = float(found.log_evidence - race.none.log_evidence)
@@ -208,7 +213,7 @@ class _Onset:
         return cls(stamp, start, int(record.log[place]))
 
 
-def _onset(found: Found | None, race: Race) -> _Onset | None:
+def _onset(found: FittedModel | None, race: SearchResult) -> _Onset | None:
     """Of a change of gain the moment of the change."""
     if found is None:
         return None

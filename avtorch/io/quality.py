@@ -170,9 +170,9 @@ def _doubtful_units(log: Log) -> list[str]:
     if log.accel_cmd is not None:
         found = command_scale(log.elapsed, parts, log.speed, log.accel, log.accel_cmd)
         if found is not None and found.correlation > 0.9 and not 0.2 <= found.slope <= 1.5:
-            witness = "speed" if log.speed is not None else "accel"
+            channel = "speed" if log.speed is not None else "accel"
             notes.append(
-                f"{witness} answers with {found.slope:.3g} times the command: units of {witness} or accel_cmd?"
+                f"{channel} answers with {found.slope:.3g} times the command: units of {channel} or accel_cmd?"
             )
     if log.speed is None and log.accel is not None and log.accel_cmd is not None:
         top = max(float(np.abs(log.accel).max()), float(np.abs(log.accel_cmd).max()))

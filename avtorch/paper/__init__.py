@@ -7,12 +7,13 @@ from avtorch.paper.monitoring import Monitoring, monitoring
 from avtorch.paper.platoon import Platoon, platoon
 from avtorch.paper.regions import Regions, regions
 from avtorch.paper.reproduce import EXPERIMENTS, SEEDS, Reproduction, reproduce
-from avtorch.paper.rows import Row
+from avtorch.paper.rows import ClaimRow
 from avtorch.paper.strategies import Strategies, strategies
 
 __all__ = [
     "EXPERIMENTS",
     "SEEDS",
+    "ClaimRow",
     "Estimation",
     "Gains",
     "Leaders",
@@ -20,7 +21,6 @@ __all__ = [
     "Platoon",
     "Regions",
     "Reproduction",
-    "Row",
     "Strategies",
     "estimation",
     "gains",

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from avtorch.paper.drive import Progress
 from avtorch.paper.leaders import Ahead, Leaders
-from avtorch.paper.rows import Row, listed, middle, resampled, share, sign, spread, within
+from avtorch.paper.rows import ClaimRow, listed, middle, resampled, share, sign, spread, within
 from avtorch.paper.windows import FOR_PRIOR, MORE, ten_windows
 
 LAGS = (0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 1.6, 2.0)
@@ -65,7 +65,7 @@ class Estimation:
     seed: int
 
     @property
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[ClaimRow]:
         out = [_coverage(self.sweeps, self.seed)] if len(self.sweeps) > 1 else []
         for sweep in self.sweeps:
             out.append(_coverage([sweep], self.seed))
@@ -111,7 +111,7 @@ def estimation(leaders: Leaders, *, seeds: int, seed: int, progress: Progress = 
     return Estimation(sweeps, seed)
 
 
-def _coverage(sweeps: list[Sweep], seed: int) -> Row:
+def _coverage(sweeps: list[Sweep], seed: int) -> ClaimRow:
     """Over used windows and both parameters; whole runs are resampled, for what belongs to one run goes together."""
     held = torch.cat([(s.inside & s.used[..., None]).double().sum((0, 3)).flatten() for s in sweeps])
     asked = torch.cat([2 * s.used.double().sum(0).flatten() for s in sweeps])
@@ -125,7 +125,7 @@ def _coverage(sweeps: list[Sweep], seed: int) -> Row:
         f"{100 * COVERAGE[0]:.0f} to {100 * COVERAGE[1]:.0f} %."
     )
     ahead = "; ".join(s.ahead.name for s in sweeps)
-    return Row(
+    return ClaimRow(
         "estimation",
         f"{MORE} windows of 5 s, all settings; {ahead}",
         "coverage of the 90 % interval",
@@ -137,7 +137,7 @@ def _coverage(sweeps: list[Sweep], seed: int) -> Row:
     )
 
 
-def _excitation(sweep: Sweep) -> Row:
+def _excitation(sweep: Sweep) -> ClaimRow:
     known = sweep.known
     poor = known < KNOWN
     value = float((~poor).double().mean())
@@ -154,7 +154,7 @@ def _excitation(sweep: Sweep) -> Row:
     )
     least, most = (100 * float(x) for x in (known.min(), known.max()))
     why = f"of the {MORE} windows after the prior {least:.0f} to {most:.0f} % are excited; {told}."
-    return Row(
+    return ClaimRow(
         "estimation",
         f"{len(known)} settings; {sweep.ahead.name}",
         "share of settings with at least half of the windows excited",
@@ -166,7 +166,7 @@ def _excitation(sweep: Sweep) -> Row:
     )
 
 
-def _growth(sweep: Sweep, what: str, along: str, relative: bool, seed: int) -> Row:
+def _growth(sweep: Sweep, what: str, along: str, relative: bool, seed: int) -> ClaimRow:
     """The exponent with which the median error goes along the sweep, a straight line through the logarithms."""
     part = slice(0, len(LAGS)) if along == "T_L" else slice(len(LAGS), None)
     column = ("T_L", "K_L").index(what)
@@ -188,7 +188,7 @@ def _growth(sweep: Sweep, what: str, along: str, relative: bool, seed: int) -> R
         f"{float(x[-1]):g}, while the command's RMS goes from {float(asked[0]):.2f} to {float(asked[-1]):.2f} m/s²."
     )
     falls = along == "K_L"
-    return Row(
+    return ClaimRow(
         "estimation",
         f"{along} from {float(x[0]):g} to {float(x[-1]):g}; {sweep.ahead.name}",
         f"exponent of the {words} in {along}",

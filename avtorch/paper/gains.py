@@ -22,7 +22,7 @@ from torch import Tensor
 
 from avtorch.paper.drive import CHANGED, HEALTHY, NOISE, Progress, noise_seeds, rms
 from avtorch.paper.leaders import DRIVE_S, Ahead, Leaders
-from avtorch.paper.rows import Row, Verdict, listed, median_interval, middle, sign
+from avtorch.paper.rows import ClaimRow, Verdict, listed, median_interval, middle, sign
 from avtorch.vehicle import NOMINAL_GAINS, ClosedLoop, GLVDPlant, LinearController
 from avtorch.vehicle.block import Block
 from avtorch.vehicle.stability import peak_gain
@@ -65,10 +65,10 @@ class Gains:
     seed: int
 
     @property
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[ClaimRow]:
         return [self._claim(*claim) for claim in _CLAIMS] + [self._damps(0), self._damps(1), self._more()]
 
-    def _claim(self, gain: str, what: str, goes: Goes, words: str) -> Row:
+    def _claim(self, gain: str, what: str, goes: Goes, words: str) -> ClaimRow:
         values = self.measured[what][NAMES.index(gain)]
         ratio = values[-1] / values[0]
         interval = median_interval(ratio, self.seed)
@@ -79,7 +79,7 @@ class Gains:
         }
         steps = ", ".join(f"{x:.3g}" for x in middle(values).tolist())
         why = f"with {gain} at {listed(FACTORS)} times its value the {what} is {steps} {_UNITS[what]}."
-        return Row(
+        return ClaimRow(
             "gains",
             f"{gain} three times as large; behind {self.ahead.name}",
             f"{what}, over that with the default gain",
@@ -90,12 +90,12 @@ class Gains:
             self.ahead.said(why),
         )
 
-    def _damps(self, index: int) -> Row:
+    def _damps(self, index: int) -> ClaimRow:
         peak = self.peak[index]
         steps = ", ".join(f"{x:.3f}" for x in peak.tolist())
         why = f"with {NAMES[index]} at {listed(FACTORS)} times its value the peak gain is {steps}."
         ratio = float(peak[-1] / peak[0])
-        return Row(
+        return ClaimRow(
             "gains",
             f"{NAMES[index]} three times as large, changed vehicle (1.5 s, 0.5), time gap 1 s",
             "exact peak gain, over that with the default gain",
@@ -106,9 +106,9 @@ class Gains:
             why,
         )
 
-    def _more(self) -> Row:
+    def _more(self) -> ClaimRow:
         k_s, k_v = (self.peak[i, -1] for i in (0, 1))
-        return Row(
+        return ClaimRow(
             "gains",
             "k_v and k_s three times as large, changed vehicle (1.5 s, 0.5), time gap 1 s",
             "exact peak gain with k_v over that with k_s",

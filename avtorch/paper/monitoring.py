@@ -16,7 +16,7 @@ from avtorch.decision.record import SupervisedRun
 from avtorch.decision.supervisor import Supervisor
 from avtorch.paper.drive import CHANGE_S, CHANGED, HEALTHY, NOISE, Progress, change, noise_seeds
 from avtorch.paper.leaders import DRIVE_S, Ahead, Leaders
-from avtorch.paper.rows import Row, error, median_interval, middle, share, spread
+from avtorch.paper.rows import ClaimRow, error, median_interval, middle, share, spread
 from avtorch.vehicle import ClosedLoop, GLVDPlant
 
 WINDOW_S = 2.0
@@ -47,11 +47,11 @@ class Watched:
         before, after = (torch.tensor(x, dtype=torch.float64) for x in (HEALTHY, CHANGED))
         return torch.where((self.start >= CHANGE_S - 1e-6)[:, None], after, before)[:, None]
 
-    def rows(self, seed: int) -> list[Row]:
+    def rows(self, seed: int) -> list[ClaimRow]:
         after = self.start >= CHANGE_S - 1e-6
         off = (self.mean - self.truth).abs()
         seen_before, seen_after = self.used & ~after[:, None], self.used & after[:, None]
-        out: list[Row] = []
+        out: list[ClaimRow] = []
         for name, column in (("T_L", 0), ("K_L", 1)):
             size, level = off[..., column], self.mean[..., column]
             out.append(self._row(name, column, "before the change", seen_before, _last(seen_before), size, level, seed))
@@ -70,7 +70,7 @@ class Watched:
         size: Tensor,
         level: Tensor,
         seed: int,
-    ) -> Row:
+    ) -> ClaimRow:
         """`seen` (window, seed), `index` (seed,) of the window asked about, None for the mean over those seen."""
         some = seen.any(0)
         paper, truth = (
@@ -81,7 +81,7 @@ class Watched:
         setting = f"{when}, {DRIVE_S:g} s, windows of {WINDOW_S:g} s; {self.ahead.name}"
         if not bool(some.any()):
             why = "no window was excited, so the belief is still the first prior."
-            return Row(
+            return ClaimRow(
                 "monitoring", setting, f"error of {name}{unit}", theirs, "not known", None, "not reproduced",
                 self.ahead.said(why),
             )  # fmt: skip
@@ -98,12 +98,12 @@ class Watched:
             f"{float(middle(levels)):.3g}, and {int((errors < theirs).sum())} of {int(some.sum())} runs with such a "
             "window are nearer than the paper."
         )
-        return Row(
+        return ClaimRow(
             "monitoring", setting, f"error of {name}{unit}", theirs, float(middle(errors)), interval, verdict,
             self.ahead.said(why),
         )  # fmt: skip
 
-    def _alert(self) -> Row:
+    def _alert(self) -> ClaimRow:
         timely = float((self.alert <= PAPER_ALERT_S + 1e-6).double().mean())
         came = self.alert < _NEVER
         first = self.used & (self.start >= CHANGE_S - 1e-6)[:, None]
@@ -114,7 +114,7 @@ class Watched:
             f"the first excited window after the change in {prompt}."
         )
         ours: float | str = float(middle(self.alert[came])) if bool(came.any()) else "never"
-        return Row(
+        return ClaimRow(
             "monitoring",
             f"change at {CHANGE_S:g} s; {self.ahead.name}",
             "time of the alert [s]",
@@ -125,10 +125,10 @@ class Watched:
             self.ahead.said(why),
         )
 
-    def _early(self) -> Row:
+    def _early(self) -> ClaimRow:
         value = float(self.early.double().mean())
         why = f"{int(self.early.sum())} of {len(self.early)} runs had an alert before the change."
-        return Row(
+        return ClaimRow(
             "monitoring",
             f"before {CHANGE_S:g} s; {self.ahead.name}",
             "share of runs with a false alarm",
@@ -148,7 +148,7 @@ class Monitoring:
     seed: int
 
     @property
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[ClaimRow]:
         return [row for one in self.watched for row in one.rows(self.seed)]
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from avtorch.decision.settings import Setting
 from avtorch.paper.drive import ACT_S, CHANGED, Progress, drive, rms, rms_about_mean, rows_from, stacked
 from avtorch.paper.leaders import PLATOON_S, Ahead, Leaders
-from avtorch.paper.rows import Row, median_interval, middle, sign
+from avtorch.paper.rows import ClaimRow, median_interval, middle, sign
 from avtorch.paper.strategies import AS_BUILT, PRINTED, supervise
 from avtorch.vehicle.block import Block
 
@@ -49,7 +49,7 @@ class Platoon:
         return measure(getattr(rows, what)) / first
 
     @property
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[ClaimRow]:
         out = []
         for i, name in enumerate(self.names):
             if i > 0:
@@ -57,7 +57,7 @@ class Platoon:
             out.append(self._attenuates(i, name))
         return out
 
-    def _row(self, i: int, name: str, what: str) -> Row:
+    def _row(self, i: int, name: str, what: str) -> ClaimRow:
         tail = self.against_leader(what, ACT_S)[..., -1]
         ratio = tail[i] / tail[0]
         interval = median_interval(ratio, self.seed)
@@ -66,7 +66,7 @@ class Platoon:
             f"vehicle {VEHICLES}'s RMS is {float(middle(tail[i])):.2f} times the leader's, without action "
             f"{float(middle(tail[0])):.2f} times; {self._crashes(i)}."
         )
-        return Row(
+        return ClaimRow(
             "platoon",
             f"{name}; {ACT_S:g} to {PLATOON_S:g} s, behind {self.ahead.name}",
             f"RMS of the last vehicle's {word}, with over without action",
@@ -77,7 +77,7 @@ class Platoon:
             self.ahead.said(why),
         )
 
-    def _attenuates(self, i: int, name: str) -> Row:
+    def _attenuates(self, i: int, name: str) -> ClaimRow:
         """Does what the leader does die out toward the tail?"""
         speed = self.against_leader("speed", PASSED_S)[i]
         ratio = speed[:, -1] / speed[:, 0]
@@ -87,7 +87,7 @@ class Platoon:
             f"{float(self.peak[i]) ** (VEHICLES - 1):.3g}; {self._crashes(i)}."
         )
         says = "amplifies (above 1)" if i == 0 else "stability regained (below 1)"
-        return Row(
+        return ClaimRow(
             "platoon",
             f"{name}; {PASSED_S:g} to {PLATOON_S:g} s, behind {self.ahead.name}",
             "RMS of the speed about its mean, vehicle 10 over vehicle 1",

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from avtorch.paper.drive import Progress
 from avtorch.paper.leaders import Ahead, Leaders
-from avtorch.paper.rows import MOST, Row, middle, sign, spread
+from avtorch.paper.rows import MOST, ClaimRow, middle, sign, spread
 from avtorch.paper.windows import ten_windows
 from avtorch.vehicle.stability import (
     local_conditions,
@@ -42,7 +42,7 @@ _SIDE, _PLANE, _DRAWS, _VEHICLES = 16, 61, 100, 9
 
 
 @dataclass(frozen=True)
-class Case:
+class Panel:
     """One panel of the paper: bounds of lag [s] and gain, time gap [s], and the lag [s] of the vehicle believed in."""
 
     title: str
@@ -53,13 +53,13 @@ class Case:
 
 
 CASES = (
-    Case("$T_L$ in [0, 0.1] s", (0.0, 0.1), 1.0, 0.1),
-    Case("$T_L$ in [0, 1] s", (0.0, 1.0), 1.0, 1.0),
-    Case(r"$\tau$ = 2 s", LAG_BOUNDS, 2.0, 0.3),
-    Case(r"$\tau$ = 0.5 s", LAG_BOUNDS, 0.5, 0.3),
+    Panel("$T_L$ in [0, 0.1] s", (0.0, 0.1), 1.0, 0.1),
+    Panel("$T_L$ in [0, 1] s", (0.0, 1.0), 1.0, 1.0),
+    Panel(r"$\tau$ = 2 s", LAG_BOUNDS, 2.0, 0.3),
+    Panel(r"$\tau$ = 0.5 s", LAG_BOUNDS, 0.5, 0.3),
 )
 
-_WIDER = Case("$K_L$ in [0.4, 1]", (0.0, 0.1), 1.0, 0.1, WIDE_GAIN_BOUNDS)
+_WIDER = Panel("$K_L$ in [0.4, 1]", (0.0, 0.1), 1.0, 0.1, WIDE_GAIN_BOUNDS)
 """Against the first case: what the paper says of K_L in words."""
 
 
@@ -83,11 +83,11 @@ class Regions:
     wider: dict[str, float]
 
     @property
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[ClaimRow]:
         pairs = [self._row(form, first) for first in (0, 2) for form in FORMS]
         return [*pairs, *(self._less(form) for form in ("print", "exact")), self._sufficient()]
 
-    def _row(self, form: str, first: int) -> Row:
+    def _row(self, form: str, first: int) -> ClaimRow:
         one, other = self.shares[first][form], self.shares[first + 1][form]
         ratio = other / one
         by_lag, random = first == 0, form == "posterior"
@@ -105,7 +105,7 @@ class Regions:
         why = f"the stable share of the gains goes from {float(middle(one)):.3f} to {float(middle(other)):.3f}: {way}."
         what = "T_L in [0, 1] s against [0, 0.1] s" if by_lag else "time gap 0.5 s against 2 s"
         where = f"behind {self.ahead.name}" if random else "K_L in [0.7, 1]"
-        return Row(
+        return ClaimRow(
             "regions",
             f"{what}; {form}; {where}",
             "stable share of the box of gains, second over first",
@@ -116,11 +116,11 @@ class Regions:
             self.ahead.said(why) if random else why,
         )
 
-    def _less(self, form: str) -> Row:
+    def _less(self, form: str) -> ClaimRow:
         """ "K_L was seen to exhibit an impact on the stability region, yet to a less extent than T_L"."""
         first, long = (float(self.shares[i][form]) for i in (0, 1))
         kept, kept_lag = self.wider[form] / first, long / first
-        return Row(
+        return ClaimRow(
             "regions",
             f"K_L down to 0.4 in place of 0.7, T_L up to 1 s in place of 0.1 s; {form}",
             "share kept as the bounds of K_L widen, less that kept as those of T_L do",
@@ -132,9 +132,9 @@ class Regions:
             f"{100 * kept_lag:.0f} % when T_L may rise to 1 s.",
         )
 
-    def _sufficient(self) -> Row:
+    def _sufficient(self) -> ClaimRow:
         passed, betrayed = sum(self.passed), sum(self.betrayed)
-        return Row(
+        return ClaimRow(
             "regions",
             f"all {len(CASES)} panels; print",
             "share of the gains passed that leave a vehicle of the bounds string unstable",
@@ -175,7 +175,7 @@ def regions(leaders: Leaders, *, seeds: int, seed: int, progress: Progress = lam
     return Regions(ahead, k_v, k_a, local, string, shares, passed, betrayed, wider)
 
 
-def _stable(case: Case, gains: Tensor, form: str) -> tuple[Tensor, Tensor]:
+def _stable(case: Panel, gains: Tensor, form: str) -> tuple[Tensor, Tensor]:
     """Locally and string stable all over the case's bounds, for `gains` (..., 3)."""
     if form == "exact":
         sides = (torch.linspace(*side, _VEHICLES, dtype=torch.float64) for side in (case.lag, case.gain))
@@ -186,11 +186,11 @@ def _stable(case: Case, gains: Tensor, form: str) -> tuple[Tensor, Tensor]:
     return local_conditions(*at, form=form).holds, string_conditions(*at, form=form).holds  # type: ignore[arg-type]
 
 
-def _both(case: Case, gains: Tensor, form: str) -> Tensor:
+def _both(case: Panel, gains: Tensor, form: str) -> Tensor:
     return torch.stack(_stable(case, gains, form)).all(0)
 
 
-def _believed(case: Case, gains: Tensor, draws: Tensor) -> tuple[Tensor, Tensor]:
+def _believed(case: Panel, gains: Tensor, draws: Tensor) -> tuple[Tensor, Tensor]:
     """Locally and string stable with probability 0.95 or more, of `gains` (..., 3) under `draws` (draw, 2)."""
     gap = torch.full(gains.shape[:-1], case.time_gap, dtype=torch.float64)
     T, K = draws.unbind(-1)

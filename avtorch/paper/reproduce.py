@@ -13,21 +13,21 @@ from avtorch.paper.leaders import Leaders
 from avtorch.paper.monitoring import monitoring
 from avtorch.paper.platoon import platoon
 from avtorch.paper.regions import regions
-from avtorch.paper.rows import Row
+from avtorch.paper.rows import ClaimRow
 from avtorch.paper.strategies import strategies
 
 SEEDS = 20
 """Noises of every setting, as the sweep asks for (SPEC section 5)."""
 
 
-class Found(Protocol):
+class Experiment(Protocol):
     """What an experiment leaves: its rows, and whatever its picture needs."""
 
     @property
-    def rows(self) -> list[Row]: ...
+    def rows(self) -> list[ClaimRow]: ...
 
 
-EXPERIMENTS: Mapping[str, Callable[..., Found]] = {
+EXPERIMENTS: Mapping[str, Callable[..., Experiment]] = {
     "regions": regions,
     "estimation": estimation,
     "monitoring": monitoring,
@@ -44,13 +44,13 @@ _COST = {"regions": 8.0, "estimation": 50.0, "monitoring": 15.0, "strategies": 6
 class Reproduction:
     """`found` by name of the experiment, in the order of the paper."""
 
-    found: dict[str, Found]
+    found: dict[str, Experiment]
     leaders: Leaders
     seeds: int
     seed: int
 
     @property
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[ClaimRow]:
         return [row for one in self.found.values() for row in one.rows]
 
     def answer(self) -> dict[str, Any]:

@@ -29,7 +29,7 @@ _RESAMPLED = 1000
 
 
 @dataclass(frozen=True)
-class Row:
+class ClaimRow:
     """`paper` and `ours` are numbers or a few words; `interval` is 90 %, None where nothing is random."""
 
     name: str

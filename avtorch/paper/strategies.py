@@ -41,7 +41,7 @@ from avtorch.paper.drive import (
     stacked,
 )
 from avtorch.paper.leaders import DRIVE_S, Ahead, Leaders
-from avtorch.paper.rows import Row, Verdict, median_interval, middle, share, sign, spread
+from avtorch.paper.rows import ClaimRow, Verdict, median_interval, middle, share, sign, spread
 from avtorch.vehicle import ClosedLoop, GLVDPlant
 from avtorch.vehicle.block import Block
 
@@ -93,7 +93,7 @@ class Strategies:
     seed: int
 
     @property
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[ClaimRow]:
         out = []
         for name, one in self.driven.items():
             if name != AS_BUILT:
@@ -109,7 +109,7 @@ class Strategies:
         ours, none = (measure(getattr(rows_from(self.driven[n].run, start), what)) for n in (name, AS_BUILT))
         return ours / none
 
-    def _calm(self, name: str, one: Driven, what: str, start: float) -> Row:
+    def _calm(self, name: str, one: Driven, what: str, start: float) -> ClaimRow:
         ratio = self.ratio(name, what, start)
         interval = median_interval(ratio, self.seed)
         word = "acceleration" if what == "accel" else "speed about its mean"
@@ -119,7 +119,7 @@ class Strategies:
             f"calmer than without action in {int((ratio < 1).sum())} of {len(ratio)} runs; "
             f"{100 * clipped:.1f} % of the commands clipped, least spacing {float(seen.spacing.min()):.1f} m."
         )
-        return Row(
+        return ClaimRow(
             "strategies",
             f"{name}, {start:g} to {DRIVE_S:g} s; behind {self.ahead.name}",
             f"RMS of the {word}, with over without action",
@@ -130,7 +130,7 @@ class Strategies:
             self.ahead.said(why),
         )
 
-    def _string(self, name: str, one: Driven) -> Row:
+    def _string(self, name: str, one: Driven) -> ClaimRow:
         good = one.peak <= UNITY
         calm = float(good.double().mean())
         verdict: Verdict = share(calm)
@@ -163,7 +163,7 @@ class Strategies:
                 f"{float(middle(one.last.time_gap)):.2g} s and command effort "
                 f"{float(middle(one.last.amplification())):.2g}, up to {one.actions} actions a run."
             )
-        return Row(
+        return ClaimRow(
             "strategies",
             f"{name}; behind {self.ahead.name}" if name in OURS else name,
             "exact peak gain at the true vehicle",

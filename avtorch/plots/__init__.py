@@ -1,6 +1,7 @@
 """Pictures: drawings that take an axes and return it, and the figures that the commands write."""
 
 from avtorch.plots.calibration_figures import calibration_figure
+from avtorch.plots.detectors import operating_curve, operating_figure
 from avtorch.plots.figures import (
     belief_figure,
     motion_figure,
@@ -9,17 +10,16 @@ from avtorch.plots.figures import (
     region_figure,
     stability_figure,
 )
-from avtorch.plots.over_detectors import operating_curve, operating_figure
-from avtorch.plots.over_gaps import gap_figure, gap_peak, gap_probability, gap_throughput
-from avtorch.plots.over_plane import gain_curve, region, setting_region, verdict_legend, verdict_map
-from avtorch.plots.over_posteriors import agreement_scatter, exact_density, joint_cloud, marginals
-from avtorch.plots.over_ranks import ecdf_difference, ecdf_of, pooled_rank_counts, rank_band, rank_plot
-from avtorch.plots.over_time import belief_band, data_quality, events, motion, string_probability
-from avtorch.plots.over_verdicts import confusion, confusion_figure
+from avtorch.plots.gaps import gap_figure, gap_peak, gap_probability, gap_throughput
 from avtorch.plots.paper_figures import PAPER_PICTURES, paper_pictures
+from avtorch.plots.plane import gain_curve, region, setting_region, verdict_legend, verdict_map
 from avtorch.plots.posterior_figures import VALIDATION_PICTURES, validation_figures
+from avtorch.plots.posteriors import agreement_scatter, exact_density, joint_cloud, marginals
+from avtorch.plots.ranks import ecdf_difference, ecdf_of, pooled_rank_counts, rank_band, rank_plot
 from avtorch.plots.signatures import effect_signature, signature_figure
 from avtorch.plots.style import STYLE, save, show
+from avtorch.plots.time import belief_band, data_quality, events, motion, string_probability
+from avtorch.plots.verdicts import confusion, confusion_figure
 
 __all__ = [
     "PAPER_PICTURES",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
-from avtorch.plots.over_ranks import ecdf_difference, ecdf_of, rank_plot
+from avtorch.plots.ranks import ecdf_difference, ecdf_of, rank_plot
 from avtorch.plots.style import BLACK, short, styled
 from avtorch.validation.calibration import Calibration
 from avtorch.validation.uniformity import ecdf_band

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from avtorch.io import Log
 from avtorch.io.clock import from_start, time_label
-from avtorch.plots.over_plane import gain_curve, region, setting_region, verdict_legend
-from avtorch.plots.over_time import Steps, Windows, belief_band, data_quality, events, motion, string_probability
+from avtorch.plots.plane import gain_curve, region, setting_region, verdict_legend
 from avtorch.plots.style import GREEN, GREY, VERMILLION, styled
+from avtorch.plots.time import Steps, Windows, belief_band, data_quality, events, motion, string_probability
 from avtorch.vehicle import stability
 
 Motion = Mapping[str, Mapping[str, ArrayLike]]

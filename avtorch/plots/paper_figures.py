@@ -19,7 +19,7 @@ from avtorch.paper.platoon import PASSED_S, Platoon
 from avtorch.paper.regions import CASES, FORMS, Regions
 from avtorch.paper.rows import middle
 from avtorch.paper.strategies import AS_BUILT, Driven, Strategies
-from avtorch.plots.over_paper import (
+from avtorch.plots.paper import (
     amplitude_by_position,
     error_growth,
     gain_effects,
@@ -28,9 +28,9 @@ from avtorch.plots.over_paper import (
     setting_traces,
     tracked,
 )
-from avtorch.plots.over_plane import verdict_map
-from avtorch.plots.over_time import belief_band, events, motion
+from avtorch.plots.plane import verdict_map
 from avtorch.plots.style import AMPLIFIES, BLUE, GREY, LABELS, STABLE, UNSTABLE, styled
+from avtorch.plots.time import belief_band, events, motion
 from avtorch.vehicle import stability
 
 _FORMS = {

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from avtorch.inference import Posterior, Quadrature
-from avtorch.plots.over_posteriors import agreement_reach, agreement_scatter, joint_cloud, marginals
-from avtorch.plots.over_ranks import METHODS, ecdf_difference, pooled_rank_counts, rank_plot
-from avtorch.plots.shown import Shown, place, relative_width, settled
+from avtorch.plots.posteriors import agreement_reach, agreement_scatter, joint_cloud, marginals
+from avtorch.plots.ranks import METHODS, ecdf_difference, pooled_rank_counts, rank_plot
+from avtorch.plots.shown import ChosenWindows, place, relative_width, settled
 from avtorch.plots.style import BLACK, short, styled
 from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE
 from avtorch.validation.diagnostics import diagnose
@@ -35,7 +35,7 @@ VALIDATION_PICTURES = ("marginals.png", "joint.png", "ranks.png", "agreement.png
 
 def validation_figures(validation: Validation) -> dict[str, Callable[[], Figure]]:
     """The figures of a validation, by the name of the file that each is for; a figure is made when called."""
-    shown = Shown(validation)
+    shown = ChosenWindows(validation)
     figures: dict[str, Callable[[], Figure]] = {
         "marginals.png": lambda: marginals_figure(shown),
         "joint.png": lambda: joint_figure(shown),
@@ -48,7 +48,7 @@ def validation_figures(validation: Validation) -> dict[str, Callable[[], Figure]
 
 
 @styled
-def marginals_figure(shown: Shown) -> Figure:
+def marginals_figure(shown: ChosenWindows) -> Figure:
     """Exact marginals with the histograms of SGLD and NUTS; a row a window, a column a parameter."""
     found, names = shown.validation, shown.validation.names
     figure = Figure(figsize=(_wide(names) * len(names) + 0.3, 2.3 * len(shown.windows) + 0.9), layout="constrained")
@@ -67,7 +67,7 @@ def marginals_figure(shown: Shown) -> Figure:
 
 
 @styled
-def joint_figure(shown: Shown) -> Figure:
+def joint_figure(shown: ChosenWindows) -> Figure:
     """Clouds of lag and gain within the 50 and 90 % regions of exact draws and of NUTS; a panel a window."""
     found = shown.validation
     figure = Figure(figsize=(3.9 * len(shown.windows) + 0.3, 4.6), layout="constrained")
@@ -87,7 +87,7 @@ def joint_figure(shown: Shown) -> Figure:
 
 
 @styled
-def ranks_figure(shown: Shown) -> Figure:
+def ranks_figure(shown: ChosenWindows) -> Figure:
     """Ranks of groups of SGLD's chains, of NUTS and of exact draws in their common pool; a row a window."""
     found, names = shown.validation, shown.validation.names
     groups = min(GROUPS, found.sgld.draws.shape[0])

@@ -24,7 +24,7 @@ class ShownWindow:
     title: str
 
 
-class Shown:
+class ChosenWindows:
     """The windows shown one by one: with the widest, a middling and the narrowest posterior of the lag.
 
     They are of those NUTS was run on, if there are any, and settled, if any did.

@@ -23,7 +23,7 @@ from avtorch.decision.algorithm2 import ACCEPTED_CHANGE
 from avtorch.decision.grid import GAINS_GRID, Grid
 from avtorch.errors import InputError
 from avtorch.gap import GapPlant
-from avtorch.gap.answer.diagnosis import Diagnosis
+from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.remedy.linearised import NOT_LINEAR, linearised
 from avtorch.vehicle.stability import Chain, chain_verdict
 

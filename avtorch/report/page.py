@@ -18,13 +18,13 @@ from matplotlib.figure import Figure
 from avtorch import __version__
 from avtorch.errors import printable
 from avtorch.experiment import Experiment
-from avtorch.gap.answer import words
-from avtorch.gap.answer.diagnosis import Diagnosis, Quantity
-from avtorch.gap.answer.quantity import unit_of, words_of
-from avtorch.gap.answer.where import UNITS
+from avtorch.gap.quantity import unit_of, words_of
+from avtorch.gap.result import text as words
+from avtorch.gap.result.diagnosis import Diagnosis, Quantity
+from avtorch.gap.result.where import UNITS
 from avtorch.io import atomic
-from avtorch.plots.over_diagnosis import road_figure, shrinkage_figure, where_figure, which_figure
-from avtorch.plots.over_experiment import experiment_figure
+from avtorch.plots.diagnosis import road_figure, shrinkage_figure, where_figure, which_figure
+from avtorch.plots.experiment import experiment_figure
 
 _METRICS = {
     "rollout_rmse_accel_0.5s": "acceleration, {horizon} s [m/s²]",

@@ -120,7 +120,7 @@ class TrialFolder:
         write_sealed(path, kept, schema=ANSWER, of=self._of(index, answerer))
 
     def kept_log(self, index: int, signals: Sequence[str]) -> Log | None:
-        """The log that was kept, with the witnesses in `signals`; None where none was, it is not the one that was
+        """The log that was kept, with the channels in `signals`; None where none was, it is not the one that was
         kept, or its truth is missing."""
         path = self.log_path(index)
         if not path.exists() or not os.path.lexists(self.truth_path(index)):

@@ -53,7 +53,7 @@ def run_trial(
         workers: processes, each with one thread; more than one needs answerers that can be pickled, and a script that
             begins work under `if __name__ == "__main__"`.
         mix, outside, draw_options: as `avtorch.blindtest.draw_cases`.
-        signals: the witnesses in the logs, in which a cause must show.
+        signals: the channels in the logs, in which a cause must show.
         keep_logs: keep `out/logs/NAME.csv`, so that a rerun need not draw the cases again.
         progress: is told (cases done, of).
         publish: False returns the answer and leaves `out/blindtest.json`, whatever it is, to the caller.

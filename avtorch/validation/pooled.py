@@ -118,7 +118,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PooledComparison:
     """A loop's last belief against the posterior given all windows, every field ``(vehicle, parameter)``.
 
     Attributes:
@@ -134,7 +134,7 @@ class Comparison:
     pooled_covered: Tensor
 
     @classmethod
-    def of(cls, track: Track, pooled: Quadrature) -> Comparison:
+    def of(cls, track: Track, pooled: Quadrature) -> PooledComparison:
         """Of the parameters that both have."""
         d = len(pooled.names)
         below = pooled.cdf(track.truth[-1, :, :d])
@@ -146,9 +146,9 @@ class Comparison:
             (below - 0.5).abs() <= 0.45,
         )
 
-    def select(self, index: Tensor) -> Comparison:
+    def select(self, index: Tensor) -> PooledComparison:
         """The vehicles named by ``index``."""
-        return Comparison(self.names, *(getattr(self, f.name)[index] for f in fields(self)[1:]))
+        return PooledComparison(self.names, *(getattr(self, f.name)[index] for f in fields(self)[1:]))
 
 
 def constant(z: Tensor, windows: int) -> Tensor:

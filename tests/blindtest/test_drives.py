@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avtorch.blindtest.car import Car, draw_car
-from avtorch.blindtest.drives import ACCEL_MAX_MPS2, ACCEL_MIN_MPS2, MANOEUVRES, Drive, draw_drive
+from avtorch.blindtest.drives import ACCEL_MAX_MPS2, ACCEL_MIN_MPS2, MANOEUVRES, DrivePlan, draw_drive
 from avtorch.blindtest.vehicle import simulate
 from avtorch.errors import InputError
 
@@ -15,7 +15,7 @@ from avtorch.errors import InputError
 def test_ordinary_drives(manoeuvre: str) -> None:
     rng = np.random.default_rng(3)
     for seed in range(4):
-        made = Drive(manoeuvre, 60.0, 25, seed)  # type: ignore[arg-type]
+        made = DrivePlan(manoeuvre, 60.0, 25, seed)  # type: ignore[arg-type]
         pilot = made.pilot()
         run = simulate(draw_car(rng), pilot, seconds=60.0, rate_hz=25, seed=seed)
         assert run.command.min() >= ACCEL_MIN_MPS2 - 0.2
@@ -28,17 +28,17 @@ def test_ordinary_drives(manoeuvre: str) -> None:
 
 def test_manoeuvres_differ_as_their_names_say() -> None:
     def mean_speed(manoeuvre: str) -> float:
-        made = Drive(manoeuvre, 60.0, 20, 2)  # type: ignore[arg-type]
+        made = DrivePlan(manoeuvre, 60.0, 20, 2)  # type: ignore[arg-type]
         return float(simulate(Car(), made.pilot(), seconds=60.0, rate_hz=20).true_speed.mean())
 
     assert mean_speed("stop_and_go") < 10 < mean_speed("cruise")
 
 
 def test_drive_is_repeatable_and_checked() -> None:
-    made = Drive("following", 60.0, 20, 7)
+    made = DrivePlan("following", 60.0, 20, 7)
     one, two = (simulate(Car(), made.pilot(), seconds=60.0, rate_hz=20).command for _ in range(2))
     np.testing.assert_array_equal(one, two)
     with pytest.raises(InputError, match="manoeuvre"):
-        Drive("drift", 60.0, 20, 7)  # type: ignore[arg-type]
+        DrivePlan("drift", 60.0, 20, 7)  # type: ignore[arg-type]
     drawn = draw_drive(np.random.default_rng(0), seconds=60.0, manoeuvre="steps")
     assert (drawn.seconds, drawn.manoeuvre) == (60.0, "steps")

@@ -53,7 +53,7 @@ def test_the_simulator_with_the_effect_answers_as_the_car_did(effect: str) -> No
 
 
 def _neutral(effect: str) -> float:
-    from avtorch.gap.chain.effect import effect_class
+    from avtorch.gap.simulator.effect import effect_class
 
     return effect_class(effect).parameters[0].neutral
 

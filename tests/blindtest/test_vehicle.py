@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from avtorch.blindtest.car import Car
 from avtorch.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, family
-from avtorch.blindtest.drives import MANOEUVRES, Drive, Recorded
+from avtorch.blindtest.drives import MANOEUVRES, DrivePlan, Recorded
 from avtorch.blindtest.vehicle import Run, simulate
 from avtorch.errors import InputError
 
@@ -37,7 +37,7 @@ def drive(effects: dict[str, dict[str, float]] | None = None, *, car: Car = CAR,
 @pytest.mark.parametrize("manoeuvre", MANOEUVRES)
 @pytest.mark.parametrize("rate", [20, 100])
 def test_without_effects_and_noise_it_is_the_closed_form(manoeuvre: str, rate: int) -> None:
-    made = Drive(manoeuvre, 60.0, rate, 4)  # type: ignore[arg-type]
+    made = DrivePlan(manoeuvre, 60.0, rate, 4)  # type: ignore[arg-type]
     run = simulate(CAR, made.pilot(), seconds=60.0, rate_hz=rate)
     moving = run.true_speed > 0.3
     assert moving.mean() > 0.5
@@ -85,7 +85,7 @@ def test_same_seed_same_log_and_another_seed_another() -> None:
 
 @pytest.mark.parametrize("name", [*EFFECTS, *CALIBRATION, *SEALED])
 def test_every_cause_vanishes_with_its_strength_and_shows_at_full(name: str) -> None:
-    made = Drive("stop_and_go" if name == "low_speed_creep" else "steps", 30.0, RATE, 8)
+    made = DrivePlan("stop_and_go" if name == "low_speed_creep" else "steps", 30.0, RATE, 8)
     draw = family(name).draw(np.random.default_rng(1), CAR, made)
     far: list[float] = []
     for strength in (1e-4, family(name).strongest):
@@ -106,7 +106,7 @@ def test_every_cause_vanishes_with_its_strength_and_shows_at_full(name: str) -> 
 
 @pytest.mark.parametrize("name", [*EFFECTS, *CALIBRATION, *SEALED])
 def test_before_its_onset_no_cause_leaves_a_trace(name: str) -> None:
-    draw = family(name).draw(np.random.default_rng(1), CAR, Drive("steps", 20.0, RATE, 1))
+    draw = family(name).draw(np.random.default_rng(1), CAR, DrivePlan("steps", 20.0, RATE, 1))
     parameters = draw(min(2.0, family(name).strongest))
     if name == "gain_change":
         parameters["change_s"] = 10.0

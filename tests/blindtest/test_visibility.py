@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avtorch.blindtest.car import Car
-from avtorch.blindtest.drives import Drive
+from avtorch.blindtest.drives import DrivePlan
 from avtorch.blindtest.strength import excess_range, solve
 from avtorch.blindtest.vehicle import simulate
 from avtorch.blindtest.visibility import TIERS, exact_gain, oracles, sight, tier_of
@@ -15,7 +15,7 @@ CAR = Car(T_L=0.4, K_L=0.9, process_sd=0.05, accel_sd=0.08, speed_sd=0.02)
 
 
 def run(effects=None, manoeuvre="steps", seconds=60.0):
-    made = Drive(manoeuvre, seconds, 50, 3)
+    made = DrivePlan(manoeuvre, seconds, 50, 3)
     return simulate(CAR, made.pilot(), seconds=seconds, rate_hz=50, effects=effects, seed=2)
 
 

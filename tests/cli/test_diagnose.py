@@ -21,8 +21,8 @@ from avtorch.cli import main
 from avtorch.cli.diagnosis_table import bar, diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, DeadTime, GapPlant, plant
-from avtorch.gap.answer.diagnosis import Candidate, Diagnosis, GapFacts, LogFacts, Quantity, near, verdict_of
 from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.result.diagnosis import Candidate, Diagnosis, GapSize, LogFacts, Quantity, near, verdict_of
 from avtorch.gap.search.checkpoint import Checkpoint, Kept, Start, read_fits
 from avtorch.gap.search.fitted_work import fitted_work
 from avtorch.io import Log
@@ -52,7 +52,7 @@ CANDIDATES = (
 
 
 def answer(logs: Sequence[Log], candidates: tuple[Candidate, ...] = CANDIDATES, **more: Any) -> Diagnosis:
-    gap = GapFacts(True, 1e-9, 0.08, 0.05, 0.21, 0.05, 0.9, 5.0)
+    gap = GapSize(True, 1e-9, 0.08, 0.05, 0.21, 0.05, 0.9, 5.0)
     given = {"verdict": verdict_of(candidates), "plant": plant([DeadTime(0.182)]), **more}
     return Diagnosis(LogFacts.of(logs), BASELINE, gap, candidates, **given)
 

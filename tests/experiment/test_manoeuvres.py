@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from avtorch.errors import InputError
 from avtorch.experiment import Limits, library
 from avtorch.gap import DeadTime, Drive, GapPlant, SecondOrderActuator, SensorLag, plant
-from avtorch.gap.answer.diagnosis import LogFacts
+from avtorch.gap.result.diagnosis import LogFacts
 from avtorch.io import Log
 from tests.gap.records import log_of
 
@@ -168,7 +168,7 @@ def test_a_cruise_still_leaves_room_and_a_log_without_speed_says_what_is_assumed
     assert (narrow.speed_min, narrow.speed_max) == pytest.approx((24.35, 25.85))
     assert (narrow.accel_min, narrow.accel_max) == (-0.3, 0.3)
     assert library(narrow)
-    blind = Limits.of_log(LogFacts.of(log_of(seconds=30.0, witnesses=("accel",))))
+    blind = Limits.of_log(LogFacts.of(log_of(seconds=30.0, channels=("accel",))))
     assert (blind.speed_min, blind.speed_max) == (Limits().speed_min, Limits().speed_max)
     assert "speeds assumed" in blind.source
     assert log.accel_cmd is not None

@@ -11,17 +11,17 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.experiment import Limits, information, library, next_experiment, write_table
-from avtorch.experiment.foretold import Foretold, responses
+from avtorch.experiment.foretold import Prediction, responses
 from avtorch.gap import Effect, plant
-from avtorch.gap.answer.contender import Contender
-from avtorch.gap.answer.diagnosis import Diagnosis, GapFacts, LogFacts
-from avtorch.gap.answer.verdict import Candidate, verdict_of
-from avtorch.gap.answer.words import to_drive
 from avtorch.gap.effects import AerodynamicDrag, ConstantResistance, DeadBand, GainChange, RoadGrade, SensorBias
 from avtorch.gap.likelihood.noise_draws import noise_draws
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.result.diagnosis import Diagnosis, GapSize, LogFacts
+from avtorch.gap.result.predictive_model import PredictiveModel
+from avtorch.gap.result.text import to_drive
+from avtorch.gap.selection.verdict import Candidate, verdict_of
 from avtorch.io import Log
 
 BOTH = ("accel", "speed")
@@ -30,22 +30,22 @@ NOISE = NoiseModel(process_sd=0.04, accel_sd=0.06, speed_sd=0.03)
 
 def contender(
     effects: list[Effect], *, spread: float = 0.01, rng: np.random.Generator, noise: NoiseModel = NOISE
-) -> Contender:
+) -> PredictiveModel:
     """Of a plant, its parameters known to a share of `spread`."""
     own = plant(effects, T_L=0.4, K_L=0.9)
     belief = {k: float(v) * np.exp(spread * rng.standard_normal(64)) for k, v in own.values().items() if v.dim() == 0}
     name = "+".join(sorted(e.name for e in effects)) or "none"
     grade = 0.02 if name == "road_grade" else None
-    return Contender(name, own, belief, noise, grade_rms=grade)
+    return PredictiveModel(name, own, belief, noise, grade_rms=grade)
 
 
-def left(rivals: list[Contender], shares: list[float]) -> Diagnosis:
+def left(rivals: list[PredictiveModel], shares: list[float]) -> Diagnosis:
     """A diagnosis that leaves these."""
     each = [Candidate(r.name, p, 0.0) for r, p in zip(rivals, shares, strict=True)]
     each += [Candidate(n, 0.01, None) for n in ("none", "unknown") if n not in {r.name for r in rivals}]
     log = LogFacts(rows=1200, segments=1, seconds=60.0, rate_hz=20.0, signals=("accel_cmd", *BOTH))
     verdict = verdict_of(each, aliases=lambda _: [r.name for r in rivals])
-    return Diagnosis(log, {}, GapFacts(True), tuple(each), verdict, contenders=tuple(rivals))
+    return Diagnosis(log, {}, GapSize(True), tuple(each), verdict, contenders=tuple(rivals))
 
 
 def test_draws_of_the_noise_are_white_to_its_own_filter(rotating_seed: int) -> None:
@@ -55,7 +55,7 @@ def test_draws_of_the_noise_are_white_to_its_own_filter(rotating_seed: int) -> N
     speed = 10 + np.sin(0.3 * time)
     log = Log.from_arrays(time=time, accel_cmd=0.3 * np.cos(0.3 * time), accel=0.3 * np.cos(0.3 * time), speed=speed)
     record = Record.of(log)
-    white = Whitener(record, noise)(noise_draws(noise, len(time), 0.05, BOTH, 40, rng)[..., record.source, None])
+    white = WhiteningFilter(record, noise)(noise_draws(noise, len(time), 0.05, BOTH, 40, rng)[..., record.source, None])
     # a steady filter begins cold, and is settled within a second
     white = white[:, :, 20:]
     size = white[:, 0].size
@@ -70,7 +70,7 @@ def test_margin_is_half_the_square_of_the_distance(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     m = [x for x in library() if x.name.startswith("holds")][:1]
     rivals = [contender([], spread=1e-6, rng=rng), contender([SensorBias(0.02)], spread=1e-6, rng=rng)]
-    foretold = [Foretold.of(r, m, BOTH, 1, 64) for r in rivals]
+    foretold = [Prediction.of(r, m, BOTH, 1, 64) for r in rivals]
     law = foretold[0].law(0)
     away = law._white((foretold[1].law(0).mean - law.mean)[None])
     distance = float(np.linalg.norm(away))
@@ -83,7 +83,7 @@ def test_the_same_cause_twice_is_never_told_apart(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     one = contender([DeadBand(0.1)], rng=rng)
     m = library()[:1]
-    told = information([Foretold.of(one, m, BOTH, 1, 32)] * 2, 0, [0.5, 0.5])
+    told = information([Prediction.of(one, m, BOTH, 1, 32)] * 2, 0, [0.5, 0.5])
     assert told.nats == pytest.approx(0.0, abs=1e-9)
     assert told.told == pytest.approx(0.5)
 
@@ -92,8 +92,8 @@ def test_a_resistance_and_a_bias_differ_in_the_speed_alone(rotating_seed: int) -
     rng = np.random.default_rng(rotating_seed)
     rivals = [contender([ConstantResistance(0.1)], rng=rng), contender([SensorBias(-0.1)], rng=rng)]
     m = [x for x in library() if x.name.startswith("steps")][:1]
-    both = information([Foretold.of(r, m, BOTH, 1, 32) for r in rivals], 0, [0.5, 0.5])
-    alone = information([Foretold.of(r, m, ("accel",), 1, 32) for r in rivals], 0, [0.5, 0.5])
+    both = information([Prediction.of(r, m, BOTH, 1, 32) for r in rivals], 0, [0.5, 0.5])
+    alone = information([Prediction.of(r, m, ("accel",), 1, 32) for r in rivals], 0, [0.5, 0.5])
     assert both.nats == pytest.approx(np.log(2), abs=1e-6)
     assert alone.nats < 0.05
 
@@ -134,8 +134,8 @@ def test_an_unknown_road_widens_what_is_foretold(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     hilly = contender([RoadGrade(0.02)], rng=rng)
     m = library()[:1]
-    law = Foretold.of(hilly, m, BOTH, 1, 32).law(0)
-    flat = Foretold.of(replace(hilly, grade_rms=None), m, BOTH, 1, 32).law(0)
+    law = Prediction.of(hilly, m, BOTH, 1, 32).law(0)
+    flat = Prediction.of(replace(hilly, grade_rms=None), m, BOTH, 1, 32).law(0)
     assert len(law.spread) > len(flat.spread)
     push = 9.81 * 0.02 * np.sin(0.02 * m[0].time)
     pushed = law.mean + np.stack([push, np.cumsum(push) * 0.05])

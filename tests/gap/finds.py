@@ -8,15 +8,15 @@ import numpy as np
 import torch
 
 from avtorch.gap import Effect, GapPlant, plant
-from avtorch.gap.likelihood.candidate import Candidate
-from avtorch.gap.likelihood.fit import finish, modes
+from avtorch.gap.likelihood.gauss_newton import finish, modes
+from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import GUST, PRIORS, fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.whitener import Whitener
-from avtorch.gap.search.chance import Tails
-from avtorch.gap.search.found import Found
-from avtorch.gap.search.losses import Losses
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.search.fitted_model import FittedModel
+from avtorch.gap.search.lost_messages import LostMessages
+from avtorch.gap.search.outliers import HeavyTails
 from tests.gap.records import QUIET, log_of
 
 SEED = 5
@@ -33,8 +33,8 @@ def found_of(
     noise: NoiseModel | None = None,
     baseline: GapPlant | None = None,
     rounds: int = 2,
-) -> Found:
-    """The candidate of these effects fitted to a drive of a car that has them, begun at their true values.
+) -> FittedModel:
+    """The hypothesis of these effects fitted to a drive of a car that has them, begun at their true values.
 
     With a `noise`, errors are drawn from it and it is held. Random effects get what a search would have told of them.
     """
@@ -44,27 +44,27 @@ def found_of(
     rng = np.random.default_rng(SEED) if rng is None else rng
     log = log_of(drawn, seconds=seconds, rate_hz=rate_hz, speed0=6.0, rng=rng, noise=QUIET if noise is None else noise)
     record = Record.of(log)
-    candidate = Candidate(record, tuple(type(e) for e in sure), plant() if baseline is None else baseline)
-    z = candidate.z_of({k: float(v) for k, v in car.values().items() if v.dim() == 0})
+    hypothesis = Hypothesis(record, tuple(type(e) for e in sure), plant() if baseline is None else baseline)
+    z = hypothesis.z_of({k: float(v) for k, v in car.values().items() if v.dim() == 0})
     gust = any(e.name == "gust" for e in effects)
     model = NoiseModel() if noise is None else noise
     for _ in range(rounds):
-        z = modes(candidate, Whitener(record, model), z[None], onset=onset, iterations=6)[0][0]
-        fit = finish(candidate, Whitener(record, model), z, onset)
+        z = modes(hypothesis, WhiteningFilter(record, model), z[None], onset=onset, iterations=6)[0][0]
+        fit = finish(hypothesis, WhiteningFilter(record, model), z, onset)
         fitted = fit_noise(record, fit.errors, model, T_L=0.35, priors=GUST if gust else PRIORS, iterations=3)
         model = fitted.noise if noise is None else noise
-    white = Whitener(record, model)
-    z = modes(candidate, white, z[None], onset=onset, iterations=6)[0][0]
-    fit = finish(candidate, white, z, onset)
+    white = WhiteningFilter(record, model)
+    z = modes(hypothesis, white, z[None], onset=onset, iterations=6)[0][0]
+    fit = finish(hypothesis, white, z, onset)
     names = {e.name for e in effects}
     none = np.zeros(record.rows)
-    tails = Tails(9.0, 0.02, 7.0, (0.2, 0.1), none.astype(bool), none) if "outliers" in names else None
-    return Found(
+    tails = HeavyTails(9.0, 0.02, 7.0, (0.2, 0.1), none.astype(bool), none) if "outliers" in names else None
+    return FittedModel(
         name="+".join(sorted(names)) or "none",
-        candidate=candidate,
+        hypothesis=hypothesis,
         z=z,
         covariance=fit.covariance,
-        values={k: float(v) for k, v in candidate.values(z[None]).items()},
+        values={k: float(v) for k, v in hypothesis.values(z[None]).items()},
         noise=fitted if noise is None else replace(fitted, noise=noise),
         log_evidence=fit.log_evidence,
         log_likelihood=fit.log_joint,
@@ -74,6 +74,6 @@ def found_of(
         grade_rms=fit.grade_rms,
         profile=fit.profile,
         tails=tails,
-        losses=Losses(9.0, 0.1, 0.3, None) if "command_hold" in names else None,
+        losses=LostMessages(9.0, 0.1, 0.3, None) if "command_hold" in names else None,
         gust=gust,
     )

@@ -32,7 +32,7 @@ def log_of(
     rate_hz: int = 20,
     noise: NoiseModel | None = QUIET,
     rng: np.random.Generator | None = None,
-    witnesses: Sequence[str] = BOTH,
+    channels: Sequence[str] = BOTH,
     speed0: float = 18.0,
     name: str = "drive",
 ) -> Log:
@@ -50,7 +50,7 @@ def log_of(
         drawn = drawn_errors(noise, len(time), 1 / rate_hz, np.random.default_rng(0) if rng is None else rng)
         accel, speed = accel + drawn[0], speed + drawn[1]
     given = {"accel": accel, "speed": speed}
-    return Log.from_arrays(name=name, time=time, accel_cmd=command, **{w: given[w] for w in witnesses})
+    return Log.from_arrays(name=name, time=time, accel_cmd=command, **{w: given[w] for w in channels})
 
 
 def drawn_errors(noise: NoiseModel, rows: int, dt: float, rng: np.random.Generator) -> Float:
@@ -63,13 +63,13 @@ def drawn_errors(noise: NoiseModel, rows: int, dt: float, rng: np.random.Generat
 
 
 def errors_of(noise: NoiseModel, record: Record, rng: np.random.Generator) -> Float:
-    """(witness, counted, 1) drawn from `noise`, every stretch by itself, from any speed."""
+    """(channel, counted, 1) drawn from `noise`, every stretch by itself, from any speed."""
     parts = []
     for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
         drawn = drawn_errors(noise, last - first, record.dt, rng)
         drawn[1] += rng.standard_normal()
         parts.append(drawn)
-    return np.concatenate(parts, 1)[[BOTH.index(w) for w in record.witnesses], :, None]
+    return np.concatenate(parts, 1)[[BOTH.index(w) for w in record.channels], :, None]
 
 
 def ornstein(sd: float, lag: float, rows: int, dt: float, rng: np.random.Generator) -> tuple[Float, Float]:
@@ -100,15 +100,15 @@ def covariance(sd: float, lag: float, time: Float) -> Float:
 
 
 def dense_covariance(
-    noise: NoiseModel, time: Float, witnesses: Sequence[str] = BOTH, *, offset_sd: float = 0.0
+    noise: NoiseModel, time: Float, channels: Sequence[str] = BOTH, *, offset_sd: float = 0.0
 ) -> Float:
-    """Covariance of the errors of `witnesses`, one after another, at `time` of one stretch."""
+    """Covariance of the errors of `channels`, one after another, at `time` of one stretch."""
     n = len(time)
     whole = covariance(noise.process_sd, noise.process_time, time - time[0])
     whole = whole + covariance(noise.force_sd, noise.force_time, time - time[0])
     whole[:n, :n] += noise.accel_sd**2 * np.eye(n)
     whole[n:, n:] += noise.speed_sd**2 * np.eye(n) + offset_sd**2
-    use = np.concatenate([np.arange(n) + n * BOTH.index(w) for w in witnesses])
+    use = np.concatenate([np.arange(n) + n * BOTH.index(w) for w in channels])
     return whole[np.ix_(use, use)]
 
 

@@ -138,4 +138,4 @@ def test_wrong_input_is_told() -> None:
     with pytest.raises(InputError, match="level"):
         avtorch.compare(long, long, level=0.0)
     with pytest.raises(InputError, match="witnesses"):
-        avtorch.compare(long, log_of(seconds=60.0, witnesses=("speed",)))
+        avtorch.compare(long, log_of(seconds=60.0, channels=("speed",)))

@@ -11,10 +11,10 @@ import pytest
 import avtorch
 from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes
 from avtorch.gap import DeadTime, Outliers, SensorBias, plant
-from avtorch.gap.answer import words
-from avtorch.gap.answer.diagnosis import Diagnosis
-from avtorch.gap.chain.effect import EFFECTS
+from avtorch.gap.result import text as words
+from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.search.search import Search
+from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.io import Log
 from avtorch.report import report_html
 from tests.gap.records import log_of

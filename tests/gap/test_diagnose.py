@@ -8,8 +8,8 @@ import pytest
 import avtorch
 from avtorch.blindtest import draw_case
 from avtorch.errors import InputError
-from avtorch.gap.chain.plant import GapPlant
 from avtorch.gap.search.checkpoint import SCHEMA
+from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log, read_sealed, write_sealed
 
 

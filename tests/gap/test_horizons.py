@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 import avtorch
 from avtorch.gap import DeadTime, plant
-from avtorch.gap.answer.diagnosis import Diagnosis
+from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.io import Log
-from avtorch.plots.over_diagnosis import shrinkage
+from avtorch.plots.diagnosis import shrinkage
 from avtorch.report import report_html
 from tests.gap.records import log_of
 from tests.overridden import taken_over
@@ -28,24 +28,24 @@ def late() -> tuple[Log, Diagnosis]:
     return log, avtorch.diagnose(log, effects=["dead_time"], pairs=False)
 
 
-def rolled(log: Log, T_L: float, K_L: float, witness: str, horizon_s: float) -> float:
+def rolled(log: Log, T_L: float, K_L: float, channel: str, horizon_s: float) -> float:
     """Root mean square over rows and rollouts of GLVD, one begun at each row: an acceleration at the measured one, a
     speed at the measured one with the actuator where the commands have brought it."""
     assert log.accel_cmd is not None
     dt = 1 / log.rate_hz
     keep = np.exp(-dt / T_L)
-    measured: NDArray[Any] = getattr(log, witness)
+    measured: NDArray[Any] = getattr(log, channel)
     driven = np.zeros(log.rows)
     for k in range(log.rows - 1):
         driven[k + 1] = keep * driven[k] + (1 - keep) * K_L * log.accel_cmd[k]
     begin = np.arange(round(SETTLED_S / dt), log.rows)
-    accel = (measured if witness == "accel" else driven)[begin].copy()
+    accel = (measured if channel == "accel" else driven)[begin].copy()
     gained = np.zeros(len(begin))
     sums, counts = np.zeros(log.rows), np.zeros(log.rows)
     for age in range(round(horizon_s / dt)):
         rows = begin + age
         there = rows < log.rows
-        told = accel if witness == "accel" else measured[begin] + gained
+        told = accel if channel == "accel" else measured[begin] + gained
         sums[rows[there]] += (measured[rows[there]] - told[there]) ** 2
         counts[rows[there]] += 1
         demand = K_L * log.accel_cmd[np.minimum(rows, log.rows - 1)]
@@ -59,27 +59,27 @@ def test_the_gap_is_over_the_horizon_that_it_names(late: tuple[Log, Diagnosis]) 
     log, found = late
     told = found.to_dict()["gap"]["rollout"]
     assert told["horizon_s"] == 10.0
-    for witness in ("accel", "speed"):
-        want = rolled(log, found.baseline["T_L"].mean, found.baseline["K_L"].mean, witness, told["horizon_s"])
+    for channel in ("accel", "speed"):
+        want = rolled(log, found.baseline["T_L"].mean, found.baseline["K_L"].mean, channel, told["horizon_s"])
         # the answer was taken at the mode, here it is at the mean
-        assert told[f"rmse_{witness}"] == pytest.approx(want, rel=0.02), witness
+        assert told[f"rmse_{channel}"] == pytest.approx(want, rel=0.02), channel
 
 
 def test_what_was_held_out_too_and_it_is_the_same_measure(late: tuple[Log, Diagnosis]) -> None:
     log, found = late
     answer = found.to_dict()
     metrics = answer["shrinkage"]["by_metric"]
-    for witness in ("accel", "speed"):
+    for channel in ("accel", "speed"):
         for horizon in ("_0.5s", "_2s", ""):
-            told = metrics[f"rollout_rmse_{witness}{horizon}"]
+            told = metrics[f"rollout_rmse_{channel}{horizon}"]
             assert told["horizon_s"] == float(horizon.strip("_s") or 10.0)
-            want = rolled(log, found.baseline["T_L"].mean, found.baseline["K_L"].mean, witness, told["horizon_s"])
+            want = rolled(log, found.baseline["T_L"].mean, found.baseline["K_L"].mean, channel, told["horizon_s"])
             # fitted to four fifths of the rows, judged on the last: within a tenth
-            assert told["before"] == pytest.approx(want, rel=0.1), (witness, horizon)
-        whole = metrics[f"rollout_rmse_{witness}_whole"]
+            assert told["before"] == pytest.approx(want, rel=0.1), (channel, horizon)
+        whole = metrics[f"rollout_rmse_{channel}_whole"]
         assert whole["horizon_s"] is None
-        usual = metrics[f"rollout_rmse_{witness}"]
-        assert usual["before"] == pytest.approx(answer["gap"]["rollout"][f"rmse_{witness}"], rel=0.1)
+        usual = metrics[f"rollout_rmse_{channel}"]
+        assert usual["before"] == pytest.approx(answer["gap"]["rollout"][f"rmse_{channel}"], rel=0.1)
     assert answer["shrinkage"]["horizon_s"] == metrics[answer["shrinkage"]["metric"]]["horizon_s"]
 
 

@@ -16,14 +16,14 @@ from avtorch.blindtest.car import Car
 from avtorch.blindtest.drives import Recorded
 from avtorch.blindtest.vehicle import simulate
 from avtorch.gap import DeadTime, RoadGrade, SecondOrderActuator, plant
-from avtorch.gap.answer.diagnosis import Diagnosis
-from avtorch.gap.answer.remainder import remainder
-from avtorch.gap.chain.effect import Effect
-from avtorch.gap.likelihood.candidate import Candidate
-from avtorch.gap.likelihood.fit import Fit, finish, modes
-from avtorch.gap.likelihood.whitener import Whitener
-from avtorch.gap.search.found import Found, Race
+from avtorch.gap.likelihood.gauss_newton import GaussNewtonFit, finish, modes
+from avtorch.gap.likelihood.hypothesis import Hypothesis
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 from avtorch.gap.search.search import Search
+from avtorch.gap.selection.adequacy import adequacy
+from avtorch.gap.simulator.effect import Effect
 from avtorch.io import Log
 
 LAPS = (1, 2, 3)
@@ -54,29 +54,29 @@ def test_every_lap_gets_an_answer_that_the_others_share(answers: dict[int, Diagn
 
 
 @pytest.fixture(scope="module")
-def races(laps: dict[int, Log]) -> dict[int, Race]:
+def races(laps: dict[int, Log]) -> dict[int, SearchResult]:
     return {k: Search([log], plant(), effects=[RoadGrade], pairs=False).run() for k, log in laps.items()}
 
 
-def fitted(race: Race, base: Found, more: type[Effect]) -> tuple[Candidate, Fit, float]:
+def fitted(race: SearchResult, base: FittedModel, more: type[Effect]) -> tuple[Hypothesis, GaussNewtonFit, float]:
     """`more` on top of what was found, under the noise found, and the nats of evidence it gains."""
-    white = Whitener(race.record, base.noise.noise)
-    candidate = Candidate(race.record, (*base.candidate.effects, more), plant())
-    z = np.stack([candidate.z_of({**base.values, "T_L": base.values["T_L"] - s}) for s in (0.0, 0.1)])
-    found, values = modes(candidate, white, z, iterations=20)
-    fit, before = finish(candidate, white, found[values.argmax()]), finish(base.candidate, white, base.z)
-    return candidate, fit, fit.log_evidence - before.log_evidence
+    white = WhiteningFilter(race.record, base.noise.noise)
+    hypothesis = Hypothesis(race.record, (*base.hypothesis.effects, more), plant())
+    z = np.stack([hypothesis.z_of({**base.values, "T_L": base.values["T_L"] - s}) for s in (0.0, 0.1)])
+    found, values = modes(hypothesis, white, z, iterations=20)
+    fit, before = finish(hypothesis, white, found[values.argmax()]), finish(base.hypothesis, white, base.z)
+    return hypothesis, fit, fit.log_evidence - before.log_evidence
 
 
 @pytest.mark.parametrize("lap", LAPS)
 @pytest.mark.parametrize("on", ["none", "road_grade"])
-def test_what_the_laps_tell_of_lag_delay_and_order(races: dict[int, Race], lap: int, on: str) -> None:
+def test_what_the_laps_tell_of_lag_delay_and_order(races: dict[int, SearchResult], lap: int, on: str) -> None:
     race = races[lap]
     base = next(f for f in race.found if f.name == on)
-    candidate, fit, _ = fitted(race, base, DeadTime)
+    hypothesis, fit, _ = fitted(race, base, DeadTime)
     # lag and delay together are known to a few hundredths of a second, of the delay alone little more than a bound
     draws = np.random.default_rng(0).multivariate_normal(fit.z, fit.covariance, 4000)
-    values = {k: x.numpy() for k, x in candidate.values(draws).items()}
+    values = {k: x.numpy() for k, x in hypothesis.values(draws).items()}
     lag, delay = values["T_L"], values["dead_time.delay_s"]
     assert (lag + delay).std() < 0.1
     assert delay.mean() < 2.5 * delay.std()
@@ -86,7 +86,7 @@ def test_what_the_laps_tell_of_lag_delay_and_order(races: dict[int, Race], lap: 
 
 @pytest.mark.parametrize("on", ["none", "road_grade"])
 @pytest.mark.parametrize("more", [DeadTime, SecondOrderActuator])
-def test_one_pole_will_do(races: dict[int, Race], on: str, more: type[Effect]) -> None:
+def test_one_pole_will_do(races: dict[int, SearchResult], on: str, more: type[Effect]) -> None:
     """3 nats are twenty to one: what only one lap of three says is not the car's."""
     bases = [(race, next(f for f in race.found if f.name == on)) for race in races.values()]
     gains = np.array([fitted(race, base, more)[2] for race, base in bases])
@@ -94,7 +94,7 @@ def test_one_pole_will_do(races: dict[int, Race], on: str, more: type[Effect]) -
 
 
 @pytest.mark.parametrize("lap", LAPS)
-def test_the_measured_speed_trembles_as_no_candidate_does(races: dict[int, Race], lap: int) -> None:
+def test_the_measured_speed_trembles_as_no_candidate_does(races: dict[int, SearchResult], lap: int) -> None:
     """At 8 to 20 Hz, which is the wheels' and not the lag's: more than the noise model has room for."""
     none = races[lap].none
     white = none.white(none.errors)[0].ravel()
@@ -103,11 +103,11 @@ def test_the_measured_speed_trembles_as_no_candidate_does(races: dict[int, Race]
     # white would have a mean of 1 with a standard deviation of 0.04 over so many frequencies
     assert power[(hz > 9) & (hz < 19)].mean() > 1.4
     assert power[(hz > 25) & (hz < 45)].mean() < 0.7
-    left = remainder(none.white, none.errors, none.candidate.record.measured - none.errors)
+    left = adequacy(none.white, none.errors, none.hypothesis.record.measured - none.errors)
     assert left.memory > 15  # of a white remainder below exp(-15)
 
 
-def test_a_force_returns_at_the_same_places_each_lap(races: dict[int, Race]) -> None:
+def test_a_force_returns_at_the_same_places_each_lap(races: dict[int, SearchResult]) -> None:
     """The field is flat: what comes back at the same metres as a slope does is the curves' own resistance."""
     metres, forces = np.arange(0.0, 400.0, 2.0), []
     for race in races.values():
@@ -115,7 +115,7 @@ def test_a_force_returns_at_the_same_places_each_lap(races: dict[int, Race]) -> 
         assert found.profile is not None
         drive = race.record.drives[0]
         assert drive.position is not None
-        road = next(e for e in found.candidate.plant.effects if isinstance(e, RoadGrade))
+        road = next(e for e in found.hypothesis.plant.effects if isinstance(e, RoadGrade))
         road = road.prepared(drive.time, drive.speed, drive.position)
         force = road.columns(drive.position).numpy() @ found.profile
         forces.append(np.interp(metres, drive.position.numpy(), force))
@@ -138,7 +138,7 @@ EFFECTS = {
 
 
 def driven(lap: Log, effects: dict[str, dict[str, float]], seed: int) -> Log:
-    """The reference vehicle under the lap's demand, open loop, with both witnesses and the noise of production sensors.
+    """The reference vehicle under the lap's demand, open loop, with both channels and the noise of production sensors.
 
     It starts 5 m/s faster than the lap did: without the loop around it the speed drifts, and must not come to rest.
     """

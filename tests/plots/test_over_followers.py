@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from avtorch.errors import InputError
 from avtorch.follower import FollowerDiagnosis, diagnose_follower
-from avtorch.plots import over_followers
+from avtorch.plots import followers as over_followers
 from tests.follower.loops import CTG, followed_log
 
 

@@ -7,7 +7,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from avtorch.paper import Leaders, reproduce
-from avtorch.plots import over_paper, paper_pictures
+from avtorch.plots import paper as over_paper
+from avtorch.plots import paper_pictures
 
 
 def test_axes_in_axes_out() -> None:

@@ -12,7 +12,7 @@ import pytest
 import avtorch
 from avtorch.blindtest import draw_case
 from avtorch.errors import InputError
-from avtorch.gap.answer.diagnosis import Diagnosis
+from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.remedy import setting_for
 from avtorch.report import report_html, write_report
 

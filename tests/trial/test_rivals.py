@@ -7,7 +7,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from avtorch.blindtest import Car, Drive, draw_case, simulate
+from avtorch.blindtest import Car, DrivePlan, draw_case, simulate
 from avtorch.blindtest.answers import read
 from avtorch.errors import InputError
 from avtorch.io import Log
@@ -18,7 +18,7 @@ from avtorch.trial.rivals.residuals import Residuals
 
 
 def drive_of(effects: dict, seed: int, *, seconds: float = 60.0, rate_hz: int = 25, manoeuvre: str = "steps") -> Log:
-    drive = Drive(manoeuvre, seconds, rate_hz, seed)  # type: ignore[arg-type]
+    drive = DrivePlan(manoeuvre, seconds, rate_hz, seed)  # type: ignore[arg-type]
     run = simulate(Car(), drive.pilot(), seconds=seconds, rate_hz=rate_hz, effects=effects, seed=seed)
     return Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed)
 

@@ -10,8 +10,8 @@ import torch
 from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, JerkStatistics, integrate
 from avtorch.validation.pooled import (
-    Comparison,
     FreeNoise,
+    PooledComparison,
     constant,
     drift,
     follow,
@@ -73,13 +73,13 @@ def test_posterior_mode_ends_where_the_pooled_posterior_is(rotating_seed):
     path = constant(fleet(10), 4)
     seen = windows_of(path, generator=g)
     pooled = truth_given_all(seen)
-    found = Comparison.of(follow(path, seen, mode="posterior", seed=rotating_seed), pooled)
+    found = PooledComparison.of(follow(path, seen, mode="posterior", seed=rotating_seed), pooled)
     assert pooled.converged.all()
     assert found.shift.abs().max() < 0.32 + 0.1
     assert (found.sd_ratio - 1).abs().max() < 0.11 + 0.1
     assert found.select(torch.tensor([3])).shift.equal(found.shift[3:4])
     # lambda I forgets all but the last of four windows: twice the SD, within what windows of other phases differ
-    loose = Comparison.of(follow(path, seen, mode="lambda", seed=rotating_seed), pooled)
+    loose = PooledComparison.of(follow(path, seen, mode="lambda", seed=rotating_seed), pooled)
     assert 1.5 < loose.sd_ratio[:, :2].median() < 2.8
 
 

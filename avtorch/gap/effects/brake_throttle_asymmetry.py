@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.gap.chain.effect import Effect, Row, register
-from avtorch.gap.chain.parameter import Parameter
+from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.gap.chain.actuator import modes_over
-from avtorch.gap.chain.effect import Effect, Row, register
-from avtorch.gap.chain.parameter import Parameter
-from avtorch.gap.chain.recursion import scan_pair
+from avtorch.gap.simulator.actuator import modes_over
+from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.recursion import scan_pair
 from avtorch.vehicle.arguments import Number, tensor
 
 

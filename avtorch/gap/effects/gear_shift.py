@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.gap.chain.domain import Domain
-from avtorch.gap.chain.effect import Effect, Row, register
-from avtorch.gap.chain.parameter import Parameter
+from avtorch.gap.simulator.domain import Domain
+from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 _REARMED = 1.5  # [m/s] below a shift speed the gear counts as changed back, without interruption

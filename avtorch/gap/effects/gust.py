@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.gap.chain.effect import Effect, NoiseChange, Row, register
-from avtorch.gap.chain.parameter import Parameter
-from avtorch.gap.chain.recursion import scan
+from avtorch.gap.simulator.effect import Effect, NoiseChange, Row, register
+from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.recursion import scan
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -19,7 +19,7 @@ from avtorch.vehicle.arguments import Number, tensor
 class Gust(Effect):
     """Ornstein-Uhlenbeck acceleration of standard deviation `sd_mps2` and `time_constant_s`, stationary; neutral at 0.
 
-    Random: its deterministic response is none; the noise model gains this force in both witnesses.
+    Random: its deterministic response is none; the noise model gains this force in both channels.
 
     Possible up to 0.6 m/s², the pull of slopes of 6 % (root mean square) that nobody knows of; a storm's wind of 10 m/s
     SD does 0.2 m/s² at 30 m/s. Faster than 0.2 s it is vibration, slower than a minute a drift.

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.gap.chain.domain import Domain
-from avtorch.gap.chain.effect import Effect, Row, register
-from avtorch.gap.chain.parameter import Parameter
+from avtorch.gap.simulator.domain import Domain
+from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 GRAVITY = 9.80665

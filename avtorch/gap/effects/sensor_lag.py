@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.gap.chain.effect import Effect, Row, register
-from avtorch.gap.chain.parameter import Parameter
-from avtorch.gap.chain.recursion import scan
+from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.recursion import scan
 from avtorch.vehicle.arguments import Number, tensor
 
 

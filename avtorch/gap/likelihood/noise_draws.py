@@ -7,15 +7,15 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_lyapunov
 
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.steady_filter import motion
+from avtorch.gap.likelihood.steady_kalman import motion
 
 Float = NDArray[np.float64]
 
 
 def noise_draws(
-    noise: NoiseModel, rows: int, dt: float, witnesses: tuple[str, ...], count: int, rng: np.random.Generator
+    noise: NoiseModel, rows: int, dt: float, channels: tuple[str, ...], count: int, rng: np.random.Generator
 ) -> Float:
-    """(draw, witness, row) at rows `dt` [s] apart; the error of the speed begins at 0, its sensor's noise apart."""
+    """(draw, channel, row) at rows `dt` [s] apart; the error of the speed begins at 0, its sensor's noise apart."""
     move, driven = motion(noise, dt)
     # what forgets is in its steady state when the drive begins
     start = np.zeros_like(move)
@@ -29,7 +29,7 @@ def noise_draws(
     accel = state[..., -1] if noise.sensor_lag > 0 else state[..., 1:].sum(-1)
     clean = {"accel": noise.sensor_scale * accel, "speed": state[..., 0]}
     sds = {"accel": noise.accel_sd, "speed": noise.speed_sd}
-    return np.stack([clean[w].T + sds[w] * rng.standard_normal((count, rows)) for w in witnesses], 1)
+    return np.stack([clean[w].T + sds[w] * rng.standard_normal((count, rows)) for w in channels], 1)
 
 
 def _root(covariance: Float) -> Float:

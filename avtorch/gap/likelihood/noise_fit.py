@@ -9,11 +9,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.gap.likelihood.earlier import earlier, whitener
 from avtorch.gap.likelihood.noise_model import NAMES, NoiseModel
+from avtorch.gap.likelihood.noise_segments import before_onset, whitening_filter
 from avtorch.gap.likelihood.random_law import RandomLaw
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 
 Float = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ def fit_noise(
     law: RandomLaw | None = None,
     law_z: Float | None = None,
 ) -> NoiseFit:
-    """Mode of the noise's parameters given the errors (witness, counted, group) of a rollout; `T_L` [s].
+    """Mode of the noise's parameters given the errors (channel, counted, group) of a rollout; `T_L` [s].
 
     Errors of groups' means come with group 1. Before `onset` the sensor reads plainly, before `gust_onset` the force is
     calm. `law`: of a random effect whose force is fitted as well, from `law_z` (coordinate,) on.
@@ -94,8 +94,8 @@ def fit_noise(
         more = {} if law is None else {k: max(x, 1e-6) for k, x in law.force(z[size:]).items()}
         return replace(start, **own, **more)
 
-    def white(z: Float) -> Whitener:
-        return whitener(record, model(z), **onsets)
+    def white(z: Float) -> WhiteningFilter:
+        return whitening_filter(record, model(z), **onsets)
 
     begin = np.log([getattr(start, n) for n in NAMES])
     z = np.concatenate([(begin - means) / sds, np.zeros(extra) if law_z is None else law_z])
@@ -115,8 +115,8 @@ def fit_noise(
     damping, information = 1e-2, np.eye(len(z))
     for _ in range(iterations):
         ahead = [model(x) for x in z + _STEP * np.eye(len(z))]
-        before = [earlier(n, **onsets) for n in ahead]
-        whites = Whitener.each(record, ahead, before, coarse=errors.shape[-1] == 1)
+        before = [before_onset(n, **onsets) for n in ahead]
+        whites = WhiteningFilter.each(record, ahead, before, coarse=errors.shape[-1] == 1)
         slopes = np.stack([(w.row_likelihoods(errors) - rows) / _STEP for w in whites])
         # squared scores tell the information where the model fits; far from it they are too large by the square of this
         excess = max(1.0, float((white(z)(errors) ** 2).mean()))

@@ -1,4 +1,4 @@
-"""A random effect as a candidate: its parameters as coordinates, and what its `noise` makes of the noise model there.
+"""A random effect as a hypothesis: its parameters as coordinates, and what its `noise` makes of the noise model there.
 
 Its evidence is that of the likelihood under the changed noise. Which one depends on what `noise` returns:
 
@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.gap.chain.drive import Drive
-from avtorch.gap.chain.effect import Effect, NoiseChange
-from avtorch.gap.chain.plant import GapPlant
-from avtorch.gap.likelihood.candidate import Candidate, Coordinate
+from avtorch.gap.likelihood.hypothesis import Coordinate, Hypothesis
 from avtorch.gap.likelihood.record import Record
+from avtorch.gap.simulator.drive import Drive
+from avtorch.gap.simulator.effect import Effect, NoiseChange
+from avtorch.gap.simulator.plant import GapPlant
 
 Float = NDArray[np.float64]
 Form = Literal["force", "tails", "command"]
@@ -47,9 +47,9 @@ class RandomLaw:
     @classmethod
     def of(cls, kind: type[Effect], record: Record, baseline: GapPlant) -> RandomLaw:
         """Raises `InputError` where `noise` does not return exactly one of a force, tails, or a command's variance."""
-        candidate = Candidate(record, (kind,), baseline)
-        effect = next(e for e in candidate.plant.effects if e.name == kind.name)
-        own = tuple(c for c in candidate.coordinates if c.key.startswith(f"{kind.name}."))
+        hypothesis = Hypothesis(record, (kind,), baseline)
+        effect = next(e for e in hypothesis.plant.effects if e.name == kind.name)
+        own = tuple(c for c in hypothesis.coordinates if c.key.startswith(f"{kind.name}."))
         change = effect.noise(record.drives[0].command)
         parts = [] if change is None else [name for name, x in vars(change).items() if x is not None]
         form: Form | None = None

@@ -1,4 +1,4 @@
-"""What a diagnosis looks at: drives at one rate, their witnesses, and the stretches that count.
+"""What a diagnosis looks at: drives at one rate, their channels, and the stretches that count.
 
 A drive is what a segment of a log holds between two overrides: while a driver is in charge (`engaged` 0) nobody obeys
 the command, so no rollout runs through those rows and each return begins anew, at what is measured there. Of the rows
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.gap.chain.drive import Drive, Place
+from avtorch.gap.simulator.drive import Drive, Place
 from avtorch.io import Log
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.engagement import SETTLE_S
@@ -86,7 +86,7 @@ class Record:
         return "specific-force" if self.drives[0].specific_force else "kinematic"
 
     @property
-    def witnesses(self) -> tuple[str, ...]:
+    def channels(self) -> tuple[str, ...]:
         return tuple(name for name in ("accel", "speed") if getattr(self, name) is not None)
 
     @property
@@ -258,7 +258,7 @@ class Record:
 
     @cached_property
     def measured(self) -> Float:
-        """What the witnesses saw, (witness, counted, group)."""
+        """What the channels saw, (channel, counted, group)."""
         return np.stack([x[self.source] for x in (self.accel, self.speed) if x is not None])
 
 

@@ -18,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.errors import InputError
-from avtorch.gap.likelihood.candidate import Candidate
-from avtorch.gap.likelihood.earlier import whitener
-from avtorch.gap.likelihood.fit import finish
+from avtorch.gap.likelihood.gauss_newton import finish
+from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import NoiseFit
 from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.likelihood.noise_segments import whitening_filter
 from avtorch.gap.likelihood.record import Record
+from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.fitted_work import difference
-from avtorch.gap.search.found import Found
 from avtorch.io import fingerprint, read_sealed, write_sealed
 
 Float = NDArray[np.float64]
@@ -48,31 +48,31 @@ class Kept:
     noise: NoiseModel
     log_prior: float
 
-    def found(self, candidate: Candidate, onset: int | None) -> Found:
+    def found(self, hypothesis: Hypothesis, onset: int | None) -> FittedModel:
         """All that follows from it."""
-        record = candidate.record
-        white = whitener(record, self.noise, onset=onset)
-        fit = finish(candidate, white, self.z, onset)
+        record = hypothesis.record
+        white = whitening_filter(record, self.noise, onset=onset)
+        fit = finish(hypothesis, white, self.z, onset)
         rows = white.row_likelihoods(fit.errors)
         noise = NoiseFit(self.noise, self.log_prior, rows, {})
         likelihood = float(rows.sum())
-        return Found.of(candidate, fit, noise, fit.log_evidence + self.log_prior, likelihood, onset)
+        return FittedModel.of(hypothesis, fit, noise, fit.log_evidence + self.log_prior, likelihood, onset)
 
 
 @dataclass(frozen=True)
 class Start:
     """Where a fit begins; `inputs` is the fingerprint of all that decides where it ends."""
 
-    candidate: Candidate
+    hypothesis: Hypothesis
     onset: int | None
     inputs: str
 
     @classmethod
-    def of(cls, candidate: Candidate, z: Float, noise: NoiseModel, onset: int | None, rounds: int) -> Start:
-        record = candidate.record
+    def of(cls, hypothesis: Hypothesis, z: Float, noise: NoiseModel, onset: int | None, rounds: int) -> Start:
+        record = hypothesis.record
         if record not in _RECORDS:
             _RECORDS[record] = fingerprint(record)
-        return cls(candidate, onset, fingerprint(_RECORDS[record], candidate.name, z, noise, onset, rounds))
+        return cls(hypothesis, onset, fingerprint(_RECORDS[record], hypothesis.name, z, noise, onset, rounds))
 
 
 _RECORDS: WeakKeyDictionary[Record, str] = WeakKeyDictionary()
@@ -97,21 +97,23 @@ class Checkpoint:
         entry = None if start is None else self._done.get(start.inputs)
         if start is None or entry is None:
             return None
-        own = (start.candidate.name, start.onset, start.candidate.size)
+        own = (start.hypothesis.name, start.onset, start.hypothesis.size)
         if (entry["name"], entry["onset"], len(entry["z"])) != own:
             raise InputError(f"{self.path}: the fit of {entry['name']} is not of the place it names; {REMEDY}")
         return Kept(np.array(entry["z"]), NoiseModel(**entry["noise"]), float(entry["log_prior"]))
 
-    def start(self, candidate: Candidate, z: Float, noise: NoiseModel, onset: int | None, rounds: int) -> Start | None:
+    def start(
+        self, hypothesis: Hypothesis, z: Float, noise: NoiseModel, onset: int | None, rounds: int
+    ) -> Start | None:
         """Where a fit begins; None where nothing is kept."""
-        return None if self.path is None else Start.of(candidate, z, noise, onset, rounds)
+        return None if self.path is None else Start.of(hypothesis, z, noise, onset, rounds)
 
     def keep(self, start: Start | None, fit: Kept) -> None:
         """One more fit is done."""
         if self.path is None or start is None:
             return
         self._done[start.inputs] = {
-            "name": start.candidate.name,
+            "name": start.hypothesis.name,
             "onset": start.onset,
             "inputs": start.inputs,
             "z": fit.z.tolist(),

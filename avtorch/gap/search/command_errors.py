@@ -10,16 +10,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.gap.likelihood.whitener import Whitener
-from avtorch.gap.search.losses import image_of_row, states_of
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.search.lost_messages import image_of_row, states_of
 
 Float = NDArray[np.float64]
 
 
-def rows_gained(white: Whitener, errors: Float, variance: Float, T_L: float, K_L: float) -> Float:
+def rows_gained(white: WhiteningFilter, errors: Float, variance: Float, T_L: float, K_L: float) -> Float:
     """Log likelihood ratio (counted,) of each row, commands with errors of this `variance` over commands as logged.
 
-    Args: `errors` (witness, counted, 1) of a rollout with `T_L` [s] and `K_L` at the log's own rate; `variance`
+    Args: `errors` (channel, counted, 1) of a rollout with `T_L` [s] and `K_L` at the log's own rate; `variance`
     (counted,) [(m/s²)²], independent from row to row.
     """
     record = white.record
@@ -35,7 +35,7 @@ def rows_gained(white: Whitener, errors: Float, variance: Float, T_L: float, K_L
             place.append(rows.clip(first, last - 1))
             valid.append((rows >= first) & (rows < last))
     at, own = np.array(place), np.array(valid)
-    e = np.where(own, white(errors)[:, at, 0], 0.0)  # (witness, chunk, step)
+    e = np.where(own, white(errors)[:, at, 0], 0.0)  # (channel, chunk, step)
     driven = np.where(own, variance[at], 0.0)
     one, pushed = np.eye(len(see)), np.outer(push, push)
     state, spread = np.zeros((len(at), len(push))), np.zeros((len(at), len(push), len(push)))

@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.gap.chain.drive import Drive
-from avtorch.gap.likelihood.fit import finish, modes
+from avtorch.gap.likelihood.gauss_newton import finish, modes
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.whitener import Whitener
-from avtorch.gap.search.found import ALIKE, Delays, Found
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.search.fitted_model import ALIKE, Delays, FittedModel
+from avtorch.gap.simulator.drive import Drive
 
 Float = NDArray[np.float64]
 
@@ -53,26 +53,26 @@ def repeats_after(drives: Sequence[Drive]) -> float | None:
     return None if not len(peaks) else float(peaks[0] * drives[0].dt.median())
 
 
-def all_delays(record: Record, best: Mapping[str, Found]) -> dict[str, Found]:
+def all_delays(record: Record, best: Mapping[str, FittedModel]) -> dict[str, FittedModel]:
     """Finds by name, most evidence first, each with all the delays that a command which repeats leaves possible."""
     period = repeats_after(record.drives)
     if period is None:
         return dict(best)
     out, top = [], next(iter(best.values()))
     for f in best.values():
-        shifts = {e.name for e in f.candidate.effects if e.shift is not None}
+        shifts = {e.name for e in f.hypothesis.effects if e.shift is not None}
         without = best.get("+".join(sorted(set(f.name.split("+")) - shifts)) or "none")
         able = shifts and without is not None and ("+" not in f.name or f is top)
         out.append(with_delays(f, without, period) if able and without is not None else f)
     return {f.name: f for f in sorted(out, key=lambda f: -f.log_evidence)}
 
 
-def with_delays(found: Found, without: Found, period: float) -> Found:
+def with_delays(found: FittedModel, without: FittedModel, period: float) -> FittedModel:
     """`found` with all its delays that fit alike under a command of this `period` [s]; itself where it has no delay.
 
     `without`: the find of the same effects less the delay.
     """
-    candidate, onset = found.candidate, found.onset
+    candidate, onset = found.hypothesis, found.onset
     keys = [f"{e.name}.{e.shift}" for e in candidate.effects if e.shift is not None]
     at = [i for i, c in enumerate(candidate.coordinates) if c.key in keys]
     if len(at) != 1:
@@ -125,8 +125,8 @@ def with_delays(found: Found, without: Found, period: float) -> Found:
     )
 
 
-def _settled(white: Whitener, errors: Float) -> float:
-    """Log likelihood of errors (witness, counted, group), less the rows at the start of each stretch."""
+def _settled(white: WhiteningFilter, errors: Float) -> float:
+    """Log likelihood of errors (channel, counted, group), less the rows at the start of each stretch."""
     record = white.record
     since = np.arange(record.rows) - record.starts[record.stretch]
     return float(white.row_likelihoods(errors)[since * record.dt >= _BEGUN_S].sum())

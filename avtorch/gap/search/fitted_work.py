@@ -13,8 +13,8 @@ from types import CodeType
 from typing import Any
 
 from avtorch import __version__
-from avtorch.gap.chain.effect import Effect
-from avtorch.gap.chain.plant import GapPlant
+from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log, fingerprint
 
 _SIGNALS = ("time", "accel_cmd", "accel", "speed", "engaged", "grade", "segment")

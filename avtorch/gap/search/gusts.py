@@ -7,19 +7,19 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.gap.likelihood.earlier import CALM, whitener
-from avtorch.gap.likelihood.fit import finish, modes
+from avtorch.gap.likelihood.gauss_newton import finish, modes
 from avtorch.gap.likelihood.noise_fit import GUST, fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.search.found import Found, merged
+from avtorch.gap.likelihood.noise_segments import CALM, whitening_filter
+from avtorch.gap.search.fitted_model import FittedModel, with_or_without_onset
 from avtorch.gap.search.onset import allowed, profile
 
 Float = NDArray[np.float64]
 
 
-def gust(base: Found) -> Found:
+def gust(base: FittedModel) -> FittedModel:
     """A coloured force on top of `base`, over the whole drive and from an onset on."""
-    record = base.candidate.record
+    record = base.hypothesis.record
     forms = []
     lag = base.values["T_L"]
     start = base.noise.noise.replaced(force_sd=0.08, force_time=2.0)
@@ -36,24 +36,24 @@ def gust(base: Found) -> Found:
             late = _blown(base, late.noise.noise, lag, moved)
         mass = float(np.log(np.exp(along[within] - along[moved]).sum() / record.rows))
         forms.append(replace(late, log_evidence=late.log_evidence + mass))
-    return merged(forms)
+    return with_or_without_onset(forms)
 
 
-def _along(blown: Found) -> Float:
+def _along(blown: FittedModel) -> Float:
     """Log likelihood (counted,) if the gust sets in at each row.
 
     Against the same noise without the gust; the base's own noise has made room for it.
     """
-    record, noise = blown.candidate.record, blown.noise.noise
+    record, noise = blown.hypothesis.record, blown.noise.noise
     calm, strong = (
-        whitener(record, n, onset=blown.onset).row_likelihoods(blown.errors)
+        whitening_filter(record, n, onset=blown.onset).row_likelihoods(blown.errors)
         for n in (noise.replaced(force_sd=CALM), noise)
     )
     return profile(calm, strong)
 
 
-def _blown(base: Found, start: NoiseModel, lag: float, onset: int | None) -> Found:
-    record, candidate = base.candidate.record, base.candidate
+def _blown(base: FittedModel, start: NoiseModel, lag: float, onset: int | None) -> FittedModel:
+    record, candidate = base.hypothesis.record, base.hypothesis
     z, errors, fitted = base.z, base.errors, None
     evidence = 0.0
     for _ in range(2):
@@ -62,7 +62,7 @@ def _blown(base: Found, start: NoiseModel, lag: float, onset: int | None) -> Fou
             record, errors, start, T_L=lag, priors=GUST, onset=base.onset, gust_onset=onset, iterations=6
         )
         start = fitted.noise
-        white = whitener(record, start, **onsets)
+        white = whitening_filter(record, start, **onsets)
         z = modes(candidate, white, z[None], onset=base.onset, iterations=3)[0][0]
         fit = finish(candidate, white, z, base.onset)
         errors = fit.errors

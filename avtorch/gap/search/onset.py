@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.gap.likelihood.candidate import Candidate
-from avtorch.gap.likelihood.fit import slope_of
-from avtorch.gap.likelihood.slope import Slope
-from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.likelihood.gauss_newton import grade_marginal
+from avtorch.gap.likelihood.grade_marginal import GradeMarginal
+from avtorch.gap.likelihood.hypothesis import Hypothesis
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 
 Float = NDArray[np.float64]
 
@@ -32,23 +32,23 @@ def allowed(rows: int, dt: float) -> slice:
     return slice(edge, rows - edge)
 
 
-def rough(white: Whitener, candidate: Candidate, z: Float) -> tuple[int, float]:
+def rough_onset(white: WhiteningFilter, hypothesis: Hypothesis, z: Float) -> tuple[int, float]:
     """Best onset row for parameters `z` of a fit over the whole drive, and what it gains [nats] over none."""
-    if candidate.grade_means is not None:
-        return _Road.of(white, candidate, z).best(allowed(candidate.record.rows, white.record.dt))
-    full = candidate.errors(z[None], coarse=True)[0]
-    silent = candidate.record.measured.mean(-1, keepdims=True) - candidate.baseline_rollouts(z[None], coarse=True)[0]
+    if hypothesis.grade_means is not None:
+        return _Road.of(white, hypothesis, z).best(allowed(hypothesis.record.rows, white.record.dt))
+    full = hypothesis.errors(z[None], coarse=True)[0]
+    silent = hypothesis.record.measured.mean(-1, keepdims=True) - hypothesis.baseline_rollouts(z[None], coarse=True)[0]
     rows = profile(-0.5 * (white(silent) ** 2).sum((0, 2)), -0.5 * (white(full) ** 2).sum((0, 2)))
     within = allowed(len(rows), white.record.dt)
     best = within.start + int(np.argmax(rows[within]))
     return best, float(rows[best] - rows[0])
 
 
-def refined(white: Whitener, candidate: Candidate, z: Float, onset: int) -> tuple[int, Float]:
+def refined_onset(white: WhiteningFilter, hypothesis: Hypothesis, z: Float, onset: int) -> tuple[int, Float]:
     """Best onset row near `onset`, and the log likelihood over all rows tried, (row,), -inf elsewhere."""
     record = white.record
     within = allowed(record.rows, record.dt)
-    road = None if candidate.grade_means is None else _Road.of(white, candidate, z)
+    road = None if hypothesis.grade_means is None else _Road.of(white, hypothesis, z)
     found = np.full(record.rows, -np.inf)
     for reach in (8.0, 1.5):
         steps = np.unique(np.round(np.linspace(-reach, reach, 17) / record.dt).astype(int))
@@ -59,7 +59,7 @@ def refined(white: Whitener, candidate: Candidate, z: Float, onset: int) -> tupl
         if road is not None:
             found[tries] = road.at(tries.tolist())
         else:
-            errors = np.stack([candidate.errors(z[None], int(t), coarse=True)[0] for t in tries])
+            errors = np.stack([hypothesis.errors(z[None], int(t), coarse=True)[0] for t in tries])
             found[tries] = white.log_likelihood(errors)
         onset = int(np.argmax(found))
     return onset, found
@@ -72,18 +72,18 @@ class _Road:
     A slope is flat where it does not act: what an onset spares is the prior of its coefficients.
     """
 
-    slope: Slope
+    slope: GradeMarginal
     full: Float
     along: Float
 
     @classmethod
-    def of(cls, white: Whitener, candidate: Candidate, z: Float) -> _Road:
-        full = white(candidate.errors(z[None], coarse=True)[0])[..., 0]
+    def of(cls, white: WhiteningFilter, hypothesis: Hypothesis, z: Float) -> _Road:
+        full = white(hypothesis.errors(z[None], coarse=True)[0])[..., 0]
         silent = white(
-            candidate.record.measured.mean(-1, keepdims=True) - candidate.baseline_rollouts(z[None], coarse=True)[0]
+            hypothesis.record.measured.mean(-1, keepdims=True) - hypothesis.baseline_rollouts(z[None], coarse=True)[0]
         )[..., 0]
         along = profile(-0.5 * (silent**2).sum(0), -0.5 * (full**2).sum(0))
-        return cls(slope_of(white, candidate, None, coarse=True), full, along)
+        return cls(grade_marginal(white, hypothesis, None, coarse=True), full, along)
 
     def at(self, rows: Sequence[int]) -> Float:
         return self.along[list(rows)] + self.slope.from_rows(self.full, rows)
@@ -102,7 +102,7 @@ class _Road:
         return best, found[best] - float(self.at([0])[0])
 
 
-def averaged(found: Float, dt: float) -> float:
+def onset_evidence(found: Float, dt: float) -> float:
     """What not knowing the onset costs [nats]: mean over a uniform prior against the best row."""
     tried = np.flatnonzero(np.isfinite(found))
     if len(tried) < 2:

@@ -15,20 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from avtorch.gap.chain.effect import Effect
-from avtorch.gap.chain.plant import GapPlant
 from avtorch.gap.effects import CommandHold, Gust, Outliers
-from avtorch.gap.likelihood.earlier import whitener
-from avtorch.gap.likelihood.fit import finish, modes
+from avtorch.gap.likelihood.gauss_newton import finish, modes
 from avtorch.gap.likelihood.noise_fit import PRIORS, fit_noise
+from avtorch.gap.likelihood.noise_segments import whitening_filter
+from avtorch.gap.likelihood.observability import is_observable
 from avtorch.gap.likelihood.random_law import Form, RandomLaw
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.whitener import Whitener
-from avtorch.gap.likelihood.witnesses import judged
-from avtorch.gap.search.chance import Tails, hessian_of
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.command_errors import rows_gained
-from avtorch.gap.search.found import ByChance, Found
-from avtorch.gap.search.raw_rows import raw_errors, raw_white
+from avtorch.gap.search.fitted_model import ByChance, FittedModel
+from avtorch.gap.search.full_rate import full_rate_errors, full_rate_filter
+from avtorch.gap.search.outliers import HeavyTails, hessian_of
+from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.plant import GapPlant
 
 Float = NDArray[np.float64]
 
@@ -48,21 +48,21 @@ def users_own(effects: Sequence[type[Effect]], raw: Record, baseline: GapPlant) 
     """Random effects without a search of their own, by what they do to the noise."""
     laws: dict[Form, list[RandomLaw]] = {"force": [], "tails": [], "command": []}
     for kind in effects:
-        if kind.random and kind not in OWN_SEARCH and judged(kind, raw.witnesses):
+        if kind.random and kind not in OWN_SEARCH and is_observable(kind, raw.channels):
             law = RandomLaw.of(kind, raw, baseline)
             laws[law.form].append(law)
     return laws
 
 
-def named(base: Found, law: RandomLaw) -> str:
+def named(base: FittedModel, law: RandomLaw) -> str:
     """Of the base with the random effect on top."""
     return "+".join(sorted([*([] if base.name == "none" else base.name.split("+")), law.name]))
 
 
-def forced(base: Found, law: RandomLaw) -> Found:
+def forced(base: FittedModel, law: RandomLaw) -> FittedModel:
     """A random force on top of `base`, fitted with the lag, the gain, the base's effects and all of the noise."""
-    candidate, record = base.candidate, base.candidate.record
-    best: Found | None = None
+    candidate, record = base.hypothesis, base.hypothesis.record
+    best: FittedModel | None = None
     for begin in (0.0, -1.0):  # typical, and fainter
         z, noise, errors = base.z, base.noise.noise, base.errors
         law_z: Float = np.full(law.size, begin)
@@ -72,7 +72,7 @@ def forced(base: Found, law: RandomLaw) -> Found:
             fitted = fit_noise(record, errors, noise, T_L=lag, onset=base.onset, law=law, law_z=law_z)
             assert fitted.law_z is not None
             noise, law_z = fitted.noise, fitted.law_z
-            white = whitener(record, noise, onset=base.onset)
+            white = whitening_filter(record, noise, onset=base.onset)
             z = modes(candidate, white, z[None], onset=base.onset, iterations=3)[0][0]
             fit = finish(candidate, white, z, base.onset)
             errors = fit.errors
@@ -101,7 +101,7 @@ def forced(base: Found, law: RandomLaw) -> Found:
     return best
 
 
-def tailed(base: Found, law: RandomLaw, tails: Tails) -> Found:
+def tailed(base: FittedModel, law: RandomLaw, tails: HeavyTails) -> FittedModel:
     """Tails on top of `base`."""
     assert tails.z is not None
     assert tails.covariance is not None
@@ -110,7 +110,9 @@ def tailed(base: Found, law: RandomLaw, tails: Tails) -> Found:
     return replace(base, name=named(base, law), log_evidence=evidence, tails=tails, by_chance=by_chance)
 
 
-def glitched(found: Sequence[Found], glitches: Sequence[tuple[RandomLaw | None, Tails]], *, pairs: bool) -> list[Found]:
+def glitched(
+    found: Sequence[FittedModel], glitches: Sequence[tuple[RandomLaw | None, HeavyTails]], *, pairs: bool
+) -> list[FittedModel]:
     """Tails alone and, where pairs are tried, on top of every single effect."""
     out = []
     for f in found:
@@ -127,17 +129,17 @@ def glitched(found: Sequence[Found], glitches: Sequence[tuple[RandomLaw | None, 
     return out
 
 
-def commanded(base: Found, law: RandomLaw, raw: Record) -> Found:
+def commanded(base: FittedModel, law: RandomLaw, raw: Record) -> FittedModel:
     """Errors of the command on top of `base`, fitted with the size of the jerk noise, which passes the same lag."""
-    errors, plain = raw_errors(raw, base), raw_white(raw, base)
+    errors, plain = full_rate_errors(raw, base), full_rate_filter(raw, base)
     T_L, K_L = base.values["T_L"], base.values["K_L"]
     _, spread, _ = PRIORS["process_sd"]
     own = base.noise.noise.process_sd
     centre = float(np.log(own) - PRIORS["process_sd"][0]) / spread
     flat = float(plain.row_likelihoods(errors).sum())
 
-    def white(shift: float) -> Whitener:
-        return Whitener(raw, plain.noise.replaced(process_sd=own * float(np.exp(spread * shift))))
+    def white(shift: float) -> WhiteningFilter:
+        return WhiteningFilter(raw, plain.noise.replaced(process_sd=own * float(np.exp(spread * shift))))
 
     def without(x: Float) -> float:
         return flat - float(white(x[0]).row_likelihoods(errors).sum()) + 0.5 * ((centre + x[0]) ** 2 - centre**2)
@@ -164,10 +166,10 @@ def commanded(base: Found, law: RandomLaw, raw: Record) -> Found:
     return replace(base, name=named(base, law), log_evidence=base.log_evidence + evidence, by_chance=by_chance)
 
 
-def variance_of(law: RandomLaw, z: Float, base: Found, raw: Record) -> Float:
+def variance_of(law: RandomLaw, z: Float, base: FittedModel, raw: Record) -> Float:
     """Of the command's errors as they reach the actuator, (counted,) [(m/s²)²]: behind a delay of the base's, late."""
     late = 0.0
-    for e in base.candidate.effects:
+    for e in base.hypothesis.effects:
         if e.shift is not None and law.effect.order <= e.order:
             late += base.values[f"{e.name}.{e.shift}"]
     parts, first = [], 0

@@ -1,6 +1,6 @@
 """The search for the cause: all single effects, then pairs where a second effect still gains.
 
-Every candidate is first fitted under the noise of the bare baseline, over the whole drive and from an onset on. The
+Every hypothesis is first fitted under the noise of the bare baseline, over the whole drive and from an onset on. The
 best are fitted anew, each with noise of its own, and joined with whatever else gains most on top of them. Causes that
 chance decides (gusts, outliers, lost messages) are judged on the errors that these leave over.
 """
@@ -15,31 +15,38 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.gap.chain.effect import EFFECTS, Effect
-from avtorch.gap.chain.plant import GapPlant
 from avtorch.gap.effects.road_grade import RoadGrade
-from avtorch.gap.likelihood.candidate import Candidate
-from avtorch.gap.likelihood.earlier import CALM, whitener
-from avtorch.gap.likelihood.fit import finish, left_over, modes
+from avtorch.gap.likelihood.gauss_newton import finish, modes, residuals
+from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.likelihood.noise_segments import CALM, whitening_filter
+from avtorch.gap.likelihood.observability import is_observable
 from avtorch.gap.likelihood.random_law import Form, RandomLaw
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.whitener import Whitener
-from avtorch.gap.likelihood.witnesses import judged
-from avtorch.gap.search.chance import Tails, tails
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.checkpoint import Checkpoint, Kept
 from avtorch.gap.search.delays import all_delays
+from avtorch.gap.search.fitted_model import (
+    FittedModel,
+    Scope,
+    SearchResult,
+    first_noise,
+    with_or_without_onset,
+    without_outliers,
+)
 from avtorch.gap.search.fitted_work import fitted_work
-from avtorch.gap.search.found import Found, Race, Scope, cleaned, merged, white_first
+from avtorch.gap.search.full_rate import full_rate_errors, full_rate_filter
 from avtorch.gap.search.gusts import gust
-from avtorch.gap.search.losses import losses
-from avtorch.gap.search.onset import averaged, refined
-from avtorch.gap.search.pairing import Base, joint, swapped
+from avtorch.gap.search.initial_values import lag_delay_starts, starts
+from avtorch.gap.search.lost_messages import lost_messages
+from avtorch.gap.search.onset import onset_evidence, refined_onset
+from avtorch.gap.search.outliers import HeavyTails, heavy_tails
+from avtorch.gap.search.pairs import Base, exchanged, joint_fit
 from avtorch.gap.search.random_effects import OWN_SEARCH, commanded, forced, glitched, users_own
-from avtorch.gap.search.raw_rows import raw_errors, raw_white
-from avtorch.gap.search.screening import ENOUGH, Look, closer, looks
-from avtorch.gap.search.starts import starts, traded
+from avtorch.gap.search.screening import ENOUGH, Screened, refine, screen
+from avtorch.gap.simulator.effect import EFFECTS, Effect
+from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log
 
 Float = NDArray[np.float64]
@@ -79,12 +86,12 @@ class Search:
         self._paired = False
         self._own = {OWN_SEARCH[e] for e in self.effects if e in OWN_SEARCH}
         self._laws: dict[Form, list[RandomLaw]] = {"force": [], "tails": [], "command": []}
-        self._glitches: list[tuple[RandomLaw | None, Tails]] = []
+        self._glitches: list[tuple[RandomLaw | None, HeavyTails]] = []
         work = None if checkpoint is None else fitted_work(self.logs, baseline, self.effects, pairs=pairs)
         self.checkpoint = Checkpoint(checkpoint, work)
 
     # the whole ---------------------------------------------------------------------------------------------------
-    def run(self) -> Race:
+    def run(self) -> SearchResult:
         glitches = None
         logs = self.logs
         record = Record.of(logs)
@@ -95,7 +102,7 @@ class Search:
         if with_tails:
             glitches = self._tails(raw, none)
             if glitches.plain:
-                logs = cleaned(logs, raw, glitches)
+                logs = without_outliers(logs, raw, glitches)
                 record = Record.of(logs)
                 none = self._none(record)
         found = self._deterministic(record, none)
@@ -105,7 +112,7 @@ class Search:
             changed = (glitches is not None and glitches.plain) != again.plain
             changed |= again.plain and abs(before - int(again.hit.sum())) > 0.3 * before + 3
             if changed and not self._late():
-                logs = cleaned(self.logs, raw, again) if again.plain else self.logs
+                logs = without_outliers(self.logs, raw, again) if again.plain else self.logs
                 record = Record.of(logs)
                 none = self._none(record)
                 found = self._deterministic(record, none)
@@ -118,15 +125,15 @@ class Search:
                 found += [commanded(f, law, rows) for f in self._alone_and_best(found, none)]
         if glitches is not None:
             found += glitched(found, self._glitches, pairs=self._paired)
-        best: dict[str, Found] = {}
+        best: dict[str, FittedModel] = {}
         for f in sorted(found, key=lambda f: -f.log_evidence):
             best.setdefault(f.name, f)
         best = all_delays(record, best)
         pairs = "none" if not self._paired else "all" if self.complete else "some"
-        scope = Scope.of(self.effects, {*best, *self._seen}, record.witnesses, pairs)
-        return Race(record, raw, tuple(logs), tuple(best.values()), self.complete, scope)
+        scope = Scope.of(self.effects, {*best, *self._seen}, record.channels, pairs)
+        return SearchResult(record, raw, tuple(logs), tuple(best.values()), self.complete, scope)
 
-    def _blowing(self, on: Found) -> list[Found]:
+    def _blowing(self, on: FittedModel) -> list[FittedModel]:
         """Every random force on top of a find."""
         return [*([gust(on)] if "force" in self._own else []), *(forced(on, law) for law in self._laws["force"])]
 
@@ -137,44 +144,44 @@ class Search:
         return False
 
     # deterministic causes and gusts --------------------------------------------------------------------------------
-    def _none(self, record: Record) -> Found:
+    def _none(self, record: Record) -> FittedModel:
         """The bare baseline, with its noise."""
-        candidate = Candidate(record, (), self.baseline)
-        noise = white_first(record)
-        white = Whitener(record, noise)
-        z = np.stack([candidate.z_of({"T_L": t, "K_L": 1.0}) for t in (0.12, 0.3, 0.8)])
-        found, values = modes(candidate, white, z, iterations=6)
-        return self._settled(candidate, found[values.argmax()], noise, rounds=6)
+        hypothesis = Hypothesis(record, (), self.baseline)
+        noise = first_noise(record)
+        white = WhiteningFilter(record, noise)
+        z = np.stack([hypothesis.z_of({"T_L": t, "K_L": 1.0}) for t in (0.12, 0.3, 0.8)])
+        found, values = modes(hypothesis, white, z, iterations=6)
+        return self._settled(hypothesis, found[values.argmax()], noise, rounds=6)
 
-    def with_effects(self, none: Found, kinds: Sequence[type[Effect]]) -> Found:
+    def with_effects(self, none: FittedModel, kinds: Sequence[type[Effect]]) -> FittedModel:
         """`none` with effects of these kinds on top from the drives' start, with noise of its own."""
-        candidate = Candidate(none.candidate.record, tuple(kinds), self.baseline)
-        white = Whitener(candidate.record, none.noise.noise)
-        places, values = modes(candidate, white, starts(candidate, none.values), iterations=6, coarse=True)
-        return self._settled(candidate, places[values.argmax()], none.noise.noise)
+        hypothesis = Hypothesis(none.hypothesis.record, tuple(kinds), self.baseline)
+        white = WhiteningFilter(hypothesis.record, none.noise.noise)
+        places, values = modes(hypothesis, white, starts(hypothesis, none.values), iterations=6, coarse=True)
+        return self._settled(hypothesis, places[values.argmax()], none.noise.noise)
 
     def _settled(
-        self, candidate: Candidate, z: Float, noise: NoiseModel, *, onset: int | None = None, rounds: int = 2
-    ) -> Found:
+        self, hypothesis: Hypothesis, z: Float, noise: NoiseModel, *, onset: int | None = None, rounds: int = 2
+    ) -> FittedModel:
         """Parameters and noise in turn until both rest."""
-        record = candidate.record
-        start = self.checkpoint.start(candidate, z, noise, onset, rounds)
+        record = hypothesis.record
+        start = self.checkpoint.start(hypothesis, z, noise, onset, rounds)
         known = self.checkpoint.next(start)
         if known is not None:
-            return known.found(candidate, onset)
+            return known.found(hypothesis, onset)
         # on averaged commands first, which is several times as fast and ends close by
         for coarse in (True, False) if record.group > 1 else (False,):
             value, best = -np.inf, (z, noise)
             usual = 2 if record.group > 1 and not coarse else rounds + 1
             for turn in range(_TURNS):
-                noise = noise.seen_through(self._values(candidate, z))
-                white = whitener(record, noise, onset=onset)
+                noise = noise.seen_through(self._values(hypothesis, z))
+                white = whitening_filter(record, noise, onset=onset)
                 enough = ENOUGH if coarse else 0.05
                 if turn < 2:  # once under the noise one came with, and once under its own
-                    z = self._traded(candidate, z, white, onset, coarse)
-                z = modes(candidate, white, z[None], onset=onset, iterations=4, coarse=coarse, enough=enough)[0][0]
-                errors = left_over(candidate, white, z, onset, coarse=coarse)
-                lag = self._values(candidate, z)["T_L"]
+                    z = self._traded(hypothesis, z, white, onset, coarse)
+                z = modes(hypothesis, white, z[None], onset=onset, iterations=4, coarse=coarse, enough=enough)[0][0]
+                errors = residuals(hypothesis, white, z, onset, coarse=coarse)
+                lag = self._values(hypothesis, z)["T_L"]
                 fitted = fit_noise(record, errors, noise, T_L=lag, onset=onset, iterations=3)
                 noise = fitted.noise
                 new = float(fitted.rows.sum()) + fitted.log_prior - 0.5 * float(z @ z)
@@ -185,25 +192,25 @@ class Search:
                 value = new
             z, noise = best
         self.checkpoint.keep(start, Kept(z, noise, log_prior))
-        return Kept(z, noise, log_prior).found(candidate, onset)
+        return Kept(z, noise, log_prior).found(hypothesis, onset)
 
     @staticmethod
-    def _traded(candidate: Candidate, z: Float, white: Whitener, onset: int | None, coarse: bool) -> Float:
+    def _traded(hypothesis: Hypothesis, z: Float, white: WhiteningFilter, onset: int | None, coarse: bool) -> Float:
         """`z`, or the best place from which a dead time and the lag are told apart better."""
-        places = np.concatenate([z[None], traded(candidate, z)])
+        places = np.concatenate([z[None], lag_delay_starts(hypothesis, z)])
         if len(places) == 1:
             return z
-        moved, values = modes(candidate, white, places, onset=onset, iterations=3, coarse=coarse, enough=ENOUGH)
+        moved, values = modes(hypothesis, white, places, onset=onset, iterations=3, coarse=coarse, enough=ENOUGH)
         return moved[values.argmax()]
 
     @staticmethod
-    def _values(candidate: Candidate, z: Float) -> dict[str, float]:
-        return {key: float(x[0]) for key, x in candidate.values(z[None]).items()}
+    def _values(hypothesis: Hypothesis, z: Float) -> dict[str, float]:
+        return {key: float(x[0]) for key, x in hypothesis.values(z[None]).items()}
 
-    def _deterministic(self, record: Record, none: Found) -> list[Found]:
-        kinds = [e for e in self.effects if not e.random and judged(e, record.witnesses)]
-        white = Whitener(record, none.noise.noise)
-        seen: list[Look] = []
+    def _deterministic(self, record: Record, none: FittedModel) -> list[FittedModel]:
+        kinds = [e for e in self.effects if not e.random and is_observable(e, record.channels)]
+        white = WhiteningFilter(record, none.noise.noise)
+        seen: list[Screened] = []
         floor, coarse_floor = (
             float(white.log_likelihood(e[None])[0]) for e in (none.errors, none.errors.mean(-1, keepdims=True))
         )
@@ -211,14 +218,14 @@ class Search:
             self.progress("single effects", i, len(kinds))
             if self._late():
                 break
-            candidate = Candidate(record, (kind,), self.baseline)
-            begin = starts(candidate, none.values)
-            found = looks(candidate, white, begin, onsets=kind.name != "gain_change", floor=coarse_floor)
-            seen += [closer(look, white) for look in found]
+            hypothesis = Hypothesis(record, (kind,), self.baseline)
+            begin = starts(hypothesis, none.values)
+            found = screen(hypothesis, white, begin, onsets=kind.name != "gain_change", floor=coarse_floor)
+            seen += [refine(look, white) for look in found]
         best: dict[str, float] = {}
-        self._seen |= {look.candidate.name for look in seen}
+        self._seen |= {look.hypothesis.name for look in seen}
         for look in seen:
-            best[look.candidate.name] = max(best.get(look.candidate.name, -np.inf), look.value)
+            best[look.hypothesis.name] = max(best.get(look.hypothesis.name, -np.inf), look.value)
         order = sorted(best, key=lambda n: -best[n])
         top = best[order[0]] - floor if order else 0.0
         lead = [n for n in order[:_SINGLES] if best[n] - floor > max(min(0.25 * top, top - 30), _LEAST)]
@@ -233,48 +240,50 @@ class Search:
             fitted.add(name)
             # a gust's noise is too quiet for causes that explain less
             noise = max((f for f in found if not f.blown), key=lambda f: f.log_evidence).noise.noise
-            found.append(self._refined([look for look in seen if look.candidate.name == name], noise))
-        found += self._left_behind([look for look in seen if look.candidate.name not in fitted], white, none)
+            found.append(self._refined([look for look in seen if look.hypothesis.name == name], noise))
+        found += self._left_behind([look for look in seen if look.hypothesis.name not in fitted], white, none)
         if self.pairs and not self._late():
             self._paired = True
             found += self._pairs(record, kinds, found, none)
         return found
 
-    def _left_behind(self, rest: Sequence[Look], white: Whitener, none: Found) -> list[Found]:
+    def _left_behind(self, rest: Sequence[Screened], white: WhiteningFilter, none: FittedModel) -> list[FittedModel]:
         """The others keep the evidence of their screening."""
-        flat = finish(none.candidate, white, none.z).log_evidence
+        flat = finish(none.hypothesis, white, none.z).log_evidence
         found = []
         for look in rest:
             if look.onset is None:
-                fit = finish(look.candidate, white, look.z)
+                fit = finish(look.hypothesis, white, look.z)
                 evidence = none.log_evidence + fit.log_evidence - flat
-                found.append(Found.of(look.candidate, fit, none.noise, evidence, fit.log_joint))
+                found.append(FittedModel.of(look.hypothesis, fit, none.noise, evidence, fit.log_joint))
         return found
 
-    def _refined(self, forms: Sequence[Look], noise: NoiseModel) -> Found:
+    def _refined(self, forms: Sequence[Screened], noise: NoiseModel) -> FittedModel:
         """One cause over the whole drive and from an onset on; both weigh the same a priori."""
-        return merged([self._from_onset(f.candidate, f.z, noise, f.onset) for f in forms])
+        return with_or_without_onset([self._from_onset(f.hypothesis, f.z, noise, f.onset) for f in forms])
 
-    def _from_onset(self, candidate: Candidate, z: Float, noise: NoiseModel, onset: int | None) -> Found:
+    def _from_onset(self, hypothesis: Hypothesis, z: Float, noise: NoiseModel, onset: int | None) -> FittedModel:
         if onset is None:
-            return self._settled(candidate, z, noise)
-        record = candidate.record
-        white = whitener(record, noise, onset=onset)
+            return self._settled(hypothesis, z, noise)
+        record = hypothesis.record
+        white = whitening_filter(record, noise, onset=onset)
         for _ in range(2):
-            z = modes(candidate, white, z[None], onset=onset, iterations=4)[0][0]
-            moved, _ = refined(white, candidate, z, onset)
+            z = modes(hypothesis, white, z[None], onset=onset, iterations=4)[0][0]
+            moved, _ = refined_onset(white, hypothesis, z, onset)
             if moved == onset:
                 break
             onset = moved
-        settled = self._settled(candidate, z, noise, onset=onset)
-        moved, tried = refined(settled.white, candidate, settled.z, onset)
+        settled = self._settled(hypothesis, z, noise, onset=onset)
+        moved, tried = refined_onset(settled.white, hypothesis, settled.z, onset)
         if abs(moved - onset) * record.dt > 0.5:
-            settled = self._settled(candidate, settled.z, settled.noise.noise, onset=moved)
-            _, tried = refined(settled.white, candidate, settled.z, moved)
-        return replace(settled, log_evidence=settled.log_evidence + averaged(tried, record.dt))
+            settled = self._settled(hypothesis, settled.z, settled.noise.noise, onset=moved)
+            _, tried = refined_onset(settled.white, hypothesis, settled.z, moved)
+        return replace(settled, log_evidence=settled.log_evidence + onset_evidence(tried, record.dt))
 
     # pairs ---------------------------------------------------------------------------------------------------------
-    def _pairs(self, record: Record, kinds: Sequence[type[Effect]], found: list[Found], none: Found) -> list[Found]:
+    def _pairs(
+        self, record: Record, kinds: Sequence[type[Effect]], found: list[FittedModel], none: FittedModel
+    ) -> list[FittedModel]:
         single = sorted((f for f in found if f.name != "none"), key=lambda f: -f.log_evidence)
         if not single or single[0].log_evidence < none.log_evidence + _LEAST:
             return []
@@ -285,77 +294,81 @@ class Search:
             # what drifts slowly is a gust or a road, and the noise that was fitted without either hides the road
             name = "+".join(sorted([base.name, "gust"]))
             gusty = made.get(name)
-            if gusty is None or RoadGrade not in kinds or RoadGrade in base.candidate.effects:
+            if gusty is None or RoadGrade not in kinds or RoadGrade in base.hypothesis.effects:
                 continue
             if gusty.log_evidence > base.log_evidence + _SECOND:
-                candidate = Candidate(record, (*base.candidate.effects, RoadGrade), self.baseline)
-                look = Look(candidate, candidate.z_of(base.values), 0.0, base.onset)
+                hypothesis = Hypothesis(record, (*base.hypothesis.effects, RoadGrade), self.baseline)
+                look = Screened(hypothesis, hypothesis.z_of(base.values), 0.0, base.onset)
                 self._settle_pairs([look], 1, gusty.noise.noise.replaced(force_sd=CALM), made)
         # a gust's noise is too quiet for causes that explain less
         noise = (bases[0] if bases else none).noise.noise
         if single[0].blown:
             self._under(single[0], kinds, none, made)
-        white = Whitener(record, noise)
+        white = WhiteningFilter(record, noise)
         alone = {f.name: f.values for f in single if not f.blown}
-        seen: dict[str, Look] = {}
+        seen: dict[str, Screened] = {}
         for i, base in enumerate(bases):
             self.progress("pairs", i, len(bases))
             if self._late():
                 break
             for look in self._joined(base, kinds, white, alone, _SECONDS if i == 0 else _SECONDS // 2):
-                known = seen.get(look.candidate.name)
+                known = seen.get(look.hypothesis.name)
                 if known is None or look.value > known.value:
-                    seen[look.candidate.name] = look
+                    seen[look.hypothesis.name] = look
         done = self._settle_pairs(list(seen.values()), _PAIRS, noise, made)
         for _ in range(_SWAPS):
             if done is None or done.log_evidence < single[0].log_evidence + _SECOND or self._late():
                 break
             # a better partner for either half, now that the noise is what the best pair leaves over
             white = done.white
-            _, value = modes(done.candidate, white, done.z[None], onset=done.onset, iterations=1)
-            here = Look(done.candidate, done.z, float(value[0]), done.onset)
+            _, value = modes(done.hypothesis, white, done.z[None], onset=done.onset, iterations=1)
+            here = Screened(done.hypothesis, done.z, float(value[0]), done.onset)
             near = here.value - _CLOSE
-            others = [k for k in swapped(here, kinds, white, alone, tries=_SECONDS) if k.candidate.name not in made]
+            others = [k for k in exchanged(here, kinds, white, alone, tries=_SECONDS) if k.hypothesis.name not in made]
             better = self._settle_pairs([k for k in others if k.value > near], 2, done.noise.noise, made)
             if better is None or better.log_evidence < done.log_evidence + 1:
                 break
             done = better
         return list(made.values())
 
-    def _under(self, blown: Found, kinds: Sequence[type[Effect]], none: Found, made: dict[str, Found]) -> None:
+    def _under(
+        self, blown: FittedModel, kinds: Sequence[type[Effect]], none: FittedModel, made: dict[str, FittedModel]
+    ) -> None:
         """Causes that show only once a random force's noise is in, each with that force, added to `made`."""
-        on = Base(none.candidate, none.z, none.values, none.onset, blown.white)
-        for candidate, z in on.partners(kinds, {}, most=_BASES, least=_LEAST):
+        on = Base(none.hypothesis, none.z, none.values, none.onset, blown.white)
+        for hypothesis, z in on.partners(kinds, {}, most=_BASES, least=_LEAST):
             if self._late():
                 break
-            forms = looks(candidate, blown.white, z[None], onsets=candidate.name != "gain_change")
-            look = max((closer(form, blown.white) for form in forms), key=lambda form: form.value)
-            under = Kept(look.z, blown.noise.noise, 0.0).found(look.candidate, look.onset)
+            forms = screen(hypothesis, blown.white, z[None], onsets=hypothesis.name != "gain_change")
+            look = max((refine(form, blown.white) for form in forms), key=lambda form: form.value)
+            under = Kept(look.z, blown.noise.noise, 0.0).found(look.hypothesis, look.onset)
             both = gust(under) if blown.by_chance is None else forced(under, blown.by_chance.law)
             if both.name not in made or made[both.name].log_evidence < both.log_evidence:
                 made[both.name] = both
 
     def _joined(
         self,
-        base: Found,
+        base: FittedModel,
         kinds: Sequence[type[Effect]],
-        white: Whitener,
+        white: WhiteningFilter,
         alone: Mapping[str, Mapping[str, float]],
         most: int,
-    ) -> list[Look]:
+    ) -> list[Screened]:
         """The `most` effects that promise most on top of `base`, each fitted with it."""
-        on = Base(base.candidate, base.z, base.values, base.onset, white)
+        on = Base(base.hypothesis, base.z, base.values, base.onset, white)
         found = [
-            joint(candidate, base.candidate.effects[0], z, base.onset, white, onsets=True)
-            for candidate, z in on.partners(kinds, alone, most=most, least=4.0)
+            joint_fit(hypothesis, base.hypothesis.effects[0], z, base.onset, white, onsets=True)
+            for hypothesis, z in on.partners(kinds, alone, most=most, least=4.0)
             if not self._late()
         ]
         # on averaged commands a controller's noise passes for a partner
-        return [near for near in (closer(look, white) for look in found) if near.value > on.flat + _LEAST]
+        return [near for near in (refine(look, white) for look in found) if near.value > on.flat + _LEAST]
 
-    def _settle_pairs(self, pairs: list[Look], most: int, noise: NoiseModel, made: dict[str, Found]) -> Found | None:
+    def _settle_pairs(
+        self, pairs: list[Screened], most: int, noise: NoiseModel, made: dict[str, FittedModel]
+    ) -> FittedModel | None:
         """The best `most` of them with noise of their own, added to `made`; the best of these."""
-        best: Found | None = None
+        best: FittedModel | None = None
         for look in sorted(pairs, key=lambda k: -k.value)[:most]:
             if self._late():
                 break
@@ -368,27 +381,27 @@ class Search:
         return best
 
     # chance --------------------------------------------------------------------------------------------------------
-    def _tails(self, raw: Record, of: Found) -> Tails:
+    def _tails(self, raw: Record, of: FittedModel) -> HeavyTails:
         """The best of all tails; `_glitches` are those of each effect, None for the one with a search of its own."""
-        errors = raw_errors(raw, of)[0, :, 0]
-        self._glitches = [(None, tails(errors, raw.dt))] if "tails" in self._own else []
+        errors = full_rate_errors(raw, of)[0, :, 0]
+        self._glitches = [(None, heavy_tails(errors, raw.dt))] if "tails" in self._own else []
         for law in self._laws["tails"]:
-            self._glitches.append((law, tails(errors, raw.dt, law=law.tails, size=law.size)))
+            self._glitches.append((law, heavy_tails(errors, raw.dt, law=law.tails, size=law.size)))
         return max((found for _, found in self._glitches), key=lambda found: found.evidence)
 
-    def _alone_and_best(self, found: list[Found], none: Found) -> list[Found]:
+    def _alone_and_best(self, found: list[FittedModel], none: FittedModel) -> list[FittedModel]:
         """What errors of the command are tried on: they pass for a delay, so always on the bare baseline, too."""
-        alone = [f for f in found if f.name != "none" and "+" not in f.name and f.candidate.effects]
+        alone = [f for f in found if f.name != "none" and "+" not in f.name and f.hypothesis.effects]
         best = max(alone, key=lambda f: f.log_evidence, default=none)
         return [none, best] if self._paired and best.log_evidence >= none.log_evidence + _LEAST else [none]
 
-    def _held(self, raw: Record, found: list[Found], none: Found) -> list[Found]:
+    def _held(self, raw: Record, found: list[FittedModel], none: FittedModel) -> list[FittedModel]:
         """Lost messages alone and, where pairs are tried, on top of the best single effect."""
         out = []
         for f in self._alone_and_best(found, none):
-            errors = raw_errors(raw, f)
-            white = raw_white(raw, f)
-            lost = losses(white, errors, raw.command[raw.source], f.values["T_L"], f.values["K_L"])
+            errors = full_rate_errors(raw, f)
+            white = full_rate_filter(raw, f)
+            lost = lost_messages(white, errors, raw.command[raw.source], f.values["T_L"], f.values["K_L"])
             name = "+".join(sorted([*([] if f is none else [f.name]), "command_hold"]))
             out.append(replace(f, name=name, log_evidence=f.log_evidence + lost.evidence, losses=lost))
         return out

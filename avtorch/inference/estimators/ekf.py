@@ -13,18 +13,20 @@ import math
 from torch import Tensor
 
 from avtorch.inference.estimators.kalman import JointKalman
-from avtorch.inference.estimators.state_model import Row, State, StateModel
+from avtorch.inference.estimators.state_model import GaussianState, Observation, StateModel
 
 
 class JointEKF(JointKalman):
     """One tangent a row: cheap, and overconfident where the belief is wide against the model's curvature."""
 
-    def predict(self, model: StateModel, state: State, row: Row) -> State:
+    def predict(self, model: StateModel, state: GaussianState, row: Observation) -> GaussianState:
         slope = model.slope(state.mean, row)
         cov = slope @ state.cov @ slope.mT + model.noise(state.mean, row)
-        return State(model.advance(state.mean, row), cov)
+        return GaussianState(model.advance(state.mean, row), cov)
 
-    def correct(self, model: StateModel, state: State, row: Row, channel: int) -> tuple[State, Tensor]:
+    def correct(
+        self, model: StateModel, state: GaussianState, row: Observation, channel: int
+    ) -> tuple[GaussianState, Tensor]:
         slope = model.observed_slope(state.mean, row, channel)
         pointing = (state.cov @ slope.unsqueeze(-1)).squeeze(-1)
         spread = (pointing * slope).sum(-1) + model.variance[:, channel]
@@ -32,7 +34,7 @@ class JointEKF(JointKalman):
         return gained(state, innovation, pointing, spread)
 
 
-def gained(state: State, innovation: Tensor, pointing: Tensor, spread: Tensor) -> tuple[State, Tensor]:
+def gained(state: GaussianState, innovation: Tensor, pointing: Tensor, spread: Tensor) -> tuple[GaussianState, Tensor]:
     """The linear update: ``pointing`` ``(vehicle, d)`` is the covariance of state and reading, ``spread`` its variance.
 
     Returns the state and the log likelihood of the reading, ``(vehicle,)``.
@@ -41,4 +43,4 @@ def gained(state: State, innovation: Tensor, pointing: Tensor, spread: Tensor) -
     mean = state.mean + gain * innovation.unsqueeze(-1)
     cov = state.cov - gain.unsqueeze(-1) * pointing.unsqueeze(-2)
     likelihood = -0.5 * (spread.log() + innovation.square() / spread + math.log(2 * math.pi))
-    return State(mean, 0.5 * (cov + cov.mT)), likelihood
+    return GaussianState(mean, 0.5 * (cov + cov.mT)), likelihood

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from avtorch.inference.estimators.state_model import Row, State
+from avtorch.inference.estimators.state_model import GaussianState, Observation
 
 
 class JerkState:
@@ -21,22 +21,22 @@ class JerkState:
         self._walk = drift**2 * torch.eye(2, dtype=sigma.dtype)
         self._still = torch.eye(2, dtype=sigma.dtype)
 
-    def start(self, actuation: State, row: Row) -> State:
+    def start(self, actuation: GaussianState, row: Observation) -> GaussianState:
         return actuation
 
-    def advance(self, x: Tensor, row: Row) -> Tensor:
+    def advance(self, x: Tensor, row: Observation) -> Tensor:
         return x
 
-    def slope(self, x: Tensor, row: Row) -> Tensor:
+    def slope(self, x: Tensor, row: Observation) -> Tensor:
         return self._still.expand(*x.shape, 2)
 
-    def noise(self, x: Tensor, row: Row) -> Tensor:
+    def noise(self, x: Tensor, row: Observation) -> Tensor:
         return row.dt * self._walk
 
-    def observe(self, x: Tensor, row: Row, channel: int) -> Tensor:
+    def observe(self, x: Tensor, row: Observation, channel: int) -> Tensor:
         log_T, log_K = x.unbind(-1)
         return (log_K.exp() * row.u - row.a) * (-log_T).exp()
 
-    def observed_slope(self, x: Tensor, row: Row, channel: int) -> Tensor:
+    def observed_slope(self, x: Tensor, row: Observation, channel: int) -> Tensor:
         by_gain = (x[..., 1] - x[..., 0]).exp() * row.u
         return torch.stack([(-x[..., 0]).exp() * row.a - by_gain, by_gain], -1)

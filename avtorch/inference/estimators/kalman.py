@@ -14,7 +14,7 @@ from avtorch.errors import InputError
 from avtorch.inference.belief import Summary
 from avtorch.inference.estimators.jerk_state import JerkState
 from avtorch.inference.estimators.latent_state import LatentState
-from avtorch.inference.estimators.state_model import Row, State, StateModel
+from avtorch.inference.estimators.state_model import GaussianState, Observation, StateModel
 from avtorch.inference.estimators.windowed import WindowedEstimator
 from avtorch.inference.evidence import Form, JerkForm, Rows
 from avtorch.inference.jerk import JerkStatistics
@@ -63,14 +63,18 @@ class JointKalman(WindowedEstimator):
         }
 
     @abstractmethod
-    def predict(self, model: StateModel, state: State, row: Row) -> State:
+    def predict(self, model: StateModel, state: GaussianState, row: Observation) -> GaussianState:
         """The state at the next row."""
 
     @abstractmethod
-    def correct(self, model: StateModel, state: State, row: Row, channel: int) -> tuple[State, Tensor]:
+    def correct(
+        self, model: StateModel, state: GaussianState, row: Observation, channel: int
+    ) -> tuple[GaussianState, Tensor]:
         """The state after one channel's reading, and the log likelihood of the reading, ``(vehicle,)``."""
 
-    def filter(self, model: StateModel, actuation: State, rows: Rows, columns: tuple[str, ...]) -> tuple[State, Tensor]:
+    def filter(
+        self, model: StateModel, actuation: GaussianState, rows: Rows, columns: tuple[str, ...]
+    ) -> tuple[GaussianState, Tensor]:
         """All usable rows of a window; a run behind a gap or an unused row starts afresh but for the parameters.
 
         Args:
@@ -92,11 +96,13 @@ class JointKalman(WindowedEstimator):
         state, total = actuation, usable.new_zeros(len(usable), dtype=torch.float64)
         before = torch.zeros(len(usable), dtype=torch.bool)
         for k in range(len(time)):
-            row = Row(clean["accel_cmd"][:, k], clean.get("accel", clean["accel_cmd"])[:, k], measured[:, k], dts[k])
+            row = Observation(
+                clean["accel_cmd"][:, k], clean.get("accel", clean["accel_cmd"])[:, k], measured[:, k], dts[k]
+            )
             on = usable[:, k]
             begins = on & (~before | bool(cut[k]))
             if k == 0 or bool(begins.any()):
-                fresh = model.start(State(state.mean[:, -2:], state.cov[:, -2:, -2:]), row)
+                fresh = model.start(GaussianState(state.mean[:, -2:], state.cov[:, -2:, -2:]), row)
                 state = fresh if k == 0 else _where(begins, fresh, state)
             everywhere = bool(on.all())
             for channel in range(len(columns)):
@@ -107,10 +113,10 @@ class JointKalman(WindowedEstimator):
                 later = self.predict(model, state, row)
                 state = later if everywhere else _where(on, later, state)
             before = on
-        return State(state.mean[:, -2:], state.cov[:, -2:, -2:]), total
+        return GaussianState(state.mean[:, -2:], state.cov[:, -2:, -2:]), total
 
     def _learn(self, rows: Rows, index: Tensor) -> tuple[Summary, Tensor]:
-        actuation = State(self._memory["mean"][index], self._memory["cov"][index])
+        actuation = GaussianState(self._memory["mean"][index], self._memory["cov"][index])
         if isinstance(self.form, LatentForm):
             columns = self.form.measured
             model: StateModel = LatentState(columns, self.noise, self.drift, len(index))
@@ -138,7 +144,7 @@ class JointKalman(WindowedEstimator):
         return Summary.log_normal(mean_z, whole, self.kept, self.generator), settled
 
 
-def _plausible(actuation: State) -> Tensor:
+def _plausible(actuation: GaussianState) -> Tensor:
     """Where mean and covariance are those of a vehicle, ``(vehicle,)`` bool."""
     low, high = (torch.tensor(x, dtype=torch.float64).log() for x in zip(*PLAUSIBLE, strict=True))
     inside = ((actuation.mean > low) & (actuation.mean < high)).all(-1)
@@ -146,6 +152,6 @@ def _plausible(actuation: State) -> Tensor:
     return inside & sound & actuation.cov.isfinite().flatten(1).all(-1)
 
 
-def _where(on: Tensor, state: State, other: State) -> State:
+def _where(on: Tensor, state: GaussianState, other: GaussianState) -> GaussianState:
     mean = torch.where(on[:, None], state.mean, other.mean)
-    return State(mean, torch.where(on[:, None, None], state.cov, other.cov))
+    return GaussianState(mean, torch.where(on[:, None, None], state.cov, other.cov))

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from avtorch.inference.estimators.state_model import Row, State
+from avtorch.inference.estimators.state_model import GaussianState, Observation
 from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, Step, discretise, initial_covariance
 
 _ROWS = {"speed": SPEED_ROW, "accel": ACCEL_ROW}
@@ -32,27 +32,27 @@ class LatentState:
         self.variance = variances.expand(vehicles, -1)
         self._rows = [torch.tensor((*_ROWS[name], 0.0, 0.0), dtype=torch.float64) for name in measured]
 
-    def start(self, actuation: State, row: Row) -> State:
+    def start(self, actuation: GaussianState, row: Observation) -> GaussianState:
         vehicles = len(actuation.mean)
         mean, cov = torch.zeros(vehicles, 6, dtype=torch.float64), torch.zeros(vehicles, 6, 6, dtype=torch.float64)
         mean[:, 4:], cov[:, 4:, 4:] = actuation
         if "speed" in self.measured:
             mean[:, 0] = row.measured[:, self.measured.index("speed")]
         cov[:, :4, :4] = initial_covariance(self._noise["coloured_sd"], self._noise["coloured_time"])
-        return State(mean, cov)
+        return GaussianState(mean, cov)
 
-    def _step(self, x: Tensor, row: Row) -> Step:
+    def _step(self, x: Tensor, row: Observation) -> Step:
         n = self._noise
         road = n.get("road_noise", torch.zeros((), dtype=torch.float64))
         parameters = (n["process_noise"], road, n["coloured_sd"], n["coloured_time"])
         return discretise(x[..., 4].exp(), x[..., 5].exp(), *parameters, row.dt)
 
-    def advance(self, x: Tensor, row: Row) -> Tensor:
+    def advance(self, x: Tensor, row: Observation) -> Tensor:
         step = self._step(x, row)
         moved = (step.transition @ x[..., :4, None])[..., 0] + step.gain * row.u[:, None]
         return torch.cat([moved, x[..., 4:]], -1)
 
-    def slope(self, x: Tensor, row: Row) -> Tensor:
+    def slope(self, x: Tensor, row: Observation) -> Tensor:
         step = self._step(x, row)
         a, K, u = x[..., 1], x[..., 5].exp(), row.u
         decay, reach = step.transition[..., 1, 1], step.transition[..., 0, 1]
@@ -63,14 +63,14 @@ class LatentState:
         out[..., :2, 5] = step.gain[..., :2] * u[:, None]
         return out
 
-    def noise(self, x: Tensor, row: Row) -> Tensor:
+    def noise(self, x: Tensor, row: Observation) -> Tensor:
         out = torch.zeros(*x.shape, 6, dtype=x.dtype)
         out[..., :4, :4] = self._step(x, row).noise
         out[..., 4, 4] = out[..., 5, 5] = self.drift**2 * row.dt
         return out
 
-    def observe(self, x: Tensor, row: Row, channel: int) -> Tensor:
+    def observe(self, x: Tensor, row: Observation, channel: int) -> Tensor:
         return x @ self._rows[channel]
 
-    def observed_slope(self, x: Tensor, row: Row, channel: int) -> Tensor:
+    def observed_slope(self, x: Tensor, row: Observation, channel: int) -> Tensor:
         return self._rows[channel].expand_as(x)

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 from torch import Tensor
 
 
-class State(NamedTuple):
+class GaussianState(NamedTuple):
     """A normal state: ``mean`` ``(vehicle, d)``, ``cov`` ``(vehicle, d, d)``; the last two are ``log T_L, log K_L``."""
 
     mean: Tensor
@@ -16,7 +16,7 @@ class State(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Row:
+class Observation:
     """One row of every vehicle.
 
     ``u`` and ``a``: demanded and, where it is known exactly, realised acceleration [m/s²], ``(vehicle,)``;
@@ -37,26 +37,26 @@ class StateModel(Protocol):
         """Of every channel's noise, ``(vehicle, channel)``."""
         ...
 
-    def start(self, actuation: State, row: Row) -> State:
+    def start(self, actuation: GaussianState, row: Observation) -> GaussianState:
         """The state at the first row of a run, given what is known of ``(log T_L, log K_L)``."""
         ...
 
-    def advance(self, x: Tensor, row: Row) -> Tensor:
+    def advance(self, x: Tensor, row: Observation) -> Tensor:
         """The state a step later, its noise apart, shape of ``x``."""
         ...
 
-    def slope(self, x: Tensor, row: Row) -> Tensor:
+    def slope(self, x: Tensor, row: Observation) -> Tensor:
         """Derivative of :meth:`advance`, ``(..., vehicle, d, d)``."""
         ...
 
-    def noise(self, x: Tensor, row: Row) -> Tensor:
+    def noise(self, x: Tensor, row: Observation) -> Tensor:
         """Covariance of the step's noise, ``(vehicle, d, d)``, at ``x`` ``(vehicle, d)``."""
         ...
 
-    def observe(self, x: Tensor, row: Row, channel: int) -> Tensor:
+    def observe(self, x: Tensor, row: Observation, channel: int) -> Tensor:
         """What the channel reads, its noise apart, ``(..., vehicle)``."""
         ...
 
-    def observed_slope(self, x: Tensor, row: Row, channel: int) -> Tensor:
+    def observed_slope(self, x: Tensor, row: Observation, channel: int) -> Tensor:
         """Derivative of :meth:`observe`, ``(..., vehicle, d)``."""
         ...

@@ -13,20 +13,22 @@ from torch import Tensor
 
 from avtorch.inference.estimators.ekf import gained
 from avtorch.inference.estimators.kalman import JointKalman
-from avtorch.inference.estimators.state_model import Row, State, StateModel
+from avtorch.inference.estimators.state_model import GaussianState, Observation, StateModel
 
 
 class JointUKF(JointKalman):
     """Second order in the mean and no derivatives, at ``2d`` runs of the model a row."""
 
-    def predict(self, model: StateModel, state: State, row: Row) -> State:
+    def predict(self, model: StateModel, state: GaussianState, row: Observation) -> GaussianState:
         points = model.advance(sigma_points(state), row)
         mean = points.mean(0)
         centred = points - mean
         cov = torch.einsum("pvi,pvj->vij", centred, centred) / len(points) + model.noise(state.mean, row)
-        return State(mean, cov)
+        return GaussianState(mean, cov)
 
-    def correct(self, model: StateModel, state: State, row: Row, channel: int) -> tuple[State, Tensor]:
+    def correct(
+        self, model: StateModel, state: GaussianState, row: Observation, channel: int
+    ) -> tuple[GaussianState, Tensor]:
         points = sigma_points(state)
         seen = model.observe(points, row, channel)
         expected = seen.mean(0)
@@ -36,7 +38,7 @@ class JointUKF(JointKalman):
         return gained(state, row.measured[:, channel] - expected, pointing, spread)
 
 
-def sigma_points(state: State) -> Tensor:
+def sigma_points(state: GaussianState) -> Tensor:
     """``(2d, vehicle, d)``; not a number where the covariance has no Cholesky factor: the filter has diverged."""
     root, failed = torch.linalg.cholesky_ex(state.cov)
     root = torch.where((failed == 0)[:, None, None], root, torch.nan)

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.gap import RoadGrade
-from avtorch.trial.rivals.maximum_likelihood import Fit, Fitter
+from avtorch.trial.rivals.maximum_likelihood import Fitter, MaximumLikelihoodFit
 
 Float = NDArray[np.float64]
 _ROAD_HZ = 3.0  # what a road does to a car is slower
 
 
-def outliers(fitter: Fitter, fit: Fit) -> float:
+def outliers(fitter: Fitter, fit: MaximumLikelihoodFit) -> float:
     """A few samples of the acceleration have a wider normal error: two more parameters, by expectation maximisation."""
     told = _innovations(fitter, fit)[0]
     square = (told / told.std()) ** 2
@@ -30,7 +30,7 @@ def outliers(fitter: Fitter, fit: Fit) -> float:
     return fit.loss - max(mixed - plain, 0.0)
 
 
-def command_hold(fitter: Fitter, fit: Fit) -> float:
+def command_hold(fitter: Fitter, fit: MaximumLikelihoodFit) -> float:
     """What a row cannot foretell is larger where the command has just stepped: one more parameter."""
     told, rows = _innovations(fitter, fit)
     # the step before the row: the row's own command already knows of the row's noise
@@ -45,7 +45,7 @@ def command_hold(fitter: Fitter, fit: Fit) -> float:
     return fit.loss - max(gains)
 
 
-def road_grade(fitter: Fitter, fit: Fit) -> float | None:
+def road_grade(fitter: Fitter, fit: MaximumLikelihoodFit) -> float | None:
     """A slope that is a smooth random function of position, as a mixed model: one more parameter, its size.
 
     The slope's coefficients are integrated out, T_L, K_L and the effects' parameters move along to first order, and
@@ -93,7 +93,7 @@ def road_grade(fitter: Fitter, fit: Fit) -> float | None:
     return best
 
 
-def _innovations(fitter: Fitter, fit: Fit, order: int = 8) -> tuple[Float, NDArray[np.intp]]:
+def _innovations(fitter: Fitter, fit: MaximumLikelihoodFit, order: int = 8) -> tuple[Float, NDArray[np.intp]]:
     """What the rows before do not foretell of the first channel's residual, and the rows it is of.
 
     By autoregression on all channels: the controller acts on noise, so a filter that looks ahead would take the

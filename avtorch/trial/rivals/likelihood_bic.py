@@ -17,7 +17,7 @@ from avtorch.gap import EFFECTS
 from avtorch.io import Log
 from avtorch.trial.reply import reply, softmax
 from avtorch.trial.rivals import chance_causes
-from avtorch.trial.rivals.maximum_likelihood import Fit, Fitter
+from avtorch.trial.rivals.maximum_likelihood import Fitter, MaximumLikelihoodFit
 from avtorch.trial.rivals.residuals import Residuals
 
 CHANCE = ("command_hold", "gust", "outliers", "road_grade")
@@ -32,7 +32,7 @@ class Scored:
 
     names: tuple[str, ...]
     score: float
-    fit: Fit
+    fit: MaximumLikelihoodFit
 
 
 def likelihood_bic(log: Log) -> dict[str, Any]:
@@ -61,7 +61,7 @@ def likelihood_bic(log: Log) -> dict[str, Any]:
 
 
 def candidates(log: Log) -> list[str]:
-    """Effects that the log's witnesses can show at all."""
+    """Effects that the log's channels can show at all."""
     needs_accel = {"sensor_lag", "sensor_bias", "sensor_scale", "outliers"}
     return [
         name
@@ -76,14 +76,14 @@ class _Search:
     def __init__(self, fitter: Fitter) -> None:
         self.fitter = fitter
         self._price = 0.5 * math.log(fitter.spectrum.rows)
-        self._fits: dict[tuple[tuple[str, ...], bool, int], Fit] = {}
+        self._fits: dict[tuple[tuple[str, ...], bool, int], MaximumLikelihoodFit] = {}
 
-    def again(self, names: tuple[str, ...], near: Fit) -> Scored:
+    def again(self, names: tuple[str, ...], near: MaximumLikelihoodFit) -> Scored:
         """Score of a deterministic candidate fitted anew from another fit."""
         fit = self.fitter.fit(names, near=near)
         return Scored(names, -fit.loss - len(fit.z) * self._price, fit)
 
-    def score(self, names: tuple[str, ...], near: Fit | None = None, *, steps: int = 12) -> Scored:
+    def score(self, names: tuple[str, ...], near: MaximumLikelihoodFit | None = None, *, steps: int = 12) -> Scored:
         """`near`: a fit to begin from; `steps` at most."""
         plain = tuple(name for name in names if name not in CHANCE)
         chance = [name for name in names if name in CHANCE]

@@ -22,7 +22,7 @@ _REACH = 6.0  # how far from its prior's middle a coordinate may go, in the prio
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class MaximumLikelihoodFit:
     """A fitted candidate. `z`: coordinates by name, each on the scale of its prior; `loss` = -log L.
 
     `transformed` residual; `sizes`, `gust_time` of the noise; `inverse` its spectrum's; `lag` T_L [s]. `slope` of the
@@ -70,8 +70,13 @@ class Fitter:
         self.spectrum = Spectrum(drive.valid, drive.step, drive.channels)
 
     def fit(
-        self, effects: Sequence[str] = (), *, near: Fit | None = None, gust: bool = False, steps: int = _STEPS
-    ) -> Fit:
+        self,
+        effects: Sequence[str] = (),
+        *,
+        near: MaximumLikelihoodFit | None = None,
+        gust: bool = False,
+        steps: int = _STEPS,
+    ) -> MaximumLikelihoodFit:
         """The most likely plant with `effects`.
 
         `near`: a fit to begin from (T_L, K_L and the effects it shares); the first two coordinates that are new are
@@ -110,7 +115,9 @@ class Fitter:
         loss, transformed, sizes, gust_time, inverse, lag = state
         named = dict(zip(names, z.tolist(), strict=True))
         slope_at = partial(self._slope, made, names, z)
-        return Fit(tuple(effects), made, named, loss, transformed, sizes, gust_time, inverse, lag, slope_at)
+        return MaximumLikelihoodFit(
+            tuple(effects), made, named, loss, transformed, sizes, gust_time, inverse, lag, slope_at
+        )
 
     def _starts(self, names: Sequence[str], begin: Float, known: Mapping[str, float]) -> Float:
         """Coordinates (start, coordinate) at which to begin."""

@@ -12,9 +12,9 @@ Float = NDArray[np.float64]
 
 
 def terms(
-    command: Float, response: Float, speed: Float | None, step: float, witnesses: int
+    command: Float, response: Float, speed: Float | None, step: float, channels: int
 ) -> Iterator[tuple[str, str, list[Float]]]:
-    """Effect, the equation it stands in and its columns (row,): `motion`, and with two witnesses their `difference`.
+    """Effect, the equation it stands in and its columns (row,): `motion`, and with two channels their `difference`.
 
     Columns come from the command, from the lag's `response` to it and from the measured speed, never from the measured
     acceleration: its noise is in the slope that is to be explained. Effects of chance have no term, so no regression
@@ -26,7 +26,7 @@ def terms(
     if speed is not None:
         for name, columns in _of_speed(u, a, speed, step):
             yield name, "motion", columns
-    if witnesses == 2:
+    if channels == 2:
         # the accelerometer's faults are where dv/dt and the measured acceleration differ
         yield "sensor_bias", "difference", [np.ones_like(a)]
         yield "sensor_scale", "difference", [a]

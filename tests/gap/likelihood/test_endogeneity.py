@@ -12,11 +12,11 @@ import pytest
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest import Drive as BlindDrive
 from avtorch.gap import plant
-from avtorch.gap.likelihood.candidate import Candidate
-from avtorch.gap.likelihood.fit import finish, modes
+from avtorch.gap.likelihood.gauss_newton import finish, modes
+from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.search import Search
 from avtorch.io import Log
 from tests.gap.records import Float
@@ -27,22 +27,22 @@ CAUSES = {
 }
 
 
-class _Means(Candidate):
+class _Means(Hypothesis):
     """Looks at the groups' means alone."""
 
     def errors(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
         return super().errors(z, onset, coarse=coarse).mean(-1, keepdims=True)
 
 
-def _gains(record: Record, kind: type[Candidate], noise: NoiseModel) -> Float:
+def _gains(record: Record, kind: type[Hypothesis], noise: NoiseModel) -> Float:
     """Evidence [nats] of each cause over none, all under one noise."""
-    white = Whitener(record, noise)
+    white = WhiteningFilter(record, noise)
     base = {"T_L": 0.4, "K_L": 1.0}
 
     def evidence(name: str, starts: list[dict[str, float]]) -> float:
-        candidate = kind.named(record, name, plant())
-        found, values = modes(candidate, white, np.stack([candidate.z_of(s) for s in starts]))
-        return finish(candidate, white, found[values.argmax()]).log_evidence
+        hypothesis = kind.named(record, name, plant())
+        found, values = modes(hypothesis, white, np.stack([hypothesis.z_of(s) for s in starts]))
+        return finish(hypothesis, white, found[values.argmax()]).log_evidence
 
     none = evidence("none", [base])
     return np.array([evidence(name, [{**base, key: x} for x in grid]) - none for name, (key, grid) in CAUSES.items()])
@@ -61,7 +61,7 @@ def test_a_controllers_noise_is_no_lag(rotating_seed: int) -> None:
         assert record.group == 5
         # noise and lag found from several starts: alternated from one, both may rest at a lag of nothing
         noise = Search([log], plant(), effects=[]).run().found[0].white.noise
-        full.append(_gains(record, Candidate, noise))
+        full.append(_gains(record, Hypothesis, noise))
         means.append(_gains(record, _Means, noise))
     # twice the gain of a nuisance parameter is chi-squared: 12 nats lie beyond five standard deviations
     assert np.max(full) < 12.0

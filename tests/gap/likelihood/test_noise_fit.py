@@ -10,7 +10,7 @@ import pytest
 from avtorch.gap.likelihood.noise_fit import GUST, PRIORS, Prior, fit_noise
 from avtorch.gap.likelihood.noise_model import NAMES, NoiseModel
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.onset import allowed, profile
 from tests.gap.records import BOTH, Float, drawn_errors, errors_of, log_of, ornstein, record_of
 
@@ -25,7 +25,7 @@ def _drawn(rng: np.random.Generator, priors: dict[str, Prior], T_L: float) -> No
 def _log_posterior(noise: NoiseModel, record: Record, errors: Float, priors: dict[str, Prior], T_L: float) -> float:
     centres = {n: m + (np.log(T_L) if n == "process_time" else 0.0) for n, (m, _, _) in priors.items()}
     z = np.array([(np.log(getattr(noise, n)) - centres[n]) / priors[n][1] for n in NAMES])
-    return float(Whitener(record, noise).row_likelihoods(errors).sum() - 0.5 * z @ z)
+    return float(WhiteningFilter(record, noise).row_likelihoods(errors).sum() - 0.5 * z @ z)
 
 
 def _away(fit, truth: NoiseModel) -> Float:  # type: ignore[no-untyped-def]
@@ -36,10 +36,10 @@ def _away(fit, truth: NoiseModel) -> Float:  # type: ignore[no-untyped-def]
 @pytest.mark.parametrize("witnesses", [BOTH, ("accel",), ("speed",)])
 @pytest.mark.parametrize("priors", [PRIORS, GUST], ids=["nuisance", "gust"])
 def test_parameters_are_found_within_their_own_bars(
-    priors: dict[str, Prior], witnesses: tuple[str, ...], rotating_seed: int
+    priors: dict[str, Prior], channels: tuple[str, ...], rotating_seed: int
 ) -> None:
     rng = np.random.default_rng(rotating_seed)
-    record = record_of(120.0, noise=None, witnesses=witnesses)
+    record = record_of(120.0, noise=None, channels=channels)
     away, deeper = [], []
     for _ in range(4):
         T_L = float(np.exp(rng.uniform(np.log(0.15), np.log(0.9))))
@@ -96,11 +96,11 @@ def test_row_likelihoods_sum_to_the_whole(rate_hz: int, rotating_seed: int) -> N
     record = Record.of(log_of(seconds=22.0, rate_hz=rate_hz))
     noise = NoiseModel()
     errors = errors_of(noise, record, rng) + 0.04 * rng.standard_normal((2, record.rows, record.group))
-    rows = Whitener(record, noise).row_likelihoods(errors)
+    rows = WhiteningFilter(record, noise).row_likelihoods(errors)
     assert rows.shape == (record.rows,)
-    assert rows.sum() == pytest.approx(float(Whitener(record, noise).log_likelihood(errors)))
+    assert rows.sum() == pytest.approx(float(WhiteningFilter(record, noise).log_likelihood(errors)))
     fit = fit_noise(record, errors, noise, T_L=0.35)
-    np.testing.assert_allclose(fit.rows, Whitener(record, fit.noise).row_likelihoods(errors), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(fit.rows, WhiteningFilter(record, fit.noise).row_likelihoods(errors), rtol=0, atol=1e-8)
 
 
 def test_the_moment_a_force_sets_in_is_found(rotating_seed: int) -> None:
@@ -115,8 +115,8 @@ def test_the_moment_a_force_sets_in_is_found(rotating_seed: int) -> None:
     errors[1, at:] += gained
     errors = errors[..., None]
 
-    quiet = Whitener(record, calm).row_likelihoods(errors)
-    loud = Whitener(record, truth).row_likelihoods(errors)
+    quiet = WhiteningFilter(record, calm).row_likelihoods(errors)
+    loud = WhiteningFilter(record, truth).row_likelihoods(errors)
     along = profile(quiet, loud)
     within = allowed(record.rows, record.dt)
     onset = within.start + int(np.argmax(along[within]))

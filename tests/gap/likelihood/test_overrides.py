@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from avtorch.errors import InputError
 from avtorch.gap import plant
-from avtorch.gap.likelihood.as_read import as_read
-from avtorch.gap.likelihood.candidate import Candidate
+from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.whitener import Whitener
-from avtorch.gap.search.chance import Tails
-from avtorch.gap.search.found import cleaned, white_first
+from avtorch.gap.likelihood.sensor_noise_floor import with_sensor_noise
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.search.fitted_model import first_noise, without_outliers
+from avtorch.gap.search.outliers import HeavyTails
 from avtorch.io import Log
 from tests.gap.records import log_of
 from tests.overridden import deleted
@@ -59,20 +59,20 @@ def _garbled(log: Log, names: tuple[str, ...], rng: np.random.Generator) -> Log:
 @given(seed=st.integers(0, 2**31))
 @settings(max_examples=4, deadline=None)
 def test_a_drivers_rows_change_no_likelihood(
-    effects: str, garbled: tuple[str, ...], witnesses: tuple[str, ...], seed: int
+    effects: str, garbled: tuple[str, ...], channels: tuple[str, ...], seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    log = _driven(log_of(seconds=50.0, rate_hz=40, rng=rng, witnesses=witnesses))
+    log = _driven(log_of(seconds=50.0, rate_hz=40, rng=rng, channels=channels))
     told = []
     for one in (log, _garbled(log, garbled, rng)):
-        record = Record.of(as_read(one)[0])
-        candidate = Candidate.named(record, effects, plant())
-        z = np.linspace(-0.5, 0.5, candidate.size)[None]
-        white = Whitener(record, white_first(record))
-        errors = candidate.errors(z)
-        told.append((errors, white.log_likelihood(errors), candidate.rollouts(z, onset=record.rows // 2)))
-        if candidate.grade_columns is not None:
-            told[-1] += (candidate.grade_columns, candidate.grade_means)
+        record = Record.of(with_sensor_noise(one)[0])
+        hypothesis = Hypothesis.named(record, effects, plant())
+        z = np.linspace(-0.5, 0.5, hypothesis.size)[None]
+        white = WhiteningFilter(record, first_noise(record))
+        errors = hypothesis.errors(z)
+        told.append((errors, white.log_likelihood(errors), hypothesis.rollouts(z, onset=record.rows // 2)))
+        if hypothesis.grade_columns is not None:
+            told[-1] += (hypothesis.grade_columns, hypothesis.grade_means)
     for one, other in zip(*told, strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -85,9 +85,9 @@ def test_drives_are_those_of_a_log_without_the_drivers_rows() -> None:
     assert other.segment == (0, 1, 2, 3)
     np.testing.assert_array_equal(own.source, other.source)
     np.testing.assert_array_equal(own.measured, other.measured)
-    candidates = [Candidate.named(r, "dead_time", plant()) for r in (own, other)]
+    hypotheses = [Hypothesis.named(r, "dead_time", plant()) for r in (own, other)]
     z = np.zeros((1, 3))
-    np.testing.assert_array_equal(*(c.rollouts(z) for c in candidates))
+    np.testing.assert_array_equal(*(c.rollouts(z) for c in hypotheses))
 
 
 def test_the_road_runs_on_under_the_driver() -> None:
@@ -99,10 +99,10 @@ def test_the_road_runs_on_under_the_driver() -> None:
         assert drive.position is not None
         # smoothed speeds and measured ones differ by the noise of 0.05 m/s and less
         np.testing.assert_allclose(drive.position.numpy(), travelled[cut.rows], atol=0.5)
-    grade = Candidate.named(record, "road_grade", plant())
+    grade = Hypothesis.named(record, "road_grade", plant())
     assert grade.grade_columns is not None
     # one road, as many knots as without the driver
-    whole = Candidate.named(Record.of(replace(log, engaged=np.ones(log.rows, bool))), "road_grade", plant())
+    whole = Hypothesis.named(Record.of(replace(log, engaged=np.ones(log.rows, bool))), "road_grade", plant())
     assert whole.grade_columns is not None
     assert abs(len(grade.grade_columns) - len(whole.grade_columns)) <= 1
     # one slope acts alike on both sides of an override: each knot is felt in the drive where the car passes it
@@ -149,7 +149,7 @@ def test_glitches_are_put_right_where_they_are() -> None:
     rows = np.concatenate([np.arange(log.rows)[cut.rows] for cut in raw.cuts])[raw.source]
     hit = np.isin(rows, glitches)
     assert hit.sum() == len(glitches)
-    (clean,) = cleaned([log], raw, Tails(10.0, 0.01, 7.0, (1.0, 1.0), hit, np.zeros(raw.rows)))
+    (clean,) = without_outliers([log], raw, HeavyTails(10.0, 0.01, 7.0, (1.0, 1.0), hit, np.zeros(raw.rows)))
     assert clean.accel is not None
     assert np.flatnonzero(clean.accel != accel).tolist() == glitches
     # the driver's rows beside a glitch are no measure of the car

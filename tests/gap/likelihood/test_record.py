@@ -9,7 +9,7 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.gap import plant
-from avtorch.gap.likelihood.candidate import Candidate
+from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.record import Record
 from avtorch.io import Log
 from tests.gap.records import log_of
@@ -66,9 +66,9 @@ def test_drives_are_rolled_out_at_the_logs_rate_coarse_ones_at_the_groups(
 def test_the_truth_leaves_nothing_over(rate_hz: int) -> None:
     car = plant(T_L=0.4, K_L=0.9)
     record = Record.of(log_of(car, seconds=40.0, rate_hz=rate_hz, noise=None))
-    candidate = Candidate.named(record, "none", plant())
-    z = candidate.z_of({"T_L": 0.4, "K_L": 0.9})[None]
-    errors = candidate.errors(z)[0]
+    hypothesis = Hypothesis.named(record, "none", plant())
+    z = hypothesis.z_of({"T_L": 0.4, "K_L": 0.9})[None]
+    errors = hypothesis.errors(z)[0]
     # the first acceleration, taken from 0.3 s, is forgotten within some lags; what it added to the speed is not
     assert np.abs(errors[0]).max() < 2e-2
     assert np.abs(np.diff(errors[1], axis=0)).max() < 2e-3
@@ -79,10 +79,10 @@ def test_the_truth_leaves_nothing_over(rate_hz: int) -> None:
 def test_coarse_responses_are_close_to_the_groups_means(rate_hz: int) -> None:
     car = plant(T_L=0.4, K_L=0.9)
     record = Record.of(log_of(car, seconds=40.0, rate_hz=rate_hz, noise=None))
-    candidate = Candidate.named(record, "none", plant())
-    z = candidate.z_of({"T_L": 0.4, "K_L": 0.9})[None]
-    means = candidate.rollouts(z).mean(-1, keepdims=True)
-    coarse = candidate.rollouts(z, coarse=True)
+    hypothesis = Hypothesis.named(record, "none", plant())
+    z = hypothesis.z_of({"T_L": 0.4, "K_L": 0.9})[None]
+    means = hypothesis.rollouts(z).mean(-1, keepdims=True)
+    coarse = hypothesis.rollouts(z, coarse=True)
     assert coarse.shape == means.shape
     # within a group the exponential is taken for a straight line, and a step of the command for its mean
     jumps = np.abs(np.diff(record.command)).max()
@@ -174,20 +174,20 @@ def test_several_logs_are_one_after_another() -> None:
     alone = [Record.of(a), Record.of(b)]
     assert record.rows == sum(r.rows for r in alone)
     np.testing.assert_array_equal(record.measured, np.concatenate([r.measured for r in alone], 1))
-    candidate = Candidate.named(record, "none", plant())
+    hypothesis = Hypothesis.named(record, "none", plant())
     z = np.zeros((2, 2))
-    together = candidate.rollouts(z)
-    parts = [Candidate.named(r, "none", plant()).rollouts(z) for r in alone]
+    together = hypothesis.rollouts(z)
+    parts = [Hypothesis.named(r, "none", plant()).rollouts(z) for r in alone]
     np.testing.assert_allclose(together, np.concatenate(parts, 2), atol=1e-9)
     np.testing.assert_array_equal(Record.of(iter([a])).source, alone[0].source)
 
 
 @pytest.mark.parametrize("witness", ["accel", "speed"])
-def test_one_witness_is_enough(witness: str) -> None:
-    record = Record.of(log_of(seconds=20.0, witnesses=(witness,)))
-    assert record.witnesses == (witness,)
+def test_one_witness_is_enough(channel: str) -> None:
+    record = Record.of(log_of(seconds=20.0, channels=(channel,)))
+    assert record.channels == (channel,)
     assert record.measured.shape == (1, record.rows, 1)
-    assert (record.drives[0].speed is None) == (witness == "accel")
+    assert (record.drives[0].speed is None) == (channel == "accel")
 
 
 def test_stamps_that_jitter_in_their_last_digits_are_even() -> None:
@@ -215,11 +215,11 @@ def test_bad_input_is_one_clear_error() -> None:
     _refused(log_of(seconds=9.0), "7.0 s", "10 s")
     _refused(replace(log, speed=np.zeros(log.rows)), "0.0 s", "moving")
     _refused(replace(log, engaged=np.zeros(log.rows, bool)), "0.0 s", "engaged")
-    _refused([log, log_of(seconds=30.0, name="other", witnesses=("speed",))], "drive", "other", "witnesses")
+    _refused([log, log_of(seconds=30.0, name="other", channels=("speed",))], "drive", "other", "witnesses")
 
 
 def test_logs_of_one_name_with_other_witnesses_are_refused() -> None:
-    _refused([log_of(seconds=30.0), log_of(seconds=30.0, witnesses=("speed",))], "witnesses")
+    _refused([log_of(seconds=30.0), log_of(seconds=30.0, channels=("speed",))], "witnesses")
 
 
 def test_logs_of_different_rates_are_refused() -> None:

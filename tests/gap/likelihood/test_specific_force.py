@@ -14,12 +14,12 @@ import torch
 
 import avtorch
 from avtorch.blindtest.car import Car
-from avtorch.blindtest.drives import Drive as Plan
+from avtorch.blindtest.drives import DrivePlan as Plan
 from avtorch.blindtest.drives import Recorded
 from avtorch.blindtest.vehicle import Run, simulate
 from avtorch.errors import InputError
 from avtorch.gap import AerodynamicDrag, Drive, RoadGrade, SensorLag, plant
-from avtorch.gap.likelihood.candidate import Candidate
+from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.record import Record
 from avtorch.io import Log
 from tests.gap.records import log_of
@@ -49,7 +49,7 @@ def test_hills_are_named_where_the_log_says_what_its_accelerometer_reads(hills: 
     # taken for dv/dt, the same reading contradicts the speed, and no slope explains that
     wrong = avtorch.diagnose(hills, accel_kind="kinematic", pairs=False)
     assert wrong.verdict.names != ("road_grade",)
-    # a candidate less probable than 1e-4 is not listed
+    # a hypothesis less probable than 1e-4 is not listed
     evidence = [next((c.log_evidence for c in a.candidates if c.name == "road_grade"), None) for a in (told, wrong)]
     assert evidence[0] is not None
     assert evidence[0] > 1000
@@ -78,7 +78,7 @@ def test_the_kind_travels_with_the_log() -> None:
     assert record.accel_kind == "specific-force"
     assert all(d.specific_force for d in (*record.drives, *record.coarse))
     assert Drive.from_log(log).specific_force
-    columns = [Candidate(Record.of(x), (RoadGrade,), plant()).grade_columns for x in (log, log_of(seconds=20.0))]
+    columns = [Hypothesis(Record.of(x), (RoadGrade,), plant()).grade_columns for x in (log, log_of(seconds=20.0))]
     assert columns[0] is not None
     assert columns[1] is not None
     assert not columns[0][:, 0].any()

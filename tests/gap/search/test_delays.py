@@ -9,7 +9,7 @@ import torch
 
 import avtorch
 from avtorch.gap import DeadTime, Drive, plant
-from avtorch.gap.answer.diagnosis import Diagnosis
+from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.search.delays import repeats_after
 from avtorch.io import Log
 from tests.gap.records import Float

@@ -8,12 +8,12 @@ import pytest
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest.drives import Recorded
 from avtorch.gap import DeadTime, SensorBias, plant
-from avtorch.gap.likelihood.candidate import Candidate
-from avtorch.gap.likelihood.fit import finish, modes, slope_of
+from avtorch.gap.likelihood.gauss_newton import finish, grade_marginal, modes
+from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.whitener import Whitener
-from avtorch.gap.search.onset import allowed, averaged, profile, refined, rough
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.search.onset import allowed, onset_evidence, profile, refined_onset, rough_onset
 from avtorch.io import Log
 from tests.gap.records import Float, command_over, log_of
 
@@ -44,20 +44,20 @@ def test_a_known_onset_is_found(name: str, rate_hz: int, rotating_seed: int) -> 
         seed=int(rng.integers(2**31)),
     )
     record = Record.of(Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed))
-    white = Whitener(record, NOISE)
-    candidate = Candidate.named(record, name, plant())
-    z = modes(candidate, white, candidate.z_of({"T_L": 0.4, "K_L": 1.0, **start})[None], coarse=True)[0][0]
-    onset, gained = rough(white, candidate, z)
+    white = WhiteningFilter(record, NOISE)
+    hypothesis = Hypothesis.named(record, name, plant())
+    z = modes(hypothesis, white, hypothesis.z_of({"T_L": 0.4, "K_L": 1.0, **start})[None], coarse=True)[0][0]
+    onset, gained = rough_onset(white, hypothesis, z)
     assert gained > 10
     for _ in range(3):
-        z = modes(candidate, white, z[None], onset=onset, iterations=6)[0][0]
-        onset, tried = refined(white, candidate, z, onset)
+        z = modes(hypothesis, white, z[None], onset=onset, iterations=6)[0][0]
+        onset, tried = refined_onset(white, hypothesis, z, onset)
     found = float(record.time[record.source[onset]])
     # a cause of this size is worth some 10 nats a second; the command moves every 3.5 s at the latest
     assert abs(found - at) < 3.6
-    whole = white.log_likelihood(candidate.errors(modes(candidate, white, z[None])[0], coarse=True))
+    whole = white.log_likelihood(hypothesis.errors(modes(hypothesis, white, z[None])[0], coarse=True))
     assert tried.max() > float(whole[0]) + 10
-    assert -np.log(record.rows) <= averaged(tried, record.dt) < 0
+    assert -np.log(record.rows) <= onset_evidence(tried, record.dt) < 0
 
 
 CAUSES = {
@@ -84,13 +84,13 @@ def test_what_sets_in_is_what_the_reference_vehicle_does(name: str) -> None:
     pilot = Recorded(command, start_speed=25.0)
     run = simulate(car, pilot, seconds=60.0, rate_hz=rate, effects={name: parameters}, onset=30.0)
     record = Record.of(Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed))
-    candidate = Candidate.named(record, name, plant())
+    hypothesis = Hypothesis.named(record, name, plant())
     told = {f"{name}.{key}": value for key, value in (other or parameters).items()}
-    z = candidate.z_of({"T_L": 0.4, "K_L": 1.0, **told})[None]
+    z = hypothesis.z_of({"T_L": 0.4, "K_L": 1.0, **told})[None]
     time = record.time[record.source]
     onset = int(np.searchsorted(time, 30.0 - 1e-6))
-    errors = candidate.errors(z, onset)[0]
-    whole = candidate.errors(z)[0]
+    errors = hypothesis.errors(z, onset)[0]
+    whole = hypothesis.errors(z)[0]
     first = (time >= 30.0) & (time < 34.0)
     # the message of the very row that it sets in with is read by the one car before and by the other after; a row of
     # 10 ms at some m/s³, or a force that is there a row late
@@ -104,31 +104,31 @@ def test_what_sets_in_is_what_the_reference_vehicle_does(name: str) -> None:
 def test_before_it_sets_in_and_in_other_drives() -> None:
     logs = [log_of(seconds=20.0), log_of(seconds=30.0), log_of(seconds=20.0)]
     record = Record.of(logs)
-    candidate = Candidate.named(record, "sensor_bias", plant())
-    z = candidate.z_of({"T_L": 0.4, "K_L": 1.0, "sensor_bias.bias_mps2": 0.3})[None]
-    without, full = candidate.baseline_rollouts(z)[0, 0], candidate.rollouts(z)[0, 0]
+    hypothesis = Hypothesis.named(record, "sensor_bias", plant())
+    z = hypothesis.z_of({"T_L": 0.4, "K_L": 1.0, "sensor_bias.bias_mps2": 0.3})[None]
+    without, full = hypothesis.baseline_rollouts(z)[0, 0], hypothesis.rollouts(z)[0, 0]
     for row in (0, 100, 360, 600, 900, 1200):
-        late = candidate.rollouts(z, row)[0, 0]
+        late = hypothesis.rollouts(z, row)[0, 0]
         np.testing.assert_allclose(late[:row], without[:row], atol=1e-12)
         np.testing.assert_allclose(late[row:], full[row:], atol=1e-9)
 
 
 def test_a_baseline_of_effects_keeps_what_it_has_in_mind() -> None:
     record = Record.of(log_of(seconds=30.0))
-    candidate = Candidate(record, (SensorBias,), plant([DeadTime(0.2)]))
-    z = candidate.z_of({"T_L": 0.4, "K_L": 1.0, "sensor_bias.bias_mps2": 0.0})[None]
-    np.testing.assert_allclose(candidate.rollouts(z, 300), candidate.baseline_rollouts(z), atol=1e-9)
+    hypothesis = Hypothesis(record, (SensorBias,), plant([DeadTime(0.2)]))
+    z = hypothesis.z_of({"T_L": 0.4, "K_L": 1.0, "sensor_bias.bias_mps2": 0.0})[None]
+    np.testing.assert_allclose(hypothesis.rollouts(z, 300), hypothesis.baseline_rollouts(z), atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["speed_dependent_lag", "speed_dependent_gain", "second_order_actuator"])
 def test_what_only_an_onset_tells_rests_without_one(name: str) -> None:
-    candidate = Candidate.named(Record.of(log_of(seconds=30.0)), name, plant())
-    rests = np.array([c.parameter.of_onset for c in candidate.coordinates])
+    hypothesis = Hypothesis.named(Record.of(log_of(seconds=30.0)), name, plant())
+    rests = np.array([c.parameter.of_onset for c in hypothesis.coordinates])
     assert rests.sum() == 1
-    z = np.full(candidate.size, 0.3)
+    z = np.full(hypothesis.size, 0.3)
     moved = np.stack([z, np.where(rests, 1.5, z)])
-    np.testing.assert_array_equal(*candidate.rollouts(moved))
-    late = candidate.rollouts(moved, 300)
+    np.testing.assert_array_equal(*hypothesis.rollouts(moved))
+    late = hypothesis.rollouts(moved, 300)
     np.testing.assert_array_equal(late[0, :, :300], late[1, :, :300])
     assert np.abs(late[0, 0, 300:] - late[1, 0, 300:]).max() > 0.01
 
@@ -140,16 +140,16 @@ def _slope_that_sets_in(rng: np.random.Generator) -> tuple[float, float, Float]:
     pilot, seed = Recorded(command, start_speed=25.0), int(rng.integers(2**31))
     run = simulate(Car(), pilot, seconds=120.0, rate_hz=20, effects=effects, onset=60.0, seed=seed)
     record = Record.of(Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed))
-    white = Whitener(record, NOISE)
-    candidate = Candidate.named(record, "road_grade", plant())
-    z = modes(candidate, white, candidate.z_of({"T_L": 0.4, "K_L": 1.0})[None])[0][0]
-    row, gain = rough(white, candidate, z)
-    row = refined(white, candidate, z, row)[0]
+    white = WhiteningFilter(record, NOISE)
+    hypothesis = Hypothesis.named(record, "road_grade", plant())
+    z = modes(hypothesis, white, hypothesis.z_of({"T_L": 0.4, "K_L": 1.0})[None])[0][0]
+    row, gain = rough_onset(white, hypothesis, z)
+    row = refined_onset(white, hypothesis, z, row)[0]
     rows = [row - 100, row, row + 100]
-    exact = [finish(candidate, white, z, int(k)).log_joint for k in rows]
-    slope = slope_of(white, candidate, None, coarse=False)
-    full = white(candidate.errors(z[None])[0])[..., 0]
-    silent = white(record.measured - candidate.baseline_rollouts(z[None])[0])[..., 0]
+    exact = [finish(hypothesis, white, z, int(k)).log_joint for k in rows]
+    slope = grade_marginal(white, hypothesis, None, coarse=False)
+    full = white(hypothesis.errors(z[None])[0])[..., 0]
+    silent = white(record.measured - hypothesis.baseline_rollouts(z[None])[0])[..., 0]
     cut = profile(-0.5 * (silent**2).sum(0), -0.5 * (full**2).sum(0))[rows] + slope.from_rows(full, rows)
     return float(record.time[record.source[row]]) - 60.0, gain, np.diff(cut) / np.diff(exact)
 
@@ -184,9 +184,9 @@ def test_not_knowing_the_onset_costs_its_mean(rotating_seed: int) -> None:
     rows = 400
     found = -0.5 * ((np.arange(rows) - 211) / 15.0) ** 2 - 100 + 0.01 * rng.standard_normal(rows)
     want = float(np.log(np.exp(found - found.max()).mean()))
-    assert averaged(found, 0.05) == pytest.approx(want, abs=1e-9)
+    assert onset_evidence(found, 0.05) == pytest.approx(want, abs=1e-9)
     # tried at some of them: straight between
     some = np.full(rows, -np.inf)
     some[150:280:5] = found[150:280:5]
-    assert averaged(some, 0.05) == pytest.approx(want, abs=0.05)
-    assert averaged(np.where(np.arange(rows) == 211, 0.0, -np.inf), 0.05) == pytest.approx(-np.log(rows))
+    assert onset_evidence(some, 0.05) == pytest.approx(want, abs=0.05)
+    assert onset_evidence(np.where(np.arange(rows) == 211, 0.0, -np.inf), 0.05) == pytest.approx(-np.log(rows))

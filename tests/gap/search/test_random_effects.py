@@ -15,10 +15,10 @@ from avtorch.errors import InputError
 from avtorch.gap import DeadTime, Drive, Effect, GapPlant, Gust, NoiseChange, Outliers, Parameter, Row, plant
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.steady_filter import motion
-from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.likelihood.steady_kalman import motion
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.command_errors import rows_gained
-from avtorch.gap.search.losses import image_of_row
+from avtorch.gap.search.lost_messages import image_of_row
 from avtorch.io import Log
 from tests.gap.records import QUIET, Float, covariance, drawn_errors
 
@@ -211,7 +211,7 @@ def test_errors_of_the_command_against_the_whole_covariance() -> None:
     log = _log([], 2, seconds=14.0, rate=20)
     record = Record.of([log], rate_hz=1e9)
     noise = NoiseModel(process_sd=0.05, process_time=0.3)
-    white = Whitener(record, noise)
+    white = WhiteningFilter(record, noise)
     rng = np.random.default_rng(4)
     errors = 0.05 * rng.standard_normal((2, record.rows, 1))
     variance: Float = rng.uniform(0.0, 0.4, record.rows)

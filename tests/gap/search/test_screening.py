@@ -1,4 +1,4 @@
-"""A first look at a candidate: which form it takes, from which starts, and whether from an onset on."""
+"""A first look at a hypothesis: which form it takes, from which starts, and whether from an onset on."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import pytest
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest.drives import Recorded
 from avtorch.gap import Saturation
-from avtorch.gap.chain.plant import plant
-from avtorch.gap.likelihood.candidate import Candidate
-from avtorch.gap.likelihood.fit import modes
+from avtorch.gap.likelihood.gauss_newton import modes
+from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.whitener import Whitener
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search import screening
-from avtorch.gap.search.screening import Look, looks
-from avtorch.gap.search.starts import starts
+from avtorch.gap.search.initial_values import starts
+from avtorch.gap.search.screening import Screened, screen
+from avtorch.gap.simulator.plant import plant
 from avtorch.io import Log
 from tests.gap.records import QUIET, Float, command_over, log_of
 
@@ -44,15 +44,15 @@ def _drive(name: str, parameters: dict[str, float], onset: float, seed: int, sec
     return Record.of(Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed))
 
 
-def _begin(record: Record, white: Whitener, name: str) -> tuple[Candidate, Float, float]:
-    """The candidate, its starts as a search makes them, and what the bare baseline comes to."""
-    none, candidate = (Candidate.named(record, n, plant()) for n in ("none", name))
+def _begin(record: Record, white: WhiteningFilter, name: str) -> tuple[Hypothesis, Float, float]:
+    """The hypothesis, its starts as a search makes them, and what the bare baseline comes to."""
+    none, hypothesis = (Hypothesis.named(record, n, plant()) for n in ("none", name))
     z, value = modes(none, white, none.z_of({"T_L": 0.3, "K_L": 1.0})[None], coarse=True)
-    return candidate, starts(candidate, {k: float(v) for k, v in none.values(z).items()}), float(value[0])
+    return hypothesis, starts(hypothesis, {k: float(v) for k, v in none.values(z).items()}), float(value[0])
 
 
-def _at(look: Look) -> float:
-    record = look.candidate.record
+def _at(look: Screened) -> float:
+    record = look.hypothesis.record
     assert look.onset is not None
     return float(record.time[record.source[look.onset]])
 
@@ -63,11 +63,11 @@ def test_an_onset_late_in_the_drive_is_found_though_the_whole_fit_is_diluted(nam
     at = float(np.round(rng.uniform(34, 46), 1))
     key, size = CASES[name]
     record = _drive(name, {key: size}, at, int(rng.integers(2**31)))
-    white = Whitener(record, NOISE)
-    candidate, begin, floor = _begin(record, white, name)
-    whole, late = looks(candidate, white, begin, floor=floor)
+    white = WhiteningFilter(record, NOISE)
+    hypothesis, begin, floor = _begin(record, white, name)
+    whole, late = screen(hypothesis, white, begin, floor=floor)
     assert whole.onset is None
-    told = [float(candidate.values(look.z[None])[f"{name}.{key}"]) for look in (whole, late)]
+    told = [float(hypothesis.values(look.z[None])[f"{name}.{key}"]) for look in (whole, late)]
     # an effect of some 10 nats a second over a quarter of the drive or more; the command moves every 3.5 s at the
     # latest
     assert abs(_at(late) - at) < 3.6
@@ -85,17 +85,17 @@ def test_starts_show_an_onset_of_which_the_whole_fit_tells_nothing(
     at = float(np.round(rng.uniform(34, 46), 1))
     key, size = CASES[name]
     record = _drive(name, {key: size}, at, int(rng.integers(2**31)))
-    white = Whitener(record, NOISE)
-    candidate, begin, floor = _begin(record, white, name)
+    white = WhiteningFilter(record, NOISE)
+    hypothesis, begin, floor = _begin(record, white, name)
     told = screening.rough
     asked: list[Float] = []
 
-    def nothing_of_the_whole(white: Whitener, candidate: Candidate, z: Float) -> tuple[int, float]:
+    def nothing_of_the_whole(white: WhiteningFilter, hypothesis: Hypothesis, z: Float) -> tuple[int, float]:
         asked.append(z)
-        return told(white, candidate, z) if len(asked) > 1 else (100, -1.0)
+        return told(white, hypothesis, z) if len(asked) > 1 else (100, -1.0)
 
     monkeypatch.setattr(screening, "rough", nothing_of_the_whole)
-    whole, late = looks(candidate, white, begin, floor=floor)
+    whole, late = screen(hypothesis, white, begin, floor=floor)
     np.testing.assert_array_equal(asked[0], whole.z)
     assert abs(_at(late) - at) < 3.6
     assert late.value > whole.value + 60
@@ -105,68 +105,68 @@ def test_starts_show_an_onset_of_which_the_whole_fit_tells_nothing(
 def test_no_onset_is_offered_where_the_effect_is_there_from_the_start(name: str, rotating_seed: int) -> None:
     key, size = CASES[name]
     record = _drive(name, {key: size}, 0.0, rotating_seed)
-    white = Whitener(record, NOISE)
-    candidate, begin, floor = _begin(record, white, name)
+    white = WhiteningFilter(record, NOISE)
+    hypothesis, begin, floor = _begin(record, white, name)
     # the first seconds without it cost a hundred nats
-    (only,) = looks(candidate, white, begin, floor=floor)
+    (only,) = screen(hypothesis, white, begin, floor=floor)
     assert only.onset is None
     assert only.value > floor + 100
-    assert float(candidate.values(only.z[None])[f"{name}.{key}"]) == pytest.approx(size, rel=0.1)
+    assert float(hypothesis.values(only.z[None])[f"{name}.{key}"]) == pytest.approx(size, rel=0.1)
 
 
 def test_none_is_looked_for_unless_asked(rotating_seed: int) -> None:
     record = _drive("dead_time", {"delay_s": 0.3}, 40.0, rotating_seed)
-    white = Whitener(record, NOISE)
-    candidate, begin, floor = _begin(record, white, "dead_time")
-    (only,) = looks(candidate, white, begin, floor=floor, onsets=False)
-    both = looks(candidate, white, begin, floor=floor)
+    white = WhiteningFilter(record, NOISE)
+    hypothesis, begin, floor = _begin(record, white, "dead_time")
+    (only,) = screen(hypothesis, white, begin, floor=floor, onsets=False)
+    both = screen(hypothesis, white, begin, floor=floor)
     assert only.onset is None
     np.testing.assert_array_equal(only.z, both[0].z)
     assert only.value == both[0].value
 
 
-def _faint(size: float) -> tuple[Candidate, Whitener, Float, float]:
+def _faint(size: float) -> tuple[Hypothesis, WhiteningFilter, Float, float]:
     """A bias of `size` [m/s²] from the middle of a drive on, no noise at all: what it tells is no matter of chance."""
     log = log_of(seconds=50.0, noise=None, speed0=25.0)
     accel = log.accel + size * (log.time > 26)
     record = Record.of(Log.from_arrays(time=log.time, accel_cmd=log.accel_cmd, accel=accel, speed=log.speed))
-    white = Whitener(record, QUIET)
-    candidate, _, floor = _begin(record, white, "sensor_bias")
-    return candidate, white, candidate.z_of({"T_L": 0.3, "K_L": 1.0, "sensor_bias.bias_mps2": 0.0})[None], floor
+    white = WhiteningFilter(record, QUIET)
+    hypothesis, _, floor = _begin(record, white, "sensor_bias")
+    return hypothesis, white, hypothesis.z_of({"T_L": 0.3, "K_L": 1.0, "sensor_bias.bias_mps2": 0.0})[None], floor
 
 
 def test_a_faint_onset_counts_where_the_effect_shows_over_the_whole_drive() -> None:
-    candidate, white, begin, floor = _faint(0.007)
-    (whole, late) = looks(candidate, white, begin)  # no floor given: anything shows
+    hypothesis, white, begin, floor = _faint(0.007)
+    (whole, late) = screen(hypothesis, white, begin)  # no floor given: anything shows
     gain = late.value - whole.value
     assert 0.3 < gain < 4.0  # by this little an onset is worth a look only where the effect is there
     assert abs(_at(late) - 26) < 1.0
-    assert [look.onset for look in looks(candidate, white, begin, floor=whole.value - 5)] == [None, late.onset]
-    assert [look.onset for look in looks(candidate, white, begin, floor=whole.value - 3)] == [None]
+    assert [look.onset for look in screen(hypothesis, white, begin, floor=whole.value - 5)] == [None, late.onset]
+    assert [look.onset for look in screen(hypothesis, white, begin, floor=whole.value - 3)] == [None]
     assert whole.value < floor + 4
     # with more of it the floor does not matter
-    candidate, white, begin, _ = _faint(0.04)
-    whole, late = looks(candidate, white, begin, floor=np.inf)
+    hypothesis, white, begin, _ = _faint(0.04)
+    whole, late = screen(hypothesis, white, begin, floor=np.inf)
     assert late.value > whole.value + 10
 
 
 def test_the_best_starts_are_followed_and_no_others(monkeypatch: pytest.MonkeyPatch) -> None:
     record = Record.of(log_of(plant(T_L=0.4), seconds=20.0, noise=None))
-    white = Whitener(record, QUIET)
-    candidate = Candidate.named(record, "dead_time", plant())
+    white = WhiteningFilter(record, QUIET)
+    hypothesis = Hypothesis.named(record, "dead_time", plant())
     delays = (0.5, 0.02, 0.3, 0.1)
-    begin = np.stack([candidate.z_of({"T_L": 0.4, "K_L": 1.0, "dead_time.delay_s": d}) for d in delays])
+    begin = np.stack([hypothesis.z_of({"T_L": 0.4, "K_L": 1.0, "dead_time.delay_s": d}) for d in delays])
     followed: list[Float] = []
 
-    def kept(candidate: Candidate, white: Whitener, z: Float, **options: object) -> tuple[Float, Float]:
+    def kept(hypothesis: Hypothesis, white: WhiteningFilter, z: Float, **options: object) -> tuple[Float, Float]:
         followed.append(z)
-        return modes(candidate, white, z, **options)  # type: ignore[arg-type]
+        return modes(hypothesis, white, z, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr(screening, "modes", kept)
     best = []
     for keep in (1, 2, 4):
         followed.clear()
-        (only,) = looks(candidate, white, begin, onsets=False, keep=keep)
+        (only,) = screen(hypothesis, white, begin, onsets=False, keep=keep)
         best.append(only.value)
         # a car without delay: the shorter, the better
         np.testing.assert_array_equal(followed[0], begin[[1, 3, 2, 0][:keep]])
@@ -178,12 +178,12 @@ def test_limits_on_both_sides_are_found_from_the_starts(limits: tuple[float, flo
     """The bare fit, where the starts begin, has taken the gain for what both limits do to it."""
     car = plant([Saturation(*limits)], T_L=0.4)
     record = Record.of(log_of(car, seconds=40.0, noise=None, speed0=25.0))
-    white = Whitener(record, QUIET)
-    candidate, begin, floor = _begin(record, white, "saturation")
-    truth = candidate.z_of({k: float(v) for k, v in car.values().items()})
-    top = float(modes(candidate, white, truth[None], coarse=True)[1][0])
+    white = WhiteningFilter(record, QUIET)
+    hypothesis, begin, floor = _begin(record, white, "saturation")
+    truth = hypothesis.z_of({k: float(v) for k, v in car.values().items()})
+    top = float(modes(hypothesis, white, truth[None], coarse=True)[1][0])
     assert top > floor + 100
-    (found,) = looks(candidate, white, begin, onsets=False, floor=floor)
+    (found,) = screen(hypothesis, white, begin, onsets=False, floor=floor)
     assert found.value > top - 2
 
 
@@ -191,9 +191,9 @@ def test_whole_and_late_are_judged_by_the_same_likelihood(rotating_seed: int) ->
     """The value of a look is the joint density of its rollout, spliced where it has an onset."""
     rng = np.random.default_rng(rotating_seed)
     record = _drive("constant_resistance", {"resistance_mps2": 0.25}, 36.0, int(rng.integers(2**31)))
-    white = Whitener(record, NOISE)
-    candidate, begin, floor = _begin(record, white, "constant_resistance")
-    for look in looks(candidate, white, begin, floor=floor):
-        errors = candidate.errors(look.z[None], look.onset, coarse=True)
+    white = WhiteningFilter(record, NOISE)
+    hypothesis, begin, floor = _begin(record, white, "constant_resistance")
+    for look in screen(hypothesis, white, begin, floor=floor):
+        errors = hypothesis.errors(look.z[None], look.onset, coarse=True)
         exact = float(white.log_likelihood(errors)[0]) - 0.5 * float(look.z @ look.z)
         assert look.value == pytest.approx(exact, abs=1e-6)

@@ -24,7 +24,7 @@ from avtorch.gap import (
     plant,
 )
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.search.found import Found, Race
+from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 from avtorch.gap.search.search import Search
 from avtorch.io import Log
 from tests.gap.records import Float, command_over
@@ -54,11 +54,11 @@ def _log(
     return Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed)
 
 
-def _search(log: Log, effects: Sequence[type[Effect]], path: Path | None = None, **options: object) -> Race:
+def _search(log: Log, effects: Sequence[type[Effect]], path: Path | None = None, **options: object) -> SearchResult:
     return Search([log], plant(), effects=effects, checkpoint=path, **options).run()  # type: ignore[arg-type]
 
 
-def _evidence(race: Race) -> dict[str, float]:
+def _evidence(race: SearchResult) -> dict[str, float]:
     """Over none [nats], by name."""
     return {f.name: f.log_evidence - race.none.log_evidence for f in race.found}
 
@@ -68,7 +68,7 @@ def _fitted(path: Path) -> list[str]:
     return [entry["name"] for entry in json.loads(path.read_text(encoding="utf-8"))["content"]["fits"]]
 
 
-def _sound(race: Race) -> None:
+def _sound(race: SearchResult) -> None:
     """Whatever the search: one find for each name, most evidence first."""
     names = [f.name for f in race.found]
     assert len(set(names)) == len(names)
@@ -125,7 +125,7 @@ def test_what_is_far_behind_at_first_sight_is_not_fitted_anew(tmp_path: Path, ro
 
 
 def test_the_best_of_equal_names_is_kept(rotating_seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    def three(self: Search, record: Record, none: Found) -> list[Found]:
+    def three(self: Search, record: Record, none: FittedModel) -> list[FittedModel]:
         more = [replace(none, name="twice", log_evidence=none.log_evidence + x, grade_rms=x) for x in (2.0, 5.0, 3.0)]
         return [none, *more, replace(none, name="behind", log_evidence=none.log_evidence - 4)]
 
@@ -201,6 +201,6 @@ def test_a_cause_that_sets_in_is_found_with_its_onset(rotating_seed: int) -> Non
     race = _search(log, [DeadTime, SensorScale], pairs=False)
     assert race.best.name == "dead_time"
     assert race.best.onset is not None
-    record = race.best.candidate.record
+    record = race.best.hypothesis.record
     assert abs(float(record.time[record.source[race.best.onset]]) - 30) < 3.6
     assert race.best.values["dead_time.delay_s"] == pytest.approx(0.3, abs=0.05)

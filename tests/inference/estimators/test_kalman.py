@@ -13,7 +13,7 @@ from avtorch.inference import JerkDensity, JerkForm, integrate
 from avtorch.inference.estimators import JointEKF, JointUKF
 from avtorch.inference.estimators.jerk_state import JerkState
 from avtorch.inference.estimators.latent_state import LatentState
-from avtorch.inference.estimators.state_model import Row, State
+from avtorch.inference.estimators.state_model import GaussianState, Observation
 from avtorch.inference.latent import FINEST, LatentDensity
 from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.latent_window import LatentWindow
@@ -64,7 +64,7 @@ def test_a_linear_model_is_filtered_exactly(kind, rotating_seed):
     a, u, y = torch.randn(3, vehicles, n, generator=g, dtype=F64)
     model, mean0 = Linear(r, q, vehicles), torch.randn(vehicles, 2, generator=g, dtype=F64)
     cov0 = torch.tensor([[1.0, 0.3], [0.3, 0.5]], dtype=F64)
-    start = State(mean0, cov0.expand(vehicles, 2, 2))
+    start = GaussianState(mean0, cov0.expand(vehicles, 2, 2))
     found, likelihood = kind(JerkForm(), vehicles=vehicles).filter(model, start, rows_of(a, u, y), ("jerk",))
     F = model.slope(mean0[:1], None)[0]
     for v in range(vehicles):
@@ -94,7 +94,7 @@ def test_a_linear_model_is_filtered_exactly(kind, rotating_seed):
 
 def random_row(g, channels, dt=0.04):
     u, a = torch.randn(2, 3, generator=g, dtype=F64)
-    return Row(u, a, torch.randn(3, channels, generator=g, dtype=F64), torch.tensor(dt, dtype=F64))
+    return Observation(u, a, torch.randn(3, channels, generator=g, dtype=F64), torch.tensor(dt, dtype=F64))
 
 
 @pytest.mark.parametrize("latent", [False, True])
@@ -130,7 +130,7 @@ def test_known_parameters_give_the_latent_form_s_likelihood(signals, rotating_se
     usable[1, 12:15] = False
     form = LatentForm(accel="accel" in signals, speed="speed" in signals)
     ekf = JointEKF(form, vehicles=2, drift=0.0)
-    actuation = State(torch.tensor([0.6, 0.8], dtype=F64).log().expand(2, 2), torch.zeros(2, 2, 2, dtype=F64))
+    actuation = GaussianState(torch.tensor([0.6, 0.8], dtype=F64).log().expand(2, 2), torch.zeros(2, 2, 2, dtype=F64))
     model = LatentState(form.measured, ekf.noise, 0.0, 2)
     rows = {"time": time, "usable": usable, **{name: columns[name] for name in form.columns}}
     _, likelihood = ekf.filter(model, actuation, rows, form.measured)

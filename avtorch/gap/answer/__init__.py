@@ -1,1 +1,0 @@
-"""What is said of them: probabilities, `unknown`, alias sets, posteriors, the verdict."""

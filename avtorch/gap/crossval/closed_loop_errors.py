@@ -1,0 +1,89 @@
+"""What a model's errors are worth in the closed loop: how far speed and spacing would be off behind a leader.
+
+A controller feeds back what goes wrong, so what a model is off by in the open loop is not what a simulated platoon is
+off by. With the actuator `P = K_L / (T_L s + 1)` and the linear controller, an error `e` of the speed rolled out in the
+open loop becomes, in the loop,
+
+    speed    e s^2 / (s^2 + P (k_s + g s - k_a s^2)),    g = k_s tau + k_v
+    spacing  less its integral
+
+by superposition: the loop is linear, and the leader the same for car and model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import bilinear, lfilter
+
+from avtorch.vehicle.controllers import NOMINAL_GAINS
+
+Float = NDArray[np.float64]
+
+_LEAST_DECAY = 0.02  # [1/s], slower than which a loop does not forget within a block
+
+
+@dataclass(frozen=True)
+class LoopMeasure:
+    """Closed-loop error of `quantity` ("speed" [m/s] or "spacing" [m]), out of errors of a `channel`.
+
+    `T_L` [s], `K_L`: of the loop's car. Controller: constant time gap `time_gap` [s], `gains` (k_s, k_v, k_a).
+    """
+
+    channel: str
+    quantity: str
+    T_L: float
+    K_L: float
+    time_gap: float = 1.0
+    gains: Sequence[float] = NOMINAL_GAINS
+
+    horizon_s = float("inf")  # nothing is restarted on the way, as with the measure over the whole drive
+
+    @property
+    def name(self) -> str:
+        return f"closed_loop_rmse_{self.quantity}"
+
+    @cached_property
+    def _transfer(self) -> tuple[list[float], list[float]]:
+        """Numerator and denominator in s, from the error of the speed."""
+        k_s, k_v, k_a = self.gains
+        K = self.K_L
+        below = [self.T_L, 1.0 - K * k_a, K * (k_s * self.time_gap + k_v), K * k_s]
+        above = [self.T_L, 1.0, 0.0, 0.0] if self.quantity == "speed" else [-self.T_L, -1.0, 0.0]
+        return above, below
+
+    @property
+    def stable(self) -> bool:
+        """Whether the loop forgets."""
+        return bool(np.roots(self._transfer[1]).real.max() < -_LEAST_DECAY)
+
+    def products(self, x: Float, blocks: Sequence[slice], dt: float, lag: float) -> Float:
+        """(block, one, other): sums over each block of products of errors in the loop.
+
+        From those of long rollouts, `x` (one, row); `dt` [s] between rows. `lag` is not used: the loop has its own.
+        """
+        off = self.of(x, dt)
+        return np.stack([off[:, b] @ off[:, b].T for b in blocks])
+
+    def of(self, errors: Float, dt: float) -> Float:
+        """Errors (..., row) in the loop from those of a long rollout (..., row), both nothing at the first row.
+
+        `dt` [s] between rows.
+        """
+        off = errors
+        if self.channel == "accel":
+            gained = np.cumsum(0.5 * dt * (errors[..., 1:] + errors[..., :-1]), -1)
+            off = np.concatenate([np.zeros_like(errors[..., :1]), gained], -1)
+        above, below = bilinear(*self._transfer, fs=1 / dt)
+        return np.asarray(lfilter(above, below, off - off[..., :1], axis=-1))
+
+
+def loop_measures(channels: Sequence[str], T_L: float, K_L: float) -> tuple[LoopMeasure, ...]:
+    """Speed and spacing behind a leader, by the better channel of motion; none where that loop is not stable."""
+    channel = "speed" if "speed" in channels else "accel"
+    made = tuple(LoopMeasure(channel, quantity, T_L, K_L) for quantity in ("speed", "spacing"))
+    return tuple(m for m in made if m.stable)

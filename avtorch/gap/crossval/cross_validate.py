@@ -1,0 +1,167 @@
+"""Contenders of a search fitted to one part of the drives and judged by the rest, each part in turn.
+
+The contenders are fitted anew to each part's other blocks, and those alone choose among them, as the search did among
+all. What judges has chosen neither the effect nor its parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.crossval.black_box import BlackBoxRegression
+from avtorch.gap.crossval.closed_loop_errors import LoopMeasure, loop_measures
+from avtorch.gap.crossval.folds import Fold, folds, whole_drive_folds
+from avtorch.gap.crossval.noise_floor import NoiseFloor
+from avtorch.gap.crossval.random_effect_density import random_effect_density
+from avtorch.gap.crossval.refit import Refit
+from avtorch.gap.crossval.rollout_errors import Measure, measures
+from avtorch.gap.crossval.scores import FoldScorer, FoldScores, parameter_spread
+from avtorch.gap.likelihood.hypothesis import Hypothesis
+from avtorch.gap.likelihood.observability import is_observable
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.search.fitted_model import FittedModel, SearchResult
+from avtorch.gap.search.initial_values import effect_starts
+from avtorch.gap.selection.model_probabilities import complexity_penalties
+from avtorch.gap.simulator.effect import EFFECTS, Effect
+
+Float = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+
+_RIVALS = 2  # besides the bare baseline and the verdict
+_NEAR = 15.0  # nats behind the verdict, for more of which no part would choose another
+
+
+@dataclass(frozen=True, eq=False)
+class CrossValidation:
+    """What the blocks that judge say of a `verdict`, every counted row once.
+
+    - `sums` by name: `before` (the bare baseline), `after` (what the rest chose), `flexible` (a black box on top of
+      that), `ceiling` (a black box on the bare baseline), `verdict`, `placebo` (the wrong effect `sham` on top of it);
+      `fitted`: the verdict as all blocks fit it; `floor`: what that leaves over, as far as its parameters are known
+    - `rows` (block,): how many single rows judge
+    - `chosen`: share of the parts that chose the verdict; `by_chance`: it has no effect that a rollout could foretell;
+      `by_drives`: whole drives are held out, not blocks of them
+    """
+
+    record: Record
+    measures: Sequence[Measure | LoopMeasure]
+    sums: Mapping[str, FoldScores]
+    floor: NoiseFloor
+    rows: Float
+    chosen: float
+    sham: type[Effect] | None
+    by_chance: bool = False
+    by_drives: bool = False
+
+
+def cross_validate(
+    race: SearchResult,
+    verdict: FittedModel,
+    *,
+    blamed: bool = True,
+    alike: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> CrossValidation | None:
+    """Of a `verdict` among the finds of a search; None where the drives are too short to be parted.
+
+    `blamed` False: it is the best of the named ones, and not the cause. `alike`: effects that no placebo may be, as
+    they might be the cause as well.
+    """
+    record = race.record
+    parts = folds(record)
+    if not parts:
+        return None
+    price = complexity_penalties(race.found)
+    contenders = _contenders(race, verdict, price)
+    sham = _sham(verdict, {*alike, *verdict.name.split("+")}, record.channels) if blamed else None
+    bare = race.none.values
+    kinds = (*measures(record.channels), *loop_measures(record.channels, bare["T_L"], bare["K_L"]))
+    whole = Refit.whole(verdict)
+    all_in = {f.name: random_effect_density(f, race.raw, record) for f in contenders}
+    # what a part cannot tell of chance is told by all: how much less its evidence is than the gain of its rows
+    owed = {f.name: price[f.name] + all_in[f.name].sum() - _chance_evidence(f) for f in contenders}
+    images = parameter_spread(whole)
+    told: dict[str, list[FoldScores]] = {}
+    chosen, rows, floors = [], [], []
+    for i, part in enumerate(parts):
+        if progress is not None:
+            progress("parts held out", i, len(parts))
+        refits = [Refit.of(f, part.fits) for f in contenders]
+        none, own = refits[0], next(r for r in refits if r.found is verdict)
+        judge = FoldScorer(record, part, kinds, none.values["T_L"])
+        gains = {r.name: random_effect_density(r.found, race.raw, part.fits) for r in refits}
+        best = max(refits, key=lambda r: r.log_evidence + gains[r.name][~judge.inside].sum() - owed[r.name])
+        chance = gains[best.name]
+        boxes = {r.name: _foretold(r, part) for r in (none, best)}
+        seen = {
+            "before": judge.judged(none),
+            "after": judge.judged(best, chance=chance),
+            "fitted": judge.judged(whole, chance=all_in[verdict.name]),
+            "flexible": judge.judged(best, less=boxes[best.name], chance=chance),
+            "ceiling": judge.judged(none, less=boxes["none"]),
+        }
+        if sham is not None:
+            seen |= {"verdict": judge.judged(own), "placebo": judge.judged(_with_sham(own, sham, part))}
+        for name, values in seen.items():
+            told.setdefault(name, []).append(values)
+        floors.append(judge.floor(whole, images))
+        chosen.append(best is own)
+        rows.append(judge.rows)
+    return CrossValidation(
+        record=record,
+        measures=kinds,
+        sums={name: FoldScores.joined(each) for name, each in told.items()},
+        floor=NoiseFloor.joined(floors),
+        rows=np.concatenate(rows),
+        chosen=float(np.mean(chosen)),
+        sham=sham,
+        by_drives=bool(whole_drive_folds(record)),
+        by_chance=verdict.name != "none" and not verdict.hypothesis.effects,
+    )
+
+
+def _contenders(race: SearchResult, verdict: FittedModel, price: Mapping[str, float]) -> list[FittedModel]:
+    """The bare baseline first, the verdict, and what might take its place."""
+    worth = {f.name: f.log_evidence - price[f.name] for f in race.found}
+    others = [f for f in race.found if f is not verdict and f.name != "none"]
+    near = [f for f in others if worth[f.name] > worth[verdict.name] - _NEAR]
+    rivals = sorted(near, key=lambda f: -worth[f.name])[:_RIVALS]
+    return [race.none, *([] if verdict is race.none else [verdict]), *rivals]
+
+
+def _foretold(refit: Refit, part: Fold) -> Float:
+    """What a black box makes of a refit's errors."""
+    record = refit.found.hypothesis.record
+    return BlackBoxRegression.of(record, record.measured - refit.errors).foretold(refit.errors, refit.white(part.fits))
+
+
+def _chance_evidence(found: FittedModel) -> float:
+    own = found.by_chance.explained if found.by_chance else 0.0
+    return own + (found.tails.evidence if found.tails else 0.0) + (found.losses.evidence if found.losses else 0.0)
+
+
+def _sham(verdict: FittedModel, taken: set[str], channels: tuple[str, ...]) -> type[Effect] | None:
+    """A wrong effect with as many parameters as the verdict's, or nearly so: the first by name after the verdict's."""
+    own = verdict.hypothesis.size - 2
+    some = [e for e in EFFECTS.values() if not e.random and e.name not in taken and is_observable(e, channels)]
+    some = [e for e in some if e.name not in _OF_THE_DRIVE]
+    if not some:
+        return None
+    order = sorted(some, key=lambda e: (abs(len(e.parameters) - own), e.name <= verdict.name, e.name))
+    return order[0]
+
+
+_OF_THE_DRIVE = ("road_grade", "gear_shift", "gain_change")  # have many coefficients, or a moment of the drive
+
+
+def _with_sham(refit: Refit, sham: type[Effect], part: Fold) -> Refit:
+    """The refit with the wrong effect on top, fitted to the same blocks."""
+    found = refit.found
+    hypothesis = Hypothesis(found.hypothesis.record, (*found.hypothesis.effects, sham), found.hypothesis.baseline)
+    starts = effect_starts(hypothesis, sham.name)
+    z = hypothesis.z_of({**refit.values, **starts[len(starts) // 2]})
+    return Refit.of(replace(found, name=hypothesis.name, hypothesis=hypothesis, z=z, onset=refit.onset), part.fits)

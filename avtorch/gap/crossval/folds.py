@@ -1,0 +1,96 @@
+"""How drives are parted: blocks that judge, and what lies far enough from them to fit.
+
+Every block judges once. Rows beside a block are left out of the fit that it judges, as far as what chance did to the
+one is still felt in the other. Blocks of one part lie all over the drive, so that each part sees early and late, slow
+and fast. Where there are three drives or more, none of which is more than half of all, whole drives judge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.likelihood.record import Record
+
+Rows = NDArray[np.bool_]
+
+FOLDS = 5
+_BLOCKS = 20  # of a long drive
+_DRIVES = 3  # or more, for whole ones to be held out
+_WHOLE_S = 10.0  # of which a block has one to six: rollouts of that length have to fit in
+
+
+@dataclass(frozen=True, eq=False)
+class Fold:
+    """`fits`: what parameters are fitted to; `blocks` (begin, end) among the record's counted rows judge them."""
+
+    fits: Record = field(repr=False)
+    judges: Record = field(repr=False)
+    blocks: tuple[slice, ...]
+
+    @property
+    def rows(self) -> NDArray[np.intp]:
+        """Counted rows of the whole record that judge."""
+        return np.concatenate([np.arange(b.start, b.stop) for b in self.blocks])
+
+
+def folds(record: Record, *, apart_s: float = 3.0, parts: int = FOLDS) -> tuple[Fold, ...]:
+    """The record's parts, `apart_s` [s] between what fits and what judges; none where there is too little for two."""
+    blocks = blocks_of(record)
+    groups = whole_drive_folds(record, parts)
+    if groups:
+        numbers = _drive_of(record)
+        each = [tuple(b for b in blocks if numbers[b.start] in group) for group in groups]
+        return tuple(_part(record, own, apart_s) for own in each)
+    count = min(parts, len(blocks))
+    if count < 2:
+        return ()
+    return tuple(_part(record, tuple(blocks[k::count]), apart_s) for k in range(count))
+
+
+def whole_drive_folds(record: Record, parts: int = FOLDS) -> list[set[int]]:
+    """Numbers of the drives that judge together, about equal shares of the rows; empty where drives are too few."""
+    sizes = np.bincount(_drive_of(record), minlength=len(record.segments))
+    there = [int(k) for k in np.argsort(-sizes, kind="stable") if sizes[k] > 0]
+    if len(there) < _DRIVES or sizes.max() > 0.5 * record.rows:
+        return []
+    groups: list[set[int]] = [set() for _ in range(min(parts, len(there)))]
+    for number in there:
+        least = min(groups, key=lambda g: sum(int(sizes[k]) for k in g))
+        least.add(number)
+    return groups
+
+
+def _drive_of(record: Record) -> NDArray[np.int64]:
+    """Number of the segment that each counted row is of."""
+    each = 1 if record.coarse is record.drives else record.group
+    ends = np.cumsum([len(d.time) * each // record.group for d in record.coarse])
+    return np.asarray(record.segment)[np.searchsorted(ends, record.source, side="right")]
+
+
+def blocks_of(record: Record) -> list[slice]:
+    """Every counted row in one block, of 10 to 60 s; short stretches are blocks of their own."""
+    return list(_blocks(record))
+
+
+def _blocks(record: Record) -> Iterator[slice]:
+    seconds = _WHOLE_S * float(np.clip(round(record.rows * record.dt / _BLOCKS / _WHOLE_S), 1, 6))
+    for begin, end in pairwise([*record.starts.tolist(), record.rows]):
+        count = max(1, int((end - begin) * record.dt / seconds + 1e-9))
+        edges = np.linspace(begin, end, count + 1).round().astype(int).tolist()
+        yield from (slice(a, b) for a, b in pairwise(edges))
+
+
+def _part(record: Record, blocks: tuple[slice, ...], apart_s: float) -> Fold:
+    judges: Rows = np.zeros(record.rows, bool)
+    fits: Rows = np.ones(record.rows, bool)
+    apart = round(apart_s / record.dt)
+    for block in blocks:
+        judges[block] = True
+        near = slice(max(block.start - apart, 0), block.stop + apart)
+        fits[near] &= record.stretch[near] != record.stretch[block.start]
+    return Fold(record.only(fits), record.only(judges), blocks)

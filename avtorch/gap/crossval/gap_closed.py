@@ -1,0 +1,140 @@
+"""How far the gap shrinks: before, after, floor and placebo on blocks that chose neither effect nor parameters.
+
+The floor is what noise leaves over of the verdict, as far as all drives tell its parameters (`floor.py`); or what a
+flexible regression leaves, where it is below by more than chance. Intervals are of floors drawn with the parameters,
+of what the regression takes, and of blocks drawn anew, with replacement, wider by what few blocks tell too little of
+their own spread (Student's t).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm as normal
+from scipy.stats import t as student
+
+from avtorch.gap.crossval.cross_validate import CrossValidation
+from avtorch.gap.crossval.noise_floor import drawn, expected
+from avtorch.gap.crossval.rollout_errors import HORIZON_S, reached
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.shrinkage import Closed, Shrinkage
+
+Float = NDArray[np.float64]
+
+DENSITY = "log_predictive_density"
+_DRAWS = 2000
+_TELLS = 1.1  # before over floor, for less of which there is nothing to close
+_MATERIAL = 0.1  # of the gap (of its squares), for less of which a flexible regression is not believed
+_TELLS_NATS = 5.0  # likewise of densities, over all blocks
+
+
+def gap_closed(held: CrossValidation) -> Shrinkage:
+    """From what blocks held out say of a verdict."""
+    sums, kinds, blocks = held.sums, held.measures, len(held.rows)
+    rng = np.random.default_rng(0)
+    again = rng.multinomial(blocks, np.full(blocks, 1 / blocks), size=_DRAWS).astype(float)
+    z = rng.standard_normal((_DRAWS, held.floor.axes))
+    told: dict[str, _Told] = {}
+    for k, measure in enumerate(kinds):
+        square = {name: s.squares[k] for name, s in sums.items()}
+        form = held.floor.squares[k]
+        floors = _floors(square, expected(form), drawn(form, z), rng, better=-1)
+        told[measure.name] = _Told(square, floors, held.rows, again, better=-1)
+    nats = {name: s.nats for name, s in sums.items()}
+    form = held.floor.nats
+    best = nats["fitted"] + form[:, 0, 0]
+    floors = _floors(nats, best - expected(form), best - drawn(form, z), rng, better=1)
+    told[DENSITY] = _Told(nats, floors, held.rows, again, better=1)
+
+    spans = {m.name: reached(m, held.record) for m in kinds}
+    by_metric = {name: replace(one.closed, horizon_s=spans.get(name)) for name, one in told.items()}
+    usual = [m.name for m in kinds if m.horizon_s == HORIZON_S]
+    shows = {name: by_metric[name].before / max(by_metric[name].floor, 1e-12) for name in usual}
+    metric = max(shows, key=lambda name: shows[name])
+    if held.by_chance or shows[metric] < _TELLS:
+        metric = DENSITY
+    return Shrinkage(
+        metric=metric,
+        by_metric=by_metric,
+        placebo_effect=None if held.sham is None else held.sham.name,
+        placebo=told[metric].placebo,
+        ceiling={m.name: told[m.name].all_in("ceiling") for m in kinds} | {DENSITY: told[DENSITY].all_in("ceiling")},
+        chosen=held.chosen,
+        blocks=blocks,
+        by_drives=held.by_drives,
+    )
+
+
+def _floors(sums: Mapping[str, Float], mean: Float, draws: Float, rng: np.random.Generator, *, better: int) -> Float:
+    """(1 + draw, block), the mean first.
+
+    The flexible regression's, where by more than blocks differ it beats the model by a tenth of the gap or more: where
+    a controller feeds noise back into its commands a regression foretells a little of the noise itself. How much of
+    what it takes could be had is not known: any share, in the draws.
+    """
+    gain = better * (sums["flexible"] - mean)
+    count = len(gain)
+    if gain.sum() > 0:
+        draws = draws + better * rng.random((len(draws), 1)) * gain
+    sure = count > 1 and gain.mean() > student.ppf(0.95, count - 1) * gain.std(ddof=1) / np.sqrt(count)
+    if sure and gain.sum() > _MATERIAL * (better * (mean - sums["before"])).sum():
+        mean = sums["flexible"]
+    return np.concatenate([mean[None], draws])
+
+
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """By one measure: sums by name (block,), `floors` (1 + draw, block), rows (block,), and how often each block is
+    drawn (draw, block). `better` -1: sums are of squares, of whose means the roots count."""
+
+    sums: Mapping[str, Float]
+    floors: Float
+    rows: Float
+    again: Float
+    better: int
+
+    def all_in(self, name: str) -> float:
+        """Of all blocks once."""
+        return float(self._mean(self.sums[name], np.ones(len(self.rows))))
+
+    @property
+    def closed(self) -> Closed:
+        before, after = self.all_in("before"), self.all_in("after")
+        floor = float(self._mean(self.floors[0], np.ones(len(self.rows))))
+        return Closed(before, after, floor, self._share("before", "after") if self._tells else None)
+
+    @property
+    def placebo(self) -> Quantity | None:
+        return self._share("verdict", "placebo") if self._tells and "placebo" in self.sums else None
+
+    @property
+    def _tells(self) -> bool:
+        """Whether there is a gap to close."""
+        before, floor = self.all_in("before"), float(self._mean(self.floors[0], np.ones(len(self.rows))))
+        if self.better < 0:
+            return before > _TELLS * floor
+        return (floor - before) * self.rows.sum() > _TELLS_NATS
+
+    def _mean(self, sums: Float, weights: Float) -> Float:
+        """Of a row, over blocks (..., block) weighed (..., block)."""
+        mean = (weights * sums).sum(-1) / (weights * self.rows).sum(-1)
+        return np.sqrt(np.maximum(mean, 0.0)) if self.better < 0 else mean
+
+    def _share(self, one: str, other: str) -> Quantity:
+        """Of the reducible gap, what lies between two sums."""
+
+        def share(weights: Float, floors: Float) -> Float:
+            before, a, b = (self._mean(self.sums[name], weights) for name in ("before", one, other))
+            whole = before - self._mean(floors, weights)
+            return (a - b) / np.where(np.abs(whole) > 1e-12, whole, np.nan)
+
+        blocks = len(self.rows)
+        mean = float(share(np.ones(blocks), self.floors[0]))
+        wider = float(student.ppf(0.95, blocks - 1) / normal.ppf(0.95) * np.sqrt(blocks / (blocks - 1)))
+        away = wider * (share(self.again, self.floors[0]) - mean) + share(np.ones(blocks), self.floors[1:]) - mean
+        away = away[np.isfinite(away)]
+        q05, q95 = mean + np.quantile(away, (0.05, 0.95))
+        return Quantity(mean, float(away.std()), min(float(q05), mean), max(float(q95), mean))

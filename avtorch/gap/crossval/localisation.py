@@ -1,0 +1,142 @@
+"""Where the gap lies: in time, speed, command, frequency, and whether the car moves or the sensor shows it otherwise.
+
+What a cause does to each row is half the square of the white image of its change, the nats it is expected to bring. On
+each axis the part named is the shortest stretch that holds nearly all of it, if plainly fewer rows lie there. A part is
+named on the strength of what its rows gain, less all that the find has paid (`shown.py`): an e-value, for which the
+procedure of Wang and Ramdas (2022) keeps the false-discovery rate whatever the dependence between parts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from avtorch.gap.crossval.attribution import RowAttribution
+from avtorch.gap.result.where import Axis, Location
+
+Float = NDArray[np.float64]
+
+_MOST = 0.95  # of the sizes of what the cause does
+_PLAINLY = 0.6  # of the rows since it set in, for more of which a stretch is no part
+_BAND = 0.9  # of the power
+_RATE = 0.05  # of false discoveries
+
+
+def localise(shown: RowAttribution, *, onset_s: float | None, lag: float) -> tuple[Location, ...]:
+    """The parts, the surest first. `onset_s`: when the cause set in, from the start; `lag` [s] of the actuator."""
+    parts: list[Part] = [*_stretches(shown, onset_s, lag), *_signals(shown), *_band(shown)]
+    q_values = _q_values([gain - shown.paid for *_, gain in parts])
+    parts = [(axis, *_stamps(shown, axis, a, b), share, gain) for axis, a, b, share, gain in parts]
+    named = [Location(axis, a, b, share, q) for (axis, a, b, share, _), q in zip(parts, q_values, strict=True)]
+    return tuple(sorted((w for w in named if w.q_value <= _RATE), key=lambda w: w.q_value))
+
+
+def _stamps(shown: RowAttribution, axis: Axis, begin: float | str, end: float | str) -> tuple[float | str, float | str]:
+    """Both ends; times from the log's start become times on the log's own clock."""
+    if axis != "time" or isinstance(begin, str) or isinstance(end, str):
+        return begin, end
+    record = shown.record
+    time, stamp = record.time[record.source], record.stamp[record.source]
+    first, last = (int(np.abs(time - t).argmin()) for t in (begin, end))
+    return begin + float(stamp[first] - time[first]), end + float(stamp[last] - time[last])
+
+
+Part = tuple[Axis, float | str, float | str, float, float]
+"""Axis, ends, share of what the cause does, and what was gained there [nats]."""
+
+
+def _stretches(shown: RowAttribution, onset_s: float | None, lag: float) -> Iterator[Part]:
+    record, does = shown.record, shown.does
+    time = record.time[record.source]
+    one_clock = bool((np.diff(time) > 0).all()) and len(np.unique(record.log)) == 1
+    if onset_s is not None and one_clock:
+        # what chance decides (glitches, lost messages) has an onset, and nothing that is known beforehand
+        since_then = does if does.any() else np.ones(len(time))
+        yield _part(shown, "time", time, onset_s, float(time[-1]), since_then)
+    if not does.any():
+        return
+    axes: list[tuple[Axis, Float]] = [("time", time)] if onset_s is None and one_clock else []
+    if record.speed is not None:
+        axes.append(("speed", record.speed.mean(-1)[record.source]))
+    # what the car is about to do: an effect of the command shows when the actuator has followed
+    share = -np.expm1(-record.dt / lag)
+    command = np.asarray(lfilter([share], [1, share - 1], record.command))[record.source]
+    axes.append(("command", command))
+    since = time >= onset_s if onset_s is not None and one_clock else np.ones(len(time), bool)
+    for axis, x in axes:
+        # by sizes and not by squares, or the edges of where it acts would not count
+        low, high = shortest(x, np.sqrt(does), _MOST)
+        if ((x >= low) & (x <= high))[since].mean() <= _PLAINLY:
+            part = _part(shown, axis, x, low, high, does)
+            yield part if axis != "command" else (axis, *_own_ends(x, low, high, record.command), *part[3:])
+
+
+def _own_ends(x: Float, low: float, high: float, command: Float) -> tuple[float, float]:
+    """`low` and `high` of an answered command `x`; where it goes no further, as far as the `command` itself goes."""
+    return (
+        float(command.min()) if low <= x.min() + 1e-9 else low,
+        float(command.max()) if high >= x.max() - 1e-9 else high,
+    )
+
+
+def _part(shown: RowAttribution, axis: Axis, x: Float, low: float, high: float, does: Float) -> Part:
+    inside = (x >= low) & (x <= high)
+    return axis, low, high, float(does[inside].sum() / does.sum()), float(shown.gained[inside].sum())
+
+
+def shortest(x: Float, weight: Float, share: float) -> tuple[float, float]:
+    """Ends of the shortest interval of `x` (row,) that holds `share` of the `weight` (row,)."""
+    order = np.argsort(x)
+    x, total = x[order], np.concatenate([[0.0], np.cumsum(weight[order])])
+    ends = np.searchsorted(total, total[:-1] + share * total[-1] * (1 - 1e-12))
+    fits = np.flatnonzero(ends <= len(x))
+    lengths = x[ends[fits] - 1] - x[fits]
+    best = fits[int(lengths.argmin())]
+    return float(x[best]), float(x[ends[best] - 1])
+
+
+def _signals(shown: RowAttribution) -> Iterator[Part]:
+    does, felt = float(shown.does.sum()), float(shown.felt.sum())
+    if does <= 0:
+        return
+    gained = float(shown.gained.sum())
+    sensing = min(felt / does, 1.0)
+    for name, share in (("actuation", 1 - sensing), ("sensing", sensing)):
+        if share > 0:
+            yield "signal", name, name, share, share * gained
+
+
+def _band(shown: RowAttribution) -> Iterator[Part]:
+    """The band of frequencies of what the cause does to the acceleration."""
+    record = shown.record
+    accel = shown.moved[0] if "accel" in record.channels else np.gradient(shown.moved[-1]) / record.dt
+    power, f = np.zeros(0), np.zeros(0)
+    for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
+        x = accel[first:last]
+        power = np.concatenate([power, np.abs(np.fft.rfft(x * np.hanning(len(x))))[1:] ** 2])
+        f = np.concatenate([f, np.fft.rfftfreq(len(x), record.dt)[1:]])
+    if not power.sum() > 0:
+        return
+    low, high = shortest(np.log(f), power, _BAND)
+    if high - low <= 0.75 * np.ptp(np.log(f)):
+        share = float(power[(np.log(f) >= low) & (np.log(f) <= high)].sum() / power.sum())
+        # the slowest that a drive holds is as good as steady
+        slowest = low <= np.log(f.min()) + 1e-9
+        begin, end = 0.0 if slowest else float(np.exp(low)), float(np.exp(high))
+        yield "frequency", begin, end, share, share * float(shown.gained.sum())
+
+
+def _q_values(gains: Sequence[float]) -> list[float]:
+    """Of e-values given by their logarithms."""
+    if not gains:
+        return []
+    order = np.argsort(-np.asarray(gains))
+    rank = np.arange(1, len(gains) + 1)
+    told = np.minimum(1.0, len(gains) / rank * np.exp(-np.clip(np.asarray(gains)[order], -50.0, 700.0)))
+    told = np.minimum.accumulate(told[::-1])[::-1]
+    out = np.empty(len(gains))
+    out[order] = told
+    return out.tolist()

@@ -1,0 +1,48 @@
+"""The floor: what the verdict would be off by with its parameters known, as far as the drives tell them.
+
+The parameters' posterior makes every rollout uncertain, so that what noise leaves over is known only so well. Along the
+axes of the posterior the errors move by images `I`; with `z` standard normal the noise is `e + I z`, and its sum of
+squares in each block a quadratic form of `(1, z)`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseFloor:
+    """Quadratic forms of `(1, z)`, `z` along the axes of the posterior.
+
+    `squares` (measure, block, 1 + axis, 1 + axis): of rollout errors. `nats` (block, 1 + axis, 1 + axis): what the log
+    density falls short of the best that it might be.
+    """
+
+    squares: Float
+    nats: Float
+
+    @classmethod
+    def joined(cls, parts: Sequence[NoiseFloor]) -> NoiseFloor:
+        """Blocks of several parts, one after another."""
+        return cls(np.concatenate([p.squares for p in parts], 1), np.concatenate([p.nats for p in parts]))
+
+    @property
+    def axes(self) -> int:
+        return self.nats.shape[-1] - 1
+
+
+def expected(form: Float) -> Float:
+    """Mean (...,) of a form (..., 1 + axis, 1 + axis) over `z`."""
+    return np.trace(form, axis1=-2, axis2=-1)
+
+
+def drawn(form: Float, z: Float) -> Float:
+    """Values (draw, ...) of a form (..., 1 + axis, 1 + axis) at `z` (draw, axis)."""
+    known = np.concatenate([np.ones((len(z), 1)), z], 1)
+    return np.einsum("di,...ij,dj->d...", known, form, known, optimize=True)

@@ -1,0 +1,120 @@
+"""Errors of rollouts over horizons, from those of one long rollout.
+
+A rollout begun anew in the middle of a drive starts at what is measured there: of the acceleration at the measured one,
+of the speed at the measured one with the actuator where the commands have brought it. What the long rollout was wrong
+by at that moment `t0` is then gone: of the speed for good, of the acceleration it would have died away with the lag
+anyway. So the errors are `e(t) - e(t0) w(t - t0)`, where `e` is the long one's and `w` is 1 or `exp(-(t - t0) / T_L)`.
+
+One start is as good as another, and what is measured there is noisy: rollouts begin at every row. Of two errors `x`
+and `y` the mean over all starts within a horizon of `t` is `x y - x M(y) - M(x) y + M2(x y)`, with moving averages `M`
+weighed by `w` and `M2` by its square.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from avtorch.gap.crossval.closed_loop_errors import LoopMeasure
+from avtorch.gap.likelihood.record import Record
+
+Float = NDArray[np.float64]
+
+HORIZON_S = 10.0
+"""The horizon of all that has no other in its name, of both channels: the speed of a whole drive's rollout wanders off
+whatever the model."""
+HORIZONS_S = (0.5, 2.0, HORIZON_S)
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One way to measure: of a `channel`, over rollouts of `horizon_s` [s]; None: the whole drive's."""
+
+    channel: str
+    horizon_s: float | None
+
+    @property
+    def name(self) -> str:
+        over = {HORIZON_S: "", None: "_whole"}.get(self.horizon_s, f"_{self.horizon_s or 0:g}s")
+        return f"rollout_rmse_{self.channel}{over}"
+
+    def products(self, x: Float, blocks: Sequence[slice], dt: float, lag: float) -> Float:
+        """(block, one, other): sums over each block of products of the errors of rollouts within a stretch.
+
+        From those of a long one, `x` (one, row) of this channel; `dt` [s] between rows, `lag` [s] of the actuator.
+        Where a horizon does not fit before a row, rollouts begin as early as the stretch does.
+        """
+        if self.horizon_s is None:
+            whole = x - x[:, :1] if self.channel == "speed" else x
+            return np.stack([whole[:, b] @ whole[:, b].T for b in blocks])
+        length = max(2, round(self.horizon_s / dt))
+        keeps = float(np.exp(-dt / lag)) if self.channel == "accel" else 1.0
+        starts = np.minimum(np.arange(x.shape[1]) + 1, length)
+        mean = _window(x, length, keeps) / starts
+        out = []
+        for b in blocks:
+            # how often each row is a start of what is judged in this block
+            judged = np.zeros(x.shape[1])
+            judged[b] = 1.0 / starts[b]
+            often = _window(judged[::-1], length, keeps**2)[::-1]
+            used = slice(max(b.start - length + 1, 0), b.stop)
+            mixed = x[:, b] @ mean[:, b].T
+            squares = (x[:, used] * often[used]) @ x[:, used].T
+            out.append(x[:, b] @ x[:, b].T - mixed - mixed.T + squares)
+        return np.stack(out)
+
+
+def _window(x: Float, length: int, keeps: float) -> Float:
+    """Sums (..., row) over the last `length` rows of `x`, each weighed by `keeps` to the power of its age."""
+    if keeps < 1.0:
+        ended = np.zeros_like(x)
+        ended[..., length:] = keeps**length * x[..., :-length]
+        return np.asarray(lfilter([1.0], [1.0, -keeps], x - ended))
+    total = np.cumsum(x, -1)
+    total[..., length:] -= total[..., :-length].copy()
+    return total
+
+
+def products(
+    measure: Measure | LoopMeasure, record: Record, errors: Float, blocks: Sequence[slice], lag: float
+) -> Float:
+    """(block, one, other): sums of products of `errors` (one, channel, counted, group) of long rollouts, by a measure.
+
+    `blocks` of counted rows, each within a stretch; `lag` [s]. Rollouts begin wherever a stretch was measured, whether
+    or not a block judges there.
+    """
+    long = errors[:, record.channels.index(measure.channel)]
+    group, out = record.group, np.zeros((len(blocks), len(errors), len(errors)))
+    for begin, end in pairwise([*record.starts.tolist(), record.rows]):
+        own = [j for j, b in enumerate(blocks) if begin <= b.start < end]
+        if own:
+            rows = long[:, begin:end].reshape(len(errors), -1)
+            within = [slice((blocks[j].start - begin) * group, (blocks[j].stop - begin) * group) for j in own]
+            out[own] = measure.products(rows, within, record.dt / group, lag)
+    return out
+
+
+def rms(measure: Measure, record: Record, errors: Float, lag: float) -> float:
+    """Root mean square of a long rollout's `errors` (channel, counted, group) by a measure, over all rows that count;
+    `lag` [s]."""
+    edges = [*record.starts.tolist(), record.rows]
+    total = products(measure, record, errors[None], [slice(a, b) for a, b in pairwise(edges)], lag).sum()
+    return float(np.sqrt(total / (record.rows * record.group)))
+
+
+def reached(measure: Measure | LoopMeasure, record: Record) -> float | None:
+    """Seconds that rollouts of a measure last at most, which no stretch outlasts; None: as long as the stretches."""
+    if measure.horizon_s is None or not np.isfinite(measure.horizon_s):
+        return None
+    longest = int(np.diff([*record.starts.tolist(), record.rows]).max()) * record.dt
+    return min(measure.horizon_s, longest)
+
+
+def measures(channels: Iterable[str]) -> tuple[Measure, ...]:
+    """All that these channels allow: a speed known at the start of a drive says little at its end."""
+    return tuple(Measure(w, h) for w in channels for h in (*HORIZONS_S, None))

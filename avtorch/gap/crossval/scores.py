@@ -1,0 +1,127 @@
+"""What rollouts and densities of a refitted find are worth on the blocks that judge it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.crossval.closed_loop_errors import LoopMeasure
+from avtorch.gap.crossval.folds import Fold
+from avtorch.gap.crossval.noise_floor import NoiseFloor
+from avtorch.gap.crossval.refit import Refit
+from avtorch.gap.crossval.rollout_errors import Measure, products
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.posterior.density import root
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FoldScores:
+    """Sums over the rows of each block: `squares` (measure, block) of rollout errors, log density `nats` (block,)."""
+
+    squares: Float
+    nats: Float
+
+    @classmethod
+    def joined(cls, parts: Sequence[FoldScores]) -> FoldScores:
+        """Blocks of several parts, one after another."""
+        return cls(np.concatenate([p.squares for p in parts], 1), np.concatenate([p.nats for p in parts]))
+
+
+@dataclass(frozen=True)
+class FoldScorer:
+    """The blocks of one part. `lag` [s]: how fast an actuator forgets where a rollout began."""
+
+    record: Record
+    part: Fold
+    measures: Sequence[Measure | LoopMeasure]
+    lag: float
+
+    def products(self, errors: Float) -> Float:
+        """(measure, block, one, other) of errors (one, channel, counted, group)."""
+        return np.stack([products(m, self.record, errors, self.part.blocks, self.lag) for m in self.measures])
+
+    def judged(self, refit: Refit, *, less: Float | None = None, chance: Float | None = None) -> FoldScores:
+        """A refit; `less`: what else (channel, counted, 1) is taken off its errors, `chance` (counted,) [nats]: what
+        else is added to the density of each row."""
+        errors = refit.errors if less is None else refit.errors - less
+        nats = self.row_nats(refit, less=less)
+        return FoldScores(
+            self.products(errors[None])[..., 0, 0], self._by_block(nats if chance is None else nats + chance)
+        )
+
+    def row_nats(self, refit: Refit, *, less: Float | None = None) -> Float:
+        """Log density (counted,) of each row that judges, 0 elsewhere."""
+        errors = refit.errors if less is None else refit.errors - less
+        out = np.zeros(self.record.rows)
+        rows = np.isin(self.record.source, self.part.judges.source)
+        out[rows] = self._white(refit).row_likelihoods(errors[:, rows])
+        return out
+
+    def floor(self, refit: Refit, images: Float) -> NoiseFloor:
+        """What noise leaves over of a refit, whose parameters move its errors by `images` (axis, channel, counted,
+        group) (`parameter_spread`)."""
+        errors = np.concatenate([refit.errors[None], images])
+        rows = np.isin(self.record.source, self.part.judges.source)
+        white = self._white(refit)(errors[:, :, rows])
+        nats = np.empty((len(self.part.blocks), len(errors), len(errors)))
+        number = self._block_of[rows]
+        for j in range(len(nats)):
+            some = white[:, :, number == j].reshape(len(errors), -1)
+            nats[j] = 0.5 * some @ some.T
+        return NoiseFloor(self.products(errors), nats)
+
+    def _by_block(self, nats: Float) -> Float:
+        """Sums (block,) over rows (counted,)."""
+        return np.array([nats[b].sum() for b in self.part.blocks])
+
+    @property
+    def _block_of(self) -> NDArray[np.intp]:
+        """Number (counted,) of each row's block, -1 outside."""
+        number = np.full(self.record.rows, -1)
+        for j, block in enumerate(self.part.blocks):
+            number[block] = j
+        return number
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """Which counted rows (counted,) lie in the blocks."""
+        inside = np.zeros(self.record.rows, bool)
+        inside[self.part.rows] = True
+        return inside
+
+    @property
+    def rows(self) -> Float:
+        """Rows (block,), single ones."""
+        return np.array([(b.stop - b.start) * self.record.group for b in self.part.blocks], float)
+
+    def _white(self, refit: Refit) -> WhiteningFilter:
+        return refit.white(self.part.judges)
+
+
+def parameter_spread(refit: Refit) -> Float:
+    """What a standard deviation along each axis of the posterior moves, (axis, channel, counted, group).
+
+    By the curvature on the rows that fit. A step that leaves the joint density lower than a normal posterior would have
+    it counts for less.
+    """
+    count = len(refit.z)
+    steps = root(refit.covariance).numpy().T
+    around = refit.around(np.concatenate([np.zeros((1, count)), steps, -steps]))
+    moved = around[1:] - around[:1]
+    white = refit.white(refit.fits)
+    fits = np.isin(refit.found.hypothesis.record.source, refit.fits.source)
+    here, there = refit.errors[:, fits], moved[:, :, fits]
+    lost = 0.5 * ((white(here - there) ** 2).sum((1, 2, 3)) - (white(here) ** 2).sum())
+    # at one standard deviation half a nat, the mean of both sides
+    lost = lost.reshape(2, -1).mean(0)
+    images = 0.5 * (moved[:count] - moved[count:])
+    images = images * np.sqrt(np.minimum(1.0, 0.5 / np.maximum(lost, 0.5)))[:, None, None, None]
+    if refit.found.hypothesis.grade_columns is not None:
+        images = np.concatenate([images, refit.slope_spread(white)])
+    return images

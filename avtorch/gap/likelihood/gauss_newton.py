@@ -1,0 +1,195 @@
+"""The mode of a hypothesis's parameters: Gauss-Newton from many starts at once, errors made white.
+
+Derivatives are forward differences: all columns of all starts are one batch of rollouts, which costs hardly more than
+one. The slope of a road is linear in its coefficients, which are integrated out exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.likelihood.grade_marginal import GradeMarginal
+from avtorch.gap.likelihood.hypothesis import Hypothesis
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter, sensed
+
+Float = NDArray[np.float64]
+
+_STEP = 1e-4
+_LONGEST = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class GaussNewtonFit:
+    """`z` (coordinate,) at the mode, its posterior covariance, errors (channel, counted, group) left over.
+
+    `log_joint`: log likelihood plus log prior at the mode; `log_evidence`: by Laplace, the noise as given.
+    `grade_rms`, `profile`: of a road's slope.
+    """
+
+    z: Float
+    covariance: Float = field(repr=False)
+    errors: Float = field(repr=False)
+    log_joint: float
+    log_evidence: float
+    grade_rms: float | None = None
+    profile: Float | None = None
+
+
+def modes(
+    hypothesis: Hypothesis,
+    white: WhiteningFilter,
+    starts: Float,
+    *,
+    onset: int | None = None,
+    iterations: int = 8,
+    coarse: bool = False,
+    enough: float = 0.01,
+) -> tuple[Float, Float]:
+    """Modes (start, coordinate) and their log joint densities (start,), from `starts` (start, coordinate).
+
+    `coarse`: on rollouts of averaged commands, several times as fast, good for a first look. A start has arrived once
+    a step gains less than `enough` nats.
+    """
+    z = np.array(starts)
+    count, size = z.shape
+    damping = np.full(count, 1e-3)
+    best = z.copy()
+    value = np.full(count, np.inf)
+    gradient, square = np.zeros((count, size)), np.tile(np.eye(size), (count, 1, 1))
+    trial = z
+    live = np.ones(count, bool)
+    for _ in range(iterations):
+        g, h, v = _quadratic(hypothesis, white, trial[live], onset, coarse)
+        where = np.flatnonzero(live)
+        good = v < value[where]
+        gain = value[where] - v
+        up = where[good]
+        best[up], value[up], gradient[up], square[up] = trial[up], v[good], g[good], h[good]
+        damping[where] = np.where(good, damping[where] * 0.2, np.maximum(damping[where] * 8, 1e-2))
+        live[where] = ~(good & (gain < enough)) & (damping[where] < 1e4)
+        if not live.any():
+            break
+        diagonal = np.einsum("cii->ci", square)
+        step = np.linalg.solve(square + (damping[:, None] * diagonal)[:, :, None] * np.eye(size), -gradient[:, :, None])
+        step = step[:, :, 0]
+        step *= np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(1, keepdims=True), 1e-12))
+        trial = np.clip(best + step, -5.0, 5.0)
+    return best, white.constant_of(coarse=coarse) - value
+
+
+def _quadratic(
+    hypothesis: Hypothesis, white: WhiteningFilter, z: Float, onset: int | None, coarse: bool = False
+) -> tuple[Float, Float, Float]:
+    """Gradient, Gauss-Newton matrix and value of the negative log joint density (less its constant) at `z`."""
+    count, size = z.shape
+    moved = np.repeat(z[:, None], size + 1, 1)
+    moved[:, 1:] += _STEP * np.eye(size)
+    errors = hypothesis.errors(moved.reshape(-1, size), onset, coarse=coarse)
+    e = white(errors)
+    flat = e.reshape(count, size + 1, -1)
+    columns = (flat[:, 1:] - flat[:, :1]) / _STEP
+    base = flat[:, 0]
+    square = columns @ columns.transpose(0, 2, 1)
+    cross = np.einsum("cpr,cr->cp", columns, base)
+    value = 0.5 * np.einsum("cr,cr->c", base, base)
+    if hypothesis.grade_means is not None:
+        slope = grade_marginal(white, hypothesis, onset, coarse=coarse)
+        square, cross, value = _integrated(slope, columns, base, square, cross, value)
+    return cross + z, square + np.eye(size), value + 0.5 * (z**2).sum(1)
+
+
+def whitened_jacobian(hypothesis: Hypothesis, white: WhiteningFilter, z: Float, onset: int | None = None) -> Float:
+    """White directions (direction, row) in which its parameters and its road's slope move a rollout from `z`."""
+    moved = np.repeat(z[None], len(z) + 1, 0)
+    moved[1:] += _STEP * np.eye(len(z))
+    e = white(hypothesis.rollouts(moved, onset)).reshape(len(z) + 1, -1)
+    columns = (e[1:] - e[:1]) / _STEP
+    if hypothesis.grade_means is None:
+        return columns
+    return np.concatenate([columns, grade_marginal(white, hypothesis, onset, coarse=False).image])
+
+
+def _integrated(
+    slope: GradeMarginal, columns: Float, base: Float, square: Float, cross: Float, value: Float
+) -> tuple[Float, Float, Float]:
+    """The quadratic with the slope's coefficients and size integrated out, (start, ...)."""
+    match = base @ slope.image.T
+    towards = columns @ slope.image.T
+    total, taken = slope.weighed(match)
+    square = square - np.einsum("cpk,ck,cqk->cpq", towards, taken, towards)
+    cross = cross - np.einsum("cpk,ck->cp", towards, taken * match)
+    return square, cross, value - total
+
+
+_LAST: WeakKeyDictionary[WhiteningFilter, tuple[Float, int | None, GradeMarginal]] = WeakKeyDictionary()
+
+
+def grade_marginal(white: WhiteningFilter, hypothesis: Hypothesis, onset: int | None, *, coarse: bool) -> GradeMarginal:
+    """Of the hypothesis's slope under this noise; the last one of each noise is kept."""
+    grade = hypothesis.grade_means if coarse else hypothesis.grade_columns
+    assert grade is not None
+    kept = _LAST.get(white)
+    if kept is not None and kept[0] is grade and kept[1] == onset:
+        return kept[2]
+    felt = sensed(white.record, white.noise, acting(white, grade, onset))
+    made = GradeMarginal.of(white(felt).reshape(len(grade), -1))
+    _LAST[white] = (grade, onset, made)
+    return made
+
+
+def acting(white: WhiteningFilter, force: Float, onset: int | None) -> Float:
+    """What a slope does (..., channel, counted, group), if only from `onset` on."""
+    if onset is None:
+        return force
+    force = force.copy()
+    if white.record.speed is not None:
+        force[..., -1, :, :] -= force[..., -1, onset, :1][..., None, :]
+    force[..., :onset, :] = 0.0
+    return force
+
+
+def residuals(
+    hypothesis: Hypothesis, white: WhiteningFilter, z: Float, onset: int | None = None, *, coarse: bool
+) -> Float:
+    """Errors (channel, counted, group) at `z` (coordinate,), less what a road's slope explains of them."""
+    errors = hypothesis.errors(z[None], onset, coarse=coarse)[0]
+    return errors if hypothesis.grade_means is None else errors - _sloped(hypothesis, white, errors, onset)[2]
+
+
+def _sloped(
+    hypothesis: Hypothesis, white: WhiteningFilter, errors: Float, onset: int | None
+) -> tuple[float, Float, Float]:
+    """`grade_rms`, coefficients (knot,), and what they do to the errors."""
+    rms, profile = grade_marginal(white, hypothesis, onset, coarse=errors.shape[-1] == 1).told(white(errors).ravel())
+    part = hypothesis.grade_response(profile)
+    part = part.mean(-1, keepdims=True) if errors.shape[-1] == 1 else part
+    return rms, profile, sensed(white.record, white.noise, acting(white, part, onset))
+
+
+def finish(hypothesis: Hypothesis, white: WhiteningFilter, z: Float, onset: int | None = None) -> GaussNewtonFit:
+    """Covariance, errors and Laplace evidence at a mode `z` (coordinate,)."""
+    size = len(z)
+    _, square, value = (x[0] for x in _quadratic(hypothesis, white, z[None], onset))
+    errors = hypothesis.errors(z[None], onset)[0]
+    rms, profile = None, None
+    if hypothesis.grade_means is not None:
+        rms, profile, part = _sloped(hypothesis, white, errors, onset)
+        errors = errors - part
+    log_joint = white.constant_of(coarse=False) - float(value)
+    return (
+        GaussNewtonFit(
+            z=z,
+            covariance=np.linalg.inv(square),
+            errors=errors,
+            log_joint=log_joint,
+            log_evidence=log_joint - 0.5 * float(np.linalg.slogdet(square)[1]),
+            grade_rms=rms,
+            profile=profile,
+        )
+        if size
+        else GaussNewtonFit(z, np.zeros((0, 0)), errors, log_joint, log_joint)
+    )

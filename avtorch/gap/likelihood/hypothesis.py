@@ -1,0 +1,235 @@
+"""A hypothesis cause: a plant with some effects, its coordinates, and what it leaves over of a record.
+
+Coordinates `z` are standard normal a priori. An effect whose size can go to its neutral value may be far fainter than
+what is typical, so the prior of sizes is twice as wide here as the table's range.
+
+With an `onset`, a row number, the effects act from there on, see `avtorch.gap.simulator.rollout_from_onset`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from avtorch.gap.effects.road_grade import GRAVITY, RoadGrade
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.simulator.drive import Drive, Response
+from avtorch.gap.simulator.effect import Effect, effect_class
+from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.plant import GapPlant, plant
+from avtorch.gap.simulator.rollout_from_onset import rollout_from_onset
+
+Float = NDArray[np.float64]
+
+_WIDER = 2.0
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One coordinate of a fit: the parameter's key in the plant, and how much wider than typical its prior is."""
+
+    key: str
+    parameter: Parameter
+    wider: float
+
+    def value(self, z: Float) -> torch.Tensor:
+        return self.parameter.constrain(torch.as_tensor(self.wider * z))
+
+    def z_of(self, value: float) -> float:
+        z = float(self.parameter.unconstrain(torch.tensor(value, dtype=torch.float64))) / self.wider
+        return float(np.clip(z, -4.0, 4.0))
+
+
+_MEANS: WeakKeyDictionary[Record, Float] = WeakKeyDictionary()
+_ROWS: WeakKeyDictionary[Record, Float] = WeakKeyDictionary()
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """Effects on top of a baseline, over a record."""
+
+    record: Record
+    effects: tuple[type[Effect], ...]
+    baseline: GapPlant
+
+    @classmethod
+    def named(cls, record: Record, name: str, baseline: GapPlant, more: Sequence[type[Effect]] = ()) -> Hypothesis:
+        """From `none`, an effect's name, or two joined by `+`."""
+        parts = () if name == "none" else tuple(name.split("+"))
+        return cls(record, tuple(effect_class(part, more) for part in parts), baseline)
+
+    @property
+    def name(self) -> str:
+        return "+".join(sorted(e.name for e in self.effects)) or "none"
+
+    @cached_property
+    def plant(self) -> GapPlant:
+        return plant(list(self.effects), baseline=self.baseline).prepared(*self.record.segments[0])
+
+    @cached_property
+    def _without(self) -> GapPlant:
+        return plant([], baseline=self.baseline).prepared(*self.record.segments[0])
+
+    @cached_property
+    def coordinates(self) -> tuple[Coordinate, ...]:
+        """`T_L`, `K_L`, then the effects'; vectors (a slope's profile) and baseline effects are left out."""
+        own = {e.name for e in self.effects}
+        found = []
+        for key, p in self.plant.parameters().items():
+            effect = key.partition(".")[0]
+            if p.size > 1 or ("." in key and effect not in own):
+                continue
+            if effect == "road_grade":
+                continue
+            sized = "." in key and p.neutral is not None and p.constraint != "interval"
+            found.append(Coordinate(key, p, _WIDER if sized else 1.0))
+        return tuple(found)
+
+    @property
+    def size(self) -> int:
+        return len(self.coordinates)
+
+    def values(self, z: Float) -> dict[str, torch.Tensor]:
+        """Parameters by key, (column,), for `z` (column, coordinate)."""
+        return {c.key: c.value(z[:, i]) for i, c in enumerate(self.coordinates)}
+
+    def held(self, z: Float, onset: int | None) -> Float:
+        """`z` (column, coordinate) with what only an onset can tell put to its prior's centre where there is none."""
+        rests = [c.parameter.of_onset for c in self.coordinates]
+        return np.where(rests, 0.0, z) if onset is None and any(rests) else z
+
+    def z_of(self, values: Mapping[str, float]) -> Float:
+        """Coordinates for values by key; what is missing gets its prior's centre."""
+        return np.array([c.z_of(values[c.key]) if c.key in values else 0.0 for c in self.coordinates])
+
+    def rollouts(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
+        """Responses for `z` (column, coordinate): (column, channel, counted, group)."""
+        values = self.values(self.held(z, onset))
+        if onset is None:
+            return self._rollouts(self.plant, values, coarse)
+        drives = self.record.coarse if coarse else self.record.drives
+        with torch.inference_mode():
+            place = self.record.place(onset, coarse=coarse)
+            responses = rollout_from_onset(self.plant, self._without, drives, values, place)
+        return self._seen(responses, len(z), coarse)
+
+    def baseline_rollouts(self, z: Float, *, coarse: bool = False) -> Float:
+        """What the baseline alone does with the `T_L` and `K_L` of `z` (column, coordinate); one column if all
+        agree."""
+        lags = z[:, [c.key in ("T_L", "K_L") for c in self.coordinates]]
+        z = z[:1] if bool((lags == lags[0]).all()) else z
+        values = {k: v for k, v in self.values(z).items() if k in ("T_L", "K_L")}
+        return self._rollouts(self._without, values, coarse)
+
+    def _rollouts(self, of: GapPlant, values: Mapping[str, torch.Tensor], coarse: bool = False) -> Float:
+        record = self.record
+        with torch.inference_mode():  # no derivatives: faster recursions
+            responses = [of.response(drive, values) for drive in (record.coarse if coarse else record.drives)]
+        return self._seen(responses, max(len(v) for v in values.values()), coarse)
+
+    def _seen(self, responses: Sequence[Response], columns: int, coarse: bool) -> Float:
+        record, parts = self.record, []
+        if record.accel is not None:
+            parts.append(record.seen([r.accel_measured for r in responses], coarse=coarse))
+        if record.speed is not None:
+            parts.append(record.seen([r.speed for r in responses], coarse=coarse))
+        return np.stack([np.broadcast_to(p, (columns, *p.shape[-2:])) for p in parts], 1)
+
+    def errors(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
+        """Measured less rolled out, (column, channel, counted, group)."""
+        measured = self.record.measured
+        return (measured.mean(-1, keepdims=True) if coarse else measured) - self.rollouts(z, onset, coarse=coarse)
+
+    @cached_property
+    def grade_columns(self) -> Float | None:
+        """Rollouts (knot, channel, counted, group) per unit of each coefficient of the slope at `grade_rms` 1.
+
+        Every segment has coefficients of its own: where one began on the other's road is not known.
+        """
+        if not self._roads:
+            return None
+        if self.record not in _ROWS:
+            _ROWS[self.record] = self._columns(self.record.drives, coarse=False)
+        return _ROWS[self.record]
+
+    @cached_property
+    def grade_means(self) -> Float | None:
+        """The same of each group's mean, (knot, channel, counted, 1): within a group no slope changes."""
+        if not self._roads:
+            return None
+        if self.record not in _MEANS:
+            _MEANS[self.record] = self._columns(self.record.coarse, coarse=True)
+        return _MEANS[self.record]
+
+    def _columns(self, drives: Sequence[Drive], *, coarse: bool) -> Float:
+        knots = sum(road.knots for road in self._roads)
+        forces = []
+        for drive, road, own in zip(drives, *self._places, strict=True):
+            force = road.columns(_position(drive)).T
+            forces.append(torch.nn.functional.pad(force, (0, 0, own.start, knots - own.stop)))
+        return self._seen_forces(drives, forces, coarse=coarse)
+
+    def grade_response(self, coefficients: Float) -> Float:
+        """What a slope of `coefficients` (knot,) does, (channel, counted, group)."""
+        drives = self.record.drives
+        forces = [road.force(_position(d), own)[None] for road, d, own in self._each_road(drives, coefficients)]
+        return self._seen_forces(drives, forces, coarse=False)[0]
+
+    def _each_road(
+        self, drives: Sequence[Drive], coefficients: Float
+    ) -> Iterator[tuple[RoadGrade, Drive, torch.Tensor]]:
+        """Each drive with its road and that road's part of `coefficients` (..., knot)."""
+        for drive, road, own in zip(drives, *self._places, strict=True):
+            yield road, drive, torch.as_tensor(coefficients[..., own])
+
+    @property
+    def _places(self) -> tuple[list[RoadGrade], list[slice]]:
+        """Of each drive the road, and where its coefficients stand among those of all roads."""
+        ends = np.cumsum([0, *(road.knots for road in self._roads)]).tolist()
+        own = [slice(*part) for part in pairwise(ends)]
+        numbers = self.record.segment
+        return [self._roads[n] for n in numbers], [own[n] for n in numbers]
+
+    def _seen_forces(self, drives: Sequence[Drive], forces: Sequence[torch.Tensor], *, coarse: bool) -> Float:
+        """Forces (column, time) of each drive as both channels see them, (column, channel, counted, group)."""
+        accel, speed = [], []
+        for drive, force in zip(drives, forces, strict=True):
+            gained = torch.cumsum(0.5 * drive.dt[:-1] * (force[:, 1:] + force[:, :-1]), -1)
+            # an accelerometer does not feel gravity
+            accel.append(torch.zeros_like(force) if drive.specific_force else force)
+            speed.append(torch.cat([torch.zeros_like(force[:, :1]), gained], -1))
+        seen = {"accel": accel, "speed": speed}
+        return np.stack([self.record.seen(seen[name], coarse=coarse) for name in self.record.channels], 1)
+
+    @cached_property
+    def _roads(self) -> list[RoadGrade]:
+        """The slope with as many knots as each segment's road needs; empty where it is none of the effects."""
+        grade = next((e for e in self.plant.effects if isinstance(e, RoadGrade)), None)
+        if grade is None or RoadGrade not in self.effects or self.record.speed is None:
+            return []
+        made = []
+        for drives in self.record.segments:
+            positions = torch.cat([_position(drive) for drive in drives])
+            made.append(grade.prepared(drives[0].time, drives[0].speed, positions))
+        return made
+
+    def grade_along(self, coefficients: Float) -> Float:
+        """Root mean square of the slope along all drives, (column,), for coefficients (column, knot)."""
+        drives = self.record.coarse
+        squares = [
+            (road.force(_position(drive), own) / GRAVITY).square().mean(-1) * len(drive.time)
+            for road, drive, own in self._each_road(drives, coefficients)
+        ]
+        return torch.stack(squares).sum(0).div(sum(len(d.time) for d in drives)).sqrt().numpy()
+
+
+def _position(drive: Drive) -> torch.Tensor:
+    assert drive.position is not None
+    return drive.position

@@ -1,0 +1,122 @@
+"""The steady Kalman filter of a noise model, as a recursive filter from errors to innovations of unit covariance.
+
+The interval between rows is integrated exactly, and the gain is the one that it settles to within some rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from avtorch.gap.likelihood.noise_model import NoiseModel
+
+Float = NDArray[np.float64]
+
+Filter = tuple[list[list[Float]], Float, float]
+"""Numerators by (out, in), the denominator, log det of the innovations' covariance."""
+
+
+def designed(noises: Sequence[NoiseModel], dt: float, channels: tuple[str, ...]) -> list[Filter]:
+    """The steady Kalman filter from errors to innovations of unit covariance, for each noise model.
+
+    The models have a sensor's lag all of them, or none, and so with a further force.
+    """
+    pairs = [motion(n, dt) for n in noises]
+    move, driven = np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])
+    use = [i for i, name in enumerate(("accel", "speed")) if name in channels]
+    keep = slice(0 if 1 in use else 1, move.shape[-1])
+    states = move.shape[-1]
+    felt = [*[0] * (states - 1), 1] if noises[0].sensor_lag > 0 else [0, *[1] * (states - 1)]
+    seen = np.array([[felt, [1, *[0] * (len(felt) - 1)]]] * len(noises), float)
+    seen[:, 0] *= np.array([n.sensor_scale for n in noises])[:, None]
+    see = seen[:, use][..., keep]
+    white = np.stack([np.diag(np.array([n.accel_sd**2, n.speed_sd**2])[use]) for n in noises])
+    move, driven = move[:, keep, keep], driven[:, keep, keep]
+    ahead = _steady(move, see, driven, white)
+    s = see @ ahead @ see.mT + white
+    gain = move @ ahead @ see.mT @ np.linalg.inv(s)
+    mix = np.linalg.inv(np.linalg.cholesky(s))
+    inner = move - gain @ see
+    # adj(z - inner) and det(z - inner) by the Faddeev-LeVerrier recursion
+    size, count = inner.shape[-1], len(use)
+    m, terms = np.broadcast_to(np.eye(size), inner.shape), []
+    bottom = np.ones((len(noises), size + 1))
+    for k in range(1, size + 1):
+        terms.append(m)
+        m = inner @ m
+        bottom[:, k] = -np.trace(m, axis1=-2, axis2=-1) / k
+        m = m + bottom[:, k, None, None] * np.eye(size)
+    # innovations: errors less what the filter expects, 1 - see adj gain / det
+    tops = np.zeros((len(noises), count, count, size + 1))
+    for k, term in enumerate(terms):
+        tops[..., k + 1] = -(see @ term @ gain)
+    tops += np.eye(count)[:, :, None] * bottom[:, None, None, :]
+    mixed = np.einsum("noi,nijk->nojk", mix, tops)
+    sizes = np.linalg.slogdet(s)[1]
+    return [([list(row) for row in mixed[i]], bottom[i], float(sizes[i])) for i in range(len(noises))]
+
+
+def motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
+    """State (error of the speed, p, d) over `dt`: its transition and the covariance that is added, both exact.
+
+    Ornstein-Uhlenbeck processes (a third where a random effect adds one) and the integral of their sum. Behind a late
+    sensor its reading is one state more, the last.
+    """
+    if n.sensor_lag > 0:
+        return _late_motion(n, dt)
+    size = 1 + len(n.forces)
+    move, driven = np.eye(size), np.zeros((size, size))
+    # a hair of speed noise, or the error of the speed is known exactly
+    driven[0, 0] = 1e-12 * dt
+    for i, (sd, time) in enumerate(n.forces, start=1):
+        lost = -np.expm1(-dt / time)
+        move[i, i], move[0, i] = 1 - lost, time * lost
+        driven[i, i] = sd**2 * lost * (2 - lost)
+        driven[0, i] = driven[i, 0] = sd**2 * time * lost**2
+        driven[0, 0] += sd**2 * time**2 * _integral(dt / time)
+    return move, driven
+
+
+def _late_motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
+    """By van Loan's matrix exponential."""
+    size = 2 + len(n.forces)
+    drift = np.diag([0.0, *(-1 / time for _, time in n.forces), -1 / n.sensor_lag])
+    drift[0, 1:-1], drift[-1, 1:-1] = 1.0, 1 / n.sensor_lag
+    spectrum = np.diag([1e-12, *(2 * sd**2 / time for sd, time in n.forces), 0.0])
+    # in halves of a step short enough for the growing half of the matrix, then doubled
+    halves = max(0, int(np.ceil(np.log2(dt / n.sensor_lag))) + 1)
+    step = np.asarray(expm(np.block([[-drift, spectrum], [np.zeros((size, size)), drift.T]]) * dt / 2**halves), float)
+    move = step[size:, size:].T
+    driven = move @ step[:size, size:]
+    for _ in range(halves):
+        driven = driven + move @ driven @ move.T
+        move = move @ move
+    return np.asarray(move, float), np.asarray(0.5 * (driven + driven.T), float)
+
+
+def _integral(x: float) -> float:
+    """Variance of the integral of a unit process over `x` of its times: 2 x - 3 + 4 exp(-x) - exp(-2 x)."""
+    if x < 0.02:  # the series, where the terms above cancel
+        return x**3 * (2 / 3 - x / 2 + 7 * x**2 / 30 - x**3 / 12)
+    return 2 * x - 3 + 4 * float(np.exp(-x)) - float(np.exp(-2 * x))
+
+
+def _steady(move: Float, see: Float, driven: Float, white: Float) -> Float:
+    """Covariances (model, state, state) ahead of a reading, once they have settled: the Riccati equation by doubling.
+
+    Structure-preserving doubling (Anderson 1978): each round covers twice as many rows as the last.
+    """
+    a, g, h = move.mT, see.mT @ np.linalg.solve(white, see), driven
+    one = np.eye(move.shape[-1])
+    for _ in range(60):
+        inside = np.linalg.inv(one + g @ h)
+        left, more = a @ inside, a.mT @ h @ inside @ a
+        g = g + left @ g @ a.mT
+        a = left @ a
+        h = h + more
+        if bool((np.abs(more).max((-1, -2)) <= 1e-14 * np.abs(h).max((-1, -2))).all()):
+            break
+    return np.asarray(0.5 * (h + h.mT), float)

@@ -1,0 +1,1 @@
+"""The posterior of a fitted model: its density, draws by SGLD, summaries."""

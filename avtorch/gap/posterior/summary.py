@@ -1,0 +1,194 @@
+"""What a find says in the answer's own names: parameters with their uncertainty, and the repaired simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from avtorch.gap.effects import CommandHold, Gust, Outliers, RoadGrade
+from avtorch.gap.likelihood.hypothesis import Coordinate
+from avtorch.gap.posterior.density import RolloutDensity, root
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.plant import GapPlant, plant
+
+if TYPE_CHECKING:
+    from avtorch.gap.posterior.sample import Draws
+    from avtorch.gap.search.fitted_model import FittedModel
+
+Float = NDArray[np.float64]
+Link = Callable[[Tensor], Tensor]
+T = TypeVar("T")
+
+_LAPLACE = 2000  # draws from Laplace's approximation where none are given
+
+
+def reported(found: FittedModel, draws: Draws | None = None) -> dict[str, Quantity]:
+    """Parameters of the find's effects by the table's names, those of a pair as `effect.parameter`.
+
+    From `draws` of the posterior, or else from Laplace's approximation at the mode. Parameters of random effects are
+    normal in their link, as the fits that found them say.
+    """
+    told = {name: Quantity.of_draws(x) for name, x in _deterministic(found, draws).items()}
+    normal = {name: Quantity.of_normal(*law) for name, law in _random(found).items()}
+    return _named(found, told | normal)
+
+
+def moved(found: FittedModel, draws: Draws | None = None) -> dict[str, Quantity]:
+    """The baseline's `T_L` [s] and `K_L` [-] with the find's effects in."""
+    values = _values(found, draws)
+    return {name: Quantity.of_draws(values[name]) for name in ("T_L", "K_L")}
+
+
+def belief(found: FittedModel, draws: Draws | None = None, *, count: int = 64) -> dict[str, Float]:
+    """Draws (draw,) of the repaired simulator's parameters, by its own names."""
+    values = {key: x.reshape(-1) for key, x in _values(found, draws).items()}
+    every = max(1, len(values["T_L"]) // count)
+    return {key: x[::every][:count] for key, x in values.items()}
+
+
+def drawn(found: FittedModel, draws: Draws) -> dict[str, Float]:
+    """Draws (chain, draw) under the names of `reported`, `T_L` and `K_L` first."""
+    rng = np.random.default_rng(0)
+    shape = draws.z.shape[:2]
+    random = {}
+    for name, (mean, sd, link) in _random(found).items():
+        random[name] = link(torch.as_tensor(mean + sd * rng.standard_normal(shape))).numpy()
+    base = {name: draws.values[name] for name in ("T_L", "K_L")}
+    return base | _named(found, _deterministic(found, draws) | random)
+
+
+def repaired(found: FittedModel, baseline: GapPlant | None = None, draws: Draws | None = None) -> GapPlant:
+    """The simulator with the find's effects in, at the posterior mean of each parameter, with the jerk noise found.
+
+    `baseline`: whose effects it keeps; the find's own by default. Effects act from the start of a drive, also those
+    that were found to set in later. A slope is the one found along the road of the first drive.
+    """
+    means = {key: float(x.mean()) for key, x in _values(found, draws).items()}
+    noise = found.noise.noise
+    filled = found.hypothesis.plant.with_values(means)
+    own = {kind.name for kind in found.hypothesis.effects}
+    effects: list[Effect] = [_plain(e) for e in filled.effects if e.name in own]
+    for i, effect in enumerate(effects):
+        if isinstance(effect, RoadGrade) and found.profile is not None:
+            rms = _deterministic(found, draws).get("road_grade.grade_rms")
+            size = float(rms.mean()) if rms is not None else float(found.grade_rms or 1.0)
+            profile = torch.as_tensor(np.asarray(found.profile[: effect.knots]) / size)
+            effects[i] = replace(effect, grade_rms=size, profile=profile, knots=len(profile))
+    told = {name: float(Quantity.of_normal(*law).mean) for name, law in _random(found).items()}
+    if "gust.sd_mps2" in told:
+        effects.append(Gust(told["gust.sd_mps2"], told["gust.time_constant_s"]))
+    if "outliers.fraction" in told:
+        own_sd = noise.accel_sd
+        effects.append(Outliers(told["outliers.fraction"], told["outliers.scale"], noise_sd=float(own_sd)))
+    if "command_hold.hold_fraction" in told:
+        effects.append(CommandHold(told["command_hold.hold_fraction"]))
+    if found.by_chance is not None:
+        chance = found.by_chance.law.at(found.by_chance.z)
+        given = {key.partition(".")[2]: x for key, x in told.items() if key.startswith(f"{chance.name}.")}
+        effects.append(_plain(chance.replaced(given)))
+    process_sd = noise.process_sd
+    if found.by_chance is not None and found.by_chance.process_sd is not None:
+        process_sd = found.by_chance.process_sd
+    return plant(
+        effects,
+        baseline=found.hypothesis.baseline if baseline is None else baseline,
+        T_L=means["T_L"],
+        K_L=means["K_L"],
+        # the stationary spread of white jerk noise through a lag
+        sigma=float(process_sd * np.sqrt(2 / noise.process_time)),
+    )
+
+
+def _values(found: FittedModel, draws: Draws | None) -> dict[str, Float]:
+    """Coordinates' values by key: (chain, draw), or (draw,) from Laplace's approximation."""
+    if draws is not None:
+        rests = {c.key for c in found.hypothesis.coordinates if c.parameter.of_onset and found.onset is None}
+        centre = found.hypothesis.values(np.zeros((1, len(found.z))))
+        return {k: np.full_like(x, float(centre[k])) if k in rests else x for k, x in draws.values.items()}
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((_LAPLACE, len(found.z)))
+    if found.delays is None:
+        z = found.z + noise @ root(found.covariance).numpy().T
+    else:  # each mode by its share
+        mode = rng.choice(len(found.delays.shares), _LAPLACE, p=found.delays.shares / found.delays.shares.sum())
+        roots = np.stack([root(c).numpy() for c in found.delays.covariances])
+        z = found.delays.z[mode] + np.einsum("dij,dj->di", roots[mode], noise)
+    z = np.clip(z, -8.0, 8.0)
+    return {key: x.numpy() for key, x in found.hypothesis.values(found.hypothesis.held(z, found.onset)).items()}
+
+
+def _deterministic(found: FittedModel, draws: Draws | None) -> dict[str, Float]:
+    """Draws by `effect.parameter`."""
+    values = _values(found, draws)
+    tensors = {key: torch.as_tensor(x) for key, x in values.items()}
+    report = found.hypothesis.plant.with_values(tensors).report()
+    out = {}
+    shape = next(iter(values.values())).shape
+    for kind in found.hypothesis.effects:
+        for key, x in report[kind.name].items():
+            out[f"{kind.name}.{key}"] = x.expand(shape).numpy()
+    if any(issubclass(kind, RoadGrade) for kind in found.hypothesis.effects):
+        rms = None if draws is None else draws.grade_rms
+        if rms is None:
+            rms = _grade_rms(found)
+        if rms is not None:
+            out["road_grade.grade_rms"] = rms
+    return out
+
+
+def _grade_rms(found: FittedModel) -> Float | None:
+    """Draws of the slope's root mean square along the road, at the mode of the other parameters."""
+    density = RolloutDensity.of(found)
+    slope = density.slope
+    if slope is None:
+        return None
+    match = density.images(torch.as_tensor(found.z)[None]) @ slope.image.T
+    return found.hypothesis.grade_along(slope.sampled(np.repeat(match, _LAPLACE, 0), np.random.default_rng(0)))
+
+
+def _random(found: FittedModel) -> dict[str, tuple[float, float, Link]]:
+    """Mean, sd and link of the random effects' parameters, by `effect.parameter`."""
+    out: dict[str, tuple[float, float, Link]] = {}
+    names = found.name.split("+")
+    if "gust" in names and found.gust:
+        noise, sds = found.noise.noise, found.noise.sds
+        out["gust.sd_mps2"] = (float(np.log(noise.force_sd)), sds["force_sd"], torch.exp)
+        out["gust.time_constant_s"] = (float(np.log(noise.force_time)), sds["force_time"], torch.exp)
+    if "outliers" in names and found.tails is not None and found.by_chance is None:
+        tails = found.tails
+        fraction = float(np.log(max(tails.fraction, 1e-9)))
+        out["outliers.fraction"] = (fraction, tails.sds[0], lambda x: x.exp().clamp_max(0.5))
+        out["outliers.scale"] = (float(np.log(tails.scale)), tails.sds[1], torch.exp)
+    if "command_hold" in names and found.losses is not None:
+        p = float(np.clip(found.losses.fraction, 1e-6, 1 - 1e-6))
+        out["command_hold.hold_fraction"] = (float(np.log(p / (1 - p))), found.losses.sd, torch.sigmoid)
+    if found.by_chance is not None:
+        law, sds = found.by_chance.law, np.sqrt(np.diag(found.by_chance.covariance))
+        for c, z, sd in zip(law.coordinates, found.by_chance.z.tolist(), sds.tolist(), strict=True):
+            if c.parameter.reported:
+                out[c.key] = (z, sd, partial(_valued, c))
+    return out
+
+
+def _valued(coordinate: Coordinate, z: Tensor) -> Tensor:
+    return coordinate.parameter.constrain(coordinate.wider * z)
+
+
+def _named(found: FittedModel, by_effect: dict[str, T]) -> dict[str, T]:
+    """Keys as the answer has them: without the effect's name where there is only one."""
+    pair = len(found.name.split("+")) > 1
+    return {key if pair else key.partition(".")[2]: x for key, x in by_effect.items()}
+
+
+def _plain(effect: Effect) -> Effect:
+    """With numbers for tensors of one number, as a text needs them."""
+    values = {key: float(x) for key, x in effect.values().items() if x.dim() == 0}
+    return effect.replaced(values)

@@ -1,0 +1,1 @@
+"""What a diagnosis returns: facts of the log, size of the gap, verdict, text, traces."""

@@ -1,0 +1,98 @@
+"""What changed between two sets of drives, as an answer says it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.diagnosis import LogFacts
+
+Telling = Literal["closer", "farther", "no telling"]
+Account = Literal["lag and gain", "not lag and gain", "cannot be told"]
+
+
+@dataclass(frozen=True)
+class Moved:
+    """One number before and after, and after over before, each with its central 90 %."""
+
+    before: Quantity
+    after: Quantity
+    ratio: Quantity
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"before": self.before.to_dict(), "after": self.after.to_dict(), "ratio": self.ratio.to_dict()}
+
+
+@dataclass(frozen=True)
+class LaterAnswer:
+    """Whether lag and gain explain a change better than a later answer of the car would.
+
+    Dead time [s] `before`, `after` and their `difference`, where every drive is fitted with one; below 0 it is noise.
+    `p_lag_gain`: the chance of such a difference of dead times where only lag and gain have changed; `p_dead_time`: of
+    such a difference of lags and gains, dead times free, where only the dead time has. An account with less than
+    `level` is rejected, and lag and gain, which are what `compare` tells, only with less than a quarter of that.
+    """
+
+    before: Quantity
+    after: Quantity
+    difference: Quantity
+    p_lag_gain: float
+    p_dead_time: float
+    level: float
+
+    @property
+    def account(self) -> Account:
+        """`"lag and gain"` where they explain the change and a dead time does not, `"not lag and gain"` where they do
+        not explain it, `"cannot be told"` where either would."""
+        if self.p_lag_gain < 0.25 * self.level:
+            return "not lag and gain"
+        return "lag and gain" if self.p_dead_time < self.level else "cannot be told"
+
+    def to_dict(self) -> dict[str, Any]:
+        delays = {"before": self.before, "after": self.after, "difference": self.difference}
+        return {
+            "account": self.account,
+            "p_lag_gain": self.p_lag_gain,
+            "p_dead_time": self.p_dead_time,
+            "dead_time_s": {name: q.to_dict() for name, q in delays.items()},
+        }
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """`car`: `T_L` [s] and `K_L` as each set of drives has them; `gap`: rollout errors of the simulator, by metric,
+    over `horizon_s` [s]: 10 s, or on both sides the longest stretch of the side that has none so long.
+
+    `changed`: the car's are not the same, at `p_value`, the chance of a difference as large between drives of one car.
+    `simulator`: whether the drives after are closer to the simulator of that side than those before were.
+    `later`: where the car has changed, whether lag and gain explain it; else None.
+    """
+
+    before: LogFacts
+    after: LogFacts
+    car: Mapping[str, Moved]
+    gap: Mapping[str, Moved]
+    p_value: float
+    changed: bool
+    simulator: Telling
+    why: str
+    later: LaterAnswer | None = None
+    horizon_s: float = 10.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """The object of `comparison.json`, schema `avtorch.comparison/1`."""
+        return {
+            "schema": "avtorch.comparison/1",
+            "before": self.before.to_dict(),
+            "after": self.after.to_dict(),
+            "car": {name: moved.to_dict() for name, moved in self.car.items()},
+            "gap": {name: moved.to_dict() for name, moved in self.gap.items()},
+            "horizon_s": self.horizon_s,
+            "p_value": self.p_value,
+            "changed": self.changed,
+            "explained": None if self.later is None else self.later.to_dict(),
+            "simulator": self.simulator,
+            "why": self.why,
+        }

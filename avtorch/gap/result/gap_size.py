@@ -1,0 +1,61 @@
+"""How far the fitted baseline is from the log, in one step and over seconds, and what the best candidate leaves."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.crossval.rollout_errors import HORIZON_S, Measure, reached, rms
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.result.diagnosis import GapSize
+from avtorch.gap.result.repeatability import repeatability
+from avtorch.gap.search.fitted_model import FittedModel, SearchResult
+
+Float = NDArray[np.float64]
+
+
+def gap_size(race: SearchResult, best: FittedModel, *, detected: bool, p_value: float | None = None) -> GapSize:
+    """Root mean square errors of `race.none`, the fitted baseline, and as their floors those of `best` if smaller.
+
+    (An effect may help the speed and cost the acceleration something, and the best of wrong ones may well.)
+    Rollouts begin at what is measured, at every row, and last `HORIZON_S` or as long as the longest stretch: the same
+    measures as those of `shrinkage`, here over all rows that count. None where the log lacks the channel.
+    """
+    none, record = race.none, race.record
+    one, lag = [], none.values["T_L"]
+    if record.accel is not None:
+        one = [_one_step(record, f.errors[0], f.values["T_L"]) for f in (none, best)]
+    usual = {name: Measure(name, HORIZON_S) for name in record.channels}
+    rollout = {name: [rms(m, record, f.errors, lag) for f in (none, best)] for name, m in usual.items()}
+    accel, speed = (rollout.get(name, []) for name in ("accel", "speed"))
+    return GapSize(
+        detected=detected,
+        p_value=p_value,
+        one_step_rmse=one[0] if one else None,
+        one_step_floor=min(one, default=None),
+        rollout_rmse_accel=accel[0] if accel else None,
+        rollout_floor_accel=min(accel, default=None),
+        rollout_rmse_speed=speed[0] if speed else None,
+        horizon_s=reached(usual[record.channels[0]], record),
+        repeats=repeatability(record),
+    )
+
+
+def _one_step(record: Record, errors: Float, lag: float) -> float:
+    """Of the acceleration foretold for a row from the one measured a row before.
+
+    An error of the rollout dies away with the lag, so the error of one step is `e[k+1] - exp(-dt / T_L) e[k]`: of GLVD
+    exactly what its zero-order hold from the measured acceleration leaves.
+    """
+    keep = float(np.exp(-record.dt / record.group / lag))
+    steps = [x[1:] - keep * x[:-1] for x in map(np.ravel, _stretches(record, errors))]
+    return _size(np.concatenate(steps))
+
+
+def _stretches(record: Record, values: Float) -> list[Float]:
+    """`values` (counted, ...) of each stretch without gaps."""
+    return np.split(values, record.starts[1:])
+
+
+def _size(x: Float) -> float:
+    return float(np.sqrt((x**2).mean()))

@@ -1,0 +1,74 @@
+"""A cause that a log left possible, with all that it takes to foretell another drive of the same car."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.posterior.summary import belief
+from avtorch.gap.search.fitted_model import FittedModel, SearchResult
+from avtorch.gap.selection.verdict import Verdict
+from avtorch.gap.simulator.plant import GapPlant
+
+Float = NDArray[np.float64]
+
+_DRAWS = 64
+_MOST = 5
+_STAND_IN = 3
+
+
+@dataclass(frozen=True, eq=False)
+class PredictiveModel:
+    """`plant` with the settings it took from the log, `belief`: draws (draw,) of its parameters by its own names.
+
+    `noise`: of single rows of the log. `grade_rms`: size of an unknown slope, None where it blames none.
+    `specific_force`: what the log's `accel` is.
+    """
+
+    name: str
+    plant: GapPlant = field(repr=False)
+    belief: Mapping[str, Float] = field(repr=False)
+    noise: NoiseModel
+    grade_rms: float | None = None
+    specific_force: bool = False
+
+    @classmethod
+    def of(cls, found: FittedModel) -> PredictiveModel:
+        """From what a search found."""
+        record = found.hypothesis.record
+        grade = found.grade_rms if "road_grade" in found.name.split("+") else None
+        return cls(
+            name=found.name,
+            plant=found.hypothesis.plant,
+            belief=belief(found, count=_DRAWS),
+            noise=found.noise.noise,
+            grade_rms=grade,
+            specific_force=record.accel_kind == "specific-force",
+        )
+
+
+def predictive_models(race: SearchResult, verdict: Verdict) -> tuple[PredictiveModel, ...]:
+    """The verdict's alias set, as far as its members were fitted, the verdict first; at most five.
+
+    What `unknown` would do nobody knows: where it leaves fewer than two, the named ones with most evidence stand in,
+    as a drive that tells these from one another asks the car for all that they stand for.
+    """
+    by_name: Mapping[str, FittedModel] = {f.name: f for f in race.found}
+    names: Sequence[str] = [n for n in verdict.alias_set if n in by_name]
+    if (len(names) < 2 and len(verdict.alias_set) > 1) or verdict.abstained:
+        others = [f.name for f in race.found if f.name not in names]
+        # what differs by chance alone foretells the same
+        names = _apart([by_name[name] for name in [*names, *others]])[: len(names) + _STAND_IN]
+    return tuple(PredictiveModel.of(by_name[name]) for name in names[:_MOST])
+
+
+def _apart(found: Sequence[FittedModel]) -> list[str]:
+    """Names of the finds whose rollouts differ from those of every earlier one."""
+    out: dict[frozenset[str], str] = {}
+    for f in found:
+        out.setdefault(frozenset(e.name for e in f.hypothesis.effects), f.name)
+    return list(out.values())

@@ -1,0 +1,229 @@
+"""A diagnosis in words: the sentences that the terminal and the report share. Plain text, a sentence or two each."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from avtorch.gap.result.where import UNITS
+from avtorch.gap.selection.verdict import meanings
+from avtorch.io.clock import clock_words
+
+if TYPE_CHECKING:
+    from avtorch.gap.result.diagnosis import Diagnosis
+    from avtorch.gap.search.fitted_model import Scope
+
+SURE = 0.9
+"""What a headline says without a perhaps."""
+_ALIASES = 4  # told by name beside the verdict
+_UNTRIED = 6  # named
+_MEASURES = {
+    "rollout_rmse_accel": ("acceleration", "m/s²"),
+    "rollout_rmse_speed": ("speed", "m/s"),
+}
+
+
+def headline(found: Diagnosis) -> str:
+    """The verdict as one sentence; provisional where the budget ended the search.
+
+    Where it is implausible it says so, and the winner's `implausible` says why.
+    """
+    return _verdict(found) if found.complete else f"Provisional: {_verdict(found)}"
+
+
+def _verdict(found: Diagnosis) -> str:
+    verdict, p = found.verdict, _share(found.winner.probability)
+    if verdict.abstained:
+        return f"The cause is none of the {_known(found)} ({p}): nothing is blamed."
+    odd = found.winner.implausible
+    but = ", but as fitted it is physically implausible" if odd else ""
+    if verdict.name == "none" and not _all_tried(found):
+        comma = "," if _cut(found) else ""
+        return f"None of the {_known(found)}{comma} brings the simulator closer to this log ({p}){but}."
+    if verdict.name == "none":
+        first = "The" if found.winner.probability >= SURE else "No effect stands out: probably the"
+        return f"{first} simulator lacks nothing that this log shows ({p}){but}."
+    told = meanings(verdict.name)
+    # what the effect means is not what it is here
+    told = ", but as fitted that is physically implausible." if odd else f": {told}." if told else "."
+    share = found.winner.probability
+    who = "The" if share >= SURE else "Probably the" if share >= 0.5 else "Perhaps the"
+    return f"{who} simulator lacks {' and '.join(verdict.names)} ({p}){told}"
+
+
+def onset(found: Diagnosis) -> list[str]:
+    """From when on."""
+    if found.onset_s is not None:
+        return [f"Onset: at {moment(found)}."]
+    return ["Onset: there from the start."] if found.winner.effects else []
+
+
+def moment(found: Diagnosis) -> str:
+    """The onset from the log's start, beside it on the log's own clock; one figure where they are the same."""
+    assert found.onset_s is not None
+    assert found.onset_from_start_s is not None
+    of = "the log's" if len(found.log.epochs_s) == 1 else f"drive {found.onset_log + 1}'s"
+    if abs(found.onset_s - found.onset_from_start_s) < 0.05:
+        return f"{found.onset_s:.1f} s of {of} time"
+    return f"{found.onset_from_start_s:.1f} s from {of} start ({clock_words(round(found.onset_s, 1))})"
+
+
+def where(found: Diagnosis) -> list[str]:
+    """Where the gap lies, an onset apart."""
+    told = []
+    for part in found.where:
+        if part.axis == "time" and found.onset_s is not None:
+            continue  # the onset says it
+        if part.axis == "signal":
+            if part.share >= 0.5:
+                told.append("in what the car does" if part.begin == "actuation" else "in what the accelerometer shows")
+        elif not isinstance(part.begin, str) and not isinstance(part.end, str):
+            begin, end = part.begin, part.end
+            if part.axis == "time":
+                begin, end = (t - found.log.epochs_s[0] for t in (begin, end))
+                told.append(f"from {begin:.1f} to {end:.1f} s after the log's start")
+                continue
+            at, unit = "frequencies" if part.axis == "frequency" else f"{part.axis}s", UNITS[part.axis]
+            ends = f"from {part.begin:.2g} to {part.end:.2g}" if part.begin else f"below {part.end:.2g}"
+            told.append(f"at {at} {ends} {unit}")
+    return [f"It lies {', '.join(told)}."] if told else []
+
+
+def shrinkage(found: Diagnosis) -> list[str]:
+    """How far it shrinks on what was held out."""
+    told = found.shrinkage
+    if told is None:
+        return []
+    top, few = told.top, "" if told.chosen == 1 else f"; chosen there by {100 * told.chosen:.0f} % of the parts"
+    parts = "drives" if told.by_drives else "blocks"
+    if told.metric in _MEASURES:
+        words, unit = _MEASURES[told.metric]
+        over = _over(top.horizon_s)
+        line = f"On {parts} held out{over}: {words} off by {top.before:.2g}, with the effect by {top.after:.2g} {unit}"
+    else:
+        gain = top.after - top.before
+        line = f"On {parts} held out: log density {gain:+.2g} nats a row with the effect; no rollout shows it"
+    if top.closed is None:
+        return [f"{line}; next to nothing could be closed{few}."]
+    q = top.closed
+    share = f"{100 * q.mean:.0f} % ({100 * q.q05:.0f} to {100 * q.q95:.0f})"
+    return [f"{line}: closes {share} of what can be closed{few}."]
+
+
+def moved(found: Diagnosis) -> list[str]:
+    """What the effect does to the baseline."""
+    baseline, with_it, told = found.baseline, found.winner.moved, []
+    for name in ("T_L", "K_L"):
+        if name in with_it and name in baseline:
+            unit = " s" if name == "T_L" else ""
+            told.append(f"{name} {baseline[name].mean:.2f} → {with_it[name].mean:.2f}{unit}")
+    return [f"The baseline, fitted without and with it: {', '.join(told)}."] if told else []
+
+
+def aliases(found: Diagnosis) -> str:
+    """What the log does not tell apart."""
+    from_words = {"none": "no effect at all", "unknown": "a cause outside the table"}
+    if _cut(found):
+        from_words["unknown"] = "a cause that was not tried"
+    others = [from_words.get(n, n.replace("+", " with ")) for n in found.verdict.alias_set if n != found.verdict.name]
+    if not others:
+        which = "other candidate on this log" if _all_tried(found) else "other candidate tried, and only from these"
+        return f"Told apart from every {which}."
+    if len(others) > _ALIASES + 1:
+        others = [*others[:_ALIASES], f"any of {len(others) - _ALIASES} that are less probable"]
+    listing = others[0] if len(others) == 1 else f"{', '.join(others[:-1])} or {others[-1]}"
+    name = from_words.get(found.verdict.name, found.verdict.name.replace("+", " with "))
+    return f"Not told apart on this log: {name}, or {listing}."
+
+
+def untried(scope: Scope) -> list[str]:
+    """Which candidates were not tried, and what the probabilities then mean."""
+    few, rest = scope.not_scored[:_UNTRIED], len(scope.not_scored) - _UNTRIED
+    parts = [*few, *([f"{rest} effects more"] if rest > 0 else [])]
+    parts += {"all": [], "some": ["some of the pairs"], "none": ["pairs"]}[scope.pairs]
+    if not parts:
+        return []
+    listing = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+    return [f"Not tried: {listing}. Probabilities are over what was tried; unknown is any cause that was not."]
+
+
+def _cut(found: Diagnosis) -> bool:
+    """Whether single effects were left untried."""
+    return found.scope is not None and bool(found.scope.not_scored)
+
+
+def _all_tried(found: Diagnosis) -> bool:
+    return found.complete and (found.scope is None or found.scope.whole)
+
+
+def _known(found: Diagnosis) -> str:
+    """The effects out of which none is the cause."""
+    if found.scope is None or _all_tried(found):
+        return "effects known here"
+    if not _cut(found):
+        return "single effects known here" if found.scope.pairs == "none" else "effects and pairs tried so far"
+    which = "single effects" if found.scope.pairs == "none" else "effects"
+    return f"{which} tried, {len(found.scope.scored)} of {len(found.scope.scored + found.scope.not_scored)}"
+
+
+def gap(found: Diagnosis) -> list[str]:
+    """How far the simulator as it is is off."""
+    gap = found.gap
+    parts = []
+    if gap.rollout_rmse_accel is not None:
+        floor = "" if gap.rollout_floor_accel is None else f" ({gap.rollout_floor_accel:.2g} is left at best)"
+        if gap.rollout_floor_accel is not None and gap.rollout_floor_accel > 0.97 * gap.rollout_rmse_accel:
+            floor = " (no less with the best candidate in)"
+        parts.append(f"acceleration off by {gap.rollout_rmse_accel:.2g} m/s²{floor}")
+    if gap.rollout_rmse_speed is not None:
+        off = "" if parts else "off "
+        parts.append(f"speed {off}by {gap.rollout_rmse_speed:.2g} m/s")
+    if not parts:
+        return []
+    lines = [f"Gap of the simulator as it is{_over(gap.horizon_s)}: {', '.join(parts)}."]
+    if gap.repeats is not None:
+        alike = [("accelerations", gap.repeats.accel, "m/s²"), ("speeds", gap.repeats.speed, "m/s")]
+        told = " and ".join(f"{name} to {x:.2g} {unit}" for name, x, unit in alike if x is not None)
+        again = f"The same commands given again ({gap.repeats.seconds:.0f} s)"
+        lines.append(f"{again} repeat {told}: noise, or not their doing.")
+    return lines
+
+
+def number(p: float) -> str:
+    """A probability of three digits."""
+    return "<.001" if 0 < p < 0.0005 else ">.999" if 0.9995 <= p < 1 else f"{p:.3f}"
+
+
+def remains(found: Diagnosis) -> list[str]:
+    """What there is besides the delay."""
+    if not found.remaining:
+        return []
+    best = sorted(found.remaining, key=lambda c: -c.probability)[:3]
+    told = ", ".join(f"{c.name} {number(c.probability)}" for c in best if c.probability >= 0.005)
+    return [f"Once dead_time is in, what remains: {told}."]
+
+
+def to_set(found: Diagnosis) -> list[str]:
+    """What to set."""
+    return [] if found.setting is None else [f"To set: {found.setting['why']}"]
+
+
+def to_drive(found: Diagnosis) -> list[str]:
+    """Which experiment next."""
+    told = found.next_experiment
+    if told is None:
+        return []
+    begin, seconds, metres = (told[key] for key in ("start_speed_mps", "seconds", "metres"))
+    line = f"Next experiment: {told['why']} It begins at {begin:.3g} m/s and takes {seconds:.0f} s and {metres:.0f} m."
+    kept = told.get("limits")
+    if kept is None:
+        return [line]
+    speeds, commands = (f"{kept[f'{k}_min']:.2g} to {kept[f'{k}_max']:.3g}" for k in ("speed", "accel"))
+    return [f"{line} Limits, {kept['source']}: {speeds} m/s, {commands} m/s²."]
+
+
+def _over(seconds: float | None) -> str:
+    return "" if seconds is None else f", in rollouts of {seconds:.3g} s"
+
+
+def _share(p: float) -> str:
+    return f"probability {p:.2f}" if p < 0.995 else "probability over 0.99"

@@ -1,0 +1,34 @@
+"""The drives as the search saw them, with what the simulator makes of their commands, before and after the repair."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Traces:
+    """Rows that count, averaged to some 20 Hz. Accelerations [m/s²], speed [m/s], `time` [s] from their log's start.
+
+    `command` (row,); `measured`, `before`, `after` (channel, row): what the log shows, and rollouts over whole drives
+    of the fitted simulator without and with the effect (equal where nothing was named). `does` (row,) [nats]: what the
+    effect does to each row. `stretch` (row,) numbers parts without gaps.
+    """
+
+    time: Float
+    command: Float
+    channels: tuple[str, ...]
+    measured: Float = field(repr=False)
+    before: Float = field(repr=False)
+    after: Float = field(repr=False)
+    does: Float = field(repr=False)
+    stretch: NDArray[np.int64] = field(repr=False)
+
+    @property
+    def speed(self) -> Float | None:
+        """Measured, (row,); None where it was not."""
+        return self.measured[self.channels.index("speed")] if "speed" in self.channels else None

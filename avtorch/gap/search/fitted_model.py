@@ -1,0 +1,233 @@
+"""A hypothesis once it is fitted, all of them after a search, and what a search begins from."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.likelihood.gauss_newton import GaussNewtonFit
+from avtorch.gap.likelihood.hypothesis import Hypothesis
+from avtorch.gap.likelihood.noise_fit import NoiseFit
+from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.likelihood.noise_segments import whitening_filter
+from avtorch.gap.likelihood.observability import is_observable
+from avtorch.gap.likelihood.random_law import RandomLaw
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.search.lost_messages import LostMessages
+from avtorch.gap.search.outliers import HeavyTails
+from avtorch.gap.simulator.effect import EFFECTS, Effect
+from avtorch.io import Log
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ByChance:
+    """A user's random effect as fitted: `law` at `z` (coordinate,) with this `covariance`.
+
+    `explained` [nats]: what it explains although the errors still show it; `process_sd` [m/s²]: of the jerk noise
+    beside it, where that was fitted anew.
+    """
+
+    law: RandomLaw
+    z: Float = field(repr=False)
+    covariance: Float = field(repr=False)
+    explained: float = 0.0
+    process_sd: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Delays:
+    """Delays that fit alike under a command that repeats itself after `period` [s], in order.
+
+    `lengths` (mode,) [s], their `shares` (mode,) of the posterior, `z` (mode, coordinate) and `covariances` at each.
+    `row`: the interval of the log's rows [s]. `gain` [nats]: of log likelihood over the find called `without`, which
+    has no delay.
+    """
+
+    period: float
+    row: float
+    lengths: Float
+    shares: Float
+    z: Float = field(repr=False)
+    covariances: Float = field(repr=False)
+    gain: float
+    without: str
+
+    @property
+    def none(self) -> float:
+        """Share of the posterior within a row of no delay, where a longer one fits alike."""
+        return float(self.shares[self.lengths < self.row].sum()) if len(self.lengths) > 1 else 0.0
+
+    @property
+    def untold(self) -> bool:
+        """Whether no delay at all does as well, within a row of the log or in the likelihood."""
+        return self.none > 0 or (self.gain < ALIKE and float(self.lengths.max()) > self.row)
+
+
+ALIKE = 4.0
+"""Nats of log likelihood by less of which two delays are not told apart."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedModel:
+    """A hypothesis fitted: `name`, `z` and parameter `values` at the mode, `log_evidence` [nats], `errors`.
+
+    `onset`, `gust_onset`: counted rows from which its effects act and a gust blows, None: from the start. `tails`,
+    `losses`: what random effects among its names found; `by_chance`: likewise, one of the user's. `delays`: all that
+    fit alike, under a command that repeats itself.
+    """
+
+    name: str
+    hypothesis: Hypothesis
+    z: Float = field(repr=False)
+    covariance: Float = field(repr=False)
+    values: Mapping[str, float]
+    noise: NoiseFit = field(repr=False)
+    log_evidence: float
+    log_likelihood: float
+    errors: Float = field(repr=False)
+    onset: int | None = None
+    grade_rms: float | None = None
+    profile: Float | None = field(default=None, repr=False)
+    tails: HeavyTails | None = field(default=None, repr=False)
+    losses: LostMessages | None = field(default=None, repr=False)
+    gust: bool = False
+    gust_onset: int | None = None
+    delays: Delays | None = field(default=None, repr=False)
+    by_chance: ByChance | None = field(default=None, repr=False)
+
+    @property
+    def blown(self) -> bool:
+        """Whether a random force is among its causes, under whose noise weaker causes do not show."""
+        return self.gust or (self.by_chance is not None and self.by_chance.law.form == "force")
+
+    @property
+    def began(self) -> int | None:
+        """Counted row from which anything of it acts; None: from the start."""
+        return self.gust_onset if self.onset is None else self.onset
+
+    @property
+    def white(self) -> WhiteningFilter:
+        """Of errors under its noise."""
+        return whitening_filter(self.hypothesis.record, self.noise.noise, onset=self.onset, gust_onset=self.gust_onset)
+
+    @classmethod
+    def of(
+        cls,
+        hypothesis: Hypothesis,
+        fit: GaussNewtonFit,
+        noise: NoiseFit,
+        log_evidence: float,
+        log_likelihood: float,
+        onset: int | None = None,
+    ) -> Self:
+        """From a fit under this noise."""
+        return cls(
+            name=hypothesis.name,
+            hypothesis=hypothesis,
+            z=fit.z,
+            covariance=fit.covariance,
+            values={k: float(v) for k, v in hypothesis.values(fit.z[None]).items()},
+            noise=noise,
+            log_evidence=log_evidence,
+            log_likelihood=log_likelihood,
+            errors=fit.errors,
+            onset=onset,
+            grade_rms=fit.grade_rms,
+            profile=fit.profile,
+        )
+
+
+@dataclass(frozen=True)
+class Scope:
+    """What a search tried: names of single effects `scored` and `not_scored`, and which `pairs`.
+
+    `not_scored`: those that the budget kept out, and those that were not asked for. `pairs`: "all" that promised
+    anything, "some" before the budget ended, or "none".
+    """
+
+    scored: tuple[str, ...] = ()
+    not_scored: tuple[str, ...] = ()
+    pairs: Literal["all", "some", "none"] = "all"
+
+    @classmethod
+    def of(
+        cls,
+        effects: Sequence[type[Effect]],
+        tried: Collection[str],
+        channels: Collection[str],
+        pairs: Literal["all", "some", "none"],
+    ) -> Self:
+        """Of a search among `effects` that `tried` those names; only what a log with these `channels` could show."""
+        own = {e.name: e for e in effects}
+        kinds = own | {n: e for n, e in EFFECTS.items() if n not in own}
+        names = [n for n, e in kinds.items() if is_observable(e, channels)]
+        return cls(tuple(n for n in names if n in tried), tuple(n for n in names if n not in tried), pairs)
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing was left out."""
+        return not self.not_scored and self.pairs == "all"
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"effects": list(self.not_scored), "pairs": self.pairs}
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """All hypotheses found, most evidence first, and what they were found on. `complete` False: the budget ended it."""
+
+    record: Record
+    raw: Record
+    logs: tuple[Log, ...]
+    found: tuple[FittedModel, ...]
+    complete: bool
+    scope: Scope = Scope()
+
+    @property
+    def none(self) -> FittedModel:
+        return next(f for f in self.found if f.name == "none")
+
+    @property
+    def best(self) -> FittedModel:
+        return self.found[0]
+
+
+def first_noise(record: Record) -> NoiseModel:
+    """Sensor noise from what rows beside each other differ by, as a first guess."""
+    same = np.diff(np.repeat(record.stretch, record.group)) == 0
+    sds = [1.4826 / np.sqrt(2) * float(np.median(np.abs(np.diff(x.ravel())[same]))) + 1e-4 for x in record.measured]
+    return NoiseModel(**{f"{name}_sd": sd for name, sd in zip(record.channels, sds, strict=True)})
+
+
+def with_or_without_onset(forms: Sequence[FittedModel]) -> FittedModel:
+    """One cause in several forms (over the whole drive, from an onset on), equally likely a priori."""
+    best = max(forms, key=lambda f: f.log_evidence)
+    total = np.logaddexp.reduce([f.log_evidence for f in forms]) - np.log(2.0)
+    return replace(best, log_evidence=float(total))
+
+
+def without_outliers(logs: Sequence[Log], raw: Record, glitches: HeavyTails) -> list[Log]:
+    """The logs with glitches of the accelerometer put to the middle of the rows beside them."""
+    hit, offset = raw.source[glitches.hit], 0
+    read = [None if log.accel is None else log.accel.copy() for log in logs]
+    for cut in raw.cuts:
+        accel, log = read[cut.log], logs[cut.log]
+        assert accel is not None
+        assert log.accel is not None
+        first, last = cut.rows.start, cut.rows.stop
+        rows = hit[(hit >= offset) & (hit < offset + last - first)] - offset + first
+        offset += last - first
+        bad = np.zeros(len(accel), bool)
+        bad[rows] = True
+        for r in rows.tolist():
+            near = [k for k in range(max(r - 3, first), min(r + 4, last)) if not bad[k]]
+            if near:
+                accel[r] = np.median(log.accel[near])
+    return [replace(log, accel=accel) for log, accel in zip(logs, read, strict=True)]

@@ -1,0 +1,265 @@
+"""Lost command messages: the car goes on with the last command it got, and the log does not say so.
+
+Which messages were lost is unknown, so the likelihood of a loss fraction `p` sums over the ways they may have been. A
+message at row `i` is lost with probability `p`; then the command that acts is still the one of the last message that
+arrived, `h`, and all later errors of the rollout get `(h - u[i])` times the white image of one row's unit pulse. A
+path of a bank is one such history: its `h`, and what its losses so far still do to the errors to come. Row by row
+every path is weighed by the white errors of that row alone, then split in two (arrived, lost); of the paths that
+differ least in what they foretell, the lighter is merged into the heavier, by mean.
+
+So an error is explained once, by those losses that foretell it best, however many rows could each claim it. And
+whatever is merged, the bank foretells each row by a proper density, given the rows before it. Under noise alone the
+likelihood ratio has mean 1 therefore, and evidence above `x` nats comes by chance in at most exp(-x) of all drives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.search.outliers import onset_of
+
+Float = NDArray[np.float64]
+
+_CENTRE, _SD = float(np.log(0.08 / 0.92)), 1.0  # of the prior of the fraction's logit
+_FIRST = np.array([-3.0, -1.0, 1.0, 3.0])  # fractions tried first, in sds of the prior
+_ROUNDS = 4
+_PATHS = 6
+_ORDER = 4  # of the image's states at most
+_FAINT = 1e-3  # what all jumps within a chunk of rows may tell together [nats] and still be skipped
+
+
+@dataclass(frozen=True, eq=False)
+class LostMessages:
+    """Lost messages: `evidence` [nats] over none, `fraction` and the sd of its logit; `onset` row or None."""
+
+    evidence: float
+    fraction: float
+    sd: float
+    onset: int | None
+
+
+def lost_messages(white: WhiteningFilter, errors: Float, command: Float, T_L: float, K_L: float) -> LostMessages:
+    """How much speaks for lost messages, and which fraction of them.
+
+    Args: `errors` (channel, counted, 1) of a rollout with `T_L` [s] and `K_L`, at the log's own rate; `command`
+    (counted,) [m/s²], one message a row. No run of losses reaches from one stretch into the next.
+    """
+    record = white.record
+    bank = Bank.of(white, white(errors)[..., 0], command, T_L, K_L)
+    if not len(bank.place):
+        return LostMessages(-2.0, 0.0, 1.0, None)  # the command never moves
+
+    def tried(z: Float) -> tuple[Float, list[tuple[int, float]]]:
+        rows = bank.ratios(_fraction(z))
+        onsets = [onset_of(row, record.dt) for row in rows]
+        # over the whole drive or from any row on, both as likely
+        return rows.sum(1) + np.logaddexp(0.0, [more for _, more in onsets]) - np.log(2.0), onsets
+
+    z = _FIRST
+    value, onsets = tried(z)
+    mass = value - 0.5 * z**2
+    evidence = float(np.logaddexp.reduce(mass) - np.logaddexp.reduce(-0.5 * z**2))
+    best = int(np.clip(mass.argmax(), 1, len(z) - 2))
+    found = _posterior(z[best - 1 : best + 2], value[best - 1 : best + 2])
+    if evidence > 0:
+        for _ in range(_ROUNDS):
+            z = found.mean + 1.5 * found.sd * np.array([-1.0, 0.0, 1.0])
+            value, onsets = tried(z)
+            before, found = found, _posterior(z, value)
+            evidence = found.evidence
+            if np.abs(found.mean - z[1]) < found.sd and 0.7 < found.sd / before.sd < 1.5:
+                break
+    onset, more = onsets[int((value - 0.5 * z**2).argmax())]
+    fraction = float(_fraction(np.array(found.mean)))
+    return LostMessages(evidence, fraction, found.sd * _SD, onset if more > 1 else None)
+
+
+def rows_gained(
+    white: WhiteningFilter, errors: Float, command: Float, T_L: float, K_L: float, fits: NDArray[np.bool_]
+) -> Float:
+    """Log likelihood ratio (counted,) of each row, losses over none, at the fraction that the rows in `fits` like best.
+
+    Arguments as of `lost_messages`.
+    """
+    bank = Bank.of(white, white(errors)[..., 0], command, T_L, K_L)
+    if not len(bank.place):
+        return np.zeros(white.record.rows)
+    z = np.linspace(-3.0, 3.0, 13)
+    rows = bank.ratios(_fraction(z))
+    return rows[int((rows[:, fits].sum(1) - 0.5 * z**2).argmax())]
+
+
+def _fraction(z: Float) -> Float:
+    return 1 / (1 + np.exp(-_CENTRE - _SD * z))
+
+
+@dataclass(frozen=True)
+class _Posterior:
+    """Of a fraction's prior coordinate: mean and sd, and the log evidence [nats]."""
+
+    mean: float
+    sd: float
+    evidence: float
+
+
+def _posterior(z: Float, value: Float) -> _Posterior:
+    """From log likelihoods `value` at three `z`, between which it runs as if so many messages were known to be lost
+    and so many to have arrived, or where that does not fit as a parabola."""
+
+    def counted(z: Float) -> Float:
+        p = _fraction(z)
+        return np.stack([np.log(p), np.log1p(-p), np.ones_like(p)], -1)
+
+    terms = counted
+    weights = np.linalg.solve(terms(z), value)
+    if weights[:2].min() < 0:
+        terms = partial(np.vander, N=3)
+        weights = np.linalg.solve(terms(z), value)
+    fine = np.linspace(2 * z[0] - z[1], 2 * z[2] - z[1], 801)
+    line = terms(fine) @ weights - 0.5 * fine**2 - 0.5 * np.log(2 * np.pi)
+    mass = np.exp(line - line.max())
+    mean = float(mass @ fine / mass.sum())
+    sd = float(np.sqrt(mass @ (fine - mean) ** 2 / mass.sum()))
+    return _Posterior(mean, max(sd, 1e-3), float(line.max() + np.log(mass.sum() * (fine[1] - fine[0]))))
+
+
+@dataclass(frozen=True, eq=False)
+class Bank:
+    """Paths over chunks of rows, all chunks and all fractions at once.
+
+    `move`, `push`, `see`: what a path's losses do, as x' = move x + push (h - u), to the white errors: see x; in
+    coordinates in which x's square is that of all errors to come. `place` (chunk, step): rows, the first `warm` of
+    them only to get the paths going; `valid` where within the stretch. `error` (channel, counted).
+    """
+
+    move: Float
+    push: Float
+    see: Float
+    place: NDArray[np.int64]
+    valid: NDArray[np.bool_]
+    warm: int
+    error: Float
+    command: Float
+
+    @classmethod
+    def of(cls, white: WhiteningFilter, error: Float, command: Float, T_L: float, K_L: float) -> Bank:
+        record = white.record
+        image = image_of_row(white, T_L, K_L)
+        move, push, see = states_of(image)
+        energy = np.cumsum((image**2).sum(0))
+        warm = 8 + int(np.searchsorted(energy, 0.995 * energy[-1]))
+        size = max(3 * warm, 120)
+        place, valid = [], []
+        jumps = np.diff(command, prepend=command[0]) ** 2
+        jumps[record.starts] = 0.0
+        for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
+            for begin in range(first, last, size):
+                rows = np.arange(begin - warm, begin + size)
+                inside = (rows >= first) & (rows < last)
+                if jumps[rows[inside]].sum() * energy[-1] > _FAINT:
+                    place.append(rows.clip(first, last - 1))
+                    valid.append(inside)
+        rows = np.array(place, np.int64).reshape(-1, warm + size)
+        return cls(move, push, see, rows, np.array(valid, bool).reshape(rows.shape), warm, error, command)
+
+    def ratios(self, fractions: Float) -> Float:
+        """Log likelihood ratio of each row given those before it, losses over none: (fraction, counted)."""
+        count, steps = self.place.shape
+        order, total = len(self.push), len(fractions) * count
+        p = np.repeat(fractions, count)[:, None]
+        u = np.tile(self.command[self.place], (len(fractions), 1))
+        e = np.tile(np.where(self.valid, self.error[:, self.place], 0.0), (1, len(fractions), 1))
+        # paths (chunk, path, states and held command); held commands count by what they may yet do
+        weight = np.zeros((total, _PATHS))
+        weight[:, 0] = 1.0
+        path = np.zeros((total, _PATHS, order + 1))
+        path[..., order] = u[:, :1]
+        scale = np.ones((total, 1, order + 1))
+        scale[:, 0, order] = np.sqrt(p[:, 0] * (self.push**2).sum())
+        out = np.zeros((total, steps))
+        drift = np.zeros((order + 1, order + 1))
+        drift[:order, :order] = self.move.T
+        drift[order, order] = 1.0
+        for t in range(steps):
+            seen = path[..., :order] @ self.see.T
+            gain = (seen @ e[:, :, t].T[..., None])[..., 0] - 0.5 * (seen**2).sum(-1)
+            with np.errstate(divide="ignore"):
+                gain += np.log(weight)
+            top = gain.max(1, keepdims=True)
+            weight = np.exp(gain - top)
+            mass = weight.sum(1, keepdims=True)
+            weight /= mass
+            out[:, t] = (top + np.log(mass))[:, 0]
+            moved = path @ drift
+            lost, now = moved.copy(), u[:, t, None]
+            moved[..., order] = now
+            lost[..., :order] += (lost[..., order] - now)[..., None] * self.push
+            weight, path = _merged(
+                np.concatenate([weight * (1 - p), weight * p], 1), np.concatenate([moved, lost], 1), scale
+            )
+        rows = np.zeros((len(fractions), len(self.command)))
+        own = self.valid[:, self.warm :]
+        out = out.reshape(len(fractions), count, steps)[:, :, self.warm :]
+        rows[:, self.place[:, self.warm :][own]] = out[:, own]
+        return rows
+
+
+def _merged(weight: Float, path: Float, scale: Float) -> tuple[Float, Float]:
+    """Half as many paths: those whose merging with a heavier one changes least go to the nearest that is kept."""
+    count = weight.shape[1]
+    keep = count // 2
+    order = np.argsort(-weight, 1)
+    weight = np.take_along_axis(weight, order, 1)
+    path = np.take_along_axis(path, order[..., None], 1)
+    at = path * scale
+    square = (at**2).sum(-1)
+    apart = at @ at.mT
+    apart *= -2
+    apart += square[:, None]
+    apart += square[:, :, None]  # (chunk, lighter, heavier)
+    loss = (apart + _HEAVIER).min(2)
+    loss *= weight
+    loss[:, 0] = np.inf
+    kept = np.argpartition(-loss, keep - 1, 1)[:, :keep]
+    apart[:, np.arange(count), np.arange(count)] = -np.inf
+    nearest = apart[np.arange(len(kept))[:, None], kept].argmin(1)
+    joins = (nearest[:, None] == np.arange(keep)[:, None]) * weight[:, None]
+    total = joins.sum(2)
+    return total, (joins @ path) / np.maximum(total, 1e-300)[..., None]
+
+
+_HEAVIER = np.triu(np.full((2 * _PATHS, 2 * _PATHS), 1e30))
+
+
+def image_of_row(white: WhiteningFilter, T_L: float, K_L: float) -> Float:
+    """White errors (channel, time) of one row whose command is one unit larger than logged."""
+    dt = white.record.dt
+    length = 2 * max(16, round(6 * T_L / dt) + 8)
+    decay = np.exp(-dt / T_L)
+    accel, speed = np.zeros(length), np.zeros(length)
+    accel[1:] = K_L * (1 - decay) * decay ** np.arange(length - 1)
+    # its integral, the command's row exact
+    speed[1] = K_L * (dt - T_L * (1 - decay))
+    speed[2:] = speed[1] + T_L * K_L * (1 - decay) * (1 - decay ** np.arange(1, length - 1))
+    return white.response(np.stack([{"accel": accel, "speed": speed}[name] for name in white.record.channels]))
+
+
+def states_of(image: Float) -> tuple[Float, Float, Float]:
+    """A few states whose response to a unit pulse is `image` (channel, time): (move, push, see) of `Bank`.
+
+    Singular vectors of the image's Hankel matrix (Kung 1978), in output-normal coordinates.
+    """
+    channels, length = image.shape
+    half = length // 2
+    index = 1 + np.arange(half)[:, None] + np.arange(half - 1)
+    hankel = image[:, index].transpose(1, 0, 2).reshape(half * channels, half - 1)  # (later row and channel, earlier)
+    u, s, v = np.linalg.svd(hankel, full_matrices=False)
+    order = max(1, min(_ORDER, int((s > 1e-3 * s[0]).sum())))
+    u, push = u[:, :order], s[:order] * v[:order, 0]
+    move = np.linalg.lstsq(u[:-channels], u[channels:], rcond=None)[0]
+    return move, push, u[:channels]

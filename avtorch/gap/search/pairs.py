@@ -1,0 +1,164 @@
+"""Two effects at once: which second one would help a first, and where the two of them come to rest together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avtorch.gap.likelihood.gauss_newton import modes, whitened_jacobian
+from avtorch.gap.likelihood.hypothesis import Hypothesis
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.search.initial_values import effect_starts, starts
+from avtorch.gap.search.onset import allowed
+from avtorch.gap.search.screening import Screened, converge, refine, screen
+from avtorch.gap.simulator.effect import Effect
+
+Float = NDArray[np.float64]
+
+_AT_ONCE = 32
+_MANY = 50  # starts of one effect, more than which are left to the fit of that effect alone
+_MUCH = 6_000_000  # starts times rows, likewise
+
+
+@dataclass(frozen=True, eq=False)
+class Base:
+    """What a second effect is tried on: a `hypothesis` at `z` (coordinate,), its parameter `values`, under `white`."""
+
+    hypothesis: Hypothesis
+    z: Float
+    values: Mapping[str, float]
+    onset: int | None
+    white: WhiteningFilter
+
+    @cached_property
+    def _rested(self) -> tuple[Float, float]:
+        """Where the base comes to rest under this noise, and its log joint density there."""
+        z, value = modes(self.hypothesis, self.white, self.z[None], onset=self.onset, iterations=4)
+        return z[0], float(value[0])
+
+    @property
+    def flat(self) -> float:
+        """Log joint density of the base alone."""
+        return self._rested[1]
+
+    @cached_property
+    def _silent(self) -> Float:
+        return self.hypothesis.rollouts(self._rested[0][None], self.onset)[0]
+
+    @cached_property
+    def _errors(self) -> Float:
+        """White errors (row,), less whatever the base's own parameters can do."""
+        return self._apart(self.white(self.hypothesis.record.measured - self._silent).reshape(1, -1))[0]
+
+    @cached_property
+    def _own(self) -> tuple[Float, Float]:
+        """White directions (direction, row) in which the base's own parameters move its rollout; their inverse Gram."""
+        columns = whitened_jacobian(self.hypothesis, self.white, self._rested[0], self.onset)
+        columns = columns[np.linalg.norm(columns, axis=1) > 1e-9]
+        gram = columns @ columns.T
+        return columns, np.asarray(np.linalg.pinv(gram, rcond=1e-10, hermitian=True), np.float64)
+
+    def _apart(self, images: Float) -> Float:
+        """White `images` (column, row) less whatever the base's own parameters can do."""
+        columns, inverse = self._own
+        return images - (images @ columns.T) @ inverse @ columns
+
+    def score(self, hypothesis: Hypothesis, alone: Mapping[str, Mapping[str, float]]) -> tuple[float, Float]:
+        """Nats a `hypothesis` of one effect more could gain, and from which start of its.
+
+        By one linear step from each start, with whatever the base's own parameters can do taken out. `alone`: where
+        single effects came to rest, by name and parameter; those with a large grid of starts begin there.
+        """
+        (more,) = set(hypothesis.effects) - set(self.hypothesis.effects)
+        known = {k: v for k, v in alone.get(more.name, {}).items() if "." in k}
+        begin = np.zeros((0, hypothesis.size))
+        if known:
+            begin = hypothesis.z_of({**self.values, **known})[None]
+        rows = self.hypothesis.record.rows * self.hypothesis.record.group
+        if not known or len(effect_starts(hypothesis, more.name)) * rows <= _MUCH:
+            begin = np.concatenate([begin, starts(hypothesis, self.values)])
+        if hypothesis.grade_means is not None and self.hypothesis.grade_means is None:
+            step, value = modes(hypothesis, self.white, begin[:1], onset=self.onset, iterations=2)
+            return float(value[0]) - self.flat, step[0]
+        e = self._errors
+        best, at = -np.inf, begin[0]
+        for i in range(0, len(begin), _AT_ONCE):
+            some = begin[i : i + _AT_ONCE]
+            apart = self.white(hypothesis.rollouts(some, self.onset) - self._silent).reshape(len(some), -1)
+            apart = self._apart(apart)
+            # a start that overshoots still tells the direction
+            gains = _gained(apart**2, apart * e, self.onset is None, self.hypothesis.record)
+            k = int(gains.argmax())
+            if gains[k] > best:
+                best, at = float(gains[k]), some[k]
+        return best, at
+
+    def partners(
+        self, kinds: Sequence[type[Effect]], alone: Mapping[str, Mapping[str, float]], *, most: int, least: float
+    ) -> list[tuple[Hypothesis, Float]]:
+        """Hypotheses with one of `kinds` besides, and where to begin: the `most` best, of `least` nats or more."""
+        record, baseline, own = self.hypothesis.record, self.hypothesis.baseline, self.hypothesis.effects
+        pairs = [Hypothesis(record, (*own, kind), baseline) for kind in kinds if kind not in own]
+        scored = sorted(((*self.score(pair, alone), pair) for pair in pairs), key=lambda s: -s[0])
+        return [(pair, start) for gain, start, pair in scored[:most] if gain > least]
+
+
+def _gained(squares: Float, crosses: Float, onsets: bool, record: Record) -> Float:
+    """Nats (column,) along a direction of the best size, from rows' parts (column, row).
+
+    Over the whole drive or, with `onsets`, from any row on.
+    """
+    square, cross = (
+        x.reshape(len(x), -1, record.rows, record.group).sum((1, 3))[:, ::-1].cumsum(1)[:, ::-1]
+        for x in (squares, crosses)
+    )
+    gains = np.where(square > 1e-6, 0.5 * np.maximum(cross, 0) ** 2 / np.maximum(square, 1e-6), 0.0)
+    if not onsets:
+        return gains[:, 0]
+    late = gains[:, allowed(record.rows, record.dt)].max(1) - np.log(record.rows)
+    return np.maximum(gains[:, 0], late)
+
+
+def joint_fit(
+    hypothesis: Hypothesis, first: type[Effect], z: Float, onset: int | None, white: WhiteningFilter, *, onsets: bool
+) -> Screened:
+    """Where a pair comes to rest: from `z`, and with the `first` effect begun anew.
+
+    Fitted alone, the first has bent to what the second does, often over a hill.
+    """
+    values = {key: float(x[0]) for key, x in hypothesis.values(z[None]).items()}
+    anew = effect_starts(hypothesis, first.name)
+    begin = [z]
+    if len(anew) <= _MANY:
+        begin += [hypothesis.z_of({**values, **own, "K_L": k}) for own in anew for k in (values["K_L"], 1.0)]
+    found = screen(hypothesis, white, np.stack(begin), onsets=onsets and onset is None, keep=2)
+    if onset is not None or len(begin) > 1:
+        found.append(converge(hypothesis, white, z, onset))
+    return max(found, key=lambda look: look.value)
+
+
+def exchanged(
+    pair: Screened,
+    kinds: Sequence[type[Effect]],
+    white: WhiteningFilter,
+    alone: Mapping[str, Mapping[str, float]],
+    *,
+    tries: int,
+) -> list[Screened]:
+    """The best pairs that keep one half of `pair` and have another effect in the place of the other."""
+    record, baseline = pair.hypothesis.record, pair.hypothesis.baseline
+    values = {key: float(x[0]) for key, x in pair.hypothesis.values(pair.z[None]).items()}
+    out = []
+    for kept in pair.hypothesis.effects:
+        base = Hypothesis(record, (kept,), baseline)
+        own = {k: v for k, v in values.items() if "." not in k or k.startswith(f"{kept.name}.")}
+        here = Base(base, base.z_of(own), own, pair.onset, white)
+        others = [kind for kind in kinds if kind not in pair.hypothesis.effects]
+        for hypothesis, start in here.partners(others, alone, most=tries, least=2.0):
+            out.append(refine(converge(hypothesis, white, start, pair.onset), white))
+    return sorted(out, key=lambda look: -look.value)

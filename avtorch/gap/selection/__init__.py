@@ -1,0 +1,1 @@
+"""Which hypothesis a log supports: probabilities, adequacy, alias sets, the verdict."""

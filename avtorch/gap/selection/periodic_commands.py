@@ -1,0 +1,71 @@
+"""What a command that repeats itself leaves open: a delay is known only up to the period, and may be none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from avtorch.gap.search.fitted_model import FittedModel
+from avtorch.gap.selection.verdict import Verdict
+
+_NAMED = 4  # delays
+
+
+def untold(found: Iterable[FittedModel]) -> dict[str, FittedModel]:
+    """Finds, by name, whose delay may as well be none."""
+    return {f.name: f for f in found if f.delays is not None and f.delays.untold}
+
+
+def shared(chances: Mapping[str, float], untold: Mapping[str, FittedModel]) -> dict[str, float]:
+    """Probabilities in which the share of a delay within a row of none is that of the find without a delay."""
+    out = dict(chances)
+    for name, f in untold.items():
+        assert f.delays is not None
+        if not out.get(f.delays.without):
+            continue  # ruled out by the prior
+        part = chances[name] * f.delays.none
+        out[name] -= part
+        out[f.delays.without] += part
+    return out
+
+
+def joined(aliases: Sequence[str], untold: Mapping[str, FittedModel]) -> list[str]:
+    """An alias set, the verdict first, with the delay that the verdict may hide, or the cause without one."""
+    more = []
+    for name, f in untold.items():
+        assert f.delays is not None
+        pair = (name, f.delays.without)
+        if aliases[0] in pair:
+            more += pair
+    return list(dict.fromkeys([*aliases, *more]))
+
+
+def why(chances: Mapping[str, float], untold: Mapping[str, FittedModel]) -> str | None:
+    """The verdict's sentence, where it is one of two that differ by a delay only; None elsewhere."""
+    first = max(chances, key=lambda name: chances[name])
+    for name, f in untold.items():
+        assert f.delays is not None
+        if first in (name, f.delays.without):
+            apart = f"{f.delays.without} and {name} are not told apart"
+            return f"{_repeats(f)}, so {apart}; {first} has probability {chances[first]:.3g}."
+    return None
+
+
+def notes(found: Iterable[FittedModel], verdict: Verdict) -> list[str]:
+    """What the verdict, or its alias, does not know of its delay, and what would tell."""
+    for f in found:
+        if f.delays is None or f.name not in verdict.alias_set:
+            continue
+        if len(f.delays.lengths) > 1 or f.delays.untold:
+            return [f"{_repeats(f)}: drive with a command that does not repeat to learn the delay."]
+    return []
+
+
+def _repeats(found: FittedModel) -> str:
+    given = found.delays
+    assert given is not None
+    if len(given.lengths) == 1:
+        return f"The command repeats every {given.period:.3g} s, under which a delay and a longer lag look alike"
+    named = [f"{x:.3f}" for x in given.lengths[:_NAMED]]
+    more = len(given.lengths) - _NAMED
+    listing = ", ".join(named) + (f" s and {more} more" if more > 0 else " s")
+    return f"The command repeats every {given.period:.3g} s, and delays of {listing} fit alike"

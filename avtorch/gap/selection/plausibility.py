@@ -1,0 +1,48 @@
+"""Is an answer physically possible? What a fit makes of a parameter, against what such a parameter can be at all.
+
+A cause that wins far outside its range is a finding in itself: the name is right about the shape of the gap and wrong
+about what makes it. Said is that once the whole central 90 % lies outside, so that a wide posterior is no accusation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from avtorch.gap.quantity import Quantity, unit_of
+from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.plant import BASELINE
+
+
+def implausible(
+    parameters: Mapping[str, Quantity],
+    moved: Mapping[str, Quantity],
+    effects: Iterable[type[Effect]] = (),
+) -> tuple[str, ...]:
+    """A sentence for each parameter whose central 90 % lies outside what is physically possible.
+
+    `parameters` of a candidate's `effects`, by their own names or as `effect.parameter`; `moved`: T_L [s] and K_L.
+    """
+    told = []
+    for effect in effects:
+        for p in (*effect.parameters, *effect.derived):
+            q = parameters.get(f"{effect.name}.{p.name}", parameters.get(p.name))
+            if q is not None and (p.reported or p in effect.derived) and outside(p, q):
+                told.append(f"{_sentence(f'{effect.name}.{p.name}', p, q)}; something else is hidden in it.")
+    told += [
+        f"{_sentence(p.name, p, moved[p.name])}." for p in BASELINE if p.name in moved and outside(p, moved[p.name])
+    ]
+    return tuple(told)
+
+
+def outside(parameter: Parameter, q: Quantity) -> bool:
+    """Whether the central 90 % has nothing in common with what is possible."""
+    low, high = parameter.physical
+    return q.q95 < low or q.q05 > high
+
+
+def _sentence(name: str, p: Parameter, q: Quantity) -> str:
+    unit = unit_of(p.name)
+    low, high = p.physical
+    why = p.beyond or f"possible are {low:.2g} to {high:.2g}"
+    return f"{name} is {q.mean:.2g}{'' if unit == '-' else ' ' + unit}, typical {p.low:.2g} to {p.high:.2g}: {why}"

@@ -1,0 +1,178 @@
+"""Candidate causes, their probabilities, and the verdict drawn from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from avtorch.errors import InputError
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.simulator.effect import EFFECTS
+
+ALWAYS = ("none", "unknown")
+LEAST_LISTED = 1e-4
+"""Candidates less probable than this are left out of an answer; `none` and `unknown` never are."""
+
+
+def candidate_name(names: str | Iterable[str]) -> str:
+    """The one way to write a candidate: its effects in alphabetical order, joined by `+`."""
+    return "+".join(sorted(names.split("+") if isinstance(names, str) else names))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A cause: `"none"`, `"unknown"`, an effect, or two (`"a+b"`, in alphabetical order).
+
+    `log_evidence` [nats] relative to `none`, free of the prior over causes; None for `unknown`. `parameters` by the
+    table's names, those of a pair as `effect.parameter`; `moved`: the baseline's `T_L` [s] and `K_L` [-] with this
+    candidate in. `onset_s` on the log's own clock; None where the effect was there from the start. `implausible`:
+    a sentence for each parameter outside what is physically possible (`plausible.implausible`).
+    """
+
+    name: str
+    probability: float
+    log_evidence: float | None = None
+    parameters: Mapping[str, Quantity] = field(default_factory=dict)
+    moved: Mapping[str, Quantity] = field(default_factory=dict)
+    onset_s: float | None = None
+    implausible: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.name != candidate_name(self.name):
+            raise InputError(f"candidate: found {self.name!r}, needs {candidate_name(self.name)!r}")
+        if not 0 <= self.probability <= 1 + 1e-9:
+            raise InputError(f"{self.name}: found probability {self.probability!r}, needs 0 to 1")
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """The effects in it: none, one or two."""
+        return () if self.name in ALWAYS else tuple(self.name.split("+"))
+
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `effects`."""
+        return {
+            "name": self.name,
+            "probability": self.probability,
+            "log_evidence": self.log_evidence,
+            "parameters": plain(self.parameters),
+            "moved": plain(self.moved),
+            "onset_s": self.onset_s,
+            **plausibility(self.implausible),
+        }
+
+
+def plausibility(implausible: Sequence[str]) -> dict[str, Any]:
+    """The keys `plausible` and, where it is not, `plausibility`: why not."""
+    return {"plausible": not implausible, "plausibility": " ".join(implausible) or None}
+
+
+def listed(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
+    """As an answer lists them: the improbable left out, renormalised to a sum of 1, the most probable first.
+
+    Raises `InputError` where `none` or `unknown` is missing, a name comes twice, or no probability is above 0.
+    """
+    given = list(candidates)
+    names = [c.name for c in given]
+    if len(set(names)) < len(names) or not set(ALWAYS) <= set(names):
+        raise InputError(f"candidates: found {', '.join(names)}, needs none and unknown and each name once")
+    # the improbable are told by their share, so that weights need not be normalised
+    total = math.fsum(c.probability for c in given)
+    if not total > 0:
+        raise InputError("candidates: found no probability above 0, needs one")
+    kept = [c for c in given if c.name in ALWAYS or c.probability >= LEAST_LISTED * total]
+    total = math.fsum(c.probability for c in kept)
+    kept.sort(key=lambda c: -c.probability)
+    shares = [c.probability / total for c in kept]
+    shares[0] = 1 - math.fsum(shares[1:])
+    return tuple(replace(c, probability=share) for c, share in zip(kept, shares, strict=True))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is named, and what it cannot be told apart from.
+
+    `names`: `("none",)`, `("unknown",)`, or one or two effects, the most probable. `alias_set`: the candidates that
+    cannot be told apart on this log, the verdict among them. `abstained`: it is `unknown`. `why`: one sentence.
+    """
+
+    names: tuple[str, ...]
+    alias_set: tuple[str, ...]
+    abstained: bool
+    why: str
+
+    @property
+    def name(self) -> str:
+        """The verdict as a candidate's name."""
+        return candidate_name(self.names)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "names": list(self.names),
+            "alias_set": list(self.alias_set),
+            "abstained": self.abstained,
+            "why": self.why,
+        }
+
+
+ALIAS_RATIO = 0.03
+"""Candidates at least this probable, in units of the most probable one, are not told apart from it."""
+UNKNOWN_RATIO = 0.5
+"""The same for `unknown`. It foretells nothing, so no log ever rules it out: below this it is a doubt, no rival."""
+
+
+def near(ratio: float, unknown: float = UNKNOWN_RATIO) -> Callable[[Sequence[Candidate]], tuple[str, ...]]:
+    """An alias set by probability: all candidates at least `ratio` as probable as the first, that one in front.
+
+    For `unknown` it takes the ratio `unknown`.
+    """
+
+    def aliases(candidates: Sequence[Candidate]) -> tuple[str, ...]:
+        ranked = sorted(candidates, key=lambda c: -c.probability)
+        first = ranked[0].probability
+        return tuple(c.name for c in ranked if c.probability >= (unknown if c.name == "unknown" else ratio) * first)
+
+    return aliases
+
+
+def verdict_of(
+    candidates: Iterable[Candidate],
+    *,
+    aliases: Callable[[Sequence[Candidate]], Iterable[str]] | None = None,
+    why: str | None = None,
+    known: str = "known effect",
+) -> Verdict:
+    """The most probable candidate.
+
+    `aliases` says which names cannot be told apart (the verdict's is put in front; default `near(ALIAS_RATIO)`);
+    `why` defaults to a sentence on evidence and runner-up, in which `known` is what was tried.
+    """
+    ranked = listed(candidates)
+    first = ranked[0]
+    others = [name for name in map(candidate_name, (aliases or near(ALIAS_RATIO))(ranked)) if name != first.name]
+    names = first.effects or (first.name,)
+    return Verdict(names, (first.name, *dict.fromkeys(others)), first.name == "unknown", why or _why(ranked, known))
+
+
+def _why(ranked: Sequence[Candidate], known: str) -> str:
+    first, second = ranked[0], ranked[1]
+    rival = f"next is {second.name} with probability {second.probability:.3g}"
+    if first.name == "none":
+        which = "effect" if known == "known effect" else known
+        return f"No {which} explains the log better than the baseline does; {rival}."
+    if first.name == "unknown":
+        return f"No {known} leaves a remainder that could be noise; {rival}."
+    gain = "" if first.log_evidence is None else f" explains the log {first.log_evidence:.0f} nats better than none and"
+    return f"{first.name}{gain} has probability {first.probability:.3g}; {rival}."
+
+
+def plain(quantities: Mapping[str, Quantity]) -> dict[str, dict[str, float]]:
+    """For a JSON answer."""
+    return {name: quantity.to_dict() for name, quantity in quantities.items()}
+
+
+def meanings(name: str) -> str:
+    """What the effects of a candidate do, in words; empty for an effect that is not registered."""
+    known = [EFFECTS[n].meaning for n in candidate_name(name).split("+") if n in EFFECTS]
+    return ", and ".join(known)

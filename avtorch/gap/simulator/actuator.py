@@ -1,0 +1,240 @@
+"""The actuator between command and body: what it does over a step in which its target and lag are held.
+
+    first order     T a' + a = g                        (Eq. 1; g = K u)
+    rate-limited    a' = (g - a) / T within ± jerk
+    second order    tau² a'' + T a' + a = g             (first order at tau = 0)
+
+A step has one part, or two where a late command switches within it. Each part is integrated exactly, for the
+acceleration, its integral and its double integral. The same formulas serve one step (...) and whole drives
+(..., time): first and second order by scans, the rate limit row by row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from avtorch.gap.simulator.nonlinear_recursion import solve
+from avtorch.gap.simulator.rate_limited import by_rows, limited_row, slewed_row
+from avtorch.gap.simulator.recursion import scan, scan_pair
+from avtorch.vehicle.glvd import motion_coefficients
+
+_NO_LIMIT = 1e9  # [m/s³], stands for infinity where infinity times a part of length 0 would be undefined
+
+
+@dataclass(frozen=True)
+class Substep:
+    """Part of a step: `target` g [m/s²], `lag` T [s], `length` [s]; (...) or (..., time)."""
+
+    target: Tensor
+    lag: Tensor
+    length: Tensor
+
+    def rows(self, rows: slice) -> Substep:
+        return Substep(*(x[..., rows] if x.dim() and x.shape[-1] > 1 else x for x in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class ActuatorState:
+    """`accel` [m/s²]; of second order also `swing` = tau² a' [m/s² s] and the slewed `target`."""
+
+    accel: Tensor
+    swing: Tensor | None = None
+    target: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """`tau` [s] None: first order. `jerk` [m/s³] None: no limit; behind a second order it slews the target."""
+
+    tau: Tensor | None = None
+    jerk: Tensor | None = None
+
+    def settled(self, accel: Tensor) -> ActuatorState:
+        """At rest at `accel`."""
+        if self.tau is None:
+            return ActuatorState(accel)
+        return ActuatorState(accel, torch.zeros_like(accel), accel)
+
+    def step(self, state: ActuatorState, parts: list[Substep]) -> tuple[ActuatorState, Tensor, Tensor]:
+        """State after a step, what it adds to the speed [m/s], and to the position besides `speed dt` [m]."""
+        gained = moved = torch.zeros_like(state.accel)
+        for part in parts:
+            state, speed, place = self._part(state, part)
+            moved = moved + gained * part.length + place
+            gained = gained + speed
+        return state, gained, moved
+
+    def over(self, accel0: Tensor, parts: list[Substep]) -> tuple[Tensor, Tensor]:
+        """Accelerations (..., time) from `accel0` (...), and what each step adds to the speed (..., time - 1).
+
+        `parts` hold the targets of all rows (the last one's is not needed); settled before the first row.
+        """
+        steps = parts[0].target.shape[-1] - 1
+        parts = [part.rows(slice(0, steps)) for part in parts]
+        if self.tau is not None:
+            return self._second_over(accel0, parts)
+        if self.jerk is None:
+            return _first_over(accel0, parts)
+        jerk = self.jerk
+
+        def step(before: Tensor, rows: slice) -> tuple[Tensor, Tensor]:
+            slope = torch.ones_like(before)
+            for part in parts:
+                before, own = _limited(before, part.rows(rows), jerk)[:2]
+                slope = slope * own
+            return before, slope
+
+        # row by row without derivatives, which a round of Newton's method then gives
+        a = _joined(accel0, solve(step, accel0, by_rows(limited_row, accel0, parts, jerk)))
+        at, gained = a[..., :-1], torch.zeros_like(a[..., 1:])
+        for part in parts:
+            at, _, speed, _ = _limited(at, part, jerk)
+            gained = gained + speed
+        return a, gained
+
+    def _part(self, state: ActuatorState, part: Substep) -> tuple[ActuatorState, Tensor, Tensor]:
+        g, T, h = part.target, part.lag, part.length
+        if self.tau is None:
+            if self.jerk is None:
+                alpha, m1, m2 = motion_coefficients(T, h)  # type: ignore[arg-type]
+                d = state.accel - g
+                return ActuatorState(g + alpha * d), h * g + m1 * d, 0.5 * h * h * g + m2 * d
+            accel, _, speed, place = _limited(state.accel, part, self.jerk)
+            return ActuatorState(accel), speed, place
+        assert state.swing is not None
+        slewed = state.target
+        if self.jerk is not None:
+            assert slewed is not None
+            slewed, _, g = _slewed(slewed, part, self.jerk)
+        m00, m01, m10, m11 = modes_over(self.tau, T, h)
+        d, w = state.accel - g, state.swing
+        accel, swing = g + m00 * d + m01 * w, m10 * d + m11 * w
+        speed = g * h - T * (accel - state.accel) - (swing - w)
+        place = 0.5 * g * h * h - T * (speed - state.accel * h)
+        place = place - (self.tau * self.tau * (accel - state.accel) - w * h)
+        return ActuatorState(accel, swing, slewed), speed, place
+
+    def _second_over(self, accel0: Tensor, parts: list[Substep]) -> tuple[Tensor, Tensor]:
+        assert self.tau is not None
+        if self.jerk is not None:
+            parts = _slewed_over(accel0, parts, self.jerk)
+        maps = []
+        for part in parts:
+            m = modes_over(self.tau, part.lag, part.length)
+            maps.append((m, ((1 - m[0]) * part.target, -m[2] * part.target)))
+        (m, b), *more = maps
+        for n, c in more:
+            b = (n[0] * b[0] + n[1] * b[1] + c[0], n[2] * b[0] + n[3] * b[1] + c[1])
+            m = (
+                n[0] * m[0] + n[1] * m[2],
+                n[0] * m[1] + n[1] * m[3],
+                n[2] * m[0] + n[3] * m[2],
+                n[2] * m[1] + n[3] * m[3],
+            )
+        rest = torch.zeros_like(accel0)
+        a, w = scan_pair(m, b, (accel0, rest))
+        a, w = _joined(accel0, a), _joined(rest, w)
+        at, swing, gained = a[..., :-1], w[..., :-1], torch.zeros_like(a[..., 1:])
+        for part, (own, add) in zip(parts, maps, strict=True):
+            after = own[0] * at + own[1] * swing + add[0]
+            swung = own[2] * at + own[3] * swing + add[1]
+            gained = gained + part.target * part.length - part.lag * (after - at) - (swung - swing)
+            at, swing = after, swung
+        return a, gained
+
+
+def _joined(first: Tensor, later: Tensor) -> Tensor:
+    return torch.cat([first.expand(later.shape[:-1])[..., None], later], -1)
+
+
+def _first_over(accel0: Tensor, parts: list[Substep]) -> tuple[Tensor, Tensor]:
+    alpha, beta = None, torch.zeros(())
+    for part in parts:
+        ratio = part.length / part.lag
+        keep, give = torch.exp(-ratio), -torch.expm1(-ratio)
+        alpha = keep if alpha is None else alpha * keep
+        beta = keep * beta + give * part.target
+    assert alpha is not None
+    a = _joined(accel0, scan(alpha if alpha.dim() else alpha[None], beta, accel0))
+    at, gained = a[..., :-1], torch.zeros_like(a[..., 1:])
+    for i, part in enumerate(parts):
+        last = i == len(parts) - 1
+        after = a[..., 1:] if last else at - torch.expm1(-part.length / part.lag) * (part.target - at)
+        gained = gained + part.target * part.length - part.lag * (after - at)
+        at = after
+    return a, gained
+
+
+def _limited(a: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Rate-limited part from `a`: acceleration after it, its slope in `a`, what speed and position gain."""
+    g, T, h = part.target, part.lag, part.length
+    J = jerk.clamp_max(_NO_LIMIT)
+    d = g - a
+    at_limit = torch.minimum((d.abs() / J - T).clamp_min(0.0), h)  # so long at the limit, then exponential
+    cut = torch.sign(d) * J * at_limit
+    rest, left = h - at_limit, d - cut
+    alpha, m1, m2 = motion_coefficients(T, rest)  # type: ignore[arg-type]
+    first = a * at_limit + 0.5 * cut * at_limit
+    place = at_limit * at_limit * (0.5 * a + cut / 6) + first * rest
+    place = place + 0.5 * rest * rest * g - m2 * left
+    return g - left * alpha, alpha, first + rest * g - m1 * left, place
+
+
+def _slewed(r: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Target after a part, slewed from `r` at no more than `jerk`; its slope in `r`; its mean over the part."""
+    h, J = part.length, jerk.clamp_max(_NO_LIMIT)
+    d = part.target - r
+    moving = torch.minimum(d.abs() / J, h)
+    after = r + torch.maximum(torch.minimum(d, J * h), -J * h)
+    # over the part it misses the target by a trapezium that shrinks while it moves, and by what is left after
+    missed = moving * 0.5 * (d + part.target - after) + (h - moving) * (part.target - after)
+    mean = part.target - torch.where(h > 0, missed / torch.where(h > 0, h, 1.0), 0.0)
+    return after, (d.abs() > J * h).to(r.dtype), mean
+
+
+def _slewed_over(accel0: Tensor, parts: list[Substep], jerk: Tensor) -> list[Substep]:
+    def step(before: Tensor, rows: slice) -> tuple[Tensor, Tensor]:
+        slope = torch.ones_like(before)
+        for part in parts:
+            before, own, _ = _slewed(before, part.rows(rows), jerk)
+            slope = slope * own
+        return before, slope
+
+    guess = by_rows(slewed_row, accel0, parts, jerk)
+    ends = _joined(accel0, solve(step, accel0, guess))
+    at, out = ends[..., :-1], []
+    for part in parts:
+        at, _, mean = _slewed(at, part, jerk)
+        out.append(Substep(mean, part.lag, part.length))
+    return out
+
+
+def modes_over(tau: Tensor, T: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Matrix over `h` on `(a - g, tau² a')`; regular at tau = 0 and at critical damping, as are its derivatives."""
+    square = tau * tau
+    bend = T * T - 4 * square
+    # (difference of the poles times h / 2)², where small taken by its series
+    small = bend.abs() * h * h < 4e-4 * square * square
+    real, complex_ = (bend > 0) & ~small, (bend <= 0) & ~small
+    root = torch.sqrt(torch.where(small, 1.0, bend.abs()))
+    slow = torch.exp(-2 * h / (T + torch.where(real, root, 0.0)))
+    safe = square.clamp_min(1e-12)
+    fast = torch.exp(-h * (T + torch.where(real, root, 0.0)) / (2 * safe))
+    envelope = torch.exp(-h * T / (2 * safe))
+    angle = torch.where(complex_, h * root / (2 * safe), 0.0)
+    x = torch.where(small, bend * h * h / (4 * safe * safe), 0.0)
+    C = torch.where(
+        real,
+        0.5 * (slow + fast),
+        envelope * torch.where(small, 1 + x / 2 + x * x / 24, torch.cos(angle)),
+    )
+    S = torch.where(
+        real,
+        (slow - fast) / root,
+        envelope * torch.where(small, h / safe * (1 + x / 6 + x * x / 120), 2 * torch.sin(angle) / root),
+    )
+    half = 0.5 * T * S
+    return C + half, S, -square * S, C - half

@@ -1,0 +1,241 @@
+"""The contract of an effect: something the car does that the simulator does not.
+
+An effect is a frozen dataclass whose fields are its parameters, floats or tensors. It sits at one place in the chain
+command → actuator → body → sensor, and its one hook means there:
+
+| place    | hook receives                        | and returns                                               |
+|----------|--------------------------------------|-----------------------------------------------------------|
+| command  | command [m/s²]                       | command [m/s²]                                            |
+| actuator | command [m/s²] as it arrives         | `(gain, lag)`, factors on K_L and T_L                     |
+| body     | acceleration of the actuator [m/s²]  | additional acceleration of the car [m/s²]                 |
+| sensor   | acceleration of the car [m/s²]       | acceleration shown [m/s²]                                 |
+
+Without memory the hook is `apply(x, row)`, and one definition serves a single step of a simulation and a whole drive
+at once: only the shapes differ. With memory (`memory = True`) it is `start` and `advance`, one row at a time, and
+`over`, a whole drive; `over` may be left out, then rows are looped over: right, but slow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from difflib import get_close_matches
+from typing import Any, ClassVar, Literal, Self, TypeVar
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError, quoted
+from avtorch.gap.simulator.domain import Domain
+from avtorch.gap.simulator.parameter import Parameter
+from avtorch.vehicle.arguments import Number, tensor
+
+Place = Literal["command", "actuator", "body", "sensor"]
+PLACES: tuple[Place, ...] = ("command", "actuator", "body", "sensor")
+"""Places in the chain, in its order."""
+
+_LARGEST = 1e12  # of a number in a text whose domain nobody said
+_NAME = 60  # characters of a name that may be an effect's, mistyped
+
+
+@dataclass(frozen=True)
+class Row:
+    """What an effect may look at besides its input: one row (...) while simulating, whole drives (..., time) else.
+
+    `time` [s] and step `dt` [s] to the next row; `position` [m] since the drive's start; the baseline's `T_L` [s],
+    `K_L` [-]; `normal`, standard normal draws for an effect that samples, None where the response is deterministic.
+    """
+
+    time: Tensor
+    dt: Tensor
+    measured_speed: Tensor | None
+    travelled: Tensor | None
+    T_L: Tensor
+    K_L: Tensor
+    normal: Tensor | None = None
+    whole: bool = True
+
+    @property
+    def speed(self) -> Tensor:
+        """[m/s], not below 0; measured, where the drive is a log. Raises `InputError` where it was not."""
+        if self.measured_speed is None:
+            raise InputError("speed: not in the drive, needed by an effect that depends on it")
+        return self.measured_speed.clamp_min(0.0)
+
+    @property
+    def position(self) -> Tensor:
+        """[m], the measured speed integrated. Raises `InputError` where it was not measured."""
+        if self.travelled is None:
+            raise InputError("speed: not in the drive, needed by an effect that depends on position")
+        return self.travelled
+
+
+@dataclass(frozen=True)
+class NoiseChange:
+    """What a random effect does to the noise model, its deterministic response being none.
+
+    `force_sd` [m/s²] and `force_time` [s]: a coloured (Ornstein-Uhlenbeck) acceleration of the body, in both
+    channels. `tail_fraction` of the accelerometer's samples has `tail_scale` times its standard deviation more.
+    `command_variance` (..., time) [(m/s²)²]: mean square of what the command acting in a row differs from the one
+    logged there, independent from row to row.
+
+    By this a diagnosis finds the effect: its parameters are fitted with those of the candidate and of the noise, by
+    the likelihood under the changed noise. A candidate says one of the three: a force, tails, or a command's variance.
+    """
+
+    force_sd: Number | None = None
+    force_time: Number | None = None
+    tail_fraction: Number | None = None
+    tail_scale: Number | None = None
+    command_variance: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Base of all effects; see the module for the hooks. `order` sorts effects at the same place.
+
+    `gravity`: a force of the body that an accelerometer does not feel (see `Drive.specific_force`). `derived`: what
+    `report` names in place of coordinates that are not reported, with typical and possible ranges. `shift`: the
+    parameter [s], if there is one, by which it makes commands late and does nothing else. `settings`: what fields that
+    are no parameters may hold in a text; a field without a domain takes any single finite number.
+    """
+
+    name: ClassVar[str]
+    place: ClassVar[Place]
+    meaning: ClassVar[str]
+    equation: ClassVar[str]
+    parameters: ClassVar[tuple[Parameter, ...]]
+    settings: ClassVar[tuple[Domain, ...]] = ()
+    order: ClassVar[int] = 0
+    memory: ClassVar[bool] = False
+    random: ClassVar[bool] = False
+    needs_speed: ClassVar[bool] = False
+    gravity: ClassVar[bool] = False
+    derived: ClassVar[tuple[Parameter, ...]] = ()
+    shift: ClassVar[str | None] = None
+
+    # the hook ------------------------------------------------------------------------------------------------------
+    def apply(self, x: Tensor, row: Row) -> Any:
+        """The effect without memory."""
+        raise NotImplementedError(f"{type(self).__name__} has neither apply nor advance")
+
+    def start(self, x: Tensor, row: Row) -> Any:
+        """State before the first row, settled at input `x` (...)."""
+        return None
+
+    def advance(self, x: Tensor, row: Row, state: Any) -> tuple[Any, Any]:
+        """Output of this row and the state after it."""
+        return self.apply(x, row), state
+
+    def over(self, x: Tensor, row: Row) -> Any:
+        """Output over whole drives, `x` (..., time)."""
+        if not self.memory:
+            return self.apply(x, row)
+        state, outputs = self.start(x[..., 0], row_at(row, 0)), []
+        for k in range(x.shape[-1]):
+            y, state = self.advance(x[..., k], row_at(row, k), state)
+            outputs.append(y)
+        if isinstance(outputs[0], tuple):
+            return tuple(_stacked([tensor(y[i]) for y in outputs]) for i in range(len(outputs[0])))
+        return _stacked(outputs)
+
+    # around it -----------------------------------------------------------------------------------------------------
+    def noise(self, u: Tensor) -> NoiseChange | None:
+        """What it adds to the noise model under commands `u` (..., time): a random effect's evidence is found by it.
+
+        None for a deterministic effect.
+        """
+        return None
+
+    def coordinates(self) -> tuple[Parameter, ...]:
+        """The parameters of a fit; as `parameters`, unless settings of this very effect enter them."""
+        return self.parameters
+
+    def prepared(self, time: Tensor, speed: Tensor | None, position: Tensor | None) -> Self:
+        """This effect with the settings it takes from a drive (mean speed, span), each (time,)."""
+        return self
+
+    def drawn(self, generator: torch.Generator | None) -> Self:
+        """This effect with whatever is drawn once a drive, drawn."""
+        return self
+
+    def lag_apart(self) -> tuple[Self, Tensor | None]:
+        """This effect without what it says about the plant's `T_L` [s], and that `T_L`; None where it says nothing."""
+        return self, None
+
+    def report(self, T_L: Tensor) -> dict[str, Tensor]:
+        """The parameters as the answer names them, given the plant's lag."""
+        return {p.name: tensor(getattr(self, p.name)) for p in self.coordinates() if p.reported}
+
+    def values(self) -> dict[str, Tensor]:
+        """The fit's coordinates by name; one not given (None) is left out."""
+        named = {p.name: getattr(self, p.name) for p in self.coordinates()}
+        return {name: tensor(value) for name, value in named.items() if value is not None}
+
+    def replaced(self, values: Mapping[str, Any]) -> Self:
+        """With other values. Raises `InputError` for a name that is no field of the effect."""
+        known = {f.name for f in fields(self)}
+        for name in values:
+            if name not in known:
+                raise InputError(f"{self.name}: found {quoted(name)}, needs one of {', '.join(sorted(known))}")
+        return replace(self, **values)
+
+    @classmethod
+    def neutral(cls) -> Self:
+        """The effect that does nothing: the plant is then GLVD to machine precision."""
+        return cls(**{p.name: p.neutral for p in cls.parameters if p.neutral is not None})
+
+    @classmethod
+    def domains(cls) -> dict[str, Domain]:
+        """What each field may hold in a text, and each other name that `of` takes."""
+        anything = {f.name: Domain(f.name, -_LARGEST, _LARGEST) for f in fields(cls)}
+        return anything | {p.name: Domain.of(p) for p in cls.parameters} | {s.name: s for s in cls.settings}
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Self:
+        """From parameters as the answer names them. Raises `InputError` for other names."""
+        known = {f.name for f in fields(cls)}
+        for name in values:
+            if name not in known:
+                raise InputError(f"{cls.name}: found {quoted(name)}, needs one of {', '.join(sorted(known))}")
+        return cls(**values)
+
+
+def _stacked(rows: list[Tensor]) -> Tensor:
+    return torch.stack(torch.broadcast_tensors(*rows), -1)
+
+
+def row_at(row: Row, k: int) -> Row:
+    """One row of a whole drive."""
+
+    def pick(x: Tensor | None) -> Any:
+        return None if x is None else x if x.dim() == 0 else x[..., 0 if x.shape[-1] == 1 else k]
+
+    parts = (row.time, row.dt, row.measured_speed, row.travelled, row.T_L, row.K_L, row.normal)
+    return Row(*(pick(x) for x in parts), whole=False)
+
+
+EFFECTS: dict[str, type[Effect]] = {}
+"""Registered effects by name."""
+
+E = TypeVar("E", bound=type[Effect])
+
+
+def register(cls: E) -> E:
+    """Make an effect known by its name (in strings, TOML files and searches). Raises `InputError` if it is taken."""
+    if cls.place not in PLACES:
+        raise InputError(f"{cls.name}: found place {cls.place!r}, needs one of {', '.join(PLACES)}")
+    if EFFECTS.get(cls.name, cls).__qualname__ != cls.__qualname__:
+        raise InputError(f"{cls.name}: another effect has this name")
+    EFFECTS[cls.name] = cls
+    return cls
+
+
+def effect_class(name: str, more: Iterable[type[Effect]] = ()) -> type[Effect]:
+    """The effect called `name`, among those registered and `more`. Raises `InputError` if there is none."""
+    known = {**EFFECTS, **{cls.name: cls for cls in more}}
+    if name not in known:
+        close = get_close_matches(name[:_NAME], known, n=1)
+        need = f"an effect's name; perhaps {close[0]}" if close else f"one of {', '.join(sorted(known))}"
+        raise InputError(f"effect: found {quoted(name)}, needs {need}")
+    return known[name]

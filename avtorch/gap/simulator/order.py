@@ -1,0 +1,58 @@
+"""The chain's order, and how the effects before the actuator make up what it is asked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from torch import Tensor
+
+from avtorch.gap.simulator.actuator import Actuator, Substep
+from avtorch.gap.simulator.effect import PLACES, Effect, Place, Row
+from avtorch.vehicle.arguments import tensor
+
+Hook = Callable[[Effect, Tensor], Any]
+"""How an effect with memory is run: `hook(effect, x) -> output`, for one row or a whole drive."""
+
+
+def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
+    """Effects by place, then by their own order."""
+    return tuple(sorted(effects, key=lambda e: (PLACES.index(e.place), e.order, e.name)))
+
+
+def at_place(effects: Iterable[Effect], place: Place) -> list[Effect]:
+    """The effects that sit there, in order."""
+    return [e for e in effects if e.place == place]
+
+
+def substeps(effects: Iterable[Effect], u: Tensor, row: Row, hook: Hook) -> list[Substep]:
+    """Targets, lags and lengths of each step's parts: the command through its effects, then gains and lags."""
+    late, early, first = u, None, None
+    for e in at_place(effects, "command"):
+        out = hook(e, late)
+        if isinstance(out, tuple):
+            early, late, first = out
+        else:
+            late = out
+    pieces = [(late, row.dt)]
+    if early is not None and first is not None:
+        pieces = [(early, first), (late, row.dt - first)]
+    once = {e.name: hook(e, late) for e in at_place(effects, "actuator") if e.memory}
+    parts = []
+    for command, length in pieces:
+        gain, lag = row.K_L, row.T_L
+        for e in at_place(effects, "actuator"):
+            more, slower = once[e.name] if e.memory else e.apply(command, row)
+            gain, lag = gain * more, lag * slower
+        parts.append(Substep(gain * command, lag, length))
+    return parts
+
+
+def actuator_of(effects: Iterable[Effect]) -> Actuator:
+    """What moves to the target: first order, unless effects say otherwise."""
+    known = {e.name: e for e in effects}
+    second, limit = known.get("second_order_actuator"), known.get("rate_limit")
+    return Actuator(
+        None if second is None else tensor(second.inverse_frequency_s),  # type: ignore[attr-defined]
+        None if limit is None else tensor(limit.jerk_max_mps3),  # type: ignore[attr-defined]
+    )

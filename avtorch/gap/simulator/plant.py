@@ -1,0 +1,219 @@
+"""A simulator out of effects: GLVD, and what the car does besides.
+
+`plant([DeadTime(0.2), AerodynamicDrag()])` composes them in the chain's order. The result answers whole drives
+(`response`, batched over parameters, differentiable) and drives in `avtorch.simulate` step by step (`step`).
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Mapping, Sequence
+from os import PathLike
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError, quoted
+from avtorch.gap.simulator.drive import Drive, Response
+from avtorch.gap.simulator.effect import Effect, NoiseChange
+from avtorch.gap.simulator.order import in_order
+from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.plant_text import Described, described, names_a_file, read_file, to_toml
+from avtorch.gap.simulator.rollout import rollout
+from avtorch.gap.simulator.stepping import Past, begin, goes_on, move
+from avtorch.vehicle.arguments import Number, checked, tensor
+from avtorch.vehicle.plant import Motion
+
+BASELINE = (
+    Parameter(  # log-normal, median 0.3, log sd 0.7
+        "T_L",
+        "s",
+        None,
+        0.3 * 0.408,
+        0.3 * 2.452,
+        possible=(0.02, 5.0),
+        beyond="no actuator is that quick or that slow",
+    ),
+    Parameter(  # log-normal, median 1, log sd 0.3
+        "K_L", "-", None, 0.681, 1.469, possible=(0.3, 3.5), beyond="no actuator makes that of a command in m/s²"
+    ),
+)
+"""Parameters of the baseline, with their priors.
+
+Possible are lags from an electric motor's torque control with its driveline (some 20 ms) to a laden truck's engine and
+air brakes (seconds), and gains as far from 1 as a truck's mass changes between empty and laden (some three times).
+"""
+
+
+class GapPlant:
+    """A plant with `effects`, `T_L` [s], `K_L` [-], jerk noise `sigma` [m/s³]; made by `plant`.
+
+    For the loop it is a `Plant`: the acceleration it returns is the *measured* one, so logs and controllers see the
+    sensor's faults, while the car moves by the true one. It remembers the drive (commands under way, position, time
+    since its first step) for as long as it is handed back the acceleration it gave, as a loop does; any other
+    acceleration starts a drive anew, settled there. `reset()` does so by force. A copy goes on by itself. Parameters
+    are floats or tensors (scenario,); `seed` is of the random effects.
+    """
+
+    def __init__(self, effects: Iterable[Effect], *, T_L: Number, K_L: Number, sigma: Number, seed: int = 0) -> None:
+        self.effects = in_order(effects)
+        names = [e.name for e in self.effects]
+        if len(set(names)) < len(names):
+            raise InputError(f"effects: found {', '.join(names)}, needs each at most once")
+        for name, value in (("T_L", T_L), ("K_L", K_L), ("sigma", sigma)):
+            checked(name, value, above=0.0 if name == "T_L" else None, least=0.0)
+        self.T_L, self.K_L, self.sigma, self.seed = T_L, K_L, sigma, seed
+        self._past: Past | None = None
+
+    def __repr__(self) -> str:
+        return f"plant({list(self.effects)}, T_L={self.T_L}, K_L={self.K_L})"
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> GapPlant:
+        return copy.copy(self)  # nothing in it is ever written to
+
+    # parameters ----------------------------------------------------------------------------------------------------
+    def parameters(self) -> dict[str, Parameter]:
+        """The coordinates of a fit: `T_L`, `K_L`, and `effect.parameter` of each effect."""
+        own = {p.name: p for p in BASELINE}
+        return own | {f"{e.name}.{p.name}": p for e in self.effects for p in e.coordinates()}
+
+    def values(self) -> dict[str, Tensor]:
+        """Their present values; those that are not set (a slope's profile) are left out."""
+        own = {"T_L": tensor(self.T_L), "K_L": tensor(self.K_L)}
+        return own | {f"{e.name}.{key}": value for e in self.effects for key, value in e.values().items()}
+
+    def with_values(self, values: Mapping[str, Any]) -> GapPlant:
+        """The plant with other values, by the names of `parameters`. Raises `InputError` for other names."""
+        own: dict[str, dict[str, Any]] = {e.name: {} for e in self.effects}
+        base = {"T_L": self.T_L, "K_L": self.K_L}
+        for name, value in values.items():
+            effect, _, key = name.partition(".")
+            if name in base:
+                base[name] = value
+            elif effect in own and key:
+                own[effect][key] = value
+            else:
+                raise InputError(f"parameters: found {name!r}, needs one of {', '.join(self.parameters())}")
+        effects = [e.replaced(own[e.name]) if own[e.name] else e for e in self.effects]
+        return GapPlant(effects, **base, sigma=self.sigma, seed=self.seed)
+
+    def prepared(self, *drives: Drive) -> GapPlant:
+        """The plant with the settings that effects take from a drive (mean speed, span, length of the road).
+
+        Several: parts of one drive, in order.
+        """
+        flat = [_joined([getattr(d, name) for d in drives]) for name in ("speed", "position")]
+        time = torch.cat([d.time for d in drives])
+        effects = [e.prepared(time, *flat) for e in self.effects]
+        return GapPlant(effects, T_L=self.T_L, K_L=self.K_L, sigma=self.sigma, seed=self.seed)
+
+    def report(self) -> dict[str, dict[str, Tensor]]:
+        """Parameters by effect, as an answer names them."""
+        return {e.name: e.report(tensor(self.T_L)) for e in self.effects}
+
+    def noise(self, command: Tensor) -> dict[str, NoiseChange]:
+        """What the random effects do to the noise model under commands (..., time)."""
+        changes = {e.name: e.noise(command) for e in self.effects}
+        return {name: change for name, change in changes.items() if change is not None}
+
+    # whole drives --------------------------------------------------------------------------------------------------
+    def response(
+        self,
+        drive: Drive,
+        parameters: Mapping[str, Tensor] | None = None,
+        *,
+        generator: torch.Generator | None = None,
+        actuator0: Tensor | None = None,
+    ) -> Response:
+        """The noise-free response to `drive`; with a `generator`, one in which the random effects are drawn.
+
+        `parameters` by the names of `parameters()`, in their own units, each (...), which broadcast with the drive's
+        leading dimensions (a vector-valued one has its size on a further, last dimension). What is missing keeps the
+        plant's own value. Differentiable in all of them. Speed-dependent effects look at the drive's measured speed.
+        `actuator0` (...) [m/s²]: where the actuator stands at the first row, in place of what the drive says of it.
+        """
+        this = self if parameters is None else self.with_values(parameters)
+        return rollout(this.effects, tensor(this.T_L), tensor(this.K_L), drive, generator, actuator0=actuator0)
+
+    # one step ------------------------------------------------------------------------------------------------------
+    @torch.no_grad()
+    def step(self, a: Tensor, v: Tensor, u: Tensor, dt: float, eps: Tensor) -> Motion:
+        """See `avtorch.vehicle.plant.Plant.step`; the acceleration that comes back is the measured one."""
+        past = self._past
+        if past is None or not goes_on(past, a):
+            past = begin(self.effects, a, v, u, dt, tensor(self.T_L), tensor(self.K_L), self.seed)
+        motion, self._past = move(past, v, u, dt, eps)
+        return motion
+
+    def reset(self) -> None:
+        """Forget the drive: the next step starts one anew."""
+        self._past = None
+
+    # as text -------------------------------------------------------------------------------------------------------
+    def to_toml(self) -> str:
+        """The plant as TOML; `from_toml` reads it. Raises `InputError` for parameters that are not single numbers."""
+        return to_toml(self.effects, {"T_L": self.T_L, "K_L": self.K_L, "sigma": self.sigma})
+
+    @classmethod
+    def from_toml(cls, text: str, *, effects: Iterable[type[Effect]] = ()) -> GapPlant:
+        """From TOML: `T_L`, `K_L`, `sigma`, and a table of parameters for each effect; or from `"dead_time=0.2"`.
+
+        `effects`: classes besides the registered ones. Raises `InputError` for unknown names and wrong values.
+        """
+        return _from(described(text, effects))
+
+
+def plant(
+    effects: Iterable[Effect | type[Effect]] = (),
+    *,
+    T_L: Number | None = None,
+    K_L: Number | None = None,
+    sigma: float | None = None,
+    baseline: GapPlant | str | PathLike[str] | None = None,
+    seed: int = 0,
+) -> GapPlant:
+    """A plant with `effects` (a class stands for its typical values) on top of a `baseline`.
+
+    `baseline`: the user's own simulator, as a plant, as a string such as `"dead_time=0.2"` (`"glvd"`: none), or a
+    TOML file (a string that ends in `.toml` or names a file is one); an effect given here takes the place of the
+    baseline's of that name. `T_L` [s], `K_L` [-] and the jerk noise `sigma` [m/s³] default to the baseline's, or 0.3,
+    1 and 0.1. Raises `InputError` for bad values or a file that is not there.
+    """
+    if isinstance(baseline, str) and not names_a_file(baseline):
+        base = GapPlant.from_toml(baseline)
+    elif isinstance(baseline, GapPlant) or baseline is None:
+        base = baseline or GapPlant((), T_L=0.3, K_L=1.0, sigma=0.1)
+    else:
+        base = _from(read_file(baseline))
+    if isinstance(effects, str):
+        raise InputError(f"effects: found the text {quoted(effects)}; needs effects; plant(baseline=...) takes a text")
+    own = [e() if isinstance(e, type) else e for e in effects]
+    for e in own:
+        if not isinstance(e, Effect):
+            raise InputError(f"effects: found {quoted(repr(e))}, needs effects, such as DeadTime(0.2)")
+    kept = [e for e in base.effects if e.name not in {x.name for x in own}]
+    for i, e in enumerate(own):
+        own[i], implied = e.lag_apart()
+        if implied is not None:
+            if T_L is not None:
+                raise InputError(f"T_L: given beside a {e.name} that sets it; needs one of the two")
+            T_L = implied
+    return GapPlant(
+        [*kept, *own],
+        T_L=base.T_L if T_L is None else T_L,
+        K_L=base.K_L if K_L is None else K_L,
+        sigma=base.sigma if sigma is None else sigma,
+        seed=seed,
+    )
+
+
+def _joined(parts: Sequence[Tensor | None]) -> Tensor | None:
+    """The first of each part's (..., time), one after another, (time,)."""
+    flat = [x.reshape(-1, x.shape[-1])[0] for x in parts if x is not None]
+    return torch.cat(flat) if flat else None
+
+
+def _from(told: Described) -> GapPlant:
+    given = told.baseline
+    return plant(told.effects, T_L=given.get("T_L"), K_L=given.get("K_L"), sigma=given.get("sigma"))

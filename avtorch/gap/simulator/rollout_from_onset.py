@@ -1,0 +1,57 @@
+"""Effects that set in during a drive: until then the baseline, from then on the whole plant, begun where the car is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from avtorch.gap.simulator.drive import Drive, Place, Response
+from avtorch.gap.simulator.plant import GapPlant
+
+
+def rollout_from_onset(
+    plant: GapPlant, without: GapPlant, drives: Sequence[Drive], values: Mapping[str, Tensor], place: Place
+) -> list[Response]:
+    """Responses to all drives of `without` before `place` and of `plant` from there on, both with these parameters.
+
+    What the plant keeps in mind (a command on its way, a filter's state) begins at rest there, the actuator where
+    `without` has brought it. A baseline with effects of its own would lose what it keeps in mind: there the car goes on
+    as if it had always been the plant, but for its speed.
+    """
+    base = {key: value for key, value in values.items() if key in ("T_L", "K_L")}
+    drive, row = drives[place.drive], place.row
+    earlier = [without.response(d, base) for d in drives[: place.drive]]
+    later = [plant.response(d, values) for d in drives[place.drive + 1 :]]
+    if row < 1:
+        return [*earlier, plant.response(drive, values), *later]
+    if row > len(drive.time) - 2:
+        return [*earlier, without.response(drive, base), *later]
+    if without.effects:
+        before, after = without.response(drive, base), plant.response(drive, values)
+        after = Response(after.accel[..., row:], after.accel_measured[..., row:], after.speed[..., row:])
+    else:
+        before = without.response(_part(drive, slice(0, row + 1)), base)
+        after = plant.response(_part(drive, slice(row, None)), values, actuator0=before.accel[..., row])
+    gone_on = after.speed - after.speed[..., :1] + before.speed[..., row : row + 1]
+    whole = Response(
+        _joined(before.accel, after.accel, row),
+        _joined(before.accel_measured, after.accel_measured, row),
+        _joined(before.speed, gone_on, row),
+    )
+    return [*earlier, whole, *later]
+
+
+def _part(drive: Drive, rows: slice) -> Drive:
+    speed = None if drive.speed is None else drive.speed[..., rows]
+    position0 = 0.0 if drive.position is None else drive.position[..., rows][..., 0]
+    return replace(
+        drive, time=drive.time[rows], command=drive.command[..., rows], speed=speed, position0=position0
+    )  # fmt: skip
+
+
+def _joined(before: Tensor, after: Tensor, row: int) -> Tensor:
+    columns = torch.broadcast_shapes(before.shape[:-1], after.shape[:-1])
+    return torch.cat([before[..., :row].expand(*columns, -1), after.expand(*columns, -1)], -1)

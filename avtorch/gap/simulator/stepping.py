@@ -1,0 +1,159 @@
+"""A plant step by step: what it carries between steps, and one step of it.
+
+The forces of the body are integrated by trapezoids, as over whole drives; those that depend on the speed at the
+step's end are found by fixed-point rounds, each of which gains some three digits.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avtorch.gap.simulator.actuator import ActuatorState
+from avtorch.gap.simulator.effect import Effect, Row
+from avtorch.gap.simulator.order import actuator_of, at_place, substeps
+from avtorch.vehicle.noise import Noise
+from avtorch.vehicle.plant import Motion
+
+_ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class Past:
+    """What a drive carries from step to step; never written to, so copies share it."""
+
+    effects: tuple[Effect, ...]
+    T_L: Tensor
+    K_L: Tensor
+    noise: dict[str, Noise]
+    row: int
+    time: float
+    dt: float  # of the step that led here
+    seen: Tensor  # the acceleration handed to the loop
+    speed: Tensor
+    position: Tensor
+    actuator: ActuatorState
+    force: Tensor
+    memory: dict[str, Any]
+
+
+def goes_on(past: Past, a: Tensor) -> bool:
+    """Whether `a` is what the last step gave, hence the same drive.
+
+    The same memory (also where a loop's copy expanded it), or equal values. A car at rest without any acceleration
+    looks like any other, so there the values alone do not tell.
+    """
+    if a.data_ptr() == past.seen.data_ptr():
+        return True
+    if a.shape != past.seen.shape:
+        return False
+    return bool((a == past.seen).all()) and bool((a != 0).any())
+
+
+def begin(
+    effects: tuple[Effect, ...], a: Tensor, v: Tensor, u: Tensor, dt: float, T_L: Tensor, K_L: Tensor, seed: int
+) -> Past:
+    """A drive that starts at the car's acceleration `a` and speed `v`, its commands settled at `u`."""
+    effects = tuple(
+        e.drawn(torch.Generator().manual_seed(_stream(e.name, seed)) if e.place == "body" else None) for e in effects
+    )
+    noise = {e.name: _noise(e.name, seed, a) for e in effects if e.random}
+    shape = np.broadcast_shapes(a.shape, v.shape, u.shape)
+    a, v, u = (x.expand(shape) for x in (a, v, u))
+    zero = torch.zeros_like(v)
+    past = Past(effects, T_L, K_L, noise, 0, 0.0, dt, a, v, zero, ActuatorState(a), zero, {})
+    row = _row(past, 0.0, v, zero, dt)
+    memory: dict[str, Any] = {}
+    for e in effects:  # each settled at what the one before gives
+        if e.place in ("command", "actuator"):
+            at = _draw(past, e, row, past.row)
+            memory[e.name] = e.start(u, at)
+            if e.place == "command":
+                out = e.advance(u, at, memory[e.name])[0]
+                u = out[1] if isinstance(out, tuple) else out
+    bodies, force = at_place(effects, "body"), zero
+    for e in bodies:
+        at = _draw(past, e, row, past.row)
+        force = force + e.advance(a, at, e.start(a, at))[0]
+    own = a - force  # the actuator gives what the car does beyond the other forces
+    for e in bodies:
+        at = _draw(past, e, row, past.row)
+        memory[e.name] = e.advance(own, at, e.start(own, at))[1]
+    shown = a
+    for e in at_place(effects, "sensor"):
+        at = _draw(past, e, row, past.row)
+        shown, memory[e.name] = e.advance(shown, at, e.start(shown, at))
+    return replace(past, actuator=actuator_of(effects).settled(own), force=force, memory=memory)
+
+
+def move(past: Past, v: Tensor, u: Tensor, dt: float, eps: Tensor) -> tuple[Motion, Past]:
+    """One step, command `u` and jerk noise `eps` held: `(measured acceleration, speed, displacement)`, and the past."""
+    # by trapezoids of the speeds, as a log's is
+    position = past.position if past.row == 0 else past.position + 0.5 * past.dt * (past.speed + v)
+    row = _row(past, past.time, v, position, dt)
+    number, time = past.row + 1, past.time + dt
+    memory = dict(past.memory)
+
+    def hook(e: Effect, x: Tensor) -> Any:
+        y, memory[e.name] = e.advance(x, _draw(past, e, row, past.row), memory[e.name])
+        return y
+
+    parts = substeps(past.effects, u, row, hook)
+    parts = [replace(part, target=torch.addcmul(part.target, part.lag, eps)) for part in parts]
+    state, gained, moved = actuator_of(past.effects).step(past.actuator, parts)
+
+    bodies = at_place(past.effects, "body")
+    force, speed = past.force, v + gained
+    if bodies:
+        speed = speed + dt * past.force
+        for _ in range(_ROUNDS if any(e.needs_speed for e in bodies) else 1):
+            after = _row(past, time, speed, position + 0.5 * dt * (v + speed), dt)
+            force = torch.zeros_like(speed)
+            for e in bodies:
+                y, kept = e.advance(state.accel, _draw(past, e, after, number), past.memory[e.name])
+                force, memory[e.name] = force + y, kept
+            speed = v + gained + 0.5 * dt * (past.force + force)
+        moved = moved + dt * dt * (past.force / 3 + force / 6)
+    after = _row(past, time, speed, position + 0.5 * dt * (v + speed), dt)
+    seen = state.accel + force
+    for e in at_place(past.effects, "sensor"):
+        seen, memory[e.name] = e.advance(seen, _draw(past, e, after, number), memory[e.name])
+    kept = replace(
+        past,
+        row=number,
+        time=time,
+        dt=dt,
+        seen=seen,
+        speed=v,
+        position=position,
+        actuator=state,
+        force=force,
+        memory=memory,
+    )
+    return (seen, speed, v * dt + moved), kept
+
+
+def _row(past: Past, time: float, v: Tensor, x: Tensor, dt: float) -> Row:
+    now, step = torch.tensor(time, dtype=torch.float64), torch.tensor(dt, dtype=torch.float64)
+    return Row(now, step, v, x, past.T_L, past.K_L, whole=False)
+
+
+def _draw(past: Past, effect: Effect, row: Row, number: int) -> Row:
+    """The row with the effect's own draw, if it is random."""
+    if not effect.random:
+        return row
+    return replace(row, normal=past.noise[effect.name].steps(number, 1)[0])
+
+
+def _stream(name: str, seed: int) -> int:
+    return (zlib.crc32(name.encode()) << 20) + seed
+
+
+def _noise(name: str, seed: int, a: Tensor) -> Noise:
+    """Draws of the shape of the loop's state: (scenario,), or (vehicle, scenario) in a platoon."""
+    return Noise(_stream(name, 0) + 7919 * seed, a.shape[-1] if a.dim() else 1, a.shape[-2] if a.dim() > 1 else None)

@@ -1,0 +1,127 @@
+"""Rate limits row by row against the actuator's own closed form, one part at a time."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from avtorch.gap.simulator import actuator
+from avtorch.gap.simulator import rate_limited as limited
+from avtorch.gap.simulator.actuator import Actuator, ActuatorState, Substep
+from avtorch.gap.simulator.rate_limited import by_rows, limited_row, slewed_row
+
+D = torch.float64
+ROWS = 60
+
+
+def _parts(batch: tuple[int, ...], generator: torch.Generator, count: int) -> list[Substep]:
+    """Targets that jump, some parts of length 0, lags by column."""
+    made = []
+    for _ in range(count):
+        target = 2 * torch.randn(*batch, ROWS, generator=generator, dtype=D).cumsum(-1) / 4
+        length = 0.05 * torch.rand(*batch, ROWS, generator=generator, dtype=D)
+        length[..., 7] = 0.0
+        lag = 0.1 + torch.rand(*batch, 1, generator=generator, dtype=D)
+        made.append(Substep(target, lag, length))
+    return made
+
+
+def _stepped(start: Tensor, parts: list[Substep], jerk: Tensor) -> Tensor:
+    """Closed form, a row at a time: where the limit lets go is solved for, then the exponential."""
+    state, rows = start, []
+    for k in range(ROWS):
+        for part in parts:
+            target, lag, length = (x[..., k] if x.shape[-1] > 1 else x[..., 0] for x in vars(part).values())
+            d = target - state
+            # at the limit until |target - a| / T = J
+            until = ((d.abs() - jerk * lag) / jerk).clamp_min(0.0).minimum(length)
+            state = state + d.sign() * jerk * until
+            state = target + (state - target) * torch.exp(-(length - until) / lag)
+        rows.append(state)
+    return torch.stack(rows, -1)
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("limit", [0.3, 2.0, 1e3])
+def test_rows_are_the_closed_form(batch: tuple[int, ...], count: int, limit: float, rotating_seed: int) -> None:
+    g = torch.Generator().manual_seed(rotating_seed)
+    parts = _parts(batch, g, count)
+    start = torch.randn(batch, generator=g, dtype=D)
+    jerk = limit * (0.5 + torch.rand(*batch, 1, generator=g, dtype=D))
+    got = by_rows(limited_row, start, parts, jerk)
+    assert got.shape == (*batch, ROWS)
+    torch.testing.assert_close(got, _stepped(start, parts, jerk[..., 0]), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("limit", [0.3, 2.0, 1e3, float("inf")])
+def test_rows_are_the_actuators_steps(limit: float, rotating_seed: int) -> None:
+    """`over` is built on the rows, `step` is not."""
+    g = torch.Generator().manual_seed(rotating_seed)
+    parts = _parts((4,), g, 2)
+    start = torch.randn(4, generator=g, dtype=D)
+    jerk = torch.full((4, 1), limit, dtype=D)
+    one = Actuator(jerk=jerk[:, 0])
+    state, rows, speeds = ActuatorState(start), [start], []
+    for k in range(ROWS - 1):
+        now = [Substep(p.target[:, k], p.lag[:, 0], p.length[:, k]) for p in parts]
+        state, gained, _ = one.step(state, now)
+        rows.append(state.accel)
+        speeds.append(gained)
+    a, gained = Actuator(jerk=jerk).over(start, parts)
+    torch.testing.assert_close(a, torch.stack(rows, -1), rtol=0, atol=1e-10)
+    torch.testing.assert_close(gained, torch.stack(speeds, -1), rtol=0, atol=1e-10)
+
+
+def test_slewed_rows_are_the_closed_form(rotating_seed: int) -> None:
+    g = torch.Generator().manual_seed(rotating_seed)
+    parts = _parts((3,), g, 2)
+    start, jerk = torch.randn(3, generator=g, dtype=D), torch.full((3, 1), 1.5, dtype=D)
+    got, state = by_rows(slewed_row, start, parts, jerk), start
+    for k in range(ROWS):
+        for part in parts:
+            state = actuator._slewed(state, Substep(part.target[:, k], part.lag[:, 0], part.length[:, k]), jerk[:, 0])[
+                0
+            ]
+        torch.testing.assert_close(got[:, k], state, rtol=0, atol=1e-12)
+
+
+def test_shapes_broadcast_and_nothing_is_differentiated() -> None:
+    time = torch.arange(ROWS, dtype=D) * 0.05
+    target = torch.sin(3 * time)
+    lag = torch.tensor([[0.2], [0.5]], dtype=D, requires_grad=True)
+    part = Substep(target, lag, torch.tensor(0.05, dtype=D))
+    jerk = torch.tensor([[1.0], [4.0]], dtype=D)
+    got = by_rows(limited_row, torch.zeros((), dtype=D), [part], jerk)
+    assert got.shape == (2, ROWS)
+    assert not got.requires_grad
+    for i in range(2):
+        own = Substep(target, lag[i].detach(), torch.tensor(0.05, dtype=D))
+        alone = by_rows(limited_row, torch.zeros((), dtype=D), [own], jerk[i])
+        torch.testing.assert_close(got[i], alone, rtol=0, atol=1e-14)
+    single = by_rows(limited_row, torch.zeros((), dtype=D), [own], torch.tensor(4.0, dtype=D))
+    torch.testing.assert_close(single, got[1], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("limit", [0.05, 0.5, 5.0])
+def test_stretches_side_by_side_are_one_drive(
+    limit: float, rotating_seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the limit binds for most of the drive and nothing is forgotten."""
+    g = torch.Generator().manual_seed(rotating_seed)
+    rows = 3 * limited._SHORTEST + 17
+    target = torch.cumsum(0.2 * torch.randn(rows, generator=g, dtype=D), 0)
+    length = 0.01 + 0.04 * torch.rand(2, rows, generator=g, dtype=D)
+    part = Substep(target, torch.tensor([[0.2], [1.0]], dtype=D), length)
+    start, jerk = torch.tensor([0.0, 1.0], dtype=D), torch.tensor([[limit], [2 * limit]], dtype=D)
+    got = by_rows(limited_row, start, [part, part], jerk)
+    monkeypatch.setattr(limited, "_SHORTEST", rows)
+    torch.testing.assert_close(got, by_rows(limited_row, start, [part, part], jerk), rtol=0, atol=1e-11)
+
+
+def test_a_limit_that_never_binds_is_the_lag_alone() -> None:
+    target, h, lag = torch.ones(ROWS, dtype=D), torch.tensor(0.05, dtype=D), torch.tensor([0.4], dtype=D)
+    got = by_rows(limited_row, torch.zeros((), dtype=D), [Substep(target, lag, h)], torch.tensor(float("inf"), dtype=D))
+    time = 0.05 * torch.arange(1, ROWS + 1, dtype=D)
+    torch.testing.assert_close(got, 1 - torch.exp(-time / 0.4), rtol=0, atol=1e-12)
