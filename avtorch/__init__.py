@@ -8,6 +8,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from avtorch.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from avtorch import decision, gap, inference, io, plots, validation, vehicle
     from avtorch.decision.algorithm2 import algorithm2
@@ -35,8 +37,6 @@ if TYPE_CHECKING:
         simulate,
         stability,
     )
-
-__version__ = "0.1.0"
 
 _HOME = {
     "avtorch": ("decision", "gap", "inference", "io", "plots", "validation", "vehicle"),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import tomllib
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -55,6 +57,33 @@ def test_module_says_what_it_is(path: Path) -> None:
 
 def test_no_rooms_without_a_name() -> None:
     assert not [p for p in SOURCES if p.stem in ("utils", "helpers", "common", "misc")]
+
+
+def imports() -> dict[str, set[str]]:
+    """Which files a file imports, anywhere in it: within functions and for types only, too."""
+    names = {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in SOURCES}
+    graph: dict[str, set[str]] = {}
+    for name, path in names.items():
+        graph[name] = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                found = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module is not None:
+                inner = [f"{node.module}.{alias.name}" for alias in node.names]
+                found = [x if x in names else node.module for x in inner]
+            else:
+                continue
+            graph[name] |= {x for x in found if x in names and x != name}
+    return graph
+
+
+def test_no_two_files_import_each_other_by_any_way_round() -> None:
+    graph = imports()
+    assert sum(map(len, graph.values())) > 1000  # it was read
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as circle:
+        pytest.fail(f"a circle: {' -> '.join(circle.args[1])}")
 
 
 @pytest.mark.parametrize("package", ["torch", "matplotlib", "rich", "cyclopts", "pyro", "arviz"])

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 from cyclopts import App, CycloptsError, MissingArgumentError
 
-from avtorch import __version__
 from avtorch.cli.blindtest import blindtest
 from avtorch.cli.compare import compare
 from avtorch.cli.diagnose import diagnose
@@ -21,6 +20,7 @@ from avtorch.cli.run import run
 from avtorch.cli.stability import stability
 from avtorch.cli.validate import validate
 from avtorch.errors import InputError, printable
+from avtorch.version import __version__
 
 app = App(
     name="avtorch",

@@ -21,7 +21,7 @@ _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 def diagnosis_headline(found: Diagnosis) -> list[str]:
     """The verdict as one sentence, what is implausible of it, and below it the diagnosis' own reason."""
-    from avtorch.gap.result.text import headline
+    from avtorch.gap.result.sentences import headline
 
     odd = found.winner.implausible
     style = (
@@ -33,7 +33,7 @@ def diagnosis_headline(found: Diagnosis) -> list[str]:
 
 def diagnosis_table(found: Diagnosis) -> Table:
     """A row a candidate: probability, log evidence, parameters."""
-    from avtorch.gap.result.text import number
+    from avtorch.gap.result.sentences import number
 
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("candidate", no_wrap=True)
@@ -60,10 +60,21 @@ def diagnosis_table(found: Diagnosis) -> Table:
 
 def diagnosis_notes(found: Diagnosis) -> list[str]:
     """What else there is to say, as lines with markup: alias set, onset, size of the gap, what remains, budget."""
-    from avtorch.gap.result import text as words
+    from avtorch.gap.result import sentences
 
-    told = [words.aliases(found), *words.onset(found), *words.where(found), *words.moved(found), *words.gap(found)]
-    told += [*words.shrinkage(found), *words.to_set(found), *words.to_drive(found), *words.remains(found)]
+    told = [
+        sentences.aliases(found),
+        *sentences.onset(found),
+        *sentences.where(found),
+        *sentences.moved(found),
+        *sentences.gap(found),
+    ]
+    told += [
+        *sentences.shrinkage(found),
+        *sentences.to_set(found),
+        *sentences.to_drive(found),
+        *sentences.remains(found),
+    ]
     lines = [escape(line) for line in told]
     if not found.complete:
         text = "The budget ended the search: the answer is provisional; the same command with more goes on from here."

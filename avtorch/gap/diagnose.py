@@ -17,9 +17,9 @@ from avtorch.gap.crossval.localisation import localise
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.sensor_noise_floor import with_sensor_noise
 from avtorch.gap.posterior import sample as posteriors
-from avtorch.gap.posterior.sample import Draws
+from avtorch.gap.posterior.draws import Draws
 from avtorch.gap.posterior.summary import belief, drawn, moved, repaired, reported
-from avtorch.gap.result import text as words
+from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis, LogFacts
 from avtorch.gap.result.gap_size import gap_size
 from avtorch.gap.result.predictive_model import predictive_models
@@ -107,7 +107,7 @@ def diagnose(
     noted = tuple(noise_added)
     if not race.complete:
         noted += ("The budget ended the search before all candidates were tried: the verdict is provisional.",)
-    noted += tuple(words.untried(race.scope))
+    noted += tuple(sentences.untried(race.scope))
     noted += tuple(delays.notes(race.found, verdict))
     if posterior == "sgld" and not one_mode and winner is not None:
         noted += ("The parameters' posterior is by laplace: it has several modes, between which no chain would walk.",)

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from avtorch.errors import InputError
+from avtorch.gap.crossval.localisation import UNITS, Axis
 from avtorch.gap.result.diagnosis import Diagnosis
-from avtorch.gap.result.where import UNITS, Axis
 from avtorch.io.clock import time_label
 from avtorch.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILLION, styled
 from avtorch.vehicle.stability import Chain, chain_gain

@@ -15,16 +15,16 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from avtorch import __version__
 from avtorch.errors import printable
 from avtorch.experiment import Experiment
+from avtorch.gap.crossval.localisation import UNITS
 from avtorch.gap.quantity import unit_of, words_of
-from avtorch.gap.result import text as words
+from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis, Quantity
-from avtorch.gap.result.where import UNITS
 from avtorch.io import atomic
 from avtorch.plots.diagnosis import road_figure, shrinkage_figure, where_figure, which_figure
 from avtorch.plots.experiment import experiment_figure
+from avtorch.version import __version__
 
 _METRICS = {
     "rollout_rmse_accel_0.5s": "acceleration, {horizon} s [m/s²]",
@@ -60,22 +60,22 @@ def report_html(
     return template.render(
         found=found,
         log=found.log,
-        headline=words.headline(found),
+        headline=sentences.headline(found),
         odd=found.winner.implausible,
-        lead=[found.verdict.why, words.aliases(found), *words.onset(found)],
+        lead=[found.verdict.why, sentences.aliases(found), *sentences.onset(found)],
         tone="amber"
         if found.winner.implausible
         else {"unknown": "amber", "none": "green"}.get(found.verdict.name, "blue"),
-        where=words.where(found),
+        where=sentences.where(found),
         parts=[_part(found, w) for w in found.where],
-        gap=[*words.gap(found), *words.moved(found), *words.remains(found)],
+        gap=[*sentences.gap(found), *sentences.moved(found), *sentences.remains(found)],
         candidates=[_candidate(found, c) for c in found.candidates[:10]],
-        shrinkage=words.shrinkage(found),
+        shrinkage=sentences.shrinkage(found),
         measures=_measures(found),
         placebo=_placebo(found),
         setting=_setting(found),
         sections=dict(sections or {}),
-        next_experiment=words.to_drive(found),
+        next_experiment=sentences.to_drive(found),
         notes=list(found.notes),
         quality=list(quality),
         version=__version__,
@@ -139,7 +139,7 @@ def _candidate(found: Diagnosis, c: Any) -> Mapping[str, Any]:
     parameters += ["physically implausible"] if c.implausible and c.name != "unknown" else []
     return {
         "name": c.name.replace("+", " + "),
-        "probability": words.number(c.probability),
+        "probability": sentences.number(c.probability),
         "width": round(100 * c.probability, 1),
         "nats": "" if c.log_evidence is None else f"{c.log_evidence:+.0f}",
         "parameters": parameters,

@@ -20,7 +20,7 @@ from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.result.diagnosis import Diagnosis, GapSize, LogFacts
 from avtorch.gap.result.predictive_model import PredictiveModel
-from avtorch.gap.result.text import to_drive
+from avtorch.gap.result.sentences import to_drive
 from avtorch.gap.selection.verdict import Candidate, verdict_of
 from avtorch.io import Log
 

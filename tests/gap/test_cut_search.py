@@ -11,7 +11,7 @@ import pytest
 import avtorch
 from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes
 from avtorch.gap import DeadTime, Outliers, SensorBias, plant
-from avtorch.gap.result import text as words
+from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.search.search import Search
 from avtorch.gap.simulator.effect import EFFECTS
@@ -89,7 +89,7 @@ def test_without_pairs_nothing_holds_a_pair() -> None:
     assert answer["pairs"] == "none"
     # the truth is a pair: the sentences leave room for it
     assert "and pairs. Probabilities are over what was tried" in str(found)
-    assert "every other candidate on this log" not in words.aliases(found)
+    assert "every other candidate on this log" not in sentences.aliases(found)
 
 
 def test_effects_that_were_not_asked_for_are_not_ruled_out() -> None:
@@ -108,7 +108,7 @@ def test_effects_that_were_not_asked_for_are_not_ruled_out() -> None:
         assert "Not tried: " in text
         assert "aerodynamic_drag" in text
         assert "Provisional" not in text
-    assert f"tried, 2 of {len(EFFECTS)}" in words.headline(found)
+    assert f"tried, 2 of {len(EFFECTS)}" in sentences.headline(found)
 
 
 def test_a_whole_search_says_nothing_of_the_kind() -> None:
@@ -116,8 +116,8 @@ def test_a_whole_search_says_nothing_of_the_kind() -> None:
     assert found.scope is not None
     whole = replace(found, scope=replace(found.scope, not_scored=()), notes=())
     assert whole.scope is not None
-    assert words.untried(whole.scope) == []
-    assert words.aliases(whole) == "Told apart from every other candidate on this log."
+    assert sentences.untried(whole.scope) == []
+    assert sentences.aliases(whole) == "Told apart from every other candidate on this log."
     assert "Provisional" not in str(found)
 
 

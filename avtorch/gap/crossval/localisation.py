@@ -2,20 +2,21 @@
 
 What a cause does to each row is half the square of the white image of its change, the nats it is expected to bring. On
 each axis the part named is the shortest stretch that holds nearly all of it, if plainly fewer rows lie there. A part is
-named on the strength of what its rows gain, less all that the find has paid (`shown.py`): an e-value, for which the
-procedure of Wang and Ramdas (2022) keeps the false-discovery rate whatever the dependence between parts.
+named on the strength of what its rows gain, less all that the find has paid (`attribution.py`): an e-value, for which
+the procedure of Wang and Ramdas (2022) keeps the false-discovery rate whatever the dependence between parts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from avtorch.gap.crossval.attribution import RowAttribution
-from avtorch.gap.result.where import Axis, Location
 
 Float = NDArray[np.float64]
 
@@ -23,6 +24,31 @@ _MOST = 0.95  # of the sizes of what the cause does
 _PLAINLY = 0.6  # of the rows since it set in, for more of which a stretch is no part
 _BAND = 0.9  # of the power
 _RATE = 0.05  # of false discoveries
+
+Axis = Literal["time", "speed", "command", "frequency", "signal"]
+
+UNITS: dict[Axis, str] = {"time": "s", "speed": "m/s", "command": "m/s²", "frequency": "Hz", "signal": ""}
+
+
+@dataclass(frozen=True)
+class Location:
+    """A part of the gap: `begin` to `end` on an `axis`, with its `share` of what the cause does to the log.
+
+    Times are on the log's own clock [s], the others [m/s, m/s², Hz]; of the axis `signal` both are `"actuation"` (the
+    car moves otherwise) or `"sensing"` (the accelerometer shows it otherwise).
+    `q_value`: the false-discovery rate at which all parts with one as small are named.
+    """
+
+    axis: Axis
+    begin: float | str
+    end: float | str
+    share: float
+    q_value: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """An entry of `where` in `diagnosis.json`."""
+        part = {"axis": self.axis, "from": self.begin, "to": self.end}
+        return part | {"share": self.share, "q_value": self.q_value}
 
 
 def localise(shown: RowAttribution, *, onset_s: float | None, lag: float) -> tuple[Location, ...]:

@@ -7,9 +7,6 @@ is, down to the exact gradient at each step.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -17,6 +14,7 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.gap.posterior.density import RolloutDensity, root
+from avtorch.gap.posterior.draws import Draws
 from avtorch.gap.posterior.importance_sampling import effective, importance
 from avtorch.gap.posterior.summary import drawn, moved, repaired, reported
 from avtorch.gap.posterior.surrogate import Corrected, Surrogate, trusted_square
@@ -42,25 +40,6 @@ _LET_PASS = 0.15  # relative error of a variance
 _ROUNDS = 12
 _ENOUGH = 250.0  # effective draws by importance
 _FEWEST = 30.0  # effective draws, fewer than which are none
-
-
-@dataclass(frozen=True, eq=False)
-class Draws:
-    """Draws of coordinates `names`: `z` (chain, draw, coordinate) and `values` by key (chain, draw), in their units.
-
-    `method`: "sgld", or "importance" where the posterior has cliffs on which Langevin steps fail, "laplace" where
-    either fails. `effective`: about how many independent draws they are worth. `grade_rms` (chain, draw): of a road's
-    slope, where the candidate has one. `exact_share`: of the gradients, those that were exact. `why` SGLD was given up.
-    """
-
-    names: tuple[str, ...]
-    z: Float = field(repr=False)
-    values: Mapping[str, Float] = field(repr=False)
-    method: str = "sgld"
-    effective: float = float("nan")
-    grade_rms: Float | None = field(default=None, repr=False)
-    exact_share: float = 1.0
-    why: str = ""
 
 
 def posterior(found: FittedModel, *, chains: int = 16, draws: int = 50, seed: int = 0) -> Draws:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -15,13 +15,11 @@ from torch import Tensor
 from avtorch.gap.effects import CommandHold, Gust, Outliers, RoadGrade
 from avtorch.gap.likelihood.hypothesis import Coordinate
 from avtorch.gap.posterior.density import RolloutDensity, root
+from avtorch.gap.posterior.draws import Draws
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant, plant
-
-if TYPE_CHECKING:
-    from avtorch.gap.posterior.sample import Draws
-    from avtorch.gap.search.fitted_model import FittedModel
 
 Float = NDArray[np.float64]
 Link = Callable[[Tensor], Tensor]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -14,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.errors import InputError
+from avtorch.gap.crossval.gap_closed import Closed, Shrinkage
+from avtorch.gap.crossval.localisation import Location
 from avtorch.gap.quantity import Quantity, unit_of
-from avtorch.gap.result import text as words
+from avtorch.gap.result import sentences
+from avtorch.gap.result.gap_size import GapSize
+from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.predictive_model import PredictiveModel
-from avtorch.gap.result.repeatability import Repeatability
-from avtorch.gap.result.shrinkage import Closed, Shrinkage
 from avtorch.gap.result.traces import Traces
-from avtorch.gap.result.where import Location
 from avtorch.gap.search.fitted_model import Scope
 from avtorch.gap.selection.verdict import (
     Candidate,
@@ -33,7 +33,7 @@ from avtorch.gap.selection.verdict import (
     verdict_of,
 )
 from avtorch.gap.simulator.plant import GapPlant
-from avtorch.io import Log, answer_set, atomic, write_json
+from avtorch.io import answer_set, atomic, write_json
 
 if TYPE_CHECKING:
     from arviz import InferenceData
@@ -63,94 +63,6 @@ DIAGNOSIS_FILES = (
     "report.html",
 )
 """Every file that a diagnosis may consist of."""
-
-SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead_accel", "grade")
-
-
-@dataclass(frozen=True)
-class LogFacts:
-    """What was looked at: usable or not, all `rows`; `seconds` without gaps; `signals` in any of the logs.
-
-    `name`: the logs' own, files without their folders, which are nobody's business where an answer is read. Of rows
-    that count: `speeds` [m/s], all but the slowest and the fastest hundredth, `commands` [m/s²], all; None: not there.
-    `epochs_s`: when each log starts, on its own clock [s].
-    """
-
-    rows: int
-    segments: int
-    seconds: float
-    rate_hz: float
-    signals: tuple[str, ...] = ()
-    name: str = "log"
-    speeds: tuple[float, float] | None = None
-    commands: tuple[float, float] | None = None
-    epochs_s: tuple[float, ...] = (0.0,)
-
-    @classmethod
-    def of(cls, logs: Log | Sequence[Log]) -> LogFacts:
-        """Of one log, or of several drives of one car; the rate is then their mean by time."""
-        all_ = [logs] if isinstance(logs, Log) else list(logs)
-        seconds = math.fsum(log.seconds for log in all_)
-        return cls(
-            rows=sum(log.rows for log in all_),
-            segments=sum(len(log.segments()) for log in all_),
-            seconds=seconds,
-            rate_hz=math.fsum(log.rate_hz * log.seconds for log in all_) / seconds,
-            signals=tuple(name for name in SIGNALS if any(getattr(log, name) is not None for log in all_)),
-            name=", ".join(Path(log.name).name or log.name for log in all_),
-            speeds=_driven(all_, "speed", 0.01),
-            commands=_driven(all_, "accel_cmd", 0.0),
-            epochs_s=tuple(log.epoch_s for log in all_),
-        )
-
-    def to_dict(self) -> dict[str, Any]:
-        given = {"rows": self.rows, "segments": self.segments, "seconds": self.seconds, "rate_hz": self.rate_hz}
-        driven = {"speeds_mps": self.speeds, "commands_mps2": self.commands}
-        told = {name: None if ends is None else list(ends) for name, ends in driven.items()}
-        return given | {"signals": list(self.signals), "name": self.name, "epochs_s": list(self.epochs_s)} | told
-
-
-def _driven(logs: Sequence[Log], signal: str, apart: float) -> tuple[float, float] | None:
-    """Where the usable rows of a signal lie, a share `apart` of them at either end left out."""
-    rows = [values[log.usable] for log in logs if (values := getattr(log, signal)) is not None]
-    joined = np.concatenate(rows) if rows else np.zeros(0)
-    if not len(joined):
-        return None
-    low, high = np.quantile(joined, (apart, 1 - apart))
-    return float(low), float(high)
-
-
-@dataclass(frozen=True)
-class GapSize:
-    """How far the baseline is from the log, and how far noise alone would be (`floor`); None where not measured.
-
-    Rollouts go over `horizon_s` [s]; accelerations [m/s²], speed [m/s]. `detected`: there is a gap, at `p_value`.
-    `repeats`: the floor as commands that were given twice tell it, None where there are none.
-    """
-
-    detected: bool
-    p_value: float | None = None
-    one_step_rmse: float | None = None
-    one_step_floor: float | None = None
-    rollout_rmse_accel: float | None = None
-    rollout_floor_accel: float | None = None
-    rollout_rmse_speed: float | None = None
-    horizon_s: float | None = None
-    repeats: Repeatability | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "one_step": {"rmse": self.one_step_rmse, "floor": self.one_step_floor},
-            "rollout": {
-                "rmse_accel": self.rollout_rmse_accel,
-                "floor_accel": self.rollout_floor_accel,
-                "rmse_speed": self.rollout_rmse_speed,
-                "horizon_s": self.horizon_s,
-            },
-            "detected": bool(self.detected),
-            "p_value": self.p_value,
-            "repeats": None if self.repeats is None else self.repeats.to_dict(),
-        }
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -214,18 +126,18 @@ class Diagnosis:
     def __str__(self) -> str:
         """The sentences of the terminal, one a line."""
         told = [
-            words.headline(self),
+            sentences.headline(self),
             *self.winner.implausible,
             self.verdict.why,
-            words.aliases(self),
-            *words.onset(self),
-            *words.where(self),
+            sentences.aliases(self),
+            *sentences.onset(self),
+            *sentences.where(self),
         ]
-        told += [*words.moved(self), *words.gap(self), *words.shrinkage(self), *words.to_set(self)]
-        return "\n".join([*told, *words.to_drive(self), *words.remains(self), *self.notes])
+        told += [*sentences.moved(self), *sentences.gap(self), *sentences.shrinkage(self), *sentences.to_set(self)]
+        return "\n".join([*told, *sentences.to_drive(self), *sentences.remains(self), *self.notes])
 
     def __repr__(self) -> str:
-        return f"<Diagnosis of {self.log.name}: {words.headline(self)}>"
+        return f"<Diagnosis of {self.log.name}: {sentences.headline(self)}>"
 
     @property
     def winner(self) -> Candidate:
@@ -283,7 +195,7 @@ class Diagnosis:
         late = " and ".join(name for name in self.verdict.names if name != "gain_change")
         if self.onset_s is None or not late:
             return ""
-        return f"# In the log {late} from {words.moment(self)} on; in this plant from the start.\n"
+        return f"# In the log {late} from {sentences.moment(self)} on; in this plant from the start.\n"
 
     def to_arviz(self) -> InferenceData:
         """The winner's draws as `arviz.InferenceData`, one variable (chain, draw) a parameter, its unit in `attrs`.

@@ -2,16 +2,51 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.gap.crossval.rollout_errors import HORIZON_S, Measure, reached, rms
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.result.diagnosis import GapSize
-from avtorch.gap.result.repeatability import repeatability
+from avtorch.gap.result.repeatability import Repeatability, repeatability
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 
 Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class GapSize:
+    """How far the baseline is from the log, and how far noise alone would be (`floor`); None where not measured.
+
+    Rollouts go over `horizon_s` [s]; accelerations [m/s²], speed [m/s]. `detected`: there is a gap, at `p_value`.
+    `repeats`: the floor as commands that were given twice tell it, None where there are none.
+    """
+
+    detected: bool
+    p_value: float | None = None
+    one_step_rmse: float | None = None
+    one_step_floor: float | None = None
+    rollout_rmse_accel: float | None = None
+    rollout_floor_accel: float | None = None
+    rollout_rmse_speed: float | None = None
+    horizon_s: float | None = None
+    repeats: Repeatability | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "one_step": {"rmse": self.one_step_rmse, "floor": self.one_step_floor},
+            "rollout": {
+                "rmse_accel": self.rollout_rmse_accel,
+                "floor_accel": self.rollout_floor_accel,
+                "rmse_speed": self.rollout_rmse_speed,
+                "horizon_s": self.horizon_s,
+            },
+            "detected": bool(self.detected),
+            "p_value": self.p_value,
+            "repeats": None if self.repeats is None else self.repeats.to_dict(),
+        }
 
 
 def gap_size(race: SearchResult, best: FittedModel, *, detected: bool, p_value: float | None = None) -> GapSize:

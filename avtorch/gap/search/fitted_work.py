@@ -12,10 +12,10 @@ from dataclasses import fields
 from types import CodeType
 from typing import Any
 
-from avtorch import __version__
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log, fingerprint
+from avtorch.version import __version__
 
 _SIGNALS = ("time", "accel_cmd", "accel", "speed", "engaged", "grade", "segment")
 

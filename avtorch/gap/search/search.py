@@ -52,6 +52,8 @@ from avtorch.io import Log
 Float = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
+Kinds = Sequence[type[Effect]]
+
 _TURNS = 10  # of parameters and noise, at most
 _SINGLES = 6  # fitted with noise of their own
 _LEAST = 3.0  # nats at first sight, for less of which no noise of its own would help
@@ -71,7 +73,7 @@ class Search:
         logs: Sequence[Log],
         baseline: GapPlant,
         *,
-        effects: Sequence[type[Effect]] | None = None,
+        effects: Kinds | None = None,
         pairs: bool = True,
         budget_s: float | None = None,
         progress: Progress | None = None,
@@ -153,7 +155,7 @@ class Search:
         found, values = modes(hypothesis, white, z, iterations=6)
         return self._settled(hypothesis, found[values.argmax()], noise, rounds=6)
 
-    def with_effects(self, none: FittedModel, kinds: Sequence[type[Effect]]) -> FittedModel:
+    def with_effects(self, none: FittedModel, kinds: Kinds) -> FittedModel:
         """`none` with effects of these kinds on top from the drives' start, with noise of its own."""
         hypothesis = Hypothesis(none.hypothesis.record, tuple(kinds), self.baseline)
         white = WhiteningFilter(hypothesis.record, none.noise.noise)
@@ -281,9 +283,7 @@ class Search:
         return replace(settled, log_evidence=settled.log_evidence + onset_evidence(tried, record.dt))
 
     # pairs ---------------------------------------------------------------------------------------------------------
-    def _pairs(
-        self, record: Record, kinds: Sequence[type[Effect]], found: list[FittedModel], none: FittedModel
-    ) -> list[FittedModel]:
+    def _pairs(self, record: Record, kinds: Kinds, found: list[FittedModel], none: FittedModel) -> list[FittedModel]:
         single = sorted((f for f in found if f.name != "none"), key=lambda f: -f.log_evidence)
         if not single or single[0].log_evidence < none.log_evidence + _LEAST:
             return []
@@ -331,9 +331,7 @@ class Search:
             done = better
         return list(made.values())
 
-    def _under(
-        self, blown: FittedModel, kinds: Sequence[type[Effect]], none: FittedModel, made: dict[str, FittedModel]
-    ) -> None:
+    def _under(self, blown: FittedModel, kinds: Kinds, none: FittedModel, made: dict[str, FittedModel]) -> None:
         """Causes that show only once a random force's noise is in, each with that force, added to `made`."""
         on = Base(none.hypothesis, none.z, none.values, none.onset, blown.white)
         for hypothesis, z in on.partners(kinds, {}, most=_BASES, least=_LEAST):
@@ -349,7 +347,7 @@ class Search:
     def _joined(
         self,
         base: FittedModel,
-        kinds: Sequence[type[Effect]],
+        kinds: Kinds,
         white: WhiteningFilter,
         alone: Mapping[str, Mapping[str, float]],
         most: int,

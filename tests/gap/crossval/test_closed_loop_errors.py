@@ -29,7 +29,7 @@ def loops(T: float, K: float, push: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.array(speed), np.array(spacing)
 
 
-@pytest.mark.parametrize("witness", ["speed", "accel"])
+@pytest.mark.parametrize("channel", ["speed", "accel"])
 def test_superposition_is_what_the_loops_differ_by(channel: str, rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     T, K = float(rng.uniform(0.2, 0.8)), float(rng.uniform(0.7, 1.2))

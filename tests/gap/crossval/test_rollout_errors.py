@@ -12,7 +12,7 @@ from tests.gap.records import command_over
 RATE = 10
 
 
-@pytest.mark.parametrize("witness", ["accel", "speed"])
+@pytest.mark.parametrize("channel", ["accel", "speed"])
 @pytest.mark.parametrize("horizon", [0.5, 2.0, 10.0])
 def test_they_are_those_of_rollouts_begun_at_what_was_measured(channel: str, horizon: float) -> None:
     rng = np.random.default_rng(3)

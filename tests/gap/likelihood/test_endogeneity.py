@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from avtorch.blindtest import Car, simulate
-from avtorch.blindtest import Drive as BlindDrive
+from avtorch.blindtest import DrivePlan as BlindDrive
 from avtorch.gap import plant
 from avtorch.gap.likelihood.gauss_newton import finish, modes
 from avtorch.gap.likelihood.hypothesis import Hypothesis

@@ -33,7 +33,7 @@ def _away(fit, truth: NoiseModel) -> Float:  # type: ignore[no-untyped-def]
     return np.array([np.log(getattr(fit.noise, n) / getattr(truth, n)) / fit.sds[n] for n in NAMES])
 
 
-@pytest.mark.parametrize("witnesses", [BOTH, ("accel",), ("speed",)])
+@pytest.mark.parametrize("channels", [BOTH, ("accel",), ("speed",)])
 @pytest.mark.parametrize("priors", [PRIORS, GUST], ids=["nuisance", "gust"])
 def test_parameters_are_found_within_their_own_bars(
     priors: dict[str, Prior], channels: tuple[str, ...], rotating_seed: int

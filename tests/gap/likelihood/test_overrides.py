@@ -45,7 +45,7 @@ def _garbled(log: Log, names: tuple[str, ...], rng: np.random.Generator) -> Log:
 
 
 @pytest.mark.parametrize(
-    ("effects", "garbled", "witnesses"),
+    ("effects", "garbled", "channels"),
     [
         ("none", ("accel_cmd", "accel", "speed"), ("accel", "speed")),
         ("brake_throttle_asymmetry+dead_time", ("accel_cmd", "accel", "speed"), ("accel", "speed")),

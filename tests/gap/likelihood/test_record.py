@@ -182,7 +182,7 @@ def test_several_logs_are_one_after_another() -> None:
     np.testing.assert_array_equal(Record.of(iter([a])).source, alone[0].source)
 
 
-@pytest.mark.parametrize("witness", ["accel", "speed"])
+@pytest.mark.parametrize("channel", ["accel", "speed"])
 def test_one_witness_is_enough(channel: str) -> None:
     record = Record.of(log_of(seconds=20.0, channels=(channel,)))
     assert record.channels == (channel,)

@@ -37,7 +37,7 @@ def _dense(noise: NoiseModel, record: Record, errors: Float) -> float:
     return total
 
 
-@pytest.mark.parametrize("witnesses", WITNESSES)
+@pytest.mark.parametrize("channels", WITNESSES)
 @pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES.keys())
 def test_log_likelihood_is_the_dense_gaussians(
     noise: NoiseModel, channels: tuple[str, ...], rotating_seed: int
@@ -50,7 +50,7 @@ def test_log_likelihood_is_the_dense_gaussians(
     assert got == pytest.approx(_dense(noise, record, errors), abs=40.0)
 
 
-@pytest.mark.parametrize("witnesses", WITNESSES)
+@pytest.mark.parametrize("channels", WITNESSES)
 @pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES.keys())
 def test_beyond_the_start_the_likelihood_is_exact(
     noise: NoiseModel, channels: tuple[str, ...], rotating_seed: int
@@ -63,7 +63,7 @@ def test_beyond_the_start_the_likelihood_is_exact(
     assert float(got) == pytest.approx(_dense(noise, long, errors) - _dense(noise, short, head), abs=0.05)
 
 
-@pytest.mark.parametrize("witnesses", WITNESSES)
+@pytest.mark.parametrize("channels", WITNESSES)
 def test_errors_of_the_model_become_white(channels: tuple[str, ...], rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     noise = NOISES["windy"]
@@ -223,7 +223,7 @@ def _settled(noise: NoiseModel, record: Record) -> tuple[Float, Float, Float, Fl
     return move, driven, see, white, np.asarray(solve_discrete_are(move.T, see.T, driven, white))
 
 
-@pytest.mark.parametrize("witnesses", WITNESSES)
+@pytest.mark.parametrize("channels", WITNESSES)
 @pytest.mark.parametrize("noise", [*SENSORS.values(), NOISES["windy"]], ids=[*SENSORS, "windy"])
 def test_begun_at_rest_the_likelihood_is_the_dense_gaussians(
     noise: NoiseModel, channels: tuple[str, ...], rotating_seed: int
@@ -256,7 +256,7 @@ def test_begun_at_rest_the_likelihood_is_the_dense_gaussians(
     assert got == pytest.approx(want, rel=1e-8)
 
 
-@pytest.mark.parametrize("witnesses", WITNESSES)
+@pytest.mark.parametrize("channels", WITNESSES)
 @pytest.mark.parametrize("noise", SENSORS.values(), ids=SENSORS.keys())
 def test_errors_behind_a_sensor_become_white(noise: NoiseModel, channels: tuple[str, ...], rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
@@ -291,7 +291,7 @@ def test_the_speed_alone_knows_nothing_of_the_accelerometer(rotating_seed: int) 
 
 
 @pytest.mark.parametrize("noise", [NOISES.values(), SENSORS.values()], ids=["plain", "late"])
-@pytest.mark.parametrize("witnesses", WITNESSES)
+@pytest.mark.parametrize("channels", WITNESSES)
 def test_filters_designed_together_are_each_alone(noise: list[NoiseModel], channels: tuple[str, ...]) -> None:
     record = record_of(12.0, channels=channels)
     noises = [n for n in noise if n is not SENSORS["scaled"]]  # of one kind in a batch, as of one candidate
@@ -304,7 +304,7 @@ def test_filters_designed_together_are_each_alone(noise: list[NoiseModel], chann
 
 
 @pytest.mark.parametrize("rate_hz", [20, 60])
-@pytest.mark.parametrize("witnesses", WITNESSES)
+@pytest.mark.parametrize("channels", WITNESSES)
 def test_each_part_of_a_record_has_its_own_noise(channels: tuple[str, ...], rate_hz: int, rotating_seed: int) -> None:
     """As if the other part did not count, but for the speed's offset, which both tell of."""
     record = record_of(30.0, rate_hz=rate_hz, channels=channels)
@@ -365,7 +365,7 @@ def test_motion_behind_a_late_sensor_is_the_integral(lag: float, dt: float) -> N
     assert np.linalg.eigvalsh(driven / scale).min() > -1e-8
 
 
-@pytest.mark.parametrize("witnesses", WITNESSES)
+@pytest.mark.parametrize("channels", WITNESSES)
 @pytest.mark.parametrize("noise", [*NOISES.values(), *SENSORS.values()], ids=[*NOISES, *SENSORS])
 def test_the_covariance_at_rest_solves_the_riccati_equation(noise: NoiseModel, channels: tuple[str, ...]) -> None:
     record = record_of(10.5, channels=channels)

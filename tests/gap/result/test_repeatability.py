@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.result import text as words
+from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis, GapSize, LogFacts
 from avtorch.gap.result.repeatability import SETTLED_S, WINDOW_S, Repeatability, repeatability
 from avtorch.gap.selection.verdict import Candidate, Verdict
@@ -71,6 +71,6 @@ def test_the_answer_says_so() -> None:
     assert gap.to_dict()["repeats"] == {"pairs": 2, "seconds": 14.0, "floor_accel": 0.08, "floor_speed": None}
     log = LogFacts(280, 1, 14.0, 20.0, ("accel",))
     each = tuple(Candidate(name, p, 0.0) for name, p in (("none", 0.9), ("unknown", 0.1)))
-    told = words.gap(Diagnosis(log, {}, gap, each, Verdict(("none",), ("none",), False, "")))
+    told = sentences.gap(Diagnosis(log, {}, gap, each, Verdict(("none",), ("none",), False, "")))
     assert told[1].startswith("The same commands given again (14 s) repeat accelerations to 0.08 m/s²:")
     assert GapSize(False).to_dict()["repeats"] is None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avtorch.blindtest import Car, simulate
-from avtorch.blindtest import Drive as BlindDrive
+from avtorch.blindtest import DrivePlan as BlindDrive
 from avtorch.blindtest.drives import Manoeuvre
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.record import Record

@@ -28,7 +28,7 @@ from avtorch.gap.likelihood.gauss_newton import modes
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.search import pairs as pairing
+from avtorch.gap.search import pairs
 from avtorch.gap.search.initial_values import effect_starts, starts
 from avtorch.gap.search.pairs import Base, exchanged, joint_fit
 from avtorch.gap.search.screening import Screened
@@ -177,7 +177,7 @@ def test_a_slope_as_the_second_effect_is_fitted(rotating_seed: int) -> None:
 
 
 def test_an_effect_of_many_starts_begins_where_it_came_to_rest_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pairing, "_MUCH", 50 * 1000)  # as for a drive of several minutes
+    monkeypatch.setattr(pairs, "_MUCH", 50 * 1000)  # as for a drive of several minutes
     record, white = _drive(plant([DeadTime(0.2), Saturation(0.6, -8.0)]))
     base, z, values = _alone(record, white, DeadTime)
     shift = {"gear_shift.first_mps": 4.1, "gear_shift.gear_ratio": 1.5}

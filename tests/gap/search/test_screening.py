@@ -87,14 +87,14 @@ def test_starts_show_an_onset_of_which_the_whole_fit_tells_nothing(
     record = _drive(name, {key: size}, at, int(rng.integers(2**31)))
     white = WhiteningFilter(record, NOISE)
     hypothesis, begin, floor = _begin(record, white, name)
-    told = screening.rough
+    told = screening.rough_onset
     asked: list[Float] = []
 
     def nothing_of_the_whole(white: WhiteningFilter, hypothesis: Hypothesis, z: Float) -> tuple[int, float]:
         asked.append(z)
         return told(white, hypothesis, z) if len(asked) > 1 else (100, -1.0)
 
-    monkeypatch.setattr(screening, "rough", nothing_of_the_whole)
+    monkeypatch.setattr(screening, "rough_onset", nothing_of_the_whole)
     whole, late = screen(hypothesis, white, begin, floor=floor)
     np.testing.assert_array_equal(asked[0], whole.z)
     assert abs(_at(late) - at) < 3.6

@@ -29,7 +29,7 @@ def quiet() -> Record:
     return Record.of(log_of(noise=None, seconds=240.0))
 
 
-@pytest.mark.parametrize("witnesses", [BOTH, ("accel",), ("speed",)])
+@pytest.mark.parametrize("channels", [BOTH, ("accel",), ("speed",)])
 def test_nothing_is_left_of_noise(channels: tuple[str, ...], rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     record = record_of(120.0, noise=None, channels=channels)

@@ -170,7 +170,7 @@ def test_an_offset_above_zero_is_no_resistance(rotating_seed: int) -> None:
     assert "constant_resistance" not in verdict.alias_set
 
 
-@pytest.mark.parametrize("witnesses", [SPEED, BOTH])
+@pytest.mark.parametrize("channels", [SPEED, BOTH])
 def test_with_the_speed_a_resistance_is_one(channels: tuple[str, ...], rotating_seed: int) -> None:
     race, told = _raced([ConstantResistance(0.15)], OFFSETS, channels, rotating_seed)
     assert ("sensor_bias" in {f.name for f in race.found}) == (channels == BOTH)

@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator import actuator
-from avtorch.gap.simulator import rate_limited as limited
+from avtorch.gap.simulator import actuator, rate_limited
 from avtorch.gap.simulator.actuator import Actuator, ActuatorState, Substep
 from avtorch.gap.simulator.rate_limited import by_rows, limited_row, slewed_row
 
@@ -110,13 +109,13 @@ def test_stretches_side_by_side_are_one_drive(
 ) -> None:
     """Also where the limit binds for most of the drive and nothing is forgotten."""
     g = torch.Generator().manual_seed(rotating_seed)
-    rows = 3 * limited._SHORTEST + 17
+    rows = 3 * rate_limited._SHORTEST + 17
     target = torch.cumsum(0.2 * torch.randn(rows, generator=g, dtype=D), 0)
     length = 0.01 + 0.04 * torch.rand(2, rows, generator=g, dtype=D)
     part = Substep(target, torch.tensor([[0.2], [1.0]], dtype=D), length)
     start, jerk = torch.tensor([0.0, 1.0], dtype=D), torch.tensor([[limit], [2 * limit]], dtype=D)
     got = by_rows(limited_row, start, [part, part], jerk)
-    monkeypatch.setattr(limited, "_SHORTEST", rows)
+    monkeypatch.setattr(rate_limited, "_SHORTEST", rows)
     torch.testing.assert_close(got, by_rows(limited_row, start, [part, part], jerk), rtol=0, atol=1e-11)
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import Any, Protocol
 
-from avtorch.gap.result.where import UNITS
-from avtorch.gap.selection.verdict import meanings
+from avtorch.gap.crossval.gap_closed import Shrinkage
+from avtorch.gap.crossval.localisation import UNITS, Location
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.gap_size import GapSize
+from avtorch.gap.result.log_facts import LogFacts
+from avtorch.gap.search.fitted_model import Scope
+from avtorch.gap.selection.verdict import Candidate, Verdict, meanings
 from avtorch.io.clock import clock_words
-
-if TYPE_CHECKING:
-    from avtorch.gap.result.diagnosis import Diagnosis
-    from avtorch.gap.search.fitted_model import Scope
 
 SURE = 0.9
 """What a headline says without a perhaps."""
@@ -22,7 +24,42 @@ _MEASURES = {
 }
 
 
-def headline(found: Diagnosis) -> str:
+class Findings(Protocol):
+    """What the sentences rest on; a `Diagnosis` has it."""
+
+    @property
+    def log(self) -> LogFacts: ...
+    @property
+    def baseline(self) -> Mapping[str, Quantity]: ...
+    @property
+    def gap(self) -> GapSize: ...
+    @property
+    def verdict(self) -> Verdict: ...
+    @property
+    def winner(self) -> Candidate: ...
+    @property
+    def onset_s(self) -> float | None: ...
+    @property
+    def onset_from_start_s(self) -> float | None: ...
+    @property
+    def onset_log(self) -> int: ...
+    @property
+    def where(self) -> tuple[Location, ...]: ...
+    @property
+    def shrinkage(self) -> Shrinkage | None: ...
+    @property
+    def remaining(self) -> tuple[Candidate, ...] | None: ...
+    @property
+    def next_experiment(self) -> Mapping[str, Any] | None: ...
+    @property
+    def setting(self) -> Mapping[str, Any] | None: ...
+    @property
+    def complete(self) -> bool: ...
+    @property
+    def scope(self) -> Scope | None: ...
+
+
+def headline(found: Findings) -> str:
     """The verdict as one sentence; provisional where the budget ended the search.
 
     Where it is implausible it says so, and the winner's `implausible` says why.
@@ -30,7 +67,7 @@ def headline(found: Diagnosis) -> str:
     return _verdict(found) if found.complete else f"Provisional: {_verdict(found)}"
 
 
-def _verdict(found: Diagnosis) -> str:
+def _verdict(found: Findings) -> str:
     verdict, p = found.verdict, _share(found.winner.probability)
     if verdict.abstained:
         return f"The cause is none of the {_known(found)} ({p}): nothing is blamed."
@@ -50,14 +87,14 @@ def _verdict(found: Diagnosis) -> str:
     return f"{who} simulator lacks {' and '.join(verdict.names)} ({p}){told}"
 
 
-def onset(found: Diagnosis) -> list[str]:
+def onset(found: Findings) -> list[str]:
     """From when on."""
     if found.onset_s is not None:
         return [f"Onset: at {moment(found)}."]
     return ["Onset: there from the start."] if found.winner.effects else []
 
 
-def moment(found: Diagnosis) -> str:
+def moment(found: Findings) -> str:
     """The onset from the log's start, beside it on the log's own clock; one figure where they are the same."""
     assert found.onset_s is not None
     assert found.onset_from_start_s is not None
@@ -67,7 +104,7 @@ def moment(found: Diagnosis) -> str:
     return f"{found.onset_from_start_s:.1f} s from {of} start ({clock_words(round(found.onset_s, 1))})"
 
 
-def where(found: Diagnosis) -> list[str]:
+def where(found: Findings) -> list[str]:
     """Where the gap lies, an onset apart."""
     told = []
     for part in found.where:
@@ -88,7 +125,7 @@ def where(found: Diagnosis) -> list[str]:
     return [f"It lies {', '.join(told)}."] if told else []
 
 
-def shrinkage(found: Diagnosis) -> list[str]:
+def shrinkage(found: Findings) -> list[str]:
     """How far it shrinks on what was held out."""
     told = found.shrinkage
     if told is None:
@@ -109,7 +146,7 @@ def shrinkage(found: Diagnosis) -> list[str]:
     return [f"{line}: closes {share} of what can be closed{few}."]
 
 
-def moved(found: Diagnosis) -> list[str]:
+def moved(found: Findings) -> list[str]:
     """What the effect does to the baseline."""
     baseline, with_it, told = found.baseline, found.winner.moved, []
     for name in ("T_L", "K_L"):
@@ -119,7 +156,7 @@ def moved(found: Diagnosis) -> list[str]:
     return [f"The baseline, fitted without and with it: {', '.join(told)}."] if told else []
 
 
-def aliases(found: Diagnosis) -> str:
+def aliases(found: Findings) -> str:
     """What the log does not tell apart."""
     from_words = {"none": "no effect at all", "unknown": "a cause outside the table"}
     if _cut(found):
@@ -146,16 +183,16 @@ def untried(scope: Scope) -> list[str]:
     return [f"Not tried: {listing}. Probabilities are over what was tried; unknown is any cause that was not."]
 
 
-def _cut(found: Diagnosis) -> bool:
+def _cut(found: Findings) -> bool:
     """Whether single effects were left untried."""
     return found.scope is not None and bool(found.scope.not_scored)
 
 
-def _all_tried(found: Diagnosis) -> bool:
+def _all_tried(found: Findings) -> bool:
     return found.complete and (found.scope is None or found.scope.whole)
 
 
-def _known(found: Diagnosis) -> str:
+def _known(found: Findings) -> str:
     """The effects out of which none is the cause."""
     if found.scope is None or _all_tried(found):
         return "effects known here"
@@ -165,7 +202,7 @@ def _known(found: Diagnosis) -> str:
     return f"{which} tried, {len(found.scope.scored)} of {len(found.scope.scored + found.scope.not_scored)}"
 
 
-def gap(found: Diagnosis) -> list[str]:
+def gap(found: Findings) -> list[str]:
     """How far the simulator as it is is off."""
     gap = found.gap
     parts = []
@@ -193,7 +230,7 @@ def number(p: float) -> str:
     return "<.001" if 0 < p < 0.0005 else ">.999" if 0.9995 <= p < 1 else f"{p:.3f}"
 
 
-def remains(found: Diagnosis) -> list[str]:
+def remains(found: Findings) -> list[str]:
     """What there is besides the delay."""
     if not found.remaining:
         return []
@@ -202,12 +239,12 @@ def remains(found: Diagnosis) -> list[str]:
     return [f"Once dead_time is in, what remains: {told}."]
 
 
-def to_set(found: Diagnosis) -> list[str]:
+def to_set(found: Findings) -> list[str]:
     """What to set."""
     return [] if found.setting is None else [f"To set: {found.setting['why']}"]
 
 
-def to_drive(found: Diagnosis) -> list[str]:
+def to_drive(found: Findings) -> list[str]:
     """Which experiment next."""
     told = found.next_experiment
     if told is None:

@@ -1,0 +1,68 @@
+"""What a diagnosis looked at: rows, rate, signals, and where speeds and commands lie."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avtorch.io import Log
+
+SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead_accel", "grade")
+
+
+@dataclass(frozen=True)
+class LogFacts:
+    """What was looked at: usable or not, all `rows`; `seconds` without gaps; `signals` in any of the logs.
+
+    `name`: the logs' own, files without their folders, which are nobody's business where an answer is read. Of rows
+    that count: `speeds` [m/s], all but the slowest and the fastest hundredth, `commands` [m/s²], all; None: not there.
+    `epochs_s`: when each log starts, on its own clock [s].
+    """
+
+    rows: int
+    segments: int
+    seconds: float
+    rate_hz: float
+    signals: tuple[str, ...] = ()
+    name: str = "log"
+    speeds: tuple[float, float] | None = None
+    commands: tuple[float, float] | None = None
+    epochs_s: tuple[float, ...] = (0.0,)
+
+    @classmethod
+    def of(cls, logs: Log | Sequence[Log]) -> LogFacts:
+        """Of one log, or of several drives of one car; the rate is then their mean by time."""
+        all_ = [logs] if isinstance(logs, Log) else list(logs)
+        seconds = math.fsum(log.seconds for log in all_)
+        return cls(
+            rows=sum(log.rows for log in all_),
+            segments=sum(len(log.segments()) for log in all_),
+            seconds=seconds,
+            rate_hz=math.fsum(log.rate_hz * log.seconds for log in all_) / seconds,
+            signals=tuple(name for name in SIGNALS if any(getattr(log, name) is not None for log in all_)),
+            name=", ".join(Path(log.name).name or log.name for log in all_),
+            speeds=_driven(all_, "speed", 0.01),
+            commands=_driven(all_, "accel_cmd", 0.0),
+            epochs_s=tuple(log.epoch_s for log in all_),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        given = {"rows": self.rows, "segments": self.segments, "seconds": self.seconds, "rate_hz": self.rate_hz}
+        driven = {"speeds_mps": self.speeds, "commands_mps2": self.commands}
+        told = {name: None if ends is None else list(ends) for name, ends in driven.items()}
+        return given | {"signals": list(self.signals), "name": self.name, "epochs_s": list(self.epochs_s)} | told
+
+
+def _driven(logs: Sequence[Log], signal: str, apart: float) -> tuple[float, float] | None:
+    """Where the usable rows of a signal lie, a share `apart` of them at either end left out."""
+    rows = [values[log.usable] for log in logs if (values := getattr(log, signal)) is not None]
+    joined = np.concatenate(rows) if rows else np.zeros(0)
+    if not len(joined):
+        return None
+    low, high = np.quantile(joined, (apart, 1 - apart))
+    return float(low), float(high)
