@@ -45,7 +45,7 @@ def single(replications: int, seed: int) -> None:
     print(f"\nSBC of one window, SGLD with default settings, {replications} replications of 200 points, seed {seed}")
     for label, amplitude in (("0.1 to 2", VARIED), ("0.1", WEAK), ("0.02", 0.02)):
         found = sbc(replications, amplitude=amplitude, seed=seed)
-        print(f"  amplitude {label} m/s^2, {found.dropped} not settled: {verdict(found.p_value)}")
+        print(f"  amplitude {label} m/s^2, {found.dropped} not converged: {verdict(found.p_value)}")
         table(found)
     stretched = sbc(replications, inflate=1.1, seed=seed)
     print(f"  amplitude 0.1 to 2 m/s^2, draws stretched by 1.1: {verdict(stretched.p_value)}")
@@ -83,7 +83,7 @@ def loop(replications: int, seed: int, windows: int) -> None:
         print(f"  {mode}, truth {truth}, amplitude {shown}, {which}: {verdict(all_in_all)}")
         print("    p by window  " + " ".join(f"{x:8.3g}" for x in p))
         print("    used         " + " ".join(f"{c.replications:8d}" for c in found))
-        print("    not settled  " + " ".join(f"{c.dropped:8d}" for c in found))
+        print("    not converged" + " ".join(f"{c.dropped:8d}" for c in found))
         for i, name in enumerate(found[0].names[:3]):
             print(f"    90 % {name:8}" + " ".join(f"{100 * float(c.coverage[0.9][i]):8.2f}" for c in found))
         worst = min(range(len(found)), key=lambda k: found[k].p_value)
@@ -100,7 +100,7 @@ def coverage(replications: int, seed: int) -> None:
         ours = sbc(replications, amplitude=amplitude, seed=seed)
         exact = sbc_quadrature(replications, amplitude=amplitude, seed=seed)
         if ours.dropped:
-            print(f"  {ours.dropped} windows not settled: coverage of the others")
+            print(f"  {ours.dropped} windows not converged: coverage of the others")
         for level in LEVELS:
             pairs = zip(ours.coverage[level][:3], exact.coverage[level], strict=True)
             row = "".join(f"{100 * float(a):13.2f}{100 * float(b):8.2f}" for a, b in pairs)

@@ -69,7 +69,7 @@ def main() -> None:
     arguments.add_argument("--n", type=int, default=40)
     arguments.add_argument("--seed", type=int, default=1)
     arguments.add_argument("--seconds", type=float, default=300.0, help="of either side")
-    arguments.add_argument("--baseline", help="the simulator that both are held against; default: GLVD")
+    arguments.add_argument("--baseline", help="the simulator that both are compared with; default: GLVD")
     arguments.add_argument("--json", type=Path)
     given = arguments.parse_args()
     rows = []
@@ -80,7 +80,7 @@ def main() -> None:
         given.json.write_text(json.dumps(rows, indent=1) + "\n")
     groups = {"all": rows} | {m: [r for r in rows if r["manoeuvre"] == m] for m in MANOEUVRES}
     for name, some in groups.items():
-        print(f"{name}: no change said of the same car in {share([not r['same']['changed'] for r in some])}")
+        print(f"{name}: no change reported for the same car in {share([not r['same']['changed'] for r in some])}")
         print(f"{name}: a lag {LONGER:g} times as long found in {share([r['slower']['changed'] for r in some])}")
         print(f"{name}: the true ratio of T_L inside the 90 % in {share(inside(some))}")
 

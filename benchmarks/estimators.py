@@ -70,7 +70,7 @@ def latent_arms(noise: float, accel_noise: float) -> dict[str, dict[str, object]
     """Filters with the default noise levels, and told the simulator's own: noise held over a step, no unknown force."""
     told = {"process_noise": noise * math.sqrt(DT), "accel_noise": accel_noise, "coloured_sd": 0.01}
     arms: dict[str, dict[str, object]] = {name: {"estimator": name} for name in ("sgld", "map", "ekf", "ukf")}
-    return arms | {f"{name}, told the noise": {"estimator": name, "noise": told} for name in ("ekf", "ukf")}
+    return arms | {f"{name}, given the noise": {"estimator": name, "noise": told} for name in ("ekf", "ukf")}
 
 
 def run(

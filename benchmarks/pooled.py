@@ -70,7 +70,7 @@ def stays(count: int, windows: int, seed: int) -> None:
             track = follow(path, seen, mode=mode, seed=seed)
             row(mode, PooledComparison.of(track, pooled))
             if not bool(track.converged.all()):
-                print(f"    {int((~track.converged).sum())} windows not settled")
+                print(f"    {int((~track.converged).sum())} windows not converged")
         free = truth_given_all(seen, shared_noise=False)
         shift = ((free.mean - pooled.mean[:, :2]) / pooled.sd[:, :2]).square().mean(0).sqrt()
         ratio = (free.sd / pooled.sd[:, :2]).median(0).values

@@ -76,7 +76,7 @@ def main() -> None:
         density = density_of(kind, drive(kind, truth, g)[1])
         found = sample(density, generator=g)
         used = found.converged
-        print(f"{kind} command: {options.vehicles} vehicles, {int((~used).sum())} not settled, seed {options.seed}")
+        print(f"{kind} command: {options.vehicles} vehicles, {int((~used).sum())} not converged, seed {options.seed}")
         for level in LEVELS:
             low, high = found.quantile(0.5 - level / 2), found.quantile(0.5 + level / 2)
             shares = ((low <= truth) & (truth <= high))[used].double().mean(0)

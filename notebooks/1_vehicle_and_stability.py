@@ -1,10 +1,10 @@
 # %% [markdown]
 # # The vehicle and its stability
 #
-# An automated vehicle does not do what it is told at once, nor in full: a lag `T_L` and a gain `K_L` lie between the
+# An automated vehicle does not follow its command at once, nor in full: a lag `T_L` and a gain `K_L` lie between the
 # command and the acceleration. You will see what the two do to one car, why a whole line of such cars may turn a tap on
-# the brake into a jam, how to tell in advance whether it will, and how sure one can be when `T_L` and `K_L` are only
-# believed, not known.
+# the brake into a jam, how to predict whether it will, and how sure you can be when `T_L` and `K_L` are estimated, not
+# known.
 #
 # Pictures appear below their cells; run as a script, the notebook saves them and prints where.
 
@@ -26,7 +26,7 @@ NOMINAL = (1.5, 1.5, -0.8)  # the paper's gains k_s [1/s²], k_v [1/s], k_a [-]
 # %% [markdown]
 # ## One car
 #
-# The vehicle obeys `da/dt = -a/T_L + K_L/T_L u` (the paper's Eq. 1). Command 1 m/s² for six seconds, then nothing.
+# The vehicle follows `da/dt = -a/T_L + K_L/T_L u` (the paper's Eq. 1). Command 1 m/s² for six seconds, then nothing.
 
 # %%
 dt = 0.01
@@ -44,14 +44,14 @@ ax.legend()
 plots.show(figure, OUT / "one_car.png")
 
 # %% [markdown]
-# The healthy car is where it should be within a second. The worn one takes several, and then it has but half of what
-# was asked for. Both go on after the command has ended, for as long as they were late.
+# The healthy car reaches the command within a second. The worn one takes several, and then realises only half of it.
+# Both go on after the command has ended, for as long as they were late.
 #
 # ## A line of cars
 #
 # Now six such cars drive behind each other, each with the paper's controller: `u = k_s Δs + k_v Δv + k_a a`, where `Δs`
-# is how much the spacing is longer than the time gap wants it, and `Δv` how much faster the car in front is. The leader
-# slows from 20 to 19 m/s and speeds up again, once.
+# is the spacing beyond that of the time gap, and `Δv` how much faster the car in front is. The leader slows from 20 to
+# 19 m/s and speeds up again, once.
 
 # %%
 leader = avtorch.Leader.from_speed([0, 10, 12, 14, 16, 60], [20, 20, 19, 19, 20, 20], name="one slow-down")
@@ -78,10 +78,10 @@ for name, dip in dips.items():
 # the one in front and overshoots afterwards: this is how a jam grows out of nothing. A line that does the former for
 # every disturbance is *string stable*.
 #
-# ## Before anybody drives
+# ## The verdict without a drive
 #
-# How a car passes on a slow or a quick wave of its leader's speed is a function of frequency, `|G(jω)|`. String stable
-# means: nowhere above one. Its highest value is the *peak gain*.
+# How much of a slow or a quick wave of its leader's speed a car passes on is a function of frequency, `|G(jω)|`. String
+# stable means that it nowhere exceeds one. Its highest value is the *peak gain*.
 
 # %%
 figure = Figure(figsize=(9, 3.2), layout="constrained")
@@ -96,14 +96,14 @@ for ax, (T, K), name in zip(figure.subplots(1, 2, sharey=True), (HEALTHY, WORN),
 plots.show(figure, OUT / "gain.png")
 
 # %% [markdown]
-# The healthy car's curve never leaves one. The worn car's waves grow wherever the curve is in the shaded part, most at
+# The healthy car's curve never exceeds one. The worn car's waves grow wherever the curve is in the shaded part, most at
 # the point: behind six cars a wave of that frequency has grown by the sixth power.
 
 # %%
 print(f"peak gain: healthy {peaks['healthy']:.3f}, worn {peaks['worn']:.4f}; sixth power {peaks['worn'] ** 6:.0f}")
 
 # %% [markdown]
-# ## What the paper's condition says, and what is so
+# ## The paper's condition and the exact verdict
 #
 # The paper tests string stability by two inequalities (its Eq. 3). They are *sufficient*: a car that meets them is
 # string stable, one that does not may still be. avtorch also has the exact verdict. Here are both for the paper's own
@@ -125,9 +125,9 @@ for name, law in settings.items():
     print(f"{name:24}{eq3:>8}{exact:>8}{float(stability.peak_gain(*law)):>12.4f}")
 
 # %% [markdown]
-# Both of the paper's settings calm the worn car, and neither makes it string stable as long as only the upper level is
-# changed. With 2.5 s the line is calm, yet Eq. 3 still says no: a condition that is only sufficient asks for more than
-# is needed. How much more? Below, every point is a car, and the controller has a time gap of 2.5 s.
+# Both of the paper's settings calm the worn car, and neither makes it string stable as long as only the upper level
+# is changed. With 2.5 s the line is calm, yet Eq. 3 rejects it: a sufficient condition requires more than is
+# necessary. How much more? Below, every point is a car, and the controller has a time gap of 2.5 s.
 
 # %%
 T_axis = torch.linspace(0.02, 2.5, 249, dtype=torch.float64)
@@ -146,12 +146,12 @@ wrongly = int((eq3.string & eq3.local & ~plane.string).sum())
 print("passed by Eq. 3 without being string stable:", wrongly)
 
 # %% [markdown]
-# All that is hatched lies within the blue, as it must; the rest of the blue is what a sufficient condition gives away.
+# All that is hatched lies within the blue, as it must; the rest of the blue is what the sufficient condition misses.
 #
-# ## Which gains, which gap
+# ## Which gains, which time gap
 #
-# The same question asked the other way round: given the car, which gains will do? The rows are two time gaps, the
-# columns two cars.
+# The same question the other way round: given the car, which gains make it string stable? The rows are two time gaps,
+# the columns two cars.
 
 # %%
 k = torch.linspace(0.05, 4, 160, dtype=torch.float64)
@@ -169,12 +169,12 @@ plots.verdict_legend(axes[1, 0], extra=False)
 plots.show(figure, OUT / "gains.png")
 
 # %% [markdown]
-# Blue is what one may choose. A longer time gap makes the blue larger, a slower car makes it smaller: that is the
+# The blue gains are string stable. A longer time gap makes the blue larger, a slower car makes it smaller: that is the
 # paper's figure of stability regions. The share of the plane that is string stable stands over each picture.
 #
 # ## A delay is not a lag
 #
-# Real actuators also have dead time: for a moment nothing happens at all. It is tempting to add it to the lag and to
+# Real actuators also have dead time: for a moment nothing happens at all. It is tempting to add it to the lag and
 # forget about it.
 
 # %%
@@ -184,7 +184,7 @@ lumped = stability.peak_gain(0.3 + dead, 1.0, 1.0, NOMINAL)
 margin = float(stability.dead_time_margin(0.3, 1.0, 1.0, NOMINAL))
 figure = Figure(figsize=(8, 3.6), layout="constrained")
 ax = figure.subplots()
-ax.plot(dead, told, color="#0072B2", label="dead time taken for what it is")
+ax.plot(dead, told, color="#0072B2", label="dead time modelled as such")
 ax.plot(dead, lumped, color="#D55E00", linestyle="--", label="dead time added to the lag")
 ax.axvline(margin, color="0.5", linestyle=":", label=f"oscillates by itself from {margin:.2f} s on")
 ax.set(xlabel="dead time [s]", ylabel="peak gain [-]", ylim=(0.9, 4))
@@ -196,14 +196,14 @@ lumped_04 = float(stability.peak_gain(0.7, *at[1:]))
 print(f"lag 0.3 s and dead time 0.4 s: peak gain {peak_04:.4f}; lag 0.7 s instead: {lumped_04:.4f}")
 
 # %% [markdown]
-# Both curves start on the same line, and for small delays it does not matter. Then the true one leaves, while the
-# lumped one stays at one: false comfort.
+# Both curves start on the same line, and for small delays the difference does not matter. Then the true curve rises,
+# while the lumped one stays at one: false comfort.
 #
-# ## When the car is only believed
+# ## When the car is only estimated
 #
-# Nobody tells a controller `T_L` and `K_L`. Let the worn car follow a leader who drives off, and estimate it from two
-# seconds of its log: draws of what the car may be. The share of the draws that are string stable is the probability
-# that the line is.
+# A controller does not know `T_L` and `K_L`. Let the worn car follow a leader who drives off, and estimate them from
+# two seconds of its log, as draws from the posterior. The share of the draws that are string stable is the
+# probability that the line is.
 
 # %%
 drive = avtorch.simulate(avtorch.Leader.default(start=48.0), plant=avtorch.GLVDPlant(*WORN, sigma=0.3), duration=4.0)
@@ -230,14 +230,14 @@ print(f"at the mean ({mean[0]:.2f} s, {mean[1]:.2f}) a time gap of {hoped:.2f} s
 print(f"where P(string stable) is {float(p[gaps == hoped][0]):.2f}; to be 95 % sure takes {enough:.2f} s.")
 
 # %% [markdown]
-# The cloud on the left is the belief, the large dot its mean, just inside the blue. Much of the cloud lies outside: who
-# computes with the mean alone is about as likely wrong as right. The step on the right is that gamble; the curve tells
-# what certainty costs.
+# The cloud on the left is the belief, the large dot its mean, just inside the blue. Much of the cloud lies outside: a
+# choice by the mean alone is about as likely wrong as right. The step on the right is that gamble; the curve shows what
+# certainty costs.
 #
 # ## Try this
 #
 # - Take eight seconds instead of two (`duration=8.0`, `window=8.0`): how far do the two time gaps come together?
 # - Give the controller a feed-forward gain on the leader's acceleration: `stability.peak_gain(..., feedforward=0.5)`,
 #   here and in `p_string_stable`.
-# - Let `dead_time=0.2` into the last cell's probabilities.
-# - Ask for a box of cars at once: `stability.string_sufficient((0.1, 0.4), (0.7, 1.0), 1.0, NOMINAL, form="rigorous")`.
+# - Add `dead_time=0.2` to the last cell's probabilities.
+# - Test a box of cars at once: `stability.string_sufficient((0.1, 0.4), (0.7, 1.0), 1.0, NOMINAL, form="rigorous")`.

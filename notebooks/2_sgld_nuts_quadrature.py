@@ -1,10 +1,10 @@
 # %% [markdown]
 # # SGLD, NUTS and quadrature on one window
 #
-# avtorch believes by SGLD: gradient descent with just enough noise that it samples a posterior instead of sinking to
-# its mode. You will write that loop yourself around a `torch.optim` optimizer, see its draws beside two references that
-# share nothing with it (Pyro's NUTS and exact quadrature), and then spoil them on purpose: with a step that is too
-# long, with minibatches, and with the paper's falling step.
+# avtorch estimates by SGLD: gradient descent with just enough noise that it samples a posterior instead of sinking to
+# its mode. You will write that loop yourself around a `torch.optim` optimizer and compare its draws with two
+# independent references, Pyro's NUTS and exact quadrature. Then you will spoil them on purpose: with a step that is
+# too long, with minibatches, and with the paper's falling step.
 
 # %%
 from pathlib import Path
@@ -25,8 +25,8 @@ TRUE = {"T_L": 0.7, "K_L": 0.7, "sigma": 0.1}  # s, -, m/s³
 # %% [markdown]
 # ## One window
 #
-# Two seconds of a drive at 100 Hz, the liveliest two: what was commanded, what came of it, and the jerk. That is all a
-# posterior gets.
+# Two seconds of a drive at 100 Hz, those with the most varied command: command, acceleration and jerk. The posterior
+# rests on these alone.
 
 # %%
 car = avtorch.GLVDPlant(TRUE["T_L"], TRUE["K_L"], sigma=TRUE["sigma"])
@@ -47,14 +47,14 @@ plots.show(figure, OUT / "window.png")
 
 # %% [markdown]
 # On the right is what the likelihood explains: `jerk = (K_L u - a) / T_L` plus noise of `sigma` (the paper's Eq. 4).
-# Two columns of numbers that look much alike, `a` and `u`, have to tell `T_L` from `K_L`; that is why their posteriors
-# are so strongly correlated, and why a sampler needs to know its way.
+# Two columns that look much alike, `a` and `u`, have to separate `T_L` from `K_L`. So their posterior is strongly
+# correlated, and a sampler needs a preconditioner.
 #
 # ## SGLD by hand
 #
 # One log density serves all samplers. It lives in `z = log(T_L, K_L, sigma)`. The mode and the curvature there turn the
-# narrow, slanted posterior into a round one of width about one, in which a single step length fits all directions. What
-# remains is a training loop. 256 chains walk at once: they are rows of one tensor.
+# narrow, slanted posterior into a round one of width about one, in which a single step length fits all directions. The
+# rest is a training loop. 256 chains run at once, as rows of one tensor.
 
 # %%
 density = JerkPoints(a, u, jerk)
@@ -91,8 +91,8 @@ for i, name in enumerate(density.names):
     print(f"{name}: {float(mine[..., i].mean()):.4f} ± {float(mine[..., i].std()):.4f}, true {TRUE[name]}")
 
 # %% [markdown]
-# Nothing in there is special to cars: any parameter of any torch model may be handed to `avtorch.SGLD`. Where no loop
-# of one's own is wanted, `sample` does all of it, and looks after burn-in, steps and chains that strayed:
+# None of this is special to cars: `avtorch.SGLD` takes any parameter of any torch model. If you do not want to write
+# the loop, `sample` runs it, and handles burn-in, step lengths and chains that diverge:
 
 # %%
 posterior = sample(density, generator=torch.Generator().manual_seed(1))
@@ -101,8 +101,8 @@ print(tuple(posterior.draws.shape), "(chain, draw, window, parameter), converged
 # %% [markdown]
 # ## Two references
 #
-# Quadrature adds the density up on a grid, which three parameters allow: exact to many digits. NUTS is another sampler,
-# written by others (Pyro), over the same density; it needs `pip install 'avtorch[nuts]'`.
+# Quadrature sums the density on a grid, which three parameters allow: exact to many digits. NUTS is another sampler,
+# written by others (Pyro), of the same density; it needs `pip install 'avtorch[nuts]'`.
 
 # %%
 exact = integrate(density)
@@ -120,7 +120,7 @@ for ax, name in zip(figure.subplots(1, 3), density.names, strict=True):
 figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=4)
 plots.show(figure, OUT / "marginals.png")
 
-print(f"{'':8}{'mean':>10}{'SD':>10}   mean off [SD], SD ratio: {'SGLD':>14}{'by hand':>18}{'NUTS':>18}")
+print(f"{'':8}{'mean':>10}{'SD':>10}   error of the mean [SD], SD ratio: {'SGLD':>14}{'by hand':>18}{'NUTS':>18}")
 samplers = {"SGLD": posterior.flat[:, 0], "by hand": mine.flatten(0, 1)}
 if reference is not None:
     samplers["NUTS"] = reference.flat[:, 0]
@@ -129,12 +129,12 @@ for i, name in enumerate(density.names):
     mean, sd = exact.mean[0, i], exact.sd[0, i]
     off[name] = {s: (float((x[:, i].mean() - mean) / sd), float(x[:, i].std() / sd)) for s, x in samplers.items()}
     told = "".join(f"{m:>+10.3f}, {r:.3f} " for m, r in off[name].values())
-    print(f"{name:8}{float(mean):>10.4f}{float(sd):>10.4f}{'':26}{told}")
+    print(f"{name:8}{float(mean):>10.4f}{float(sd):>10.4f}{'':35}{told}")
 
 # %% [markdown]
 # Grey is exact, blue is SGLD, the dashed line NUTS, the dotted one the truth. The three lie on top of each other, and
-# the table says how closely: means within a few hundredths of an SD, widths within a few per cent. That is what is to
-# be expected of so many draws; NUTS has the fewest.
+# the table shows how closely: means within a few hundredths of an SD, widths within a few per cent. That is the Monte
+# Carlo error of so many draws; NUTS has the fewest.
 #
 # ## The price of a step
 #
@@ -163,14 +163,14 @@ for noise in ("independent", "averaged"):
     print(*(f"{x:.3f}" for x in ratio[noise, 2.0]), "at h = 2")
 
 # %% [markdown]
-# With independent noise the width grows with the step as the formula foretells. With averaged noise it stays at one,
-# and so avtorch can afford long steps.
+# With independent noise the width grows with the step as the formula predicts. With averaged noise it stays at one, so
+# avtorch can afford long steps.
 #
 # ## The price of a minibatch
 #
-# "Stochastic gradient" means: look at a few points of the window a step. The gradient is then right on average, and its
-# noise goes into the draws. The law, again for a round Gaussian: batches of `n` out of `N` points multiply the variance
-# by `1 + h N/(4 n)`.
+# "Stochastic gradient" means that each step uses a few points of the window. The gradient is then right on average,
+# but its noise enters the draws. The law, again for a round Gaussian: batches of `n` out of `N` points multiply the
+# variance by `1 + h N/(4 n)`.
 
 # %%
 h, batches = 0.3, [10, 20, 50, 100, 200]
@@ -194,9 +194,9 @@ plots.show(figure, OUT / "minibatch.png")
 print("widest SD ratio by batch:", ", ".join(f"{n}: {max(x):.2f}" for n, x in wide.items()))
 
 # %% [markdown]
-# Ten points at a time make the belief much too wide, in the way the formula says. For windows of a few hundred points
-# there is nothing to be gained: the whole window's likelihood is six sums, whatever its length, so avtorch takes all
-# points in every step. `avtorch.inference.ControlVariates` is the cure where points are too many.
+# Ten points at a time make the posterior much too wide, as the formula predicts. Windows of a few hundred points gain
+# nothing from minibatches: the whole window's likelihood is six sums, whatever its length, so avtorch uses all points
+# in every step. Where points are too many, use `avtorch.inference.ControlVariates`.
 #
 # ## A step that falls too fast
 #
@@ -228,14 +228,14 @@ ax.set(xlabel="SD within a chain over the posterior's, steps 400 to 1000", xlim=
 plots.show(figure, OUT / "falling_step.png")
 
 # %% [markdown]
-# With `1/k` the chains freeze: after 1000 steps each has still seen only a part of the posterior, and a belief made of
-# one such chain would be too sure of itself. The slower fall keeps walking.
+# With `1/k` the chains freeze: after 1000 steps each has covered only a part of the posterior, and an estimate from one
+# such chain would be overconfident. With the slower fall they keep moving.
 #
 # ## Try this
 #
 # - `temperature=0.0` in `walk`'s optimizer: the noise is gone and SGLD is gradient descent. Where do the chains end?
-# - Take the two seconds of the evenest command (`argmin` for `argmax`). The gain is now known much better than before,
-#   without anything happening. Why?
+# - Take the two seconds of the most constant command (`argmin` for `argmax`). The gain is now known much better than
+#   before, although nothing happens. Why?
 # - `sample(density, SamplerSettings(whitening="none", attempts=1))`, with `SamplerSettings` from `avtorch.inference`:
 #   how wide are the draws without the curvature? Does `converged` notice?
 # - `avtorch validate --synthetic --windows 24 --out out/validate` does this comparison over many windows.

@@ -1,10 +1,10 @@
 # %% [markdown]
 # # A drive, watched and saved
 #
-# At second 26 of a drive a car becomes slow and weak; nobody tells its controller. You will see a belief follow the car
-# two seconds at a time, a monitor notice the change, and a strategist pick the least intrusive setting that keeps the
-# traffic behind the car calm (the paper's Algorithm 2, made to reach its aim). Beside it drives the same car with
-# nobody acting.
+# At second 26 of a drive a car becomes slow and weak; its controller does not know. You will see a belief follow the
+# car two seconds at a time, a monitor detect the change, and a strategist select the least intrusive setting that
+# keeps the traffic behind the car calm (the paper's Algorithm 2, made to reach its aim). For comparison the same car
+# drives without action.
 
 # %%
 from pathlib import Path
@@ -25,8 +25,9 @@ HEALTHY, WORN = (0.3, 1.0), (1.5, 0.5)  # T_L [s], K_L [-]
 # %% [markdown]
 # ## The drive
 #
-# The leader drives the US06 cycle: off, up to 20 m/s, to a full stop, and off again. The loop is advanced by a
-# supervisor: window by window it estimates, watches, and acts. `events` is how the world changes behind its back.
+# The leader drives the US06 cycle: off, up to 20 m/s, to a full stop, and off again. A
+# supervisor advances the loop: window by window it estimates, monitors and acts. `events` changes the car without its
+# knowledge.
 
 
 # %%
@@ -49,14 +50,14 @@ for time, text in sorted(said, key=lambda entry: entry[0]):
     print(f"{time:4.0f} s  {text}")
 
 # %% [markdown]
-# Each alert names its detector and its reason, at the end of the window that raised it: the moment it could be known.
-# Each action says what was set, and how sure the belief is that this will do: strategy 1 changes the lower level, 2 the
-# time gap, 3 the gains. It also says honestly that nothing is *sufficient* in the full sense: this leader asks for more
-# acceleration than half a car can give, so any setting would have had commands clipped.
+# Each alert names its detector and its reason, at the end of the window that raised it: the earliest possible moment.
+# Each action reports the new setting and P(string stable) under it: strategy 1 changes the lower level, 2 the time
+# gap, 3 the gains. It also reports that no setting is *sufficient* in the full sense: this leader demands more
+# acceleration than the worn car can give, so commands would be clipped under any setting.
 #
 # ## The same without action
 #
-# Same leader, same noise, same change; this supervisor has no strategist and only watches.
+# Same leader, same noise, same change; this supervisor has no strategist and only monitors.
 
 # %%
 alone = avtorch.Supervisor(fresh(), window=2.0).run(SECONDS, events=[(CHANGE_S, change)])
@@ -74,10 +75,10 @@ truth = {name: [(0.0, HEALTHY[i]), (CHANGE_S, WORN[i])] for i, name in enumerate
 plots.show(plots.overview_figure(answer, saved.rows.time, traces, truth=truth), OUT / "overview.png")
 
 # %% [markdown]
-# From above: the accelerations; what is believed of lag and gain, with the truth dashed; the probability that the
-# setting in force is string stable. Windows in grey taught nothing (the car stood, or drove evenly), and the belief was
-# carried over. The first excited window after the change sees the probability at nothing, and the actions bring it
-# back.
+# From the top: the accelerations; the estimates of lag and gain, with the truth dashed; the probability that the
+# setting in force is string stable. Windows in grey were not excited (the car stood, or drove evenly), so the belief
+# was carried over. In the first excited window after the change the probability falls to zero, and the actions
+# restore it.
 
 # %%
 print(f"{'':34}{'without action':>16}{'with action':>16}")
@@ -93,13 +94,13 @@ for key, name in measures.items():
     print(f"{name:34}{told['without_action'][key]:>16.4g}{told['with_action'][key]:>16.4g}")
 
 # %% [markdown]
-# Above one in the first two rows, the car makes more of its leader's moves than they were; below one, less. The last
-# row is the price: whoever keeps a longer gap takes more room.
+# Above one in the first two rows, the car amplifies its leader's motion; below one, it damps it. The last row is the
+# price: a longer time gap takes more road.
 #
 # ## Why this setting
 #
-# A setting divides the plane of all cars into those it keeps string stable and the others. Left the setting as built,
-# right the one after the last action.
+# A setting divides the plane of all cars into those that it keeps string stable and the others. On the left is the
+# setting as built, on the right the one after the last action.
 
 # %%
 last = saved.actions[0][-1]
@@ -118,10 +119,10 @@ print(f"after the action {last.peak_gain_true:.3f}; strategies {last.strategies}
 #
 # ## The paper's Algorithm 2, as printed
 #
-# The print updates the lower level and then lengthens the gap to 2 s or raises the gains. Here is what it decides given
-# the belief behind our first action, set at the same moment of the same drive; and the same advice without its lower
-# level, which has to command a multiple of what it is asked for in order to hide a slow actuator. The judges are the
-# exact peak gain at the true car, and the drive itself.
+# The print updates the lower level and then lengthens the time gap to 2 s or raises the gains. Here are its
+# decisions under the belief of our first action, set at the same moment of the same drive, with and without its lower
+# level, which has to command a multiple of the demand in order to hide a slow actuator. They are compared by the exact
+# peak gain at the true car, and by the drive itself.
 
 # %%
 first = next(w for w in saved.windows if w.report.names())
@@ -155,10 +156,10 @@ for name, run in runs.items():
     print(f"{name:24}{peaks[name]:>10.3f}{m['accel_rms_ratio']:>14.3f}{told_of_it}")
 
 # %% [markdown]
-# With its lower level the advice is string stable at the true car, by the time gap as well as by the gains; without it
-# neither is. On this drive the printed time gap with its lower level is as calm as the strategist's choice, and the gap
-# is shorter. Larger gains make a livelier car. The strategist counts commands that would be clipped, and has fewest of
-# them: it lets the lower level be as slow as the car is, and buys the stability by a longer gap instead.
+# With its lower level both decisions, time gap and gains, are string stable at the true car; without it neither is. On
+# this drive the printed time gap with its lower level is as calm as the strategist's choice, and the gap is shorter.
+# Larger gains make a jerkier car. The strategist counts the commands that would be clipped, and has the fewest: it lets
+# the lower level be as slow as the car, and gains the stability by a longer time gap instead.
 #
 # ## The traffic behind
 #
@@ -197,6 +198,6 @@ print("the sixth car slows by", ", ".join(f"{dip:.2f} m/s ({name})" for name, di
 #
 # - `Strategist(Grid(allowed={1, 3}))`, with `Grid` from `avtorch.decision`: the time gap must stay. What does that
 #   cost?
-# - `Strategist(driver_delay=5.0)`: the time gap is not set but asked for, and the driver takes five seconds.
-# - `WORN = (0.8, 0.8)`: a car that is only somewhat tired. Is there an alert? Should there be?
+# - `Strategist(driver_delay=5.0)`: the strategist asks the driver for the time gap, and the driver takes five seconds.
+# - `WORN = (0.8, 0.8)`: a car that is only somewhat worn. Is there an alert? Should there be?
 # - `avtorch run --change-at 26 --T 1.5 --K 0.5 --out out/run` is this drive on the command line.

@@ -2,9 +2,9 @@
 # # Diagnosing a sim-to-real gap
 #
 # A simulator and a car disagree. Which effect does the simulator lack? You will draw a drive of a reference vehicle
-# that shares no code with the diagnosis, with one effect in it that stays sealed; diagnose it from its log alone; read
-# where the gap lies, how far it shrinks and which manoeuvre would settle the rest; drive that manoeuvre; and only then
-# open the seal. At the end the repaired simulator drives on.
+# that shares no code with the diagnosis, with one hidden effect. You will diagnose it from its log alone, see where
+# the gap lies, how far it shrinks and which manoeuvre would separate the remaining hypotheses, drive that manoeuvre,
+# and only then look at the truth. At the end the repaired simulator drives.
 
 # %%
 from pathlib import Path
@@ -43,11 +43,11 @@ ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
 plots.show(figure, OUT / "log.png")
 
 # %% [markdown]
-# Nobody would name an effect by looking at this. The measurement is noisy, and lag and gain are unknown as well.
+# No one could name an effect by eye here. The measurement is noisy, and lag and gain are unknown as well.
 #
 # ## The diagnosis
 #
-# Every effect of the table is fitted, alone and in pairs, with `T_L` and `K_L` free beside it.
+# Every effect of the table is fitted, alone and in pairs, together with `T_L` and `K_L`.
 
 # %%
 found = avtorch.diagnose(log)
@@ -59,46 +59,47 @@ for candidate in found.candidates[:6]:
 plots.show(over_diagnosis.which_figure(found), OUT / "which.png")
 
 # %% [markdown]
-# Printed, a diagnosis says what it found. In the picture, blue bars are what this log cannot tell apart. `unknown`
-# means none of the table: it is always a candidate, and where it is first the diagnosis blames nothing.
+# Printed, a diagnosis reports its verdict. In the picture, blue bars are the hypotheses that this log cannot
+# distinguish. `unknown` means that the cause is not in the table. It is always a hypothesis, and where it comes first
+# the diagnosis names no effect.
 #
-# ## Where it lies, and how far it shrinks
+# ## Where the gap lies, and how far it shrinks
 
 # %%
 plots.show(over_diagnosis.road_figure(found), OUT / "road.png")
 plots.show(over_diagnosis.where_figure(found), OUT / "where.png")
 
 # %% [markdown]
-# Above, the stretch where the simulator with the effect (blue) and without (orange) differ most, beside the
-# measurement. Below, in blue, where the effect does what it does, over time, speed and command; in grey the drive
-# itself. In words it was said above: it lies in what the car does, not in what its sensor shows, and at low
+# Above: the stretch where the simulators with the effect (blue) and without it (orange) differ most, and the
+# measurement. Below: how the effect (blue) and the drive (grey) are distributed over time, speed and command. The
+# printed diagnosis has it in words: the gap lies in the car's motion, not in its sensor's reading, and at low
 # frequencies. A part of the time, the speeds or the commands is named (and shaded) only where it holds nearly all of
-# the effect in much fewer rows.
+# the effect in far fewer rows.
 
 # %%
 told = found.shrinkage
 if told is not None:
     top = told.top
-    print(f"{told.metric}: {top.before:.3g} as it is, {top.after:.3g} with the effect, {top.floor:.3g} at best")
+    print(f"{told.metric}: {top.before:.3g} baseline, {top.after:.3g} with the effect, {top.floor:.3g} noise floor")
     if top.closed is not None:
         closed = f"{top.closed.mean:.0%} ({top.closed.q05:.0%} to {top.closed.q95:.0%})"
-        print(f"closed {closed} of the gap, on rows that chose neither the effect nor its size")
+        print(f"closed {closed} of the reducible gap, on held-out rows")
     plots.show(over_diagnosis.shrinkage_figure(found), OUT / "shrinkage.png")
 
 # %% [markdown]
-# Rollouts on parts of the drive that were held out. Orange is the simulator as it is, blue the repaired one; the light
-# line is what noise alone would leave, the grey crosses what a black box makes of it: with a minute to learn from,
-# worse than nothing. Read the interval of `closed`: a minute in which an effect hardly acts cannot say how far it
-# closes the gap.
+# Rollouts on held-out parts of the drive. Orange is the baseline simulator, blue the repaired one. The light line is
+# the noise floor. The grey crosses are the baseline with a black box, which with a minute of training data increases
+# the error. Note the interval of `closed`: a minute in which an effect hardly acts cannot show how far it closes the
+# gap.
 #
 # ## The next experiment
 #
-# More than one cause is left. Each foretells another answer to a manoeuvre; which manoeuvre sets them apart?
+# More than one hypothesis is left. Each predicts another response to a manoeuvre; which manoeuvre separates them best?
 
 # %%
 ahead = next_experiment(found, Limits(seconds=60.0))
 if ahead is None:
-    print("nothing is confused")
+    print("one hypothesis is left")
     both = found
 else:
     print(ahead.why)
@@ -128,16 +129,16 @@ else:
     plots.show(figure, OUT / "manoeuvre.png")
     both = avtorch.diagnose([log, second])
     print(both.verdict.why)
-    print("not told apart:", ", ".join(both.verdict.alias_set))
+    print("not distinguished:", ", ".join(both.verdict.alias_set))
 
 # %% [markdown]
-# The ramps go through zero slowly, both ways, at low speed and on a road that is taken as level: there a dead band is
-# seen and the others are not. Both drives are diagnosed together.
+# The ramps go through zero slowly, both ways, at low speed and on a road that is assumed level: there a dead band shows
+# and the others do not. Both drives are diagnosed together.
 #
 # ## The truth
 
 # %%
-print("the sealed cause:", case.truth_name, {k: dict(v) for k, v in case.parameters.items()})
+print("the hidden cause:", case.truth_name, {k: dict(v) for k, v in case.parameters.items()})
 print("from" if case.onset_s else "", f"{case.onset_s:.1f} s on" if case.onset_s else "from the start")
 print(f"the car: T_L {case.car.T_L:.3f} s, K_L {case.car.K_L:.3f}")
 for name, answer in (("first drive", found), ("both drives", both)):
@@ -148,8 +149,8 @@ for name, answer in (("first drive", found), ("both drives", both)):
 # %% [markdown]
 # ## Back into the simulator
 #
-# `found.plant` is the repaired simulator. Written down it is a few lines of TOML, and it drives in `avtorch.simulate`
-# like any other plant.
+# `found.plant` is the repaired simulator. As a file it is a few lines of TOML, and it drives in `avtorch.simulate` like
+# any other plant.
 
 # %%
 files = both.write(OUT)
@@ -173,13 +174,13 @@ else:
     plots.show(figure, OUT / "repaired.png")
 
 # %% [markdown]
-# The lower curve is what the missing effect had hidden: a controller tuned in the old simulator would have been wrong
-# about its spacing by so much.
+# The lower curve is the error that the missing effect caused: a controller tuned in the old simulator would have been
+# wrong about its spacing by that much.
 #
 # ## Try this
 #
-# - `avtorch.diagnose(case.log(signals=["speed"]))`: one channel instead of two. What is no longer told apart?
-# - `draw_cases(1, 2026, mix={"outside": 1.0}, seconds=60.0)`: a cause that is not in the table. Is it blamed on a name?
-# - `avtorch.diagnose(log, baseline="dead_time=0.2")`: a simulator that has a delay which the car has not. Is the answer
-#   the same?
+# - `avtorch.diagnose(case.log(signals=["speed"]))`: one channel instead of two. What can no longer be distinguished?
+# - `draw_cases(1, 2026, mix={"outside": 1.0}, seconds=60.0)`: a cause that is not in the table. Is an effect named?
+# - `avtorch.diagnose(log, baseline="dead_time=0.2")`: a simulator with a delay that the car lacks. Is the answer the
+#   same?
 # - Bring your own: `avtorch.Log.read("drive.csv")`, or `avtorch diagnose drive.csv --out out/diagnosis`.

@@ -1,10 +1,10 @@
 # %% [markdown]
 # # Real cars
 #
-# Nobody outside a car maker knows what the controller of a production car demands. You will see how much its speed, its
-# gap and the speed of the car in front tell all the same: how it follows, whether a line of such cars calms a
-# disturbance or makes it grow, and what of that is conditional on what. Then comes a car whose commands *are* known, a
-# test vehicle on three laps, and a diagnosis that declines to blame.
+# Only the maker knows what the controller of a production car demands. Its speed, its spacing and its leader's speed
+# are informative all the same: you will see how the car follows, whether a line of such cars damps a disturbance or
+# amplifies it, and which of these results is conditional on what. Then comes a car whose commands *are* known, a test
+# vehicle on three laps, and a diagnosis that names no effect.
 #
 # The recordings belong to others and are not part of the project, but they are public: OpenACC by the European
 # Commission's Joint Research Centre (its data catalogue has it, GitHub's `yinglonghe/C2ART-OPT` the platoons on
@@ -38,7 +38,7 @@ def there(*names: str) -> bool:
     """Whether the recordings are at hand; says what is missing."""
     missing = [name for name in names if DATA is None or not (DATA / name).exists()]
     if missing:
-        print("not shown, for want of", ", ".join(missing), "in the folder that AVTORCH_DATA names")
+        print("not shown, for lack of", ", ".join(missing), "in the folder that AVTORCH_DATA names")
     return not missing
 
 
@@ -64,8 +64,8 @@ if there(PLATOON):
 # %% [markdown]
 # Three minutes of it: whenever the leader changes its speed, each car overshoots a little more than the one in front.
 #
-# A law of following is fitted to one half of each drive and judged on the other: driven by its leader alone, the loop
-# has to find the car's speed over a minute.
+# A law of following is fitted to one half of each drive and scored on the other: driven by its leader alone, the loop
+# has to predict the car's speed over a minute.
 
 # %%
 for log in logs:
@@ -73,8 +73,10 @@ for log in logs:
     own = found.loops[found.law.name]
     cars.append(found)
     print(f"{found.name.split(', ')[-1]}, {found.law.name.replace('_', ' ')}:")
-    print(f"  speed off by {own.speed:.2f} m/s (a car that keeps its speed: {found.keeps_speed:.1f})")
-    print(f"  passes on {own.amplified:.2f} of its leader's motion, its loop {own.amplified_simulated:.2f};", end=" ")
+    print(f"  speed error {own.speed:.2f} m/s (constant speed: {found.keeps_speed:.1f})")
+    print(
+        f"  amplifies its leader's motion {own.amplified:.2f} times, its loop {own.amplified_simulated:.2f};", end=" "
+    )
     print(f"P(string stable) {found.usual.p_string_stable:.2f}")
 
 # %%
@@ -82,21 +84,21 @@ if cars:
     plots.show(over_followers.followers_figure(cars), OUT / "followers.png")
 
 # %% [markdown]
-# From left: the time gap that each car keeps, how long it takes from what it sees to what it does, and the peak gain.
-# They follow at little more than a second and take about as long to answer, and so they pass on more than they get: all
-# peak gains are above one. What the simulated loops amplify is what the cars amplify.
+# From the left: the time gap that each car keeps, how long it takes from perception to motion, and the peak gain. They
+# follow at little more than a second and take about as long to respond, so they amplify: all peak gains are above one.
+# The simulated loops amplify as much as the cars.
 #
-# All this is conditional on the form of the law, and is about controller and car together. The slopes of the road,
-# which is surveyed, hardly show in these speeds, because the lower level of a production car holds what is demanded
-# uphill and down: from a follower's speed nobody can recover the road. [Real cars](../docs/real-cars.md) has the
-# figures, for 55 drives.
+# All this is conditional on the form of the law, and concerns controller and car together. The slopes of the road,
+# which is surveyed, hardly show in these speeds, because the lower level of a production car realises the demand
+# uphill and down: the road cannot be recovered from a follower's speed. [Real cars](../docs/real-cars.md) has the
+# figures, for 54 drives.
 #
 # ## A car whose commands are known
 #
 # Three laps of one test vehicle with the demanded acceleration and the speed, no accelerometer. Four effects are
-# candidates here, so that it does not take long; each lap is judged by what the other two fitted. The same question is
-# asked twice: as it is, and with `unknown` ruled out. The fits are kept in a file between the two, and the second time
-# only the odds are new.
+# tried here, so that it does not take long; each lap is scored by a fit to the other two. The diagnosis runs twice:
+# once as usual, once with `unknown` excluded. The fits are kept in a file between the two, so the second run computes
+# only new probabilities.
 
 # %%
 if there(*LAPS):
@@ -106,13 +108,13 @@ if there(*LAPS):
         kept = Path(folder) / "fits.json"
         as_it_is = avtorch.diagnose(laps, effects=among, pairs=False, checkpoint=kept)
         told = avtorch.diagnose(laps, effects=among, pairs=False, checkpoint=kept, prior={"unknown": 0})
-    print(f"as it is: {as_it_is.verdict.name}, probability {as_it_is.winner.probability:.2f}")
-    print(f"if it must be one of these: {told.verdict.name}, probability {told.winner.probability:.2f}", end="; ")
+    print(f"as usual: {as_it_is.verdict.name}, probability {as_it_is.winner.probability:.2f}")
+    print(f"without unknown: {told.verdict.name}, probability {told.winner.probability:.2f}", end="; ")
     print(", ".join(f"{name} {q.mean:.2f} ({q.q05:.2f} to {q.q95:.2f})" for name, q in told.winner.parameters.items()))
 
 # %% [markdown]
-# The measured speed trembles at 8 to 20 Hz as no effect of the table makes it, so the honest answer is `unknown`: the
-# diagnosis blames nothing. Made to choose, it takes brakes that are stronger than the engine.
+# The measured speed fluctuates at 8 to 20 Hz as under no effect of the table, so the honest verdict is `unknown`.
+# Without that choice, the verdict is brakes that are stronger than the engine.
 
 # %%
 if there(*LAPS) and told.shrinkage is not None:
@@ -123,15 +125,14 @@ if there(*LAPS) and told.shrinkage is not None:
         ("closed_loop_rmse_speed", "a drive behind a leader"),
     ):
         moved = told.shrinkage.by_metric[metric]
-        print(f"speed over {words}: off by {moved.before:.2g} m/s, with the effect {moved.after:.2g}", end="")
+        print(f"speed over {words}: error {moved.before:.2g} m/s, with the effect {moved.after:.2g}", end="")
         closed = moved.closed
         print("" if closed is None else f"; closed {closed.mean:.0%} ({closed.q05:.0%} to {closed.q95:.0%})")
 
 # %% [markdown]
-# On the lap that was held out the effect helps over ten seconds. Over a whole lap the interval reaches from worse than
-# nothing to most of the gap, and behind a leader there is hardly a gap to close: three laps of a minute say that
-# something of the kind is there, not what it is worth. With all effects as candidates, not four, even that is less
-# sure.
+# On the held-out lap the effect reduces the error over ten seconds. Over a whole lap the interval reaches from an
+# increase to most of the gap, and behind a leader there is hardly a gap to close: three laps of a minute show that
+# some such effect exists, not how much it closes. With all effects tried, not four, even that is less sure.
 #
 # ## Try this
 #

@@ -1,10 +1,9 @@
 # %% [markdown]
 # # Your own
 #
-# Your car has something that is not among the 22 effects of the table, or a controller that nobody has written down as
-# three gains. You will write an effect in a dozen lines, look at it, drive with it and have it diagnosed; then put a
-# controller of your own into the loop, find the setting that it amounts to, and let the monitor watch it through a
-# change of the car.
+# Your car has an effect that is not among the 22 of the table, or a controller that is not three gains. You will
+# write an effect in a dozen lines, plot it, drive with it and diagnose it. Then you will put a controller of your own
+# into the loop, find the equivalent setting, and monitor it through a change of the car.
 
 # %%
 from dataclasses import dataclass
@@ -29,8 +28,8 @@ OUT = Path("out/notebooks/6_your_own")
 # %% [markdown]
 # ## An effect
 #
-# Many cars answer a small command with less than its share: the pedal's map is bent. The class below says so: its place
-# in the chain (`command`), its parameter with a typical range, which is its prior, and what it does. At the neutral
+# Many cars realise a smaller share of a small command: the pedal's map is bent. The class below defines this: its place
+# in the chain (`command`), its parameter with a typical range, which is its prior, and its equation. At the neutral
 # value it must do nothing. [How to add an effect](../docs/own-effect.md) has the rules for all places in the chain.
 
 
@@ -56,10 +55,10 @@ ax.legend(loc="upper center", bbox_to_anchor=(0.5, 1.25), ncols=4)
 plots.show(figure, OUT / "signature.png")
 
 # %% [markdown]
-# Its signature: the standard command in grey, the answer without and with the effect, and below, magnified, the gap
-# between the two. Small commands fall short, the brake pulse of 2 m/s² does not.
+# Its signature: the standard command in grey, the response without and with the effect, and below, magnified, the
+# difference of the two. Small commands fall short, the brake pulse of 2 m/s² does not.
 #
-# Neutral must be the plain vehicle, to the last digits:
+# At the neutral value it must equal the plain vehicle, to the last digits:
 
 # %%
 time = torch.arange(2000, dtype=torch.float64) * 0.02
@@ -71,7 +70,7 @@ print(f"neutral against none: {error:.1e} m/s²; bent against none: {float((bent
 # %% [markdown]
 # ## The effect diagnosed
 #
-# A minute of driving with it. Then the diagnosis, with the class as one more candidate beside the 22.
+# A minute of driving with it. Then the diagnosis, with the class as one more hypothesis beside the 22.
 
 # %%
 car = plant([PedalMap(0.4)], baseline="T_L=0.4, K_L=0.9", sigma=0.1)
@@ -83,18 +82,19 @@ print("true curve 0.4;", "not named" if q is None else f"found {q.mean:.3f} ({q.
 plots.show(over_diagnosis.which_figure(found), OUT / "which.png")
 
 without = avtorch.diagnose(run.log(), pairs=False)
-print("without the class among the candidates:", without.verdict.name, f"{without.winner.probability:.2f}")
+print("without the class among the hypotheses:", without.verdict.name, f"{without.winner.probability:.2f}")
 
 # %% [markdown]
-# With the class among the candidates the diagnosis has a name for what it sees, and its size. Without it there is none
-# to be had: the best that can be said then is `unknown`, or a name that is wrong.
+# With the class among the hypotheses the diagnosis names the effect and its size. Without it it cannot: the verdict is
+# `unknown` at best, or a wrong name.
 #
-# `@register` above the class would make it a candidate everywhere: in strings, in TOML files, in every diagnosis.
+# `@register` above the class would make it available everywhere: in strings, in TOML files, in every diagnosis.
 #
 # ## A controller
 #
-# Any callable that turns what a follower sees into a demanded acceleration [m/s²] will do: a law, a network, a binary
-# behind a wire. This one drives at the speed that its spacing allows, and is never told of gains or a time gap.
+# A controller is any callable that maps a follower's measurements to a demanded acceleration [m/s²]: a law, a
+# network, a binary behind a wire. This one drives at the speed that its spacing allows, and has neither gains nor a
+# time gap.
 
 
 # %%
@@ -109,11 +109,11 @@ def controller(state: FollowerState) -> torch.Tensor:
 
 
 # %% [markdown]
-# ## What it amounts to
+# ## Its equivalent setting
 #
-# Stability is asked of gains and a time gap. Near a steady drive every smooth controller has them: its derivatives.
-# With `u = k_s (spacing - tau v - d) + k_v (v_lead - v) + k_a a`, autograd finds all four. Here they are over the
-# speeds.
+# Stability is a property of gains and a time gap. Near a steady drive every smooth controller has them: its
+# derivatives. With `u = k_s (spacing - tau v - d) + k_v (v_lead - v) + k_a a`, autograd finds all four. Here they are
+# over the speeds.
 
 # %%
 speeds = torch.linspace(2.0, 26.0, 49, dtype=torch.float64)
@@ -144,15 +144,15 @@ setting = Setting(time_gap=float(time_gap[at]), gains=gains[at].tolist())
 print(f"at 15 m/s: time gap {float(time_gap[at]):.2f} s, gains", *(f"{k:.2f}" for k in gains[at]))
 
 # %% [markdown]
-# Left: the faster it drives, the more distance it wants for each m/s, and the softer it answers a spacing that is off.
-# Right: what that means in a line of cars. With the healthy actuator the peak gain is one, with the worn one it is
-# more, but for high speeds. The monitor below is told the setting at 15 m/s.
+# Left: the faster it drives, the more distance it keeps for each m/s, and the more softly it corrects its spacing.
+# Right: the result in a line of cars. With the healthy actuator the peak gain is one, with the worn one it is larger,
+# except at high speeds. The monitor below gets the setting at 15 m/s.
 #
-# ## Watched
+# ## Monitored
 #
-# The supervisor takes the controller as it is. Because the controller does not tell its setting, we do. The strategist
-# may change the lower level only (strategy 1): it cannot reach into a controller that it does not know. At 26 s the car
-# changes.
+# The supervisor takes the controller as it is. Because the controller has no setting of its own, we pass one. The
+# strategist may change the lower level only (strategy 1): it cannot adjust a controller that it does not know. At 26
+# s the car changes.
 
 
 # %%
@@ -189,14 +189,13 @@ for key in ("accel_rms_ratio", "jerk_rms_mps3", "min_spacing_m"):
     print(f"{key}: {told['without_action'][key]:.3g} without action, {told['with_action'][key]:.3g} with")
 
 # %% [markdown]
-# The belief follows lag and gain as it does under the paper's controller: it looks at what was sent and what came of
-# it, never at who sent it. Without action the worn car runs into its leader at the stop (the least spacing is below
-# zero; what the orange line does afterwards means nothing). With a lower level that knows the car, it stops clear of
-# it.
+# The belief follows lag and gain as it does under the paper's controller: it uses the commands and the response, not
+# the controller. Without action the worn car runs into its leader at the stop (the least spacing is below zero; the
+# orange line means nothing afterwards). With a lower level that knows the car, it stops clear of its leader.
 #
 # ## Try this
 #
 # - A `torch.nn.Module` as the controller: the same call, the same derivatives.
 # - `PedalMap` with `memory`: a pedal that sticks (`StickyPedal` in [the page](../docs/own-effect.md)).
-# - `plant([PedalMap(0.4)], baseline=...)` behind your controller: which of the two does the diagnosis blame?
-# - `avtorch.MPC()` as the controller: it tells its setting, so no `setting=` is needed.
+# - `plant([PedalMap(0.4)], baseline=...)` behind your controller: does the diagnosis name the effect?
+# - `avtorch.MPC()` as the controller: it has a setting of its own, so no `setting=` is needed.

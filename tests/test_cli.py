@@ -126,7 +126,7 @@ def test_windows_that_did_not_settle_are_told_apart() -> None:
     note = estimates_note({"windows": [lost, calm], "spread_over_sd": ratio})
     assert "first prior" in note
     away = {**good, "alerts": ["accepted_change"]}
-    assert "say so with --accepted" in estimates_note({"windows": [away], "spread_over_sd": ratio})
+    assert "pass its own with --accepted" in estimates_note({"windows": [away], "spread_over_sd": ratio})
     note = estimates_note({"windows": [away] * 3, "spread_over_sd": {"T_L": 2.3, "K_L": 0.9}})
     assert "avtorch diagnose" in note
     assert "--accepted" not in note
@@ -321,7 +321,7 @@ def test_a_sound_car_of_other_values_is_accepted(tmp_path: Path, capsys: pytest.
         answer = json.loads((out / "estimates.json").read_text(encoding="utf-8"))
         assert list(answer["assumed"]["accepted"].values()) == [float(x) for x in values.split(",")]
         alerts[values] = [a for a in answer["alerts"] if a["detector"] == "accepted_change"]
-        assert ("say so with --accepted" in said) == bool(alerts[values])
+        assert ("pass its own with --accepted" in said) == bool(alerts[values])
     assert len(alerts["0.3,1.0"]) >= 2
     assert alerts["0.5,0.8"] == []
 

@@ -14,15 +14,17 @@ from avtorch.errors import InputError
 
 def blindtest(
     *,
-    n: Annotated[int, Parameter(name="--n", converter=whole_number, help="How many cases; 20 hold the mix.")],
+    n: Annotated[int, Parameter(name="--n", converter=whole_number, help="Number of cases; 20 hold the mix.")],
     seed: Seed,
     out: Out,
-    signals: Annotated[Literal["both", "accel", "speed"], Parameter(help="What the logs tell of the motion.")] = "both",
+    signals: Annotated[
+        Literal["both", "accel", "speed"], Parameter(help="Which measured channels the logs hold.")
+    ] = "both",
     rivals: Annotated[
         str, Parameter(help="all that are installed, none but the random guess, or names with commas between.")
     ] = "all",
     workers: Annotated[int, Parameter(converter=whole_number, help="Processes, one thread each.")] = 1,
-    resume: Annotated[bool, Parameter(negative=(), help="Go on with what lies in --out.")] = False,
+    resume: Annotated[bool, Parameter(negative=(), help="Resume the trial in --out.")] = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""The table of a blind test: the judged one with its 90 % intervals, what is asked for, and the rivals."""
+"""The table of a blind test: the method with its 90 % intervals, the aims, and the rivals."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _MEASURES = (
     ("top-1, faint", "top1.faint", "%", "≥ 60 %"),
     ("alias set holds the truth", "alias_set.accuracy", "%", "≥ 99 %"),
     ("alias set's size", "alias_set.mean_size", "", "≤ 1.5"),
-    ("none accused", "false_alarm", "%", "≤ 3 %"),
-    ("confident and wrong", "confident_errors", "%", "≤ 2 %"),
+    ("false alarms on none", "false_alarm", "%", "≤ 3 %"),
+    ("above 0.9 and wrong", "confident_errors", "%", "≤ 2 %"),
     ("unknown, AUROC", "unknown_auroc", "", "≥ 0.95"),
     ("unknown, FPR at 95 %", "unknown_fpr95", "%", ""),
-    ("unknown blamed on a name", "unknown_confidently_blamed", "%", "≤ 10 %"),
+    ("unknown named as an effect", "unknown_confidently_blamed", "%", "≤ 10 %"),
     ("calibration error", "ece", "", "≤ 0.05"),
     ("Brier score", "brier", "", ""),
     ("macro F1", "macro_f1", "", ""),
     ("pairs exact", "pairs_exact", "%", "≥ 80 %"),
     ("pairs, Jaccard", "pairs_jaccard", "", "≥ 0.9"),
-    ("onset off, median [s]", "onset_error_s", "", "≤ 5"),
-    ("seconds a case", "seconds_per_case", "", ""),
+    ("onset error, median [s]", "onset_error_s", "", "≤ 5"),
+    ("seconds per case", "seconds_per_case", "", ""),
 )
 
 
@@ -35,7 +35,7 @@ def blindtest_table(answer: Mapping[str, Any]) -> Table:
     """A row a measure; `answer` as of `avtorch.trial.run_trial`. Measures that no case bears on are left out."""
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("")
-    for name in (answer["answerer"], "90 %", "asked for", *answer["baselines"]):
+    for name in (answer["answerer"], "90 %", "aim", *answer["baselines"]):
         table.add_column(escape(name), justify="right", no_wrap=True)
     for words, path, kind, asked in _MEASURES:
         if _at(answer, path) is None:

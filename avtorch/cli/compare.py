@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 _ROWS = {
     "T_L": "lag T_L [s]",
     "K_L": "gain K_L [-]",
-    "rollout_rmse_accel": "off in acceleration, {horizon} s [m/s²]",
-    "rollout_rmse_speed": "off in speed, {horizon} s [m/s]",
+    "rollout_rmse_accel": "acceleration error, {horizon} s [m/s²]",
+    "rollout_rmse_speed": "speed error, {horizon} s [m/s]",
 }
 
 
@@ -34,7 +34,7 @@ def compare(
         str, Parameter(help="The simulator: effects such as dead_time=0.2, or TOML; glvd is fitted to BEFORE.")
     ] = "glvd",
     baseline_after: Annotated[
-        str | None, Parameter(help="The simulator that AFTER is held against; default: the same.")
+        str | None, Parameter(help="The simulator that AFTER is compared with; default: the same.")
     ] = None,
     out: Annotated[Path | None, Parameter(name="--out", group=OUTPUT, help="Folder for comparison.json.")] = None,
     map: Annotated[

@@ -56,17 +56,20 @@ def diagnose(
     ] = "glvd",
     prior: Annotated[
         list[str] | None,
-        Parameter(negative=(), help="Prior weight of a cause, NAME=WEIGHT (effect, none, unknown, pair); repeatable."),
+        Parameter(
+            negative=(), help="Prior weight of a hypothesis, NAME=WEIGHT (effect, none, unknown, pair); repeatable."
+        ),
     ] = None,
     accel_kind: Annotated[
         Literal["kinematic", "specific-force"],
-        Parameter(help="What accel is: dv/dt, or an accelerometer's reading with gravity's share in it."),
+        Parameter(help="What accel is: dv/dt, or an accelerometer's reading of specific force."),
     ] = "kinematic",
     budget: Annotated[float | None, Parameter(help="Stop the search after this time [s]; default: none.")] = None,
     effects: Annotated[str | None, Parameter(help="Only these effects, NAME,NAME,...; default: all.")] = None,
     pairs: Annotated[bool, Parameter(help="Look for two effects at once.")] = True,
     posterior: Annotated[
-        Literal["laplace", "sgld"], Parameter(help="Of the winner's parameters: normal approximation, or SGLD.")
+        Literal["laplace", "sgld"],
+        Parameter(help="Posterior of the winner's parameters: normal approximation, or SGLD."),
     ] = "sgld",
     follower: Annotated[
         bool, Parameter(group=FOLLOWER, negative=(), help="The log is of a car that follows, and has no accel_cmd.")
@@ -74,19 +77,21 @@ def diagnose(
     vehicle: Annotated[int | None, Parameter(group=FOLLOWER, help="Which vehicle of an OpenACC platoon.")] = None,
     law: Annotated[
         Literal["constant_time_gap", "intelligent_driver"] | None,
-        Parameter(group=FOLLOWER, help="What its controller is taken to be; default: what foretells it better."),
+        Parameter(group=FOLLOWER, help="The assumed controller; default: the one that predicts better."),
     ] = None,
     event: Annotated[int | None, Parameter(group=FOLLOWER, help="Which event of an NGSIM file.")] = None,
-    resume: Annotated[bool, Parameter(help="Go on from an interrupted run in --out, or begin anew.")] = True,
+    resume: Annotated[bool, Parameter(help="Resume an interrupted run in --out, or start again.")] = True,
     speed_min: Annotated[
-        float | None, Parameter(group=TRACK, help="Slowest of the next experiment [m/s]; default: as in the log.")
+        float | None, Parameter(group=TRACK, help="Lowest speed of the next experiment [m/s]; default: as in the log.")
     ] = None,
-    speed_max: Annotated[float | None, Parameter(group=TRACK, help="Fastest [m/s]; default: as in the log.")] = None,
+    speed_max: Annotated[
+        float | None, Parameter(group=TRACK, help="Highest speed [m/s]; default: as in the log.")
+    ] = None,
     accel_min: Annotated[
         float | None, Parameter(group=TRACK, help="Hardest braking [m/s²], below 0; default: as in the log.")
     ] = None,
     accel_max: Annotated[
-        float | None, Parameter(group=TRACK, help="Hardest push [m/s²]; default: as in the log.")
+        float | None, Parameter(group=TRACK, help="Hardest acceleration [m/s²]; default: as in the log.")
     ] = None,
     road: Annotated[float | None, Parameter(group=TRACK, help="Length of the road [m]; default: 2000.")] = None,
     seconds: Annotated[float | None, Parameter(group=TRACK, help="Duration [s]; default: 60.")] = None,
@@ -94,10 +99,10 @@ def diagnose(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """What does the simulator lack? Names the effect, its parameters, and what cannot be told apart.
+    """What does the simulator lack? Names the effect, its parameters, and what the log cannot distinguish.
 
-    Writes diagnosis.json and plant.toml, the simulator with the effect in. A run that was interrupted, or ended by its
-    --budget, goes on where it stood when the command is given again.
+    Writes diagnosis.json and plant.toml, the repaired simulator. Give the command again to resume a run that was
+    interrupted or ended by its --budget.
 
     Parameters
     ----------
@@ -168,7 +173,7 @@ def diagnose(
             )
     except KeyboardInterrupt:
         if (out / FITS).exists():
-            told = f"no answer was written; what is done is kept in {out / FITS}: the same command goes on from there"
+            told = f"no answer was written; finished fits are kept in {out / FITS}: the same command resumes there"
             raise KeyboardInterrupt(told) from None
         raise
     from avtorch.remedy import setting_for, write_exports

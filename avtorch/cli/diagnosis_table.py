@@ -36,7 +36,7 @@ def diagnosis_table(found: Diagnosis) -> Table:
     from avtorch.gap.result.sentences import number
 
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
-    table.add_column("candidate", no_wrap=True)
+    table.add_column("hypothesis", no_wrap=True)
     table.add_column("probability", no_wrap=True)
     table.add_column("nats", justify="right", no_wrap=True)
     table.add_column("parameters (90 %)")
@@ -77,7 +77,9 @@ def diagnosis_notes(found: Diagnosis) -> list[str]:
     ]
     lines = [escape(line) for line in told]
     if not found.complete:
-        text = "The budget ended the search: the answer is provisional; the same command with more goes on from here."
+        text = (
+            "The budget ended the search: the answer is provisional; the same command with a larger one resumes here."
+        )
         lines.append(f"[yellow]{text}[/]")
     return lines + [f"[dim]{escape(note)}[/]" for note in found.notes if found.complete or "budget" not in note]
 

@@ -56,17 +56,19 @@ def estimate(
     tau: TimeGap = 1.0,
     gains: Gains = "1.5,1.5,-0.8",
     accepted: Annotated[
-        str, Parameter(help="T_L,K_L of the car as it should be, which accepted_change compares with [s, -].")
+        str, Parameter(help="    T_L,K_L of the car as it should be, which accepted_change compares with [s, -].")
     ] = "0.3,1.0",
-    dead_time: Annotated[float, Parameter(help="Dead time of the car [s], if known: avtorch diagnose tells it.")] = 0.0,
+    dead_time: Annotated[
+        float, Parameter(help="Dead time of the car [s], if known; avtorch diagnose estimates it.")
+    ] = 0.0,
     seed: Seed = 0,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """What a recorded drive says about the vehicle's actuation, window by window.
+    """Estimate the vehicle's actuation, lag and gain, from a recorded drive, window by window.
 
     A check of the log comes first. Then one posterior of (T_L, K_L) per window, alerts, and P(string stable) under the
-    controller named by --tau and --gains, which a log does not tell.
+    controller named by --tau and --gains, which a log does not hold.
 
     Parameters
     ----------
@@ -81,7 +83,7 @@ def estimate(
     free_folder(out, without="run.json")
     seed_number(seed)
     if mode != "lambda" and estimator not in ("sgld", "map"):
-        raise InputError(f"--mode: has no meaning with --estimator {estimator}, which hands no prior on; leave it out")
+        raise InputError(f"--mode: has no meaning with --estimator {estimator}, which passes no prior on; leave it out")
 
     from avtorch.decision.estimation import estimate as work
     from avtorch.decision.monitor import Monitor
@@ -125,13 +127,13 @@ def estimates_note(answer: Mapping[str, Any]) -> str:
     windows = answer["windows"]
     excited, used = ([w for w in windows if w[key]] for key in ("excited", "used"))
     if not excited:
-        longer = "a longer --window holds more" if len(windows) > 1 else "a livelier drive is needed"
+        longer = "use a longer --window" if len(windows) > 1 else "drive with more acceleration and braking"
         return f"{len(windows)} windows, none excited: the belief is still the first prior; {longer}."
     lost = len(excited) - len(used)
     count = f"{len(excited)} of {len(windows)} windows excited"
     if lost:
         what = "their chains" if answer.get("estimator", "sgld") == "sgld" else "the estimates"
-        count += f", {lost} of them not used, as {what} did not settle"
+        count += f", {lost} of them not used, as {what} did not converge"
     if not used:
         return f"{count}; the belief is still the first prior."
     last = used[-1]
@@ -139,8 +141,10 @@ def estimates_note(answer: Mapping[str, Any]) -> str:
     spread = [f"{name} {x:.1f}" for name, x in answer["spread_over_sd"].items() if x is not None]
     told = f" Spread from window to window over posterior SD: {', '.join(spread)}." if spread else ""
     if any((x or 0.0) > UNEXPLAINED for x in answer["spread_over_sd"].values()):
-        told += " Lag and gain alone do not explain this log, or they changed: avtorch diagnose says what may"
-        told += " (a dead time goes into --dead-time)."
+        told += " Lag and gain alone do not explain this log, or they changed: find the cause with avtorch diagnose"
+        told += " (pass a dead time with --dead-time)."
     elif all("accepted_change" in w["alerts"] for w in used):
-        told += " All of them are away from what is accepted: if the car is sound so, say so with --accepted T_L,K_L."
-    return f"{count}; the last {'used' if lost else 'of them'} says {text}.{told}"
+        told += (
+            " All of them differ from the accepted values: if the car is sound, pass its own with --accepted T_L,K_L."
+        )
+    return f"{count}; the last {'used' if lost else 'of them'} estimates {text}.{told}"

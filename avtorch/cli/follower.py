@@ -66,7 +66,7 @@ def follow(
         talk.out.print(escape(line))
     talk.out.print()
     talk.out.print(_table(found.parameters))
-    talk.out.print("\nConditional on that law, on the half of the drive that did not fit it:")
+    talk.out.print("\nConditional on that law, on the held-out half of the drive:")
     talk.out.print(*diagnosis_headline(gap), sep="\n")
     for note in diagnosis_notes(gap):
         talk.out.print(note)

@@ -24,12 +24,12 @@ def paper(
         Path | None,
         Parameter(help="Folder that holds ngsim and the OpenACC platoons; default: AVTORCH_DATA, or US06 without one."),
     ] = None,
-    seeds: Annotated[int, Parameter(converter=whole_number, help="Noises of every setting.")] = 20,
+    seeds: Annotated[int, Parameter(converter=whole_number, help="Noise seeds of every setting.")] = 20,
     seed: Seed = 0,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run the paper's experiments anew, and say of each claim: same, better, or not reproduced.
+    """Repeat the paper's experiments, and report of each claim: same, better, or not reproduced.
 
     All of them take some minutes, and are equal by seed. Pictures and paper.json are written.
 

@@ -53,7 +53,9 @@ def run(
     K: Annotated[Gain, Parameter(help="Actuation gain K_L from the change on [-].")] = 0.5,
     strategy: Annotated[
         Literal["auto", "1", "2", "3", "none"],
-        Parameter(help="What may be done: 1 lower level, 2 time gap as well, 3 gains as well, auto any, none watch."),
+        Parameter(
+            help="What may change: 1 lower level, 2 time gap as well, 3 gains as well, auto any, none only watch."
+        ),
     ] = "auto",
     controller: Annotated[Literal["linear", "mpc"], Parameter(help="Upper level.")] = "linear",
     noise: Annotated[float, Parameter(help="Jerk noise [m/s³].")] = 0.1,
@@ -63,7 +65,7 @@ def run(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Follow a leader, change the vehicle on the way, watch what is believed of it, act.
+    """Simulate a follower whose vehicle changes: estimate, detect the change, act.
 
     The same drive without any action, under the same noise, stands beside it.
     """

@@ -36,7 +36,7 @@ def stability(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Is one setting stable, and does it damp what the leader does: conditions, exact verdict, peak gain, region."""
+    """Is one setting stable and string stable: conditions, exact verdict, peak gain, region."""
     positive("--T", T, "s")
     positive("--K", K)
     not_negative("--tau", tau, "s")

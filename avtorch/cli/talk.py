@@ -60,7 +60,7 @@ class Talk:
             table.add_column(escape(name), justify="left" if name == "" else "right", no_wrap=name != "")
         for w in windows[:most]:
             style = None if w["used"] else "dim"
-            unused = "not settled" if w["excited"] else "not excited"
+            unused = "not converged" if w["excited"] else "not excited"
             cells = [
                 f"{w['start_s']:.0f}-{w['end_s']:.0f}" if _whole(w) else f"{w['start_s']:.1f}-{w['end_s']:.1f}",
                 str(w["n"]),
@@ -77,13 +77,13 @@ class Talk:
 
     def summary(self, answer: Mapping[str, Any], sentence: str) -> None:
         self.out.print(sentence)
-        # an alarm that nobody answers goes on: its first window tells, the rest are counted
+        # an unanswered alarm repeats in every window: show the first, count the rest
         first: dict[str, Mapping[str, Any]] = {}
         for alert in answer["alerts"]:
             first.setdefault(alert["detector"], alert)
         for name, alert in first.items():
             count = sum(a["detector"] == name for a in answer["alerts"])
-            again = f" (and {count - 1} window{'s' * (count > 2)} more)" if count > 1 else ""
+            again = f" (and {count - 1} more window{'s' * (count > 2)})" if count > 1 else ""
             told = f"{alert['time_s']:.1f} s  {name}: {alert['why']}{again}"
             self.out.print(told, style="yellow", markup=False)
 
@@ -116,7 +116,7 @@ class Talk:
         self.out.print(table)
         hit = [side.replace("_", " ") for side, seen in both.items() if (seen["min_spacing_m"] or 0.0) < 0]
         if hit:
-            text = f"Collision {' and '.join(hit)}: what follows it, figures included, is no longer physical."
+            text = f"Collision {' and '.join(hit)}: everything after it, figures included, is not physical."
             self.out.print(text, style="bold red")
 
     def stability(self, answer: Mapping[str, Any]) -> None:
@@ -130,14 +130,14 @@ class Talk:
         self.out.print(table)
         self.out.print()
         if answer["setting"]["dead_time_s"] > 0:
-            self.out.print("The conditions above know no dead time; the verdict below does.", style="dim")
+            self.out.print("The conditions above ignore the dead time; the verdict below includes it.", style="dim")
         local, string, peak = answer["locally_stable"], answer["string_stable"], answer["peak_gain"]
         self.out.print(f"locally stable   {_yes(local)}")
         self.out.print(f"string stable    {_yes(string)}")
         if peak is not None:
             where = f" at {answer['peak_frequency_radps']:.3g} rad/s" if not string else ""
             self.out.print(f"peak gain        [bold]{peak:.4f}[/bold]{where}")
-        self.out.print(f"dead time left   {answer['dead_time_margin_s']:.3f} s until locally unstable")
+        self.out.print(f"dead time left   {answer['dead_time_margin_s']:.3f} s before local instability")
 
     def done(self, out: Path, answer: Mapping[str, Any]) -> None:
         if self.json:

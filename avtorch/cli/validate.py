@@ -31,13 +31,15 @@ def validate(
         bool, Parameter(negative=(), help="Windows of simulated vehicles, slow to quick, in place of a log.")
     ] = False,
     windows: Annotated[
-        int | None, Parameter(converter=whole_number, help="How many windows; 200 synthetic ones, or all of a log.")
+        int | None, Parameter(converter=whole_number, help="Number of windows; 200 synthetic ones, or all of a log.")
     ] = None,
     window: Annotated[float, Parameter(help="Length of a log's windows [s].")] = 2.0,
     out: Out,
     nuts_windows: Annotated[
         int | None,
-        Parameter(converter=whole_number, help="On how many of them NUTS is run; 3, or 1 without jerk (minutes each)."),
+        Parameter(
+            converter=whole_number, help="Number of windows that NUTS samples; 3, or 1 without jerk (minutes each)."
+        ),
     ] = None,
     spread: Annotated[float, Parameter(help="Posterior SDs around the mode at which chains start.")] = 0.0,
     chains: Annotated[int | None, Parameter(converter=whole_number, help="SGLD chains per window.")] = None,
@@ -58,7 +60,7 @@ def validate(
 ) -> None:
     """Do SGLD's posteriors agree with exact quadrature and with NUTS?
 
-    Each window is taken on its own, under the first prior. Needs pip install 'avtorch[validate]'.
+    Each window is estimated alone, under the first prior. Needs pip install 'avtorch[validate]'.
 
     Parameters
     ----------

@@ -10,13 +10,13 @@ from rich.table import Table
 
 
 def validation_table(answer: Mapping[str, Any]) -> Table:
-    """A row a parameter: how far SGLD lies from the reference over the windows, above what is asked for."""
+    """A row a parameter: how far SGLD lies from the reference over the windows; last the aims."""
     from avtorch.inference.arviz_export import UNITS
 
     units = {name: unit.replace("^2", "²").replace("^3", "³").replace("sqrt(s)", "√s") for name, unit in UNITS.items()}
     summary = answer["summary"]
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
-    for name in ("", "mean off [SD]", "SD ratio", "W1 [SD]", "90 % covers", "exact", "ESS"):
+    for name in ("", "mean error [SD]", "SD ratio", "W1 [SD]", "90 % covers", "exact", "ESS"):
         table.add_column(escape(name), justify="right" if name else "left", no_wrap=True)
     exact = summary.get("coverage_90_quadrature")
     for key in ("T_L", "K_L", "sigma"):
@@ -30,7 +30,7 @@ def validation_table(answer: Mapping[str, Any]) -> Table:
             "" if exact is None else f"{100 * exact[key]:.1f} %",
             f"{summary['ess_bulk_median'][key]:.0f}",
         )
-    table.add_row("asked for", "0.100", "0.950-1.050", "", "", "", "", style="dim")
+    table.add_row("aim", "0.100", "0.950-1.050", "", "", "", "", style="dim")
     return table
 
 
@@ -42,7 +42,8 @@ def validation_notes(answer: Mapping[str, Any]) -> list[str]:
     covers = "interval covers the truth" if summary["coverage_is"] == "truth" else "interval's mass in the reference"
     compared = summary["compared"]
     return [
-        f"SGLD against {answer['reference']}, {compared} windows: 95 % of them below, or between; 90 % {covers}.",
-        f"{summary['windows']} windows, {summary['excited']} excited, {summary['settled']} settled; "
+        f"SGLD against {answer['reference']}, {compared} windows: errors and W1 are 95 % quantiles, SD ratios "
+        f"the central 95 %; 90 % {covers}.",
+        f"{summary['windows']} windows, {summary['excited']} excited, {summary['settled']} converged; "
         f"one takes {', '.join(run)}.",
     ]

@@ -78,7 +78,7 @@ class MonitorReport:
             return f"P(string stable) is {p:.2f} with the setting in force{worse} ({seen})"
         if name == "accepted_change":
             sure = float(self.statistics[name][scenario])
-            return f"{seen} left what was accepted ({T0:.2f} s, {K0:.2f}) with probability {sure:.3f}"
+            return f"{seen} left the accepted values ({T0:.2f} s, {K0:.2f}) with probability {sure:.3f}"
         value = float(self.statistics[name][scenario])
         if name in CHARTS:
             limit = float(self.statistics[name + "_limit"][scenario])

@@ -32,7 +32,7 @@ def sentences(
         steps = []
         if 1 in used:
             steps.append(
-                f"lower level models T {now['T_hat']:.2f} s, K {now['K_hat']:.2f} and aims at {now['T_d']:.2f} s"
+                f"lower level models T {now['T_hat']:.2f} s, K {now['K_hat']:.2f} and targets {now['T_d']:.2f} s"
             )
         if 2 in used:
             verb = "driver asked for a time gap of" if bool(asked[i]) else "time gap"
@@ -51,5 +51,5 @@ def sentences(
         if bool(sufficient[i]):
             out.append(f"least intrusive sufficient setting: {what} ({result})")
         else:
-            out.append(f"no setting of the grid is sufficient, the best is taken: {what} ({result})")
+            out.append(f"no setting of the grid is sufficient; the best one: {what} ({result})")
     return out

@@ -284,7 +284,7 @@ def read_setting(loop: ClosedLoop) -> Setting:
     controller, lower = loop.controller, loop.lower_level
     gains: Any = getattr(controller, "gains", None)
     if gains is None or not hasattr(controller, "time_gap"):
-        raise InputError("controller: tells no gains and time_gap; give the setting to be judged by")
+        raise InputError("controller: has no gains and time_gap; give the setting to assume")
     gap = controller.time_gap  # type: ignore[attr-defined]
     k_f = getattr(controller, "feedforward", 0.0)
     return Setting(lower.T_hat, lower.K_hat, lower.T_d, lower.K_d, gap, gains, k_f, scenarios=loop.scenarios)

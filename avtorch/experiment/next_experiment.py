@@ -153,11 +153,11 @@ def _sentence(
     causes = ["no effect" if n == "none" else n.replace("+", " with ") for n in names]
     listing = " and ".join([", ".join(causes[:-1]), causes[-1]])
     if told.nats < _FAINT * entropy:
-        text = f"nothing within the limits tells {listing} apart; nearest comes {m.name}"
+        text = f"no manoeuvre within the limits separates {listing}; the closest is {m.name}"
     else:
         share = "over 0.99" if told.told > 0.99 else f"{told.told:.2f}"
-        text = f"{m.name}, to tell apart {listing}; expected probability of the true one afterwards: {share}"
+        text = f"{m.name}, to separate {listing}; expected probability of the true hypothesis afterwards: {share}"
     if untold and len(channels) == 1:
         other = "speed" if channels == ("accel",) else "accel"
-        text += f"; {', '.join(untold)} can only be told with {other} in the log as well"
+        text += f"; {', '.join(untold)} can only be separated with {other} in the log as well"
     return text[0].upper() + text[1:] + "."

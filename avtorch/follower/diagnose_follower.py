@@ -188,12 +188,13 @@ def _parameters(law: Law, draws: Mapping[str, Float], speed: float) -> dict[str,
 
 def _conditional(law: Law, off: float, keeps: float) -> tuple[str, ...]:
     return (
-        f"The controller is not known: {law.name} is assumed. With it the leader's motion alone foretells the speed "
-        f"over a minute, on each half as fitted to the other, to {off:.2g} m/s; a car that keeps its speed would be "
-        f"off by {keeps:.2g} m/s.",
-        "K_L is held at 1: it cannot be told from the law's gains, which are those of controller and car together.",
-        "Lag and delay are those of the way from what was recorded to the speed, radar and controller included; a gain "
-        "on the car's own acceleration is part of T_L.",
-        "P(string stable) is about small motions; it is the loop's, whatever of it is controller or car.",
-        "The cause is conditional on the law: what the real controller does otherwise is taken for the car's.",
+        f"The controller is not known: {law.name} is assumed. With it the leader's motion alone predicts the speed "
+        f"over a minute, on each half as fitted to the other, to {off:.2g} m/s; a car at constant speed would err by "
+        f"{keeps:.2g} m/s.",
+        "K_L is fixed at 1: the log cannot distinguish it from the law's gains, which are those of controller and car "
+        "together.",
+        "Lag and delay cover the whole path from the recorded motion to the speed, radar and controller included; a "
+        "gain on the car's own acceleration is part of T_L.",
+        "P(string stable) holds for small motions; it is the whole loop's, controller and car together.",
+        "The cause is conditional on the law: where the real controller departs from it, the car takes the cause.",
     )

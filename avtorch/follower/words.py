@@ -16,14 +16,14 @@ def loop_lines(found: FollowerDiagnosis) -> list[str]:
     rivals = [x for name, x in found.loops.items() if name not in (found.law.name, "without_delay")]
     other = f" (the other law: {rivals[0].speed:.2g} m/s)" if rivals else ""
     return [
-        f"Held to {_SPOKEN[found.law.name]}: headway {_told(q['headway_s'], ' s')} at {usual.speed:.0f} m/s, "
+        f"Assuming {_SPOKEN[found.law.name]}: headway {_told(q['headway_s'], ' s')} at {usual.speed:.0f} m/s, "
         f"lag with delay {_told(q['lag_with_delay_s'], ' s')}.",
-        f"P(string stable) is {usual.p_string_stable:.2f} at {usual.speed:.0f} m/s{peak}. Over a minute the car's "
-        f"speed spread {own.amplified:.2f} times as much as its leader's; {own.amplified_simulated:.2f} times in the "
-        "simulated loop.",
-        f"Driven by the leader alone, the loop is off by {own.speed:.2g} m/s and {own.spacing:.2g} m over a minute "
-        f"that did not fit it{other}; without a dead time by {bare.speed:.2g} m/s and {bare.spacing:.2g} m, and a car "
-        f"that keeps its speed by {found.keeps_speed:.2g} m/s.",
+        f"P(string stable) is {usual.p_string_stable:.2f} at {usual.speed:.0f} m/s{peak}. Over a minute the car "
+        f"amplified its leader's speed variation {own.amplified:.2f} times; the simulated loop does "
+        f"{own.amplified_simulated:.2f} times.",
+        f"Driven by the leader alone over a held-out minute, the loop errs by {own.speed:.2g} m/s and "
+        f"{own.spacing:.2g} m{other}; without a dead time by {bare.speed:.2g} m/s and {bare.spacing:.2g} m, and a car "
+        f"at constant speed by {found.keeps_speed:.2g} m/s.",
     ]
 
 

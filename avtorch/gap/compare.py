@@ -70,7 +70,7 @@ def compare(
     fitted = [_Side.of(logs, plants[0], name) for logs, name in zip(sides, ("before", "after"), strict=True)]
     one, two = fitted
     if one.found.hypothesis.record.channels != two.found.hypothesis.record.channels:
-        raise InputError("before, after: have different witnesses; needs accel, speed or both in both")
+        raise InputError("before, after: have different channels; needs accel, speed or both in both")
     away = two.mean - one.mean
     covariance = one.covariance + two.covariance
     blocks = min(one.blocks, two.blocks)
@@ -233,7 +233,7 @@ def _sentence(
     words = {
         "closer": "the drives after are closer to the simulator",
         "farther": "the drives after are farther from the simulator",
-        "no telling": "how close the simulator is has not changed measurably",
+        "no telling": "the simulator's error has not changed measurably",
     }
     return f"{first}; {words[telling]}."
 
@@ -241,17 +241,17 @@ def _sentence(
 def _account(numbers: str, chance: str, later: LaterAnswer | None) -> str:
     """What is said of the car: the numbers of lag and gain explain the change only where a delay does not."""
     if later is None:
-        return f"No change of the car shows: {numbers} ({chance})"
+        return f"No change of the car is detected: {numbers} ({chance})"
     delays = " to ".join(f"{max(q.mean, 0.0):.2f}" for q in (later.before, later.after))
     if later.account == "lag and gain":
-        more = f"a later answer alone does not explain it (p = {later.p_dead_time:.2g})"
+        more = f"a change of dead time alone does not explain it (p = {later.p_dead_time:.2g})"
         return f"The car has changed: {numbers} ({chance}); {more}"
     if later.account == "cannot be told":
         return (
-            f"The car has changed ({chance}), but these drives do not tell lag and gain ({numbers}) from a later "
-            f"answer (dead time {delays} s, p = {later.p_dead_time:.2g})"
+            f"The car has changed ({chance}), but these drives cannot distinguish a change of lag and gain ({numbers}) "
+            f"from one of dead time ({delays} s, p = {later.p_dead_time:.2g})"
         )
     return (
-        f"The car has changed ({chance}), but lag and gain do not explain it (p = {later.p_lag_gain:.2g}): where a "
-        f"dead time is fitted as well, it goes from {delays} s, and without one they would be {numbers}"
+        f"The car has changed ({chance}), but lag and gain do not explain it (p = {later.p_lag_gain:.2g}): a dead time "
+        f"fitted as well goes from {delays} s, and without one they would be {numbers}"
     )

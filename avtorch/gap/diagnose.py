@@ -106,11 +106,13 @@ def diagnose(
         candidates = [told if c.name == winner.name else c for c in candidates]
     noted = tuple(noise_added)
     if not race.complete:
-        noted += ("The budget ended the search before all candidates were tried: the verdict is provisional.",)
+        noted += ("The budget ended the search before all hypotheses were tried: the verdict is provisional.",)
     noted += tuple(sentences.untried(race.scope))
     noted += tuple(delays.notes(race.found, verdict))
     if posterior == "sgld" and not one_mode and winner is not None:
-        noted += ("The parameters' posterior is by laplace: it has several modes, between which no chain would walk.",)
+        noted += (
+            "The parameters' posterior is by laplace: it has several modes, and no chain would cross between them.",
+        )
     if draws is not None and draws.method != "sgld":
         noted += (f"The parameters' posterior is by {draws.method}: {draws.why}.",)
     if apart.note is not None:

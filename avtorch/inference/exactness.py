@@ -111,16 +111,16 @@ class Exactness:
                 reasons.append("")
             elif float(self.missed[w]) > 0:
                 mass = f"{float(self.missed[w]):.3g} times the mass at the draws"
-                reasons.append(f"the density has another mode, which no chain has reached, of {mass}")
+                reasons.append(f"the density has another mode of {mass}, which no chain has reached")
             elif not known:
                 k = f"Pareto-k {float(self.pareto_k[w]):.2f}, needs {RELIABLE:g} or less"
-                k = k if float(self.pareto_k[w]) >= RELIABLE else "too few points count"
-                reasons.append(f"nothing shows that the draws follow the density, which is not like them ({k})")
+                k = k if float(self.pareto_k[w]) >= RELIABLE else "too few effective points"
+                reasons.append(f"importance weights cannot show that the draws follow the density ({k})")
             else:
                 kind, i = divmod(int(beyond.flatten().int().argmax()), len(names))
                 off = (
-                    f"the mean of {names[i]} is {float(self.mean_shift[w, i]):+.2f} SDs off",
-                    f"the SD of {names[i]} is {float(self.sd_ratio[w, i]):.2f} of what it should be",
+                    f"the mean of {names[i]} is wrong by {float(self.mean_shift[w, i]):+.2f} SDs",
+                    f"the SD of {names[i]} is {float(self.sd_ratio[w, i]):.2f} times the exact one",
                     f"the tails of {names[i]} hold {float(self.tail_excess[w, i]):+.3f} of probability too much",
                 )[kind]
                 reasons.append(f"the draws do not follow the density: in unconstrained coordinates {off}")

@@ -193,7 +193,7 @@ def _why(mode_found: bool, strayed: bool, apart: bool, stuck: bool, off: str) ->
     if not mode_found:
         return "the search for the posterior's mode did not end at a maximum"
     if stuck:
-        return "the posterior is so uneven that the longest walk would not cross it"
+        return "the posterior is so uneven that the longest chain would not cross it"
     if strayed:
         return "chains left the posterior, also with the shortest step tried"
     return "chains disagree, also with the shortest step tried" if apart else off

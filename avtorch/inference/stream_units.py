@@ -149,8 +149,8 @@ class StreamUnits:
         sure = correlation.abs() >= SURE
         wrong = sure & ~((slope >= pair.limits[0]) & (slope <= pair.limits[1]))
         for v in wrong.nonzero().squeeze(-1).tolist():
-            moves = f"{pair.level} answers with" if pair.integrated else f"{pair.level} changes"
-            told = f"{moves} {float(slope[v]):.3g} times what {pair.rate} says"
+            moves = f"{pair.level} responds with" if pair.integrated else f"{pair.level} changes"
+            told = f"{moves} {float(slope[v]):.3g} times as much as {pair.rate} implies"
             if float(slope[v]) < 0:
                 raise self._refusal(v, pair.level, pair.rate, f"{told}, so one has the wrong sign")
             hints = _HINTS[pair.level, pair.rate]

@@ -123,7 +123,7 @@ def _require(table: Table, mapping: SignalMap, following: bool) -> None:
         raise InputError(f"{table.source}: columns 'accel' and 'speed' are both missing; one is needed; {advice}")
     for signal in mapping.stamp:
         if signal in mapping.elsewhere:
-            raise InputError(f"{table.source}: {signal} is stamped and also told to lie in another file; one is enough")
+            raise InputError(f"{table.source}: {signal} has a stamp column and also a file of its own; one is enough")
 
 
 def _advice(signal: str, names: Iterable[str]) -> str:

@@ -127,8 +127,8 @@ def _whole(name: str, time: Float, speed: Float, spacing: Float, lead: Float) ->
     told = float(np.sum(np.diff(time[part]) * (lead - speed)[part][:-1]))
     if abs(opened - told) > _DRIFT_M + _DRIFT_MPS * float(time[part][-1] - time[part][0]):
         raise InputError(
-            f"{name}: the gap opened by {opened:.0f} m where the speeds say {told:.0f} m; "
-            "needs gap and speeds of one and the same leader"
+            f"{name}: the spacing grew by {opened:.0f} m where the speeds imply {told:.0f} m; "
+            "needs spacing and speeds of one and the same leader"
         )
     log = Log.from_arrays(
         name=name,

@@ -105,14 +105,14 @@ def check(log: Log) -> Quality:
         notes.append(f"{driver} rows masked: not engaged")
     if returns:
         notes.append(
-            f"{returns} return{'s' * (returns != 1)} to engaged: each starts a drive anew, {settling * step:.1f} s "
-            f"masked in which the car settles ({SETTLE_S:g} s after each)"
+            f"{returns} return{'s' * (returns != 1)} to engaged: the simulation restarts at each; "
+            f"{settling * step:.1f} s of settling masked ({SETTLE_S:g} s after each)"
         )
     if still:
         how = "below 0.3 m/s" if log.speed is not None else "braked, yet not slowing"
         notes.append(f"{still} rows masked: standstill ({how})")
     if masked == log.rows:
-        notes.append("no row is left to learn from")
+        notes.append("no row is left to estimate from")
     notes.extend(f"{name} is constant ({present[name][0]:.6g}): it excites nothing" for name in constant)
     notes.extend(_says_missing(missing))
     notes.extend(_repeats(present, log))
@@ -131,9 +131,9 @@ def check(log: Log) -> Quality:
 
 def _says_missing(missing: tuple[str, ...]) -> list[str]:
     said = {
-        "accel_cmd": "no accel_cmd: what is said of the actuator is conditional on an assumed controller",
-        "accel": "no accel: speed is the only witness, so sensor faults and real forces cannot be told apart",
-        "speed": "no speed: accel is the only witness, short stops stay unseen, and sensor faults look like forces",
+        "accel_cmd": "no accel_cmd: every result on the actuator is conditional on an assumed controller",
+        "accel": "no accel: speed is the only channel, so the log cannot distinguish sensor faults from real forces",
+        "speed": "no speed: accel is the only channel, short stops go unnoticed, and sensor faults look like forces",
     }
     return [said[name] for name in missing]
 
@@ -166,22 +166,24 @@ def _doubtful_units(log: Log) -> list[str]:
     if log.speed is not None and log.accel is not None:
         found = scale_between(log.elapsed, parts, log.speed, log.accel)
         if found is not None and found.correlation > 0.9 and not 0.8 <= found.slope <= 1.25:
-            notes.append(f"speed changes {found.slope:.3g} times what accel says: a unit or a sensor's scale is off")
+            notes.append(
+                f"speed changes {found.slope:.3g} times as much as accel implies: a unit or a sensor's scale is wrong"
+            )
     if log.accel_cmd is not None:
         found = command_scale(log.elapsed, parts, log.speed, log.accel, log.accel_cmd)
         if found is not None and found.correlation > 0.9 and not 0.2 <= found.slope <= 1.5:
             channel = "speed" if log.speed is not None else "accel"
             notes.append(
-                f"{channel} answers with {found.slope:.3g} times the command: units of {channel} or accel_cmd?"
+                f"{channel} responds with {found.slope:.3g} times the command: units of {channel} or accel_cmd?"
             )
     if log.speed is None and log.accel is not None and log.accel_cmd is not None:
         top = max(float(np.abs(log.accel).max()), float(np.abs(log.accel_cmd).max()))
         if 0 < top < 0.6:
-            notes.append(f"accel and accel_cmd stay below {top:.2g}: calm, or in g? Without speed nothing can tell")
+            notes.append(f"accel and accel_cmd stay below {top:.2g}: calm, or in g? Only speed could show which")
     if log.jerk is not None and log.accel is not None:
         found = scale_between(log.elapsed, parts, log.accel, log.jerk)
         if found is not None and found.correlation > 0.9 and not 0.5 <= found.slope <= 2:
-            notes.append(f"accel changes {found.slope:.3g} times what jerk says: a unit is off")
+            notes.append(f"accel changes {found.slope:.3g} times as much as jerk implies: a unit is wrong")
     if log.lead_speed is not None and log.speed is not None:
         ratio = float(np.abs(log.lead_speed).sum() / max(np.abs(log.speed).sum(), 1e-9))
         if not 0.5 < ratio < 2:

@@ -191,14 +191,14 @@ def _refuse_scale(
     if found is None or abs(found.correlation) < _SURE or limits[0] <= found.slope <= limits[1]:
         return
     place = f"{source}: columns {level!r} and {rate!r}"
-    moves = "speed changes" if level == "speed" else "accel answers with"
+    moves = "speed changes" if level == "speed" else "accel changes"
     if found.slope < 0:
         raise InputError(
-            f"{place}: {moves} {found.slope:.3g} times what {rate} says, so one has the wrong sign; "
-            f"`--unit {sign}` turns it round"
+            f"{place}: {moves} {found.slope:.3g} times as much as {rate} implies, so one has the wrong sign; "
+            f"`--unit {sign}` reverses it"
         )
     near = min(options, key=lambda name: abs(math.log(found.slope / options[name])))
     raise InputError(
-        f"{place}: {moves} {found.slope:.3g} times what {rate} says, so their units differ; "
+        f"{place}: {moves} {found.slope:.3g} times as much as {rate} implies, so their units differ; "
         f"`--unit {near}` is the nearest"
     )

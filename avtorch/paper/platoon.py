@@ -69,7 +69,7 @@ class Platoon:
         return ClaimRow(
             "platoon",
             f"{name}; {ACT_S:g} to {PLATOON_S:g} s, behind {self.ahead.name}",
-            f"RMS of the last vehicle's {word}, with over without action",
+            f"RMS of the last vehicle's {word}, with action / without",
             "calmer (below 1)",
             float(middle(ratio)),
             interval,
@@ -102,7 +102,7 @@ class Platoon:
         hit = (self.run.spacing[i] <= 0).any(-1).any(-1)
         least = float(self.run.spacing[i].min())
         if bool(hit.any()):
-            return f"{int(hit.sum())} of {len(hit)} runs hold a collision, and what follows it is no longer physical"
+            return f"{int(hit.sum())} of {len(hit)} runs hold a collision, and motion after it is not physical"
         return f"least spacing {least:.1f} m"
 
 

@@ -122,7 +122,7 @@ class Strategies:
         return ClaimRow(
             "strategies",
             f"{name}, {start:g} to {DRIVE_S:g} s; behind {self.ahead.name}",
-            f"RMS of the {word}, with over without action",
+            f"RMS of the {word}, with action / without",
             "calmer (below 1)",
             float(middle(ratio)),
             interval,

@@ -41,7 +41,7 @@ def gap_on_the_road(ax: Axes, found: Diagnosis, *, seconds: float = _SECONDS) ->
         # a rollout begun at the measured speed
         offset = np.array([(traces.measured[k] - x[k])[inside][0] for x in (traces.before, traces.after)])
     ax.plot(time, traces.measured[k][inside], color=BLACK, lw=1.2, label="measured")
-    ax.plot(time, traces.before[k][inside] + offset[0], color=VERMILLION, label="simulator as it is")
+    ax.plot(time, traces.before[k][inside] + offset[0], color=VERMILLION, label="baseline simulator")
     if found.winner.effects:
         ax.plot(
             time, traces.after[k][inside] + offset[1], color=BLUE, label=f"with {' and '.join(found.verdict.names)}"
@@ -91,7 +91,9 @@ def where_it_lies(ax: Axes, found: Diagnosis, axis: Axis) -> Axes:
     for part in found.where:
         if part.axis == axis and not isinstance(part.begin, str) and not isinstance(part.end, str):
             away = found.log.epochs_s[0] if axis == "time" else 0.0
-            ax.axvspan(part.begin - away, part.end - away, color=ORANGE, alpha=0.18, lw=0, label="named part")
+            ax.axvspan(
+                part.begin - away, part.end - away, color=ORANGE, alpha=0.18, lw=0, label="named part of the gap"
+            )
     ax.set(xlabel=f"{axis} [{UNITS[axis]}]", ylabel="share", ylim=(0, None))
     ax.margins(x=0)
     return ax
@@ -114,7 +116,7 @@ _HORIZONS = ("0.5s", "2s", "10s", "whole")
 
 
 def shrinkage(ax: Axes, found: Diagnosis, channel: str) -> Axes:
-    """Rollout errors of a `channel` over their horizons: before, after, floor, and as far as a black box gets.
+    """Rollout errors of a `channel` over their horizons: before, after, noise floor, and with a black box.
 
     Raises `InputError` where nothing was held out, or not this channel.
     """
@@ -125,15 +127,15 @@ def shrinkage(ax: Axes, found: Diagnosis, channel: str) -> Axes:
     at = np.arange(len(names))
     each = [told.by_metric[name] for name in names]
     lines: Sequence[tuple[str, list[float], str, str]] = (
-        ("simulator as it is", [c.before for c in each], VERMILLION, "o"),
-        ("black box on top", [told.ceiling[name] for name in names], GREY, "x"),
+        ("baseline simulator", [c.before for c in each], VERMILLION, "o"),
+        ("baseline with black box", [told.ceiling[name] for name in names], GREY, "x"),
         ("with the effect", [c.after for c in each], BLUE, "o"),
-        ("floor", [c.floor for c in each], SKY, "_"),
+        ("noise floor", [c.floor for c in each], SKY, "_"),
     )
     for label, values, colour, marker in lines:
         ax.plot(at, values, color=colour, marker=marker, lw=1.2, ms=7, label=label)
     ax.set_xticks(at, ["whole drive" if c.horizon_s is None else f"{c.horizon_s:.3g} s" for c in each])
-    ax.set(xlabel="rollout over", ylabel=f"off in {_NAMES[channel]}")
+    ax.set(xlabel="rollout over", ylabel=f"error of {_NAMES[channel]}")
     ax.set_ylim(0, None)
     return ax
 
@@ -198,7 +200,7 @@ def which_figure(found: Diagnosis) -> Figure:
 
 @styled
 def shrinkage_figure(found: Diagnosis) -> Figure:
-    """How far the gap shrinks, a panel a channel."""
+    """How far the gap shrinks, a panel per channel."""
     told = found.shrinkage
     names = [] if told is None else [w for w in ("accel", "speed") if f"rollout_rmse_{w}" in told.by_metric]
     figure = Figure(figsize=(8.6, 3.0), layout="constrained")

@@ -19,7 +19,7 @@ def commands(ax: Axes, m: Manoeuvre) -> Axes:
 
 
 def expected_speed(ax: Axes, m: Manoeuvre) -> Axes:
-    """The speed that the likeliest cause foretells."""
+    """The speed that the most probable hypothesis predicts."""
     ax.plot(m.time, m.speed, color=ORANGE)
     ax.set(xlabel="time [s]", ylabel="expected speed [m/s]", ylim=(0, 1.15 * float(m.speed.max())))
     ax.margins(x=0)

@@ -160,7 +160,7 @@ def ecdf_figure(validation: Validation) -> Figure:
     for ax in axes.flat:
         ax.label_outer()
     figure.suptitle(
-        "A line a settled window, dashed where it leaves its own 95 % band (at most 1 in 20 would by chance);"
+        "One line per converged window, dashed where it leaves its own 95 % band (1 in 20 at most by chance);"
         " grey: the band at the median effective sample size",
         fontsize=9.5,
         color=BLACK,

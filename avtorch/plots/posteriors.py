@@ -179,7 +179,7 @@ def agreement_scatter(
     x, y = 100 * np.asarray(width, dtype=float), np.asarray(value, dtype=float)
     middle = 0.5 * (limits[0] + limits[1])
     reach = agreement_reach(y, limits) if reach is None else reach
-    ax.axhspan(*limits, color=EXACT_FILL, alpha=0.5, linewidth=0, zorder=0.5, label="limits asked for")
+    ax.axhspan(*limits, color=EXACT_FILL, alpha=0.5, linewidth=0, zorder=0.5, label="required limits")
     ax.axhline(middle, color=EXACT, linewidth=0.9, zorder=0.6)
     for limit in limits:
         ax.axhline(limit, color=EXACT, linewidth=0.9, linestyle="--", zorder=0.6)
@@ -200,7 +200,7 @@ def agreement_scatter(
             chosen = mask & (sound == good)
             if chosen.any() or (good and label):
                 look: Any = {"alpha": 0.6, "markeredgewidth": 0} if good else {"fillstyle": "none"}
-                text = label if good else "not settled"
+                text = label if good else "not converged"
                 ax.plot(x[chosen], at[chosen], marker, color=colour, markersize=size, label=text, **look)
     if error is not None:
         spread = float(np.nanmedian(np.asarray(error, dtype=float)))

@@ -148,5 +148,5 @@ def ecdf_of(values: ArrayLike, points: int = 100) -> NDArray[np.float64]:
 
 
 def _looks(count: int) -> Sequence[dict]:
-    """A look a curve, told apart by dashes as well as by colour."""
+    """A line style per curve, distinct in dashes as well as in colour."""
     return [LOOKS[i % len(LOOKS)] for i in range(count)]

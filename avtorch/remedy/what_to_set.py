@@ -142,7 +142,7 @@ def what_to_set(
     sufficient = p_best >= required
     strategies = tuple(sorted(chosen.strategies(now)[0]))
     names = [e.name for e in plant.effects if e.name in NOT_LINEAR]
-    notes = (f"{' and '.join(names)}: told for steps of {STEP_MPS2:g} m/s².",) if names else ()
+    notes = (f"{' and '.join(names)}: evaluated for steps of {STEP_MPS2:g} m/s².",) if names else ()
     return WhatToSet(
         in_force=now,
         set=chosen,
@@ -233,7 +233,8 @@ def _sentence(
     steps = []
     s = chosen.as_dict()
     if 1 in strategies:
-        steps.append(f"let the lower level model T {s['T_hat']:.2f} s, K {s['K_hat']:.2f} and aim at {s['T_d']:.2f} s")
+        model = f"a lower level that models T {s['T_hat']:.2f} s and K {s['K_hat']:.2f}"
+        steps.append(f"{model} and targets a lag of {s['T_d']:.2f} s")
     if 2 in strategies:
         steps.append(f"time gap {s['time_gap_s']:g} s instead of {now.as_dict()['time_gap_s']:g} s")
     if 3 in strategies:
@@ -242,15 +243,16 @@ def _sentence(
         steps.append(f"feed the leader's acceleration forward with k_f {s['feedforward']:g}")
     if not steps:
         if good:
-            return f"Nothing to set: P(string stable) is {before:.2f} as it is."
+            return f"Nothing to set: P(string stable) is {before:.2f} without a change."
         return (
-            f"No setting on offer is sufficient, and none better than the one in force (P(string stable) {before:.2f})."
+            "No available setting is sufficient, and none is better than the one in force "
+            f"(P(string stable) {before:.2f})."
         )
     what = "; ".join(steps)
     told = f"P(string stable) {then:.2f} instead of {before:.2f}"
     if good:
-        return f"Least intrusive of what suffices: {what} ({told})."
-    return f"No setting on offer reaches {required:g}; the best is: {what} ({told})."
+        return f"Least intrusive sufficient setting: {what} ({told})."
+    return f"No available setting reaches {required:g}; the best is: {what} ({told})."
 
 
 def _finite(x: float) -> float | None:

@@ -37,7 +37,7 @@ _METRICS = {
     "rollout_rmse_speed_whole": "speed, whole drive [m/s]",
     "closed_loop_rmse_speed": "speed, closed loop [m/s]",
     "closed_loop_rmse_spacing": "spacing, closed loop [m]",
-    "log_predictive_density": "log density [nats a row]",
+    "log_predictive_density": "log predictive density [nats per row]",
 }
 
 
@@ -191,7 +191,7 @@ def _placebo(found: Diagnosis) -> str | None:
     told = found.shrinkage
     if told is None or told.placebo is None or told.placebo_effect is None:
         return None
-    return f"A placebo ({told.placebo_effect}, which is not the cause) on top closes {_percent(told.placebo)}."
+    return f"A placebo ({told.placebo_effect}, a wrong effect added to the verdict) closes {_percent(told.placebo)}."
 
 
 def _peak(told: Mapping[str, float | None]) -> str:
@@ -208,12 +208,12 @@ def _setting(found: Diagnosis) -> Mapping[str, Any] | None:
     return {
         "why": told["why"],
         "rows": [
-            ("P(string stable), simulator as it was", f"{p['assumed']:.2f}"),
-            ("P(string stable), car as it is", f"{p['in_force']:.2f}"),
+            ("P(string stable), baseline simulator", f"{p['assumed']:.2f}"),
+            ("P(string stable), repaired simulator", f"{p['in_force']:.2f}"),
             ("P(string stable), with this setting", f"{p['then']:.2f}"),
-            ("string gain at its peak, simulator as it was", peaks["assumed"]),
-            ("string gain at its peak, car as it is", peaks["in_force"]),
-            ("string gain at its peak, with this setting", peaks["then"]),
+            ("peak gain, baseline simulator", peaks["assumed"]),
+            ("peak gain, repaired simulator", peaks["in_force"]),
+            ("peak gain, with this setting", peaks["then"]),
         ],
         "notes": told["notes"],
     }

@@ -149,7 +149,7 @@ def _worked(tasks: Sequence[Task], workers: int) -> Iterator[int]:
                 yield one.result()
         except BrokenProcessPool:
             raise InputError(
-                "workers: one was ended from outside, perhaps for want of memory; what was answered is kept, "
+                "workers: one was ended from outside, perhaps for lack of memory; what was answered is kept, "
                 "needs fewer workers"
             ) from None
         finally:

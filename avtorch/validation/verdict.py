@@ -81,11 +81,11 @@ def judge(
         parts.append(f"{_percent(REQUIRED_SHARE)} are needed")
     unsettled = int((~settled).sum())
     if unsettled:
-        parts.append(f"the chains or the reference of {unsettled} did not settle")
+        parts.append(f"the chains or the reference of {unsettled} did not converge")
     if good < count:
         parts.append(_furthest(agreement, settled, range(count) if numbers is None else numbers))
     if interval.low < REQUIRED_SHARE <= interval.high:
-        parts.append("more windows could still turn it")
+        parts.append("more windows could still change the verdict")
     if exact < REQUIRED_SHARE:
         parts.append(f"exact draws of the same effective number would only reach {_percent(exact)}: take more draws")
     else:

@@ -12,8 +12,8 @@ from benchmarks.options.watched import CHANGE_S, belief, told, watched
 
 SETTINGS = (
     ("as designed", 1.0, (1.5, 1.5, -0.8)),
-    ("gap 1.6 s", 1.6, (1.5, 1.5, -0.8)),
-    ("gap 2.5 s", 2.5, (1.5, 1.5, -0.8)),
+    ("time gap 1.6 s", 1.6, (1.5, 1.5, -0.8)),
+    ("time gap 2.5 s", 2.5, (1.5, 1.5, -0.8)),
     ("paper's gains", 1.0, (3.0, 3.0, -1.8)),
 )
 
@@ -51,7 +51,7 @@ def rechecked() -> None:
 def measures(runs: int) -> None:
     """Comfort, energy, safe spacing and throughput after the change, with nobody acting and with the strategist."""
     done = {
-        "nobody acts": watched(runs=runs),
+        "no action": watched(runs=runs),
         "strategist": watched(runs=runs, strategist=Strategist()),
     }
     names = (

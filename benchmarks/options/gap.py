@@ -34,7 +34,7 @@ def trade_off(out: Path | None) -> None:
     fine = torch.linspace(0.8, 3.2, 121, dtype=torch.float64)
     whole = {n: gap_trade_off(*draws, fine, setting=setting) for n, (draws, setting) in curves.items()}
     for name, curve in whole.items():
-        print(f"shortest gap that reaches 0.95, {name}: {curve.least_gap() or math.nan:.2f} s")
+        print(f"shortest time gap that reaches 0.95, {name}: {curve.least_gap() or math.nan:.2f} s")
     print(f"command effort of half the lag: {float(halved.amplification()[0]):.2f}")
     if out is not None:
         from avtorch.plots import gap_figure, save
@@ -84,7 +84,7 @@ def driver(runs: int) -> None:
                 gap = float(a.setting.time_gap[0])
                 reached.append(a.time_s + a.driver_delay_s + (gap - 1.0) / 0.1 - CHANGE_S)
         when = f"{sum(reached) / len(reached):.1f}" if reached else "-"
-        name = "nobody asks" if delay is None else f"{delay:g}"
+        name = "no request" if delay is None else f"{delay:g}"
         collided = f"{int(run.rows.collided.sum())} of {runs}"
         print(f"| {name} | {when} | {told(seen.accel_rms_ratio)} | {told(seen.min_spacing_m)} | {collided} |")
 

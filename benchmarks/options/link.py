@@ -64,7 +64,7 @@ def _decided(run: SupervisedRun, vehicle: tuple[float, float], delay: float | No
     past = History.of_blocks([run.rows])
     chosen = rules.decide(T, K, past, current=Setting(), default=Setting(), accel_min=-12.0, accel_max=12.0)
     s = chosen.setting.as_dict()
-    steps = [f"gap {s['time_gap_s']:g} s"] if 2 in chosen.strategies[0] else []
+    steps = [f"time gap {s['time_gap_s']:g} s"] if 2 in chosen.strategies[0] else []
     steps += ["gains " + "/".join(f"{k:g}" for k in s["gains"])] if 3 in chosen.strategies[0] else []
     steps += [f"k_f {s['feedforward']:g}"] if 4 in chosen.strategies[0] else []
     truth = (torch.tensor([x], dtype=torch.float64) for x in vehicle)

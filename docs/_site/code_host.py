@@ -26,6 +26,7 @@ FIRST = (
     "compare",
     "followers",
     "own-effect",
+    "words",
     "reference",
 )
 

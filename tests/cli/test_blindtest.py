@@ -34,7 +34,7 @@ def test_writes_answer_and_picture_and_goes_on(
     assert main([*line, "--n", "3"]) == 0
     told = capsys.readouterr().out
     assert "3 cases: " in told
-    assert "asked for" in told
+    assert "aim" in told
     assert {"blindtest.json", "confusion.png", "trial.json", "truth", "answers"} == {p.name for p in out.glob("[!.]*")}
     assert main([*line, "--n", "4"]) == 2
     assert "--resume" in capsys.readouterr().err

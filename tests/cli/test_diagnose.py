@@ -213,8 +213,8 @@ def test_interrupted_then_on_again(
     assert main(["diagnose", drive, "--quiet", "--out", str(out)]) == 130
     told = capsys.readouterr().err
     assert told.count("\n") == 1
-    assert f"interrupted; no answer was written; what is done is kept in {out / 'fits.json'}" in told
-    assert "the same command goes on from there" in told
+    assert f"interrupted; no answer was written; finished fits are kept in {out / 'fits.json'}" in told
+    assert "the same command resumes there" in told
     assert not (out / "diagnosis.json").exists()
     search.interrupted_after = None
     # neither the budget nor the prior over causes belongs to the fits, nor how the posterior is drawn
@@ -418,7 +418,7 @@ def lines(shown: object, width: int = 80) -> list[str]:
 def test_table(logs: list[Log], width: int) -> None:
     told = lines(diagnosis_table(answer(logs)), width)
     assert max(map(len, told)) <= width
-    assert told[0].split() == ["candidate", "probability", "nats", "parameters", "(90", "%)"]
+    assert told[0].split() == ["hypothesis", "probability", "nats", "parameters", "(90", "%)"]
     assert told[1].startswith("dead_time ")
     assert "0.930 ███████▌" in told[1]
     assert "+1234  delay 0.182 s (0.175 to 0.189)" in told[1]
@@ -450,7 +450,7 @@ def test_headline_for_each_kind_of_verdict(logs: list[Log]) -> None:
     assert said("dead_time", 0.9).startswith("The simulator lacks dead_time (")
     unsure = (Candidate("dead_time", 0.6), Candidate("gust", 0.4), Candidate("none", 0.0), Candidate("unknown", 0.0))
     assert diagnosis_headline(answer(logs, unsure))[0].startswith("[bold cyan]Probably the simulator lacks dead_time")
-    assert said("unknown").startswith("The cause is none of the effects known here")
+    assert said("unknown").startswith("The cause is not among the effects known here")
     assert said("dead_time+gust") == (
         "The simulator lacks dead_time and gust (probability over 0.99): "
         "the command acts after a delay, and wind and road push the car at random, for seconds."
@@ -463,29 +463,32 @@ def test_notes(logs: list[Log]) -> None:
     more = {"onset_s": 132.42, "remaining": remaining, "complete": False, "notes": ("speed [only]",)}
     notes = diagnosis_notes(answer(logs, verdict=both, **more))
     told = lines("\n".join(notes), 200)
-    assert told[0] == "Not told apart on this log: dead_time, or second_order_actuator."
+    assert told[0] == "This log cannot distinguish dead_time from second_order_actuator."
     assert told[1] == "Onset: at 132.4 s of the log's time."
-    assert told[2] == "The baseline, fitted without and with it: T_L 0.52 → 0.31 s, K_L 1.02 → 0.99."
+    assert told[2] == "Baseline fitted without and with the effect: T_L 0.52 → 0.31 s, K_L 1.02 → 0.99."
     assert told[3] == (
-        "Gap of the simulator as it is, in rollouts of 5 s: acceleration off by 0.21 m/s² (0.05 is left at best), "
-        "speed by 0.9 m/s."
+        "Gap of the baseline simulator, in rollouts of 5 s: acceleration error 0.21 m/s² (0.05 with the best "
+        "hypothesis), speed error 0.9 m/s."
     )
-    assert told[4] == "Once dead_time is in, what remains: aerodynamic_drag 0.897, none 0.100."
+    assert told[4] == "Hypotheses once the simulator has dead_time: aerodynamic_drag 0.897, none 0.100."
     assert told[5].startswith("The budget ended the search")
     assert told[6] == "speed [only]"
 
     sure = verdict_of(CANDIDATES, aliases=lambda ranked: ())
     told = lines("\n".join(diagnosis_notes(answer(logs, verdict=sure))), 200)
-    assert told[:2] == ["Told apart from every other candidate on this log.", "Onset: there from the start."]
+    assert told[:2] == [
+        "This log distinguishes dead_time from every other hypothesis.",
+        "Onset: present from the start.",
+    ]
     wide = verdict_of(CANDIDATES, aliases=lambda ranked: ["none", "unknown", "backlash+dead_band"])
     told = lines("\n".join(diagnosis_notes(answer(logs, verdict=wide))), 200)
     assert told[0] == (
-        "Not told apart on this log: dead_time, or no effect at all, a cause outside the table or "
+        "This log cannot distinguish dead_time from no effect at all, a cause outside the table or "
         "backlash with dead_band."
     )
     many = Candidate("dead_time", 0.3, 9.0), *(Candidate(n, 0.05, 1.0) for n in sorted(EFFECTS) if n != "dead_time")
     told = lines("\n".join(diagnosis_notes(answer(logs, (*many, *CANDIDATES[-2:])))), 200)
-    assert told[0].endswith("command_hold or any of 17 that are less probable.")
+    assert told[0].endswith("command_hold or any of 17 less probable hypotheses.")
 
 
 def test_bar() -> None:

@@ -126,7 +126,7 @@ def test_rollouts_of_both_sides_last_as_long_as_they_are_said_to(rotating_seed: 
     table = Console(width=100, record=True, file=StringIO())
     table.print(_table(told))
     shown = table.export_text()
-    assert "off in speed, 6 s [m/s]" in shown
+    assert "speed error, 6 s [m/s]" in shown
     assert "10 s" not in shown
 
 
@@ -137,5 +137,5 @@ def test_wrong_input_is_told() -> None:
         avtorch.compare(long, _drive(rng, seconds=36.0))
     with pytest.raises(InputError, match="level"):
         avtorch.compare(long, long, level=0.0)
-    with pytest.raises(InputError, match="witnesses"):
+    with pytest.raises(InputError, match="channels"):
         avtorch.compare(long, log_of(seconds=60.0, channels=("speed",)))

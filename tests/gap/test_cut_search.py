@@ -88,12 +88,12 @@ def test_without_pairs_nothing_holds_a_pair() -> None:
     assert not set(answer["effects"]) & set(AMONG)
     assert answer["pairs"] == "none"
     # the truth is a pair: the sentences leave room for it
-    assert "and pairs. Probabilities are over what was tried" in str(found)
-    assert "every other candidate on this log" not in sentences.aliases(found)
+    assert "and pairs. Probabilities cover only what was tried" in str(found)
+    assert "every other hypothesis." not in sentences.aliases(found)
 
 
 def test_effects_that_were_not_asked_for_are_not_ruled_out() -> None:
-    """Once "told apart from every other candidate" and "none of the effects known here", of two effects tried."""
+    """Once "distinguished from every other hypothesis" and "none of the effects known here", of two effects tried."""
     chosen = ["sensor_bias", "sensor_scale"]
     found = avtorch.diagnose(_log(), effects=chosen)
     assert found.complete
@@ -104,7 +104,7 @@ def test_effects_that_were_not_asked_for_are_not_ruled_out() -> None:
     for text in (str(found), "\n".join([*diagnosis_headline(found), *diagnosis_notes(found)]), page):
         assert "known here" not in text
         assert "known effect leaves" not in text
-        assert "other candidate on this log" not in text
+        assert "every other hypothesis." not in text
         assert "Not tried: " in text
         assert "aerodynamic_drag" in text
         assert "Provisional" not in text
@@ -117,7 +117,7 @@ def test_a_whole_search_says_nothing_of_the_kind() -> None:
     whole = replace(found, scope=replace(found.scope, not_scored=()), notes=())
     assert whole.scope is not None
     assert sentences.untried(whole.scope) == []
-    assert sentences.aliases(whole) == "Told apart from every other candidate on this log."
+    assert sentences.aliases(whole) == f"This log distinguishes {whole.verdict.name} from every other hypothesis."
     assert "Provisional" not in str(found)
 
 

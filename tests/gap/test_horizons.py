@@ -86,8 +86,8 @@ def test_what_was_held_out_too_and_it_is_the_same_measure(late: tuple[Log, Diagn
 def test_sentences_and_page_name_it(late: tuple[Log, Diagnosis]) -> None:
     _, found = late
     told = str(found)
-    assert re.search(r"Gap of the simulator as it is, in rollouts of 10 s: acceleration off by", told)
-    assert re.search(r"held out, in rollouts of 10 s: (acceleration|speed) off by", told)
+    assert re.search(r"Gap of the baseline simulator, in rollouts of 10 s: acceleration error", told)
+    assert re.search(r"On held-out blocks, in rollouts of 10 s: (acceleration|speed) error", told)
     assert "over the drive" not in told
     page = report_html(found)
     for label in ("acceleration, 10 s [m/s²]", "acceleration, whole drive [m/s²]", "speed, 10 s [m/s]"):

@@ -88,8 +88,8 @@ def test_the_look_at_a_log_counts_returns_and_what_settles(
     assert len(said) == bool(returns)
     if returns:
         assert f"{returns} return" in said[0]
-        assert f"{settling / RATE_HZ:.1f} s masked" in said[0]
-    assert ("no row is left to learn from" in seen.notes) == (usable == 0)
+        assert f"{settling / RATE_HZ:.1f} s of settling masked" in said[0]
+    assert ("no row is left to estimate from" in seen.notes) == (usable == 0)
 
 
 def test_a_driver_who_drives_on_against_the_brake_is_no_standstill() -> None:

@@ -100,5 +100,5 @@ def test_recordings(data_dir: Path, name: str, vehicle: int | None, rows: int) -
 
 
 def test_a_gap_that_is_another_leaders_is_refused(data_dir: Path) -> None:
-    with pytest.raises(InputError, match="the gap opened by -19 m where the speeds say 509 m"):
+    with pytest.raises(InputError, match="the spacing grew by -19 m where the speeds imply 509 m"):
         read_following(data_dir / "i24/2021-03-08-22-35-14_0.csv")

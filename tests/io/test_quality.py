@@ -43,13 +43,13 @@ def test_constant_signals_are_said_not_refused():
 def test_doubtful_units_are_noted():
     assert "could it be km/h" in notes(speed=GOOD["speed"] + 50)
     # a command of which 1.8 times arrives: half the gain, and speed in km/h?
-    assert "answers with" in notes(accel_cmd=GOOD["accel_cmd"] / 1.9)
-    assert "accel says" in notes(accel=GOOD["accel"] * 1.7)
+    assert "responds with" in notes(accel_cmd=GOOD["accel_cmd"] / 1.9)
+    assert "accel implies" in notes(accel=GOOD["accel"] * 1.7)
     assert "the leader is" in notes(lead_speed=GOOD["speed"] * 2.3)
     jerk = np.gradient(GOOD["accel"], GOOD["time"])
-    assert "what jerk says" in notes(jerk=jerk / 9.80665)
+    assert "jerk implies" in notes(jerk=jerk / 9.80665)
     calm = {"time": GOOD["time"], "accel_cmd": GOOD["accel_cmd"] / 9.80665, "accel": GOOD["accel"] / 9.80665}
-    assert any("Without speed nothing can tell" in note for note in check(Log.from_arrays(**calm)).notes)
+    assert any("Only speed could show which" in note for note in check(Log.from_arrays(**calm)).notes)
 
 
 def test_witnesses_that_tell_different_drives():
@@ -63,11 +63,11 @@ def test_a_held_signal_is_recognised():
 
 
 def test_all_masked_and_missing_witnesses_are_said():
-    assert "no row is left to learn from" in notes(engaged=np.zeros(1500))
+    assert "no row is left to estimate from" in notes(engaged=np.zeros(1500))
     one = {k: GOOD[k] for k in ("time", "accel_cmd", "speed")}
     seen = check(Log.from_arrays(**one))
     assert seen.missing == ("accel",)
-    assert any("only witness" in note for note in seen.notes)
+    assert any("only channel" in note for note in seen.notes)
 
 
 def test_many_gaps_are_counted_not_listed():

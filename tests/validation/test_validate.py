@@ -58,7 +58,7 @@ def test_exact_draws_agree(windows: Windows, exact: Quadrature, rotating_seed: i
     assert verdict.share_if_exact > 0.99
     assert verdict.low == pytest.approx(0.025 ** (1 / WINDOWS))
     assert f"{WINDOWS} of {WINDOWS} windows (100 %" in verdict.why
-    assert "more windows could still turn it" in verdict.why
+    assert "more windows could still change the verdict" in verdict.why
     # independent draws: z-scores within 5 sigma of a chi^2, three correlated parameters counted as two
     bar = 5 * math.sqrt(2 / (2 * WINDOWS)) + 0.1
     assert float(found.z_mean.square().mean()) < 1 + bar
@@ -80,7 +80,7 @@ def test_windows_that_did_not_settle_do_not_pass(windows: Windows, exact: Quadra
     verdict = judge(agreement(drawn(windows, exact, 0), exact), settled)
     assert not verdict.agree
     assert verdict.share <= 1 - 1 / WINDOWS
-    assert "the chains or the reference of 1 did not settle" in verdict.why
+    assert "the chains or the reference of 1 did not converge" in verdict.why
 
 
 def test_too_few_draws_are_named_as_the_reason(windows: Windows, exact: Quadrature) -> None:

@@ -89,7 +89,7 @@ def cross_validate(
     chosen, rows, floors = [], [], []
     for i, part in enumerate(parts):
         if progress is not None:
-            progress("parts held out", i, len(parts))
+            progress("held-out folds", i, len(parts))
         refits = [Refit.of(f, part.fits) for f in contenders]
         none, own = refits[0], next(r for r in refits if r.found is verdict)
         judge = FoldScorer(record, part, kinds, none.values["T_L"])

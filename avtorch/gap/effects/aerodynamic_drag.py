@@ -25,7 +25,7 @@ class AerodynamicDrag(Effect):
     name = "aerodynamic_drag"
     place = "body"
     needs_speed = True
-    meaning = "air resistance that the lower level does not make up for"
+    meaning = "air resistance that the lower level does not compensate"
     equation = "-c (v + w)²"
     parameters = (
         Parameter(

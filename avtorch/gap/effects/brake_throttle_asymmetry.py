@@ -25,7 +25,7 @@ class BrakeThrottleAsymmetry(Effect):
 
     name = "brake_throttle_asymmetry"
     place = "actuator"
-    meaning = "gain and lag under braking differ from those under drive"
+    meaning = "gain and lag differ between braking and driving"
     equation = "K_L, T_L times ratios where u < 0"
     parameters = (
         Parameter(

@@ -24,7 +24,7 @@ class DeadBand(Effect):
     name = "dead_band"
     place = "command"
     order = 2
-    meaning = "commands within a band do nothing, larger ones arrive short by its half width"
+    meaning = "commands within a band do nothing, larger ones are reduced by its half width"
     equation = "sign(u) max(|u| - delta, 0)"
     parameters = (
         Parameter("half_width_mps2", "m/s²", 0.0, 0.02, 0.3, possible=(0.0, 1.0), beyond="no pedal ignores that much"),

@@ -37,7 +37,7 @@ class DrivelineOscillation(Effect):
     name = "driveline_oscillation"
     place = "body"
     memory = True
-    meaning = "changes of the drive make the driveline ring"
+    meaning = "changes of the drive torque make the driveline ring"
     equation = "amplitude y,  y'' + 2 zeta omega y' + omega² y = omega da/dt"
     parameters = (
         Parameter("frequency_hz", "Hz", None, 1.0, 5.0, possible=(0.3, 15.0), beyond="no driveline rings there"),

@@ -34,7 +34,7 @@ class GainChange(Effect):
 
     name = "gain_change"
     place = "actuator"
-    meaning = "from some moment on the car gives another share of what is asked"
+    meaning = "from some moment on the car realises another share of the command"
     equation = "K_L (1 + (ratio - 1) clip((t - t_change) / ramp, 0, 1))"
     parameters = (
         Parameter("gain_ratio", "-", 1.0, 0.65, 1.4, possible=(0.2, 5.0), beyond="payload and fading brakes do less"),

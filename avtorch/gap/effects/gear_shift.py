@@ -40,7 +40,7 @@ class GearShift(Effect):
     place = "actuator"
     memory = True
     needs_speed = True
-    meaning = "shifting up at certain speeds interrupts the drive"
+    meaning = "upshifts at certain speeds interrupt the drive torque"
     equation = "K_L (1 - depth) for duration after each upshift, where u > 0"
     parameters = (
         Parameter("depth", "-", 0.0, 0.3, 0.95, "unit"),

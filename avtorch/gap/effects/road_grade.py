@@ -42,7 +42,7 @@ class RoadGrade(Effect):
     place = "body"
     needs_speed = True
     gravity = True
-    meaning = "hills that the log does not know of"
+    meaning = "slopes that the log does not record"
     equation = "-g sin(slope(x)), slope a smooth random function of position"
     parameters = (Parameter("grade_rms", "-", 0.0, 0.02, 0.06, possible=(0.0, 0.2), beyond="no road is that steep"),)
     settings = (

@@ -26,7 +26,7 @@ class Saturation(Effect):
     name = "saturation"
     place = "command"
     order = 1
-    meaning = "demands beyond what drive or brakes can give are cut"
+    meaning = "commands beyond what drive or brakes can deliver are clipped"
     equation = "K u within [a_min, a_max]"
     parameters = (
         Parameter(

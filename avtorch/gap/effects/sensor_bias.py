@@ -24,7 +24,7 @@ class SensorBias(Effect):
     name = "sensor_bias"
     place = "sensor"
     order = 2
-    meaning = "the accelerometer shows a constant offset"
+    meaning = "the accelerometer has a constant offset"
     equation = "a + b"
     parameters = (
         Parameter(

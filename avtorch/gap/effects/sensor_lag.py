@@ -29,7 +29,7 @@ class SensorLag(Effect):
     name = "sensor_lag"
     place = "sensor"
     memory = True
-    meaning = "the accelerometer shows what happened a little earlier"
+    meaning = "the accelerometer lags the car's acceleration"
     equation = "s' = (a - s) / lag"
     parameters = (Parameter("lag_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.0), beyond="no accelerometer is that late"),)
 

@@ -24,7 +24,7 @@ class SensorScale(Effect):
     name = "sensor_scale"
     place = "sensor"
     order = 1
-    meaning = "the accelerometer shows too much or too little"
+    meaning = "the accelerometer's gain is wrong"
     equation = "scale a"
     parameters = (
         Parameter("scale", "-", 1.0, 0.83, 1.2, possible=(0.5, 2.0), beyond="no accelerometer is off like that"),

@@ -116,7 +116,7 @@ class Record:
         }
         names = list(dict.fromkeys(log.name for log in each))
         if len({(log.accel is not None, log.speed is not None) for log in each}) > 1:
-            raise InputError(f"logs: {', '.join(names)} have different witnesses; needs accel, speed or both in all")
+            raise InputError(f"logs: {', '.join(names)} have different channels; needs accel, speed or both in all")
         kinds = {log.accel_kind for log in each}
         if len(kinds) > 1:
             raise InputError(f"logs: {', '.join(names)} have different kinds of accel; needs one in all")

@@ -46,7 +46,7 @@ def with_sensor_noise(log: Log) -> tuple[Log, str | None]:
         if name in bare:
             read[name] = read[name] + sd * white[name]
             told.append(f"{name} ({sd:g} {unit})")
-    added = f"noise is added to {' and '.join(told)} to be judged"
+    added = f"the diagnosis adds noise to {' and '.join(told)}"
     return replace(log, **read), f"No sensor noise in {' and '.join(bare)}, as if simulated: {added}."
 
 

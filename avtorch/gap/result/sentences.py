@@ -70,7 +70,7 @@ def headline(found: Findings) -> str:
 def _verdict(found: Findings) -> str:
     verdict, p = found.verdict, _share(found.winner.probability)
     if verdict.abstained:
-        return f"The cause is none of the {_known(found)} ({p}): nothing is blamed."
+        return f"The cause is not among the {_known(found)} ({p}); no cause is named."
     odd = found.winner.implausible
     but = ", but as fitted it is physically implausible" if odd else ""
     if verdict.name == "none" and not _all_tried(found):
@@ -91,7 +91,7 @@ def onset(found: Findings) -> list[str]:
     """From when on."""
     if found.onset_s is not None:
         return [f"Onset: at {moment(found)}."]
-    return ["Onset: there from the start."] if found.winner.effects else []
+    return ["Onset: present from the start."] if found.winner.effects else []
 
 
 def moment(found: Findings) -> str:
@@ -112,7 +112,7 @@ def where(found: Findings) -> list[str]:
             continue  # the onset says it
         if part.axis == "signal":
             if part.share >= 0.5:
-                told.append("in what the car does" if part.begin == "actuation" else "in what the accelerometer shows")
+                told.append("in the car's motion" if part.begin == "actuation" else "in the accelerometer's reading")
         elif not isinstance(part.begin, str) and not isinstance(part.end, str):
             begin, end = part.begin, part.end
             if part.axis == "time":
@@ -122,28 +122,30 @@ def where(found: Findings) -> list[str]:
             at, unit = "frequencies" if part.axis == "frequency" else f"{part.axis}s", UNITS[part.axis]
             ends = f"from {part.begin:.2g} to {part.end:.2g}" if part.begin else f"below {part.end:.2g}"
             told.append(f"at {at} {ends} {unit}")
-    return [f"It lies {', '.join(told)}."] if told else []
+    return [f"The gap lies {', '.join(told)}."] if told else []
 
 
 def shrinkage(found: Findings) -> list[str]:
-    """How far it shrinks on what was held out."""
+    """How far the gap shrinks on held-out data."""
     told = found.shrinkage
     if told is None:
         return []
-    top, few = told.top, "" if told.chosen == 1 else f"; chosen there by {100 * told.chosen:.0f} % of the parts"
+    top, few = told.top, "" if told.chosen == 1 else f"; {100 * told.chosen:.0f} % of the folds selected it"
     parts = "drives" if told.by_drives else "blocks"
     if told.metric in _MEASURES:
         words, unit = _MEASURES[told.metric]
         over = _over(top.horizon_s)
-        line = f"On {parts} held out{over}: {words} off by {top.before:.2g}, with the effect by {top.after:.2g} {unit}"
+        errors = f"{words} error {top.before:.2g} {unit} without the effect, {top.after:.2g} {unit} with it"
+        line = f"On held-out {parts}{over}: {errors}"
     else:
         gain = top.after - top.before
-        line = f"On {parts} held out: log density {gain:+.2g} nats a row with the effect; no rollout shows it"
+        density = f"log predictive density {gain:+.2g} nats per row with the effect"
+        line = f"On held-out {parts}: {density}; rollouts do not show it"
     if top.closed is None:
-        return [f"{line}; next to nothing could be closed{few}."]
+        return [f"{line}; almost none of the gap is reducible{few}."]
     q = top.closed
     share = f"{100 * q.mean:.0f} % ({100 * q.q05:.0f} to {100 * q.q95:.0f})"
-    return [f"{line}: closes {share} of what can be closed{few}."]
+    return [f"{line}; the effect closes {share} of the reducible gap{few}."]
 
 
 def moved(found: Findings) -> list[str]:
@@ -153,34 +155,34 @@ def moved(found: Findings) -> list[str]:
         if name in with_it and name in baseline:
             unit = " s" if name == "T_L" else ""
             told.append(f"{name} {baseline[name].mean:.2f} → {with_it[name].mean:.2f}{unit}")
-    return [f"The baseline, fitted without and with it: {', '.join(told)}."] if told else []
+    return [f"Baseline fitted without and with the effect: {', '.join(told)}."] if told else []
 
 
 def aliases(found: Findings) -> str:
-    """What the log does not tell apart."""
+    """Which hypotheses the log cannot distinguish."""
     from_words = {"none": "no effect at all", "unknown": "a cause outside the table"}
     if _cut(found):
         from_words["unknown"] = "a cause that was not tried"
     others = [from_words.get(n, n.replace("+", " with ")) for n in found.verdict.alias_set if n != found.verdict.name]
     if not others:
-        which = "other candidate on this log" if _all_tried(found) else "other candidate tried, and only from these"
-        return f"Told apart from every {which}."
+        which = "hypothesis" if _all_tried(found) else "hypothesis tried, and only from those"
+        return f"This log distinguishes {found.verdict.name.replace('+', ' with ')} from every other {which}."
     if len(others) > _ALIASES + 1:
-        others = [*others[:_ALIASES], f"any of {len(others) - _ALIASES} that are less probable"]
+        others = [*others[:_ALIASES], f"any of {len(others) - _ALIASES} less probable hypotheses"]
     listing = others[0] if len(others) == 1 else f"{', '.join(others[:-1])} or {others[-1]}"
     name = from_words.get(found.verdict.name, found.verdict.name.replace("+", " with "))
-    return f"Not told apart on this log: {name}, or {listing}."
+    return f"This log cannot distinguish {name} from {listing}."
 
 
 def untried(scope: Scope) -> list[str]:
-    """Which candidates were not tried, and what the probabilities then mean."""
+    """Which hypotheses were not tried, and what the probabilities then mean."""
     few, rest = scope.not_scored[:_UNTRIED], len(scope.not_scored) - _UNTRIED
-    parts = [*few, *([f"{rest} effects more"] if rest > 0 else [])]
+    parts = [*few, *([f"{rest} more effects"] if rest > 0 else [])]
     parts += {"all": [], "some": ["some of the pairs"], "none": ["pairs"]}[scope.pairs]
     if not parts:
         return []
     listing = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
-    return [f"Not tried: {listing}. Probabilities are over what was tried; unknown is any cause that was not."]
+    return [f"Not tried: {listing}. Probabilities cover only what was tried; unknown stands for the rest."]
 
 
 def _cut(found: Findings) -> bool:
@@ -203,25 +205,24 @@ def _known(found: Findings) -> str:
 
 
 def gap(found: Findings) -> list[str]:
-    """How far the simulator as it is is off."""
+    """The rollout errors of the baseline simulator."""
     gap = found.gap
     parts = []
     if gap.rollout_rmse_accel is not None:
-        floor = "" if gap.rollout_floor_accel is None else f" ({gap.rollout_floor_accel:.2g} is left at best)"
+        floor = "" if gap.rollout_floor_accel is None else f" ({gap.rollout_floor_accel:.2g} with the best hypothesis)"
         if gap.rollout_floor_accel is not None and gap.rollout_floor_accel > 0.97 * gap.rollout_rmse_accel:
-            floor = " (no less with the best candidate in)"
-        parts.append(f"acceleration off by {gap.rollout_rmse_accel:.2g} m/s²{floor}")
+            floor = " (no smaller with the best hypothesis)"
+        parts.append(f"acceleration error {gap.rollout_rmse_accel:.2g} m/s²{floor}")
     if gap.rollout_rmse_speed is not None:
-        off = "" if parts else "off "
-        parts.append(f"speed {off}by {gap.rollout_rmse_speed:.2g} m/s")
+        parts.append(f"speed error {gap.rollout_rmse_speed:.2g} m/s")
     if not parts:
         return []
-    lines = [f"Gap of the simulator as it is{_over(gap.horizon_s)}: {', '.join(parts)}."]
+    lines = [f"Gap of the baseline simulator{_over(gap.horizon_s)}: {', '.join(parts)}."]
     if gap.repeats is not None:
         alike = [("accelerations", gap.repeats.accel, "m/s²"), ("speeds", gap.repeats.speed, "m/s")]
         told = " and ".join(f"{name} to {x:.2g} {unit}" for name, x, unit in alike if x is not None)
-        again = f"The same commands given again ({gap.repeats.seconds:.0f} s)"
-        lines.append(f"{again} repeat {told}: noise, or not their doing.")
+        again = f"Under repeated commands ({gap.repeats.seconds:.0f} s) the car repeats {told}"
+        lines.append(f"{again}; this spread is noise, or does not depend on the commands.")
     return lines
 
 
@@ -231,17 +232,20 @@ def number(p: float) -> str:
 
 
 def remains(found: Findings) -> list[str]:
-    """What there is besides the delay."""
+    """What the simulator lacks besides the delay."""
     if not found.remaining:
         return []
     best = sorted(found.remaining, key=lambda c: -c.probability)[:3]
     told = ", ".join(f"{c.name} {number(c.probability)}" for c in best if c.probability >= 0.005)
-    return [f"Once dead_time is in, what remains: {told}."]
+    return [f"Hypotheses once the simulator has dead_time: {told}."]
 
 
 def to_set(found: Findings) -> list[str]:
     """What to set."""
-    return [] if found.setting is None else [f"To set: {found.setting['why']}"]
+    if found.setting is None:
+        return []
+    why = found.setting["why"]
+    return [why if why.startswith("Nothing to set") else f"To set: {why}"]
 
 
 def to_drive(found: Findings) -> list[str]:
@@ -250,7 +254,7 @@ def to_drive(found: Findings) -> list[str]:
     if told is None:
         return []
     begin, seconds, metres = (told[key] for key in ("start_speed_mps", "seconds", "metres"))
-    line = f"Next experiment: {told['why']} It begins at {begin:.3g} m/s and takes {seconds:.0f} s and {metres:.0f} m."
+    line = f"Next experiment: {told['why']} It starts at {begin:.3g} m/s and takes {seconds:.0f} s and {metres:.0f} m."
     kept = told.get("limits")
     if kept is None:
         return [line]

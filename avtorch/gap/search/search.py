@@ -236,7 +236,7 @@ class Search:
             found += self._blowing(none)
         fitted = set()
         for i, name in enumerate(lead):
-            self.progress("the best of them", i, len(lead))
+            self.progress("best effects", i, len(lead))
             if self._late():
                 break
             fitted.add(name)

@@ -99,15 +99,17 @@ def note(channels: Collection[str], effects: Iterable[type[Effect]]) -> str | No
     if not names:
         return None
     if "accel" not in channels:
-        return f"Without accel in the log these cannot be judged, as they leave no mark on speed: {', '.join(names)}."
+        return (
+            f"Without accel in the log these effects cannot be tested, as speed does not show them: {', '.join(names)}."
+        )
     told = []
     need = [n for n in names if n != "sensor_scale"]
     if need:
         told.append(
-            f"Without speed in the log these cannot be judged, and pass for another cause: {', '.join(need)}."
+            f"Without speed in the log these effects cannot be tested and appear as others: {', '.join(need)}."
         )  # fmt: skip
     if "sensor_scale" in names:
-        told.append("Without speed in the log sensor_scale is the same as another K_L, and cannot be judged.")
+        told.append("Without speed in the log sensor_scale is equivalent to another K_L and cannot be tested.")
     return " ".join(told)
 
 

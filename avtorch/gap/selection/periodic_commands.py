@@ -45,7 +45,7 @@ def why(chances: Mapping[str, float], untold: Mapping[str, FittedModel]) -> str 
     for name, f in untold.items():
         assert f.delays is not None
         if first in (name, f.delays.without):
-            apart = f"{f.delays.without} and {name} are not told apart"
+            apart = f"this log cannot distinguish {f.delays.without} from {name}"
             return f"{_repeats(f)}, so {apart}; {first} has probability {chances[first]:.3g}."
     return None
 
@@ -56,7 +56,7 @@ def notes(found: Iterable[FittedModel], verdict: Verdict) -> list[str]:
         if f.delays is None or f.name not in verdict.alias_set:
             continue
         if len(f.delays.lengths) > 1 or f.delays.untold:
-            return [f"{_repeats(f)}: drive with a command that does not repeat to learn the delay."]
+            return [f"{_repeats(f)}: to estimate the delay, drive with a command that does not repeat."]
     return []
 
 
@@ -64,8 +64,8 @@ def _repeats(found: FittedModel) -> str:
     given = found.delays
     assert given is not None
     if len(given.lengths) == 1:
-        return f"The command repeats every {given.period:.3g} s, under which a delay and a longer lag look alike"
+        return f"The command repeats every {given.period:.3g} s, so a delay and a longer lag fit equally well"
     named = [f"{x:.3f}" for x in given.lengths[:_NAMED]]
     more = len(given.lengths) - _NAMED
     listing = ", ".join(named) + (f" s and {more} more" if more > 0 else " s")
-    return f"The command repeats every {given.period:.3g} s, and delays of {listing} fit alike"
+    return f"The command repeats every {given.period:.3g} s, so delays of {listing} fit equally well"

@@ -28,7 +28,7 @@ def implausible(
         for p in (*effect.parameters, *effect.derived):
             q = parameters.get(f"{effect.name}.{p.name}", parameters.get(p.name))
             if q is not None and (p.reported or p in effect.derived) and outside(p, q):
-                told.append(f"{_sentence(f'{effect.name}.{p.name}', p, q)}; something else is hidden in it.")
+                told.append(f"{_sentence(f'{effect.name}.{p.name}', p, q)}; the effect stands in for something else.")
     told += [
         f"{_sentence(p.name, p, moved[p.name])}." for p in BASELINE if p.name in moved and outside(p, moved[p.name])
     ]

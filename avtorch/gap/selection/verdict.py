@@ -162,7 +162,7 @@ def _why(ranked: Sequence[Candidate], known: str) -> str:
         which = "effect" if known == "known effect" else known
         return f"No {which} explains the log better than the baseline does; {rival}."
     if first.name == "unknown":
-        return f"No {known} leaves a remainder that could be noise; {rival}."
+        return f"No {known} leaves residuals that could be noise; {rival}."
     gain = "" if first.log_evidence is None else f" explains the log {first.log_evidence:.0f} nats better than none and"
     return f"{first.name}{gain} has probability {first.probability:.3g}; {rival}."
 

@@ -126,7 +126,7 @@ def _answer(log: Log, scored: list[Scored], none: Scored) -> dict[str, Any]:
     return reply(
         log,
         probabilities,
-        why=f"least BIC of {len(scored)} fitted candidates, {best.score - none.score:.1f} nats from none, {rows} rows",
+        why=f"least BIC of {len(scored)} fitted hypotheses, {best.score - none.score:.1f} nats from none, {rows} rows",
         baseline={name: values[name] for name in ("T_L", "K_L")},
         log_evidence={name: one.score - none.score for name, one in named.items()},
         parameters=parameters,

@@ -30,4 +30,4 @@ def random_guess(log: Log) -> dict[str, Any]:
     shares = {name: SHARES["single"] / len(effects) for name in effects}
     shares |= {"none": SHARES["none"], "unknown": SHARES["unknown"]}
     shares[drawn] = max(shares.values()) + 1e-6
-    return reply(log, shares, why="drawn by lot")
+    return reply(log, shares, why="drawn at random")

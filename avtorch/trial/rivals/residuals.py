@@ -42,7 +42,7 @@ class Residuals:
     def of(cls, log: Log, *, rate_hz: float) -> Residuals:
         """At about `rate_hz`, or the log's rate if that is lower. Raises `InputError` for too little to look at."""
         if log.accel_cmd is None:
-            raise InputError(f"{log.name}: has no accel_cmd, needed to hold a plant against it")
+            raise InputError(f"{log.name}: has no accel_cmd, needed to simulate a plant")
         every = max(1, round(log.rate_hz / rate_hz))
         channels = tuple(name for name in ("accel", "speed") if getattr(log, name) is not None)
         drives, seen, valid, push = [], [], [], []
@@ -68,7 +68,7 @@ class Residuals:
                 )
             )
         if not valid or np.concatenate(valid).sum() < 100:
-            raise InputError(f"{log.name}: fewer than 100 rows in motion, needs more to tell anything")
+            raise InputError(f"{log.name}: fewer than 100 rows in motion, needs more to diagnose")
         step = every / log.rate_hz
         return cls(tuple(drives), channels, np.concatenate(seen, 1), np.concatenate(valid), np.concatenate(push), step)
 

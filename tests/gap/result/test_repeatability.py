@@ -72,5 +72,5 @@ def test_the_answer_says_so() -> None:
     log = LogFacts(280, 1, 14.0, 20.0, ("accel",))
     each = tuple(Candidate(name, p, 0.0) for name, p in (("none", 0.9), ("unknown", 0.1)))
     told = sentences.gap(Diagnosis(log, {}, gap, each, Verdict(("none",), ("none",), False, "")))
-    assert told[1].startswith("The same commands given again (14 s) repeat accelerations to 0.08 m/s²:")
+    assert told[1].startswith("Under repeated commands (14 s) the car repeats accelerations to 0.08 m/s²;")
     assert GapSize(False).to_dict()["repeats"] is None

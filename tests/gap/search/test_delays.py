@@ -50,7 +50,7 @@ def _diagnosed(log: Log) -> Diagnosis:
 
 
 def test_alternating_commands_of_20_hz_show_no_dead_time() -> None:
-    """Once called a dead time of 0.217 ± 0.002 s, or of 0.117 s, and told apart from everything."""
+    """Once called a dead time of 0.217 ± 0.002 s, or of 0.117 s, and distinguished from everything."""
     found = _diagnosed(_euler())
     assert {"none", "dead_time"} <= set(found.verdict.alias_set)
     assert found.verdict.name != "dead_time"
@@ -72,7 +72,7 @@ def test_a_multiple_of_the_period_is_no_delay(shape: str, period: float, rate: f
     assert found.probability("dead_time") < 0.05
     if found.verdict.name == "none":
         assert "dead_time" in found.verdict.alias_set
-        assert "Told apart" not in str(found)
+        assert "This log distinguishes" not in str(found)
 
 
 @pytest.mark.slow

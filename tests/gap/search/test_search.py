@@ -120,7 +120,7 @@ def test_what_is_far_behind_at_first_sight_is_not_fitted_anew(tmp_path: Path, ro
     assert len(behind) == 2
     assert all(f.noise is race.none.noise for f in behind)
     assert all(f.onset is None for f in behind)
-    assert [of for what, _, of in told if what == "the best of them"] == [1]
+    assert [of for what, _, of in told if what == "best effects"] == [1]
     assert [(done, of) for what, done, of in told if what == "single effects"] == [(0, 3), (1, 3), (2, 3)]
 
 

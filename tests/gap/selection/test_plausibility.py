@@ -51,7 +51,7 @@ def shaken() -> Diagnosis:
 def test_a_gust_that_no_wind_makes_is_remarked_with_its_name(shaken: Diagnosis) -> None:
     assert shaken.verdict.names == ("gust",)
     assert shaken.winner.parameters["sd_mps2"].mean > 1.0
-    said_everywhere(shaken, "wind and road do not do this; something else is hidden in it")
+    said_everywhere(shaken, "wind and road do not do this; the effect stands in for something else")
     first = str(shaken).splitlines()[0]
     assert "physically implausible" in first
     assert Gust.meaning not in first
@@ -92,7 +92,9 @@ def test_what_an_effect_reports_has_a_range_that_holds_its_typical_values(kind: 
 
 def test_one_interval_that_reaches_in_is_no_accusation() -> None:
     (late,) = implausible({"lag_s": Quantity(2.4, 0.1, 2.2, 2.6)}, {}, [SensorLag])
-    assert late.startswith("sensor_lag.lag_s is 2.4 s, typical 0.05 to 0.5: no accelerometer is that late; something")
+    assert late.startswith(
+        "sensor_lag.lag_s is 2.4 s, typical 0.05 to 0.5: no accelerometer is that late; the effect stands"
+    )
     assert implausible({"lag_s": Quantity(2.4, 1.0, 0.9, 4.2)}, {}, [SensorLag]) == ()
     # of a pair each by its own name
     pair = {"sensor_lag.lag_s": about(0.2), "gust.sd_mps2": about(1.9), "gust.time_constant_s": about(2.0)}
