@@ -31,8 +31,8 @@ def clouds(seed: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("unevenness", [(0.0, 0.0), (0.1, 0.03)])
-def test_first_alarms_are_the_monitors(rotating_seed: int, unevenness: tuple[float, float]) -> None:
-    T, K, used = clouds(rotating_seed)
+def test_first_alarms_are_the_monitors(fresh_seed: int, unevenness: tuple[float, float]) -> None:
+    T, K, used = clouds(fresh_seed)
     end = 2.0 * torch.arange(1.0, WINDOWS + 1.0, dtype=torch.float64)
     alone = {n: Monitor(RUNS, detectors=[n], unevenness=unevenness) for n in DETECTORS}
     first = {n: torch.full((RUNS,), torch.inf, dtype=torch.float64) for n in DETECTORS}

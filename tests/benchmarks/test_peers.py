@@ -20,6 +20,7 @@ from benchmarks.peers.score import WANTED, Exact, effective, seconds_to
 from benchmarks.peers.single import Row
 from benchmarks.peers.tables import markdown, one_window, text
 from benchmarks.peers.torch_rows import own_log_density
+from tests.bars import BAR
 
 #: Methods that need nothing beyond avtorch itself.
 ALONE = ("avtorch", "conjugate", "laplace", "rls", "scalar", "quadrature")
@@ -114,13 +115,14 @@ def test_unknown_method_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -
     assert "'nuts2' is none of" in capsys.readouterr().err
 
 
-def test_effective_draws_of_many_short_chains(rotating_seed: int) -> None:
+@pytest.mark.statistical
+def test_effective_draws_of_many_short_chains(rotating_seed: int, draws_factor: int) -> None:
     g = np.random.default_rng(rotating_seed)
-    chains, length = 512, 8
+    chains, length = 512 * draws_factor, 8
     independent = np.exp(g.standard_normal((chains, length, 1, 2)))
     bulk, _ = effective(independent)
     # the least of two, each with a relative error of sqrt(2/512), is low by a little
-    assert abs(bulk[0] / (chains * length) - 1) < 5 * np.sqrt(2 / chains) + 0.05
+    assert abs(bulk[0] / (chains * length) - 1) < BAR * np.sqrt(2 / chains) + 0.05
     rho = 0.9
     walk = np.empty((chains, length, 1, 1))
     walk[:, 0] = g.standard_normal((chains, 1, 1))
@@ -128,7 +130,7 @@ def test_effective_draws_of_many_short_chains(rotating_seed: int) -> None:
         walk[:, k] = rho * walk[:, k - 1] + np.sqrt(1 - rho**2) * g.standard_normal((chains, 1, 1))
     lags = np.arange(1, length)
     expected = chains * length / (1 + 2 * ((1 - lags / length) * rho**lags).sum())
-    assert abs(effective(walk)[0][0] / expected - 1) < 5 * np.sqrt(2 / chains)
+    assert abs(effective(walk)[0][0] / expected - 1) < BAR * np.sqrt(2 / chains)
 
 
 def test_effective_draws_never_exceed_the_draws() -> None:

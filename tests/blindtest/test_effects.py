@@ -10,6 +10,7 @@ from avtorch.blindtest.car import Car
 from avtorch.blindtest.command import losses
 from avtorch.blindtest.drives import Recorded
 from avtorch.blindtest.vehicle import Run, simulate
+from tests.bars import BAR
 
 CAR = Car(T_L=0.37, K_L=0.93).silent()
 RATE, DT = 50, 0.02
@@ -147,24 +148,27 @@ def test_sensor_faults_leave_the_motion_alone() -> None:
     close(drive("sensor_lag", lag_s=0.3), np.asarray(lagged), atol=5e-3)
 
 
-def test_share_of_lost_messages(rotating_seed: int) -> None:
-    lost = np.array(losses(np.random.default_rng(rotating_seed), 40_000, 0.1))
+@pytest.mark.statistical
+def test_share_of_lost_messages(rotating_seed: int, draws_factor: int) -> None:
+    messages = 40_000 * draws_factor
+    lost = np.array(losses(np.random.default_rng(rotating_seed), messages, 0.1))
     # bursts of 1.3 widen the spread of the share by at most 1.5
-    assert lost.mean() == pytest.approx(0.1, abs=5 * 1.5 * np.sqrt(0.09 / 40_000))
+    assert lost.mean() == pytest.approx(0.1, abs=BAR * 1.5 * np.sqrt(0.09 / messages))
     assert not any(losses(np.random.default_rng(0), 100, 0.0))
 
 
-def test_outliers_have_their_share_and_are_chance(rotating_seed: int) -> None:
+@pytest.mark.statistical
+def test_outliers_have_their_share_and_are_chance(rotating_seed: int, draws_factor: int) -> None:
     car = Car(accel_sd=0.05)
-    u = np.zeros(6000)
+    u = np.zeros(6000 * draws_factor)
     run = simulate(
         car,
         Recorded(u, start_speed=20.0),
-        seconds=120.0,
+        seconds=120.0 * draws_factor,
         rate_hz=RATE,
         effects={"outliers": {"fraction": 0.03, "scale": 8.0}},
         seed=rotating_seed,
     )
     hit = run.chance_accel != 0
-    assert hit.mean() == pytest.approx(0.03, abs=5 * np.sqrt(0.03 / 6000))
+    assert hit.mean() == pytest.approx(0.03, abs=BAR * np.sqrt(0.03 / len(u)))
     assert np.abs(run.chance_accel[hit]).min() >= 0.6 * 8.0 * 0.05 - 1e-12

@@ -10,6 +10,7 @@ import pytest
 
 from avtorch.cli import main
 from avtorch.io import Log
+from tests.bars import BAR
 from tests.overridden import taken_over
 
 EPOCH = 1.7e9
@@ -26,6 +27,7 @@ def drive(tmp_path: Path, rotating_seed: int) -> Path:
     return path
 
 
+@pytest.mark.statistical
 def test_from_a_file_to_the_page(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     command = [
@@ -47,8 +49,7 @@ def test_from_a_file_to_the_page(drive: Path, tmp_path: Path, capsys: pytest.Cap
     answer = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
     assert answer["verdict"]["names"] == ["dead_time"]
     delay = next(e for e in answer["effects"] if e["name"] == "dead_time")["parameters"]["delay_s"]
-    # five standard errors
-    assert abs(delay["mean"] - 0.2) < 5 * delay["sd"]
+    assert abs(delay["mean"] - 0.2) < BAR * delay["sd"]
     assert answer["not_tried"]["pairs"] == "none"
     assert "aerodynamic_drag" in answer["not_tried"]["effects"]
     assert "dead_time" in (out / "report.html").read_text(encoding="utf-8")

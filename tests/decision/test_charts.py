@@ -7,6 +7,7 @@ import torch
 
 from avtorch.decision.charts import CHARTS, Chart, chart_limit, cusum_arl, ewma_arl, shewhart_arl
 from avtorch.errors import InputError
+from tests.bars import BAR
 
 
 def run_lengths(kind, *, arl, components, shift, runs, seed, longest=6000):
@@ -25,21 +26,23 @@ def run_lengths(kind, *, arl, components, shift, runs, seed, longest=6000):
     raise AssertionError("a chart never alarmed")
 
 
-def five_sigma(lengths):
-    return 5.0 * float(lengths.std()) / math.sqrt(len(lengths))
+def bar_of(lengths):
+    return BAR * float(lengths.std()) / math.sqrt(len(lengths))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("kind", CHARTS)
-def test_in_control_run_length_is_what_was_asked(kind, rotating_seed):
-    lengths = run_lengths(kind, arl=60.0, components=1, shift=0.0, runs=4000, seed=rotating_seed)
-    assert abs(float(lengths.mean()) - 60.0) < five_sigma(lengths)
+def test_in_control_run_length_is_what_was_asked(kind, rotating_seed, draws_factor):
+    lengths = run_lengths(kind, arl=60.0, components=1, shift=0.0, runs=4000 * draws_factor, seed=rotating_seed)
+    assert abs(float(lengths.mean()) - 60.0) < bar_of(lengths)
 
 
-def test_two_components_alarm_once_per_arl(rotating_seed):
-    lengths = run_lengths("shewhart", arl=60.0, components=2, shift=0.0, runs=4000, seed=rotating_seed)
+@pytest.mark.statistical
+def test_two_components_alarm_once_per_arl(rotating_seed, draws_factor):
+    lengths = run_lengths("shewhart", arl=60.0, components=2, shift=0.0, runs=4000 * draws_factor, seed=rotating_seed)
     exact = 1.0 / (1.0 - (1.0 - 1.0 / 120.0) ** 2)  # either of two independent charts of 120
     assert 60.0 < exact < 61.0
-    assert abs(float(lengths.mean()) - exact) < five_sigma(lengths)
+    assert abs(float(lengths.mean()) - exact) < bar_of(lengths)
 
 
 def test_shewhart_is_exact_and_ewma_of_weight_one_is_shewhart():
@@ -59,18 +62,20 @@ def test_a_cusum_of_no_height_is_two_one_sided_shewhart_arms():
     assert cusum_arl(1e-9, 1.5) == pytest.approx(1.0 / math.erfc(1.5 / math.sqrt(2.0)), rel=1e-6)
 
 
-def test_small_shifts_are_found_sooner_by_the_charts_that_remember(rotating_seed):
+@pytest.mark.statistical
+def test_small_shifts_are_found_sooner_by_the_charts_that_remember(rotating_seed, draws_factor):
     mean = {
-        kind: run_lengths(kind, arl=300.0, components=1, shift=1.0, runs=1500, seed=rotating_seed) for kind in CHARTS
+        kind: run_lengths(kind, arl=300.0, components=1, shift=1.0, runs=1500 * draws_factor, seed=rotating_seed)
+        for kind in CHARTS
     }
     for kind in ("ewma", "cusum"):
-        gap = five_sigma(mean[kind]) + five_sigma(mean["shewhart"])
+        gap = bar_of(mean[kind]) + bar_of(mean["shewhart"])
         assert float(mean[kind].mean()) < float(mean["shewhart"].mean()) - gap
 
 
 @pytest.mark.parametrize("kind", CHARTS)
-def test_unseen_windows_move_nothing_and_a_state_resumes_to_the_bit(kind, rotating_seed):
-    generator = torch.Generator().manual_seed(rotating_seed)
+def test_unseen_windows_move_nothing_and_a_state_resumes_to_the_bit(kind, fresh_seed):
+    generator = torch.Generator().manual_seed(fresh_seed)
     z = torch.randn(30, 5, 2, generator=generator, dtype=torch.float64)
     seen = torch.rand(30, 5, generator=generator) < 0.6
     whole, part = Chart(kind, 5, 20.0), Chart(kind, 5, 20.0)

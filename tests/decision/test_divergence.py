@@ -21,6 +21,7 @@ from avtorch.decision.divergence import (
     weighted_chi2_tail,
 )
 from avtorch.errors import InputError
+from tests.bars import BAR
 
 
 def random_gaussian(batch, generator, scale=1.0):
@@ -30,8 +31,8 @@ def random_gaussian(batch, generator, scale=1.0):
 
 
 @pytest.fixture
-def pair(rotating_seed):
-    generator = torch.Generator().manual_seed(rotating_seed)
+def pair(fresh_seed):
+    generator = torch.Generator().manual_seed(fresh_seed)
     return random_gaussian(6, generator), random_gaussian(6, generator)
 
 
@@ -74,11 +75,12 @@ def test_tail_of_weighted_chi_squares():
     torch.testing.assert_close(single, torch.from_numpy(chi2.sf(value.numpy(), 1)), rtol=1e-2, atol=1e-12)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("kind", DIVERGENCES)
 @pytest.mark.parametrize("baseline_scale", [0.1, 1.0, 3.0])
-def test_false_alarm_rate_counts_the_baselines_own_uncertainty(kind, baseline_scale, rotating_seed):
+def test_false_alarm_rate_counts_the_baselines_own_uncertainty(kind, baseline_scale, rotating_seed, draws_factor):
     generator = torch.Generator().manual_seed(rotating_seed)
-    n, rate = 20000, 0.05
+    n, rate = 20000 * draws_factor, 0.05
     p, q = (random_gaussian(1, generator, s) for s in (1.0, baseline_scale))
 
     def around_the_truth(g):
@@ -87,10 +89,11 @@ def test_false_alarm_rate_counts_the_baselines_own_uncertainty(kind, baseline_sc
 
     chance = divergence_p_value(kind, around_the_truth(p), around_the_truth(q))
     share = float((chance < rate).double().mean())
-    assert abs(share - rate) < 5.0 * math.sqrt(rate * (1.0 - rate) / n)
+    assert abs(share - rate) < BAR * math.sqrt(rate * (1.0 - rate) / n)
 
 
-def test_combined_beliefs_add_their_precisions_and_leave_white_residuals(rotating_seed):
+@pytest.mark.statistical
+def test_combined_beliefs_add_their_precisions_and_leave_white_residuals(rotating_seed, draws_factor):
     generator = torch.Generator().manual_seed(rotating_seed)
     a, b = random_gaussian(4, generator), random_gaussian(4, generator)
     both = a.combine(b)
@@ -99,7 +102,7 @@ def test_combined_beliefs_add_their_precisions_and_leave_white_residuals(rotatin
     pulled = torch.linalg.inv(a.cov) @ a.mean[..., None] + torch.linalg.inv(b.cov) @ b.mean[..., None]
     torch.testing.assert_close(precision @ both.mean[..., None], pulled, rtol=1e-9, atol=1e-9)
 
-    n = 20000
+    n = 20000 * draws_factor
     cov = a.cov[:1].expand(n, 2, 2)
     windows = [
         Gaussian(torch.randn(n, 2, generator=generator, dtype=torch.float64) @ torch.linalg.cholesky(cov[0]).mT, cov)
@@ -111,7 +114,7 @@ def test_combined_beliefs_add_their_precisions_and_leave_white_residuals(rotatin
         baseline = baseline.combine(window)
     z = torch.cat(residuals, dim=-1)
     # Covariance of n standard normal vectors: entries off the identity by sqrt(2/n) at most, 1 sigma.
-    assert float((z.mT @ z / n - torch.eye(4, dtype=torch.float64)).abs().max()) < 5.0 * math.sqrt(2.0 / n)
+    assert float((z.mT @ z / n - torch.eye(4, dtype=torch.float64)).abs().max()) < BAR * math.sqrt(2.0 / n)
 
 
 def test_bad_calls_are_refused(pair):

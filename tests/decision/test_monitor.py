@@ -10,6 +10,7 @@ from avtorch.decision.divergence import DIVERGENCES
 from avtorch.decision.monitor import DEFAULT_DETECTORS, DETECTORS, Monitor
 from avtorch.decision.settings import Setting
 from avtorch.errors import InputError
+from tests.bars import BAR
 
 
 def cloud(T, K, *, sd=0.03, draws=400, seed=0):
@@ -116,11 +117,12 @@ def test_saved_state_resumes_to_the_bit():
             resumed.load_state_dict(whole.state_dict())
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", [*DIVERGENCES, *CHARTS])
-def test_rates_of_false_alarm_in_control(name, rotating_seed):
+def test_rates_of_false_alarm_in_control(name, rotating_seed, draws_factor):
     """Window posteriors scatter about one truth as wide as they claim: alarms come at the stated rate."""
     generator = torch.Generator().manual_seed(rotating_seed)
-    n, windows, rate = 3000, 12, 0.02
+    n, windows, rate = 3000 * draws_factor, 12, 0.02
     monitor = Monitor(n, detectors=[name], false_alarm_rate=rate, arl=50.0)
     alarms = torch.zeros(n, dtype=torch.float64)
     for _ in range(windows):
@@ -132,13 +134,13 @@ def test_rates_of_false_alarm_in_control(name, rotating_seed):
     if name in CHARTS:
         # An alarm every 50 windows at most: memoryless for Shewhart; the others start from zero and alarm later.
         expected = counted / 50.0
-        spread = 5.0 * float(alarms.std()) / math.sqrt(n)
+        spread = BAR * float(alarms.std()) / math.sqrt(n)
         assert float(alarms.mean()) < expected + spread
         assert float(alarms.mean()) > (0.9 * expected - spread if name == "shewhart" else 0.0)
     else:
         # Alarmed windows are kept out of the baseline, which only steadies it: the rate is met to a tenth of itself.
         share = alarms / counted
-        assert abs(float(share.mean()) - rate) < 5.0 * float(share.std()) / math.sqrt(n) + 0.1 * rate
+        assert abs(float(share.mean()) - rate) < BAR * float(share.std()) / math.sqrt(n) + 0.1 * rate
 
 
 def test_a_baseline_may_come_from_elsewhere_and_inflation_quiets():

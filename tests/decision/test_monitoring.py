@@ -8,13 +8,14 @@ import torch
 from avtorch.decision import Strategist, Supervisor
 from avtorch.vehicle import ClosedLoop, GLVDPlant, Leader, LowerLevel
 from benchmarks.monitoring import drive, score
+from tests.bars import BAR
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.statistical]
 
 
 def least(share, n):
-    """The least count out of n that a true `share` leaves in all but one of 3 million cases (5 sigma)."""
-    return math.floor(n * share - 5 * math.sqrt(n * share * (1 - share)))
+    """The least count out of n that a true `share` leaves in all but one of 2 million cases."""
+    return math.floor(n * share - BAR * math.sqrt(n * share * (1 - share)))
 
 
 def test_the_papers_change_is_seen_at_once_and_believed_honestly(rotating_seed):

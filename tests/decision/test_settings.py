@@ -10,8 +10,8 @@ from avtorch.vehicle.controllers import LinearController
 from avtorch.vehicle.lower_level import LowerLevel
 
 
-def test_verdicts_use_the_effective_actuation_of_every_draw(rotating_seed):
-    generator = torch.Generator().manual_seed(rotating_seed)
+def test_verdicts_use_the_effective_actuation_of_every_draw(fresh_seed):
+    generator = torch.Generator().manual_seed(fresh_seed)
     T = 0.2 + 2.0 * torch.rand(3, 50, generator=generator, dtype=torch.float64)
     K = 0.3 + torch.rand(3, 50, generator=generator, dtype=torch.float64)
     setting = Setting(
@@ -74,8 +74,8 @@ def test_choosing_indexing_and_retargeting():
     assert b.lower_level(accel_min=-3.0, accel_max=2.0).accel_max == 2.0
 
 
-def test_design_bounds_hold_their_coverage(rotating_seed):
-    generator = torch.Generator().manual_seed(rotating_seed)
+def test_design_bounds_hold_their_coverage(fresh_seed):
+    generator = torch.Generator().manual_seed(fresh_seed)
     z = torch.randn(2, 2, 4000, generator=generator, dtype=torch.float64)
     T, K = 1.5 * torch.exp(0.1 * z[0]), 0.5 * torch.exp(0.05 * (z[0] * 0.9 + 0.4 * z[1]))
     box = DesignBounds.of_belief(T, K, coverage=0.9)

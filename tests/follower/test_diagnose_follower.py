@@ -24,6 +24,7 @@ def key_values(values: dict[str, float]) -> dict[str, float]:
     return {f"law.{k}": v for k, v in values.items()} | {"T_L": T_L, "dead_time.delay_s": DELAY}
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TRUTHS)
 def test_law_lag_and_delay_are_found(name: str, rotating_seed: int) -> None:
@@ -52,6 +53,7 @@ def drawn_z(found: FollowerDiagnosis) -> np.ndarray:
     return np.stack([(c.parameter.unconstrain(torch.as_tensor(found.draws[c.key])) / c.wider).numpy() for c in each], 1)
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 def test_a_gap_that_was_changed_midway_is_not_told_to_a_hair(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
@@ -68,6 +70,7 @@ def test_a_gap_that_was_changed_midway_is_not_told_to_a_hair(rotating_seed: int)
     assert found.draws(wide)["law.time_gap_s"].std() > 0.1
 
 
+@pytest.mark.statistical
 def test_a_driver_who_falls_back_is_no_part_of_the_law(rotating_seed: int) -> None:
     """He brakes while the law asks for more; rolled out through, he came out as half a second of delay."""
     overrides = [(30.0, 34.0), (62.0, 66.0), (95.0, 99.0), (130.0, 134.0)]
@@ -83,6 +86,7 @@ def test_a_driver_who_falls_back_is_no_part_of_the_law(rotating_seed: int) -> No
     assert found.loops["constant_time_gap"].speed < found.keeps_speed
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", TRUTHS)
 def test_loop_of_the_truth_goes_with_the_drive(name: str, rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
@@ -97,8 +101,8 @@ def test_loop_of_the_truth_goes_with_the_drive(name: str, rotating_seed: int) ->
     assert errors.spacing < 0.15
 
 
-def test_stability_is_that_of_the_exact_verdicts_without_delay(rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_stability_is_that_of_the_exact_verdicts_without_delay(fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     k_s, k_v, h, T = rng.uniform([[0.02], [0.1], [0.5], [0.1]], [[0.5], [1.5], [3.0], [1.0]], (4, 60))
     gains = torch.as_tensor(np.stack([k_s, k_v, np.zeros(60)], -1))
     setting = (torch.as_tensor(T), torch.ones(60, dtype=torch.float64), torch.as_tensor(h), gains)
@@ -117,6 +121,7 @@ def test_stability_is_that_of_the_exact_verdicts_without_delay(rotating_seed: in
             assert told.p_string_stable == float(string[i] & local[i])
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 def test_cause_is_told_conditionally(rotating_seed: int) -> None:
     log = followed_log("constant_time_gap", CTG, seconds=240, rng=np.random.default_rng(rotating_seed))
@@ -142,6 +147,7 @@ def test_a_short_drive_is_refused() -> None:
         diagnose_follower(log)
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 def test_drives_that_begin_their_time_anew_keep_their_own_rows(
     rotating_seed: int, monkeypatch: pytest.MonkeyPatch

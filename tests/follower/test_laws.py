@@ -16,8 +16,8 @@ def drawn(law: Law, seed: int) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("law", LAWS.values(), ids=lambda law: law.name)
-def test_equilibrium_demands_nothing(law: Law, rotating_seed: int) -> None:
-    values = drawn(law, rotating_seed)
+def test_equilibrium_demands_nothing(law: Law, fresh_seed: int) -> None:
+    values = drawn(law, fresh_seed)
     for v in (3.0, 12.0, 18.0):
         speed = torch.tensor([v], dtype=torch.float64)
         seen = Seen(law.spacing(values, v).reshape(1), speed, speed)
@@ -26,8 +26,8 @@ def test_equilibrium_demands_nothing(law: Law, rotating_seed: int) -> None:
 
 
 @pytest.mark.parametrize("law", LAWS.values(), ids=lambda law: law.name)
-def test_slopes_are_the_derivatives_of_the_command(law: Law, rotating_seed: int) -> None:
-    values = drawn(law, rotating_seed)
+def test_slopes_are_the_derivatives_of_the_command(law: Law, fresh_seed: int) -> None:
+    values = drawn(law, fresh_seed)
     v = 11.0
     at = torch.stack([law.spacing(values, v).clamp_min(1.0), torch.tensor(v).double(), torch.tensor(v).double()])
     slopes = torch.autograd.functional.jacobian(

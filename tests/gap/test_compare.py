@@ -14,6 +14,7 @@ from avtorch.errors import InputError
 from avtorch.gap import DeadTime, GapPlant, plant
 from avtorch.gap.delay_rival import WithDelay, later_answer
 from avtorch.io import Log
+from tests.bars import BAR
 from tests.gap.records import QUIET, log_of
 from tests.overridden import taken_over
 
@@ -22,13 +23,14 @@ def _drive(rng: np.random.Generator, *, seconds: float = 120.0, **of: float) -> 
     return log_of(plant(**of), seconds=seconds, rng=rng, noise=QUIET)
 
 
+@pytest.mark.statistical
 def test_a_slower_car_is_told_and_by_how_much(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     told = avtorch.compare(_drive(rng, T_L=0.4, K_L=0.9), _drive(rng, T_L=0.56, K_L=0.9))
     assert told.changed
     lag = told.car["T_L"].ratio
-    # five standard deviations, told from ten blocks a side
-    assert abs(np.log(lag.mean) - np.log(1.4)) < 5 * max(lag.sd / lag.mean, 0.02)
+    # told from ten blocks a side
+    assert abs(np.log(lag.mean) - np.log(1.4)) < BAR * max(lag.sd / lag.mean, 0.02)
     assert told.simulator == "farther"
     assert "has changed" in told.why
     json.dumps(told.to_dict(), allow_nan=False)
@@ -41,6 +43,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("delay", [0.0, 0.12])
 @pytest.mark.parametrize("what", CHANGES)
 def test_a_later_answer_is_not_taken_for_lag_and_gain(what: str, delay: float, rotating_seed: int) -> None:
@@ -55,24 +58,27 @@ def test_a_later_answer_is_not_taken_for_lag_and_gain(what: str, delay: float, r
     told = avtorch.compare(*(log_of(x, seconds=90.0, rng=rng, noise=QUIET) for x in (car(), car(**change))))
     assert told.changed
     assert told.later is not None
-    # of the true account the chance is uniform: below 0.01 in 1 of 100, and drawn again then; the other one is far off
-    assert told.later.account == account
-    gone = told.later.difference
-    assert abs(gone.mean - change.get("delay", 0.0)) < 5 * gone.sd
-    if what == "delay":
+    later = told.later
+    # of the true account the chance is uniform, so that one of 100 drives rejects it, too; the other one is far off
+    true, other = (later.p_dead_time, later.p_lag_gain)[:: 1 if what == "delay" else -1]
+    assert other < 1e-3 < true
+    if what != "delay" and true < 0.25 * later.level:
+        account = "not lag and gain"
+    assert later.account == account
+    gone = later.difference
+    assert abs(gone.mean - change.get("delay", 0.0)) < BAR * gone.sd
+    if account == "not lag and gain":
         assert "lag and gain do not explain it" in told.why
-        assert told.later.p_lag_gain < 1e-3 < told.later.p_dead_time
     else:
         assert told.why.startswith("The car has changed: T_L ")
-        assert told.later.p_dead_time < 1e-3 < told.later.p_lag_gain
     answer = told.to_dict()["explained"]
     assert answer["account"] == account
     json.dumps(answer, allow_nan=False)
 
 
-def test_what_cannot_be_told_is_not(rotating_seed: int) -> None:
+def test_what_cannot_be_told_is_not(fresh_seed: int) -> None:
     """Where either account would do, neither is given."""
-    numbers = np.random.default_rng(rotating_seed).normal(scale=0.01, size=(2, 3))
+    numbers = np.random.default_rng(fresh_seed).normal(scale=0.01, size=(2, 3))
     spread = np.diag([0.1, 0.1, 0.05]) ** 2
     one, two = (WithDelay(x, spread, 9) for x in numbers)
     told = later_answer(one, two, level=0.04)
@@ -84,6 +90,7 @@ def test_what_cannot_be_told_is_not(rotating_seed: int) -> None:
     assert both.account == "not lag and gain"
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 def test_one_car_stays_one_car(rotating_seed: int) -> None:
     """With a delay that the model lacks: what it lacks is spread, and no change."""
@@ -96,6 +103,7 @@ def test_one_car_stays_one_car(rotating_seed: int) -> None:
     assert changed < 5
 
 
+@pytest.mark.statistical
 def test_two_simulators_on_one_drive(rotating_seed: int) -> None:
     log = _drive(np.random.default_rng(rotating_seed), T_L=0.4, K_L=0.9)
     told = avtorch.compare(log, log, baseline=plant(T_L=0.2, K_L=0.8), baseline_after=plant(T_L=0.4, K_L=0.9))
@@ -109,6 +117,7 @@ def test_two_simulators_on_one_drive(rotating_seed: int) -> None:
     assert turned.simulator == "farther"
 
 
+@pytest.mark.statistical
 def test_rollouts_of_both_sides_last_as_long_as_they_are_said_to(rotating_seed: int) -> None:
     """Between overrides every 8 s no rollout lasts 10 s, and errors grow with how long they do: once those of 6 s were
     called 10 s, and held against 10 s of a drive without overrides."""

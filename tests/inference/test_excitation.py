@@ -6,15 +6,17 @@ import pytest
 import torch
 
 from avtorch.inference import ExcitationRule, JerkStatistics
+from tests.bars import BAR
 
 F64 = torch.float64
 
 
-def test_predicted_sds_are_those_of_repeated_least_squares(make_windows, rotating_seed):
+@pytest.mark.statistical
+def test_predicted_sds_are_those_of_repeated_least_squares(make_windows, rotating_seed, draws_factor):
     """2000 noises on one window whose truth is the reference: the spread of T_L and K_L is the predicted one."""
     w = make_windows(rotating_seed, [1.0], T=1.0, K=1.0, sigma=0.05)
     clean = (w.u - w.a) / 1.0
-    repeats = 2000
+    repeats = 2000 * draws_factor
     g = torch.Generator().manual_seed(rotating_seed)
     jerk = clean + 0.05 * torch.randn(repeats, w.u.shape[1], generator=g, dtype=F64)
     statistics = JerkStatistics.from_samples(w.a.expand(repeats, -1), w.u.expand(repeats, -1), jerk)
@@ -22,7 +24,7 @@ def test_predicted_sds_are_those_of_repeated_least_squares(make_windows, rotatin
     predicted = torch.stack([x.square().mean().sqrt() for x in ExcitationRule().predicted_sd(statistics)])
     found = torch.stack([(1 / inverse_lag).std(), (gain_over_lag / inverse_lag).std()])
     # an SD from 2000 draws is good to 1/sqrt(4000); the delta method's own error is of order (SD/T)^2
-    slack = 5 / (2 * repeats) ** 0.5 + 6 * predicted.max().item() ** 2
+    slack = BAR / (2 * repeats) ** 0.5 + 6 * predicted.max().item() ** 2
     assert predicted.max() < 0.06
     assert ((found - predicted) / predicted).abs().max() < slack
 

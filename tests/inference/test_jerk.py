@@ -44,8 +44,8 @@ def priors(windows: int, seed: int = 0) -> dict[str, object]:
 
 @pytest.mark.parametrize("check", [gradcheck, gradgradcheck])
 @pytest.mark.parametrize("shape", [(), (2,), (3, 2)])
-def test_likelihood_gradients(check, shape, rotating_seed):
-    g = torch.Generator().manual_seed(rotating_seed)
+def test_likelihood_gradients(check, shape, fresh_seed):
+    g = torch.Generator().manual_seed(fresh_seed)
     T, K, sigma = (0.3 + torch.rand(shape, generator=g, dtype=F64) for _ in range(3))
     a, u, jerk = (torch.randn(*shape, 4, generator=g, dtype=F64) for _ in range(3))
     assert check(jerk_log_likelihood, [x.requires_grad_() for x in (T, K, sigma, a, u, jerk)])
@@ -53,19 +53,19 @@ def test_likelihood_gradients(check, shape, rotating_seed):
 
 @pytest.mark.parametrize("check", [gradcheck, gradgradcheck])
 @pytest.mark.parametrize("kind", ["first", "lambda", "posterior", "switch", "switch-posterior"])
-def test_density_gradients(check, kind, make_windows, rotating_seed):
-    w = make_windows(rotating_seed, [1.0, 0.5], rows=20, sigma=0.5)
-    density = JerkDensity(w.statistics, priors(2, rotating_seed)[kind])
-    z = torch.randn(3, 2, 3, generator=torch.Generator().manual_seed(rotating_seed), dtype=F64) * 0.3 - 0.3
+def test_density_gradients(check, kind, make_windows, fresh_seed):
+    w = make_windows(fresh_seed, [1.0, 0.5], rows=20, sigma=0.5)
+    density = JerkDensity(w.statistics, priors(2, fresh_seed)[kind])
+    z = torch.randn(3, 2, 3, generator=torch.Generator().manual_seed(fresh_seed), dtype=F64) * 0.3 - 0.3
     # central differences of a potential of some thousands: the default step is right, its relative bar too
     assert check(density.log_prob, [z.requires_grad_()], atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["first", "lambda", "posterior", "switch", "switch-posterior"])
-def test_score_is_the_gradient(kind, make_windows, rotating_seed):
-    w = make_windows(rotating_seed, [1.0, 0.5, 0.01])
-    density = JerkDensity(w.statistics, priors(3, rotating_seed)[kind])
-    z = torch.randn(5, 3, 3, generator=torch.Generator().manual_seed(rotating_seed), dtype=F64).requires_grad_()
+def test_score_is_the_gradient(kind, make_windows, fresh_seed):
+    w = make_windows(fresh_seed, [1.0, 0.5, 0.01])
+    density = JerkDensity(w.statistics, priors(3, fresh_seed)[kind])
+    z = torch.randn(5, 3, 3, generator=torch.Generator().manual_seed(fresh_seed), dtype=F64).requires_grad_()
     (gradient,) = torch.autograd.grad(density.log_prob(z).sum(), z)
     scale = gradient.abs().amax(-1, keepdim=True)
     assert ((density.score(z.detach()) - gradient) / (1 + scale)).abs().max() < 1e-12
@@ -113,9 +113,9 @@ def test_edges_of_the_ranges(T, K, sigma, make_windows):
     assert density.score(z).isfinite().all()
 
 
-def test_sums_and_points_agree(make_windows, rotating_seed):
-    w = make_windows(rotating_seed, [1.0, 0.3, 0.03], T=[0.2, 0.5, 1.5], K=[1.0, 0.8, 0.5])
-    z = torch.randn(7, 3, 3, generator=torch.Generator().manual_seed(rotating_seed), dtype=F64)
+def test_sums_and_points_agree(make_windows, fresh_seed):
+    w = make_windows(fresh_seed, [1.0, 0.3, 0.03], T=[0.2, 0.5, 1.5], K=[1.0, 0.8, 0.5])
+    z = torch.randn(7, 3, 3, generator=torch.Generator().manual_seed(fresh_seed), dtype=F64)
     T, K, sigma = z.exp().unbind(-1)
     points = jerk_log_likelihood(T, K, sigma, w.a, w.u, w.jerk)
     torch.testing.assert_close(JerkDensity(w.statistics).log_likelihood(z), points, rtol=1e-10, atol=1e-10)
@@ -144,11 +144,11 @@ def test_float32_is_kept(make_windows):
 
 
 @pytest.mark.parametrize("size", [1, 2])
-def test_minibatches_are_unbiased(size, make_windows, rotating_seed):
+def test_minibatches_are_unbiased(size, make_windows, fresh_seed):
     """The estimate averaged over every batch of the size is the whole, prior counted once."""
-    w = make_windows(rotating_seed, [1.0, 0.2], rows=9)
+    w = make_windows(fresh_seed, [1.0, 0.2], rows=9)
     density = JerkPoints(w.a, w.u, w.jerk)
-    z = torch.randn(4, 2, 3, generator=torch.Generator().manual_seed(rotating_seed), dtype=F64)
+    z = torch.randn(4, 2, 3, generator=torch.Generator().manual_seed(fresh_seed), dtype=F64)
     batches = [torch.tensor(c) for c in combinations(range(9), size)]
     average = torch.stack([density.log_prob_minibatch(z, index) for index in batches]).mean(0)
     torch.testing.assert_close(average, density.log_prob(z), rtol=1e-11, atol=1e-9)

@@ -38,8 +38,8 @@ def one_window(density: JerkDensity, w: int):
 
 
 @pytest.mark.parametrize("kind", ["first", "lambda"])
-def test_mode_is_scipys(kind, make_windows, rotating_seed):
-    density = densities(make_windows, rotating_seed)[kind]
+def test_mode_is_scipys(kind, make_windows, fresh_seed):
+    density = densities(make_windows, fresh_seed)[kind]
     mode = find_mode(density)
     assert mode.converged.all()
     sd = mode.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
@@ -56,8 +56,8 @@ def test_mode_is_scipys(kind, make_windows, rotating_seed):
 
 
 @pytest.mark.parametrize("kind", ["first", "lambda"])
-def test_laplace_covariance_is_the_inverse_hessian(kind, make_windows, rotating_seed):
-    density = densities(make_windows, rotating_seed)[kind]
+def test_laplace_covariance_is_the_inverse_hessian(kind, make_windows, fresh_seed):
+    density = densities(make_windows, fresh_seed)[kind]
     mode = find_mode(density)
     for w in range(density.windows):
 

@@ -14,6 +14,9 @@ from torch import Tensor
 
 from avtorch.inference import JerkDensity, JerkStatistics, Quadrature, SamplerSettings, find_mode, integrate, sample
 from avtorch.vehicle.glvd import glvd_jerk, glvd_rollout
+from tests.bars import BAR
+
+pytestmark = pytest.mark.statistical
 
 F64 = torch.float64
 WINDOWS, ROWS = 50, 200
@@ -62,15 +65,15 @@ def test_strange_units_and_noise(rotating_seed: int) -> None:
         # the draws of the default settings are all but independent; half of them is on the safe side
         ess = 0.5 * posterior.draws.shape[0] * posterior.draws.shape[1]
         mean = ((posterior.mean - truth.mean) / truth.sd)[judged]
-        assert mean.abs().max() < BIAS + 5 / math.sqrt(ess)
+        assert mean.abs().max() < BIAS + BAR / math.sqrt(ess)
         for q, value in quantiles.items():
             below = (posterior.flat < value).double().mean(0)[judged]
-            assert (below - q).abs().max() < BIAS_OF_PROBABILITY + 5 * math.sqrt(q * (1 - q) / ess)
+            assert (below - q).abs().max() < BIAS_OF_PROBABILITY + BAR * math.sqrt(q * (1 - q) / ess)
         # a sample SD has a normal error only where the tails are not long
         short = judged[:, None] & (tail < 5)
         assert short.double().mean() > 0.5
         ratio = posterior.sd / truth.sd - 1
-        assert (ratio.abs() < BIAS + 5 * ((tail - 1) / (4 * ess)).sqrt())[short].all()
+        assert (ratio.abs() < BIAS + BAR * ((tail - 1) / (4 * ess)).sqrt())[short].all()
 
 
 def test_a_window_without_motion_settles_on_the_prior_or_says_why(rotating_seed: int) -> None:
@@ -85,5 +88,5 @@ def test_a_window_without_motion_settles_on_the_prior_or_says_why(rotating_seed:
     ess = 0.5 * z.shape[0] * z.shape[1]
     for i, (median, sd) in enumerate(((0.3, 0.7), (1.0, 0.3))):
         score = (z[..., i] - math.log(median)) / sd
-        assert (score.mean((0, 1)).abs() < BIAS + 5 / math.sqrt(ess)).all()
-        assert ((score.std((0, 1)) - 1).abs() < BIAS + 5 / math.sqrt(2 * ess)).all()
+        assert (score.mean((0, 1)).abs() < BIAS + BAR / math.sqrt(ess)).all()
+        assert ((score.std((0, 1)) - 1).abs() < BIAS + BAR / math.sqrt(2 * ess)).all()

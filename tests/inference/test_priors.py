@@ -23,9 +23,9 @@ from avtorch.inference.priors import (
     default_actuation_prior,
     default_jerk_noise_prior,
 )
+from tests.bars import LEVEL
 
 F64 = torch.float64
-P_5_SIGMA = 2 * stats.norm.sf(5)
 
 MEANS = torch.tensor([[0.3, 1.0], [1.5, 0.5], [0.02, 0.05], [-0.4, 0.2]], dtype=F64)
 COV = torch.tensor([[[0.04, 0.018], [0.018, 0.01]], [[0.2, -0.1], [-0.1, 0.3]]], dtype=F64)
@@ -126,11 +126,12 @@ def test_finite_far_out(name):
 
 
 def follows(draws: Tensor, law) -> None:
-    assert stats.kstest(draws.numpy(), law.cdf).pvalue > P_5_SIGMA
+    assert stats.kstest(draws.numpy(), law.cdf).pvalue > LEVEL
 
 
-def test_draws_follow_the_law(rotating_seed):
-    g, n = torch.Generator().manual_seed(rotating_seed), 20_000
+@pytest.mark.statistical
+def test_draws_follow_the_law(rotating_seed, draws_factor):
+    g, n = torch.Generator().manual_seed(rotating_seed), 20_000 * draws_factor
     actuation = default_actuation_prior().sample(n, 2, generator=g)
     assert actuation.shape == (n, 2, 2)
     follows(actuation[:, 1, 0], stats.norm(math.log(0.3), 0.7))
@@ -149,14 +150,15 @@ def test_draws_follow_the_law(rotating_seed):
             follows(z[:, w] @ c, stats.norm(centre, math.sqrt(variance)))
 
 
-def test_a_switch_takes_each_window_from_its_side(rotating_seed):
+@pytest.mark.statistical
+def test_a_switch_takes_each_window_from_its_side(rotating_seed, draws_factor):
     switch, _, _ = every_prior()["switch"]
     assert isinstance(switch, Switch)
     z = torch.randn(6, 4, 3, dtype=F64, generator=torch.Generator().manual_seed(rotating_seed))
     later, first = switch.later.log_prob(z), switch.first.log_prob(z)
     assert switch.log_prob(z)[:, [0, 2]].equal(later[:, [0, 2]])
     assert switch.log_prob(z)[:, [1, 3]].equal(first[:, [1, 3]])
-    draws = switch.sample(20_000, 4, generator=torch.Generator().manual_seed(rotating_seed)).exp()
+    draws = switch.sample(20_000 * draws_factor, 4, generator=torch.Generator().manual_seed(rotating_seed)).exp()
     follows(draws[:, 0, 0], stats.truncnorm(-0.3 / 0.5, np.inf, loc=0.3, scale=0.5))
     follows(draws[:, 1, 0].log(), stats.norm(math.log(0.3), 0.7))
     torch.testing.assert_close(switch.center()[0, :2], MEANS[0].log())

@@ -22,6 +22,7 @@ from avtorch.inference.priors import Joint, QuadrantNormal, default_jerk_noise_p
 from avtorch.inference.sampler import walk
 from avtorch.inference.schedules import harmonic, polynomial
 from avtorch.inference.whitening import Coordinates, stiffness
+from tests.bars import BAR
 
 F64 = torch.float64
 AMPLITUDES = [0.03, 0.1, 0.2, 0.4, 1.0, 3.0]
@@ -54,30 +55,33 @@ def against(draws: Tensor, mean: Tensor, sd: Tensor) -> tuple[Tensor, Tensor, Te
     return shift.mean(0), shift.std(0) / root, 0.5 * (square.mean(0) - 1), 0.5 * square.std(0) / root
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("prior", ["first", "lambda"])
-def test_posteriors_are_those_of_quadrature(prior, make_windows, rotating_seed):
+def test_posteriors_are_those_of_quadrature(prior, make_windows, rotating_seed, draws_factor):
     """From hardly to well excited: 5 sigma, and 1 % for the step's bias in excited windows, 4 % in the others."""
     w = make_windows(rotating_seed, AMPLITUDES, T=LAGS, K=GAINS)
     belief = Joint(QuadrantNormal(torch.tensor([[0.4, 0.9]] * 6, dtype=F64), 0.25), default_jerk_noise_prior())
     density = JerkDensity(w.statistics, belief if prior == "lambda" else None)
     mode = find_mode(density)
     mean, sd = quadrature(density, mode)
-    settings = SamplerSettings(chains=CHAINS, draws=150)
+    chains = CHAINS * draws_factor
+    settings = SamplerSettings(chains=chains, draws=150)
     posterior = sample(density, settings, generator=generator(rotating_seed), mode=mode)
     assert posterior.converged.all()
-    assert posterior.draws.shape == (CHAINS, 150, 6, 3)
+    assert posterior.draws.shape == (chains, 150, 6, 3)
     shift, shift_error, wide, wide_error = against(posterior.draws, mean, sd)
     excited = ExcitationRule()(w.statistics, 200)
     assert excited[-2:].all()
     assert not excited[0]
     bias = torch.where(excited, 0.01, 0.04)[:, None]
-    assert (shift.abs() < 5 * shift_error + bias).all()
-    assert (wide.abs() < 5 * wide_error + bias).all()
+    assert (shift.abs() < BAR * shift_error + bias).all()
+    assert (wide.abs() < BAR * wide_error + bias).all()
     # and the comparison is worth making
     assert shift_error[excited].max() < 0.03
     assert wide_error[excited].max() < 0.03
 
 
+@pytest.mark.statistical
 def test_default_settings_are_good_enough_for_intervals(make_windows, rotating_seed):
     w = make_windows(rotating_seed, AMPLITUDES[3:], T=LAGS[3:], K=GAINS[3:])
     density = JerkDensity(w.statistics)
@@ -85,50 +89,54 @@ def test_default_settings_are_good_enough_for_intervals(make_windows, rotating_s
     posterior = sample(density, generator=generator(rotating_seed), mode=mode)
     mean, sd = quadrature(density, mode)
     shift, shift_error, wide, wide_error = against(posterior.draws, mean, sd)
-    assert (shift.abs() < 5 * shift_error + 0.01).all()
-    assert (wide.abs() < 5 * wide_error + 0.01).all()
+    assert (shift.abs() < BAR * shift_error + 0.01).all()
+    assert (wide.abs() < BAR * wide_error + 0.01).all()
     assert shift_error.max() < 0.05
 
 
-def test_overdispersed_starts_are_forgotten(make_windows, rotating_seed):
+@pytest.mark.statistical
+def test_overdispersed_starts_are_forgotten(make_windows, rotating_seed, draws_factor):
     w = make_windows(rotating_seed, AMPLITUDES[3:], T=LAGS[3:], K=GAINS[3:])
     density = JerkDensity(w.statistics)
     mode = find_mode(density)
     mean, sd = quadrature(density, mode)
-    settings = SamplerSettings(chains=CHAINS, draws=100, spread=2.0)
+    settings = SamplerSettings(chains=CHAINS * draws_factor, draws=100, spread=2.0)
     posterior = sample(density, settings, generator=generator(rotating_seed), mode=mode)
     assert posterior.converged.all()
     shift, shift_error, wide, wide_error = against(posterior.draws, mean, sd)
-    assert (shift.abs() < 5 * shift_error + 0.01).all()
-    assert (wide.abs() < 5 * wide_error + 0.01).all()
+    assert (shift.abs() < BAR * shift_error + 0.01).all()
+    assert (wide.abs() < BAR * wide_error + 0.01).all()
 
 
-def test_spread_is_in_posterior_sds(make_windows, rotating_seed):
+@pytest.mark.statistical
+def test_spread_is_in_posterior_sds(make_windows, rotating_seed, draws_factor):
     w = make_windows(rotating_seed, [0.1, 1.0])
     density = JerkDensity(w.statistics)
     mode = find_mode(density)
-    settings = SamplerSettings(chains=4000, draws=4, burn_in=0, step=1e-6, spread=2.0)
+    settings = SamplerSettings(chains=4000 * draws_factor, draws=4, burn_in=0, step=1e-6, spread=2.0)
     z = walk(density, mode, settings, generator=generator(rotating_seed))[:, 0]
     ratio = z.var(0) / mode.covariance.diagonal(dim1=-2, dim2=-1)
-    # four tiny steps add 1e-6; a variance from 4000 draws is good to sqrt(2/4000)
-    assert (ratio / 4 - 1).abs().max() < 5 * math.sqrt(2 / 4000)
+    # four tiny steps add 1e-6; a variance from n draws is good to sqrt(2/n)
+    assert (ratio / 4 - 1).abs().max() < BAR * math.sqrt(2 / len(z))
 
 
-def test_the_independent_noise_has_the_bias_it_should(make_windows, rotating_seed):
+@pytest.mark.statistical
+def test_the_independent_noise_has_the_bias_it_should(make_windows, rotating_seed, draws_factor):
     """SD ratio (1 - h'/4)^-1/2 in a well excited window, h' the step after division by the stiffness."""
     w = make_windows(rotating_seed, [3.0])
     density = JerkDensity(w.statistics)
     mode = find_mode(density)
-    settings = SamplerSettings(chains=512, draws=150, burn_in=20, step=1.0, noise="independent")
+    settings = SamplerSettings(chains=512 * draws_factor, draws=150, burn_in=20, step=1.0, noise="independent")
     z = walk(density, mode, settings, generator=generator(rotating_seed))
     step = 1.0 / stiffness(density, Coordinates.of(mode)).item()
     _, _, wide, error = against(z, z.mean((0, 1)), mode.covariance.diagonal(dim1=-2, dim2=-1).sqrt())
     expected = 0.5 * (1 / (1 - step / 4) - 1)
     # 200 points: a posterior is Gaussian to about 1/200 and 2 % of variance
-    assert (wide - expected).abs().max() < 5 * error.max() + 0.02
+    assert (wide - expected).abs().max() < BAR * error.max() + 0.02
     assert expected > 0.1
 
 
+@pytest.mark.statistical
 def test_minibatches_widen_as_they_should(make_windows, rotating_seed):
     """Batch 50 of 200 and step 0.2: a whitened gradient variance N/n = 4 on top, so Var = (1 + h)/(1 - h/4)."""
     w = make_windows(rotating_seed, [3.0])
@@ -146,6 +154,7 @@ def test_minibatches_widen_as_they_should(make_windows, rotating_seed):
         sample(JerkDensity(w.statistics), SamplerSettings(batch=10))
 
 
+@pytest.mark.statistical
 def test_the_papers_schedule_freezes(make_windows, rotating_seed):
     """eta_1/k leaves the chains near the mode where they started; (1 + k/100)^(-1/3) lets them reach the posterior."""
     w = make_windows(rotating_seed, [1.0])
@@ -172,6 +181,7 @@ def test_runs_repeat_and_thinning_takes_every_other_step(make_windows):
     assert second.equal(every[:, 1::2])
 
 
+@pytest.mark.statistical
 def test_windows_keep_their_places_when_walked_at_several_paces(make_windows, rotating_seed):
     """Skewed windows before and between others, in every order: each ends where it ends alone, far from the rest."""
     w = make_windows(rotating_seed, [0.03, 3.0, 0.1, 3.0], T=[0.3, 0.1, 1.5, 1.0], K=[1.0, 1.0, 0.5, 0.6])
@@ -204,6 +214,7 @@ class Valley:
         return torch.zeros(2, 1, dtype=F64)
 
 
+@pytest.mark.statistical
 def test_a_step_that_is_too_long_is_halved_for_the_window_that_needs_it(rotating_seed):
     """Curvature 17 behind the wall, reached by some twenty draws: steps above 4/17 diverge there, 1.5/8 does not."""
     density = Valley((0.0, 8.0))
@@ -217,6 +228,7 @@ def test_a_step_that_is_too_long_is_halved_for_the_window_that_needs_it(rotating
     assert posterior.draws[:, :, 0].equal(once.draws[:, :, 0])
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("whitening", ["none", "diagonal"])
 def test_a_walk_too_short_for_a_space_left_unwhitened_is_said(whitening, make_windows, rotating_seed):
     """Chains that begin at the mode agree with each other long before they have reached the posterior's width."""
@@ -237,6 +249,7 @@ def test_a_walk_too_short_for_a_space_left_unwhitened_is_said(whitening, make_wi
     torch.testing.assert_close(Coordinates.of(mode).widest(mode), torch.ones(3, dtype=torch.float64))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("wall", [1e4, math.nan, math.inf, -3.0])
 def test_divergence_is_said(wall, rotating_seed):
     """Far too steep, undefined, a cliff, or falling to minus infinity: not converged, and the neighbour is."""

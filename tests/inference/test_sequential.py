@@ -12,6 +12,7 @@ from torch import Tensor
 from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, JerkStatistics, SamplerSettings, SequentialInference, find_mode
 from avtorch.inference.priors import Joint, LogSpaceNormal, QuadrantNormal, Switch
+from tests.bars import BAR, student
 
 F64 = torch.float64
 MODES = ["lambda", "posterior", "forgetting"]
@@ -34,13 +35,15 @@ def assert_same(one, other, vehicles=slice(None)) -> None:
         ), name
 
 
-def test_before_any_window_the_belief_is_the_first_prior(rotating_seed):
-    loop = SequentialInference(vehicles=3, kept=20_000, seed=rotating_seed)
+@pytest.mark.statistical
+def test_before_any_window_the_belief_is_the_first_prior(rotating_seed, draws_factor):
+    kept = 20_000 * draws_factor
+    loop = SequentialInference(vehicles=3, kept=kept, seed=rotating_seed)
     z = loop.belief.draws.log()
-    assert z.shape == (20_000, 3, 3)
+    assert z.shape == (kept, 3, 3)
     for i, (mean, sd) in enumerate([(math.log(0.3), 0.7), (0.0, 0.3)]):
-        assert (z[..., i].mean(0) - mean).abs().max() < 5 * sd / math.sqrt(20_000)
-        assert (z[..., i].std(0) / sd - 1).abs().max() < 5 / math.sqrt(2 * 20_000)
+        assert (z[..., i].mean(0) - mean).abs().max() < BAR * sd / math.sqrt(kept)
+        assert (z[..., i].std(0) / sd - 1).abs().max() < BAR / math.sqrt(2 * kept)
     prior = loop.prior()
     assert isinstance(prior, Switch)
     index = torch.arange(3)
@@ -127,10 +130,11 @@ def test_a_window_that_diverges_never_reaches_the_belief(mode, make_windows):
         assert getattr(belief, name).isfinite().all()
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("mode", MODES)
-def test_vehicles_side_by_side_are_vehicles_alone(mode, make_windows, rotating_seed):
+def test_vehicles_side_by_side_are_vehicles_alone(mode, make_windows, rotating_seed, draws_factor):
     """Three vehicles at once, 16 copies of each for the error, against loops of their own: the same posterior means."""
-    copies, lags, gains = 16, [0.3, 0.3, 1.5], [1.0, 0.7, 0.5]
+    copies, lags, gains = 16 * draws_factor, [0.3, 0.3, 1.5], [1.0, 0.7, 0.5]
     together = SequentialInference(vehicles=3 * copies, mode=mode, seed=rotating_seed)
     alone = [SequentialInference(vehicles=copies, mode=mode, seed=rotating_seed + 1 + v) for v in range(3)]
     for k in range(2):
@@ -141,10 +145,10 @@ def test_vehicles_side_by_side_are_vehicles_alone(mode, make_windows, rotating_s
             own = alone[v].update(density_of(w.statistics.select(torch.full((copies,), v))), every(copies))
             a, b = batch.mean[v::3], own.mean
             error = ((a.var(0) + b.var(0)) / copies).sqrt()
-            # 30 degrees of freedom: Student's 5-sigma quantile is 6.4
-            assert ((a.mean(0) - b.mean(0)) / error).abs().max() < 6.4
+            assert ((a.mean(0) - b.mean(0)) / error).abs().max() < student(2 * (copies - 1))
 
 
+@pytest.mark.statistical
 def test_posterior_mode_adds_windows_up(make_windows, rotating_seed):
     """Five windows in a row are nearly one window of a thousand points under the first prior.
 

@@ -16,6 +16,7 @@ from torch.optim.lr_scheduler import StepLR
 from avtorch.errors import InputError
 from avtorch.inference import SGLD
 from avtorch.inference.sghmc import SGHMC
+from tests.bars import BAR
 
 F64 = torch.float64
 
@@ -61,9 +62,10 @@ def test_the_stated_variance_is_that_of_the_scheme(h, p, friction, s):
     assert covariance[0, 0] == pytest.approx(stated, rel=1e-10)
 
 
-def test_a_chain_at_its_stationary_law_keeps_it(rotating_seed):
+@pytest.mark.statistical
+def test_a_chain_at_its_stationary_law_keeps_it(rotating_seed, draws_factor):
     """Covariance of place and velocity and the lagged one, one group a case, after 1, 2 and 10 steps; 5 sigma."""
-    g, chains = generator(rotating_seed), 50_000
+    g, chains = generator(rotating_seed), 50_000 * draws_factor
     laws = [transition(h, p, friction, s**2) for h, p, friction, s in CASES]
     covariances = [torch.from_numpy(solve_discrete_lyapunov(*law)) for law in laws]
     places, velocities, groups = [], [], []
@@ -100,13 +102,14 @@ def test_a_chain_at_its_stationary_law_keeps_it(rotating_seed):
             for measured, expected in ((new.mT @ new, covariance), (new.mT @ old, lagged)):
                 # the product of two Gaussians of covariance S_ij has variance S_ii S_jj + S_ij^2
                 error = ((spread + expected.square()) / chains).sqrt()
-                assert ((measured / chains - expected) / error).abs().max() < 5, (case, k)
-            assert (new.mean(0) / (variances / chains).sqrt()).abs().max() < 5, (case, k)
+                assert ((measured / chains - expected) / error).abs().max() < BAR, (case, k)
+            assert (new.mean(0) / (variances / chains).sqrt()).abs().max() < BAR, (case, k)
 
 
-def test_the_stationary_variance_is_reached_and_scales_with_temperature(rotating_seed):
+@pytest.mark.statistical
+def test_the_stationary_variance_is_reached_and_scales_with_temperature(rotating_seed, draws_factor):
     """From a point, full gradients: the Gaussian's own variance, and half of it at temperature 1/2."""
-    g, chains, p, h = generator(rotating_seed), 100_000, 2.0, 0.8
+    g, chains, p, h = generator(rotating_seed), 100_000 * draws_factor, 2.0, 0.8
     x, y = (torch.zeros(chains, dtype=F64, requires_grad=True) for _ in range(2))
     optimizer = SGHMC([{"params": [x]}, {"params": [y], "temperature": 0.5}], h, generator=g)
     for _ in range(40):
@@ -116,7 +119,7 @@ def test_the_stationary_variance_is_reached_and_scales_with_temperature(rotating
     assert radius**80 < 1e-3
     for place, expected in ((x, 1 / p), (y, 0.5 / p)):
         variance = place.detach().square().mean().item()
-        assert abs(variance / expected - 1) < 5 * math.sqrt(2 / chains) + 1e-3
+        assert abs(variance / expected - 1) < BAR * math.sqrt(2 / chains) + 1e-3
 
 
 def test_infinite_friction_is_sgld_with_averaged_noise():

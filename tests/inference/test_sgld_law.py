@@ -1,6 +1,6 @@
 """The law of SGLD: its noise, its stationary law and the order of its bias, against closed forms and exact kernels.
 
-Many independent chains run side by side, so that standard errors are those of independent draws. Every bar is 5 sigma.
+Many independent chains run side by side, so that standard errors are those of independent draws. Every bar is `BAR`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from scipy.integrate import quad
 from torch import Tensor
 
 from avtorch.inference import SGLD
+from tests.bars import BAR
 
 F64 = torch.float64
 
@@ -38,15 +39,16 @@ def z_scores_of_moments(x: Tensor, y: Tensor, cov_xx: Tensor, cov_xy: Tensor) ->
     return torch.cat([mean, auto.flatten(), cross.flatten()])
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("h", "temperature"), [(0.05, 1.0), (0.4, 1.0), (1.2, 1.0), (0.4, 0.25)])
 @pytest.mark.parametrize("noise", ["independent", "averaged"])
-def test_a_chain_at_its_stationary_law_keeps_it(h, temperature, noise, rotating_seed):
+def test_a_chain_at_its_stationary_law_keeps_it(h, temperature, noise, rotating_seed, draws_factor):
     """Mean, covariance and lag-1 covariance of a correlated Gaussian, after 1, 2 and 10 steps.
 
     noise keeps P^-1 itself: y = x - sqrt(h) xi/2 is autoregressive with covariance P^-1 (I - hP/4), and cov(x', x) too.
     noise keeps P^-1 itself: y = x - sqrt(h) xi/2 is autoregressive, of cov P^-1 (I - hP/4) like cov(x', x).
     """
-    g, chains, eye = generator(rotating_seed), 50_000, torch.eye(2, dtype=F64)
+    g, chains, eye = generator(rotating_seed), 50_000 * draws_factor, torch.eye(2, dtype=F64)
     precision = torch.tensor([[2.0, -0.9], [-0.9, 1.0]], dtype=F64)
     shrink = eye - h * precision / 4
     inverse = torch.linalg.inv(precision)
@@ -70,19 +72,20 @@ def test_a_chain_at_its_stationary_law_keeps_it(h, temperature, noise, rotating_
         optimizer.step(lambda: 0.5 * ((x @ precision) * x).sum(-1))
         if k in (1, 2, 10):
             score = z_scores_of_moments(before, x.detach(), temperature * cov, temperature * lagged)
-            assert score.abs().max() < 5, f"after {k} steps"
+            assert score.abs().max() < BAR, f"after {k} steps"
 
 
 CASES = [(h, lam, s) for h in (0.05, 0.2, 0.8) for lam in (0.5, 3.0) for s in (0.0, 2.0)]
 
 
-def test_stationary_variance_with_gradient_noise(rotating_seed):
+@pytest.mark.statistical
+def test_stationary_variance_with_gradient_noise(rotating_seed, draws_factor):
     """Var = (1 + h s^2/4) / (lambda (1 - h lambda/4)), one parameter group a case.
 
     The chains start at the target's variance 1/lambda; of that, (1 - h lambda/2)^2k is left after k steps. The bar must
     also see the usual mistakes: noise sqrt(2h), and noise h in place of sqrt(h).
     """
-    g, chains, steps = generator(rotating_seed), 100_000, 20
+    g, chains, steps = generator(rotating_seed), 100_000 * draws_factor, 20
     x = [(torch.randn(chains, generator=g, dtype=F64) / math.sqrt(lam)).requires_grad_() for _, lam, _ in CASES]
     optimizer = SGLD([{"params": [p], "lr": h} for p, (h, _, _) in zip(x, CASES, strict=True)], 1.0, generator=g)
 
@@ -103,18 +106,19 @@ def test_stationary_variance_with_gradient_noise(rotating_seed):
             stationary = (amplitude + h * s**2 / 4) / (lam * (1 - h * lam / 4))
             return stationary + left * (1 / lam - stationary)
 
-        bar = 5 * math.sqrt(2 / chains) * variance(1.0)
+        bar = BAR * math.sqrt(2 / chains) * variance(1.0)
         assert abs(p.detach().square().mean().item() - variance(1.0)) < bar, (h, lam, s)
         assert abs(variance(2.0) - variance(1.0)) > 5 * bar, "the bar is too wide to tell"
         assert abs(variance(h) - variance(1.0)) > 2 * bar, "the bar is too wide to tell"
 
 
-def test_minibatches_on_the_scale_of_the_whole_window(rotating_seed):
+@pytest.mark.statistical
+def test_minibatches_on_the_scale_of_the_whole_window(rotating_seed, draws_factor):
     """A Gaussian mean, N points, batches of n: the closed form with s^2 = N^2/n Var(data)/sigma^4, Var(data) = sigma^2.
 
     N/n is in the closure, the sum over the window is what U means; dividing by N would give a variance N times this.
     """
-    g, chains, N, n, sigma, h = generator(rotating_seed), 20_000, 200, 20, 2.0, 0.002
+    g, chains, N, n, sigma, h = generator(rotating_seed), 20_000 * draws_factor, 200, 20, 2.0, 0.002
     data = torch.randn(N, generator=g, dtype=F64)
     data = 1.0 + sigma * (data - data.mean()) / data.std(correction=0)
     lam, s2 = N / sigma**2, N**2 / n / sigma**2
@@ -131,8 +135,8 @@ def test_minibatches_on_the_scale_of_the_whole_window(rotating_seed):
         optimizer.step(potential)
     deviation = (x.detach() - data.mean()).square()
     # the minibatch noise is a sum of n bounded terms, so the draws are Gaussian enough for their own error estimate
-    assert abs(deviation.mean().item() - variance) < 5 * deviation.std().item() / math.sqrt(chains)
-    assert 5 * deviation.std().item() / math.sqrt(chains) < 0.1 * variance
+    assert abs(deviation.mean().item() - variance) < BAR * deviation.std().item() / math.sqrt(chains)
+    assert BAR * deviation.std().item() / math.sqrt(chains) < 0.1 * variance
 
 
 def stationary_moment(
@@ -176,19 +180,20 @@ def wavy_moment() -> float:
     return moments[1] / moments[0]
 
 
-def test_bias_is_of_order_one_in_the_step(rotating_seed):
+@pytest.mark.statistical
+def test_bias_is_of_order_one_in_the_step(rotating_seed, draws_factor):
     """On an anharmonic target the measured bias is the exact kernel's, and its order lies where theory puts it."""
     g, truth = generator(rotating_seed), wavy_moment()
     steps, biases, errors = (0.4, 0.2), [], []
     exact = [stationary_moment(wavy_drift, np.ones_like, h) - truth for h in (*steps, 0.1, 0.05)]
     for h, expected in zip(steps, exact, strict=False):
-        x = torch.zeros(20_000, dtype=F64, requires_grad=True)
+        x = torch.zeros(20_000 * draws_factor, dtype=F64, requires_grad=True)
         moment, error = time_average(SGLD([x], h, generator=g), x, lambda x=x: wavy(x), round(30 / h), round(10 / h))
-        assert abs(moment - truth - expected) < 5 * error
+        assert abs(moment - truth - expected) < BAR * error
         biases.append(moment - truth)
         errors.append(error)
     order = math.log2(biases[0] / biases[1])
-    bar = 5 / math.log(2) * math.hypot(errors[0] / biases[0], errors[1] / biases[1])
+    bar = BAR / math.log(2) * math.hypot(errors[0] / biases[0], errors[1] / biases[1])
     theory = [math.log2(a / b) for a, b in pairwise(exact)]
     assert abs(order - theory[0]) < bar < 0.5
     # towards one as the step shrinks
@@ -196,27 +201,29 @@ def test_bias_is_of_order_one_in_the_step(rotating_seed):
     assert abs(theory[2] - 1) < abs(theory[0] - 1)
 
 
-def test_averaged_noise_has_hardly_a_bias(rotating_seed):
+@pytest.mark.statistical
+def test_averaged_noise_has_hardly_a_bias(rotating_seed, draws_factor):
     """Leimkuhler-Matthews at h = 0.4 on the anharmonic target: below a tenth of the plain scheme's bias, 0.13.
 
     (Its order, two, shows at steps whose bias would take 10^7 independent draws to see.)
     """
     g, truth, h = generator(rotating_seed), wavy_moment(), 0.4
-    x = torch.zeros(20_000, dtype=F64, requires_grad=True)
+    x = torch.zeros(20_000 * draws_factor, dtype=F64, requires_grad=True)
     optimizer = SGLD([x], h, noise="averaged", generator=g)
     moment, error = time_average(optimizer, x, lambda: wavy(x), 150, 30)
     plain = stationary_moment(wavy_drift, np.ones_like, h) - truth
-    assert 5 * error < 0.1 * plain
+    assert BAR * error < 0.1 * plain
     assert abs(moment - truth) < 0.1 * plain
 
 
-def test_preconditioned_law_needs_gamma(rotating_seed):
+@pytest.mark.statistical
+def test_preconditioned_law_needs_gamma(rotating_seed, draws_factor):
     """pSGLD on a Gaussian, with alpha 0 (G a function of the place alone) and eps 1: the exact kernel's variance.
 
     Left out, Gamma would give the law exp(-U)/G, half as wide again.
     """
     g, h, eps = generator(rotating_seed), 0.2, 1.0
-    x = torch.randn(40_000, generator=g, dtype=F64).requires_grad_()
+    x = torch.randn(40_000 * draws_factor, generator=g, dtype=F64).requires_grad_()
     optimizer = SGLD([x], h, preconditioner="rmsprop", alpha=0.0, eps=eps, chain_dims=1, generator=g)
     moment, error = time_average(optimizer, x, lambda: 0.5 * x.square(), 160, 80)
 
@@ -225,7 +232,7 @@ def test_preconditioned_law_needs_gamma(rotating_seed):
 
     with_gamma = stationary_moment(lambda x: -metric(x) * x - metric(x) ** 2 * np.sign(x), metric, h)
     without = stationary_moment(lambda x: -metric(x) * x, metric, h)
-    assert abs(moment - with_gamma) < 5 * error
+    assert abs(moment - with_gamma) < BAR * error
     # the target's variance is one; what is left is the step's bias, which falls with it
     assert abs(with_gamma - 1) < 0.15 < 0.4 < without - 1
     half = stationary_moment(lambda x: -metric(x) * x - metric(x) ** 2 * np.sign(x), metric, h / 4)
@@ -234,9 +241,9 @@ def test_preconditioned_law_needs_gamma(rotating_seed):
 
 @pytest.mark.parametrize("maximize", [False, True])
 @pytest.mark.parametrize("eps", [1e-5, 0.7])
-def test_gamma_is_the_derivative_of_the_preconditioner(maximize, eps, rotating_seed):
+def test_gamma_is_the_derivative_of_the_preconditioner(maximize, eps, fresh_seed):
     """A noise-free-in-law step minus the step without Gamma is (h/2) dG/dtheta, by autograd of G written down here."""
-    g, alpha, h = generator(rotating_seed), 0.9, 0.01
+    g, alpha, h = generator(fresh_seed), 0.9, 0.01
     start = torch.randn(4, 3, generator=g, dtype=F64)
     sign = -1.0 if maximize else 1.0
 

@@ -88,31 +88,31 @@ HARMS = [
 
 
 @pytest.mark.parametrize(("columns", "factors", "message"), HARMS)
-def test_a_wrong_unit_or_sign_is_named(columns, factors, message, rotating_seed):
-    time, given = drive(rotating_seed)
+def test_a_wrong_unit_or_sign_is_named(columns, factors, message, fresh_seed):
+    time, given = drive(fresh_seed)
     watch(columns, time, given)
     with pytest.raises(InputError, match=rf"^stream: columns {message}") as caught:
         watch(columns, time, changed(given, **factors))
     assert "\n" not in str(caught.value)
 
 
-def test_swapped_command_and_acceleration_are_named_where_jerk_is_measured(rotating_seed):
-    time, given = drive(rotating_seed)
+def test_swapped_command_and_acceleration_are_named_where_jerk_is_measured(fresh_seed):
+    time, given = drive(fresh_seed)
     with pytest.raises(InputError, match=r"'accel' and 'accel_cmd'.* swapped"):
         watch(JERK, time, {**given, "accel": given["accel_cmd"], "accel_cmd": given["accel"]})
 
 
 @pytest.mark.parametrize("dead", [0.0, 0.3])
 @pytest.mark.parametrize("columns", [JERK, BOTH, ACCEL, SPEED])
-def test_weak_slow_and_hardly_moving_cars_are_not_refused(columns, dead, rotating_seed):
+def test_weak_slow_and_hardly_moving_cars_are_not_refused(columns, dead, fresh_seed):
     """A hundred cars: lags of 0.1 to 2 s, gains of 0.4 to 1.1, commands of 0.03 to 3 m/s^2, 60 s each."""
     wide = {"lag": (0.1, 2.0), "gain": (0.4, 1.1), "size": (0.03, 3.0)}
-    watch(columns, *drive(rotating_seed, vehicles=100, seconds=60.0, noise=0.3, dead=dead, **wide))
+    watch(columns, *drive(fresh_seed, vehicles=100, seconds=60.0, noise=0.3, dead=dead, **wide))
 
 
-def test_the_vehicle_is_named_and_what_is_masked_is_not_looked_at(rotating_seed):
+def test_the_vehicle_is_named_and_what_is_masked_is_not_looked_at(fresh_seed):
     # a stretch that holds the turn may say nothing; the one after it does
-    time, given = drive(rotating_seed, vehicles=3, seconds=80.0)
+    time, given = drive(fresh_seed, vehicles=3, seconds=80.0)
     flipped = given["accel_cmd"].clone()
     flipped[1, 1000:] *= -1
     bad = {**given, "accel_cmd": flipped}
@@ -124,9 +124,9 @@ def test_the_vehicle_is_named_and_what_is_masked_is_not_looked_at(rotating_seed)
     watch(JERK, time, bad, usable)
 
 
-def test_a_jump_of_the_clock_costs_nothing(rotating_seed):
+def test_a_jump_of_the_clock_costs_nothing(fresh_seed):
     """To Unix time and on: a stretch ends at a break, and no table of a billion seconds is made."""
-    time, given = drive(rotating_seed, seconds=30.0)
+    time, given = drive(fresh_seed, seconds=30.0)
     time = torch.where(time < 5.0, time, time + 1.7e9)
     watch(BOTH, time, given)
     with pytest.raises(InputError, match=r"wrong sign"):
@@ -137,9 +137,9 @@ def stream(**options) -> BeliefStream:
     return BeliefStream(**{"settings": SMALL, "kept": 50, "seed": 4, **options})
 
 
-def test_a_sign_flip_is_not_believed(rotating_seed):
+def test_a_sign_flip_is_not_believed(fresh_seed):
     """Before it was: T_L 2.94 s and K_L 0.06. The stream is left as it was, and goes on with the right sign."""
-    time, given = drive(rotating_seed, seconds=20.0)
+    time, given = drive(fresh_seed, seconds=20.0)
     found, fresh = stream(), stream()
     with pytest.raises(InputError, match=r"wrong sign.* nothing learnt in this time is kept"):
         found.feed(time, changed(given, accel_cmd=-1.0))
@@ -152,9 +152,9 @@ def test_a_sign_flip_is_not_believed(rotating_seed):
 
 
 @pytest.mark.slow
-def test_cuts_and_saving_change_nothing(tmp_path, rotating_seed):
+def test_cuts_and_saving_change_nothing(tmp_path, fresh_seed):
     """The same refusal, word for word, and the prior's belief after it, however the rows come."""
-    time, given = drive(rotating_seed, seconds=15.0)
+    time, given = drive(fresh_seed, seconds=15.0)
     given = changed(given, accel_cmd=-1.0)
     prior = stream().inference.belief.draws
 
@@ -177,9 +177,9 @@ def test_cuts_and_saving_change_nothing(tmp_path, rotating_seed):
     assert said.pop().startswith("stream: columns 'accel' and 'accel_cmd'")
 
 
-def test_what_was_found_right_is_kept(rotating_seed):
+def test_what_was_found_right_is_kept(fresh_seed):
     """The sign turns in mid drive, as after work on the car: what was learnt before its stretch stays."""
-    time, given = drive(rotating_seed, seconds=80.0)
+    time, given = drive(fresh_seed, seconds=80.0)
     flipped = given["accel_cmd"].clone()
     flipped[:, 2000:] *= -1
     found = stream()
@@ -210,8 +210,8 @@ def test_the_memory_of_a_stretch_is_bounded():
     assert max(kept) < 40 / 0.05 + 50
 
 
-def test_forms_without_a_command_in_acceleration_are_checked_by_what_they_have(rotating_seed):
-    time, given = drive(rotating_seed, seconds=20.0)
+def test_forms_without_a_command_in_acceleration_are_checked_by_what_they_have(fresh_seed):
+    time, given = drive(fresh_seed, seconds=20.0)
     rows = {**given, "speed_cmd": given["speed"]}
     watch(SpeedLagForm.columns, time, rows)
     with pytest.raises(InputError, match=r"speed is in km/h"):

@@ -184,8 +184,8 @@ def test_time_in_another_unit_and_rates_out_of_range(tmp_path, scale, what):
         (("accel",), 100.0, "--unit accel=cm/s2"),
     ],
 )
-def test_a_unit_mistake_that_the_signals_prove(tmp_path, signals, factor, advice, rotating_seed):
-    columns = drive(noise=0.02, seed=rotating_seed)
+def test_a_unit_mistake_that_the_signals_prove(tmp_path, signals, factor, advice, fresh_seed):
+    columns = drive(noise=0.02, seed=fresh_seed)
     # noise in the record's own unit is scaled with it; that is how a recorder errs
     columns = {name: values * factor if name in signals else values for name, values in columns.items()}
     refused(write(tmp_path / "lap.csv", columns), advice)

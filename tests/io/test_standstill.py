@@ -36,6 +36,7 @@ def stop(rest_s: float, rng: np.random.Generator, *, lag: float = 0.4, bias: flo
     return Log.from_arrays(time=np.arange(len(accel)) * DT, accel_cmd=command, accel=seen, speed=speed)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("rest_s", [1.2, 4.0, 40.0])
 @pytest.mark.parametrize("bias", [0.0, -0.08])
 def test_a_stop_is_masked_from_slow_to_slow(rest_s: float, bias: float, rotating_seed: int) -> None:
@@ -49,6 +50,7 @@ def test_a_stop_is_masked_from_slow_to_slow(rest_s: float, bias: float, rotating
     assert f"{taken.sum()} rows masked: standstill (braked, yet not slowing)" in check(blind).notes
 
 
+@pytest.mark.statistical
 def test_a_car_that_moves_is_never_taken_for_one_that_stands(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     # of 87 000 such cars, whose demand leaps by up to 5 m/s² every two seconds, 2 are taken for standing
@@ -66,8 +68,8 @@ def test_no_brake_no_stop() -> None:
     assert standing(np.full(rows, -0.8), np.zeros(rows), DT, STANDSTILL_MPS)[200:].all()
 
 
-def test_each_drive_has_its_own_stops(rotating_seed: int) -> None:
-    log = stop(4.0, np.random.default_rng(rotating_seed))
+def test_each_drive_has_its_own_stops(fresh_seed: int) -> None:
+    log = stop(4.0, np.random.default_rng(fresh_seed))
     twice = replace(
         log,
         speed=None,

@@ -8,10 +8,12 @@ import torch
 from avtorch.decision.settings import Setting
 from avtorch.paper.drive import ACT_S, drive, noise_seeds, rms_about_mean, rows_from, stacked
 from avtorch.vehicle import Leader
+from tests.bars import BAR
 
 SETTINGS = stacked([Setting(scenarios=1), Setting(time_gap=2.0), Setting(1.33, 0.64, gains=(3.0, 3.0, -1.8))])
 
 
+@pytest.mark.statistical
 def test_settings_share_the_noise_and_part_at_the_action(rotating_seed: int) -> None:
     run = drive(Leader.default(), SETTINGS, seeds=2, seed=rotating_seed, duration=32.0)
     assert run.accel.shape == (3, 2, 3200)
@@ -25,8 +27,8 @@ def test_settings_share_the_noise_and_part_at_the_action(rotating_seed: int) -> 
     # the vehicle that follows the jerk law after the change is the changed one
     row = rows_from(run, 27.0, 28.0)
     noise = row.jerk - (0.5 * row.accel_cmd - row.accel) / 1.5
-    # 600 independent draws of SD 0.1: five standard errors of an SD
-    assert float(noise.std()) == pytest.approx(0.1, rel=5 / (2 * 600) ** 0.5)
+    # the standard error of an SD of 600 independent draws
+    assert float(noise.std()) == pytest.approx(0.1, rel=BAR / (2 * 600) ** 0.5)
 
 
 def test_a_platoon_follows_itself() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
 
 from avtorch.paper.rows import ClaimRow, error, listed, median_interval, share, sign, spread, within
@@ -26,8 +27,9 @@ def test_what_is_not_finite_is_never_the_same() -> None:
     assert error(0.1, (math.nan, math.nan)) == "not reproduced"
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say(rotating_seed: int) -> None:
-    trials, runs = 400, 40
+@pytest.mark.statistical
+def test_intervals_hold_the_truth_as_often_as_they_say(rotating_seed: int, draws_factor: int) -> None:
+    trials, runs = 400 * draws_factor, 40
     generator = torch.Generator().manual_seed(rotating_seed)
     values = torch.randn(trials, runs, generator=generator, dtype=torch.float64)
     held = sum(low <= 0.0 <= high for low, high in (median_interval(v, i) for i, v in enumerate(values)))

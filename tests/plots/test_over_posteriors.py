@@ -14,6 +14,7 @@ from scipy.stats import gamma
 
 from avtorch import plots
 from avtorch.inference import Posterior, Quadrature
+from tests.bars import BAR
 
 NAMES = ("T_L", "K_L", "sigma")
 MEAN, SD = (0.3, 1.0, 0.1), (0.06, 0.1, 0.01)
@@ -68,8 +69,10 @@ def test_exact_curve_is_the_density() -> None:
         assert np.trapezoid(density, value) == pytest.approx(0.999, abs=1e-4)
 
 
-def test_histograms_integrate_to_one_and_follow_the_density(rotating_seed: int) -> None:
-    a, b = draws(rotating_seed), draws(rotating_seed + 1, chains=2)
+@pytest.mark.statistical
+def test_histograms_integrate_to_one_and_follow_the_density(rotating_seed: int, draws_factor: int) -> None:
+    chains = 8 * draws_factor
+    a, b = draws(rotating_seed, chains), draws(rotating_seed + 1, chains // 4)
     ax = axes()
     assert plots.marginals(ax, "T_L", a["T_L"], b["T_L"], quadrature(), truth=0.31) is ax
     law = laws()[0]
@@ -78,8 +81,8 @@ def test_histograms_integrate_to_one_and_follow_the_density(rotating_seed: int) 
         assert (height * np.diff(edges)).sum() == pytest.approx(1.0, abs=1e-12)
         share, count = np.diff(law.cdf(edges)), posterior["T_L"].numel()
         found = height * np.diff(edges)
-        # 6 sigma over some 40 bins; a count below a few draws is not normal, hence the 8 draws
-        assert (np.abs(found - share) <= 6 * np.sqrt(share / count) + 8 / count).all()
+        # over some 40 bins; a count below a few draws is not normal, hence the 8 draws
+        assert (np.abs(found - share) <= BAR * np.sqrt(share / count) + 8 / count).all()
     lines = {line.get_label(): float(np.asarray(line.get_xdata())[0]) for line in ax.lines}
     assert lines["truth"] == 0.31
 
@@ -99,15 +102,19 @@ def test_marginals_without_quadrature() -> None:
     assert low < 0.8 < 1.2 < high
 
 
-def test_regions_hold_the_share_they_name(rotating_seed: int) -> None:
+@pytest.mark.statistical
+def test_regions_hold_the_share_they_name(rotating_seed: int, draws_factor: int) -> None:
     ax = axes()
-    references = {"exact": (draws(rotating_seed, count=500), 0), "NUTS": (draws(rotating_seed + 1, count=100), 0)}
-    own = draws(rotating_seed + 2, count=1000)
+    references = {
+        "exact": (draws(rotating_seed, count=500 * draws_factor), 0),
+        "NUTS": (draws(rotating_seed + 1, count=100), 0),
+    }
+    own = draws(rotating_seed + 2, count=1000 * draws_factor)
     assert plots.joint_cloud(ax, own, references=references, truth=(0.3, 1.0)) is ax
     inside = [float(word) for word in ax.get_title("left").replace("%", "").split() if word.isdigit()]
     # 4000 draws on either side; half a point for rounding and half for what smoothing does
     for share, found in zip((0.5, 0.9), inside, strict=True):
-        assert abs(found - 100 * share) <= 1 + 500 * math.sqrt(2 * share * (1 - share) / 4000)
+        assert abs(found - 100 * share) <= 1 + 100 * BAR * math.sqrt(2 * share * (1 - share) / (4000 * draws_factor))
     assert sum(bool(len(c.get_paths())) for c in ax.collections) == 2
 
 

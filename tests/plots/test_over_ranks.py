@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from avtorch import plots
 from avtorch.errors import InputError
 from avtorch.validation.uniformity import ecdf_band
+from tests.bars import BAR
 
 
 def axes():
@@ -29,9 +30,10 @@ def test_ranks_in_a_pool() -> None:
         plots.pooled_rank_counts({"alone": [1.0]})
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("sizes", [(800, 800, 800, 2000), (300,)])
-def test_band_holds_all_bars_at_its_level(sizes: tuple[int, ...], rotating_seed: int) -> None:
-    rng, trials = np.random.default_rng(rotating_seed), 400
+def test_band_holds_all_bars_at_its_level(sizes: tuple[int, ...], rotating_seed: int, draws_factor: int) -> None:
+    rng, trials = np.random.default_rng(rotating_seed), 400 * draws_factor
     held = 0
     for _ in range(trials):
         drawn = {f"group {i}": rng.random(n) for i, n in enumerate(sizes)}
@@ -40,12 +42,13 @@ def test_band_holds_all_bars_at_its_level(sizes: tuple[int, ...], rotating_seed:
         else:
             counts = {"ranks": np.histogram(drawn["group 0"], np.linspace(0, 1, 11))[0]}
         held += all_inside(counts)
-    # Bonferroni errs on the wide side only; 5 sigma
-    assert held / trials >= 0.95 - 5 * (0.95 * 0.05 / trials) ** 0.5
+    # Bonferroni errs on the wide side only
+    assert held / trials >= 0.95 - BAR * (0.95 * 0.05 / trials) ** 0.5
 
 
-def test_band_counts_correlated_draws_as_what_they_are_worth(rotating_seed: int) -> None:
-    rng, trials = np.random.default_rng(rotating_seed), 300
+@pytest.mark.statistical
+def test_band_counts_correlated_draws_as_what_they_are_worth(rotating_seed: int, draws_factor: int) -> None:
+    rng, trials = np.random.default_rng(rotating_seed), 300 * draws_factor
     held = {"worth": 0, "all": 0}
     for _ in range(trials):
         # every draw five times over: a fifth of them is what they are worth
@@ -53,7 +56,7 @@ def test_band_counts_correlated_draws_as_what_they_are_worth(rotating_seed: int)
         counts = plots.pooled_rank_counts(drawn, bins=10)
         held["worth"] += all_inside(counts, effective={"chain": 200.0})
         held["all"] += all_inside(counts)
-    assert held["worth"] / trials >= 0.95 - 5 * (0.95 * 0.05 / trials) ** 0.5
+    assert held["worth"] / trials >= 0.95 - BAR * (0.95 * 0.05 / trials) ** 0.5
     assert held["all"] / trials < 0.6
 
 
@@ -68,14 +71,15 @@ def test_bars_outside_the_band_are_crossed() -> None:
     assert [t.get_text() for t in ax.get_yticklabels()] == ["SGLD 1–4", "NUTS"]
 
 
-def test_ecdf_of_uniform_values_stays_in_its_band(rotating_seed: int) -> None:
-    rng, trials = np.random.default_rng(rotating_seed), 400
+@pytest.mark.statistical
+def test_ecdf_of_uniform_values_stays_in_its_band(rotating_seed: int, draws_factor: int) -> None:
+    rng, trials = np.random.default_rng(rotating_seed), 400 * draws_factor
     low, high = (side.numpy() for side in ecdf_band(500, 99))
     held = 0
     for _ in range(trials):
         share = plots.ecdf_of(rng.random(500))
         held += bool(((low <= share + 1e-12) & (share <= high + 1e-12)).all())
-    assert abs(held / trials - 0.955) <= 0.02 + 5 * (0.95 * 0.05 / trials) ** 0.5
+    assert abs(held / trials - 0.955) <= 0.02 + BAR * (0.95 * 0.05 / trials) ** 0.5
 
 
 def test_ecdf_difference_is_drawn_less_the_uniform() -> None:

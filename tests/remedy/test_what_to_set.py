@@ -28,8 +28,8 @@ def test_a_calm_car_needs_nothing() -> None:
     assert told.why.startswith("Nothing to set")
 
 
-def test_a_weak_actuator_as_the_exact_verdict_has_it(rotating_seed: int) -> None:
-    belief = _belief(rotating_seed, 1.5, 0.5)
+def test_a_weak_actuator_as_the_exact_verdict_has_it(fresh_seed: int) -> None:
+    belief = _belief(fresh_seed, 1.5, 0.5)
     told = what_to_set(plant(T_L=1.5, K_L=0.5), belief)
     T, K = (torch.as_tensor(belief[name]) for name in ("T_L", "K_L"))
     assert told.p_now == pytest.approx(
@@ -42,8 +42,8 @@ def test_a_weak_actuator_as_the_exact_verdict_has_it(rotating_seed: int) -> None
 
 
 @pytest.mark.slow
-def test_a_dead_time_is_not_a_lag(rotating_seed: int) -> None:
-    belief = _belief(rotating_seed, 0.3, 1.0, dead_time__delay_s=0.4)
+def test_a_dead_time_is_not_a_lag(fresh_seed: int) -> None:
+    belief = _belief(fresh_seed, 0.3, 1.0, dead_time__delay_s=0.4)
     told = what_to_set(plant([DeadTime(0.4)], T_L=0.3, K_L=1.0), belief)
     assert told.p_assumed == 1.0
     assert told.p_now < 0.05

@@ -17,6 +17,7 @@ pytest.importorskip("arviz")
 
 from avtorch.validation.agreement import Agreement, agreement, between
 from avtorch.validation.diagnostics import diagnose, superchains
+from tests.bars import BAR
 
 LOG_SD = 0.05
 
@@ -108,33 +109,36 @@ def test_draws_beyond_the_grid_count_with_their_distance() -> None:
     assert agreement(far, exact).w1 == pytest.approx(torch.full((1, 2), 1000.0).numpy(), rel=1e-4)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("chains", "draws", "rho"), [(4, 500, 0.0), (256, 10, 0.4), (2, 1500, 0.7)])
 def test_z_scores_are_standard_and_the_expected_w1_is_met(
-    chains: int, draws: int, rho: float, rotating_seed: int
+    chains: int, draws: int, rho: float, rotating_seed: int, draws_factor: int
 ) -> None:
-    windows = 80
+    windows = 80 * draws_factor
     law = LogNormals(windows)
     found = agreement(law.posterior(autoregressive((chains, draws, windows, 2), rho, rotating_seed)), law.exact())
     # chi^2 of the z-scores within 5 sigma, and 6 % for the error of the effective sample size itself
-    bar = 5 * math.sqrt(2 / (2 * windows)) + 0.12
+    bar = BAR * math.sqrt(2 / (2 * windows)) + 0.12
     for z in (found.z_mean, found.z_sd):
         assert abs(float(z.square().mean()) - 1) < bar
     # W1 of one window scatters by about 40 %; far from the mean draws are less correlated than the mean's ESS counts
-    ratio, bar = float((found.w1 / found.w1_expected).mean()), 5 * 0.4 / math.sqrt(2 * windows) + 0.04
+    ratio, bar = float((found.w1 / found.w1_expected).mean()), BAR * 0.4 / math.sqrt(2 * windows) + 0.04
     assert 1 - bar - 0.3 * rho < ratio < 1 + bar
 
 
-def test_chance_of_exact_draws_is_the_share_that_meets_the_tolerance(rotating_seed: int) -> None:
-    windows = 150
+@pytest.mark.statistical
+def test_chance_of_exact_draws_is_the_share_that_meets_the_tolerance(rotating_seed: int, draws_factor: int) -> None:
+    windows = 150 * draws_factor
     law = LogNormals(windows)
     found = agreement(law.posterior(autoregressive((4, 150, windows, 2), 0.0, rotating_seed)), law.exact())
     chance = float(found.chance_within().mean())
     assert 0.5 < chance < 0.95
-    assert abs(float(found.within().double().mean()) - chance) < 5 * math.sqrt(chance * (1 - chance) / windows) + 0.02
+    assert abs(float(found.within().double().mean()) - chance) < BAR * math.sqrt(chance * (1 - chance) / windows) + 0.02
     assert float(found.chance_within(slack=2.0).mean()) > chance
     assert int(found.within(slack=2.0).sum()) >= int(found.within().sum())
 
 
+@pytest.mark.statistical
 def test_many_short_chains_are_not_counted_twice(rotating_seed: int) -> None:
     windows, chains, draws, rho = 20, 256, 20, 0.3
     law = LogNormals(windows)
@@ -146,6 +150,7 @@ def test_many_short_chains_are_not_counted_twice(rotating_seed: int) -> None:
     assert float(found.rhat.max()) < 1.02
 
 
+@pytest.mark.statistical
 def test_chains_that_sit_still_count_one_draw_each(rotating_seed: int) -> None:
     still = autoregressive((256, 1, 10, 2), 0.0, rotating_seed).expand(-1, 20, -1, -1)
     assert float(diagnose(LogNormals(10).posterior(still)).ess_mean.mean()) == pytest.approx(256, rel=0.15)
@@ -160,16 +165,17 @@ def test_superchains() -> None:
     assert superchains(draws[:1].expand(1, 3, 1, 1)).shape == (2, 1, 1, 1)
 
 
-def test_two_sets_of_draws(rotating_seed: int) -> None:
-    windows = 80
+@pytest.mark.statistical
+def test_two_sets_of_draws(rotating_seed: int, draws_factor: int) -> None:
+    windows = 80 * draws_factor
     law = LogNormals(windows)
     first = law.posterior(autoregressive((64, 20, windows, 2), 0.3, rotating_seed))
     second = law.posterior(autoregressive((2, 700, windows, 2), 0.5, rotating_seed + 1))
     found = between(first, second)
-    bar = 5 * math.sqrt(2 / (2 * windows)) + 0.12
+    bar = BAR * math.sqrt(2 / (2 * windows)) + 0.12
     for z in (found.z_mean, found.z_sd):
         assert abs(float(z.square().mean()) - 1) < bar
-    ratio, bar = float((found.w1 / found.w1_expected).mean()), 5 * 0.4 / math.sqrt(2 * windows) + 0.04
+    ratio, bar = float((found.w1 / found.w1_expected).mean()), BAR * 0.4 / math.sqrt(2 * windows) + 0.04
     assert 1 - bar - 0.15 < ratio < 1 + bar
 
 

@@ -31,8 +31,8 @@ def fleet(count: int) -> torch.Tensor:
     return torch.stack([0.3 + 0.7 * share, 1.0 - 0.4 * share, 0.1 + 0.0 * share], -1).log()
 
 
-def test_sums_of_windows_are_sums_of_all_rows(rotating_seed):
-    g = torch.Generator().manual_seed(rotating_seed)
+def test_sums_of_windows_are_sums_of_all_rows(fresh_seed):
+    g = torch.Generator().manual_seed(fresh_seed)
     z = fleet(3)
     rows = [(*simulate(z, u, generator=g), u) for u in (command(3, 50, 1.0, generator=g) for _ in range(4))]
     parts = [JerkStatistics.from_samples(a, u, jerk) for a, jerk, u in rows]
@@ -43,9 +43,9 @@ def test_sums_of_windows_are_sums_of_all_rows(rotating_seed):
 
 
 @pytest.mark.parametrize("amplitude", [1.0, 0.2])
-def test_one_window_with_a_sigma_of_its_own_is_that_window(amplitude, rotating_seed):
+def test_one_window_with_a_sigma_of_its_own_is_that_window(amplitude, fresh_seed):
     """With one window both are the same posterior: that of the vehicle with sigma integrated out."""
-    g = torch.Generator().manual_seed(rotating_seed)
+    g = torch.Generator().manual_seed(fresh_seed)
     (seen,) = windows_of(constant(fleet(4), 1), amplitude=amplitude, generator=g)
     free, whole = integrate(FreeNoise([seen])), integrate(JerkDensity(seen))
     assert torch.allclose(free.log_evidence, whole.log_evidence, atol=1e-5)
@@ -53,8 +53,8 @@ def test_one_window_with_a_sigma_of_its_own_is_that_window(amplitude, rotating_s
     assert torch.allclose(free.sd, whole.sd[:, :2], rtol=1e-4)
 
 
-def test_selected_vehicles_keep_their_density(rotating_seed):
-    g = torch.Generator().manual_seed(rotating_seed)
+def test_selected_vehicles_keep_their_density(fresh_seed):
+    g = torch.Generator().manual_seed(fresh_seed)
     density = FreeNoise(windows_of(constant(fleet(3), 2), generator=g))
     z = fleet(3)[:, :2]
     index = torch.tensor([2, 0])
@@ -62,6 +62,7 @@ def test_selected_vehicles_keep_their_density(rotating_seed):
     assert density.constrain(z).equal(z.exp())
 
 
+@pytest.mark.statistical
 def test_posterior_mode_ends_where_the_pooled_posterior_is(rotating_seed):
     """Four well excited windows.
 
@@ -83,6 +84,7 @@ def test_posterior_mode_ends_where_the_pooled_posterior_is(rotating_seed):
     assert 1.5 < loose.sd_ratio[:, :2].median() < 2.8
 
 
+@pytest.mark.statistical
 def test_a_sigma_of_its_own_for_every_window_costs_little(rotating_seed):
     """Where all windows have the same sigma, letting it vary loses of order one part in 2 n of the information."""
     g = torch.Generator().manual_seed(rotating_seed)
@@ -104,6 +106,7 @@ def test_paths():
     assert torch.allclose(drifts[3] - z, torch.tensor([0.3, -0.3, 0.0], dtype=F64).expand(2, 3))
 
 
+@pytest.mark.statistical
 def test_lambda_follows_a_step_that_posterior_mode_does_not(rotating_seed):
     g = torch.Generator().manual_seed(rotating_seed)
     z = torch.tensor([[0.3, 1.0, 0.1]], dtype=F64).log().expand(10, -1)

@@ -10,34 +10,37 @@ import torch
 
 from avtorch.errors import InputError
 from avtorch.validation.uniformity import bonferroni, chi2_p_value, dispersion_p_value, ecdf_band, ecdf_p_value
+from tests.bars import BAR
 
 RUNS, N, DRAWS = 2000, 300, 19
 
 
 @pytest.fixture
-def uniform(rotating_seed) -> torch.Tensor:
+def uniform(rotating_seed, draws_factor) -> torch.Tensor:
     """Runs as quantities, so that one call tests them all."""
-    return torch.from_numpy(np.random.default_rng(rotating_seed).integers(0, DRAWS + 1, (N, RUNS)))
+    return torch.from_numpy(np.random.default_rng(rotating_seed).integers(0, DRAWS + 1, (N, RUNS * draws_factor)))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("test", [chi2_p_value, ecdf_p_value, dispersion_p_value])
 def test_level_is_kept(test, uniform):
     p = test(uniform, DRAWS)
     for level in (0.01, 0.05, 0.5):
         rejected = float((p <= level).double().mean())
-        error = (level * (1 - level) / RUNS) ** 0.5
+        error = (level * (1 - level) / uniform.shape[1]) ** 0.5
         # counts are discrete, chi^2 and the normal are limits: a tenth of the level for that
-        assert rejected <= 1.1 * level + 5 * error
-        assert rejected >= 0.7 * level - 5 * error
+        assert rejected <= 1.1 * level + BAR * error
+        assert rejected >= 0.7 * level - BAR * error
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("level", [0.5, 0.95])
 def test_band_holds_all_points_as_often_as_it_says(level, uniform):
     low, high = ecdf_band(N, DRAWS, level=level)
     counts = torch.stack([torch.bincount(r, minlength=DRAWS + 1) for r in uniform.T])
     ecdf = counts.cumsum(-1).double() / N
     inside = ((ecdf >= low - 1e-12) & (ecdf <= high + 1e-12)).all(-1)
-    error = 5 * (level * (1 - level) / RUNS) ** 0.5
+    error = BAR * (level * (1 - level) / uniform.shape[1]) ** 0.5
     assert -error <= float(inside.double().mean()) - level <= 0.05 + error
     # the band and the p-value are one test
     assert ((ecdf_p_value(uniform, DRAWS) > 1 - level) == inside).double().mean() > 0.98
@@ -64,6 +67,7 @@ def test_small_case_by_enumeration():
     assert (p[~extreme] > 2 / 9 + 1e-9).all()
 
 
+@pytest.mark.statistical
 def test_wrong_spread_and_wrong_place_are_seen(rotating_seed):
     """By normal scores stretched by 1.1 and shifted by 0.2: far below any level at 20 000 ranks."""
     g = torch.Generator().manual_seed(rotating_seed)

@@ -23,6 +23,7 @@ from avtorch.validation.reference import NODES, join, reference, select
 from avtorch.validation.validate import NutsSettings, Validation, check_installed
 from avtorch.validation.verdict import chi2_of_means, judge
 from avtorch.validation.windows import Windows
+from tests.bars import BAR, LEVEL
 
 WINDOWS = 12
 
@@ -49,6 +50,7 @@ def inflated(posterior: Posterior, factor: float) -> Posterior:
     return Posterior(posterior.names, center + factor * (posterior.draws - center), posterior.converged)
 
 
+@pytest.mark.statistical
 def test_exact_draws_agree(windows: Windows, exact: Quadrature, rotating_seed: int) -> None:
     assert bool(exact.converged.all())
     found = agreement(drawn(windows, exact, rotating_seed), exact)
@@ -60,11 +62,12 @@ def test_exact_draws_agree(windows: Windows, exact: Quadrature, rotating_seed: i
     assert f"{WINDOWS} of {WINDOWS} windows (100 %" in verdict.why
     assert "more windows could still change the verdict" in verdict.why
     # independent draws: z-scores within 5 sigma of a chi^2, three correlated parameters counted as two
-    bar = 5 * math.sqrt(2 / (2 * WINDOWS)) + 0.1
+    bar = BAR * math.sqrt(2 / (2 * WINDOWS)) + 0.1
     assert float(found.z_mean.square().mean()) < 1 + bar
     assert float(found.z_sd.square().mean()) < 1 + bar
 
 
+@pytest.mark.statistical
 def test_ten_percent_inflation_disagrees(windows: Windows, exact: Quadrature, rotating_seed: int) -> None:
     found = agreement(inflated(drawn(windows, exact, rotating_seed), 1.1), exact)
     verdict = judge(found, exact.converged)
@@ -100,10 +103,12 @@ def test_references_that_contradict_each_other_settle_nothing(windows: Windows, 
     assert "NUTS contradicts quadrature" in verdict.why
 
 
+@pytest.mark.statistical
 def test_p_value_of_exact_means(windows: Windows, exact: Quadrature, rotating_seed: int) -> None:
-    assert chi2_of_means(agreement(drawn(windows, exact, rotating_seed, count=2000), exact)) > 1e-6
+    assert chi2_of_means(agreement(drawn(windows, exact, rotating_seed, count=2000), exact)) > LEVEL
 
 
+@pytest.mark.statistical
 def test_draws_of_a_quadrature_have_its_moments(windows: Windows, exact: Quadrature, rotating_seed: int) -> None:
     draws = drawn(windows, exact, rotating_seed, count=20_000)
     g = torch.Generator().manual_seed(rotating_seed)
@@ -115,7 +120,7 @@ def test_draws_of_a_quadrature_have_its_moments(windows: Windows, exact: Quadrat
         return torch.einsum("nwi,nwj->wij", x, x) / len(x)
 
     # a correlation of n draws has an SD of at most 1/sqrt(n); the conjugate draws are worth half their number
-    assert float((correlation(draws) - correlation(other)).abs().max()) < 5 * math.sqrt(3.5 / 20_000) * 1.2
+    assert float((correlation(draws) - correlation(other)).abs().max()) < BAR * math.sqrt(3.5 / 20_000) * 1.2
 
 
 @pytest.mark.slow

@@ -57,8 +57,8 @@ def test_unsmoothed_leader_interpolates_its_samples():
     assert [leader.speed[round(s / 0.01)].item() for s in t] == pytest.approx(v, abs=1e-9)
 
 
-def test_stop_and_go_never_goes_negative(rotating_seed):
-    rng = np.random.default_rng(rotating_seed)
+def test_stop_and_go_never_goes_negative(fresh_seed):
+    rng = np.random.default_rng(fresh_seed)
     v = np.maximum(rng.normal(0, 5, 300), 0.0)
     leader = Leader.from_speed(np.arange(300), v)
     assert leader.speed.min() >= 0

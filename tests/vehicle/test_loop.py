@@ -19,6 +19,7 @@ from avtorch.vehicle import (
     LowerLevel,
     simulate,
 )
+from tests.bars import BAR
 
 F64 = torch.float64
 QUIET = GLVDPlant(sigma=0.0)
@@ -96,15 +97,16 @@ def test_a_scenario_is_the_same_alone_in_a_batch_and_in_blocks():
         torch.testing.assert_close(batch.jerk[i], alone.jerk[0], rtol=0, atol=1e-9)
 
 
-def test_jerk_noise_has_the_stated_law(rotating_seed):
-    seeds = [rotating_seed + i for i in range(20)]
-    run = ClosedLoop(WAVE, plant=GLVDPlant(0.4, 0.9, 0.25), scenarios=20, seeds=seeds).advance(2000)
+@pytest.mark.statistical
+def test_jerk_noise_has_the_stated_law(rotating_seed, draws_factor):
+    seeds = [rotating_seed + i for i in range(20 * draws_factor)]
+    run = ClosedLoop(WAVE, plant=GLVDPlant(0.4, 0.9, 0.25), scenarios=len(seeds), seeds=seeds).advance(2000)
     noise = run.jerk - (0.9 * run.accel_cmd - run.accel) / 0.4
     n = noise.numel()
-    assert abs(noise.mean().item()) < 5 * 0.25 / n**0.5
-    assert abs(noise.std().item() / 0.25 - 1) < 5 / (2 * n) ** 0.5
+    assert abs(noise.mean().item()) < BAR * 0.25 / n**0.5
+    assert abs(noise.std().item() / 0.25 - 1) < BAR / (2 * n) ** 0.5
     for lag in (noise[:, 1:] * noise[:, :-1], noise[1:] * noise[:-1]):
-        assert abs(lag.mean().item()) < 5 * 0.25**2 / lag.numel() ** 0.5
+        assert abs(lag.mean().item()) < BAR * 0.25**2 / lag.numel() ** 0.5
     # and it is what moved the car: the row's draw acts over that row's step
     step = GLVDPlant(0.4, 0.9, 0.25).step(
         run.accel[:, :-1], run.speed[:, :-1], run.accel_cmd[:, :-1], 0.01, noise[:, :-1]

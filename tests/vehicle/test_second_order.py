@@ -23,8 +23,8 @@ def test_speed_steps_as_an_exponential():
 
 
 @pytest.mark.parametrize("zeta", [0.3, 1.0, 2.0])
-def test_position_is_an_independent_solver_s(zeta, rotating_seed):
-    g = torch.Generator().manual_seed(rotating_seed)
+def test_position_is_an_independent_solver_s(zeta, fresh_seed):
+    g = torch.Generator().manual_seed(fresh_seed)
     T, dt, x_cmd = 0.7, 0.1, torch.randn(30, generator=g, dtype=F64)
     x, v = PositionLag(T, zeta).rollout(torch.tensor(0.4, dtype=F64), torch.tensor(-0.2, dtype=F64), x_cmd, dt)
     state, found = np.array([0.4, -0.2]), []

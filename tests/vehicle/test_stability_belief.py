@@ -15,8 +15,8 @@ NOMINAL = [1.5, 1.5, -0.8]
 
 
 @pytest.fixture
-def draws(rotating_seed):
-    rng = torch.Generator().manual_seed(rotating_seed)
+def draws(fresh_seed):
+    rng = torch.Generator().manual_seed(fresh_seed)
     z = torch.randn(2, 400, generator=rng, dtype=torch.float64)
     return 1.5 * torch.exp(0.2 * z[0]), 0.55 * torch.exp(0.15 * z[1])
 

@@ -18,6 +18,7 @@ from avtorch.vehicle.stability import (
 NOMINAL = torch.tensor([1.5, 1.5, -0.8], dtype=torch.float64)
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 def test_as_the_exact_verdicts_of_glvd_with_dead_time(rotating_seed: int) -> None:
     generator = torch.Generator().manual_seed(rotating_seed)
@@ -46,6 +47,7 @@ def test_as_the_exact_verdicts_of_glvd_with_dead_time(rotating_seed: int) -> Non
     assert bool((seen.string_stable == string)[both & ~border].all())
 
 
+@pytest.mark.statistical
 def test_the_lower_level_is_the_effective_actuation(rotating_seed: int) -> None:
     generator = torch.Generator().manual_seed(rotating_seed)
     T = 0.3 + torch.rand(500, generator=generator, dtype=torch.float64)
@@ -73,9 +75,9 @@ def test_the_dead_time_of_the_specification() -> None:
     assert bool(chain_verdict(actuator(frequencies(), T, K, 0.5), one, NOMINAL).locally_stable)
 
 
-def test_a_second_pole_and_drag_against_the_eigenvalues(rotating_seed: int) -> None:
+def test_a_second_pole_and_drag_against_the_eigenvalues(fresh_seed: int) -> None:
     """Rational chains have a polynomial whose roots NumPy finds."""
-    rng = np.random.default_rng(rotating_seed)
+    rng = np.random.default_rng(fresh_seed)
     omega = frequencies()
     s = 1j * omega
     for _ in range(300):
@@ -103,8 +105,8 @@ def test_wrong_chains_are_told() -> None:
         Chain(omega, one, one[:-1], torch.zeros(()))
 
 
-def test_feed_forward_is_that_of_the_exact_verdicts(rotating_seed: int) -> None:
-    generator = torch.Generator().manual_seed(rotating_seed)
+def test_feed_forward_is_that_of_the_exact_verdicts(fresh_seed: int) -> None:
+    generator = torch.Generator().manual_seed(fresh_seed)
     T, K, kf = torch.rand(3, 300, generator=generator, dtype=torch.float64)
     T, K, kf = 0.3 + 1.2 * T, 0.5 + 0.6 * K, 1.5 * kf
     tau, far = torch.tensor(1.2, dtype=torch.float64), frequencies(points=4000)

@@ -1,12 +1,15 @@
 """A black box finds what is there, and makes up little where nothing is."""
 
 import numpy as np
+import pytest
 
 from avtorch.gap.crossval.black_box import BlackBoxRegression
 from avtorch.gap.crossval.folds import folds
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from tests.gap.finds import found_of
 from tests.gap.records import QUIET, errors_of
+
+pytestmark = pytest.mark.statistical
 
 
 def test_noise_stays_noise(rotating_seed: int) -> None:

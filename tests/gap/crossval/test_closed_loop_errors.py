@@ -30,8 +30,8 @@ def loops(T: float, K: float, push: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 @pytest.mark.parametrize("channel", ["speed", "accel"])
-def test_superposition_is_what_the_loops_differ_by(channel: str, rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_superposition_is_what_the_loops_differ_by(channel: str, fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     T, K = float(rng.uniform(0.2, 0.8)), float(rng.uniform(0.7, 1.2))
     time = np.arange(round(60 / DT)) * DT
     push = 0.2 * np.sin(rng.uniform(0.2, 1.0) * time) + 0.1 * (time > 20)

@@ -12,6 +12,8 @@ from avtorch.gap.search.search import Search
 from avtorch.gap.selection.model_probabilities import favourite
 from avtorch.gap.simulator.plant import plant
 
+pytestmark = pytest.mark.statistical
+
 SINGLE = {"none": 0.0, "single": 1.0, "pair": 0.0, "outside": 0.0}
 
 

@@ -12,6 +12,7 @@ from avtorch.gap.crossval.scores import FoldScorer, parameter_spread
 from tests.gap.finds import found_of
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("effects", [[DeadTime(0.2)], [AerodynamicDrag()], [Gust(0.3, 2.0)]])
 def test_a_part_tells_the_same_within_its_uncertainty(effects: list, rotating_seed: int) -> None:
     found = found_of(effects, seconds=120.0, rng=np.random.default_rng(rotating_seed))
@@ -32,6 +33,7 @@ def test_the_whole_is_the_find_itself() -> None:
     assert refit.values == pytest.approx(found.values)
 
 
+@pytest.mark.statistical
 def test_what_is_owed_is_what_draws_of_the_posterior_cost(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     found = found_of([SensorScale(1.2)], seconds=90.0, rng=rng)

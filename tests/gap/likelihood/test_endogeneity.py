@@ -48,6 +48,7 @@ def _gains(record: Record, kind: type[Hypothesis], noise: NoiseModel) -> Float:
     return np.array([evidence(name, [{**base, key: x} for x in grid]) - none for name, (key, grid) in CAUSES.items()])
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 def test_a_controllers_noise_is_no_lag(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)

@@ -41,6 +41,7 @@ CARS = {
 }
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("rate_hz", [20, 50])
 @pytest.mark.parametrize("name", CARS)
 def test_the_mode_is_the_optimisers(name: str, rate_hz: int, rotating_seed: int) -> None:
@@ -70,8 +71,8 @@ def test_the_mode_is_the_optimisers(name: str, rate_hz: int, rotating_seed: int)
         assert abs(found[0, i] - hypothesis.z_of({key: value})[i]) < 6 * np.sqrt(fit.covariance[i, i])
 
 
-def test_many_starts_are_each_alone(rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_many_starts_are_each_alone(fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     hypothesis, white = _case(CARS["dead_time"], "dead_time", rng)
     starts = np.stack(
         [
@@ -88,6 +89,7 @@ def test_many_starts_are_each_alone(rotating_seed: int) -> None:
         assert own[0] == pytest.approx(value, abs=1e-5)
 
 
+@pytest.mark.statistical
 def test_a_coarse_look_is_near(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     hypothesis, white = _case(CARS["dead_time"], "dead_time", rng, rate_hz=100)
@@ -123,8 +125,8 @@ def _by_quadrature(
         ("none", plant()),
     ],
 )
-def test_laplace_is_the_evidence_of_what_is_linear(name: str, car: GapPlant, rate_hz: int, rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_laplace_is_the_evidence_of_what_is_linear(name: str, car: GapPlant, rate_hz: int, fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     hypothesis, white = _case(car, name, rng, rate_hz=rate_hz)
     z, _ = modes(hypothesis, white, hypothesis.z_of({"T_L": 0.3, "K_L": 1.0})[None], iterations=12)
     fit = finish(hypothesis, white, z[0])
@@ -132,6 +134,7 @@ def test_laplace_is_the_evidence_of_what_is_linear(name: str, car: GapPlant, rat
     assert fit.log_evidence == pytest.approx(exact, abs=0.1)
 
 
+@pytest.mark.statistical
 def test_evidence_prefers_the_cause_that_is_there(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     for car, sign in ((plant([SensorBias(0.1)]), 1), (plant(), -1)):
@@ -147,8 +150,8 @@ def test_evidence_prefers_the_cause_that_is_there(rotating_seed: int) -> None:
         assert sign * (evidence[0] - evidence[1]) > (15 if sign > 0 else -8)
 
 
-def test_an_onset_counts_what_comes_after_it(rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_an_onset_counts_what_comes_after_it(fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     hypothesis, white = _case(CARS["none"], "sensor_bias", rng)
     z = hypothesis.z_of({"T_L": 0.4, "K_L": 0.95})
     start = np.append(z[:2], 0.5)[None]
@@ -180,8 +183,8 @@ def _white_columns(hypothesis: Hypothesis, white: WhiteningFilter, onset: int | 
 
 
 @pytest.mark.parametrize("onset", [None, 80])
-def test_integrating_a_slope_out_is_the_dense_gaussian(onset: int | None, rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_integrating_a_slope_out_is_the_dense_gaussian(onset: int | None, fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     hypothesis, white = _case(_hills(rng), "road_grade", rng, speed0=30.0, seconds=14.0)
     z = hypothesis.z_of({"T_L": 0.3, "K_L": 1.0})
     fit = finish(hypothesis, white, z, onset)
@@ -202,8 +205,8 @@ def test_integrating_a_slope_out_is_the_dense_gaussian(onset: int | None, rotati
 
 
 @pytest.mark.parametrize("onset", [None, 80])
-def test_the_slope_told_is_the_posterior_mean(onset: int | None, rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_the_slope_told_is_the_posterior_mean(onset: int | None, fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     hypothesis, white = _case(_hills(rng), "road_grade", rng, speed0=30.0, seconds=14.0)
     z = hypothesis.z_of({"T_L": 0.3, "K_L": 1.0})
     fit = finish(hypothesis, white, z, onset)
@@ -228,6 +231,7 @@ def test_the_slope_told_is_the_posterior_mean(onset: int | None, rotating_seed: 
     assert left @ left < e @ e
 
 
+@pytest.mark.statistical
 def test_the_slope_told_is_the_roads(rotating_seed: int) -> None:
     """A plant given the profile found does what the log shows, all but the noise."""
     rng = np.random.default_rng(rotating_seed)
@@ -250,8 +254,8 @@ def test_the_slope_told_is_the_roads(rotating_seed: int) -> None:
     assert left == pytest.approx(1.0, abs=0.25)
 
 
-def test_slope_columns_are_the_rollouts_derivatives(rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_slope_columns_are_the_rollouts_derivatives(fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     hypothesis, _ = _case(plant(), "road_grade", rng)
     columns, record = hypothesis.grade_columns, hypothesis.record
     assert columns is not None
@@ -270,8 +274,8 @@ def test_slope_columns_are_the_rollouts_derivatives(rotating_seed: int) -> None:
         np.testing.assert_allclose(speed - speed[0], own[1] - own[1, 0], atol=1e-9)
 
 
-def test_a_slope_over_several_drives(rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_a_slope_over_several_drives(fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     logs = [log_of(_hills(rng), seconds=s, name=f"{s} s", rng=rng, speed0=30.0) for s in (20.0, 30.0)]
     record = Record.of(logs)
     hypothesis, white = Hypothesis.named(record, "road_grade", plant()), WhiteningFilter(record, QUIET)
@@ -279,6 +283,7 @@ def test_a_slope_over_several_drives(rotating_seed: int) -> None:
     assert np.isfinite(fit.log_evidence)
 
 
+@pytest.mark.statistical
 def test_a_gap_in_a_drive_with_a_slope(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     log = log_of(_hills(rng), seconds=42.0, rng=rng, speed0=30.0)
@@ -290,9 +295,9 @@ def test_a_gap_in_a_drive_with_a_slope(rotating_seed: int) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [20, 100])
-def test_what_a_slope_does_is_the_sum_of_its_columns(rate_hz: int, rotating_seed: int) -> None:
+def test_what_a_slope_does_is_the_sum_of_its_columns(rate_hz: int, fresh_seed: int) -> None:
     """Over two drives, one of them with a gap, of hills of their own."""
-    rng = np.random.default_rng(rotating_seed)
+    rng = np.random.default_rng(fresh_seed)
     first, second = (log_of(seconds=s, rate_hz=rate_hz, name=f"{s} s", rng=rng, speed0=30.0) for s in (20.0, 30.0))
     record = Record.of([first, replace(second, engaged=(second.time < 12) | (second.time > 15))])
     assert len(record.starts) == 3
@@ -331,9 +336,9 @@ def _row(drive: Drive) -> Row:
 
 
 @pytest.mark.parametrize("rate_hz", [20, 100])
-def test_the_size_along_the_road_is_that_of_the_slope_itself(rate_hz: int, rotating_seed: int) -> None:
+def test_the_size_along_the_road_is_that_of_the_slope_itself(rate_hz: int, fresh_seed: int) -> None:
     """By what the effect does at every row of both drives."""
-    rng = np.random.default_rng(rotating_seed)
+    rng = np.random.default_rng(fresh_seed)
     logs = [log_of(seconds=s, rate_hz=rate_hz, name=f"{s} s", rng=rng, speed0=30.0) for s in (20.0, 30.0)]
     record = Record.of(logs)
     hypothesis = Hypothesis.named(record, "road_grade", plant())

@@ -33,6 +33,7 @@ def _away(fit, truth: NoiseModel) -> Float:  # type: ignore[no-untyped-def]
     return np.array([np.log(getattr(fit.noise, n) / getattr(truth, n)) / fit.sds[n] for n in NAMES])
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("channels", [BOTH, ("accel",), ("speed",)])
 @pytest.mark.parametrize("priors", [PRIORS, GUST], ids=["nuisance", "gust"])
 def test_parameters_are_found_within_their_own_bars(
@@ -58,6 +59,7 @@ def test_parameters_are_found_within_their_own_bars(
     assert np.sqrt((np.clip(away, -4, 4) ** 2).mean()) < 2.0
 
 
+@pytest.mark.statistical
 def test_the_mode_is_found_from_afar(rotating_seed: int) -> None:
     """From the usual start, whatever the sensors are: never thousands of nats short."""
     rng = np.random.default_rng(rotating_seed)
@@ -77,6 +79,7 @@ def test_the_mode_is_found_from_afar(rotating_seed: int) -> None:
     assert max(short) < 2.0
 
 
+@pytest.mark.statistical
 def test_what_is_seen_well_is_told_well(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     record = record_of(120.0, noise=None)
@@ -91,8 +94,8 @@ def test_what_is_seen_well_is_told_well(rotating_seed: int) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [20, 100])
-def test_row_likelihoods_sum_to_the_whole(rate_hz: int, rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_row_likelihoods_sum_to_the_whole(rate_hz: int, fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     record = Record.of(log_of(seconds=22.0, rate_hz=rate_hz))
     noise = NoiseModel()
     errors = errors_of(noise, record, rng) + 0.04 * rng.standard_normal((2, record.rows, record.group))
@@ -103,6 +106,7 @@ def test_row_likelihoods_sum_to_the_whole(rate_hz: int, rotating_seed: int) -> N
     np.testing.assert_allclose(fit.rows, WhiteningFilter(record, fit.noise).row_likelihoods(errors), rtol=0, atol=1e-8)
 
 
+@pytest.mark.statistical
 def test_the_moment_a_force_sets_in_is_found(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     record = record_of(100.0, noise=None)

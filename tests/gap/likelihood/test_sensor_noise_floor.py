@@ -50,6 +50,7 @@ def test_noise_is_added_where_there_is_none(decimals: int | None, sigma: float) 
     assert abs(gained[-1] - (np.asarray(read.speed) - speed)[-1]) < off
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["accel", "speed"])
 def test_a_witness_with_noise_of_its_own_gets_none(name: str, rotating_seed: int) -> None:
@@ -68,9 +69,9 @@ def test_a_witness_with_noise_of_its_own_gets_none(name: str, rotating_seed: int
 
 
 @pytest.mark.slow
-def test_what_was_interpolated_is_no_simulation(rotating_seed: int) -> None:
+def test_what_was_interpolated_is_no_simulation(fresh_seed: int) -> None:
     """A sensor of 2 Hz, brought to 10 Hz by straight lines; and speed alone, which is left as it is."""
-    rng = np.random.default_rng(rotating_seed)
+    rng = np.random.default_rng(fresh_seed)
     time = np.arange(600) * 0.1
     few = np.arange(0, 61, 0.5)
     seen = {"accel": np.sin(0.3 * few), "speed": 20 - np.cos(0.3 * few) / 0.3}

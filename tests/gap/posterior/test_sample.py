@@ -46,6 +46,7 @@ from avtorch.gap.posterior.sample import (
 from avtorch.gap.posterior.surrogate import Corrected
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.inference.density import Density, ScoredDensity, SubsampledDensity
+from tests.bars import BAR
 from tests.gap.finds import found_of
 from tests.gap.records import QUIET
 
@@ -201,6 +202,7 @@ def moments(z: np.ndarray, worth: float) -> tuple[np.ndarray, np.ndarray, np.nda
     return mean, sd / math.sqrt(worth), sd, sd * np.sqrt((fourth - 1) / (4 * worth))
 
 
+@pytest.mark.statistical
 def test_sgld_is_laplaces_where_that_is_right(rotating_seed: int) -> None:
     """A bias of the sensor and the gain are linear; the lag nearly so."""
     found = found_of([SensorBias(0.05)], seconds=60)
@@ -212,10 +214,11 @@ def test_sgld_is_laplaces_where_that_is_right(rotating_seed: int) -> None:
     mean, mean_error, sd, sd_error = moments(z, len(z) / 2)
     laplace = np.sqrt(np.diag(found.covariance))
     # a lag's skew moves its mean and sd by a few hundredths of an sd
-    assert np.all(np.abs(mean - found.z) < 5 * mean_error + 0.05 * laplace)
-    assert np.all(np.abs(sd - laplace) < 5 * sd_error + 0.05 * laplace)
+    assert np.all(np.abs(mean - found.z) < BAR * mean_error + 0.05 * laplace)
+    assert np.all(np.abs(sd - laplace) < BAR * sd_error + 0.05 * laplace)
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 @pytest.mark.parametrize("effect", [DeadTime(0.163), SecondOrderActuator(0.15)], ids=lambda e: e.name)
 def test_sgld_against_nuts(effect: Effect, rotating_seed: int) -> None:
@@ -232,8 +235,8 @@ def test_sgld_against_nuts(effect: Effect, rotating_seed: int) -> None:
     reference = walked.draws[0, :, 0].log().numpy()  # NUTS takes every density for one of logarithms
     # autocorrelation: NUTS' draws here are worth a half of their number, or more
     near_mean, near_mean_error, near_sd, near_sd_error = moments(reference, len(reference) / 2)
-    assert np.all(np.abs(mean - near_mean) < 5 * np.hypot(mean_error, near_mean_error) + 0.05 * sd)
-    assert np.all(np.abs(sd - near_sd) < 5 * np.hypot(sd_error, near_sd_error) + 0.05 * sd)
+    assert np.all(np.abs(mean - near_mean) < BAR * np.hypot(mean_error, near_mean_error) + 0.05 * sd)
+    assert np.all(np.abs(sd - near_sd) < BAR * np.hypot(sd_error, near_sd_error) + 0.05 * sd)
 
 
 def test_the_same_seed_gives_the_same_draws() -> None:
@@ -264,6 +267,7 @@ def test_draws_that_are_too_wide_are_noticed() -> None:
     assert stein_discrepancy(density, mode, too_wide, torch.Generator().manual_seed(0)) > 0.5
 
 
+@pytest.mark.statistical
 def test_importance_on_a_cliff(rotating_seed: int) -> None:
     """A normal cut off at its centre: mean sqrt(2/pi), variance 1 - 2/pi, times a normal five times as wide."""
 

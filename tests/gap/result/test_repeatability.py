@@ -12,6 +12,7 @@ from avtorch.gap.result.diagnosis import Diagnosis, GapSize, LogFacts
 from avtorch.gap.result.repeatability import SETTLED_S, WINDOW_S, Repeatability, repeatability
 from avtorch.gap.selection.verdict import Candidate, Verdict
 from avtorch.io import Log
+from tests.bars import BAR
 
 DT = 0.05
 NOISE_A, NOISE_V = 0.08, 0.03
@@ -35,6 +36,7 @@ def steps(seconds: float, rng: np.random.Generator) -> np.ndarray:
     return np.repeat(sizes - sizes.mean(), round(2 / DT))
 
 
+@pytest.mark.statistical
 def test_a_manoeuvre_driven_twice_tells_the_noise(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     manoeuvre = steps(40, rng)
@@ -44,12 +46,13 @@ def test_a_manoeuvre_driven_twice_tells_the_noise(rotating_seed: int) -> None:
     assert told.seconds == pytest.approx(told.pairs * (WINDOW_S - SETTLED_S))
     rows = told.seconds / DT
     # a standard deviation told by so many rows is off by 1 / sqrt(2 rows); five of them
-    assert told.accel == pytest.approx(NOISE_A, rel=5 / np.sqrt(2 * rows))
+    assert told.accel == pytest.approx(NOISE_A, rel=BAR / np.sqrt(2 * rows))
     # the noise of the speed at each start stays in: one squared normal a pair, of mean 1
     excess = (float(told.speed or 0.0) / NOISE_V) ** 2 - 1
-    assert -5 * np.sqrt(2 / rows) < excess < 1 + 5 * np.sqrt(2 / told.pairs)
+    assert -BAR * np.sqrt(2 / rows) < excess < 1 + BAR * np.sqrt(2 / told.pairs)
 
 
+@pytest.mark.statistical
 def test_what_is_driven_once_tells_nothing(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     assert repeatability(Record.of(log_of(steps(120, rng), rng))) is None
@@ -58,6 +61,7 @@ def test_what_is_driven_once_tells_nothing(rotating_seed: int) -> None:
     assert repeatability(Record.of(log_of(steps(16, rng), rng))) is None
 
 
+@pytest.mark.statistical
 def test_drives_may_repeat_each_other(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     manoeuvre = steps(30, rng)

@@ -42,6 +42,7 @@ def test_one_parameter_moves_at_a_time() -> None:
     assert len(starts(hypothesis, {"T_L": 0.3, "K_L": 0.9})) == 42  # every limit above with every one below
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 @pytest.mark.parametrize("manoeuvre", ["stop_and_go", "cruise"])
 def test_a_delay_is_found_from_either_side_of_its_valley(manoeuvre: Manoeuvre, rotating_seed: int) -> None:

@@ -18,6 +18,7 @@ from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.lost_messages import Bank, LostMessages, lost_messages
 from avtorch.io import Log
+from tests.bars import BAR
 from tests.gap.records import Float, command_over, drawn_errors
 
 NOISE = NoiseModel(process_sd=0.03, process_time=0.3, force_sd=0.003, accel_sd=0.03, speed_sd=0.01)
@@ -50,6 +51,7 @@ def _smooth(rate_hz: int, seconds: float = 100.0) -> Float:
     return command_over(np.arange(round(seconds * rate_hz)) / rate_hz)
 
 
+@pytest.mark.statistical
 def test_likelihoods_are_those_of_all_ways_to_lose_messages(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     apart = np.array([_bank_and_sum(rng) for _ in range(5)])
@@ -94,6 +96,7 @@ def _bank_and_sum(rng: np.random.Generator) -> list[float]:
     return out
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(("rate_hz", "least"), [(20, 40.0), (50, 0.0)])
 def test_lost_messages_are_found_where_the_command_steps(rate_hz: int, least: float, rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
@@ -101,19 +104,21 @@ def test_lost_messages_are_found_where_the_command_steps(rate_hz: int, least: fl
     assert min(f.evidence for f in found) > least / 6
     assert np.mean([f.evidence for f in found]) > least
     away = [(np.log(f.fraction / (1 - f.fraction)) - np.log(0.15 / 0.85)) / f.sd for f in found]
-    assert np.abs(away).max() < 5
+    assert np.abs(away).max() < BAR
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 def test_a_command_that_also_drifts_hides_no_losses(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     found = [_found(_smooth(20, 400.0), 0.15, rng, 20) for _ in range(4)]
     assert np.mean([f.evidence for f in found]) > 30
     away = [(np.log(f.fraction / (1 - f.fraction)) - np.log(0.15 / 0.85)) / f.sd for f in found]
-    assert np.abs(away).max() < 5
+    assert np.abs(away).max() < BAR
     assert np.mean([f.fraction for f in found]) == pytest.approx(0.15, rel=0.5)
 
 
+@pytest.mark.statistical
 def test_messages_that_all_arrive_are_not_lost(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     evidence = []
@@ -128,6 +133,7 @@ def test_messages_that_all_arrive_are_not_lost(rotating_seed: int) -> None:
     assert largest[1] < 8
 
 
+@pytest.mark.statistical
 def test_losses_from_a_moment_on(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     at, onsets = 1000, []
@@ -145,6 +151,7 @@ def test_losses_from_a_moment_on(rotating_seed: int) -> None:
     assert -150 < np.median(onsets) - at < 200
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("effect", [Saturation(), RateLimit(), DeadTime()], ids=lambda e: e.name)
 @pytest.mark.parametrize("steps", [True, False], ids=["steps", "smooth"])
 def test_another_cause_is_not_claimed(effect: Effect, steps: bool, rotating_seed: int) -> None:

@@ -26,6 +26,7 @@ CASES = {
 }
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("rate_hz", [20, 50])
 @pytest.mark.parametrize("name", CASES)
 def test_a_known_onset_is_found(name: str, rate_hz: int, rotating_seed: int) -> None:
@@ -154,6 +155,7 @@ def _slope_that_sets_in(rng: np.random.Generator) -> tuple[float, float, Float]:
     return float(record.time[record.source[row]]) - 60.0, gain, np.diff(cut) / np.diff(exact)
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 def test_a_slopes_onset_is_found_though_it_is_flat_before(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
@@ -167,8 +169,8 @@ def test_a_slopes_onset_is_found_though_it_is_flat_before(rotating_seed: int) ->
     assert np.median(np.concatenate(ratios)) == pytest.approx(1.0, abs=0.2)
 
 
-def test_the_profile_is_the_sum_on_both_sides(rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_the_profile_is_the_sum_on_both_sides(fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     a, b = rng.standard_normal((2, 50))
     want = [a[:k].sum() + b[k:].sum() for k in range(50)]
     np.testing.assert_allclose(profile(a, b), want, atol=1e-12)
@@ -179,8 +181,8 @@ def test_rows_at_the_edges_are_no_onset() -> None:
     assert allowed(200, 0.05) == slice(50, 150)
 
 
-def test_not_knowing_the_onset_costs_its_mean(rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_not_knowing_the_onset_costs_its_mean(fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     rows = 400
     found = -0.5 * ((np.arange(rows) - 211) / 15.0) ** 2 - 100 + 0.01 * rng.standard_normal(rows)
     want = float(np.log(np.exp(found - found.max()).mean()))

@@ -8,7 +8,10 @@ from numpy.typing import NDArray
 
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.search.outliers import heavy_tails
+from tests.bars import log_odds
 from tests.gap.records import Float, drawn_errors
+
+pytestmark = pytest.mark.statistical
 
 ROWS = 6000
 
@@ -55,7 +58,7 @@ def test_normal_noise_has_no_outliers(rotating_seed: int) -> None:
         found = heavy_tails(errors, 0.05)
         evidence.append(found.evidence)
         assert found.hit.sum() <= 6
-    assert max(evidence) < np.log(20 / 1e-5)  # 20 drives, together wrong once in 100 000
+    assert max(evidence) < log_odds(20)
     # 6 of 20 once in two million, were one drive in 70 above 0 (the 95 % bound of none in 200)
     assert sum(x > 0 for x in evidence) <= 5
 
@@ -80,5 +83,5 @@ def test_noise_that_grows_rougher_has_no_outliers(rotating_seed: int) -> None:
         errors = 0.05 * rng.standard_normal(ROWS)
         errors[ROWS // 2 :] *= 3.0
         found = heavy_tails(errors, 0.05)
-        assert found.evidence < np.log(6 / 1e-5)
+        assert found.evidence < log_odds(6)
         assert found.hit.sum() <= 12

@@ -67,6 +67,7 @@ PAIRS: dict[str, tuple[Effect, Effect]] = {
 }
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("name", PAIRS)
 def test_the_true_second_effect_is_ranked_first(name: str, rotating_seed: int) -> None:
     first, second = PAIRS[name]
@@ -84,6 +85,7 @@ def test_the_true_second_effect_is_ranked_first(name: str, rotating_seed: int) -
     assert gains[order[0]] > 20
 
 
+@pytest.mark.statistical
 def test_a_gain_is_told_before_it_is_fitted(rotating_seed: int) -> None:
     """What one linear step foretells of a faint second effect is what the fit finds."""
     record, white = _drive(plant([SensorBias(0.1), ConstantResistance(0.1)]), np.random.default_rng(rotating_seed))
@@ -131,6 +133,7 @@ def test_what_the_base_itself_can_do_is_no_gain(sign: int, kind: type[Effect]) -
     assert 0 <= gain < 0.001 * worth
 
 
+@pytest.mark.statistical
 def test_a_second_gain_is_no_second_effect(rotating_seed: int) -> None:
     record, white = _drive(plant(T_L=0.4, K_L=1.25), np.random.default_rng(rotating_seed))
     base = Hypothesis(record, (), plant())
@@ -143,6 +146,7 @@ def test_a_second_gain_is_no_second_effect(rotating_seed: int) -> None:
     assert 0 <= gain < 12.5  # half of a chi-squared with one degree of freedom, at five standard deviations
 
 
+@pytest.mark.statistical
 def test_a_slope_of_the_base_is_taken_out_too(rotating_seed: int) -> None:
     """Uphill a resistance does what the hill does."""
     climb = 0.5 + np.abs(np.random.default_rng(rotating_seed).standard_normal(20))
@@ -164,6 +168,7 @@ def test_a_slope_of_the_base_is_taken_out_too(rotating_seed: int) -> None:
     assert max(sloped) < 0.02 * worth
 
 
+@pytest.mark.statistical
 def test_a_slope_as_the_second_effect_is_fitted(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     climb = 0.5 + np.abs(rng.standard_normal(20))
@@ -221,6 +226,7 @@ def test_a_pair_comes_to_rest_at_the_truth_from_a_new_start_only(case: str) -> N
     assert found.onset is None
 
 
+@pytest.mark.statistical
 def test_a_pair_that_sets_in_late_keeps_its_onset(rotating_seed: int) -> None:
     pair = (ConstantResistance, DeadTime)
     truth = {"T_L": 0.3, "K_L": 1.0, "constant_resistance.resistance_mps2": 0.2, "dead_time.delay_s": 0.25}
@@ -258,6 +264,7 @@ def _with(record: Record, measured: Float) -> Record:
     return replace(record, **columns)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("wrong", [SpeedDependentLag, SensorScale])
 def test_the_wrong_half_of_a_pair_is_exchanged(wrong: type[Effect], rotating_seed: int) -> None:
     car = plant([ConstantResistance(0.2), DeadTime(0.25)], T_L=0.35, K_L=0.95)
@@ -285,6 +292,7 @@ def _no_pair_again(others: Sequence[Screened], here: Screened, tries: int) -> No
     assert len({k.hypothesis.name for k in others}) == len(others)
 
 
+@pytest.mark.statistical
 def test_of_a_right_pair_nothing_is_exchanged_for_better(rotating_seed: int) -> None:
     car = plant([ConstantResistance(0.2), DeadTime(0.25)], T_L=0.35, K_L=0.95)
     record, white = _drive(car, np.random.default_rng(rotating_seed))

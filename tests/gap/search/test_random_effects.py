@@ -106,6 +106,7 @@ def _log(effects: list[Effect], seed: int, *, seconds: float = 50.0, rate: int =
     return Log.from_arrays(time=time, accel_cmd=command, accel=accel, speed=speed)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("kind", ALL)
 def test_it_is_named_where_it_acts(kind: type[Effect], rotating_seed: int) -> None:
     found = avtorch.diagnose(_log([kind()], rotating_seed), effects=["dead_time", kind], pairs=False)
@@ -124,6 +125,7 @@ def test_it_is_named_where_it_acts(kind: type[Effect], rotating_seed: int) -> No
         assert [e.name for e in again.effects] == [kind.name]
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("kind", ALL)
 def test_it_is_not_named_where_it_does_not(kind: type[Effect], rotating_seed: int) -> None:
     found = avtorch.diagnose(_log([], rotating_seed), effects=["dead_time", kind], pairs=False)
@@ -134,6 +136,7 @@ def test_it_is_not_named_where_it_does_not(kind: type[Effect], rotating_seed: in
     assert kind.name in found.scope.scored
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ALL)
 def test_a_pair_with_the_leading_effect(kind: type[Effect], rotating_seed: int) -> None:
@@ -147,6 +150,7 @@ def test_a_pair_with_the_leading_effect(kind: type[Effect], rotating_seed: int) 
     assert f"{kind.name}.{kind.parameters[0].name}" in told
 
 
+@pytest.mark.statistical
 def test_one_derived_from_a_built_in_is_a_users_own(rotating_seed: int) -> None:
     """It has the built-in's class behind it, not its name: it must not be searched, and reported, under that."""
 

@@ -77,6 +77,7 @@ def _sound(race: SearchResult) -> None:
     assert np.isfinite(evidence).all()
 
 
+@pytest.mark.statistical
 def test_none_stays_none(rotating_seed: int) -> None:
     race = _search(_log({}, rotating_seed), [DeadTime, ConstantResistance, *SENSOR])
     _sound(race)
@@ -87,6 +88,7 @@ def test_none_stays_none(rotating_seed: int) -> None:
     assert race.none.values["T_L"] == pytest.approx(Car().T_L, rel=0.2)
 
 
+@pytest.mark.statistical
 def test_a_pair_is_found(rotating_seed: int) -> None:
     log = _log({"dead_time": {"delay_s": 0.25}, "sensor_bias": {"bias_mps2": 0.15}}, rotating_seed)
     race = _search(log, [DeadTime, ConstantResistance, *SENSOR])
@@ -103,6 +105,7 @@ def test_a_pair_is_found(rotating_seed: int) -> None:
     assert {f.name for f in alone.found} == {"none", "dead_time", "sensor_bias"}
 
 
+@pytest.mark.statistical
 def test_what_is_far_behind_at_first_sight_is_not_fitted_anew(tmp_path: Path, rotating_seed: int) -> None:
     """The plain cause and what comes near it get noise of their own; what does nothing keeps its first figure."""
     path = tmp_path / "fits.json"
@@ -124,13 +127,13 @@ def test_what_is_far_behind_at_first_sight_is_not_fitted_anew(tmp_path: Path, ro
     assert [(done, of) for what, done, of in told if what == "single effects"] == [(0, 3), (1, 3), (2, 3)]
 
 
-def test_the_best_of_equal_names_is_kept(rotating_seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_best_of_equal_names_is_kept(fresh_seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     def three(self: Search, record: Record, none: FittedModel) -> list[FittedModel]:
         more = [replace(none, name="twice", log_evidence=none.log_evidence + x, grade_rms=x) for x in (2.0, 5.0, 3.0)]
         return [none, *more, replace(none, name="behind", log_evidence=none.log_evidence - 4)]
 
     monkeypatch.setattr(Search, "_deterministic", three)
-    race = _search(_log({}, rotating_seed, seconds=20.0), [SensorBias])
+    race = _search(_log({}, fresh_seed, seconds=20.0), [SensorBias])
     assert [f.name for f in race.found] == ["twice", "none", "behind"]
     assert race.best.grade_rms == 5.0
 
@@ -140,6 +143,7 @@ def _steps(rng: np.random.Generator, seconds: float = 50.0) -> Float:
     return np.repeat(rng.uniform(-1.5, 1.5, round(2 * seconds)), 10)
 
 
+@pytest.mark.statistical
 def test_lost_messages_on_top_of_a_single_effect(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     effects = {"sensor_bias": {"bias_mps2": 0.2}, "command_hold": {"hold_fraction": 0.4}}
@@ -161,6 +165,7 @@ def test_lost_messages_on_top_of_a_single_effect(rotating_seed: int) -> None:
     assert evidence["command_hold"] < evidence["sensor_bias"]
 
 
+@pytest.mark.statistical
 def test_lost_messages_alone(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     log = _log({"command_hold": {"hold_fraction": 0.4}}, int(rng.integers(2**31)), command=_steps(rng))
@@ -172,6 +177,7 @@ def test_lost_messages_alone(rotating_seed: int) -> None:
     assert _evidence(race)["command_hold"] < 12
 
 
+@pytest.mark.statistical
 def test_lost_messages_alone_are_judged_where_they_look_like_a_delay(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     log = _log({"command_hold": {"hold_fraction": 0.4}}, int(rng.integers(2**31)), command=_steps(rng))
@@ -180,8 +186,8 @@ def test_lost_messages_alone_are_judged_where_they_look_like_a_delay(rotating_se
     assert "command_hold" in {f.name for f in race.found}
 
 
-def test_an_effect_that_the_log_cannot_show_is_not_tried(rotating_seed: int) -> None:
-    log = _log({}, rotating_seed, seconds=30.0)
+def test_an_effect_that_the_log_cannot_show_is_not_tried(fresh_seed: int) -> None:
+    log = _log({}, fresh_seed, seconds=30.0)
     blind = Log.from_arrays(time=log.time, accel_cmd=log.accel_cmd, accel=log.accel)
     race = _search(blind, [AerodynamicDrag, SensorBias])
     assert {f.name for f in race.found} == {"none", "sensor_bias"}
@@ -190,12 +196,13 @@ def test_an_effect_that_the_log_cannot_show_is_not_tried(rotating_seed: int) -> 
     assert {f.name for f in race.found} == {"none", "aerodynamic_drag"}
 
 
-def test_out_of_time_it_says_so(rotating_seed: int) -> None:
-    race = _search(_log({}, rotating_seed, seconds=30.0), [SensorBias, DeadTime], budget_s=0.0)
+def test_out_of_time_it_says_so(fresh_seed: int) -> None:
+    race = _search(_log({}, fresh_seed, seconds=30.0), [SensorBias, DeadTime], budget_s=0.0)
     assert not race.complete
     assert [f.name for f in race.found] == ["none"]
 
 
+@pytest.mark.statistical
 def test_a_cause_that_sets_in_is_found_with_its_onset(rotating_seed: int) -> None:
     log = _log({"dead_time": {"delay_s": 0.3}}, rotating_seed, onset=30.0)
     race = _search(log, [DeadTime, SensorScale], pairs=False)

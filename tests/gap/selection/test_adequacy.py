@@ -29,6 +29,7 @@ def quiet() -> Record:
     return Record.of(log_of(noise=None, seconds=240.0))
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize("channels", [BOTH, ("accel",), ("speed",)])
 def test_nothing_is_left_of_noise(channels: tuple[str, ...], rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
@@ -39,6 +40,7 @@ def test_nothing_is_left_of_noise(channels: tuple[str, ...], rotating_seed: int)
         assert left.total < CHANCE
 
 
+@pytest.mark.statistical
 def test_a_loop_that_feeds_noise_back_feigns_nothing(rotating_seed: int) -> None:
     """Cruise at 100 Hz on noisy readings, rows in groups of five."""
     rng = np.random.default_rng(rotating_seed)
@@ -93,6 +95,7 @@ def _rough(record: Record, rng: np.random.Generator) -> Float:
     return np.stack([size * rng.standard_normal(record.rows), np.zeros(record.rows)])[..., None]
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("put_in", "name"),
     [
@@ -112,8 +115,8 @@ def test_structure_is_seen_by_its_own_question(
     assert left.total > CHANCE
 
 
-def test_what_random_causes_explain_is_taken_off(quiet: Record, rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_what_random_causes_explain_is_taken_off(quiet: Record, fresh_seed: int) -> None:
+    rng = np.random.default_rng(fresh_seed)
     errors = errors_of(QUIET, quiet, rng) + _bent(quiet, rng)
     whole, less = _left(quiet, errors), _left(quiet, errors, explained=10.0)
     none = _left(quiet, errors, explained=1e6)

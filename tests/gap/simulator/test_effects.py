@@ -12,6 +12,7 @@ from avtorch import gap
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, Drive, Effect, GapPlant, plant
 from avtorch.vehicle import GLVDPlant
+from tests.bars import BAR
 from tests.gap.drives import drive_of, driven, filled, smooth_drive
 
 D = torch.float64
@@ -315,35 +316,40 @@ def test_random_effects_have_no_deterministic_response(cls: type[Effect]) -> Non
     assert any(x is not None for x in vars(change).values())
 
 
-def test_gust_is_the_process_it_names(rotating_seed: int) -> None:
-    sd, tau, dt, rows, count = 0.3, 2.0, 0.1, 400, 400
+@pytest.mark.statistical
+def test_gust_is_the_process_it_names(rotating_seed: int, draws_factor: int) -> None:
+    sd, tau, dt, rows, count = 0.3, 2.0, 0.1, 400, 400 * draws_factor
     time = torch.arange(rows, dtype=D) * dt
     drive = Drive(time, torch.zeros(count, rows, dtype=D))
     force = plant([gap.Gust(sd, tau)]).response(drive, generator=torch.Generator().manual_seed(rotating_seed)).accel
     effective = count * rows * dt / (2 * tau)  # independent pieces of an OU process
-    assert float(force.square().mean()) == pytest.approx(sd**2, abs=5 * sd**2 * math.sqrt(2 / effective))
+    assert float(force.square().mean()) == pytest.approx(sd**2, abs=BAR * sd**2 * math.sqrt(2 / effective))
     lag = round(tau / dt)
     together = (force[:, lag:] * force[:, :-lag]).mean() / sd**2
-    assert float(together) == pytest.approx(math.exp(-1), abs=5 * math.sqrt(2 / effective))
+    assert float(together) == pytest.approx(math.exp(-1), abs=BAR * math.sqrt(2 / effective))
     car = plant([gap.Gust(sd, tau)], sigma=0.0, seed=rotating_seed % 10**6)
-    stepped = driven(car, seconds=4.0, scenarios=600).accel - driven(GLVDPlant(sigma=0.0), seconds=4.0).accel
+    stepped = (
+        driven(car, seconds=4.0, scenarios=600 * draws_factor).accel - driven(GLVDPlant(sigma=0.0), seconds=4.0).accel
+    )
     spread = stepped[:, -1].square().mean()
-    assert float(spread) == pytest.approx(sd**2, abs=5 * sd**2 * math.sqrt(2 / 600))
+    assert float(spread) == pytest.approx(sd**2, abs=BAR * sd**2 * math.sqrt(2 / len(stepped)))
 
 
-def test_outliers_come_as_often_and_as_large_as_told(rotating_seed: int) -> None:
-    rows, fraction, scale = 200_000, 0.03, 8.0
+@pytest.mark.statistical
+def test_outliers_come_as_often_and_as_large_as_told(rotating_seed: int, draws_factor: int) -> None:
+    rows, fraction, scale = 200_000 * draws_factor, 0.03, 8.0
     time = torch.arange(rows, dtype=D) * 0.1
     car = plant([gap.Outliers(fraction, scale, 0.05)])
     r = car.response(Drive(time, torch.zeros_like(time)), generator=torch.Generator().manual_seed(rotating_seed))
     error = r.accel_measured[r.accel_measured != 0]
-    assert len(error) / rows == pytest.approx(fraction, abs=5 * math.sqrt(fraction / rows))
+    assert len(error) / rows == pytest.approx(fraction, abs=BAR * math.sqrt(fraction / rows))
     size = scale * 0.05
-    assert float(error.square().mean()) == pytest.approx(size**2, abs=5 * size**2 * math.sqrt(2 / len(error)))
+    assert float(error.square().mean()) == pytest.approx(size**2, abs=BAR * size**2 * math.sqrt(2 / len(error)))
 
 
-def test_lost_messages_have_the_mean_square_that_is_told(rotating_seed: int) -> None:
-    p, rows, count = 0.2, 60, 20_000
+@pytest.mark.statistical
+def test_lost_messages_have_the_mean_square_that_is_told(rotating_seed: int, draws_factor: int) -> None:
+    p, rows, count = 0.2, 60, 20_000 * draws_factor
     u = torch.sin(torch.arange(rows, dtype=D) * 0.3)
     effect = gap.CommandHold(p)
     row = gap.Row(torch.arange(rows, dtype=D), torch.tensor(0.1, dtype=D), None, None, torch.ones(1), torch.ones(1))
@@ -352,7 +358,7 @@ def test_lost_messages_have_the_mean_square_that_is_told(rotating_seed: int) -> 
     seen = (held - u).square()
     told = effect.noise(u).command_variance
     assert told is not None
-    far = 5.5 * seen.std(0) / math.sqrt(count) + 1e-9  # 60 rows are looked at
+    far = BAR * seen.std(0) / math.sqrt(count) + 1e-9
     assert bool(((seen.mean(0) - told).abs() < far)[20:].all())
     # step by step the very same messages are lost
     state, out = effect.start(u[0], row), []
@@ -362,6 +368,7 @@ def test_lost_messages_have_the_mean_square_that_is_told(rotating_seed: int) -> 
     assert torch.equal(torch.stack(out, -1), held)
 
 
+@pytest.mark.statistical
 def test_slope_has_the_size_it_names(rotating_seed: int) -> None:
     effect = gap.RoadGrade(0.03, knots=40)
     position = torch.linspace(0, 36 * effect.knot_m, 300, dtype=D)

@@ -254,6 +254,7 @@ def test_drives_of_logs() -> None:
 # parameters ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.statistical
 def test_parameters_are_standard_normals_in_z(rotating_seed: int) -> None:
     for p in plant([cls for n, cls in EFFECTS.items() if n != "road_grade"]).parameters().values():
         z = torch.tensor([-1.2815515655, 0.0, 1.2815515655], dtype=D)

@@ -44,8 +44,8 @@ def _stepped(start: Tensor, parts: list[Substep], jerk: Tensor) -> Tensor:
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("limit", [0.3, 2.0, 1e3])
-def test_rows_are_the_closed_form(batch: tuple[int, ...], count: int, limit: float, rotating_seed: int) -> None:
-    g = torch.Generator().manual_seed(rotating_seed)
+def test_rows_are_the_closed_form(batch: tuple[int, ...], count: int, limit: float, fresh_seed: int) -> None:
+    g = torch.Generator().manual_seed(fresh_seed)
     parts = _parts(batch, g, count)
     start = torch.randn(batch, generator=g, dtype=D)
     jerk = limit * (0.5 + torch.rand(*batch, 1, generator=g, dtype=D))
@@ -55,9 +55,9 @@ def test_rows_are_the_closed_form(batch: tuple[int, ...], count: int, limit: flo
 
 
 @pytest.mark.parametrize("limit", [0.3, 2.0, 1e3, float("inf")])
-def test_rows_are_the_actuators_steps(limit: float, rotating_seed: int) -> None:
+def test_rows_are_the_actuators_steps(limit: float, fresh_seed: int) -> None:
     """`over` is built on the rows, `step` is not."""
-    g = torch.Generator().manual_seed(rotating_seed)
+    g = torch.Generator().manual_seed(fresh_seed)
     parts = _parts((4,), g, 2)
     start = torch.randn(4, generator=g, dtype=D)
     jerk = torch.full((4, 1), limit, dtype=D)
@@ -73,8 +73,8 @@ def test_rows_are_the_actuators_steps(limit: float, rotating_seed: int) -> None:
     torch.testing.assert_close(gained, torch.stack(speeds, -1), rtol=0, atol=1e-10)
 
 
-def test_slewed_rows_are_the_closed_form(rotating_seed: int) -> None:
-    g = torch.Generator().manual_seed(rotating_seed)
+def test_slewed_rows_are_the_closed_form(fresh_seed: int) -> None:
+    g = torch.Generator().manual_seed(fresh_seed)
     parts = _parts((3,), g, 2)
     start, jerk = torch.randn(3, generator=g, dtype=D), torch.full((3, 1), 1.5, dtype=D)
     got, state = by_rows(slewed_row, start, parts, jerk), start
@@ -104,11 +104,9 @@ def test_shapes_broadcast_and_nothing_is_differentiated() -> None:
 
 
 @pytest.mark.parametrize("limit", [0.05, 0.5, 5.0])
-def test_stretches_side_by_side_are_one_drive(
-    limit: float, rotating_seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stretches_side_by_side_are_one_drive(limit: float, fresh_seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where the limit binds for most of the drive and nothing is forgotten."""
-    g = torch.Generator().manual_seed(rotating_seed)
+    g = torch.Generator().manual_seed(fresh_seed)
     rows = 3 * rate_limited._SHORTEST + 17
     target = torch.cumsum(0.2 * torch.randn(rows, generator=g, dtype=D), 0)
     length = 0.01 + 0.04 * torch.rand(2, rows, generator=g, dtype=D)

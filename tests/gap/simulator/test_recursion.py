@@ -23,8 +23,8 @@ def looped(alpha: torch.Tensor, beta: torch.Tensor, x: torch.Tensor) -> torch.Te
 
 @pytest.mark.parametrize("steps", [1, 2, 31, 32, 33, 100, 1025])
 @pytest.mark.parametrize("constant", [False, True])
-def test_scan_is_the_loop(steps: int, constant: bool, rotating_seed: int) -> None:
-    torch.manual_seed(rotating_seed)
+def test_scan_is_the_loop(steps: int, constant: bool, fresh_seed: int) -> None:
+    torch.manual_seed(fresh_seed)
     alpha, beta, start = (
         torch.rand(3, 1 if constant else steps, dtype=D),
         torch.randn(3, steps, dtype=D),
@@ -46,8 +46,8 @@ def test_scan_broadcasts() -> None:
 
 
 @pytest.mark.parametrize("steps", [6, 40])
-def test_pair_is_the_loop(steps: int, rotating_seed: int) -> None:
-    torch.manual_seed(rotating_seed)
+def test_pair_is_the_loop(steps: int, fresh_seed: int) -> None:
+    torch.manual_seed(fresh_seed)
     m = [0.6 * torch.randn(2, steps, dtype=D) for _ in range(4)]
     b = [torch.randn(2, steps, dtype=D) for _ in range(2)]
     x = [torch.randn(2, dtype=D) for _ in range(2)]

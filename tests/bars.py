@@ -1,0 +1,43 @@
+"""How far a statistical test may find a number from the truth: bars that follow from the number of comparisons.
+
+In one of a hundred runs of the whole suite a correct program is to miss a bar. The comparisons share that evenly: each
+may fail by chance in one of a million, and its bar lies 4.9 standard errors off, which comments round to 5 sigma. What
+misses one is drawn once more; three such tests in one run, which fail it, are a chance of one in several million.
+"""
+
+from __future__ import annotations
+
+import math
+
+from scipy import stats
+
+ALARM = 0.01
+"""Of runs of the whole suite, how many miss a bar by chance."""
+TESTS = 230
+"""Test functions marked `statistical`; `tests/test_statistical.py` holds it to their number within a factor of two."""
+PER_TEST = 40
+"""Comparisons of one: its cases, times windows, parameters, moments or lags. A factor of two moves the bar by 0.14."""
+LEVEL = ALARM / (TESTS * PER_TEST)
+"""Probability with which one comparison may fail by chance: the bar of a p-value."""
+
+
+def sigmas(level: float = LEVEL) -> float:
+    """Two-sided bar of a normal error, in standard errors."""
+    return float(stats.norm.isf(level / 2))
+
+
+BAR = sigmas()
+
+
+def student(degrees: float, level: float = LEVEL) -> float:
+    """The same where the standard error comes from so few numbers that it is uncertain itself."""
+    return float(stats.t.isf(level / 2, degrees))
+
+
+def log_odds(count: int = 1) -> float:
+    """What the largest of `count` log likelihood ratios against the truth [nats] stays below.
+
+    A ratio's mean is 1 under the truth, so that it exceeds x nats with a probability of exp(-x) at most. It is most of
+    what its test asks, and has the level of a whole test.
+    """
+    return math.log(count / (PER_TEST * LEVEL))
