@@ -10,10 +10,18 @@ _NAME, _NAMES = 24, 12  # characters of a name in a list, and names
 
 
 class InputError(ValueError):
-    """Bad input, told in one line: the argument, or the file, row and column; what was found; what would be right.
+    """Bad input, reported in one line: the argument, or the file, row and column; what was found; what would be right.
 
     Whatever text a file brought into the message, it stays one printable line of at most 1000 characters. The command
     line prints it to stderr and exits with code 2.
+
+    Example:
+        >>> from avtorch import GLVD, InputError
+        >>> try:
+        ...     GLVD(T_L=-0.3, K_L=1.0)
+        ... except InputError as error:
+        ...     print(error)
+        T_L: found -0.3, needs finite and > 0 s
     """
 
     def __init__(self, message: object = "") -> None:

@@ -1,4 +1,11 @@
-"""The honest check: a reference vehicle that shares no code with the diagnosis, sealed cases, and their score."""
+"""The honest check: a reference vehicle that shares no code with the diagnosis, sealed cases, and their score.
+
+Example:
+    >>> from avtorch.blindtest import draw_case
+    >>> case = draw_case(0, seed=1, mix={"none": 1.0}, seconds=20.0)
+    >>> case.truth_name, case.log().accel_cmd is None
+    ('none', False)
+"""
 
 from avtorch.blindtest.car import Car, draw_car
 from avtorch.blindtest.case import Case, write

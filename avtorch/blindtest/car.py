@@ -20,6 +20,12 @@ class Car:
     (an Ornstein-Uhlenbeck process of time constant `T_L`); `accel_sd` [m/s²] and `speed_sd` [m/s] are white sensor
     noise, one draw a row; `speed_quantum` [m/s] is the speed signal's last digit (0: none). Raises `InputError` for
     values that are negative, and for a lag of zero.
+
+    Example:
+        >>> from avtorch.blindtest import Car
+        >>> car = Car(T_L=0.5, accel_sd=0.05)
+        >>> car.silent().accel_sd, car.silent().T_L
+        (0.0, 0.5)
     """
 
     T_L: float = 0.4
@@ -40,7 +46,15 @@ class Car:
 
 
 def draw_car(rng: np.random.Generator) -> Car:
-    """A car of ordinary actuation: lag 0.15 to 0.9 s, gain 0.8 to 1.1, noise of production sensors."""
+    """A car of ordinary actuation: lag 0.15 to 0.9 s, gain 0.8 to 1.1, noise of production sensors.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.blindtest import draw_car
+        >>> car = draw_car(np.random.default_rng(0))
+        >>> 0.15 <= car.T_L <= 0.9, 0.8 <= car.K_L <= 1.1
+        (True, True)
+    """
 
     def between(low: float, high: float) -> float:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))

@@ -36,6 +36,12 @@ class Case:
     drive. `oracles`: rollout errors by metric of GLVD and of one who knows the cause. `without`, `with_cause`
     (row,) [m/s²]: noise-free measured acceleration under the log's own command of this car without the cause, and
     with it as far as it can be foretold.
+
+    Example:
+        >>> from avtorch.blindtest import draw_case
+        >>> case = draw_case(0, seed=1, mix={"single": 1.0}, effects=["sensor_bias"], tiers=["easy"], seconds=20.0)
+        >>> case.truth_name, case.tier, "sensor_bias" in str(case.log())  # the log does not tell
+        ('sensor_bias', 'easy', False)
     """
 
     index: int
@@ -125,6 +131,12 @@ def write(case: Case, folder: str | os.PathLike[str]) -> Path:
     """Write `folder/logs/NAME.csv`, which a diagnosis may see, and `folder/truth/NAME.json`, which it may not.
 
     Returns the path of the log. Both files appear whole or not at all, the truth first.
+
+    Example:
+        >>> from avtorch.blindtest import draw_case, write
+        >>> path = write(draw_case(0, seed=1, mix={"none": 1.0}, seconds=10.0), "cases")
+        >>> path.parent.name, path.suffix
+        ('logs', '.csv')
     """
     path = Path(folder) / "logs" / f"{case.name}.csv"
     write_json(Path(folder) / "truth" / f"{case.name}.json", case.truth())

@@ -53,6 +53,11 @@ def draw_cases(
     cause, or else its plainest drive stands, in the tier it has.
 
     Raises `InputError` for unknown kinds, tiers, effects or signals.
+
+    Example:
+        >>> from avtorch.blindtest import draw_cases
+        >>> [case.truth_name for case in draw_cases(2, seed=1, mix={"none": 1.0}, seconds=10.0)]
+        ['none', 'none']
     """
     for i in range(start, start + n):
         yield draw_case(
@@ -80,7 +85,14 @@ def draw_case(
     manoeuvre: str | None = None,
     signals: Sequence[str] = SIGNALS,
 ) -> Case:
-    """One case; arguments as `draw_cases`."""
+    """Draw case `index` of the set `seed`; the other arguments, and what raises `InputError`, as in `draw_cases`.
+
+    Example:
+        >>> from avtorch.blindtest import draw_case
+        >>> case = draw_case(0, seed=1, mix={"single": 1.0}, effects=["dead_time"], tiers=["easy"], seconds=20.0)
+        >>> case.truth_name, case.tier
+        ('dead_time', 'easy')
+    """
     if set(tiers) - TIERS.keys() or not tiers:
         raise InputError(f"tiers: found {tuple(tiers)}, needs some of {', '.join(TIERS)}")
     if set(effects) - EFFECTS.keys() or not effects:

@@ -28,6 +28,12 @@ class Family:
 
     `by_chance`: nobody can foretell what it does row by row, so no rollout shows it, only the predictive density.
     `suits`: the manoeuvres in which it can show at all (empty: all of them).
+
+    Example:
+        >>> from avtorch.blindtest import Family, family
+        >>> dead_time: Family = family("dead_time")
+        >>> dead_time.place, dead_time.by_chance
+        ('command', False)
     """
 
     name: str
@@ -219,7 +225,14 @@ EFFECTS: dict[str, Family] = {
         Family("outliers", "sensor", _outliers, 6.0, by_chance=True),
     )
 }
-"""The 22 effects of the table, by name."""
+"""The 22 effects of the table, by name.
+
+Example:
+    >>> from avtorch.blindtest import EFFECTS
+    >>> from avtorch.gap import EFFECTS as KNOWN
+    >>> sorted(EFFECTS) == sorted(KNOWN)  # the table, on either side
+    True
+"""
 
 CALIBRATION: dict[str, Family] = {
     family.name: family
@@ -232,7 +245,13 @@ CALIBRATION: dict[str, Family] = {
         Family("wheel_slip", "sensor", _fixed(slip_s=0.15), 8.0),
     )
 }
-"""Families outside the table that may serve to calibrate `unknown`, by name."""
+"""Families outside the table that may serve to calibrate `unknown`, by name.
+
+Example:
+    >>> from avtorch.blindtest import CALIBRATION, EFFECTS, SEALED
+    >>> bool(CALIBRATION.keys() & (EFFECTS.keys() | SEALED.keys()))  # no family is in two groups
+    False
+"""
 
 SEALED: dict[str, Family] = {
     family.name: family
@@ -246,11 +265,24 @@ SEALED: dict[str, Family] = {
         Family("tyre_radius", "sensor", _fixed(growth=0.03), 5.0),
     )
 }
-"""Families outside the table that never do, by name."""
+"""Families outside the table that never do, by name.
+
+Example:
+    >>> from avtorch.blindtest import SEALED, draw_case
+    >>> case = draw_case(0, seed=1, mix={"outside": 1.0}, seconds=20.0)
+    >>> case.names[0] in SEALED, case.truth_name
+    (True, 'unknown')
+"""
 
 
 def family(name: str) -> Family:
-    """The cause of that name. Raises `InputError` for an unknown one."""
+    """The cause of that name. Raises `InputError` for an unknown one.
+
+    Example:
+        >>> from avtorch.blindtest import family
+        >>> family("command_hold").by_chance, family("dead_time").by_chance
+        (True, False)
+    """
     for group in (EFFECTS, CALIBRATION, SEALED):
         if name in group:
             return group[name]

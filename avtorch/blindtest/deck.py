@@ -9,7 +9,13 @@ import numpy as np
 from avtorch.errors import InputError
 
 MIX: dict[str, float] = {"none": 0.25, "single": 0.40, "pair": 0.20, "outside": 0.15}
-"""Shares of the kinds of case."""
+"""Shares of the kinds of case.
+
+Example:
+    >>> from avtorch.blindtest import MIX
+    >>> round(sum(MIX.values()), 6), max(MIX, key=MIX.get)
+    (1.0, 'single')
+"""
 _ROUND = 20
 
 

@@ -14,11 +14,31 @@ from avtorch.errors import InputError
 
 Manoeuvre = Literal["cruise", "following", "stop_and_go", "steps"]
 MANOEUVRES: tuple[Manoeuvre, ...] = get_args(Manoeuvre)
-"""Kinds of drive."""
+"""Kinds of drive.
+
+Example:
+    >>> import numpy as np
+    >>> from avtorch.blindtest import MANOEUVRES, draw_drive
+    >>> draw_drive(np.random.default_rng(0)).manoeuvre in MANOEUVRES
+    True
+"""
 DURATIONS_S = (60.0, 300.0, 900.0)
-"""Lengths of the drives [s]."""
+"""Lengths of the drives [s].
+
+Example:
+    >>> import numpy as np
+    >>> from avtorch.blindtest import DURATIONS_S, draw_drive
+    >>> draw_drive(np.random.default_rng(0)).seconds in DURATIONS_S
+    True
+"""
 RATES_HZ = (20, 25, 40, 50, 100)
-"""Rates of the logs [Hz]."""
+"""Rates of the logs [Hz].
+
+Example:
+    >>> from avtorch.blindtest import RATES_HZ
+    >>> [1000 % rate for rate in RATES_HZ]  # whole steps of the reference vehicle's 1 ms
+    [0, 0, 0, 0, 0]
+"""
 TYPICAL_SPEED_MPS = {"cruise": 25.0, "following": 16.0, "stop_and_go": 5.0, "steps": 17.0}
 """Speed around which an effect that depends on speed is drawn."""
 ACCEL_MAX_MPS2, ACCEL_MIN_MPS2 = 2.0, -3.5
@@ -29,6 +49,13 @@ class DrivePlan:
     """A drive to be made: `manoeuvre`, `seconds`, `rate_hz` of the log, `seed` of what the road has in store.
 
     Raises `InputError` for an unknown manoeuvre.
+
+    Example:
+        >>> from avtorch.blindtest import Car, Drive, simulate
+        >>> drive = Drive("steps", seconds=10.0, rate_hz=50, seed=3)
+        >>> run = simulate(Car(), drive.pilot(), seconds=drive.seconds, rate_hz=drive.rate_hz)
+        >>> len(run.time) == 500
+        True
     """
 
     manoeuvre: Manoeuvre
@@ -54,7 +81,15 @@ class DrivePlan:
 
 
 def draw_drive(rng: np.random.Generator, *, seconds: float | None = None, manoeuvre: str | None = None) -> DrivePlan:
-    """A drive of any kind; `seconds` and `manoeuvre` narrow it."""
+    """A drive of any kind; `seconds` and `manoeuvre` narrow it.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.blindtest import draw_drive
+        >>> drive = draw_drive(np.random.default_rng(0), seconds=60.0, manoeuvre="following")
+        >>> drive.seconds, drive.manoeuvre
+        (60.0, 'following')
+    """
     return DrivePlan(
         manoeuvre=MANOEUVRES[int(rng.integers(4))] if manoeuvre is None else manoeuvre,  # type: ignore[arg-type]
         seconds=float(rng.choice(DURATIONS_S)) if seconds is None else seconds,
@@ -150,6 +185,14 @@ class Recorded:
     """Sends a recorded command row by row, whatever the car does: an open loop.
 
     Args: `command` (row,) [m/s²]; `start_speed` [m/s].
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.blindtest import Car, Recorded, simulate
+        >>> pilot = Recorded(np.sin(np.arange(200) / 20), start_speed=20.0)
+        >>> run = simulate(Car().silent(), pilot, seconds=10.0, rate_hz=20)
+        >>> round(float(run.speed[0]), 1), len(run.command) == 200
+        (20.0, True)
     """
 
     def __init__(self, command: ArrayLike, *, start_speed: float) -> None:

@@ -89,6 +89,14 @@ def put_in_front(
         seed: of what is drawn (moments, roads, gusts, glitches).
 
     Raises `InputError` for an unknown effect, a log that lacks what it acts on, or a lag, gain or size out of range.
+
+    Example:
+        >>> from avtorch import Leader, simulate
+        >>> from avtorch.blindtest import put_in_front
+        >>> log = simulate(Leader.default(start=50.0, duration=20.0, dt=0.05)).log()
+        >>> changed, truth = put_in_front(log, "sensor_bias", T_L=0.3, K_L=1.0)
+        >>> truth, round(float((changed.accel - log.accel).mean()), 2)
+        ({'bias_mps2': 0.15415960099117626}, 0.15)
     """
     if effect not in IN_FRONT:
         raise InputError(f"effect: found {effect!r}, needs one of {', '.join(IN_FRONT)}")
@@ -245,7 +253,13 @@ IN_FRONT: Mapping[str, Callable[[_Bench], tuple[Log, Truth]]] = {
     "sensor_lag": _sensor_lag,
     "outliers": _outliers,
 }
-"""Effects that can be put in front of a recording, by name; the last four need `accel`."""
+"""Effects that can be put in front of a recording, by name; the last four need `accel`.
+
+Example:
+    >>> from avtorch.blindtest import EFFECTS, IN_FRONT
+    >>> sorted(EFFECTS.keys() - IN_FRONT.keys())[:3]  # some that cannot be put in front of a log
+    ['command_hold', 'driveline_oscillation', 'gear_shift']
+"""
 
 
 def _rows(log: Log, kept: NDArray[np.bool_]) -> Log:

@@ -45,6 +45,14 @@ def score(
 
     Args: `seconds` each answer took. `resamples`, `seed` of the bootstrap. Raises `InputError` for lengths that
     differ and for answers that break the schema.
+
+    Example:
+        >>> from avtorch.blindtest import draw_cases, score
+        >>> from avtorch.trial import reply
+        >>> cases = list(draw_cases(2, seed=1, mix={"none": 1.0}, seconds=10.0))
+        >>> answers = [reply(case.log(), {"none": 0.9, "dead_time": 0.1}, why="nothing to see") for case in cases]
+        >>> score([case.truth() for case in cases], answers, resamples=10)["false_alarm"]
+        0.0
     """
     if len(truths) != len(answers) or (seconds is not None and len(seconds) != len(truths)):
         raise InputError(f"answers: found {len(answers)} for {len(truths)} cases, needs one each")

@@ -49,6 +49,13 @@ class Run:
     that nobody can foretell (gusts, outliers), the latter summed likewise. `felt_accel`: what a late or wrongly scaled
     accelerometer shows of process noise and gusts beyond the noise itself.
     `true_accel`, `true_speed`, `position`: the car's own.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.blindtest import Car, Recorded, simulate
+        >>> run = simulate(Car(), Recorded(np.zeros(200), start_speed=20.0), seconds=10.0, rate_hz=20, seed=1)
+        >>> bool(np.allclose(run.accel - run.noise_accel, run.true_accel, atol=0.1))
+        True
     """
 
     time: Float
@@ -81,6 +88,15 @@ def simulate(
     Args: `effects`: parameters by name (`avtorch.blindtest.catalogue` draws them). The same `seed` gives the same
     noise, the same road and the same losses, whatever the effects are. Raises `InputError` for a rate that does not
     divide 1000, fewer than two rows, or an onset outside the drive.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.blindtest import Car, Recorded, simulate
+        >>> step = Recorded(np.where(np.arange(200) < 20, 0.0, 1.0), start_speed=20.0)
+        >>> late = {"dead_time": {"delay_s": 0.4}}
+        >>> run = simulate(Car(T_L=0.3).silent(), step, seconds=10.0, rate_hz=20, effects=late)
+        >>> round(float(run.time[np.argmax(run.accel > 0.01)]), 2)  # sent at 1 s
+        1.45
     """
     if rate_hz < 1 or 1000 % rate_hz:
         raise InputError(f"rate_hz: found {rate_hz}, needs a divisor of 1000")

@@ -31,7 +31,13 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 TIERS = {"easy": (3.0, np.inf), "medium": (1.6, 3.0), "hard": (1.15, 1.6), "faint": (1.02, 1.15)}
-"""Bounds of visibility by tier: how many times larger the error of rollouts is without the effect than with it."""
+"""Bounds of visibility by tier: how many times larger the error of rollouts is without the effect than with it.
+
+Example:
+    >>> from avtorch.blindtest import TIERS, tier_of
+    >>> [tier_of(low) for low, _ in TIERS.values()] == list(TIERS)
+    True
+"""
 HORIZON_S = 10.0
 _SETTLED_S = 2.0  # of a drive, in which no log tells what the actuator was at before
 _MOVING_MPS = 0.3
@@ -39,7 +45,13 @@ _LAGS_S = (0.02, 3.0)
 
 
 def tier_of(visibility: float) -> str | None:
-    """The tier a visibility falls in, None below 1.02."""
+    """The tier a visibility falls in, None below 1.02.
+
+    Example:
+        >>> from avtorch.blindtest import tier_of
+        >>> [tier_of(visibility) for visibility in (1.01, 1.1, 2.0)]
+        [None, 'faint', 'medium']
+    """
     return next((name for name, (low, high) in TIERS.items() if low <= visibility < high), None)
 
 
@@ -53,7 +65,14 @@ def glvd_response(command: Float, dt: float, T_L: float, K_L: float) -> Float:
 @dataclass(frozen=True)
 class Sight:
     """What a drive shows. `accel`, `speed`: visibility in one channel, 1 in one that is not logged; `T_L`, `K_L`: GLVD
-    refitted to the drive."""
+    refitted to the drive.
+
+    Example:
+        >>> from avtorch.blindtest import Sight
+        >>> seen = Sight(accel=1.7, speed=1.2, T_L=0.6, K_L=1.0)
+        >>> seen.most
+        1.7
+    """
 
     accel: float
     speed: float
@@ -116,7 +135,15 @@ def exact_gain(command: Float, dt: float, T_L: float) -> tuple[Float, Float]:
 
 
 def sight(run: Run, signals: Sequence[str] = ("accel", "speed")) -> Sight:
-    """How plainly the drive differs from any GLVD in the channels `signals`; the head of this file says how."""
+    """How plainly the drive differs from any GLVD in the channels `signals`; the head of this file says how.
+
+    Example:
+        >>> from avtorch.blindtest import Car, Drive, sight, simulate
+        >>> drive, effect = Drive("steps", seconds=20.0, rate_hz=50, seed=3), {"dead_time": {"delay_s": 0.5}}
+        >>> run = simulate(Car(), drive.pilot(), seconds=20.0, rate_hz=50, effects=effect)
+        >>> sight(run).accel > 1.15
+        True
+    """
     channel = _Witnesses(run)
     dt = float(run.time[1] - run.time[0])
     accel = run.accel - run.noise_accel
@@ -151,6 +178,12 @@ class Oracle:
 
     `closed` is what knowing the cause closes of the gap, None where there is none to close (`before` within 10 % of
     `floor`).
+
+    Example:
+        >>> from avtorch.blindtest import Oracle
+        >>> oracle = Oracle(before=0.5, after=0.2, floor=0.1)
+        >>> round(oracle.closed, 2)  # (0.5 - 0.2) of (0.5 - 0.1)
+        0.75
     """
 
     before: float

@@ -1,4 +1,12 @@
-"""What is done: detectors, Algorithm 2, the strategist, and the supervisor that closes the loop online."""
+"""What is done: detectors, Algorithm 2, the strategist, and the supervisor that closes the loop online.
+
+Example:
+    >>> from avtorch import GLVDPlant, Leader, Setting, estimate, simulate
+    >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(T_L=1.5, K_L=0.5))
+    >>> last = estimate(run.log(), estimator="map").windows[-1]
+    >>> round(last.window.belief.stat("T_L")["mean"], 1), last.report.names()
+    (1.4, ['stability', 'accepted_change'])
+"""
 
 from avtorch.decision.algorithm2 import Algorithm2, algorithm2
 from avtorch.decision.estimation import Estimates, estimate

@@ -41,6 +41,14 @@ class Algorithm2:
 
     `outside`: the estimate left the accepted boundary; `stable`: what the check said (checked or not, so that it can be
     shown); `lower_level_updated`, `time_gap_increased`, `gains_increased`: what was done.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.decision import Setting, algorithm2
+        >>> T_L, K_L = torch.tensor([0.3, 1.5], dtype=torch.float64), torch.tensor([1.0, 0.5], dtype=torch.float64)
+        >>> taken = algorithm2(T_L, K_L, Setting(scenarios=2), check="exact")  # a sound car and a degraded one
+        >>> taken.outside.tolist(), taken.lower_level_updated.tolist(), taken.setting.T_hat.tolist()
+        ([False, True], [False, True], [0.3, 1.5])
     """
 
     outside: Tensor
@@ -69,6 +77,14 @@ def algorithm2(
     what was accepted last. `check="print"` is Eq. 2 with the sufficient Eq. 3 at the estimate; `"exact"` the exact
     string condition. Raises `InputError` where the new time gap is not longer or a new gain not larger in size than
     the one in force, as the print demands, in a scenario that takes that branch.
+
+    Example:
+        >>> import torch
+        >>> from avtorch import Setting, algorithm2
+        >>> T_L, K_L = torch.tensor([1.33], dtype=torch.float64), torch.tensor([0.64], dtype=torch.float64)
+        >>> taken = algorithm2(T_L, K_L, Setting())  # the paper's estimate
+        >>> taken.time_gap_increased.item(), taken.setting.time_gap.item()
+        (True, 2.0)
     """
     T, K = torch.broadcast_tensors(torch.as_tensor(T_L, dtype=torch.float64), torch.as_tensor(K_L, dtype=torch.float64))
     around = (setting.T_hat, setting.K_hat) if accepted is None else accepted

@@ -38,6 +38,13 @@ class Estimates:
     log, looked at first; `setting` under which P(string stable) was asked: a log does not tell its controller;
     `estimator` by name; `accepted` (T_L [s], K_L [-]) of a sound car, with which `accepted_change` compares;
     `dead_time` [s] that commands were given.
+
+    Example:
+        >>> from avtorch import GLVDPlant, Leader, estimate, simulate
+        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
+        >>> estimates = estimate(run.log(), estimator="map")
+        >>> len(estimates.windows), estimates.form, estimates.excited_share
+        (2, 'jerk', 1.0)
     """
 
     windows: list[WatchedWindow]
@@ -100,6 +107,13 @@ def estimate(
 
     Raises `InputError` for a log without accel_cmd or without any row that counts, a form whose columns it lacks, a
     window longer than the log, or an estimator that is not known or cannot take the form.
+
+    Example:
+        >>> from avtorch import GLVDPlant, Leader, estimate, simulate
+        >>> run = simulate(Leader.default(start=50.0, duration=2.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
+        >>> window = estimate(run.log(), window=2.0).windows[0].window
+        >>> [round(window.belief.stat(name)["mean"], 1) for name in ("T_L", "K_L")]
+        [0.5, 0.9]
     """
     if log.accel_cmd is None:
         raise InputError(f"{log.name}: has no accel_cmd; T_L and K_L need the demanded acceleration")

@@ -52,7 +52,16 @@ back a slow one. k_s stays, as it is neutral (paper, table on gains). The paper'
 
 @dataclass(frozen=True)
 class Intrusiveness:
-    """Weights of the cost in this module's text; `margin` is the strategist's price of a setting that barely passes."""
+    """Weights of the cost in this module's text; `margin` is the strategist's price of a setting that barely passes.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.decision import Grid, Intrusiveness, Setting
+        >>> cautious = Grid(intrusiveness=Intrusiveness(gap=0.5))  # a longer time gap is thought of as cheap
+        >>> longer, fresh = Setting(time_gap=1.6), torch.tensor([False])
+        >>> [round(w(longer, Setting(), fresh).item(), 2) for w in (Intrusiveness(), cautious.intrusiveness)]
+        [3.3, 2.3]
+    """
 
     update: float = 1.0
     effort: float = 0.5
@@ -112,6 +121,15 @@ class Grid:
     of {1, 2, 3, 4} that may be used. gains_of_gap: for a controller whose gains follow from
     its time gap (an MPC's equivalent gains): (time gap [s]) -> triple; Strategies 3 and 4 are then not on offer. Raises
     `InputError` for an empty or impossible grid.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.decision import Grid, Setting
+        >>> grid = Grid(time_gaps=(1.0, 1.6, 2.5), allowed=frozenset({2}))
+        >>> T_L, K_L, known = torch.tensor([1.5]), torch.tensor([0.5]), torch.tensor([False])
+        >>> offer = grid.candidates(T_L, K_L, current=Setting(), default=Setting(), model_wrong=known)
+        >>> offer.setting.time_gap.unique().tolist()
+        [1.0, 1.6, 2.5]
     """
 
     time_gaps: Sequence[float] = DRIVER_TIME_GAPS

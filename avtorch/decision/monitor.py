@@ -31,10 +31,24 @@ from avtorch.errors import InputError
 from avtorch.inference.state import shaped_as
 
 DETECTORS = ("stability", "accepted_change", *DIVERGENCES, *CHARTS)
-"""All detectors, in order of precedence."""
+"""All detectors, in order of precedence.
+
+Example:
+    >>> from avtorch.decision import DETECTORS, Monitor
+    >>> monitor = Monitor(detectors=DETECTORS)  # all of them
+    >>> len(DETECTORS), DETECTORS[0]  # the first takes precedence
+    (8, 'stability')
+"""
 
 DEFAULT_DETECTORS = ("stability", "accepted_change")
-"""The detectors that alert unless told otherwise."""
+"""The detectors that alert by default.
+
+Example:
+    >>> from avtorch.decision import DEFAULT_DETECTORS, Monitor
+    >>> monitor = Monitor(detectors=(*DEFAULT_DETECTORS, "cusum"))
+    >>> monitor.detectors
+    ('stability', 'accepted_change', 'cusum')
+"""
 
 
 @dataclass(frozen=True)
@@ -43,6 +57,16 @@ class MonitorReport:
 
     `alerts` by detector's name, in order of precedence, bool; `statistics` by name: what each detector compared;
     `p_string_stable`, `p_local_stable` under the belief with the setting in force; `mean` (T_L [s], K_L [-]).
+
+    Example:
+        >>> import torch
+        >>> from avtorch.decision import Monitor, Setting
+        >>> T_L = torch.linspace(1.4, 1.6, 101, dtype=torch.float64).unsqueeze(0)  # (scenario, draw)
+        >>> report = Monitor().update(T_L, torch.full_like(T_L, 0.5), torch.tensor([True]), Setting())
+        >>> report.any.tolist(), report.p_string_stable.tolist()
+        ([True], [0.0])
+        >>> print(report.why("accepted_change"))
+        T_L 1.50 s, K_L 0.50 left what was accepted (0.30 s, 1.00) with probability 1.000
     """
 
     alerts: dict[str, Tensor]
@@ -100,6 +124,17 @@ class Monitor:
     is not GLVD to a per cent (0.1 and 0.03 kept them quiet, docs/detectors.md). dead_time [s]: of the vehicle, number
     or (scenario,). link_delay [s]: of the leader's acceleration where it is fed forward. Raises `InputError` for
     unknown detectors and numbers out of range.
+
+    Example:
+        >>> import torch
+        >>> from avtorch import Monitor, Setting
+        >>> g, monitor = torch.Generator().manual_seed(0), Monitor()
+        >>> noise = 0.05 * torch.randn(2, 1, 500, dtype=torch.float64, generator=g)
+        >>> for T_L, K_L in ((0.3, 1.0), (1.5, 0.5)):  # before and after the degradation
+        ...     report = monitor.update(T_L * noise[0].exp(), K_L * noise[1].exp(), torch.tensor([True]), Setting())
+        ...     print(report.names())
+        []
+        ['stability', 'accepted_change']
     """
 
     def __init__(

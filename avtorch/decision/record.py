@@ -11,7 +11,14 @@ from avtorch.vehicle.block import Block
 
 @dataclass(frozen=True)
 class Alert:
-    """`detector` was alarmed at `time_s`, the end of a window; `why` in one sentence."""
+    """`detector` was alarmed at `time_s`, the end of a window; `why` in one sentence.
+
+    Example:
+        >>> from avtorch.decision import Alert
+        >>> alert = Alert(time_s=28.0, detector="stability", why="P(string stable) is 0.02, below 0.90")
+        >>> f"{alert.time_s:g} s, {alert.detector}"
+        '28 s, stability'
+    """
 
     time_s: float
     detector: str
@@ -25,6 +32,13 @@ class Action:
     `strategies` lead to `setting` (of shape ``(1,)``) from the default; `sufficient` tells whether it meets the
     strategist's conditions. `peak_gain_true`: the exact peak gain at the true vehicle, None where there is no truth.
     `driver_delay_s`: where a driver was asked for the time gap, how long until it begins to move; else 0.
+
+    Example:
+        >>> from avtorch.decision import Action, Setting
+        >>> why, longer = "P(string stable) fell to 0.02", Setting(time_gap=2.5)
+        >>> action = Action(28.0, [2], longer, why, sufficient=True, p_string_stable=0.98, peak_gain_true=1.0)
+        >>> action.setting.as_dict()["time_gap_s"]
+        2.5
     """
 
     time_s: float
@@ -39,7 +53,15 @@ class Action:
 
 @dataclass(frozen=True)
 class SupervisedRun:
-    """What a supervised run leaves: `rows` (scenario, time), `windows`, and per scenario its `alerts` and `actions`."""
+    """What a supervised run leaves: `rows` (scenario, time), `windows`, and per scenario its `alerts` and `actions`.
+
+    Example:
+        >>> from avtorch import BeliefStream, ClosedLoop, Leader, Supervisor
+        >>> loop = ClosedLoop(Leader.default(start=50.0, duration=4.0, dt=0.02))
+        >>> run = Supervisor(loop, stream=BeliefStream(estimator="map")).run(4.0)
+        >>> tuple(run.rows.speed.shape), len(run.windows), run.alerts, run.actions
+        ((1, 200), 2, [[]], [[]])
+    """
 
     rows: Block
     windows: list[WatchedWindow]

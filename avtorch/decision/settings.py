@@ -36,6 +36,15 @@ class Setting:
     `gains` (k_s [1/s²], k_v [1/s], k_a [-]); `feedforward` k_f [-] on the leader's acceleration, 0 without a link.
     Plain numbers are broadcast. Raises `InputError` for values that are not positive (gains, feedforward: not finite)
     or shapes that do not go together.
+
+    Example:
+        >>> import torch
+        >>> from avtorch import Setting
+        >>> tried = Setting(time_gap=torch.tensor([1.0, 1.6, 2.5]))  # three scenarios
+        >>> tried.peak_gain(1.5, 0.5).round(decimals=2).tolist()
+        [2.24, 1.36, 1.0]
+        >>> tried.strategies(Setting(scenarios=3))
+        [set(), {2}, {2}]
     """
 
     T_hat: Tensor
@@ -214,6 +223,15 @@ class DesignBounds:
 
     The paper's further option (Section 4): instead of the handbook's [0.1, 0.4] s and [0.7, 1] the box is what the
     posterior holds likely; `recheck` judges the design over it.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.decision import DesignBounds
+        >>> T_L = torch.linspace(0.2, 0.4, 101, dtype=torch.float64).unsqueeze(0)  # draws of one car
+        >>> box = DesignBounds.of_belief(T_L, torch.full_like(T_L, 0.9))
+        >>> local, string = box.recheck(time_gap=1.0, gains=(1.5, 1.5, -0.8))
+        >>> local.holds.tolist(), string.holds.tolist()
+        ([True], [True])
     """
 
     T_L: tuple[Tensor, Tensor]

@@ -53,6 +53,17 @@ class Decision:
     `strategies` lead from the default to the choice; `changes`: it differs from the setting in force. `why`: one
     sentence each. `interim`: the setting until the driver has set the longer time gap, `p_interim` its P(string
     stable), `driver_delay_s` the time allowed for it; where no driver is asked, 0 and the choice itself.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.decision import Grid, History, Setting, Strategist
+        >>> T_L, K_L = torch.full((1, 50), 1.5, dtype=torch.float64), torch.full((1, 50), 0.5, dtype=torch.float64)
+        >>> steady = torch.full((1, 100), 20.0, dtype=torch.float64)
+        >>> seen = History(0.05, steady, 0 * steady, spacing=steady[:, 0] + 5, speed=steady[:, 0])
+        >>> only_gap = Strategist(grid=Grid(allowed=frozenset({2})))
+        >>> decision = only_gap.decide(T_L, K_L, seen, current=Setting(), default=Setting())
+        >>> decision.sufficient.item(), decision.strategies, decision.setting.time_gap.item()
+        (True, [{2}], 2.5)
     """
 
     setting: Setting
@@ -91,6 +102,15 @@ class Strategist:
     driver_delay [s]: where above zero the time gap is not set but asked for, and the driver needs that long.
     link_delay [s]: age of the leader's acceleration where it is heard (a grid with `feedforward`).
     Raises `InputError` for numbers out of range.
+
+    Example:
+        >>> import torch
+        >>> from avtorch import Setting, Strategist
+        >>> T_L = torch.linspace(1.3, 1.6, 61, dtype=torch.float64).unsqueeze(0)  # draws of one car
+        >>> known = Setting(T_hat=1.45, K_hat=0.5)  # its model in the lower level, the nominal target
+        >>> strategist, K_L = Strategist(), torch.full_like(T_L, 0.5)
+        >>> [round(strategist.probability(s, T_L, K_L).item(), 2) for s in (Setting(), known)]
+        [0.0, 1.0]
     """
 
     grid: Grid = field(default_factory=Grid)

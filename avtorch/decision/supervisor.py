@@ -61,6 +61,13 @@ class Supervisor:
 
     Raises `InputError` for a platoon, for parts that do not go together, and for a strategist that may change what the
     controller cannot.
+
+    Example:
+        >>> from avtorch import BeliefStream, ClosedLoop, GLVDPlant, Leader, Supervisor
+        >>> loop = ClosedLoop(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(1.5, 0.5))
+        >>> watching = Supervisor(loop, stream=BeliefStream(estimator="map"))  # without a strategist it acts on nothing
+        >>> [(alert.time_s, alert.detector) for alert in watching.run(4.0).alerts[0]]
+        [(2.0, 'stability'), (2.0, 'accepted_change'), (4.0, 'stability'), (4.0, 'accepted_change')]
     """
 
     def __init__(

@@ -20,6 +20,12 @@ class Information:
 
     `told`: expected probability of the true cause afterwards. `margin`: median log odds [nats] of the true cause
     against the likest other one, for the worst pair.
+
+    Example:
+        >>> from avtorch.experiment import Information
+        >>> expected = Information(0.6, 0.95, 4.0)
+        >>> 0.69 - expected.nats < 0.1  # of two causes alike in probability, log 2 nats, little stays unknown
+        True
     """
 
     nats: float
@@ -30,7 +36,19 @@ class Information:
 def information(foretold: Sequence[Prediction], number: int, prior: Sequence[float], *, seed: int = 0) -> Information:
     """Of manoeuvre `number`, with causes a priori as probable as `prior` says, by examples of what would be measured.
 
-    Every example is judged by the law of each cause.
+    Each example is scored by the law of each cause.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, simulate
+        >>> from avtorch.experiment import information, library
+        >>> from avtorch.experiment.foretold import Foretold
+        >>> from avtorch.gap import DeadTime, plant
+        >>> late = plant([DeadTime(0.4)], sigma=0.0)
+        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
+        >>> cause = diagnose(log, effects=["dead_time"], pairs=False).contenders[0]
+        >>> one = Foretold.of(cause, library(), ("accel", "speed"), group=1, draws=20)
+        >>> round(information([one, one], 0, prior=[0.5, 0.5]).nats, 3)  # two causes that do the same
+        0.0
     """
     rng = np.random.default_rng([seed, number])
     laws = [f.law(number) for f in foretold]

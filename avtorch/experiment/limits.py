@@ -19,6 +19,12 @@ class Limits:
     """Speeds [m/s], commands [m/s²], length of the road [m] and duration [s] that a manoeuvre keeps to.
 
     `source`: where they come from, in words. Raises `InputError` where nothing could be driven.
+
+    Example:
+        >>> from avtorch.experiment import Limits, library
+        >>> track = Limits(speed_max=15.0, road=500.0, seconds=30.0)
+        >>> all(manoeuvre.within(track) for manoeuvre in library(track))
+        True
     """
 
     speed_min: float = 1.0

@@ -32,7 +32,14 @@ _PUSH = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Manoeuvre:
-    """`command` (row,) [m/s²] at `time` (row,) [s], and the `speed` (row,) [m/s] that is expected of the car."""
+    """`command` (row,) [m/s²] at `time` (row,) [s], and the `speed` (row,) [m/s] that is expected of the car.
+
+    Example:
+        >>> from avtorch.experiment import library
+        >>> manoeuvre = library()[0]
+        >>> manoeuvre.time.shape == manoeuvre.command.shape, manoeuvre.metres <= 2000.0, manoeuvre.effort > 0
+        (True, True, True)
+    """
 
     name: str
     time: Float = field(repr=False)
@@ -82,7 +89,14 @@ class Manoeuvre:
 
 
 def library(limits: Limits | None = None, *, rate_hz: float = 20.0) -> tuple[Manoeuvre, ...]:
-    """All manoeuvres that a perfect car could drive within the limits, each as long as they allow."""
+    """All manoeuvres that a perfect car could drive within the limits, each as long as they allow.
+
+    Example:
+        >>> from avtorch.experiment import Limits, library
+        >>> names = [manoeuvre.name for manoeuvre in library(Limits(road=1000.0))]
+        >>> len(names) == len(set(names)), len(names) > 3
+        (True, True)
+    """
     given = Limits() if limits is None else limits
     return tuple(m for m in _all(given, rate_hz) if m.within(given))
 

@@ -35,6 +35,13 @@ class Experiment:
     `information`: what is to be expected of it; `entropy` [nats]: how much is unknown of the cause. `every`: the same
     of all manoeuvres within the `limits`. `untold`: what no manoeuvre tells apart with these signals.
     `why`: a sentence.
+
+    Example:
+        >>> from avtorch.experiment import Experiment, Information, library
+        >>> manoeuvre, expected = library()[0], Information(0.6, 0.95, 4.0)
+        >>> experiment = Experiment(manoeuvre, ("dead_time", "rate_limit"), expected, entropy=0.69, every={})
+        >>> experiment.separates, experiment.information.nats <= experiment.entropy
+        (('dead_time', 'rate_limit'), True)
     """
 
     manoeuvre: Manoeuvre
@@ -68,6 +75,16 @@ def next_experiment(found: Diagnosis, limits: Limits | None = None, *, seed: int
 
     Start it at its first expected speed, on a level road if there is one. `limits` default to what the car did in the
     log (`Limits.of_log`). Raises `InputError` where the limits allow no manoeuvre at all.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, simulate
+        >>> from avtorch.experiment import next_experiment
+        >>> from avtorch.gap import DeadTime, plant
+        >>> late = plant([DeadTime(0.4)], sigma=0.0)
+        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
+        >>> found = diagnose(log, effects=["dead_time"], pairs=False)
+        >>> next_experiment(found).separates
+        ('dead_time', 'none')
     """
     rivals = list(found.contenders)
     if len(rivals) < 2:
@@ -103,6 +120,14 @@ def write_table(experiment: Experiment | None, folder: str | PathLike[str]) -> l
 
     A command holds until the next row's time. An earlier table in the folder goes where there is no experiment.
     Raises `InputError` where the folder cannot be written.
+
+    Example:
+        >>> from avtorch.experiment import Experiment, Information, library, write_table
+        >>> manoeuvre, expected = library()[0], Information(0.6, 0.95, 4.0)
+        >>> experiment = Experiment(manoeuvre, ("dead_time", "rate_limit"), expected, entropy=0.69, every={})
+        >>> path, = write_table(experiment, "out")
+        >>> path.read_text().splitlines()[0]
+        'time,accel_cmd,speed_expected'
     """
     path = Path(folder) / "manoeuvre.csv"
     if experiment is None:

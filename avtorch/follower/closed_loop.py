@@ -19,6 +19,12 @@ class LoopErrors(NamedTuple):
 
     `spacing` [m], `speed` [m/s]; `amplified`, `amplified_simulated`: spread of the car's speed over the leader's, as
     measured and in the simulated loop.
+
+    Example:
+        >>> from avtorch.follower import LoopErrors
+        >>> errors = LoopErrors(spacing=1.8, speed=0.4, amplified=1.12, amplified_simulated=1.09)
+        >>> errors.amplified > 1  # the car swings more than its leader
+        True
     """
 
     spacing: float
@@ -31,6 +37,17 @@ def loop_errors(law: Law, values: Mapping[str, float], seen: Seen, dt: float, *,
     """Of stretches of `seconds` of one drive, side by side; rows `dt` [s] apart.
 
     `values`: the law's as `law.*`, `T_L` [s], `dead_time.delay_s` [s]; `K_L` is 1.
+
+    Example:
+        >>> from avtorch import Leader, simulate
+        >>> from avtorch.follower import ConstantTimeGap, Seen, loop_errors
+        >>> run = simulate(Leader.default(start=50.0, duration=60.0, dt=0.1))
+        >>> seen = Seen(run.spacing[0, 0], run.speed[0, 0], run.lead_speed[0, 0])
+        >>> law = {"spacing_gain_per_s2": 0.9, "speed_gain_per_s": 0.9, "time_gap_s": 1.0, "standstill_m": 5.0}
+        >>> values = {"T_L": 0.3, **{f"law.{name}": value for name, value in law.items()}}
+        >>> errors = loop_errors(ConstantTimeGap(), values, seen, dt=0.1, seconds=20.0)
+        >>> errors.spacing < 2.0, errors.speed < 1.0  # m and m/s
+        (True, True)
     """
     own = tensors({k.partition(".")[2]: v for k, v in values.items() if k.startswith("law.")})
     s, v, lead = (x.numpy() for x in seen)

@@ -42,6 +42,15 @@ class FollowerDiagnosis:
     - `stability` about slow, usual and quick speeds of the drive
     - `diagnosis`: gap and cause on that half, conditional on the law; None where it was not asked for
     - `conditional`: which claims are conditional on what, one sentence each
+
+    Example:
+        >>> from avtorch import Leader, LinearController, simulate
+        >>> from avtorch.follower import FollowerDiagnosis, diagnose_follower
+        >>> car = LinearController(gains=(0.2, 0.6, 0.0), time_gap=1.5)
+        >>> log = simulate(Leader.default(start=50.0, duration=45.0, dt=0.1), car).log()
+        >>> found: FollowerDiagnosis = diagnose_follower(log, law="constant_time_gap", cause=False)
+        >>> sorted(found.loops), len(found.stability), found.diagnosis is None
+        (['constant_time_gap', 'without_delay'], 3, True)
     """
 
     name: str
@@ -97,6 +106,15 @@ def diagnose_follower(
 
     Raises `InputError` for a log without speed, spacing or the leader's speed, with less than 40 s of following, or for
     an unknown law.
+
+    Example:
+        >>> from avtorch import Leader, LinearController, simulate
+        >>> from avtorch.follower import diagnose_follower
+        >>> car = LinearController(gains=(0.2, 0.6, 0.0), time_gap=1.5)
+        >>> log = simulate(Leader.default(start=50.0, duration=45.0, dt=0.1), car).log()
+        >>> found = diagnose_follower(log, law="constant_time_gap", cause=False)
+        >>> round(found.parameters["time_gap_s"].mean, 1)
+        1.5
     """
     laws = list(LAWS.values()) if law is None else [law_named(law)]
     plain = followed(log, laws[0])

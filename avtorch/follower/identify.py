@@ -33,7 +33,17 @@ _DELAYS_S = (0.3, 1.2)
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """`z` (coordinate,) at the mode, its `covariance`, `noise`; `log_evidence` [nats] of what was fitted."""
+    """`z` (coordinate,) at the mode, its `covariance`, `noise`; `log_evidence` [nats] of what was fitted.
+
+    Example:
+        >>> from avtorch import Leader, LinearController, simulate
+        >>> from avtorch.follower import Identified, diagnose_follower
+        >>> car = LinearController(gains=(0.2, 0.6, 0.0), time_gap=1.5)
+        >>> log = simulate(Leader.default(start=50.0, duration=45.0, dt=0.1), car).log()
+        >>> fit: Identified = diagnose_follower(log, law="constant_time_gap", cause=False).identified
+        >>> round(float(fit.values["law.time_gap_s"]), 1), fit.draws(count=100)["T_L"].shape
+        (1.5, (100,))
+    """
 
     candidate: Followed = field(repr=False)
     z: Float

@@ -19,7 +19,14 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LoopStability:
-    """`p_locally_stable`, `p_string_stable`; `peak_gain` [-] over the draws that are locally stable, None where few."""
+    """`p_locally_stable`, `p_string_stable`; `peak_gain` [-] over the draws that are locally stable, None where few.
+
+    Example:
+        >>> from avtorch.follower import LoopStability
+        >>> at = LoopStability(speed=20.0, p_locally_stable=1.0, p_string_stable=0.04, peak_gain=None)
+        >>> at.p_string_stable < 0.05 < at.p_locally_stable
+        True
+    """
 
     speed: float
     p_locally_stable: float
@@ -31,6 +38,15 @@ def loop_stability(law: Law, draws: Mapping[str, Float], speeds: Sequence[float]
     """For small motions about `speeds` [m/s], of draws (draw,) by key.
 
     What holds of the loop holds whatever of it is controller or car: of gains and `K_L` only the product counts.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.follower import ConstantTimeGap, loop_stability
+        >>> law = {"spacing_gain_per_s2": 0.1, "speed_gain_per_s": 0.5, "standstill_m": 3.0}
+        >>> draws = {"T_L": np.full(50, 0.4), "law.time_gap_s": np.linspace(0.8, 2.0, 50)}
+        >>> draws |= {f"law.{name}": np.full(50, value) for name, value in law.items()}
+        >>> [round(at.p_string_stable, 2) for at in loop_stability(ConstantTimeGap(), draws, speeds=[10.0, 25.0])]
+        [0.26, 0.26]
     """
     values = {k: torch.as_tensor(x) for k, x in draws.items()}
     own = {k.partition(".")[2]: x for k, x in values.items() if k.startswith("law.")}

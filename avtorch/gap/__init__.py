@@ -1,4 +1,14 @@
-"""What the simulator lacks: effects along the chain command, actuator, body, sensor, and plants made of them."""
+"""What the simulator lacks: effects along the chain command, actuator, body, sensor, and plants made of them.
+
+Example:
+    >>> from avtorch import Leader, diagnose, simulate
+    >>> from avtorch.gap import DeadTime, plant
+    >>> late = plant([DeadTime(0.4)], sigma=0.0)  # a car whose commands act 0.4 s late
+    >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.05), plant=late).log()
+    >>> found = diagnose(log, effects=["dead_time"], pairs=False)  # leave both out to try all effects
+    >>> found.verdict.name, round(float(found.plant.values()["dead_time.delay_s"]), 1)
+    ('dead_time', 0.4)
+"""
 
 from avtorch.gap import effects
 from avtorch.gap.effects import (

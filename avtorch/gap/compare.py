@@ -61,6 +61,14 @@ def compare(
 
     Raises `InputError` for logs that cannot be diagnosed or hold less than 50 s, channels that differ, or a level out
     of range.
+
+    Example:
+        >>> from avtorch import GLVDPlant, Leader, compare, simulate
+        >>> leader = Leader.default(start=50.0, duration=54.0, dt=0.1)
+        >>> before, after = (simulate(leader, plant=GLVDPlant(*car)).log() for car in ((0.3, 1.0), (1.0, 0.7)))
+        >>> found = compare(before, after)
+        >>> found.changed, round(found.car["T_L"].after.mean, 1), found.simulator
+        (True, 1.0, 'farther')
     """
     if not 0 < level < 1:
         raise InputError(f"level: found {level}, needs a number between 0 and 1")

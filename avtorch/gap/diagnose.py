@@ -58,13 +58,22 @@ def diagnose(
     fitted. `prior`: weights over causes, see `odds.probabilities`. `effects`: candidates, by name or class (default:
     all registered). `pairs`: also try two at once. `posterior` of the verdict's parameters: by SGLD, or Laplace's
     approximation. `budget_s`: after so many seconds no new candidate is begun, `complete` is False and the verdict
-    provisional: `scope` has what was tried, and only from that is the verdict told apart.
+    provisional: `scope` has what was tried, and the verdict is distinguished only from that.
     `accel_kind`: whether `accel` is dv/dt or an accelerometer's reading (default: as the logs say).
-    `progress(what, done, of)` is told of each step. `checkpoint`: a file in which fits are kept, and from which a
+    `progress(what, done, of)` is called at each step. `checkpoint`: a file in which fits are kept, and from which a
     search of the same logs and settings goes on, to the same answer.
 
     Raises `InputError` for a log without `accel_cmd`, without 10 s of usable driving, for wrong arguments, or for a
     `checkpoint` that is damaged or of other logs or settings.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, simulate
+        >>> from avtorch.gap import SensorBias, plant
+        >>> tilted = plant([SensorBias(0.3)], sigma=0.0)  # an accelerometer that reads 0.3 m/s² too much
+        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.05), plant=tilted).log()
+        >>> found = diagnose(log, effects=["dead_time", "sensor_bias"], pairs=False)
+        >>> found.verdict.name, round(found.probability("dead_time"), 2)
+        ('sensor_bias', 0.0)
     """
     each = [logs] if isinstance(logs, Log) else list(logs)
     if accel_kind is not None:

@@ -1,4 +1,14 @@
-"""What we believe: densities and priors, SGLD, Algorithm 1, and the sequential loop."""
+"""What we believe: densities and priors, SGLD, Algorithm 1, and the sequential loop.
+
+Example:
+    >>> from avtorch import GLVDPlant, Leader, simulate
+    >>> from avtorch.inference import JerkDensity, JerkStatistics, sample
+    >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
+    >>> sums = JerkStatistics.from_samples(run.accel[:, 0], run.accel_cmd[:, 0], run.jerk[:, 0])
+    >>> posterior = sample(JerkDensity(sums))
+    >>> posterior.names, posterior.converged.tolist(), [round(x, 1) for x in posterior.mean[0].tolist()]
+    (('T_L', 'K_L', 'sigma'), [True], [0.5, 0.9, 0.1])
+"""
 
 from avtorch.inference.belief import Belief
 from avtorch.inference.conjugate import Conjugate, sample_conjugate

@@ -13,6 +13,18 @@ class Density(Protocol):
 
     The potential of a Langevin sampler is ``U(z) = -log_prob(z)``, on the scale of the *whole* window: no mean over the
     points is taken anywhere.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import Density, integrate
+        >>> class Normal:  # log(lag) ~ Normal(-1, 0.1)
+        ...     names, windows = ("T_L",), 1
+        ...     def log_prob(self, z):
+        ...         return -(((z[..., 0] + 1) / 0.1) ** 2) / 2
+        ...     def initial(self):
+        ...         return torch.zeros(1, 1, dtype=torch.float64)
+        >>> round(float(integrate(Normal()).quantile(0.5)), 3)  # exp(-1)
+        0.368
     """
 
     @property
@@ -39,7 +51,18 @@ class Density(Protocol):
 
 @runtime_checkable
 class SubsampledDensity(Density, Protocol):
-    """A density that can also be estimated from a minibatch of its points (SGLD proper)."""
+    """A density that can also be estimated from a minibatch of its points (SGLD proper).
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import JerkPoints, SubsampledDensity
+        >>> a, u, noise = torch.randn(3, 1, 500, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        >>> points: SubsampledDensity = JerkPoints(a, u, (0.9 * u - a) / 0.5 + 0.1 * noise)
+        >>> z, batches = points.initial(), torch.arange(500).reshape(5, 100)
+        >>> mean = sum(points.log_prob_minibatch(z, batch) for batch in batches) / 5
+        >>> bool(torch.allclose(mean, points.log_prob(z)))  # unbiased: over all batches, the whole window's
+        True
+    """
 
     @property
     def points(self) -> int:
@@ -53,7 +76,18 @@ class SubsampledDensity(Density, Protocol):
 
 @runtime_checkable
 class ScoredDensity(Density, Protocol):
-    """A density that gives its gradient in closed form, which the sampler then uses instead of autograd."""
+    """A density that gives its gradient in closed form, which the sampler then uses instead of autograd.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import ScoredDensity
+        >>> from avtorch.validation import synthetic_windows
+        >>> density: ScoredDensity = synthetic_windows(1, seed=1).density
+        >>> z = density.initial().requires_grad_()
+        >>> slope, = torch.autograd.grad(density.log_prob(z).sum(), z)
+        >>> bool(torch.allclose(slope, density.score(z)))
+        True
+    """
 
     def score(self, z: Tensor) -> Tensor:
         """Gradient of ``log_prob`` in ``z``, shape ``(..., window, parameter)``."""
@@ -62,7 +96,16 @@ class ScoredDensity(Density, Protocol):
 
 @runtime_checkable
 class SelectableDensity(Density, Protocol):
-    """A density whose windows can be taken apart, so that a sampler works on those that need it."""
+    """A density whose windows can be taken apart, so that a sampler works on those that need it.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import SelectableDensity
+        >>> from avtorch.validation import synthetic_windows
+        >>> density: SelectableDensity = synthetic_windows(5, seed=1).density
+        >>> density.select(torch.tensor([0, 3])).windows
+        2
+    """
 
     def select(self, index: Tensor) -> Density:
         """The windows named by ``index``, integers or bool."""
@@ -71,7 +114,17 @@ class SelectableDensity(Density, Protocol):
 
 @runtime_checkable
 class ConstrainedDensity(Density, Protocol):
-    """A density whose parameters are not all positive, or not ``exp(z)``."""
+    """A density whose parameters are not all positive, or not ``exp(z)``.
+
+    Example:
+        >>> import torch
+        >>> from torch.distributions import Beta, constraints
+        >>> from avtorch.inference import ConstrainedDensity, TorchDensity
+        >>> unit = {"x": constraints.unit_interval}
+        >>> share: ConstrainedDensity = TorchDensity(lambda p: Beta(2.0, 3.0).log_prob(p["x"]), unit)
+        >>> share.constrain(torch.zeros(1, 1)).tolist()
+        [[0.5]]
+    """
 
     def constrain(self, z: Tensor) -> Tensor:
         """Parameters in their own units, each from its own entry of ``z``, shape of ``z``."""

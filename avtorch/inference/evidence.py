@@ -26,6 +26,16 @@ class Evidence:
         n: usable rows, ``(vehicle,)``.
         excited: ``(vehicle,)`` bool, by the fixed rule.
         density: the posterior density of the vehicles named by an index, from their priors.
+
+    Example:
+        >>> import torch
+        >>> from avtorch import GLVDPlant, Leader, simulate
+        >>> from avtorch.inference import JerkForm
+        >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
+        >>> rows = {"accel": run.accel[:, 0], "accel_cmd": run.accel_cmd[:, 0], "jerk": run.jerk[:, 0]}
+        >>> evidence = JerkForm().evidence({**rows, "usable": torch.ones(1, 200, dtype=torch.bool)}, full=200)
+        >>> evidence.n.tolist(), evidence.excited.tolist()
+        ([200.0], [True])
     """
 
     n: Tensor
@@ -34,7 +44,14 @@ class Evidence:
 
 
 class Form(Protocol):
-    """A form of the log density: which columns it reads, which parameters it has, what a window of rows is to it."""
+    """A form of the log density: which columns it reads, which parameters it has, what a window of rows is to it.
+
+    Example:
+        >>> from avtorch.inference import Form, JerkForm, SpeedLagForm
+        >>> forms: list[Form] = [JerkForm(), SpeedLagForm()]
+        >>> [form.names for form in forms]
+        [('T_L', 'K_L', 'sigma'), ('T_V', 'K_V', 'sigma')]
+    """
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -56,7 +73,15 @@ class Form(Protocol):
 
 
 class JerkForm:
-    """Jerk is measured: Eq. 4 of the paper from six sums."""
+    """Jerk is measured: Eq. 4 of the paper from six sums.
+
+    Example:
+        >>> from avtorch.inference import BeliefStream, ExcitationRule, JerkForm
+        >>> strict = JerkForm(rule=ExcitationRule(sd_T=0.1, sd_K=0.1))  # uses fewer windows, each of them sharper
+        >>> stream = BeliefStream(window=2.0, form=strict)
+        >>> strict.names, strict.columns
+        (('T_L', 'K_L', 'sigma'), ('accel_cmd', 'accel', 'jerk'))
+    """
 
     names = ("T_L", "K_L", "sigma")
     columns = ("accel_cmd", "accel", "jerk")

@@ -23,6 +23,16 @@ class ExcitationRule:
         T_ref, K_ref: reference lag [s] and gain [-], slow enough that a degraded vehicle is resolved, too.
         sd_T, sd_K: the widest predicted SDs of ``T_L`` [s] and ``K_L`` [-]: the paper's accepted changes.
         share: the least share of the window's rows that must be usable.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import ExcitationRule, JerkStatistics
+        >>> t = torch.linspace(0.0, 2.0, 200, dtype=torch.float64)
+        >>> u = torch.stack([torch.sin(3 * t), 0.01 * torch.sin(3 * t)])  # a lively window and a calm one
+        >>> noise = 0.1 * torch.randn(200, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        >>> sums = JerkStatistics.from_samples(0.8 * u.roll(30, -1), u, 2 * u - 1.6 * u.roll(30, -1) + noise)
+        >>> ExcitationRule()(sums, rows=200).tolist()
+        [True, False]
     """
 
     T_ref: float = 1.0

@@ -62,6 +62,16 @@ class SamplerSettings:
         compare: hold the draws against the exact density (:mod:`avtorch.inference.exactness`), whatever made them: a
             minibatch, a schedule, another optimizer. Without, ``converged`` says no more than that chains agree with
             each other; for a density too dear to evaluate at some hundred points.
+
+    Raises:
+        InputError: naming the setting that is out of range.
+
+    Example:
+        >>> from avtorch.inference import SamplerSettings
+        >>> few_long = SamplerSettings(chains=4, draws=2000, burn_in=500)  # for `sample` or `SequentialInference`
+        >>> slower = few_long.slower(2.0)
+        >>> slower.step, slower.burn_in, slower.thinning
+        (2.0, 2000, 4)
     """
 
     chains: int = 1024
@@ -122,6 +132,16 @@ def sample(
     Args:
         density: the target.
         mode: its mode and curvature, if known.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import integrate, sample
+        >>> from avtorch.validation import synthetic_windows
+        >>> density = synthetic_windows(2, seed=1).density
+        >>> posterior = sample(density, generator=torch.Generator().manual_seed(0))
+        >>> exact = integrate(density, nodes=25)
+        >>> posterior.converged.tolist(), bool(((posterior.mean - exact.mean).abs() < 0.1 * exact.sd).all())
+        ([True, True], True)
     """
     settings = SamplerSettings() if settings is None else settings
     mode = find_mode(density) if mode is None else mode

@@ -40,6 +40,15 @@ class SpeedLagDensity(JerkDensity):
     """Posterior of ``(T_V [s], K_V [-], sigma [m/s²])``: ``accel ~ Normal((K_V v_cmd - v)/T_V, sigma^2)``.
 
     It is Eq. 4 with speed, speed command and acceleration in the places of acceleration, command and jerk.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import SpeedLagDensity, find_mode
+        >>> g = torch.Generator().manual_seed(0)
+        >>> v, v_cmd, noise = torch.randn(3, 1, 500, dtype=torch.float64, generator=g)
+        >>> sums = SpeedLagDensity.sums(v, v_cmd, (0.9 * v_cmd - v) / 0.8 + 0.1 * noise)
+        >>> [round(x, 1) for x in find_mode(SpeedLagDensity(sums)).z.exp()[0].tolist()]  # T_V [s], K_V [-], sigma
+        [0.8, 0.9, 0.1]
     """
 
     names = ("T_V", "K_V", "sigma")
@@ -60,7 +69,17 @@ class SpeedLagDensity(JerkDensity):
 
 
 class PositionLagDensity(JerkDensity):
-    """Posterior of ``(T_P [s], zeta [-], sigma [m/s²])``: ``accel ~ Normal(error/T_P² - 2 zeta v/T_P, sigma^2)``."""
+    """Posterior of ``(T_P [s], zeta [-], sigma [m/s²])``: ``accel ~ Normal(error/T_P² - 2 zeta v/T_P, sigma^2)``.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import PositionLagDensity, find_mode
+        >>> g = torch.Generator().manual_seed(0)
+        >>> error, v, noise = torch.randn(3, 1, 500, dtype=torch.float64, generator=g)
+        >>> sums = PositionLagDensity.sums(error, v, error / 0.5**2 - 2 * 0.7 / 0.5 * v + 0.1 * noise)
+        >>> [round(x, 1) for x in find_mode(PositionLagDensity(sums)).z.exp()[0].tolist()]  # T_P [s], zeta [-], sigma
+        [0.5, 0.7, 0.1]
+    """
 
     names = ("T_P", "zeta", "sigma")
 

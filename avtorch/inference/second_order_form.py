@@ -21,6 +21,14 @@ class SpeedLagForm:
     """Windows of ``speed_cmd``, ``speed`` and ``accel``; the rule of excitation is the jerk form's, at its reference.
 
     Give the stream ``actuation_prior=default_speed_lag_prior()``.
+
+    Example:
+        >>> from avtorch.inference import BeliefStream, SpeedLagForm
+        >>> from avtorch.inference.second_order import default_speed_lag_prior
+        >>> form = SpeedLagForm()
+        >>> stream = BeliefStream(window=2.0, form=form, actuation_prior=default_speed_lag_prior())
+        >>> form.columns, form.names
+        (('speed_cmd', 'speed', 'accel'), ('T_V', 'K_V', 'sigma'))
     """
 
     names = SpeedLagDensity.names
@@ -46,6 +54,14 @@ class PositionLagForm:
     A window is excited if least squares alone would resolve ``T_P`` and ``zeta`` to the share ``resolved`` at a lag of
     1 s and critical damping, from the columns and the noise level only. Give the stream
     ``actuation_prior=default_position_lag_prior()``.
+
+    Example:
+        >>> from avtorch.inference import BeliefStream, PositionLagForm
+        >>> from avtorch.inference.second_order import default_position_lag_prior
+        >>> form = PositionLagForm()
+        >>> stream = BeliefStream(window=2.0, form=form, actuation_prior=default_position_lag_prior())
+        >>> form.columns, form.names
+        (('position_cmd', 'position', 'speed', 'accel'), ('T_P', 'zeta', 'sigma'))
     """
 
     names = PositionLagDensity.names

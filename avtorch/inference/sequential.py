@@ -51,6 +51,18 @@ class SequentialInference:
 
     Raises:
         InputError: for a mode, ``lam`` or ``forgetting`` out of range.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import JerkDensity, SequentialInference
+        >>> from avtorch.validation import synthetic_windows
+        >>> vehicle, window = SequentialInference(mode="posterior"), synthetic_windows(1, seed=1).density
+        >>> for _ in range(2):  # the same window twice: the belief narrows
+        ...     density = lambda index, prior: JerkDensity(window.statistics, prior)
+        ...     belief = vehicle.update(density, excited=torch.tensor([True]))
+        ...     print(belief.converged.item(), round(belief.stat("K_L")["sd"], 4))
+        True 0.0152
+        True 0.0104
     """
 
     def __init__(

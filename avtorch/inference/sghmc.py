@@ -46,6 +46,16 @@ class SGHMC(LangevinOptimizer):
 
     Raises:
         InputError: naming the argument that is out of range.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import SGHMC
+        >>> theta = torch.zeros(1000, requires_grad=True)  # a thousand chains
+        >>> sampler = SGHMC([theta], lr=0.2, generator=torch.Generator().manual_seed(0))
+        >>> for _ in range(100):
+        ...     potential = sampler.step(lambda: ((theta - 2) ** 2 / 2).sum())  # of Normal(2, 1)
+        >>> round(theta.mean().item(), 1), round(theta.std().item(), 1)
+        (2.0, 1.0)
     """
 
     def __init__(

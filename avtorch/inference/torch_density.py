@@ -17,9 +17,6 @@ LogDensity = Callable[[dict[str, Tensor]], Tensor]
 class TorchDensity:
     """A posterior over scalar parameters, each with its constraint, given as a function of them.
 
-    >>> from torch.distributions import Gamma, constraints
-    >>> rate = TorchDensity(lambda p: Gamma(3.0, 2.0).log_prob(p["rate"]), {"rate": constraints.positive})
-
     The parameters are walked in an unconstrained space by PyTorch's own bijections (``log`` for positive ones), whose
     Jacobian is counted here and must not be in ``log_density``.
 
@@ -32,6 +29,15 @@ class TorchDensity:
 
     Raises:
         InputError: for no parameters, a constraint that is not of a single number, or a start that breaks one.
+
+    Example:
+        >>> import torch
+        >>> from torch.distributions import Gamma, constraints
+        >>> from avtorch.inference import TorchDensity, sample
+        >>> rate = TorchDensity(lambda p: Gamma(3.0, 2.0).log_prob(p["rate"]), {"rate": constraints.positive})
+        >>> posterior = sample(rate, generator=torch.Generator().manual_seed(0))
+        >>> posterior.converged.item(), round(posterior.mean.item(), 1)  # 3/2
+        (True, 1.5)
     """
 
     windows = 1

@@ -1,4 +1,15 @@
-"""Logs and their checks, recorded leaders, answers for machines."""
+"""Logs and their checks, recorded leaders, answers for machines.
+
+Example:
+    >>> import numpy as np
+    >>> from avtorch.io import Log, check
+    >>> time = np.arange(0.0, 20.0, 0.05)
+    >>> log = Log.from_arrays(time=time, accel_cmd=np.sin(time), speed=20 - 0.9 * np.cos(time))
+    >>> log.write("drive.csv")
+    >>> quality = check(Log.read("drive.csv"))
+    >>> quality.rows, round(quality.rate_hz, 3), quality.segments
+    (400, 20.0, 1)
+"""
 
 from avtorch.io.answer_set import answer_set
 from avtorch.io.answers import write_json

@@ -54,6 +54,14 @@ def answer_set(folder: str | os.PathLike[str], names: Sequence[str]) -> Iterator
     earlier one of that name is removed before: while it is missing, what lies in `folder` is not whole.
 
     Raises InputError where `folder` cannot be written, ValueError for a file that `names` does not have.
+
+    Example:
+        >>> from avtorch.io import answer_set, write_json
+        >>> with answer_set("out", ["estimates.json", "estimates.png"]) as folder:
+        ...     write_json(folder / "estimates.json", {"T_L": 0.3})
+        >>> from pathlib import Path
+        >>> sorted(path.name for path in Path("out").glob("*.json"))
+        ['estimates.json']
     """
     place = Path(folder)
     if place in _staged:

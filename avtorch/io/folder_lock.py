@@ -33,6 +33,12 @@ def sole_use(folder: str | os.PathLike[str], *, work: str) -> Iterator[bool]:
 
     Raises `InputError` that names the other process (pid, host, command, since when), or says why the folder cannot be
     written.
+
+    Example:
+        >>> from avtorch.io import sole_use
+        >>> with sole_use("out", work="a diagnosis") as locked:
+        ...     print(locked)
+        True
     """
     place = Path(folder)
     made = _make(place)

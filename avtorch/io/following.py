@@ -39,6 +39,16 @@ def read_following(
     says so. ``map``, ``unit``, ``stamp``: of a log, as ``Log.read`` has them; a recording's form tells its own. Raises
     InputError for a vehicle or event that is not there or follows nobody, for a gap that is not the speeds', for an
     option without a meaning, and as ``Log.read`` does.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.io import Log, read_following
+        >>> time = np.arange(0.0, 20.0, 0.1)
+        >>> columns = dict(speed=20 - np.cos(time), lead_speed=20 + np.sin(time), spacing=np.full(200, 25.0))
+        >>> Log.from_arrays(time=time, **columns, following=True).write("following.csv")
+        >>> log = read_following("following.csv")
+        >>> log.accel_cmd is None, log.rows
+        (True, 200)
     """
     table = read_table(path, header="Time", wanted=recorded)
     names = set(table.names)

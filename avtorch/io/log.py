@@ -25,7 +25,16 @@ from avtorch.io.tables import Table, read_table
 from avtorch.io.validity import check_units
 
 STANDSTILL_MPS = 0.3
-"""Below this speed GLVD does not hold; such rows are masked."""
+"""Below this speed GLVD does not hold; such rows are masked.
+
+Example:
+    >>> import numpy as np
+    >>> from avtorch.io import STANDSTILL_MPS, Log
+    >>> speed = np.linspace(0.0, 5.0, 200)
+    >>> log = Log.from_arrays(time=0.1 * np.arange(200), accel_cmd=np.full(200, 0.25), speed=speed)
+    >>> bool(speed[log.usable].min() > STANDSTILL_MPS)
+    True
+"""
 
 Float = NDArray[np.float64]
 AccelKind = Literal["kinematic", "specific-force"]
@@ -43,6 +52,14 @@ class Log:
     ``name`` of the source; ``ignored``: its further columns; ``remarks``: what merging left out. ``accel_kind`` is not
     in a file: ``accel`` is dv/dt, as on a vehicle bus, or what an accelerometer fixed to the car reads along it, dv/dt
     plus gravity's share on a slope; ``dataclasses.replace`` sets it.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch import Log
+        >>> time = np.arange(0.0, 20.0, 0.05)
+        >>> log = Log.from_arrays(time=time, accel_cmd=np.sin(time), speed=72 - 3.6 * np.cos(time), unit="speed=km/h")
+        >>> log.rows, round(log.rate_hz, 3), round(float(log.speed.mean()), 1)  # in m/s
+        (400, 20.0, 20.0)
     """
 
     time: Float

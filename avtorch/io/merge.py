@@ -16,6 +16,14 @@ def held(
     ``clock`` is ``(time,)``, ``stamps`` and ``values`` are ``(message,)``, stamps strictly rising; both answers are
     ``(time,)``. Before the first message there is nothing to hold: value NaN, age infinite. Interpolating instead would
     let a value act before it was measured. Raises InputError for stamps that do not rise.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.io import held
+        >>> clock, stamps, commands = np.array([0.0, 0.1, 0.2]), np.array([0.05, 0.18]), np.array([1.0, 2.0])
+        >>> value, age = held(clock, stamps, commands)
+        >>> value.tolist(), age.round(2).tolist()
+        ([nan, 1.0, 2.0], [inf, 0.05, 0.02])
     """
     if len(stamps) != len(values):
         raise InputError(f"stamps: {len(stamps)} of them for {len(values)} values; one each is needed")

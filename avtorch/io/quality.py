@@ -21,7 +21,17 @@ SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead
 
 @dataclass(frozen=True)
 class Gap:
-    """A gap begins after ``row`` (of the log, from 1) at ``start_s`` on the log's time and lasts ``seconds``."""
+    """A gap begins after ``row`` (of the log, from 1) at ``start_s`` on the log's time and lasts ``seconds``.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.io import Log, check
+        >>> time = np.concatenate([np.arange(0, 10, 0.1), np.arange(15, 25, 0.1)])
+        >>> log = Log.from_arrays(time=time, accel_cmd=np.sin(time), speed=20 - np.cos(time))
+        >>> gap, = check(log).gaps
+        >>> gap.row, round(gap.start_s, 1), round(gap.seconds, 1)
+        (100, 9.9, 5.1)
+    """
 
     row: int
     start_s: float
@@ -37,6 +47,16 @@ class Quality:
     ``masked_rows``: rows not usable, of which ``driver_rows`` not engaged, ``settling_rows`` within 2 s of one of
     ``returns`` to engaged and ``standstill_rows`` below 0.3 m/s or, without speed, taken for it; ``notes``: all of it
     in sentences.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.io import Log, check
+        >>> time = np.arange(0.0, 20.0, 0.05)
+        >>> engaged = (time < 5) | (time > 8)  # the driver takes over for 3 s
+        >>> log = Log.from_arrays(time=time, accel_cmd=np.sin(time), speed=20 - np.cos(time), engaged=engaged)
+        >>> quality = check(log)
+        >>> quality.driver_rows, quality.returns, quality.settling_rows
+        (61, 1, 40)
     """
 
     rows: int
@@ -63,7 +83,16 @@ class Quality:
 
 
 def check(log: Log) -> Quality:
-    """Look a log over. Takes any valid `Log` and raises nothing."""
+    """Look a log over. Takes any valid `Log` and raises nothing.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.io import Log, check
+        >>> time = np.arange(0.0, 20.0, 0.05)
+        >>> quality = check(Log.from_arrays(time=time, accel_cmd=np.sin(time), speed=20 - np.cos(time)))
+        >>> round(quality.seconds, 2), quality.missing
+        (19.95, ('accel',))
+    """
     same = np.diff(log.segment) == 0
     step = median_step(log.elapsed, same)
     steps = np.diff(log.elapsed)[same]

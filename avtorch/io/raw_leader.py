@@ -24,6 +24,14 @@ class RawLeader:
     ``time`` [s] is the file's own, strictly rising; ``speed`` [m/s] >= 0; ``accel`` [m/s^2] and ``spacing`` [m, to the
     vehicle ahead, bumper to bumper; NaN where not recorded] are None where the file has none. ``events``: what was
     joined, in order. ``note``: what was chosen, cut or mended, in words; empty where nothing was.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.io import RawLeader
+        >>> time = np.arange(0.0, 5.0, 0.1)
+        >>> leader = RawLeader(time, speed=20 - time, accel=None, spacing=None, name="braking")
+        >>> leader.name, leader.speed.shape
+        ('braking', (50,))
     """
 
     time: Float

@@ -28,6 +28,15 @@ def read_leader(
     are joined at equal speed until they last ``duration`` [s] (default 80). ``unit`` (``speed=km/h``) is for the plain
     form. A recording is cut to its longest stretch without empty speeds or steps over 1.5 s; ``note`` says so.
     Raises InputError for a file of no known form, a vehicle or event that is not in it, and bad values.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.io import read_leader
+        >>> time = np.arange(0.0, 5.0, 0.1)
+        >>> np.savetxt("lead.csv", np.c_[time, 72 - 3.6 * time], delimiter=",", header="time,speed", comments="")
+        >>> leader = read_leader("lead.csv", unit="speed=km/h")
+        >>> [round(v, 1) for v in leader.speed[[0, -1]].tolist()]
+        [20.0, 15.1]
     """
     table = read_table(path, header="Time", wanted=recorded)
     names = set(table.names)

@@ -37,11 +37,33 @@ _FIRST = re.compile(rb'\{"schema": "([a-z0-9_./-]{1,80})", "sha256": "([0-9a-f]{
 
 
 class Damaged(InputError):
-    """A regular file whose content cannot be believed; what can be computed again may be."""
+    """A regular file whose content cannot be believed; what can be computed again may be.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from avtorch.io import Damaged, read_sealed, write_sealed
+        >>> path = Path("fit.json")
+        >>> write_sealed(path, {"T_L": 0.3}, schema="fit/1", of={"log": "drive.csv"})
+        >>> _ = path.write_text(path.read_text().replace("0.3", "0.4"))
+        >>> try:
+        ...     read_sealed(path, schema="fit/1")
+        ... except Damaged:
+        ...     print("computed again")
+        computed again
+    """
 
 
 class Sealed(NamedTuple):
-    """What a file belongs to (`of`), and its `content`: from JSON, or bytes."""
+    """What a file belongs to (`of`), and its `content`: from JSON, or bytes.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from avtorch.io import read_sealed, write_sealed
+        >>> write_sealed(Path("fit.json"), {"T_L": 0.3}, schema="fit/1", of={"log": "drive.csv"})
+        >>> found = read_sealed(Path("fit.json"), schema="fit/1")
+        >>> found.of, found.content
+        ({'log': 'drive.csv'}, {'T_L': 0.3})
+    """
 
     of: dict[str, Any]
     content: Any
@@ -51,6 +73,13 @@ def write_sealed(path: Path, content: Any, *, schema: str, of: Mapping[str, Any]
     """Write `content` (see `json_text` for what it may hold, or bytes) so that `path` is whole or as it was.
 
     `of`: what it belongs to. Raises `InputError` where `path` cannot be written, or is a symlink, a folder, a device.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from avtorch.io import read_sealed, write_sealed
+        >>> write_sealed(Path("fit.json"), {"T_L": 0.3}, schema="fit/1", of={"seed": 7})
+        >>> read_sealed(Path("fit.json"), schema="fit/1").of
+        {'seed': 7}
     """
     _free_or_regular(path)
     if isinstance(content, bytes):
@@ -69,6 +98,13 @@ def read_sealed(path: Path, *, schema: str, most: int = MOST, remedy: str = REME
 
     `most`: bytes, above which the file is not read. `remedy`: what a user can do, the end of every message. Raises
     `InputError` for what is no regular file, `Damaged` for anything but a file of this `schema` as it was written.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from avtorch.io import read_sealed, write_sealed
+        >>> write_sealed(Path("fit.json"), {"T_L": 0.3}, schema="fit/1", of={"log": "drive.csv"})
+        >>> read_sealed(Path("fit.json"), schema="fit/1").content["T_L"]
+        0.3
     """
     rest = _verified(path, schema, most, remedy)
     found = _parsed(b"{" + rest, path, remedy)
@@ -78,7 +114,15 @@ def read_sealed(path: Path, *, schema: str, most: int = MOST, remedy: str = REME
 
 
 def read_sealed_bytes(path: Path, *, schema: str, most: int = MOST, remedy: str = REMEDY) -> Sealed:
-    """The same of a file with bytes as its content."""
+    """The same of a file with bytes as its content.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from avtorch.io import read_sealed_bytes, write_sealed
+        >>> write_sealed(Path("state.bin"), b"weights", schema="state/1", of={"log": "drive.csv"})
+        >>> read_sealed_bytes(Path("state.bin"), schema="state/1").content
+        b'weights'
+    """
     line, _, content = _verified(path, schema, most, remedy).partition(b"\n")
     found = _parsed(b"{" + line, path, remedy)
     if not isinstance(found, dict) or set(found) != {"of", "bytes"} or not isinstance(found["of"], dict):

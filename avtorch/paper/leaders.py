@@ -36,6 +36,12 @@ class Ahead:
 class Leaders:
     """`sweep`: behind which the parameters are estimated (NGSIM, OpenACC). `drives`: behind which a vehicle changes
     and is watched (OpenACC; a lively section and a steadier one). The first of `drives` leads the other experiments.
+
+    Example:
+        >>> from avtorch.paper import Leaders
+        >>> leaders = Leaders.read()  # without a folder of recordings: the embedded US06
+        >>> len(leaders.sweep), len(leaders.drives)
+        (1, 1)
     """
 
     sweep: tuple[Ahead, ...]

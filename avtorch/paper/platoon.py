@@ -32,7 +32,14 @@ _WHOLE_S = 46.0  # long enough for the strategist's first choices
 
 @dataclass(frozen=True)
 class Platoon:
-    """`run` (setting, seed, vehicle, time), settings in the order of `names`; exact `peak` (setting,) at the truth."""
+    """`run` (setting, seed, vehicle, time), settings in the order of `names`; exact `peak` (setting,) at the truth.
+
+    Example:
+        >>> from avtorch.paper import Leaders, Platoon, platoon
+        >>> found: Platoon = platoon(Leaders.read(), seeds=2, seed=0)
+        >>> found.run.speed.dim(), len(found.names) == len(found.peak)
+        (4, True)
+    """
 
     ahead: Ahead
     names: tuple[str, ...]
@@ -107,7 +114,14 @@ class Platoon:
 
 
 def platoon(leaders: Leaders, *, seeds: int, seed: int, progress: Progress = lambda _: None) -> Platoon:
-    """All settings and noises (`MOST_SEEDS` at most) in one batch."""
+    """All settings and noises (`MOST_SEEDS` at most) in one batch.
+
+    Example:
+        >>> from avtorch.paper import Leaders, platoon
+        >>> rows = platoon(Leaders.read(), seeds=2, seed=0).rows
+        >>> rows[0].quantity
+        'RMS of the speed about its mean, vehicle 10 over vehicle 1'
+    """
     ahead, seeds = leaders.main, min(seeds, MOST_SEEDS)
     chosen = our_setting(ahead, seed, lambda x: progress(0.3 * x))
     named = {

@@ -17,7 +17,13 @@ from avtorch.paper.rows import ClaimRow
 from avtorch.paper.strategies import strategies
 
 SEEDS = 20
-"""Noises of every setting, as the sweep asks for (SPEC section 5)."""
+"""Noises of every setting, as the sweep asks for (SPEC section 5).
+
+Example:
+    >>> from avtorch.paper import SEEDS
+    >>> SEEDS  # noises of each setting unless others are asked for
+    20
+"""
 
 
 class Experiment(Protocol):
@@ -35,14 +41,27 @@ EXPERIMENTS: Mapping[str, Callable[..., Experiment]] = {
     "gains": gains,
     "platoon": platoon,
 }
-"""In the order of the paper: `(leaders, seeds=, seed=, progress=)` to what was found."""
+"""In the order of the paper: `(leaders, seeds=, seed=, progress=)` to what was found.
+
+Example:
+    >>> from avtorch.paper import EXPERIMENTS
+    >>> list(EXPERIMENTS)
+    ['regions', 'estimation', 'monitoring', 'strategies', 'gains', 'platoon']
+"""
 
 _COST = {"regions": 8.0, "estimation": 50.0, "monitoring": 15.0, "strategies": 60.0, "gains": 5.0, "platoon": 20.0}
 
 
 @dataclass(frozen=True)
 class Reproduction:
-    """`found` by name of the experiment, in the order of the paper."""
+    """`found` by name of the experiment, in the order of the paper.
+
+    Example:
+        >>> from avtorch.paper import Reproduction, reproduce
+        >>> found: Reproduction = reproduce(["gains"], seeds=2)
+        >>> list(found.found), found.seeds
+        (['gains'], 2)
+    """
 
     found: dict[str, Experiment]
     leaders: Leaders
@@ -76,6 +95,12 @@ def reproduce(
 
     `leaders`: default the embedded US06. `progress(done, of)`. Raises `InputError` for an unknown name, or fewer than
     two seeds: an interval needs them.
+
+    Example:
+        >>> from avtorch.paper import reproduce
+        >>> found = reproduce(["gains"], seeds=2)
+        >>> {row.verdict for row in found.rows} <= {"same", "better", "not reproduced"}
+        True
     """
     chosen = list(EXPERIMENTS) if names is None else [n for n in EXPERIMENTS if n in names]
     for name in names or ():

@@ -86,7 +86,14 @@ class Driven:
 
 @dataclass(frozen=True)
 class Strategies:
-    """By name, `AS_BUILT` first, then the printed ones, then ours; `seed` of the intervals."""
+    """By name, `AS_BUILT` first, then the printed ones, then ours; `seed` of the intervals.
+
+    Example:
+        >>> from avtorch.paper import Leaders, Strategies, strategies
+        >>> found: Strategies = strategies(Leaders.read(), seeds=2, seed=0)
+        >>> len(found.driven), found.seed
+        (10, 0)
+    """
 
     ahead: Ahead
     driven: dict[str, Driven]
@@ -176,7 +183,14 @@ class Strategies:
 
 
 def strategies(leaders: Leaders, *, seeds: int, seed: int, progress: Progress = lambda _: None) -> Strategies:
-    """Everything behind the main leader, every setting under the same `seeds` noises."""
+    """Everything behind the main leader, every setting under the same `seeds` noises.
+
+    Example:
+        >>> from avtorch.paper import Leaders, strategies
+        >>> rows = strategies(Leaders.read(), seeds=2, seed=0).rows
+        >>> len(rows) > 0, {row.name for row in rows}
+        (True, {'strategies'})
+    """
     ahead = leaders.main
     named = {AS_BUILT: Setting(scenarios=1), **PRINTED}
     steps = 1 + len(OURS)

@@ -1,4 +1,13 @@
-"""Pictures: drawings that take an axes and return it, and the figures that the commands write."""
+"""Pictures: drawings that take an axes and return it, and the figures that the commands write.
+
+Example:
+    >>> import numpy as np
+    >>> from avtorch import plots
+    >>> time = np.arange(0.0, 10.0, 0.1)
+    >>> traces = {"speed": {"leader": 20 + np.sin(time), "with action": 20 + np.sin(time - 1)}}
+    >>> plots.save(plots.motion_figure({}, time, traces), "motion.png").name
+    'motion.png'
+"""
 
 from avtorch.plots.calibration_figures import calibration_figure
 from avtorch.plots.detectors import operating_curve, operating_figure

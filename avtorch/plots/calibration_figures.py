@@ -15,7 +15,18 @@ POINTS = 100
 
 @styled
 def calibration_figure(calibration: Calibration, *, title: str = "") -> Figure:
-    """Simulation-based calibration, a row a quantity: histogram of ranks, ECDF difference, coverage of intervals."""
+    """Simulation-based calibration, a row a quantity: histogram of ranks, ECDF difference, coverage of intervals.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.plots import calibration_figure
+        >>> from avtorch.validation.ranks import Calibration
+        >>> g, names = torch.Generator().manual_seed(0), ("T_L", "K_L")
+        >>> ranks, below = torch.randint(0, 100, (200, 2), generator=g), torch.rand(200, 2, generator=g)
+        >>> figure = calibration_figure(Calibration(names, ranks, 99, below.double(), dropped=0))
+        >>> len(figure.axes)  # a row each of histogram, ECDF difference and coverage
+        6
+    """
     names = calibration.names
     counts, ecdf, band = calibration.counts(20), calibration.ecdf, calibration.ecdf_band()
     # a central interval of level c holds the truth where this is at most c

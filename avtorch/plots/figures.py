@@ -24,7 +24,16 @@ Motion = Mapping[str, Mapping[str, ArrayLike]]
 
 @styled
 def motion_figure(answer: Mapping[str, Any], time: ArrayLike, traces: Motion) -> Figure:
-    """Speeds, accelerations and spacings of a run with and without action."""
+    """Speeds [m/s], accelerations [m/s²] and spacings [m] of a run with and without action, over `time` (time,) [s].
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.plots import motion_figure
+        >>> time = np.arange(0.0, 10.0, 0.1)
+        >>> traces = {q: {"leader": np.sin(time), "with action": np.sin(time - 1)} for q in ("speed", "accel")}
+        >>> len(motion_figure({"change": {"time_s": 4.0}}, time, traces).axes)
+        2
+    """
     figure = Figure(figsize=(9, 2.3 * len(traces) + 0.6), layout="constrained")
     axes = figure.subplots(len(traces), 1, sharex=True, squeeze=False)[:, 0]
     for ax, (quantity, named) in zip(axes, traces.items(), strict=True):
@@ -46,6 +55,15 @@ def belief_figure(
     """Posterior bands of T_L and K_L over time; with a `log`, the quality of its rows below them.
 
     Times are drawn from the log's start, which the answer's `epoch_s` or the `log` tells.
+
+    Example:
+        >>> from avtorch import Leader, estimate, simulate
+        >>> from avtorch.plots import belief_figure
+        >>> from avtorch.results import estimates_answer
+        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
+        >>> answer = estimates_answer(estimate(log, estimator="map"))
+        >>> len(belief_figure(answer["windows"], log=log).axes)  # T_L, K_L, quality of the rows
+        3
     """
     epoch_s = log.epoch_s if log is not None else (answer or {}).get("epoch_s", 0.0)
     recorded, windows, answer = windows, from_start(windows, epoch_s), _from_start(answer, epoch_s)
@@ -65,7 +83,17 @@ def belief_figure(
 
 @styled
 def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = None, target: float = 0.95) -> Figure:
-    """P(string stable) over time, with alerts and actions; each action says what it set."""
+    """P(string stable) over time, with alerts and actions; each action says what it set.
+
+    Example:
+        >>> from avtorch import Leader, estimate, simulate
+        >>> from avtorch.plots import probability_figure
+        >>> from avtorch.results import estimates_answer
+        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
+        >>> answer = estimates_answer(estimate(log, estimator="map"))
+        >>> len(probability_figure(answer["windows"]).axes)
+        1
+    """
     epoch_s = (answer or {}).get("epoch_s", 0.0)
     windows, answer = from_start(windows, epoch_s), _from_start(answer, epoch_s)
     figure = Figure(figsize=(9, 3.6), layout="constrained")
@@ -87,7 +115,19 @@ def region_figure(
     *,
     truth: tuple[float, float] | None = None,
 ) -> Figure:
-    """The posterior cloud in the stability region of each named setting, side by side on the same axes."""
+    """The posterior cloud in the stability region of each named setting, side by side on the same axes.
+
+    `clouds`: draws of T_L [s] and K_L [-], (draw,) each, by name; `truth`: the two of the true vehicle.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch import Setting
+        >>> from avtorch.plots import region_figure
+        >>> settings = [(f"{gap} s", Setting(time_gap=gap).as_dict()) for gap in (1.0, 2.5)]
+        >>> T_L, K_L = np.random.default_rng(0).normal([[1.5], [0.5]], 0.02, (2, 100))
+        >>> len(region_figure(settings, {"now": (T_L, K_L)}, truth=(1.5, 0.5)).axes)
+        2
+    """
     t = np.concatenate([np.asarray(c[0]) for c in clouds.values()] + [[] if truth is None else [truth[0]]])
     k = np.concatenate([np.asarray(c[1]) for c in clouds.values()] + [[] if truth is None else [truth[1]]])
     # a few far draws of a broad belief must not squeeze the rest into a corner
@@ -121,6 +161,17 @@ def overview_figure(
 
     `answer` is `run.json`, or `avtorch.results.run_answer` of a `SupervisedRun` and the same drive without action;
     `time` [s] (time,) and `traces` of `motion`. `truth`: by name, (from [s], value) pairs; `bounds`: design bounds.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch import Leader, estimate, simulate
+        >>> from avtorch.plots import overview_figure
+        >>> from avtorch.results import estimates_answer
+        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
+        >>> answer = {**estimates_answer(estimate(log, estimator="map")), "alerts": [], "actions": []}
+        >>> traces = {"accel": {"leader": log.lead_accel, "with action": log.accel}}
+        >>> len(overview_figure(answer, log.time, traces).axes)
+        4
     """
     figure = Figure(figsize=(9, 8.4), layout="constrained")
     axes = figure.subplots(4, 1, sharex=True)
@@ -148,7 +199,18 @@ def stability_figure(
 ) -> Figure:
     """A stability region with one setting in it, beside that setting's gain over frequency.
 
-    `stable`: the setting is locally stable; where it is not the gain is only formal, and the picture says so.
+    `omega` [rad/s] and `gain` [-] are (frequency,), `peak` the two at the peak. `stable`: the setting is
+    locally stable; where it is not the gain is only formal, and the picture says so.
+
+    Example:
+        >>> import torch
+        >>> from avtorch import stability
+        >>> from avtorch.plots import stability_figure
+        >>> plane = stability.region(("T", torch.linspace(0.1, 2, 21)), ("K", torch.linspace(0.2, 1.3, 11)))
+        >>> omega = torch.logspace(-1, 1, 50)
+        >>> size = stability.gain(omega, 1.5, 0.5, 1.0, (1.5, 1.5, -0.8))
+        >>> len(stability_figure(plane, (1.5, 0.5), omega, size).axes)
+        2
     """
     figure = Figure(figsize=(10.4, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[1, 1.05])

@@ -66,7 +66,14 @@ _KINDS = {
 
 
 def paper_pictures(found: Mapping[str, Any]) -> dict[str, Callable[[], Figure]]:
-    """File name to figure, of the experiments found (`Reproduction.found`)."""
+    """File name to figure, of the experiments found (`Reproduction.found`).
+
+    Example:
+        >>> from avtorch.paper import reproduce
+        >>> from avtorch.plots import paper_pictures
+        >>> sorted(paper_pictures(reproduce(["gains"], seeds=2).found))
+        ['gains.png']
+    """
     pictures: dict[str, Callable[[], Figure]] = {}
     for name, one in found.items():
         if name == "strategies":
@@ -250,7 +257,13 @@ _STRATEGIES: Mapping[str, Callable[[Strategies], Figure]] = {
 
 
 PAPER_PICTURES = (*(f"{name}.png" for name in _DRAWN), *(f"strategies_{x}.png" for x in _STRATEGIES))
-"""Every file that `paper_pictures` may name."""
+"""Every file that `paper_pictures` may name.
+
+Example:
+    >>> from avtorch.plots import PAPER_PICTURES, paper_pictures
+    >>> len(PAPER_PICTURES), paper_pictures({})  # of nothing found there is no picture
+    (8, {})
+"""
 
 
 def _windows(one: Watched, scenario: int = 0) -> list[dict[str, Any]]:

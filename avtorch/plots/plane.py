@@ -23,6 +23,15 @@ def verdict_map(
     """Where a loop is string stable, where it only is locally stable and amplifies, where it is unstable; masks (y, x).
 
     Contours inside the amplifying part give the peak gain.
+
+    Example:
+        >>> import numpy as np
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.plots import verdict_map
+        >>> x = y = np.linspace(0.0, 1.0, 11)
+        >>> local, string = np.add.outer(y, x) < 1.5, np.add.outer(y, x) < 1.0
+        >>> [float(end) for end in verdict_map(Figure().subplots(), x, y, local, string).get_xlim()]
+        [0.0, 1.0]
     """
     x, y, local, string = (np.asarray(v) for v in (x, y, local, string))
     kind = np.where(string, 2, np.where(local, 1, 0))
@@ -58,7 +67,17 @@ def verdict_map(
 
 
 def region(ax: Axes, plane: stability.Region, *, point: tuple[float, float] | None = None) -> Axes:
-    """A `stability.Region`, with the setting asked about as a point in it."""
+    """A `stability.Region`, with the setting asked about as a point in it.
+
+    Example:
+        >>> import torch
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch import stability
+        >>> from avtorch.plots import region
+        >>> plane = stability.region(("T", torch.linspace(0.1, 2, 21)), ("K", torch.linspace(0.2, 1.3, 11)))
+        >>> region(Figure().subplots(), plane, point=(0.3, 1.0)).get_xlabel()
+        'actuation lag $T_L$ [s]'
+    """
     verdict_map(ax, plane.x, plane.y, plane.local, plane.string, plane.peak_gain)
     if point is not None:
         ax.plot(
@@ -83,6 +102,14 @@ def setting_region(
 
     The lower level's inversion is taken into account: the verdict on a vehicle is that on its effective lag and gain.
     `clouds`: draws `(T_L, K_L)` of the belief, by the name of the moment; the last one is drawn strongest.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch import Setting
+        >>> from avtorch.plots import setting_region
+        >>> setting = Setting(time_gap=1.6).as_dict()
+        >>> setting_region(Figure().subplots(), setting, T_range=(0.1, 2.0), K_range=(0.3, 1.3), points=41).get_ylabel()
+        'actuation gain $K_L$ [-]'
     """
     T = torch.linspace(*T_range, points, dtype=torch.float64)
     K = torch.linspace(*K_range, points, dtype=torch.float64)
@@ -111,7 +138,18 @@ def setting_region(
 
 
 def gain_curve(ax: Axes, omega: ArrayLike, gain: ArrayLike, *, peak: tuple[float, float] | None = None) -> Axes:
-    """`|G(jω)|` from the leader's speed to the follower's over frequency [rad/s]; above one, disturbances grow."""
+    """`|G(jω)|` from the leader's speed to the follower's over frequency [rad/s]; above one, disturbances grow.
+
+    Example:
+        >>> import torch
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch import stability
+        >>> from avtorch.plots import gain_curve
+        >>> omega = torch.logspace(-1, 1, 50)
+        >>> size = stability.gain(omega, 1.5, 0.5, 1.0, (1.5, 1.5, -0.8))
+        >>> gain_curve(Figure().subplots(), omega, size).get_xscale()
+        'log'
+    """
     omega, gain = np.asarray(omega), np.asarray(gain)
     ax.fill_between(omega, 1.0, gain, where=gain > 1, color=ORANGE, alpha=0.3, linewidth=0)
     ax.axhline(1.0, color=GREY, linewidth=1.0, linestyle=":")
@@ -129,7 +167,14 @@ def gain_curve(ax: Axes, omega: ArrayLike, gain: ArrayLike, *, peak: tuple[float
 
 
 def verdict_legend(ax: Axes, *, extra: bool = True) -> Axes:
-    """Name the three colours of a verdict map, and whatever else the axes labels, below it."""
+    """Name the three colours of a verdict map, and whatever else the axes labels, below it.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.plots import verdict_legend
+        >>> [text.get_text() for text in verdict_legend(Figure().subplots()).get_legend().get_texts()]
+        ['string stable', 'stable, amplifies (lines: peak gain)', 'unstable']
+    """
     patches: list[Any] = [
         Patch(facecolor=STABLE, edgecolor=GREY, label="string stable"),
         Patch(facecolor=AMPLIFIES, edgecolor=GREY, label="stable, amplifies (lines: peak gain)"),

@@ -30,11 +30,27 @@ Place = Literal["outside upper center", "outside lower center"]
 
 
 VALIDATION_PICTURES = ("marginals.png", "joint.png", "ranks.png", "agreement.png", "ecdf.png")
-"""Every file that `validation_figures` may name."""
+"""Every file that `validation_figures` may name.
+
+Example:
+    >>> from avtorch.plots import VALIDATION_PICTURES
+    >>> VALIDATION_PICTURES[0], len(VALIDATION_PICTURES)
+    ('marginals.png', 5)
+"""
 
 
 def validation_figures(validation: Validation) -> dict[str, Callable[[], Figure]]:
-    """The figures of a validation, by the name of the file that each is for; a figure is made when called."""
+    """The figures of a validation, by the name of the file that each is for; a figure is made when called.
+
+    Example:
+        >>> from avtorch.inference import SamplerSettings
+        >>> from avtorch.plots import validation_figures
+        >>> from avtorch.validation import NutsSettings, synthetic_windows, validate
+        >>> quick = dict(settings=SamplerSettings(chains=64), nuts=NutsSettings(1, 20, 10), nuts_windows=1)
+        >>> figures = validation_figures(validate(synthetic_windows(1, seed=1), **quick))
+        >>> sorted(figures)
+        ['agreement.png', 'ecdf.png', 'joint.png', 'marginals.png', 'ranks.png']
+    """
     shown = ChosenWindows(validation)
     figures: dict[str, Callable[[], Figure]] = {
         "marginals.png": lambda: marginals_figure(shown),

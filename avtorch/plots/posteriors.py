@@ -46,9 +46,17 @@ def marginals(
     are left out of the picture but not of the count.
 
     Args:
-        sgld_draws, nuts_draws: draws of that parameter in that window, any shape.
+        sgld_draws, nuts_draws: draws of that parameter in that window, `(...)`, in its own unit.
         quadrature: exact marginals, one of whose windows is ``window``; None where there are none.
         truth: its true value, drawn as a line.
+
+    Example:
+        >>> import numpy as np
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.plots import marginals
+        >>> draws = np.random.default_rng(0).normal(0.5, 0.02, 1000)
+        >>> marginals(Figure().subplots(), "T_L", draws, None, None, truth=0.5).get_xlabel()
+        'actuation lag $T_L$ [s]'
     """
     view, sd = [np.inf, -np.inf], np.nan
     if quadrature is not None:
@@ -91,6 +99,16 @@ def exact_density(
 
     Args:
         tail: mass left out at either end.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.inference import integrate
+        >>> from avtorch.plots import exact_density
+        >>> from avtorch.validation import synthetic_windows
+        >>> exact = integrate(synthetic_windows(1, seed=1).density, nodes=25)
+        >>> lag, density = exact_density(exact, "T_L")
+        >>> round(float((density[:-1] * np.diff(lag)).sum()), 2)  # a density
+        1.0
     """
     i = quadrature.names.index(name)
     nodes, mass = quadrature.nodes[window, i], quadrature.mass[window, i]
@@ -120,6 +138,16 @@ def joint_cloud(
         posterior: what is judged, drawn as points.
         references: draws for the contours and which of their windows, by method: ``"exact"``, ``"NUTS"``.
         shown: points drawn at most, evenly taken.
+
+    Example:
+        >>> import torch
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.inference import sample
+        >>> from avtorch.plots import joint_cloud
+        >>> from avtorch.validation import synthetic_windows
+        >>> posterior = sample(synthetic_windows(1, seed=1).density, generator=torch.Generator().manual_seed(0))
+        >>> joint_cloud(Figure().subplots(), posterior).get_xlabel()
+        'actuation lag $T_L$ [s]'
     """
     cloud = _pair(posterior, names, window)
     ax.plot(*_thinned(cloud, shown).T, ".", color=BLUE, markersize=2.5, alpha=0.4, rasterized=True)
@@ -175,6 +203,14 @@ def agreement_scatter(
         error: Monte Carlo standard error of ``value``, ``(window,)``; twice its median is drawn as a bar at the left.
         settled: windows whose chains and reference both settled, ``(window,)``; the others are hollow.
         reach: half height of the axis; by default it shows nearly all windows, and at least twice the limits.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.plots import agreement_scatter
+        >>> width, difference = [0.02, 0.05, 0.2], [0.03, -0.02, 0.3]  # of three windows
+        >>> ax = agreement_scatter(Figure().subplots(), width, difference, limits=(-0.1, 0.1))
+        >>> ax.get_title("left")
+        '67 % within'
     """
     x, y = 100 * np.asarray(width, dtype=float), np.asarray(value, dtype=float)
     middle = 0.5 * (limits[0] + limits[1])

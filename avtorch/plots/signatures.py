@@ -52,8 +52,18 @@ def standard_response(effect: Effect | None, *, seed: int = _SEED) -> Response:
 
 
 def effect_signature(ax: Axes, effect: Effect, *, seed: int = _SEED) -> Axes:
-    """The measured acceleration [m/s²] with `effect` and without, over the standard command; below, the gap, magnified
-    by the factor that is written there."""
+    """Plot the measured acceleration [m/s²] with `effect` and without, over the standard command.
+
+    Below them lies the gap, magnified by the factor that is written there.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.gap import DeadTime
+        >>> from avtorch.plots import effect_signature
+        >>> ax = effect_signature(Figure().subplots(), DeadTime(0.4))
+        >>> len(ax.lines) >= 2
+        True
+    """
     time, command = standard_command()
     with_it = standard_response(effect, seed=seed).accel_measured
     without = standard_response(None).accel_measured
@@ -76,7 +86,13 @@ def effect_signature(ax: Axes, effect: Effect, *, seed: int = _SEED) -> Axes:
 
 @styled
 def signature_figure() -> Figure:
-    """All registered effects at typical strength, in the order of the chain."""
+    """All registered effects at typical strength, in the order of the chain.
+
+    Example:
+        >>> from avtorch.plots import signature_figure
+        >>> len(signature_figure().axes) >= 22
+        True
+    """
     typical = [GainChange(change_s=9.0) if cls is GainChange else cls() for cls in EFFECTS.values()]
     effects = sorted(typical, key=lambda e: (PLACES.index(e.place), e.order, e.name))
     columns = 4

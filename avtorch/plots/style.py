@@ -49,7 +49,15 @@ STYLE: Any = {
     "ytick.labelcolor": BLACK,
     "hatch.linewidth": 0.6,
 }
-"""The look of all pictures, as matplotlib's rcParams."""
+"""The look of all pictures, as matplotlib's rcParams.
+
+Example:
+    >>> import matplotlib
+    >>> from avtorch.plots import STYLE
+    >>> with matplotlib.rc_context(STYLE):
+    ...     print(matplotlib.rcParams["font.size"])
+    10.0
+"""
 
 LABELS = {
     "T_L": "actuation lag $T_L$ [s]",
@@ -100,7 +108,14 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
-    """Write a figure as PNG, whole or not at all."""
+    """Write a figure as PNG, whole or not at all.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.plots import save
+        >>> save(Figure(figsize=(1, 1)), "empty.png").read_bytes()[1:4]
+        b'PNG'
+    """
     picture = _png(figure)
     with atomic(path, binary=True) as stream:
         stream.write(picture)
@@ -111,6 +126,12 @@ def show(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Show a figure where one looks: below the cell in a notebook; elsewhere it is saved at `path`, which is printed.
 
     Raises `InputError` where the file cannot be written.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.plots import show
+        >>> show(Figure(figsize=(1, 1)), "empty.png")  # in a notebook the picture itself
+        picture: empty.png
     """
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     # the shell of a terminal has no kernel, and no pictures

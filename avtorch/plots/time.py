@@ -27,7 +27,17 @@ Steps = Sequence[tuple[float, float]]
 
 
 def motion(ax: Axes, time: ArrayLike, traces: Mapping[str, ArrayLike], *, quantity: str = "speed") -> Axes:
-    """Speeds, accelerations or spacings over time [s]; `traces` by name: leader, without action, with action."""
+    """Speeds, accelerations or spacings over time [s]; `traces` by name: leader, without action, with action.
+
+    Example:
+        >>> import numpy as np
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.plots import motion
+        >>> time = np.arange(0.0, 10.0, 0.1)
+        >>> ax = motion(Figure().subplots(), time, {"leader": 20 + np.sin(time), "with action": 20 + np.sin(time - 1)})
+        >>> ax.get_ylabel()
+        'speed [m/s]'
+    """
     for name, values in traces.items():
         ax.plot(np.asarray(time), np.asarray(values), label=name, **_TRACES.get(name, {}))
     if quantity == "spacing" and any(np.nanmin(np.asarray(values)) <= 0 for values in traces.values()):
@@ -50,6 +60,16 @@ def belief_band(
     """The belief about one parameter: 90 % interval and mean of each window, paler where the window was not used.
 
     `truth`: what it really was. `bounds`: the design bounds that the controller was built for.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch import Leader, estimate, simulate
+        >>> from avtorch.plots import belief_band
+        >>> from avtorch.results import estimates_answer
+        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
+        >>> windows = estimates_answer(estimate(log, estimator="map"))["windows"]
+        >>> belief_band(Figure().subplots(), windows, "T_L", bounds=(0.1, 0.4)).get_ylabel()
+        'actuation lag $T_L$ [s]'
     """
     if bounds is not None:
         ax.axhspan(
@@ -72,7 +92,18 @@ def belief_band(
 
 
 def string_probability(ax: Axes, windows: Windows, *, target: float = 0.95) -> Axes:
-    """P(string stable) of the setting in force, over time."""
+    """P(string stable) of the setting in force, over time.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch import Leader, estimate, simulate
+        >>> from avtorch.plots import string_probability
+        >>> from avtorch.results import estimates_answer
+        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
+        >>> windows = estimates_answer(estimate(log, estimator="map"))["windows"]
+        >>> string_probability(Figure().subplots(), windows).get_ylabel()
+        'P(string stable) [-]'
+    """
     x = np.array([t for w in windows for t in (w["start_s"], w["end_s"])])
     p = np.array([w["p_string_stable"] for w in windows for _ in range(2)])
     ax.fill_between(x, p, color=SKY, alpha=0.25, linewidth=0)
@@ -101,7 +132,16 @@ def events(
     actions: Iterable[Mapping[str, Any]] = (),
     label: bool = True,
 ) -> Axes:
-    """Mark the change of the vehicle, the alerts and the actions on a time axis."""
+    """Mark the change of the vehicle, the alerts and the actions on a time axis.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.plots import events
+        >>> alert = {"time_s": 28.0, "detector": "stability", "why": "P(string stable) is 0.02"}
+        >>> ax = events(Figure().subplots(), change_s=26.0, alerts=[alert])
+        >>> len(ax.lines)
+        2
+    """
     # an action follows its alert at once: the broad pale line leaves the thin one on top of it to be seen
     for i, time in enumerate(sorted({a["time_s"] for a in alerts})):
         ax.axvline(time, color=ORANGE, alpha=0.45, linewidth=5, zorder=1.7, label="alert" if label and i == 0 else None)
@@ -118,6 +158,16 @@ def data_quality(ax: Axes, log: Log, windows: Windows = ()) -> Axes:
     """Which rows of a log serve: recorded, masked (driver, standstill); and which windows were excited.
 
     Times are drawn from the log's start; `windows` are on its own clock, as answers have them.
+
+    Example:
+        >>> import numpy as np
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.io import Log
+        >>> from avtorch.plots import data_quality
+        >>> time = np.arange(0.0, 20.0, 0.1)
+        >>> log = Log.from_arrays(time=time, accel_cmd=np.sin(time), speed=20 - np.cos(time), engaged=time < 15)
+        >>> [label.get_text() for label in data_quality(Figure().subplots(), log).get_yticklabels()]
+        ['recorded', 'driver in charge', 'standstill', 'excited windows']
     """
     windows = from_start(windows, log.epoch_s)
     step = 1 / log.rate_hz

@@ -35,6 +35,14 @@ def confusion(ax: Axes, counts: Counts) -> Axes:
 
     Raises:
         InputError: where there is no case.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.plots import confusion
+        >>> counts = {"none": {"none": 9, "dead_time": 1}, "dead_time": {"dead_time": 5}}
+        >>> ax = confusion(Figure().subplots(), counts)
+        >>> [text.get_text() for text in ax.texts]
+        ['9', '1', '5']
     """
     gathered = _gathered(counts)
     rows = [name for name in _order() if sum(gathered.get(name, {}).values())]
@@ -81,7 +89,15 @@ def confusion(ax: Axes, counts: Counts) -> Axes:
 
 @styled
 def confusion_figure(answer: Mapping[str, Any]) -> Figure:
-    """The confusion matrix of `blindtest.json`."""
+    """The confusion matrix of `blindtest.json`.
+
+    Example:
+        >>> from avtorch.plots import confusion_figure
+        >>> counts = {"none": {"none": 9, "dead_time": 1}, "dead_time": {"dead_time": 5}}
+        >>> answer = {"confusion": counts, "cases": 15, "answerer": "avtorch", "signals": ["accel", "speed"]}
+        >>> len(confusion_figure(answer).axes) > 0
+        True
+    """
     gathered = _gathered(answer["confusion"])
     told = {verdict for one in gathered.values() for verdict in one} | gathered.keys()
     size = 0.31 * len(told)

@@ -18,7 +18,15 @@ from avtorch.io import answer_set, atomic
 
 @dataclass(frozen=True)
 class Exported:
-    """`values` by the tool's own names; `lost`: what the plant has and the tool cannot say, one sentence each."""
+    """`values` by the tool's own names; `lost`: what the plant has and the tool cannot say, one sentence each.
+
+    Example:
+        >>> from avtorch.gap import plant
+        >>> from avtorch.remedy import to_autoware
+        >>> exported = to_autoware(plant(baseline="sensor_bias=0.1"))
+        >>> exported.tool, sorted(exported.values), len(exported.lost)
+        ('Autoware planning simulator', ['acc_time_constant', 'acc_time_delay', 'debug_acc_scaling_factor'], 1)
+    """
 
     tool: str
     values: Mapping[str, float]
@@ -34,7 +42,17 @@ _SENSING = {"sensor_lag", "sensor_bias", "sensor_scale", "outliers"}
 
 
 def to_autoware(plant: GapPlant) -> Exported:
-    """Delay, time constant, scaling and limits of `plant`."""
+    """Delay, time constant, scaling and limits of `plant`.
+
+    Example:
+        >>> from avtorch.gap import plant
+        >>> from avtorch.remedy import to_autoware
+        >>> print(to_autoware(plant(baseline="dead_time=0.2", T_L=0.4)).to_text(), end="")
+        # Autoware planning simulator
+        acc_time_delay: 0.2
+        acc_time_constant: 0.4
+        debug_acc_scaling_factor: 1
+    """
     effects = {e.name: {k: float(v) for k, v in e.values().items() if v.dim() == 0} for e in plant.effects}
     values = {
         "acc_time_delay": effects.get("dead_time", {}).get("delay_s", 0.0),
@@ -55,7 +73,14 @@ def to_autoware(plant: GapPlant) -> Exported:
 
 
 def to_openpilot(plant: GapPlant) -> Exported:
-    """The actuator's delay as openpilot means it: until the response to a step has gone 63 % of its way."""
+    """The actuator's delay as openpilot means it: until the response to a step has gone 63 % of its way.
+
+    Example:
+        >>> from avtorch.gap import plant
+        >>> from avtorch.remedy import to_openpilot
+        >>> {k: round(v, 2) for k, v in to_openpilot(plant(baseline="dead_time=0.2", T_L=0.4)).values.items()}
+        {'longitudinalActuatorDelay': 0.6}
+    """
     effects = {e.name: {k: float(v) for k, v in e.values().items() if v.dim() == 0} for e in plant.effects}
     delay = effects.get("dead_time", {}).get("delay_s", 0.0) + float(plant.T_L)
     lost = [f"K_L {float(plant.K_L):.3g}: a gain is learned on the way"] if abs(float(plant.K_L) - 1) > 0.01 else []
@@ -68,6 +93,12 @@ def write_exports(plant: GapPlant | None, folder: str | PathLike[str]) -> list[P
     """Publish `plant.autoware.yaml` and `plant.openpilot.yaml` together; returns the files. None: earlier ones go.
 
     Raises `InputError` where the folder cannot be written.
+
+    Example:
+        >>> from avtorch.gap import plant
+        >>> from avtorch.remedy import write_exports
+        >>> [path.name for path in write_exports(plant(baseline="dead_time=0.2"), "out")]
+        ['plant.autoware.yaml', 'plant.openpilot.yaml']
     """
     tools = {"plant.autoware.yaml": to_autoware, "plant.openpilot.yaml": to_openpilot}
     with answer_set(folder, list(tools)) as staged:

@@ -30,7 +30,17 @@ def linearised(
     """The chain of `plant` at `speed` [m/s] for steps of `step` [m/s²] (below 0: braking).
 
     `belief`: draws (draw,) of its parameters by the plant's names; without, its own values, and a batch of one. Drags
-    and pushes are told at that speed, random effects and the road are left out.
+    and pushes are linearised at that speed, random effects and the road are left out.
+
+    Example:
+        >>> import torch
+        >>> from avtorch import stability
+        >>> from avtorch.gap import plant
+        >>> from avtorch.remedy import linearised
+        >>> car = linearised(plant(baseline="dead_time=0.4"), speed=20.0)
+        >>> verdict = stability.chain_verdict(car, torch.tensor([1.0]), torch.tensor([1.5, 1.5, -0.8]))
+        >>> verdict.string_stable.tolist(), verdict.peak_gain.round(decimals=2).tolist()
+        ([False], [1.75])
     """
     own = [e for e in plant.effects if not e.random and e.name not in _LEFT_OUT]
     car = GapPlant(own, T_L=plant.T_L, K_L=plant.K_L, sigma=0.0)

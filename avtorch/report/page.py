@@ -52,6 +52,16 @@ def report_html(
 
     `quality`: what was noted of the data when it was read, a line each. `experiment`: what to drive next, for a picture
     of it. `sections`: what else there is to say after the verdict, lines by title.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, simulate
+        >>> from avtorch.gap import DeadTime, plant
+        >>> from avtorch.report import report_html
+        >>> late = plant([DeadTime(0.4)], sigma=0.0)
+        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
+        >>> page = report_html(diagnose(log, effects=["dead_time"], pairs=False))
+        >>> "dead_time" in page, page.rstrip().endswith("</html>")
+        (True, True)
     """
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, finalize=_seen, trim_blocks=True, lstrip_blocks=True
@@ -96,7 +106,17 @@ def write_report(
     experiment: Experiment | None = None,
     sections: Mapping[str, Sequence[str]] | None = None,
 ) -> Path:
-    """Write `report.html` into `folder`; returns its path. Raises `InputError` where it cannot be written."""
+    """Write `report.html` into `folder`; returns its path. Raises `InputError` where it cannot be written.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, simulate
+        >>> from avtorch.gap import DeadTime, plant
+        >>> from avtorch.report import write_report
+        >>> late = plant([DeadTime(0.4)], sigma=0.0)
+        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
+        >>> write_report(diagnose(log, effects=["dead_time"], pairs=False), "out").name
+        'report.html'
+    """
     path = Path(folder) / "report.html"
     text = report_html(found, quality=quality, experiment=experiment, sections=sections)
     with atomic(path) as stream:

@@ -13,7 +13,14 @@ from avtorch.trial.work import Answerer
 
 
 def avtorch(log: Log) -> dict[str, Any]:
-    """avtorch's own diagnosis, by Laplace's approximation."""
+    """avtorch's own diagnosis, by Laplace's approximation.
+
+    Example:
+        >>> from avtorch.trial import avtorch, rivals
+        >>> answerers = {"avtorch": avtorch, **rivals("none")}  # for `run_trial`
+        >>> list(answerers)
+        ['avtorch', 'random_guess']
+    """
     from avtorch.gap.diagnose import diagnose
 
     return diagnose(log, posterior="laplace").to_dict()
@@ -25,13 +32,24 @@ RIVALS: dict[str, Answerer] = {
     "black_box": black_box,
     "random_guess": random_guess,
 }
-"""The competitors."""
+"""The competitors.
+
+Example:
+    >>> from avtorch.trial import RIVALS
+    >>> sorted(RIVALS)
+    ['black_box', 'likelihood_bic', 'random_guess', 'sparse_regression']
+"""
 
 
 def rivals(names: str | Sequence[str] = "all") -> dict[str, Answerer]:
     """Competitors by name: `"all"` that are installed, `"none"`, or those named; the random guess is always among them.
 
     Raises `InputError` for an unknown name, and for one that is named and not installed.
+
+    Example:
+        >>> from avtorch.trial import rivals
+        >>> list(rivals(["black_box"]))
+        ['black_box', 'random_guess']
     """
     if names == "all":
         wanted = [name for name in RIVALS if name != "sparse_regression" or find_spec("pysindy") is not None]

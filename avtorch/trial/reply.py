@@ -26,6 +26,14 @@ def reply(
 
     Args: `probabilities` of candidates, at any scale; `none` and `unknown` are added with 0. `baseline`, `parameters`:
     (mean, sd) of normal laws. `log_evidence` relative to `none`. Candidates below 1e-4 are left out.
+
+    Example:
+        >>> from avtorch.io import Log
+        >>> from avtorch.trial import reply
+        >>> log = Log.from_arrays(time=[0.0, 0.1, 0.2], accel_cmd=[0.0, 0.5, 1.0], accel=[0.0, 0.1, 0.4])
+        >>> answer = reply(log, {"dead_time": 6.0, "rate_limit": 3.0, "none": 1.0}, why="the response comes late")
+        >>> answer["verdict"]["alias_set"]
+        ['dead_time', 'rate_limit', 'none']
     """
     weights = {"none": 0.0, "unknown": 0.0} | {name: float(p) for name, p in probabilities.items()}
     total = sum(weights.values())

@@ -63,6 +63,15 @@ def run_trial(
 
     Raises `InputError` for a folder with another trial's settings or in use by another process, for files of it that
     are damaged or another case's, and for arguments out of range.
+
+    Example:
+        >>> from avtorch.trial import reply, run_trial
+        >>> def always_none(log):
+        ...     return reply(log, {"none": 1.0}, why="it never finds anything")
+        >>> options = dict(mix={"none": 1.0}, seconds=20.0)
+        >>> answer = run_trial(2, seed=1, out="trial", answerers={"always_none": always_none}, **options)
+        >>> answer["false_alarm"], answer["schema"]
+        (0.0, 'avtorch.blindtest/1')
     """
     names = list(answerers)
     _check(n, seed, names, workers, signals)

@@ -19,7 +19,16 @@ from avtorch.io.answers import json_text
 from avtorch.trial.folder import TrialFolder
 
 Answerer = Callable[[Log], dict[str, Any]]
-"""Takes a log, returns an answer of `avtorch.diagnosis/1`."""
+"""Takes a log, returns an answer of `avtorch.diagnosis/1`.
+
+Example:
+    >>> from avtorch.trial import Answerer, reply
+    >>> def always_none(log):
+    ...     return reply(log, {"none": 1.0}, why="it never finds anything")
+    >>> answerers: dict[str, Answerer] = {"always_none": always_none}
+    >>> sorted(answerers)
+    ['always_none']
+"""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,12 @@
-"""How we know: draws held against references, with the error that chance makes."""
+"""How we know: draws held against references, with the error that chance makes.
+
+Example:
+    >>> from avtorch.inference import integrate, sample
+    >>> from avtorch.validation import agreement, synthetic_windows
+    >>> density = synthetic_windows(2, seed=1).density
+    >>> agreement(sample(density), integrate(density, nodes=25)).within(slack=0.02).tolist()
+    [True, True]
+"""
 
 from avtorch.validation.agreement import Agreement, agreement, between
 from avtorch.validation.stein import Stein, stein_discrepancy

@@ -39,6 +39,16 @@ class Agreement:
         z_mean, z_sd: differences of mean and of SD over their Monte Carlo standard errors.
         rhat: rank-normalised split R-hat, over superchains (see `avtorch.validation.diagnostics`).
         ess_bulk, ess_tail: effective sample sizes for the bulk and for the 5 % and 95 % quantiles.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import sample
+        >>> from avtorch.validation import between, synthetic_windows
+        >>> density = synthetic_windows(1, seed=1).density
+        >>> one, two = (sample(density, generator=torch.Generator().manual_seed(s)) for s in (0, 1))
+        >>> found = between(one, two)
+        >>> tuple(found.sd_ratio.shape), bool((found.rhat < 1.05).all()), bool((found.w1 < 0.1).all())
+        ((1, 3), True, True)
     """
 
     names: tuple[str, ...]
@@ -84,6 +94,16 @@ def agreement(posterior: Posterior, quadrature: Quadrature) -> Agreement:
 
     Raises:
         InputError: if parameters or windows differ, or ArviZ is missing.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import integrate, sample
+        >>> from avtorch.validation import agreement, synthetic_windows
+        >>> density = synthetic_windows(1, seed=1).density
+        >>> posterior = sample(density, generator=torch.Generator().manual_seed(0))
+        >>> found = agreement(posterior, integrate(density, nodes=25))
+        >>> bool((found.mean_difference.abs() < 0.1).all()), bool(((found.sd_ratio - 1).abs() < 0.1).all())
+        (True, True)
     """
     _same(posterior, quadrature.names, len(quadrature.mean))
     found = diagnose(posterior)
@@ -106,6 +126,16 @@ def between(posterior: Posterior, other: Posterior) -> Agreement:
 
     Raises:
         InputError: if parameters or windows differ, or ArviZ is missing.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import sample, sample_conjugate
+        >>> from avtorch.validation import between, synthetic_windows
+        >>> density = synthetic_windows(1, seed=1).density
+        >>> posterior = sample(density, generator=torch.Generator().manual_seed(0))
+        >>> other = sample_conjugate(density, generator=torch.Generator().manual_seed(0)).posterior
+        >>> bool((between(posterior, other).mean_difference.abs() < 0.2).all())
+        True
     """
     _same(posterior, other.names, other.draws.shape[2])
     found, reference = diagnose(posterior), diagnose(other)

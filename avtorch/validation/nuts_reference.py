@@ -15,7 +15,17 @@ from avtorch.validation.windows import Windows
 
 @dataclass(frozen=True)
 class NutsSettings:
-    """Chains, draws a chain and steps of adaptation of the NUTS reference."""
+    """Chains, draws a chain and steps of adaptation of the NUTS reference.
+
+    Raises:
+        InputError: for fewer than 1 chain, 16 draws or 1 step of adaptation.
+
+    Example:
+        >>> from avtorch.validation import NutsSettings
+        >>> quick = NutsSettings(chains=1, draws=200, warmup=100)  # for `validate`
+        >>> quick.chains * quick.draws
+        200
+    """
 
     chains: int = 2
     draws: int = 1000

@@ -64,6 +64,14 @@ class Validation:
         stein: kernel Stein discrepancy of SGLD, its null and p-value, ``(W,)`` each.
         seconds: per window, by method: "sgld", "nuts", "quadrature" (0 where it was not run).
         verdict: see `Verdict`.
+
+    Example:
+        >>> from avtorch.inference import SamplerSettings
+        >>> from avtorch.validation import NutsSettings, synthetic_windows, validate
+        >>> quick = dict(settings=SamplerSettings(chains=64), nuts=NutsSettings(1, 20, 10), nuts_windows=1)
+        >>> found = validate(synthetic_windows(1, seed=1), **quick)
+        >>> found.reference, tuple(found.agreement.sd_ratio.shape), sorted(found.seconds)
+        ('quadrature', (1, 3), ['nuts', 'quadrature', 'sgld'])
     """
 
     windows: Windows
@@ -165,6 +173,14 @@ def validate(
 
     Raises:
         InputError: if ArviZ or Pyro is missing, for ``nuts_windows`` below 1, or for a log that cannot be used.
+
+    Example:
+        >>> from avtorch.inference import SamplerSettings
+        >>> from avtorch.validation import NutsSettings, synthetic_windows, validate
+        >>> quick = dict(settings=SamplerSettings(chains=64), nuts=NutsSettings(1, 20, 10), nuts_windows=1)
+        >>> found = validate(synthetic_windows(1, seed=1), **quick)  # too few draws for a verdict; the defaults suffice
+        >>> found.names, bool((found.agreement.mean_difference.abs() < 0.5).all())
+        (('T_L', 'K_L', 'sigma'), True)
     """
     check_installed()
     if nuts_windows is not None and nuts_windows < 1:

@@ -30,6 +30,13 @@ class Verdict:
         share_if_exact: the share that exact draws of the same effective number would be expected to reach.
         nuts_p: p-value of the chi^2 test of NUTS's means against quadrature, or None where there is no quadrature.
         why: a plain sentence.
+
+    Example:
+        >>> from avtorch.validation import Verdict
+        >>> why = "98 of 100 windows agree"
+        >>> verdict = Verdict(True, share=0.98, low=0.93, high=1.0, share_if_exact=0.97, nuts_p=0.4, why=why)
+        >>> verdict.agree, verdict.low <= verdict.share <= verdict.high
+        (True, True)
     """
 
     agree: bool

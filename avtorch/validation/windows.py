@@ -45,6 +45,15 @@ class Windows:
         truth: the true parameters in the order of ``density.names``, ``(window, parameter)``, or None where unknown.
         start_s, end_s: bounds on the log's clock [s], ``(window,)``; from 0 for synthetic windows.
         sampler: settings of SGLD that the form has by default.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.validation import synthetic_windows
+        >>> windows = synthetic_windows(4, seed=1)
+        >>> len(windows), windows.names, windows.n.tolist()
+        (4, ('T_L', 'K_L', 'sigma'), [200.0, 500.0, 200.0, 500.0])
+        >>> tuple(windows.select(torch.tensor([0, 2])).truth.shape)
+        (2, 3)
     """
 
     name: str
@@ -92,6 +101,14 @@ def synthetic_windows(count: int, *, seed: int = 0) -> Windows:
 
     Raises:
         InputError: for ``count`` below 1.
+
+    Example:
+        >>> from avtorch.inference import find_mode
+        >>> from avtorch.validation import synthetic_windows
+        >>> windows = synthetic_windows(3, seed=1)
+        >>> estimate, truth = find_mode(windows.density).z.exp(), windows.truth
+        >>> bool(((estimate / truth - 1).abs() < 0.5).all())
+        True
     """
     generator = _generator(count, seed)
     T, sigma = _log_uniform(LAG, count, generator), _log_uniform(NOISE, count, generator)
@@ -105,6 +122,12 @@ def windows_from_prior(count: int, *, seed: int = 0, prior: Prior | None = None)
 
     Raises:
         InputError: for ``count`` below 1.
+
+    Example:
+        >>> from avtorch.validation import windows_from_prior
+        >>> windows = windows_from_prior(1000, seed=0)
+        >>> round(windows.truth[:, 0].median().item(), 1), windows.names[0]  # the prior's median lag of 0.3 s
+        (0.3, 'T_L')
     """
     generator = _generator(count, seed)
     prior = Joint(default_actuation_prior(), default_jerk_noise_prior()) if prior is None else prior
@@ -124,6 +147,14 @@ def windows_of_log(log: Log, *, window: float = 2.0, count: int | None = None) -
     Raises:
         InputError: for a log without accel_cmd or without a usable window, a ``window`` that is not positive, or
             ``count`` below 1.
+
+    Example:
+        >>> from avtorch import Leader, simulate
+        >>> from avtorch.validation import windows_of_log
+        >>> log = simulate(Leader.default(start=50.0, duration=6.0, dt=0.02)).log()
+        >>> windows = windows_of_log(log, window=2.0)
+        >>> windows.form, windows.end_s.tolist()
+        ('jerk', [2.0, 4.0, 6.0])
     """
     if log.accel_cmd is None:
         raise InputError(f"{log.name}: has no accel_cmd; T_L and K_L need the demanded acceleration")

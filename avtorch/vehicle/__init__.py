@@ -1,4 +1,12 @@
-"""What moves: the GLVD, controllers, closed loop and platoons, leaders, performance; stability in its own package."""
+"""What moves: the GLVD, controllers, closed loop and platoons, leaders, performance; stability in its own package.
+
+Example:
+    >>> from avtorch.vehicle import GLVDPlant, Leader, performance, simulate
+    >>> leader = Leader.default(start=180.0, duration=40.0, dt=0.05)
+    >>> run = simulate(leader, plant=GLVDPlant(T_L=1.5, K_L=0.5, sigma=0.0))
+    >>> float(performance(run).accel_rms_ratio.round(decimals=2))  # above 1: the follower amplifies
+    1.14
+"""
 
 from avtorch.vehicle.black_box import Linearised, linearise, measured_gain
 from avtorch.vehicle.block import Block, Trajectory

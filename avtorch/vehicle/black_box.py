@@ -38,6 +38,12 @@ class Linearised:
     `gains` (k_s [1/s²], k_v [1/s], k_a [-]), `time_gap` [s] and `feedforward` [-] as a `LinearController`'s.
     `bend` [-]: how much the slopes over a step ten times as large differ from these, as a share of the largest; near
     0 for a smooth law, large at a kink or a step of a table, where small motions have no one law.
+
+    Example:
+        >>> from avtorch.vehicle import LinearController, linearise
+        >>> law = linearise(LinearController(time_gap=1.6), speed=25.0)
+        >>> [round(k, 3) for k in law.gains], round(law.time_gap, 3), round(law.spacing, 2)
+        ([1.5, 1.5, -0.8], 1.6, 45.0)
     """
 
     speed: float
@@ -54,6 +60,16 @@ def linearise(controller: Controller, speed: float, *, step: float = 0.02) -> Li
     The controller is asked as in the loop, with tensors (scenario,), at time 0. Raises `InputError` where it has no
     equilibrium spacing up to 400 m, answers a spacing with no or with less acceleration (k_s <= 0: it does not follow),
     or something that is not finite.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle import linearise
+        >>> def cautious(state):  # a law of unknown structure: it limits what it demands
+        ...     wish = 1.2 * (state.spacing - 1.4 * state.speed - 6) + 1.3 * (state.lead_speed - state.speed)
+        ...     return 3 * torch.tanh(wish / 3)
+        >>> k_s, k_v, k_a = linearise(cautious, speed=20.0).gains
+        >>> round(k_s, 2), round(k_v, 2)
+        (1.2, 1.3)
     """
     spacing = _equilibrium(controller, speed)
     rest = (spacing, speed, 0.0, speed, 0.0)
@@ -122,6 +138,15 @@ def measured_gain(
     `cycles` whole cycles of the slowest (harmonics of a controller that is not linear are left out). `plant` has no
     noise by default; `spacing` [m] at the start, None for the controller's equilibrium. Infinite where the follower
     collides or stops. Raises `InputError` for bad numbers, or where the leader would roll back.
+
+    Example:
+        >>> from avtorch.vehicle import NOMINAL_GAINS, LinearController, measured_gain, stability
+        >>> omega = [1.0, 2.0]
+        >>> measured = measured_gain(LinearController(), omega, settle=10.0, cycles=1, dt=0.02)
+        >>> [round(x, 2) for x in measured.tolist()]
+        [0.78, 0.5]
+        >>> [round(x, 2) for x in stability.gain(omega, 0.3, 1.0, 1.0, NOMINAL_GAINS).tolist()]  # by linear theory
+        [0.78, 0.5]
     """
     w = torch.as_tensor(omega, dtype=torch.float64).reshape(-1)
     if len(w) == 0 or not bool((torch.isfinite(w) & (w > 0.0)).all()):

@@ -19,13 +19,27 @@ from avtorch.vehicle.arguments import Number, checked
 from avtorch.vehicle.time_gap import RAMP_RATE, TimeGap
 
 NOMINAL_GAINS = (1.5, 1.5, -0.8)
-"""Gains (k_s [1/s²], k_v [1/s], k_a [-]) of the upper level unless told otherwise."""
+"""Gains (k_s [1/s²], k_v [1/s], k_a [-]) of the upper level by default (Table 1 of the paper).
+
+Example:
+    >>> from avtorch.vehicle import NOMINAL_GAINS, stability
+    >>> bool(stability.string_stable(T_L=0.3, K_L=1.0, time_gap=1.0, gains=NOMINAL_GAINS))
+    True
+"""
 
 
 class FollowerState(NamedTuple):
     """What a follower sees at one tick. `time` [s] is a float, the same for all; the rest are tensors (..., scenario).
 
     `lead_accel` is what the link delivers: the leader's acceleration `link_delay` ago (see `ClosedLoop`).
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle import FollowerState, LinearController
+        >>> x = torch.tensor([30.0, 20.0, 0.0, 19.0, 0.0], dtype=torch.float64)
+        >>> state = FollowerState(0.0, *x.unsqueeze(-1))  # one scenario: 5 m too far back, closing in at 1 m/s
+        >>> LinearController()(state).tolist()
+        [6.0]
     """
 
     time: float
@@ -37,7 +51,16 @@ class FollowerState(NamedTuple):
 
 
 Controller = Callable[[FollowerState], Tensor]
-"""Takes what a follower sees, returns the demanded acceleration [m/s²]."""
+"""Takes what a follower sees, returns the demanded acceleration [m/s²].
+
+Example:
+    >>> from avtorch.vehicle import Controller, FollowerState, Leader, simulate
+    >>> def bang_bang(state: FollowerState):
+    ...     return 2.0 * (state.spacing - 1.5 * state.speed - 5).sign()
+    >>> run = simulate(Leader.constant(speed=20.0, duration=5.0), bang_bang)
+    >>> float(run.demanded.abs().max())
+    2.0
+"""
 
 
 @dataclass(frozen=True)
@@ -50,6 +73,14 @@ class LinearController:
     `feedforward` k_f [-] floats or tensors; all broadcast with (..., scenario). `ramp`, if given, is how the gap moves
     toward `time_gap` (made by `retargeted`). Frozen: a new setting is a new object. Raises `InputError` for non-finite
     values, gains that are not three, or a negative time gap or standstill spacing.
+
+    Example:
+        >>> from avtorch.vehicle import Leader, LinearController, simulate
+        >>> longer = LinearController().retargeted(at=5.0, time_gap=1.6)
+        >>> leader = Leader.constant(speed=20.0, duration=30.0, dt=0.05)
+        >>> run = simulate(leader, schedule=[(5.0, {"controller": longer})])
+        >>> [round(float(x), 1) for x in run.spacing[0, 0, [0, -1]]]  # 0.6 s at 20 m/s: 12 m more
+        [25.0, 37.0]
     """
 
     gains: Sequence[float] | Tensor = NOMINAL_GAINS

@@ -55,7 +55,13 @@ def _check_dt(dt: Number) -> None:
 
 
 def glvd_jerk(a: Number, u: Number, T_L: Number, K_L: Number) -> Tensor:
-    """Noise-free jerk `(K_L u - a) / T_L` [m/s³] (Eq. 1); all arguments broadcast."""
+    """Noise-free jerk `(K_L u - a) / T_L` [m/s³] (Eq. 1); all arguments broadcast.
+
+    Example:
+        >>> from avtorch.vehicle import glvd_jerk
+        >>> float(glvd_jerk(a=0.5, u=2.0, T_L=0.3, K_L=0.8).round(decimals=3))
+        3.667
+    """
     a, u, T_L, K_L = _with_dtype(a, u, T_L, K_L)
     return (K_L * u - a) / T_L
 
@@ -64,6 +70,11 @@ def glvd_step(a: Number, u: Number, T_L: Number, K_L: Number, dt: Number, *, met
     """Acceleration [m/s²] after one step of `dt` [s] with `u` held; all arguments broadcast.
 
     Raises `InputError` for an unknown `method` or a `dt` that is no positive number.
+
+    Example:
+        >>> from avtorch.vehicle import glvd_step
+        >>> [float(glvd_step(0.0, 1.0, 0.3, 1.0, dt=0.3, method=m).round(decimals=3)) for m in ("zoh", "euler")]
+        [0.632, 1.0]
     """
     _check_dt(dt)
     a, u, T_L, K_L = _with_dtype(a, u, T_L, K_L)
@@ -82,6 +93,14 @@ def glvd_rollout(a0: Number, u: Tensor, T_L: Number, K_L: Number, dt: Number, *,
     where alpha is 0 or negative (Euler) or underflows.
 
     Raises `InputError` for an unknown `method`, a `dt` that is no positive number, or a `u` without time dimension.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle import glvd_rollout
+        >>> step_command = torch.ones(150, dtype=torch.float64)
+        >>> a = glvd_rollout(0.0, step_command, T_L=torch.tensor([0.3, 1.5]), K_L=1.0, dt=0.01)
+        >>> tuple(a.shape), a[:, -1].round(decimals=3).tolist()  # after one lag of 1.5 s: 1 - 1/e
+        ((2, 150), [0.993, 0.632])
     """
     _check_dt(dt)
     a0, u, T_L, K_L = _with_dtype(a0, u, T_L, K_L)
@@ -121,6 +140,13 @@ def exact_motion(
 
     Args: `a` [m/s²], `v` [m/s], `u` [m/s²], `eps` [m/s³], `dt` [s], `T_L` [s], `K_L` [-].
     Returns acceleration, speed and displacement [m] at the end of the step. Standstill is the loop's affair.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle import exact_motion
+        >>> a, v, u, eps, T_L, K_L = torch.tensor([0.0, 20.0, 1.0, 0.0, 0.3, 1.0], dtype=torch.float64)
+        >>> [round(float(x), 4) for x in exact_motion(a, v, u, eps, 0.1, T_L, K_L)]
+        [0.2835, 20.015, 2.0005]
     """
     alpha, m1, m2 = motion_coefficients(tensor(T_L), dt)
     a_inf = K_L * u + T_L * eps
@@ -134,6 +160,15 @@ class GLVD(torch.nn.Module):
     Floats become float64 parameters, tensors keep their dtype (`module.float()` converts). `K_L = 0` is allowed:
     an actuator that ignores its command. Raises `InputError` for `T_L <= 0`, `K_L < 0`, non-finite values or shapes
     that do not broadcast.
+
+    Example:
+        >>> import torch
+        >>> from avtorch import GLVD
+        >>> car = GLVD(T_L=0.3, K_L=1.0)
+        >>> a = car.rollout(0.0, torch.ones(100, dtype=torch.float64), dt=0.01)
+        >>> a[-1].backward()
+        >>> round(a[-1].item(), 4), round(car.T_L.grad.item(), 4)  # after 1 s, and its slope in the lag
+        (0.9643, -0.3964)
     """
 
     def __init__(self, T_L: Number, K_L: Number) -> None:

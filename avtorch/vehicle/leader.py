@@ -25,6 +25,14 @@ class Leader:
     """`position` [m], `speed` [m/s] >= 0, `accel` [m/s²], each (time,) or (scenario, time), at `time` (time,) [s].
 
     `time` starts at 0 in steps of `dt` [s]; float64. Raises `InputError` for shapes that differ.
+
+    Example:
+        >>> from avtorch import Leader
+        >>> leader = Leader.from_speed(time=[0.0, 5.0, 10.0], speed=[20.0, 15.0, 20.0], smooth_s=0.0)
+        >>> leader.duration, tuple(leader.speed.shape)
+        (10.0, (1001,))
+        >>> leader.accel[[250, 750]].round(decimals=2).tolist()
+        [-1.0, 1.0]
     """
 
     time: Tensor

@@ -43,12 +43,21 @@ class ClosedLoop:
         scenarios: how many.
         vehicles: None for a single follower.
         seeds: of the jerk noise, one per scenario; an int s means s, s+1, …; None means 0, 1, ….
-        spacing0: [m], None for the controller's equilibrium at the leader's first speed (5 m + 1 s where it does not
-            tell a time gap).
+        spacing0: [m], None for the controller's equilibrium at the leader's first speed (5 m + 1 s where it has
+            no time gap).
         speed0: [m/s], None for the leader's first speed.
         link_delay: [s], age of the leader's acceleration that the controller sees (a radio link; rounded to steps).
 
     Raises `InputError` for bad arguments, and from `advance` where the leader ends before the block does.
+
+    Example:
+        >>> from avtorch import ClosedLoop, GLVDPlant, Leader
+        >>> loop = ClosedLoop(Leader.default(start=180.0, duration=20.0, dt=0.05), scenarios=2)
+        >>> before = loop.advance(200)
+        >>> loop.plant = GLVDPlant(T_L=1.5, K_L=0.5)  # the actuator degrades, the car's state is carried over
+        >>> after = loop.advance(200)
+        >>> tuple(after.accel.shape), round(float(after.time[0]), 2)
+        ((2, 200), 10.0)
     """
 
     def __init__(
@@ -255,6 +264,13 @@ def simulate(
     keywords as `ClosedLoop`. Parameters are floats or tensors (scenario,) or (vehicle, 1).
 
     Raises `InputError` for bad arguments and where the leader is shorter than `duration`.
+
+    Example:
+        >>> from avtorch import GLVDPlant, Leader, simulate
+        >>> change = [(26.0, {"plant": GLVDPlant(T_L=1.5, K_L=0.5, sigma=0.0)})]
+        >>> run = simulate(Leader.default(start=180.0, duration=40.0, dt=0.05), schedule=change)
+        >>> tuple(run.speed.shape), round(float(run.spacing.min()), 1)
+        ((1, 1, 800), 28.9)
     """
     steps = leader.time.shape[-1] - 1 if duration is None else round(duration / leader.dt)
     loop = ClosedLoop(leader, controller, vehicles=vehicles, scenarios=scenarios, **settings)

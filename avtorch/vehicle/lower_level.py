@@ -25,6 +25,15 @@ class LowerLevel:
 
     Frozen: a new setting is a new object (`dataclasses.replace`). Raises `InputError` unless lags and gains are
     > 0 and `accel_min < accel_max`.
+
+    Example:
+        >>> import torch
+        >>> from avtorch import LowerLevel
+        >>> inverse = LowerLevel(T_hat=1.5, K_hat=0.5)  # knows the degraded actuator, aims at the nominal one
+        >>> round(float(inverse.command(a=torch.tensor(0.0), u=torch.tensor(0.2))), 3), float(inverse.amplification())
+        (2.0, 10.0)
+        >>> [round(float(x), 3) for x in inverse.effective(1.5, 0.5)]
+        [0.3, 1.0]
     """
 
     T_hat: Number = 0.3

@@ -47,6 +47,12 @@ class MPC:
             difference of 1 m/s and a demand of 1 m/s² level.
 
     Raises `InputError` for numbers out of range or a horizon that is no whole number of steps.
+
+    Example:
+        >>> from avtorch import MPC, stability
+        >>> mpc = MPC(time_gap=1.6)
+        >>> bool(stability.string_stable(T_L=0.3, K_L=1.0, time_gap=1.6, gains=mpc.equivalent_gains()))
+        True
     """
 
     def __init__(

@@ -39,6 +39,15 @@ class Performance:
     - `comfort_share`: rows within 2 m/s² and 2.5 m/s³. `energy_jpkgm`: positive traction work per kg and metre driven
       (acceleration, rolling, air; no recuperation). `throughput_vph`: vehicles an hour at equilibrium at the mean speed
       of the leader, NaN without a time gap.
+
+    Example:
+        >>> from avtorch.vehicle import Leader, performance, simulate
+        >>> run = simulate(Leader.default(start=180.0, duration=30.0, dt=0.05), vehicles=3)
+        >>> measures = performance(run, time_gap=1.0)
+        >>> measures.row(0, 2)["clipped_share"]  # of scenario 0, the last of three vehicles
+        0.0
+        >>> bool((measures.min_spacing_m > 0).all())
+        True
     """
 
     speed_rms_ratio: Tensor
@@ -64,9 +73,17 @@ class Performance:
 def performance(
     run: Block, *, time_gap: Number | None = None, standstill: Number = 5.0, length: float = VEHICLE_LENGTH_M
 ) -> Performance:
-    """The measures of a `Block` or `Trajectory` (..., time); `time_gap` [s] is that of the setting, for the throughput.
+    """Compute the measures of a `Block` or `Trajectory` (..., time).
 
-    The peak gain belongs to a setting, not to a run: `avtorch.stability.peak_gain`.
+    `time_gap` [s] is that of the setting, for the throughput; `standstill` and `length` of a vehicle [m]. The peak gain
+    belongs to a setting, not to a run: `avtorch.stability.peak_gain`.
+
+    Example:
+        >>> from avtorch import GLVDPlant, Leader, performance, simulate
+        >>> leader = Leader.default(start=180.0, duration=40.0, dt=0.05)
+        >>> cars = [GLVDPlant(T_L=0.3, K_L=1.0, sigma=0.0), GLVDPlant(T_L=1.5, K_L=0.5, sigma=0.0)]
+        >>> [round(float(performance(simulate(leader, plant=car)).accel_rms_ratio), 2) for car in cars]
+        [0.85, 1.14]
     """
     v, a, lead_v, lead_a = run.speed, run.accel, run.lead_speed, run.lead_accel
     dt = float(run.time[1] - run.time[0]) if len(run.time) > 1 else math.nan
@@ -99,6 +116,12 @@ def equilibrium_throughput(
     """Vehicles an hour past a point when all drive at `speed` [m/s] and `time_gap` [s]; arguments broadcast.
 
     `3600 v / (time_gap v + standstill + length)`. Raises `InputError` for negative values.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle import equilibrium_throughput
+        >>> equilibrium_throughput(speed=25.0, time_gap=torch.tensor([1.0, 1.6, 2.5])).round().tolist()
+        [2609.0, 1818.0, 1250.0]
     """
     v, gap = checked("speed", speed, unit="m/s", least=0.0), checked("time_gap", time_gap, unit="s", least=0.0)
     return 3600 * v / (gap * v + tensor(standstill) + length)

@@ -23,7 +23,18 @@ Motion = tuple[Tensor, Tensor, Tensor]
 
 
 class Plant(Protocol):
-    """What the loop asks of a plant."""
+    """What the loop asks of a plant.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle import Leader, Plant, simulate
+        >>> class Ideal:
+        ...     def step(self, a, v, u, dt, eps):
+        ...         return u, v + dt * u, dt * v + dt * dt / 2 * u
+        >>> run = simulate(Leader.constant(speed=20.0, duration=2.0), plant=Ideal())
+        >>> tuple(run.accel.shape)
+        (1, 1, 200)
+    """
 
     def step(self, a: Tensor, v: Tensor, u: Tensor, dt: float, eps: Tensor) -> Motion:
         """Acceleration [m/s²], speed [m/s] and displacement [m] after `dt` [s], command `u` and noise `eps` held."""
@@ -41,6 +52,14 @@ class GLVDPlant:
     and `accel_max` [m/s²] bound what the vehicle can physically follow: `K_L u` is clipped to them (the car does not
     tell; the log still shows the command sent). Frozen: another car is another object. Raises `InputError` for
     `T_L <= 0`, `K_L < 0`, `sigma < 0`, non-finite values or crossed limits.
+
+    Example:
+        >>> import torch
+        >>> from avtorch import GLVDPlant
+        >>> plant = GLVDPlant(T_L=0.3, K_L=1.0, accel_max=2.0)  # an engine that gives no more than 2 m/s²
+        >>> a, u = torch.tensor(1.4, dtype=torch.float64), torch.tensor([1.7, 3.0], dtype=torch.float64)
+        >>> plant.jerk(a, u).round(decimals=3).tolist()
+        [1.0, 2.0]
     """
 
     T_L: Number = 0.3

@@ -39,6 +39,14 @@ class SpeedLag(torch.nn.Module):
 
     Raises:
         InputError: for values out of range.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle import SpeedLag
+        >>> car = SpeedLag(T_V=0.8, K_V=0.95)
+        >>> v = car.rollout(20.0, torch.full((400,), 22.0, dtype=torch.float64), dt=0.01)
+        >>> tuple(v.shape), round(float(v[-1].detach()), 2)  # near 0.95 times 22 m/s
+        ((400,), 20.89)
     """
 
     def __init__(self, T_V: Number, K_V: Number) -> None:
@@ -67,6 +75,14 @@ class PositionLag(torch.nn.Module):
 
     Raises:
         InputError: for values out of range.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle import PositionLag
+        >>> car, zero = PositionLag(T_P=0.5, zeta=1.0), torch.zeros((), dtype=torch.float64)
+        >>> x, v = car.rollout(zero, zero, torch.ones(300, dtype=torch.float64), dt=0.01)
+        >>> round(float(x[-1].detach()), 3)  # of the 1 m asked for, after 3 s
+        0.983
     """
 
     def __init__(self, T_P: Number, zeta: Number) -> None:

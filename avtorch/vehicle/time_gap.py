@@ -16,10 +16,17 @@ from torch import Tensor
 from avtorch.errors import InputError
 from avtorch.vehicle.arguments import Number, checked
 
-#: Rate of the time gap [s/s]. While the gap opens, the follower falls behind by this fraction of its speed per second.
-#: With the nominal controller 0.1 costs a peak braking of 1.2 m/s² at 30 m/s: below the 2 m/s² that count as
-#: comfortable, with room for a slower actuator. 1 to 2.5 s then takes 15 s.
 RAMP_RATE = 0.1
+"""Rate of the time gap [s/s]. While the gap opens, the follower falls behind by this fraction of its speed per second.
+
+With the nominal controller 0.1 costs a peak braking of 1.2 m/s² at 30 m/s: below the 2 m/s² that count as comfortable,
+with room for a slower actuator. 1 to 2.5 s then takes 15 s.
+
+Example:
+    >>> from avtorch.vehicle import RAMP_RATE, TimeGap
+    >>> round(0.6 / RAMP_RATE, 1), round(TimeGap(target=1.6, start=1.0).done_at, 1)  # 0.6 s more take 6 s
+    (6.0, 6.0)
+"""
 
 
 @dataclass(frozen=True)
@@ -28,6 +35,12 @@ class TimeGap:
 
     Before `since` the gap is `start` (a driver who complies later: `since` in the future). Raises `InputError` for
     gaps < 0 or `rate <= 0`.
+
+    Example:
+        >>> from avtorch.vehicle import TimeGap
+        >>> gap = TimeGap(target=1.6, start=1.0, since=10.0)
+        >>> [float(gap.at(t).round(decimals=3)) for t in (9.0, 12.0, 20.0)]
+        [1.0, 1.2, 1.6]
     """
 
     target: Number

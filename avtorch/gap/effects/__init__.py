@@ -1,4 +1,10 @@
-"""The effects that the diagnosis knows, one file each, in the order of the chain."""
+"""The effects that the diagnosis knows, one file each, in the order of the chain.
+
+Example:
+    >>> from avtorch.gap import effects
+    >>> len(effects.__all__), effects.DeadTime.place, effects.DeadTime.equation
+    (22, 'command', 'u(t - tau)')
+"""
 
 from avtorch.gap.effects.aerodynamic_drag import AerodynamicDrag
 from avtorch.gap.effects.backlash import Backlash

@@ -17,6 +17,15 @@ class AerodynamicDrag(Effect):
     """`-drag_per_m (v + wind_mps)²`, against the wind met; neutral at 0. The head wind is fitted along.
 
     Possible up to 3e-3 1/m, a cyclist's; a car has 2 to 6e-4 (half of rho c_d A / m).
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import AerodynamicDrag, Drive, plant
+        >>> time = torch.arange(200, dtype=torch.float64) * 0.05
+        >>> coasting = Drive(time, 0 * time, speed=torch.full_like(time, 30.0))
+        >>> accel = plant([AerodynamicDrag(4e-4)]).response(coasting).accel
+        >>> round(accel[-1].item(), 2)  # 4e-4 times 30²
+        -0.36
     """
 
     drag_per_m: Number = 3.5e-4

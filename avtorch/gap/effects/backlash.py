@@ -22,6 +22,14 @@ class Backlash(Effect):
     blocks; which rows moved is then known, and the output of those is `u ± half width`, to be differentiated.
 
     Possible up to 1 m/s²: more play than that is no play of a driveline or pedal.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Backlash, Drive, plant
+        >>> time = torch.arange(600, dtype=torch.float64) * 0.02
+        >>> accel = plant([Backlash(0.3)]).response(Drive(time, torch.sin(time))).accel
+        >>> round(accel.max().item(), 1)  # the play of 0.3 m/s² is missing at the top
+        0.7
     """
 
     half_width_mps2: Number = 0.08

@@ -18,6 +18,15 @@ class BrakeThrottleAsymmetry(Effect):
     """Gain and lag times `brake_gain_ratio`, `brake_lag_ratio` where the command is negative; neutral at 1, 1.
 
     Possible are five times either way for the gain and ten times for the lag, as between air brakes and a motor.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import BrakeThrottleAsymmetry, Drive, plant
+        >>> time = torch.arange(500, dtype=torch.float64) * 0.02
+        >>> command = torch.stack([torch.ones(500), -torch.ones(500)]).double()
+        >>> car = plant([BrakeThrottleAsymmetry(brake_gain_ratio=0.7)])
+        >>> [round(a, 1) for a in car.response(Drive(time, command)).accel[:, -1].tolist()]
+        [1.0, -0.7]
     """
 
     brake_gain_ratio: Number = 0.7

@@ -18,6 +18,14 @@ class ConstantResistance(Effect):
     """`-resistance_mps2` while the car moves, which it does wherever no speed was measured; neutral at 0.
 
     Possible up to 3.5 m/s²: loose sand, or a motor that brakes as soon as the pedal is let go.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import ConstantResistance, Drive, plant
+        >>> time = torch.arange(100, dtype=torch.float64) * 0.05
+        >>> rolling = Drive(time, 0 * time, speed=torch.full_like(time, 10.0))
+        >>> plant([ConstantResistance(0.12)]).response(rolling).accel[-1].item()
+        -0.12
     """
 
     resistance_mps2: Number = 0.12

@@ -17,6 +17,15 @@ class DeadBand(Effect):
     """Soft threshold of `|u|` at `half_width_mps2`; neutral at 0.
 
     Possible up to 1 m/s², an eighth of what brakes can do.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import DeadBand, Drive, plant
+        >>> time = torch.arange(200, dtype=torch.float64) * 0.05
+        >>> command = torch.tensor([[0.05], [0.5]], dtype=torch.float64).expand(2, 200)  # a faint and a firm command
+        >>> accel = plant([DeadBand(0.08)]).response(Drive(time, command)).accel
+        >>> accel[:, -1].round(decimals=2).tolist()
+        [0.0, 0.42]
     """
 
     half_width_mps2: Number = 0.08

@@ -22,6 +22,15 @@ class DeadTime(Effect):
     the older one still acts, and the actuator integrates both parts exactly. Always last among the command's effects.
 
     Possible up to 1.5 s: a radio link of 0.5 s and the air brakes of a long truck, one after the other.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import DeadTime, Drive, plant
+        >>> time = torch.arange(100, dtype=torch.float64) * 0.05
+        >>> step = (time >= 1.0).double()
+        >>> accel = plant([DeadTime(0.4)]).response(Drive(time, step)).accel
+        >>> round(time[accel > 1e-9][0].item(), 2)  # the first row after 1.4 s
+        1.45
     """
 
     delay_s: Number = 0.16

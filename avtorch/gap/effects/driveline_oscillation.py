@@ -19,14 +19,24 @@ from avtorch.vehicle.arguments import Number, tensor
 @register
 @dataclass(frozen=True)
 class DrivelineOscillation(Effect):
-    """`y'' + 2 zeta omega y' + omega² y = omega j` with `j` the actuator's jerk; the car gains
-    `amplitude y + quadrature y' / omega`. Neutral at amplitude and quadrature 0.
+    """A mode of the driveline that the actuator's jerk `j` excites; neutral at amplitude and quadrature 0.
+
+    `y'' + 2 zeta omega y' + omega² y = omega j`; the car gains `amplitude y + quadrature y' / omega` [m/s²].
 
     A step of the actuator by 1 m/s² rings with `amplitude` [m/s²]. Where in the driveline the mode sits decides on
     its phase, so a quadrature part is fitted along; the answer names the length of both. Over a step the mean jerk
     is held, and the mode is integrated exactly, at any damping (above 1 it creeps back and does not ring).
 
     Possible are 0.3 to 15 Hz (shuffle of trucks to that of small cars), and a ring of twice the step at most.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, DrivelineOscillation, plant
+        >>> time = torch.arange(400, dtype=torch.float64) * 0.01
+        >>> step = Drive(time, (time >= 1.0).double())
+        >>> accel = plant([DrivelineOscillation(frequency_hz=2.2, amplitude=0.3)], T_L=0.1).response(step).accel
+        >>> round(accel.max().item(), 1)  # the step of 1 m/s² rings
+        1.1
     """
 
     frequency_hz: Number = 2.2

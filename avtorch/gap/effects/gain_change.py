@@ -24,6 +24,15 @@ class GainChange(Effect):
     span, `earliest_s … latest_s`, is the prior of that time.
 
     Possible are five times either way: the payload of a truck, brakes that fade. The moment may be any.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, GainChange, plant
+        >>> time = torch.arange(800, dtype=torch.float64) * 0.05
+        >>> heavier = plant([GainChange(gain_ratio=0.75, change_s=20.0)])
+        >>> accel = heavier.response(Drive(time, torch.ones_like(time))).accel
+        >>> accel[[399, 799]].round(decimals=2).tolist()
+        [1.0, 0.75]
     """
 
     gain_ratio: Number = 0.75

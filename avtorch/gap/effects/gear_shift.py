@@ -28,6 +28,15 @@ class GearShift(Effect):
     by the part of its step that lies in the interruption, so the response is differentiable in duration and speeds.
 
     Possible is an interruption of 0.02 s (two clutches) to 2.5 s (an automated gearbox of a truck).
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, GearShift, plant
+        >>> time = torch.arange(200, dtype=torch.float64) * 0.05
+        >>> pulling = Drive(time, torch.ones_like(time), speed=4.0 + time)  # shifts at 4.5, 6.75, 10.1 m/s
+        >>> accel = plant([GearShift(depth=0.7)], T_L=0.1).response(pulling).accel
+        >>> accel.max().item() - accel.min().item() > 0.5
+        True
     """
 
     depth: Number = 0.7

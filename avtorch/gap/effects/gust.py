@@ -23,6 +23,15 @@ class Gust(Effect):
 
     Possible up to 0.6 m/s², the pull of slopes of 6 % (root mean square) that nobody knows of; a storm's wind of 10 m/s
     SD does 0.2 m/s² at 30 m/s. Faster than 0.2 s it is vibration, slower than a minute a drift.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, Gust, plant
+        >>> time = torch.arange(2000, dtype=torch.float64) * 0.05
+        >>> windy, drive = plant([Gust(sd_mps2=0.2)]), Drive(time, 0 * time, speed=torch.full_like(time, 20.0))
+        >>> accel = windy.response(drive, generator=torch.Generator().manual_seed(0)).accel
+        >>> windy.response(drive).accel.std().item(), round(accel.std().item(), 1)  # the mean response, and one drawn
+        (0.0, 0.2)
     """
 
     sd_mps2: Number = 0.2

@@ -21,6 +21,15 @@ class LowSpeedCreep(Effect):
     """`creep_mps2` below about 3 m/s, fading smoothly there; neutral at 0.
 
     Possible up to 1.5 m/s²: a converter's whole torque at rest.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, LowSpeedCreep, plant
+        >>> time = torch.arange(100, dtype=torch.float64) * 0.05
+        >>> speed = torch.tensor([[0.5], [20.0]], dtype=torch.float64).expand(2, 100)
+        >>> accel = plant([LowSpeedCreep(0.22)]).response(Drive(time, 0 * speed, speed=speed)).accel
+        >>> accel[:, -1].round(decimals=1).tolist()
+        [0.2, 0.0]
     """
 
     creep_mps2: Number = 0.22

@@ -22,6 +22,15 @@ class Outliers(Effect):
     standard deviation. `noise_sd` matters to the simulator only.
 
     Possible up to 0.3 of the samples: more are no outliers but the noise's own shape; and from twice the noise on.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, Outliers, plant
+        >>> time = torch.arange(2000, dtype=torch.float64) * 0.05
+        >>> car = plant([Outliers(fraction=0.02, noise_sd=0.05)])
+        >>> seen = car.response(Drive(time, 0 * time), generator=torch.Generator().manual_seed(0)).accel_measured
+        >>> round((seen.abs() > 0.05).double().mean().item(), 2)
+        0.02
     """
 
     fraction: Number = 0.016

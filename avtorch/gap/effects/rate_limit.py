@@ -19,6 +19,15 @@ class RateLimit(Effect):
     Behind a second-order actuator the set-point `K u` is slewed instead: what limits the one limits the other.
 
     Possible are 0.1 m/s³, ten seconds to a gentle push, to 50 m/s³, an emergency brake.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, RateLimit, plant
+        >>> time = torch.arange(200, dtype=torch.float64) * 0.02
+        >>> step = Drive(time, 2 * (time >= 0.5).double())
+        >>> accel = plant([RateLimit(jerk_max_mps3=1.4)]).response(step).accel
+        >>> round((accel.diff() / 0.02).max().item(), 2)  # m/s³
+        1.4
     """
 
     jerk_max_mps3: Number = 1.4

@@ -31,6 +31,16 @@ class RoadGrade(Effect):
     integrate them out by the `columns`. Where `profile` is None the slope is 0, or drawn, where drives are sampled.
 
     Possible up to 0.2 over a drive: the steepest streets there are reach 0.35.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, RoadGrade, plant
+        >>> time = torch.arange(1000, dtype=torch.float64) * 0.1
+        >>> drive = Drive(time, 0 * time, speed=torch.full_like(time, 20.0))  # 2 km of road
+        >>> hilly = plant([RoadGrade(grade_rms=0.03)]).prepared(drive)
+        >>> accel = hilly.response(drive, generator=torch.Generator().manual_seed(0)).accel
+        >>> bool(accel.abs().max() > 0.2)  # a slope of 3 % pulls with 0.3 m/s²
+        True
     """
 
     grade_rms: Number = 0.03

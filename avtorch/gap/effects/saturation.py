@@ -18,6 +18,14 @@ class Saturation(Effect):
     """`K u` clipped to `accel_min_mps2 … accel_max_mps2`; neutral at -inf and inf.
 
     Possible are 0.1 m/s² (a truck's drive) and -0.3 m/s² (a motor's drag) to 12 m/s², what tyres hold.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, Saturation, plant
+        >>> time = torch.arange(800, dtype=torch.float64) * 0.02
+        >>> accel = plant([Saturation(accel_max_mps2=1.25)]).response(Drive(time, 2 * torch.sin(time))).accel
+        >>> round(accel.max().item(), 2), round(accel.min().item(), 1)
+        (1.25, -1.9)
     """
 
     accel_max_mps2: Number = 1.25

@@ -28,6 +28,14 @@ class SecondOrderActuator(Effect):
     drive, `T_L` is the lag until then and `lag_ratio` times it that from then on.
 
     Possible are 0.5 to 60 rad/s, a swing of 12 s to one of 0.1 s, damped by 0.03 to 5.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, SecondOrderActuator, plant
+        >>> time = torch.arange(400, dtype=torch.float64) * 0.01
+        >>> car = plant([SecondOrderActuator(inverse_frequency_s=0.2, damping_ratio=0.3)])
+        >>> round(car.response(Drive(time, (time >= 0.5).double())).accel.max().item(), 2)  # it overshoots
+        1.37
     """
 
     inverse_frequency_s: Number = 1 / 6

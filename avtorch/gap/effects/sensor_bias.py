@@ -17,6 +17,14 @@ class SensorBias(Effect):
     """`bias_mps2` on top of the measured acceleration; neutral at 0.
 
     Possible up to 1 m/s² either way, an accelerometer that is tilted by 6 degrees.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, SensorBias, plant
+        >>> time = torch.arange(100, dtype=torch.float64) * 0.05
+        >>> response = plant([SensorBias(0.12)]).response(Drive(time, torch.sin(time)))
+        >>> bool(torch.allclose(response.accel_measured, response.accel + 0.12))
+        True
     """
 
     bias_mps2: Number = 0.12

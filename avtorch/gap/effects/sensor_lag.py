@@ -22,6 +22,15 @@ class SensorLag(Effect):
     Exact for an acceleration that is linear between rows.
 
     Possible up to 1 s: an accelerometer answers within milliseconds, and no filter on a vehicle bus is slower.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, SensorLag, plant
+        >>> time = torch.arange(500, dtype=torch.float64) * 0.02
+        >>> response = plant([SensorLag(0.16)]).response(Drive(time, torch.sin(time)))
+        >>> rows = response.accel_measured[:300].argmax() - response.accel[:300].argmax()
+        >>> round(0.02 * rows.item(), 2)  # s later than the car
+        0.14
     """
 
     lag_s: Number = 0.16

@@ -17,6 +17,14 @@ class SensorScale(Effect):
     """The measured acceleration times `scale`; neutral at 1.
 
     Possible are half to twice the truth; beyond that it is another unit.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, SensorScale, plant
+        >>> time = torch.arange(100, dtype=torch.float64) * 0.05
+        >>> response = plant([SensorScale(1.12)]).response(Drive(time, torch.sin(time)))
+        >>> bool(torch.allclose(response.accel_measured, 1.12 * response.accel))
+        True
     """
 
     scale: Number = 1.12

@@ -24,6 +24,15 @@ class SpeedDependentGain(Effect):
     effect was always there, and is 1 then.
 
     Possible up to 2 either way, where nothing of the gain is left at half or one and a half times the mean speed.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, SpeedDependentGain, plant
+        >>> time = torch.arange(200, dtype=torch.float64) * 0.05
+        >>> speed = torch.tensor([[5.0], [25.0]], dtype=torch.float64).expand(2, 200)
+        >>> car = plant([SpeedDependentGain(0.3, mean_speed=15.0)])
+        >>> car.response(Drive(time, torch.ones_like(speed), speed=speed)).accel[:, -1].round(decimals=2).tolist()
+        [0.8, 1.2]
     """
 
     gain_slope: Number = 0.3

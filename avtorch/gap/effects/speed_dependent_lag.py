@@ -24,6 +24,16 @@ class SpeedDependentLag(Effect):
     effect was always there, and is 1 then.
 
     Possible up to 2 either way, where nothing of the lag is left at half or one and a half times the mean speed.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, SpeedDependentLag, plant
+        >>> time = torch.arange(60, dtype=torch.float64) * 0.05
+        >>> speed = torch.tensor([[5.0], [25.0]], dtype=torch.float64).expand(2, 60)
+        >>> car, step = plant([SpeedDependentLag(0.5)]), (time >= 0.5).double().expand(2, 60)
+        >>> slow, quick = car.response(Drive(time, step, speed=speed)).accel[:, 20].tolist()
+        >>> slow > quick  # 0.5 s after the step: the lag grows with the speed
+        True
     """
 
     lag_slope: Number = 0.5

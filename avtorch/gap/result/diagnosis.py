@@ -87,6 +87,17 @@ class Diagnosis:
       all, probabilities are over what was tried, and `unknown` is a cause that was not
 
     Raises `InputError` where verdict and candidates do not agree.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, simulate
+        >>> from avtorch.gap import DeadTime, plant
+        >>> late = plant([DeadTime(0.4)], sigma=0.0)
+        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.05), plant=late).log()
+        >>> found = diagnose(log, effects=["dead_time"], pairs=False)
+        >>> print(str(found).split(". ")[0].splitlines()[0])
+        The simulator lacks dead_time (probability 0.96): the command acts after a delay.
+        >>> [path.name for path in found.write("out")]
+        ['diagnosis.json', 'plant.toml']
     """
 
     log: LogFacts

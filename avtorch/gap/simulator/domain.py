@@ -19,6 +19,12 @@ class Domain:
     """Field `name`: numbers from `low` to `high`, and `neutral`, at which the effect does nothing, wherever it lies.
 
     `whole`: whole numbers only. `most` above 0: a list of `least` to `most` numbers, `rising` or not.
+
+    Example:
+        >>> from avtorch.gap import Domain
+        >>> share = Domain("depth", low=0.0, high=1.0, neutral=0.0)
+        >>> share.value("gear_shift.depth", 0.7)
+        0.7
     """
 
     name: str

@@ -27,6 +27,14 @@ class Drive:
     the speed alone.
 
     Raises `InputError` for shapes that do not fit, time that does not rise, or values that are not finite.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive
+        >>> time = torch.arange(100, dtype=torch.float64) * 0.05
+        >>> drive = Drive(time, torch.sin(time), speed=torch.full_like(time, 20.0))
+        >>> bool(drive.uniform), round(drive.position[-1].item(), 2)  # metres
+        (True, 99.0)
     """
 
     time: Tensor
@@ -103,6 +111,14 @@ class Response:
 
     `speed` is the car's acceleration integrated from the first measured speed (0 where there is none). Nothing stops
     at standstill: such rows are masked.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Drive, SensorBias, plant
+        >>> time = torch.arange(100, dtype=torch.float64) * 0.05
+        >>> response = plant([SensorBias(0.12)]).response(Drive(time, 0 * time))
+        >>> round((response.accel_measured - response.accel)[-1].item(), 2)
+        0.12
     """
 
     accel: Tensor

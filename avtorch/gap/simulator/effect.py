@@ -32,7 +32,13 @@ from avtorch.vehicle.arguments import Number, tensor
 
 Place = Literal["command", "actuator", "body", "sensor"]
 PLACES: tuple[Place, ...] = ("command", "actuator", "body", "sensor")
-"""Places in the chain, in its order."""
+"""Places in the chain, in its order.
+
+Example:
+    >>> from avtorch.gap import EFFECTS, PLACES
+    >>> {place: sum(effect.place == place for effect in EFFECTS.values()) for place in PLACES}
+    {'command': 5, 'actuator': 7, 'body': 6, 'sensor': 4}
+"""
 
 _LARGEST = 1e12  # of a number in a text whose domain nobody said
 _NAME = 60  # characters of a name that may be an effect's, mistyped
@@ -44,6 +50,14 @@ class Row:
 
     `time` [s] and step `dt` [s] to the next row; `position` [m] since the drive's start; the baseline's `T_L` [s],
     `K_L` [-]; `normal`, standard normal draws for an effect that samples, None where the response is deterministic.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import AerodynamicDrag, Row
+        >>> speed, one = torch.tensor([10.0, 30.0]), torch.tensor(1.0)
+        >>> row = Row(torch.tensor([0.0, 0.1]), 0.1 * one, measured_speed=speed, travelled=None, T_L=0.3 * one, K_L=one)
+        >>> [round(a, 2) for a in AerodynamicDrag(4e-4).apply(0 * speed, row).tolist()]
+        [-0.04, -0.36]
     """
 
     time: Tensor
@@ -81,6 +95,13 @@ class NoiseChange:
 
     By this a diagnosis finds the effect: its parameters are fitted with those of the candidate and of the noise, by
     the likelihood under the changed noise. A candidate says one of the three: a force, tails, or a command's variance.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Gust
+        >>> change = Gust(sd_mps2=0.2, time_constant_s=2.2).noise(torch.zeros(100))
+        >>> float(change.force_sd), float(change.force_time), change.command_variance
+        (0.2, 2.2, None)
     """
 
     force_sd: Number | None = None
@@ -98,6 +119,19 @@ class Effect:
     `report` names in place of coordinates that are not reported, with typical and possible ranges. `shift`: the
     parameter [s], if there is one, by which it makes commands late and does nothing else. `settings`: what fields that
     are no parameters may hold in a text; a field without a domain takes any single finite number.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> from avtorch.gap import Effect, Parameter, plant
+        >>> @dataclass(frozen=True)
+        ... class Trailer(Effect):
+        ...     mass_ratio: float = 0.4
+        ...     name, place, meaning, equation = "trailer", "actuator", "an unknown trailer", "K_L / (1 + m)"
+        ...     parameters = (Parameter("mass_ratio", "-", neutral=0.0, low=0.1, high=0.8),)
+        ...     def apply(self, x, row):
+        ...         return 1 / (1 + self.mass_ratio), 1.0  # factors on K_L and T_L
+        >>> sorted(plant([Trailer(0.3)]).parameters())
+        ['K_L', 'T_L', 'trailer.mass_ratio']
     """
 
     name: ClassVar[str]
@@ -216,13 +250,31 @@ def row_at(row: Row, k: int) -> Row:
 
 
 EFFECTS: dict[str, type[Effect]] = {}
-"""Registered effects by name."""
+"""Registered effects by name.
+
+Example:
+    >>> from avtorch.gap import EFFECTS
+    >>> len(EFFECTS), [name for name, effect in EFFECTS.items() if effect.place == "sensor"]
+    (22, ['outliers', 'sensor_bias', 'sensor_lag', 'sensor_scale'])
+"""
 
 E = TypeVar("E", bound=type[Effect])
 
 
 def register(cls: E) -> E:
-    """Make an effect known by its name (in strings, TOML files and searches). Raises `InputError` if it is taken."""
+    """Make an effect known by its name (in strings, TOML files and searches). Raises `InputError` if it is taken.
+
+    Example:
+        >>> from avtorch import InputError
+        >>> from avtorch.gap import DeadTime, register
+        >>> class Mine(DeadTime):
+        ...     pass  # its name is still `dead_time`
+        >>> try:
+        ...     register(Mine)
+        ... except InputError as error:
+        ...     print(str(error).split(":")[0])
+        dead_time
+    """
     if cls.place not in PLACES:
         raise InputError(f"{cls.name}: found place {cls.place!r}, needs one of {', '.join(PLACES)}")
     if EFFECTS.get(cls.name, cls).__qualname__ != cls.__qualname__:
@@ -232,7 +284,13 @@ def register(cls: E) -> E:
 
 
 def effect_class(name: str, more: Iterable[type[Effect]] = ()) -> type[Effect]:
-    """The effect called `name`, among those registered and `more`. Raises `InputError` if there is none."""
+    """The effect called `name`, among those registered and `more`. Raises `InputError` if there is none.
+
+    Example:
+        >>> from avtorch.gap import effect_class
+        >>> effect_class("dead_time")(delay_s=0.2)
+        DeadTime(delay_s=0.2)
+    """
     known = {**EFFECTS, **{cls.name: cls for cls in more}}
     if name not in known:
         close = get_close_matches(name[:_NAME], known, n=1)

@@ -30,11 +30,20 @@ class Parameter:
     `"unit"` (0 to 1) its logit, `"interval"` uniform from `low` to `high`, by the normal distribution function.
     `reported` False: a coordinate that the table of effects does not name, fitted and kept out of the answer.
     `size`: 1, or the length of a vector-valued coordinate, then on its last dimension. `of_onset`: one that can only be
-    told where an effect sets in during a drive, and rests at its prior's centre elsewhere.
+    identified where an effect sets in during a drive, and rests at its prior's centre elsewhere.
     `possible`: what physics allows at all; an answer that lies wholly outside says so, with the reason `beyond` ("wind
     and road do not do this"). Default: three times the typical range, on the link's scale.
 
     Raises `InputError` for a range that is empty or outside the constraint.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import Parameter
+        >>> lag = Parameter("lag_s", "s", neutral=0.0, low=0.1, high=0.4)
+        >>> round(lag.typical().item(), 2)  # the prior's median, a geometric mean
+        0.2
+        >>> round(lag.constrain(lag.unconstrain(torch.tensor(0.3, dtype=torch.float64))).item(), 6)
+        0.3
     """
 
     name: str

@@ -43,6 +43,11 @@ BASELINE = (
 
 Possible are lags from an electric motor's torque control with its driveline (some 20 ms) to a laden truck's engine and
 air brakes (seconds), and gains as far from 1 as a truck's mass changes between empty and laden (some three times).
+
+Example:
+    >>> from avtorch.gap import BASELINE
+    >>> {p.name: [round(x, 2) for x in p.physical] for p in BASELINE}  # what physics allows at all
+    {'T_L': [0.02, 5.0], 'K_L': [0.3, 3.5]}
 """
 
 
@@ -53,7 +58,14 @@ class GapPlant:
     sensor's faults, while the car moves by the true one. It remembers the drive (commands under way, position, time
     since its first step) for as long as it is handed back the acceleration it gave, as a loop does; any other
     acceleration starts a drive anew, settled there. `reset()` does so by force. A copy goes on by itself. Parameters
-    are floats or tensors (scenario,); `seed` is of the random effects.
+    are floats or tensors (scenario,); `seed` is of the random effects. Raises `InputError` for an effect given twice.
+
+    Example:
+        >>> from avtorch.gap import GapPlant
+        >>> car = GapPlant.from_toml("dead_time=0.2")
+        >>> slower = car.with_values({"dead_time.delay_s": 0.4, "T_L": 0.5})
+        >>> {name: round(float(value), 2) for name, value in slower.values().items()}
+        {'T_L': 0.5, 'K_L': 1.0, 'dead_time.delay_s': 0.4}
     """
 
     def __init__(self, effects: Iterable[Effect], *, T_L: Number, K_L: Number, sigma: Number, seed: int = 0) -> None:
@@ -179,6 +191,14 @@ def plant(
     TOML file (a string that ends in `.toml` or names a file is one); an effect given here takes the place of the
     baseline's of that name. `T_L` [s], `K_L` [-] and the jerk noise `sigma` [m/s³] default to the baseline's, or 0.3,
     1 and 0.1. Raises `InputError` for bad values or a file that is not there.
+
+    Example:
+        >>> from avtorch import Leader, simulate
+        >>> from avtorch.gap import DeadTime, SensorBias, plant
+        >>> car = plant([DeadTime(0.2), SensorBias], T_L=0.4)  # a class stands for its typical values
+        >>> run = simulate(Leader.constant(speed=20.0, duration=2.0, dt=0.02), plant=car)
+        >>> list(car.report())
+        ['dead_time', 'sensor_bias']
     """
     if isinstance(baseline, str) and not names_a_file(baseline):
         base = GapPlant.from_toml(baseline)

@@ -28,6 +28,13 @@ def scan(alpha: Tensor, beta: Tensor, start: Tensor) -> Tensor:
     """`x` (..., time) of the recursion above.
 
     Args: `alpha` (..., time), or (..., 1) where it is constant, `beta` (..., time), `start` (...). All broadcast.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import scan
+        >>> alpha, beta = torch.tensor([0.5]), torch.ones(4)
+        >>> scan(alpha, beta, start=torch.tensor(0.0)).tolist()  # x[k] = 0.5 x[k-1] + 1
+        [1.0, 1.5, 1.75, 1.875]
     """
     aligned = _aligned(1, [alpha], [beta], [start])
     if torch.is_inference_mode_enabled() and alpha.shape[-1] == 1:
@@ -42,6 +49,15 @@ def scan_pair(
     """The two components (..., time) of `x[k] = A[k] x[k-1] + beta[k]`, `A = [[m0, m1], [m2, m3]]`.
 
     Args: `matrix` four of (..., time) or (..., 1), `beta` two of (..., time), `start` two of (...). All broadcast.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.gap import scan_pair
+        >>> turn = tuple(torch.tensor([x]) for x in (0.0, -1.0, 1.0, 0.0))  # by 90 degrees a row
+        >>> none, start = torch.zeros(4), (torch.tensor(1.0), torch.tensor(0.0))
+        >>> x, y = scan_pair(turn, (none, none), start)
+        >>> (x + 0.0).tolist(), (y + 0.0).tolist()
+        ([0.0, -1.0, 0.0, 1.0], [1.0, 0.0, -1.0, 0.0])
     """
     aligned = _aligned(2, list(matrix), list(beta), list(start))
     if torch.is_inference_mode_enabled() and all(m.shape[-1] == 1 for m in matrix):

@@ -1,4 +1,13 @@
-"""Stability of the car-following loop: Eq. 2, Eq. 3, the exact string condition, dead time, regions and beliefs."""
+"""Stability of the car-following loop: Eq. 2, Eq. 3, the exact string condition, dead time, regions and beliefs.
+
+Example:
+    >>> from avtorch import stability
+    >>> gains = (1.5, 1.5, -0.8)
+    >>> round(float(stability.peak_gain(T_L=1.5, K_L=0.5, time_gap=1.0, gains=gains)), 4)  # amplifies
+    2.2445
+    >>> bool(stability.string_stable(T_L=1.5, K_L=0.5, time_gap=2.5, gains=gains))  # a longer gap repairs it
+    True
+"""
 
 from avtorch.vehicle.stability.belief import (
     Interval,

@@ -19,7 +19,16 @@ BLOCK = 1 << 15  # (setting, draw) pairs held at a time: the temporaries then st
 
 
 class Interval(NamedTuple):
-    """Median and 90 % interval, each (setting,) or of the settings' shape: order statistics, so inf is no trouble."""
+    """Median and 90 % interval, each (setting,) or of the settings' shape: order statistics, so inf is no trouble.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle.stability import stability_belief
+        >>> T_L = torch.linspace(1.0, 1.6, 101, dtype=torch.float64)  # draws of the lag
+        >>> peak = stability_belief(T_L, K_L=0.5, time_gap=1.0, gains=(1.5, 1.5, -0.8)).margins["peak_gain"]
+        >>> [round(float(q), 2) for q in peak]
+        [1.42, 1.82, 2.43]
+    """
 
     q05: Tensor
     q50: Tensor
@@ -37,6 +46,16 @@ class StabilityBelief:
     - B [-] and C_over_K [1/s^2]: the lines of Eq. 3, without dead time;
     - dead_time [s]: how much more dead time the loop bears before it is locally unstable, counted from the one it has;
     - peak_gain [-]: with dead time; inf where locally unstable.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle.stability import stability_belief
+        >>> T_L, gap = torch.linspace(0.3, 1.5, 121, dtype=torch.float64), torch.tensor([1.0, 1.6, 2.5])
+        >>> belief = stability_belief(T_L, K_L=0.6, time_gap=gap, gains=(1.5, 1.5, -0.8))
+        >>> belief.p_string_stable.round(decimals=2).tolist()  # by time gap
+        [0.0, 0.74, 1.0]
+        >>> sorted(belief.margins)
+        ['B', 'C_over_K', 'dead_time', 'local', 'peak_gain']
     """
 
     p_locally_stable: Tensor
@@ -53,6 +72,14 @@ def p_locally_stable(T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, d
     values. The settings, time_gap (setting,) and gains (setting, 3), broadcast with each other. Draws that leave the
     loop without a stable actuator (T_L < 0 or infinite, K_L <= 0) count as unstable. Raises InputError as
     `local_stable`, and where there is no draw.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle.stability import p_locally_stable
+        >>> T_L = torch.linspace(0.2, 1.0, 81, dtype=torch.float64)  # draws of the lag
+        >>> p = p_locally_stable(T_L, 1.0, time_gap=1.0, gains=(1.5, 1.5, -0.8), dead_time=0.5)
+        >>> round(float(p), 2)
+        0.38
     """
     return _share(locally_stable, _Blocks(T_L, K_L, time_gap, gains, dead_time, 0.0, 0.0))
 
@@ -67,7 +94,16 @@ def p_string_stable(
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
 ) -> Tensor:
-    """P(string stable), arguments as in `p_locally_stable`; feedforward [-] and its delay [s] belong to the setting."""
+    """P(string stable), arguments as in `p_locally_stable`; feedforward [-] and its delay [s] belong to the setting.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle.stability import p_string_stable
+        >>> T_L = torch.linspace(0.2, 1.8, 161, dtype=torch.float64)  # draws of the lag
+        >>> gains = torch.tensor([[1.5, 1.5, -0.8], [3.0, 3.0, -1.8]])  # two settings
+        >>> p_string_stable(T_L, 0.6, time_gap=1.0, gains=gains).round(decimals=2).tolist()
+        [0.0, 0.52]
+    """
     return _share(string_stable_of, _Blocks(T_L, K_L, time_gap, gains, dead_time, feedforward, feedforward_delay))
 
 
@@ -81,7 +117,16 @@ def stability_belief(
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
 ) -> StabilityBelief:
-    """Probabilities and margins with intervals, arguments as in `p_string_stable`."""
+    """Probabilities and margins with intervals, arguments as in `p_string_stable`.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle.stability import stability_belief
+        >>> T_L = torch.linspace(1.1, 1.6, 101, dtype=torch.float64)  # draws of lag and gain
+        >>> belief = stability_belief(T_L, K_L=0.4 + 0.2 * T_L, time_gap=2.0, gains=(1.5, 1.5, -0.8))
+        >>> round(float(belief.p_string_stable), 2), round(float(belief.margins["peak_gain"].q95), 3)
+        (0.86, 1.024)
+    """
     blocks = _Blocks(T_L, K_L, time_gap, gains, dead_time, feedforward, feedforward_delay)
     local, string, n = [], [], blocks.draws
     margins: dict[str, list[Interval]] = {}

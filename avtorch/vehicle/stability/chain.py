@@ -7,7 +7,7 @@ With `P` from command to acceleration, `S` from acceleration to its reading, a d
     V / V_lead = beta P (k_s + k_v s + k_f s^2 exp(-s theta_f)) / F
 
 `P` and `S` are stable and fade at high frequencies, so `F / (s + 1)^2` goes to 1 and its phase along the imaginary axis
-counts the growing modes (the argument principle). Everything is told on a grid of frequencies.
+counts the growing modes (the argument principle). All of it is evaluated on a grid of frequencies.
 """
 
 from __future__ import annotations
@@ -29,7 +29,17 @@ class Chain:
     """A car for small motions: `omega` (frequency,) [rad/s], rising from near 0 to where nothing is left.
 
     `motion` (..., frequency): complex acceleration for a unit command; `sensed` (..., frequency): the reading's share
-    of the acceleration; `drag` (...) [1/s]: by how much the acceleration falls with the speed.
+    of the acceleration; `drag` (...) [1/s]: by how much the acceleration falls with the speed. Raises `InputError` for
+    fewer than ten frequencies, frequencies that do not rise from above 0, or responses of another length.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle.stability import Chain, chain_verdict, frequencies
+        >>> omega = frequencies()
+        >>> slow, late = 1 / (1 + 0.3j * omega), 1 / (1 + 0.2j * omega)  # actuator of 0.3 s, sensor of 0.2 s
+        >>> car = Chain(omega, motion=slow, sensed=late, drag=torch.tensor(0.0))
+        >>> chain_verdict(car, torch.tensor(1.0), torch.tensor([1.5, 1.5, -0.8])).string_stable.item()
+        True
     """
 
     omega: Tensor
@@ -48,7 +58,17 @@ class Chain:
 
 @dataclass(frozen=True)
 class ChainVerdict:
-    """`locally_stable`, `string_stable` (bool), `peak_gain` [-], inf where locally unstable, of the batch's shape."""
+    """`locally_stable`, `string_stable` (bool), `peak_gain` [-], inf where locally unstable, of the batch's shape.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle.stability import actuator, chain_verdict, frequencies
+        >>> T_L, K_L = torch.tensor([0.3, 1.5], dtype=torch.float64), torch.tensor([1.0, 0.5], dtype=torch.float64)
+        >>> cars = actuator(frequencies(), T_L, K_L)
+        >>> verdict = chain_verdict(cars, torch.tensor(1.0), torch.tensor([1.5, 1.5, -0.8]))
+        >>> verdict.string_stable.tolist(), verdict.peak_gain.round(decimals=2).tolist()
+        ([True, False], [1.0, 2.24])
+    """
 
     locally_stable: Tensor
     string_stable: Tensor
@@ -56,12 +76,27 @@ class ChainVerdict:
 
 
 def frequencies(*, points: int = 600, least: float = 0.01, most: float = 200.0) -> Tensor:
-    """A grid [rad/s] for `Chain.omega`: 1.7 % apart, from far below a platoon's modes to far above an actuator's."""
+    """A grid [rad/s] for `Chain.omega`: 1.7 % apart, from far below a platoon's modes to far above an actuator's.
+
+    Example:
+        >>> from avtorch.vehicle.stability import frequencies
+        >>> omega = frequencies(points=5, least=0.01, most=100.0)
+        >>> omega.round(decimals=3).tolist()
+        [0.01, 0.1, 1.0, 10.0, 100.0]
+    """
     return torch.logspace(math.log10(least), math.log10(most), points, dtype=torch.float64)
 
 
 def actuator(omega: Tensor, T_L: Tensor, K_L: Tensor, dead_time: Tensor | float = 0.0) -> Chain:
-    """GLVD with a dead time [s] as a chain, parameters (...)."""
+    """GLVD with a dead time [s] as a chain, parameters (...).
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle.stability import actuator, frequencies
+        >>> car = actuator(frequencies(), T_L=torch.tensor(0.3), K_L=torch.tensor(1.0), dead_time=0.4)
+        >>> car.motion.dtype, round(float(car.motion[0].abs()), 3)
+        (torch.complex128, 1.0)
+    """
     s = 1j * omega
     T, K, theta = torch.broadcast_tensors(T_L, K_L, torch.as_tensor(dead_time, dtype=torch.float64))
     motion = K[..., None] * torch.exp(-s * theta[..., None]) / (1 + s * T[..., None])
@@ -78,11 +113,19 @@ def chain_verdict(
     feedforward: Tensor | float = 0.0,
     feedforward_delay: float = 0.0,
 ) -> ChainVerdict:
-    """Of a linear controller around `chain`, batches that broadcast with each other.
+    """Stability of a linear controller around `chain`; batches broadcast with each other.
 
     `time_gap` (...) [s], `gains` (..., 3); the lower level sends `inner` times the sensed acceleration plus `forward`
     times what the upper level asks, (...) (0 and 1: it passes that through). `feedforward` k_f (...) [-] acts on the
     leader's acceleration `feedforward_delay` [s] ago.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle.stability import actuator, chain_verdict, frequencies
+        >>> car = actuator(frequencies(), torch.tensor(0.3), torch.tensor(1.0), torch.tensor([0.0, 0.4, 0.6]))
+        >>> verdict = chain_verdict(car, torch.tensor(1.0), torch.tensor([1.5, 1.5, -0.8]))
+        >>> verdict.peak_gain.round(decimals=2).tolist()  # without dead time, with 0.4 s, with 0.6 s
+        [1.0, 1.74, inf]
     """
     loop, asked = _loop(chain, time_gap, gains, inner, forward, feedforward, feedforward_delay)
     gain = asked.abs() / loop.abs().clamp_min(1e-300)
@@ -103,7 +146,17 @@ def chain_gain(
     feedforward: Tensor | float = 0.0,
     feedforward_delay: float = 0.0,
 ) -> Tensor:
-    """`|V / V_lead|` (..., frequency), arguments as in `chain_verdict`; formal where the loop is locally unstable."""
+    """`|V / V_lead|` (..., frequency), arguments as in `chain_verdict`; formal where the loop is locally unstable.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle.stability import actuator, chain_gain
+        >>> omega = torch.linspace(0.5, 5.0, 10, dtype=torch.float64)
+        >>> car = actuator(omega, torch.tensor(0.3), torch.tensor(1.0), dead_time=0.4)
+        >>> size = chain_gain(car, torch.tensor(1.0), torch.tensor([1.5, 1.5, -0.8]))
+        >>> float(omega[size.argmax()]), round(float(size.max()), 2)
+        (3.0, 1.74)
+    """
     loop, asked = _loop(chain, time_gap, gains, inner, forward, feedforward, feedforward_delay)
     return asked.abs() / loop.abs().clamp_min(1e-300)
 

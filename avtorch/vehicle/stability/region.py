@@ -24,6 +24,14 @@ class Region:
 
     local: locally stable. string: string stable (form "exact"), or what Eq. 3's box form passes. peak_gain: inf where
     locally unstable; None for the box forms, which are about every vehicle of a box at once.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle.stability import region
+        >>> axis = torch.linspace(0.1, 3.0, 30)
+        >>> plane = region(("k_s", axis), ("k_v", axis), T_L=1.5, K_L=0.5)
+        >>> tuple(plane.string.shape), plane.local_share > plane.string_share
+        ((30, 30), True)
     """
 
     x_name: str
@@ -59,12 +67,20 @@ def region(
 ) -> Region:
     """Stability over the plane of two axes, each (name, values) with a name out of k_s, k_v, k_a, tau, T, K.
 
-    What no axis names keeps the value given. form="exact" judges points, with any dead_time [s]; "print" and
-    "rigorous" judge boxes by Eqs. 2 and 3 (`local_conditions`, `string_sufficient`), where T_L and K_L may be
+    What no axis names keeps the value given. form="exact" checks points, with any dead_time [s]; "print" and
+    "rigorous" check boxes by Eqs. 2 and 3 (`local_conditions`, `string_sufficient`), where T_L and K_L may be
     (lower, upper) tuples and no dead time is known: the paper's stability figures are of this kind.
 
     Raises InputError for unknown or equal axes, an axis that is not one-dimensional and finite, a tuple on an axis or
     with form="exact" and a dead time with a box form.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle.stability import region
+        >>> k_s, tau = torch.linspace(0.1, 3.0, 30), torch.tensor([0.5, 2.0])
+        >>> plane = region(("k_s", k_s), ("tau", tau), T_L=(0.0, 0.4), K_L=(0.7, 1.0), form="print")
+        >>> plane.string.double().mean(-1).round(decimals=2).tolist()  # the region grows with the time gap
+        [0.0, 0.23]
     """
     if form not in ("exact", "print", "rigorous"):
         raise InputError(f"form: expected 'exact', 'print' or 'rigorous', found {form!r}")

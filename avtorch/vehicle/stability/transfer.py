@@ -23,6 +23,12 @@ def transfer_function(
 
     With E = exp(-j omega theta): G = K E (k_f s^2 E_f + k_v s + k_s) / (T s^3 + s^2 + K E (-k_a s^2 + g s + k_s)).
     Formal where the loop is locally unstable; 0 where the actuation is no vehicle (T_L < 0, K_L <= 0, not finite).
+
+    Example:
+        >>> from avtorch.vehicle.stability import transfer_function
+        >>> G = transfer_function([0.01, 1.0], T_L=1.5, K_L=0.5, time_gap=1.0, gains=(1.5, 1.5, -0.8))
+        >>> G.dtype, G.abs().round(decimals=3).tolist()
+        (torch.complex128, [1.0, 1.632])
     """
     w = as_tensor(omega, [omega, T_L, K_L, time_gap, gains], "omega")
     s = read_setting(
@@ -46,7 +52,13 @@ def gain(
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
 ) -> Tensor:
-    """`|G(j omega)|` [-], as `transfer_function`."""
+    """`|G(j omega)|` [-], as `transfer_function`.
+
+    Example:
+        >>> from avtorch.vehicle.stability import gain
+        >>> gain([0.5, 1.0, 4.0], T_L=1.5, K_L=0.5, time_gap=1.0, gains=(1.5, 1.5, -0.8)).round(decimals=2).tolist()
+        [1.21, 1.63, 0.03]
+    """
     w = as_tensor(omega, [omega, T_L, K_L, time_gap, gains], "omega")
     s = read_setting(
         T_L, K_L, time_gap, gains, dead_time=dead_time, feedforward=feedforward, feedforward_delay=feedforward_delay

@@ -16,8 +16,13 @@ def local_stable(T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, dead_
     """True where disturbances die out: Eq. 2 at one point, or a Nyquist count where dead_time [s] > 0.
 
     T_L [s], K_L [-], time_gap [s] and dead_time broadcast with the leading dimensions of gains (..., 3) =
-    (k_s [1/s^2], k_v [1/s], k_a [-]); returns bool of that shape. Exact both ways. Feed-forward has no
-    part in it. T_L < 0, K_L <= 0, infinite or NaN (a lower level that inverts itself unstable) is not stable.
+    (k_s [1/s^2], k_v [1/s], k_a [-]); returns bool of that shape. Exact both ways. Feed-forward
+    does not enter. T_L < 0, K_L <= 0, infinite or NaN (a lower level that inverts itself unstable) is not stable.
+
+    Example:
+        >>> from avtorch.vehicle.stability import local_stable
+        >>> local_stable(0.3, 1.0, 1.0, (1.5, 1.5, -0.8), dead_time=[0.0, 0.5, 0.6]).tolist()
+        [True, True, False]
     """
     s = read_setting(T_L, K_L, time_gap, gains, dead_time=dead_time)
     return s.full(locally_stable(s))
@@ -38,6 +43,11 @@ def string_stable(
     Without dead time in closed form (the signs of B and C); with it, or with a feed-forward gain k_f [-] on the
     leader's acceleration that is itself delayed [s], by frequency sweep. The only tolerance is rounding: a few tens of
     machine epsilons of the terms summed, so a loop exactly on the boundary counts as stable.
+
+    Example:
+        >>> from avtorch.vehicle.stability import string_stable
+        >>> string_stable(T_L=1.5, K_L=0.5, time_gap=[1.0, 2.0, 2.5], gains=(1.5, 1.5, -0.8)).tolist()
+        [False, False, True]
     """
     s = read_setting(
         T_L, K_L, time_gap, gains, dead_time=dead_time, feedforward=feedforward, feedforward_delay=feedforward_delay
@@ -61,6 +71,16 @@ def peak_gain(
     Arguments as in `string_stable`. Without dead time the peak's frequency is the root of a cubic, else it is swept and
     refined. Differentiable once in every argument where finite: the peak moves, but at a maximum that is of second
     order, so the derivative is that of `|G|` at the peak's frequency (0 where string stable).
+
+    Example:
+        >>> import torch
+        >>> from avtorch.vehicle.stability import peak_gain
+        >>> round(float(peak_gain(T_L=0.3, K_L=1.0, time_gap=1.0, gains=(1.5, 1.5, -0.8), dead_time=0.4)), 4)
+        1.7464
+        >>> T_L = torch.tensor(1.5, dtype=torch.float64, requires_grad=True)
+        >>> peak_gain(T_L, 0.5, 1.0, (1.5, 1.5, -0.8)).backward()
+        >>> round(float(T_L.grad), 3)  # per second of lag
+        2.446
     """
     s = read_setting(
         T_L, K_L, time_gap, gains, dead_time=dead_time, feedforward=feedforward, feedforward_delay=feedforward_delay
@@ -82,6 +102,11 @@ def peak_frequency(
 
     Arguments as in `string_stable`. Where the loop is locally unstable it is the largest formal `|G|` on the axis (near
     the growing oscillation, if barely unstable); 0 where the actuation is no vehicle. Carries no gradient.
+
+    Example:
+        >>> from avtorch.vehicle.stability import peak_frequency
+        >>> round(float(peak_frequency(T_L=0.3, K_L=1.0, time_gap=1.0, gains=(1.5, 1.5, -0.8), dead_time=0.4)), 2)
+        3.02
     """
     s = read_setting(
         T_L, K_L, time_gap, gains, dead_time=dead_time, feedforward=feedforward, feedforward_delay=feedforward_delay
@@ -91,7 +116,13 @@ def peak_frequency(
 
 
 def dead_time_margin(T_L: Value, K_L: Value, time_gap: Value, gains: Gains) -> Tensor:
-    """Smallest dead time [s] that costs the loop its local stability, in closed form; 0 where it has none to lose."""
+    """Smallest dead time [s] that costs the loop its local stability, in closed form; 0 where it has none to lose.
+
+    Example:
+        >>> from avtorch.vehicle.stability import dead_time_margin
+        >>> round(float(dead_time_margin(T_L=0.3, K_L=1.0, time_gap=1.0, gains=(1.5, 1.5, -0.8))), 3)
+        0.521
+    """
     s = read_setting(T_L, K_L, time_gap, gains)
     return s.full(lost_at(s))
 

@@ -1,0 +1,122 @@
+"""Every public name is documented with an example, and the examples run and show what they say they show."""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.public_names import Public, every, path_of
+
+PUBLIC = every()
+# Public names that have no example yet. A name that has one leaves the list.
+WITHOUT: frozenset[str] = frozenset()
+# What needs recordings or a display, and so cannot run everywhere, with the reason.
+SKIPPED: dict[str, str] = {}
+# Whole experiments and diagnoses, though small ones: seconds each.
+SLOW = frozenset(
+    {
+        "avtorch.experiment.information.information",
+        "avtorch.experiment.next_experiment.next_experiment",
+        "avtorch.follower.diagnose_follower.FollowerDiagnosis",
+        "avtorch.follower.diagnose_follower.diagnose_follower",
+        "avtorch.follower.identify.Identified",
+        "avtorch.gap.compare.compare",
+        "avtorch.paper.estimation.Estimation",
+        "avtorch.paper.estimation.estimation",
+        "avtorch.paper.gains.Gains",
+        "avtorch.paper.gains.gains",
+        "avtorch.paper.monitoring.Monitoring",
+        "avtorch.paper.monitoring.monitoring",
+        "avtorch.paper.platoon.Platoon",
+        "avtorch.paper.platoon.platoon",
+        "avtorch.paper.regions.Regions",
+        "avtorch.paper.regions.regions",
+        "avtorch.paper.reproduce.Reproduction",
+        "avtorch.paper.reproduce.reproduce",
+        "avtorch.paper.strategies.Strategies",
+        "avtorch.paper.strategies.strategies",
+        "avtorch.plots.paper_figures.paper_pictures",
+        "avtorch.plots.posterior_figures.validation_figures",
+        "avtorch.plots.signatures.signature_figure",
+        "avtorch.remedy.what_to_set.setting_for",
+        "avtorch.report.page.report_html",
+        "avtorch.report.page.write_report",
+        "avtorch.validation.validate.Validation",
+        "avtorch.validation.validate.validate",
+    }
+)
+
+
+def examples(public: Public) -> list[doctest.Example]:
+    return doctest.DocTestParser().get_examples(public.doc, str(public))
+
+
+RUN = [pytest.param(p, marks=pytest.mark.slow if str(p) in SLOW else []) for p in PUBLIC if str(p) not in WITHOUT]
+
+
+@pytest.mark.parametrize("public", RUN, ids=str)
+def test_example_runs(public: Public, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As pasted into a fresh interpreter in an empty folder: whatever it needs it imports itself."""
+    monkeypatch.chdir(tmp_path)
+    test = doctest.DocTestParser().get_doctest(
+        public.doc, {"__name__": "__main__"}, str(public), str(path_of(public.module)), 0
+    )
+    report: list[str] = []
+    assert any(example.want for example in test.examples), "no example, or one that shows nothing"
+    assert doctest.DocTestRunner(verbose=False).run(test, out=report.append).failed == 0, "".join(report)
+
+
+def test_only_names_without_example_are_listed() -> None:
+    assert {str(p) for p in PUBLIC if not examples(p)} == WITHOUT
+
+
+def test_slow_ones_are_public_names() -> None:
+    assert {str(p) for p in PUBLIC} >= SLOW
+
+
+def test_only_what_cannot_run_is_skipped() -> None:
+    skips = {str(p) for p in PUBLIC for e in examples(p) if doctest.SKIP in e.options}
+    assert skips == SKIPPED.keys()
+
+
+def test_summary_is_a_sentence_on_the_first_line() -> None:
+    assert not [str(p) for p in PUBLIC if not re.search(r"[.:](\s|$)", p.doc.strip().split("\n")[0])]
+
+
+def test_errors_are_documented() -> None:
+    """Where a public function, or a constructor, refuses its input by itself, its docstring names `InputError`."""
+    refusing = [p for p in PUBLIC if any(_refuses(f) for f in _entrances(p.node))]
+    assert len(refusing) > 50
+    assert not [str(p) for p in refusing if "InputError" not in p.doc]
+
+
+def test_arrays_have_a_shape_or_a_unit() -> None:
+    """Of a function that takes or returns arrays: `(window, time)`, `[m/s²]`, or that it is another's arguments."""
+    said = re.compile(r"\[[^\]]+\]|\((\.\.\.|\w+( \+ 1)?)(, [\w.]+)*,?\)|\b(as|in|see|of|per) `")
+    taking = [p for p in PUBLIC if _takes_arrays(p.node)]
+    assert len(taking) > 40
+    assert not [str(p) for p in taking if not said.search(p.doc.split("Example:")[0])]
+
+
+def _takes_arrays(node: ast.stmt | ast.Module) -> bool:
+    if not isinstance(node, ast.FunctionDef):
+        return False
+    kinds = [a.annotation for a in (*node.args.args, *node.args.kwonlyargs)] + [node.returns]
+    arrays = re.compile(r"\b(Tensor|NDArray|Float|ndarray|ArrayLike|Number|Value|PointOrBox)\b")
+    return any(kind is not None and arrays.search(ast.unparse(kind)) for kind in kinds)
+
+
+def _entrances(node: ast.stmt | ast.Module) -> list[ast.FunctionDef]:
+    if isinstance(node, ast.FunctionDef):
+        return [node]
+    body = node.body if isinstance(node, ast.ClassDef) else []
+    return [f for f in body if isinstance(f, ast.FunctionDef) and f.name in ("__init__", "__post_init__")]
+
+
+def _refuses(function: ast.FunctionDef) -> bool:
+    raised = [n.exc for n in ast.walk(function) if isinstance(n, ast.Raise)]
+    return any(isinstance(e, ast.Call) and ast.unparse(e.func) == "InputError" for e in raised)
