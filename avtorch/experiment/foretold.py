@@ -14,12 +14,12 @@ import torch
 from numpy.typing import NDArray
 
 from avtorch.experiment.manoeuvres import Manoeuvre
-from avtorch.gap.effects import GainChange, RoadGrade
 from avtorch.gap.likelihood.noise_draws import noise_draws
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.gap.simulator.drive import Drive, Response
+from avtorch.gap.simulator.integrated import Integrated
 from avtorch.io import Log
 
 Float = NDArray[np.float64]
@@ -34,10 +34,11 @@ def responses(contender: PredictiveModel, manoeuvres: Sequence[Manoeuvre], draws
     time = torch.as_tensor(manoeuvres[0].time)
     belief = {k: torch.as_tensor(x[draws]) for k, x in contender.belief.items()}
     effects = contender.plant.effects
-    late = next((e for e in effects if isinstance(e, GainChange)), None)
-    if late is not None:  # what changed in the log has changed
-        belief |= {"gain_change.change_s": torch.full_like(belief["T_L"], -1e3)}
-        belief |= {"gain_change.ramp_s": torch.zeros_like(belief["T_L"])} if "gain_change.ramp_s" in belief else {}
+    for effect in effects:  # what changed in the log has changed
+        for name, value in effect.settled().items():
+            key = f"{effect.name}.{name}"
+            if key in belief or name == effect.own_onset:
+                belief |= {key: torch.full_like(belief["T_L"], value)}
     with torch.inference_mode():
         return contender.plant.response(Drive(time, command, speed, 0.0, contender.specific_force), belief)
 
@@ -126,7 +127,8 @@ class Prediction:
         m = self.manoeuvres[number]
         drive = Drive(torch.as_tensor(m.time), torch.as_tensor(m.command), torch.as_tensor(m.speed))
         assert drive.position is not None
-        road = RoadGrade().prepared(drive.time, drive.speed, drive.position)
+        own = next(e for e in self.contender.plant.effects if isinstance(e, Integrated))
+        road = own.prepared(drive.time, drive.speed, drive.position)
         force = size * road.columns(drive.position).numpy().T
         step = float(m.time[1] - m.time[0])
         gained = np.cumsum(0.5 * step * (force[:, 1:] + force[:, :-1]), -1)

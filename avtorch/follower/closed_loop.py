@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from avtorch.follower.laws import Law, Seen, tensors
+from avtorch.gap.simulator.effect import delay_key
 
 Float = NDArray[np.float64]
 
@@ -36,7 +37,7 @@ class LoopErrors(NamedTuple):
 def loop_errors(law: Law, values: Mapping[str, float], seen: Seen, dt: float, *, seconds: float = 60.0) -> LoopErrors:
     """Of stretches of `seconds` of one drive, side by side; rows `dt` [s] apart.
 
-    `values`: the law's as `law.*`, `T_L` [s], `dead_time.delay_s` [s]; `K_L` is 1.
+    `values`: the law's as `law.*`, `T_L` [s], the delay [s] by `delay_key()`; `K_L` is 1.
 
     Example:
         >>> from avtorch import Leader, simulate
@@ -52,7 +53,7 @@ def loop_errors(law: Law, values: Mapping[str, float], seen: Seen, dt: float, *,
     own = tensors({k.partition(".")[2]: v for k, v in values.items() if k.startswith("law.")})
     s, v, lead = (x.numpy() for x in seen)
     length = min(round(seconds / dt), len(s) - 1)
-    delay = values.get("dead_time.delay_s", 0.0) / dt
+    delay = values.get(delay_key(), 0.0) / dt
     whole, part = int(delay), delay - int(delay)
     starts = np.arange(0, len(s) - length, length)
     rows = starts + np.arange(length + 1)[:, None]

@@ -24,6 +24,7 @@ from avtorch.gap.diagnose import diagnose
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.simulator.effect import delay_effect, delay_key
 from avtorch.io import Log
 
 Float = NDArray[np.float64]
@@ -197,9 +198,11 @@ def _cause(
 
 
 def _parameters(law: Law, draws: Mapping[str, Float], speed: float) -> dict[str, Quantity]:
-    told = {k.removeprefix("law.").removeprefix("dead_time."): Quantity.of_draws(x) for k, x in draws.items()}
+    told = {
+        k.removeprefix("law.").removeprefix(f"{delay_effect().name}."): Quantity.of_draws(x) for k, x in draws.items()
+    }
     own = {k.removeprefix("law."): torch.as_tensor(x) for k, x in draws.items() if k.startswith("law.")}
-    total = draws["T_L"] + draws.get("dead_time.delay_s", 0.0)
+    total = draws["T_L"] + draws.get(delay_key(), 0.0)
     more = {"lag_with_delay_s": total, "headway_s": law.spacing(own, speed) / speed}
     return told | {name: Quantity.of_draws(x) for name, x in more.items()}
 

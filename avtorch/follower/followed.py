@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from avtorch.errors import InputError
 from avtorch.follower.laws import Law, Seen
-from avtorch.gap.effects import DeadTime
 from avtorch.gap.likelihood.hypothesis import Coordinate, Hypothesis
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.simulator.drive import Drive
+from avtorch.gap.simulator.effect import delay_effect, delay_key
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log
 
@@ -85,7 +85,7 @@ def followed(log: Log, law: Law, *, dead_time: bool = True) -> Followed:
     whole = seen_in(log)
     rows = [cut.rows for cut in record.cuts]
     seen = tuple(Seen(*(x[part] for x in whole)) for part in rows)
-    kinds = (DeadTime,) if dead_time else ()
+    kinds = (delay_effect(),) if dead_time else ()
     return Followed(record, kinds, plant([]), law=law, seen=seen, begins=tuple(part.start for part in rows))
 
 
@@ -99,5 +99,5 @@ def seen_in(log: Log) -> Seen:
 
 def car_of(values: Mapping[str, float]) -> GapPlant:
     """The plant with lag and delay as found, `K_L` 1."""
-    delay = values.get("dead_time.delay_s")
-    return plant([] if delay is None else [DeadTime(delay)], T_L=values["T_L"], K_L=1.0)
+    kind, delay = delay_effect(), values.get(delay_key())
+    return plant([] if delay is None else [kind.of({str(kind.shift): delay})], T_L=values["T_L"], K_L=1.0)

@@ -20,6 +20,7 @@ from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.posterior.density import root
+from avtorch.gap.simulator.effect import delay_key
 
 Float = NDArray[np.float64]
 
@@ -113,9 +114,9 @@ def widened(found: Identified, record: Record) -> Float:
 def _starts(candidate: Followed) -> Float:
     centre = np.zeros(candidate.size)
     keys = [c.key for c in candidate.coordinates]
-    if "dead_time.delay_s" not in keys:
+    if delay_key() not in keys:
         return centre[None]
-    at = keys.index("dead_time.delay_s")
+    at = keys.index(delay_key())
     out = np.tile(centre, (len(_DELAYS_S), 1))
     out[:, at] = [candidate.coordinates[at].z_of(d) for d in _DELAYS_S]
     return out

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from avtorch.follower.laws import Law
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.simulator.effect import delay_key
 from avtorch.vehicle.stability import chain_verdict, frequencies
 from avtorch.vehicle.stability.chain import actuator
 
@@ -50,7 +51,7 @@ def loop_stability(law: Law, draws: Mapping[str, Float], speeds: Sequence[float]
     """
     values = {k: torch.as_tensor(x) for k, x in draws.items()}
     own = {k.partition(".")[2]: x for k, x in values.items() if k.startswith("law.")}
-    delay = values.get("dead_time.delay_s", torch.zeros_like(values["T_L"]))
+    delay = values.get(delay_key(), torch.zeros_like(values["T_L"]))
     chain = actuator(frequencies(points=500), values["T_L"], torch.ones_like(values["T_L"]), delay)
     out = []
     for speed in speeds:

@@ -17,16 +17,15 @@ from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 from avtorch.gap.crossval.folds import blocks_of
-from avtorch.gap.effects import DeadTime
 from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import LaterAnswer
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
+from avtorch.gap.simulator.effect import delay_effect, delay_key
 
 Float = NDArray[np.float64]
 
-_KEYS = ("T_L", "K_L", "dead_time.delay_s")
 _FELT_S = 0.03  # below it the delay's own scale, a logarithm, has no slope to go by
 
 
@@ -41,24 +40,22 @@ class WithDelay:
     @classmethod
     def of(cls, search: Search, none: FittedModel) -> WithDelay:
         """With a dead time on top of what `search` found without any effect, in place of one of the baseline's."""
-        found = search.with_effects(none, [DeadTime])
+        found = search.with_effects(none, [delay_effect()])
         candidate, record = found.hypothesis, found.hypothesis.record
-        keys = [c.key for c in candidate.coordinates]
+        keys, own = [c.key for c in candidate.coordinates], _keys()
         here = found.z.copy()
-        delay = keys.index(_KEYS[2])
+        delay = keys.index(own[2])
         here[delay] = max(here[delay], candidate.coordinates[delay].z_of(_FELT_S))
         columns = whitened_jacobian(candidate, found.white, here).reshape(len(here), -1)
         # from the fit's own scales to logarithms and seconds
-        columns = np.stack(
-            [columns[keys.index(k)] / slope for k, slope in zip(_KEYS, _slopes(found, here), strict=True)]
-        )
+        columns = np.stack([columns[keys.index(k)] / slope for k, slope in zip(own, _slopes(found, here), strict=True)])
         white = found.white(found.errors).ravel()
         inverse = np.linalg.inv(columns @ columns.T)
         pulls = columns * white
-        by_row = pulls.reshape(len(_KEYS), len(record.channels), record.rows, record.group).sum((1, 3))
+        by_row = pulls.reshape(len(own), len(record.channels), record.rows, record.group).sum((1, 3))
         blocks = blocks_of(record)
         scores = np.stack([by_row[:, b].sum(1) for b in blocks], 1)
-        values = [found.values[key] for key in _KEYS]
+        values = [found.values[key] for key in own]
         # a step that the prior and the scale's end at no delay have held back: an estimate that may be below 0
         mean = np.array([np.log(values[0]), np.log(values[1]), values[2]]) + inverse @ scores.sum(1)
         scores = scores - scores.mean(1, keepdims=True)
@@ -97,14 +94,19 @@ def _chance(away: Float, covariance: Float, which: Sequence[int], blocks: int) -
     return float(fisher.sf(square * (blocks - count) / (count * (blocks - 1)), count, blocks - count))
 
 
+def _keys() -> tuple[str, str, str]:
+    """Lag, gain and delay among the plant's parameters."""
+    return "T_L", "K_L", delay_key()
+
+
 def _slopes(found: FittedModel, z: Float) -> list[float]:
     """Of ln T_L, ln K_L and the dead time [s] by their own coordinates at `z`."""
     step = 1e-4
     keys = [c.key for c in found.hypothesis.coordinates]
     each = found.hypothesis.values(z + step * np.vstack([np.zeros(len(z)), np.eye(len(z))]))
     out = []
-    for key in _KEYS:
+    for key in _keys():
         x = each[key].numpy()
-        x = x if key == _KEYS[2] else np.log(x)
+        x = x if key == delay_key() else np.log(x)
         out.append(float(x[1 + keys.index(key)] - x[0]) / step)
     return out

@@ -225,15 +225,17 @@ class _Onset:
 
 
 def _onset(found: FittedModel | None, race: SearchResult) -> _Onset | None:
-    """Of a change of gain the moment of the change."""
+    """Of an effect that has an onset of its own, that one."""
     if found is None:
         return None
-    if found.name == "gain_change":
-        change = float(found.values["gain_change.change_s"])
+    own = found.hypothesis.effects[0] if len(found.hypothesis.effects) == 1 else None
+    if own is not None and own.own_onset is not None and found.name == own.name:
+        change = float(found.values[f"{own.name}.{own.own_onset}"])
         row = int(np.abs(race.record.time[race.record.source] - change).argmin())
         return _Onset.at(race.record, row, change)
-    if found.name == "outliers" and found.tails is not None and found.tails.onset is not None:
+    alone = bool(found.searched) and found.name == found.searched[-1].name
+    if alone and found.tails is not None and found.tails.onset is not None:
         return _Onset.at(race.raw, found.tails.onset)
-    if found.name == "command_hold" and found.losses is not None and found.losses.onset is not None:
+    if alone and found.losses is not None and found.losses.onset is not None:
         return _Onset.at(race.raw, found.losses.onset)
     return None if found.began is None else _Onset.at(race.record, found.began)

@@ -11,13 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from avtorch.gap import EFFECTS, PLACES, Drive, Effect, GainChange, Response, plant
+from avtorch.gap import EFFECTS, PLACES, Drive, Effect, Response, plant
 from avtorch.plots.style import BLACK, BLUE, GREY, VERMILLION, styled
 
 _DT = 0.02
+_ONSET_S = 9.0  # [s]
 _SEED = 3  # of the random effects' picture
-_FROM_MPS = {"low_speed_creep": 1.0, "aerodynamic_drag": 25.0}
-_FROM_ELSE_MPS = 12.0
 _FACTORS = (1, 2, 5, 10, 20, 50)
 _GAP_AT = -3.6  # [m/s²], where the gap's zero is drawn
 
@@ -39,7 +38,7 @@ def standard_response(effect: Effect | None, *, seed: int = _SEED) -> Response:
     The speed that an effect looks at is that of the very response, found by repeating.
     """
     time, command = standard_command()
-    first = _FROM_ELSE_MPS if effect is None else _FROM_MPS.get(effect.name, _FROM_ELSE_MPS)
+    first = (Effect if effect is None else effect).pictured
     drive = Drive(
         time, command, torch.full_like(time, first), 0.0 if effect is None or effect.place != "body" else None
     )
@@ -84,6 +83,12 @@ def effect_signature(ax: Axes, effect: Effect, *, seed: int = _SEED) -> Axes:
     return ax
 
 
+def _typical(kind: type[Effect]) -> Effect:
+    """At its typical strength; one with an onset of its own within the picture."""
+    effect = kind()
+    return effect if kind.own_onset is None else effect.replaced({kind.own_onset: _ONSET_S})
+
+
 @styled
 def signature_figure() -> Figure:
     """All registered effects at typical strength, in the order of the chain.
@@ -93,7 +98,7 @@ def signature_figure() -> Figure:
         >>> len(signature_figure().axes) >= 22
         True
     """
-    typical = [GainChange(change_s=9.0) if cls is GainChange else cls() for cls in EFFECTS.values()]
+    typical = [_typical(cls) for cls in EFFECTS.values()]
     effects = sorted(typical, key=lambda e: (PLACES.index(e.place), e.order, e.name))
     columns = 4
     rows = -(-(len(effects) + 1) // columns)

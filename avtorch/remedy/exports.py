@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -38,9 +38,6 @@ class Exported:
         return "\n".join([*lines, *(f"{name}: {value:.6g}" for name, value in self.values.items())]) + "\n"
 
 
-_SENSING = {"sensor_lag", "sensor_bias", "sensor_scale", "outliers"}
-
-
 def to_autoware(plant: GapPlant) -> Exported:
     """Delay, time constant, scaling and limits of `plant`.
 
@@ -53,23 +50,17 @@ def to_autoware(plant: GapPlant) -> Exported:
         acc_time_constant: 0.4
         debug_acc_scaling_factor: 1
     """
-    effects = {e.name: {k: float(v) for k, v in e.values().items() if v.dim() == 0} for e in plant.effects}
     values = {
-        "acc_time_delay": effects.get("dead_time", {}).get("delay_s", 0.0),
+        "acc_time_delay": _delay(plant),
         "acc_time_constant": float(plant.T_L),
         "debug_acc_scaling_factor": float(plant.K_L),
     }
-    told = {"dead_time"}
-    if "saturation" in effects:
-        values["vel_rate_lim"] = max(effects["saturation"]["accel_max_mps2"], -effects["saturation"]["accel_min_mps2"])
-        told.add("saturation")
-    lost = []
-    if "saturation" in effects:
-        lost.append("saturation: limits that differ for driving and braking; the tool's one is the wider")
-    if "second_order_actuator" in effects:
-        lost.append("second_order_actuator: its overshoot; the time constant is that of the two poles together")
-        told.add("second_order_actuator")
-    return Exported("Autoware planning simulator", values, (*lost, *_unsaid(plant, told)))
+    limits = [limit for e in plant.effects if (limit := e.accel_limit()) is not None]
+    if limits:
+        values["vel_rate_lim"] = min(limits)
+    half = [e for e in plant.effects if e.half_said]
+    lost = [f"{e.name}: {e.half_said}" for e in half]
+    return Exported("Autoware planning simulator", values, (*lost, *_unsaid(plant, {e.name for e in half})))
 
 
 def to_openpilot(plant: GapPlant) -> Exported:
@@ -81,12 +72,9 @@ def to_openpilot(plant: GapPlant) -> Exported:
         >>> {k: round(v, 2) for k, v in to_openpilot(plant(baseline="dead_time=0.2", T_L=0.4)).values.items()}
         {'longitudinalActuatorDelay': 0.6}
     """
-    effects = {e.name: {k: float(v) for k, v in e.values().items() if v.dim() == 0} for e in plant.effects}
-    delay = effects.get("dead_time", {}).get("delay_s", 0.0) + float(plant.T_L)
+    delay = _delay(plant) + float(plant.T_L)
     lost = [f"K_L {float(plant.K_L):.3g}: a gain is learned on the way"] if abs(float(plant.K_L) - 1) > 0.01 else []
-    return Exported(
-        "openpilot CarParams", {"longitudinalActuatorDelay": delay}, (*lost, *_unsaid(plant, {"dead_time"}))
-    )
+    return Exported("openpilot CarParams", {"longitudinalActuatorDelay": delay}, (*lost, *_unsaid(plant)))
 
 
 def write_exports(plant: GapPlant | None, folder: str | PathLike[str]) -> list[Path]:
@@ -109,11 +97,16 @@ def write_exports(plant: GapPlant | None, folder: str | PathLike[str]) -> list[P
     return [] if plant is None else [Path(folder) / name for name in tools]
 
 
-def _unsaid(plant: GapPlant, told: set[str]) -> tuple[str, ...]:
+def _delay(plant: GapPlant) -> float:
+    """By which all effects together make commands late [s]."""
+    return sum((float(getattr(e, e.shift)) for e in plant.effects if e.shift is not None), 0.0)
+
+
+def _unsaid(plant: GapPlant, said: Collection[str] = ()) -> tuple[str, ...]:
     lost = []
     for e in plant.effects:
-        if e.name in told:
+        if e.name in said or e.shift is not None:
             continue
-        where = "the sensor's, not the car's" if e.name in _SENSING else e.meaning
+        where = "the sensor's, not the car's" if e.place == "sensor" else e.meaning
         lost.append(f"{e.name}: {where}")
     return tuple(lost)

@@ -13,12 +13,9 @@ import torch
 from torch import Tensor
 
 from avtorch.gap import Drive, GapPlant
+from avtorch.gap.simulator.integrated import Integrated
 from avtorch.vehicle.stability import Chain, frequencies
 
-NOT_LINEAR = frozenset({"dead_band", "backlash", "saturation", "rate_limit"})
-"""Effects whose response is no multiple of the command: what is told holds for steps of one size."""
-
-_LEFT_OUT = frozenset({"road_grade"})  # a place on a road, no property of the car
 _DT, _SECONDS, _BEFORE = 0.01, 30.0, 1.0
 _LATE = 1e5  # [s], when every change of gain is over
 _ASIDE = 0.5  # [m/s]
@@ -42,7 +39,8 @@ def linearised(
         >>> verdict.string_stable.tolist(), verdict.peak_gain.round(decimals=2).tolist()
         ([False], [1.75])
     """
-    own = [e for e in plant.effects if not e.random and e.name not in _LEFT_OUT]
+    # a road is a place, no property of the car
+    own = [e for e in plant.effects if not e.random and not isinstance(e, Integrated)]
     car = GapPlant(own, T_L=plant.T_L, K_L=plant.K_L, sigma=0.0)
     given = {k: v for k, v in (belief or {}).items() if k in car.parameters()}
     values = {k: torch.as_tensor(v, dtype=torch.float64).reshape(-1) for k, v in {**car.values(), **given}.items()}

@@ -24,7 +24,7 @@ from avtorch.decision.grid import GAINS_GRID, Grid
 from avtorch.errors import InputError
 from avtorch.gap import GapPlant
 from avtorch.gap.result.diagnosis import Diagnosis
-from avtorch.remedy.linearised import NOT_LINEAR, linearised
+from avtorch.remedy.linearised import linearised
 from avtorch.vehicle.stability import Chain, chain_verdict
 
 SOFTER: tuple[tuple[float, float, float], ...] = tuple(product((0.1, 0.2, 0.4, 0.8), (0.4, 0.7, 1.0), (-0.8, -0.2)))
@@ -160,7 +160,7 @@ def what_to_set(
     at = {"assumed": _told(thought_at[0]), "in_force": now_at, "then": then_at}
     sufficient = p_best >= required
     strategies = tuple(sorted(chosen.strategies(now)[0]))
-    names = [e.name for e in plant.effects if e.name in NOT_LINEAR]
+    names = [e.name for e in plant.effects if not e.linear]
     notes = (f"{' and '.join(names)}: evaluated for steps of {STEP_MPS2:g} m/s².",) if names else ()
     return WhatToSet(
         in_force=now,
@@ -207,8 +207,7 @@ def setting_for(
 
 def _chains(plant: GapPlant, draws: Mapping[str, Tensor], speeds: Sequence[float]) -> list[Chain]:
     """At every speed; driving and braking apart where the plant answers them otherwise."""
-    names = {e.name for e in plant.effects}
-    bends = names & {"brake_throttle_asymmetry", "saturation"}
+    bends = any(e.one_sided for e in plant.effects)
     at = speeds if any(e.needs_speed for e in plant.effects) else speeds[:1]
     steps = (STEP_MPS2, -STEP_MPS2) if bends else (STEP_MPS2,)
     return [linearised(plant, draws, speed=v, step=u) for v in at for u in steps]

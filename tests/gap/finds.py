@@ -76,4 +76,5 @@ def found_of(
         tails=tails,
         losses=LostMessages(9.0, 0.1, 0.3, None) if "command_hold" in names else None,
         gust=gust,
+        searched=tuple(type(e) for e in effects if e.own_search()),
     )

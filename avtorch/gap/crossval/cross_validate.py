@@ -148,14 +148,11 @@ def _sham(verdict: FittedModel, taken: set[str], channels: tuple[str, ...]) -> t
     """A wrong effect with as many parameters as the verdict's, or nearly so: the first by name after the verdict's."""
     own = verdict.hypothesis.size - 2
     some = [e for e in EFFECTS.values() if not e.random and e.name not in taken and is_observable(e, channels)]
-    some = [e for e in some if e.name not in _OF_THE_DRIVE]
+    some = [e for e in some if not e.of_the_drive]
     if not some:
         return None
     order = sorted(some, key=lambda e: (abs(len(e.parameters) - own), e.name <= verdict.name, e.name))
     return order[0]
-
-
-_OF_THE_DRIVE = ("road_grade", "gear_shift", "gain_change")  # have many coefficients, or a moment of the drive
 
 
 def _with_sham(refit: Refit, sham: type[Effect], part: Fold) -> Refit:

@@ -32,7 +32,7 @@ def random_effect_density(found: FittedModel, raw: Record, fits: Record) -> Floa
     gained = np.zeros(raw.rows)
     began = None
     if found.tails is not None:
-        law = {} if own is None else {"law": own.law.tails, "size": own.law.size}
+        law = {} if own is None or own.law.form != "tails" else {"law": own.law.tails, "size": own.law.size}
         gained += heavy_tails(errors[0, :, 0], raw.dt, fits=seen, **law).ratios
         began = found.tails.onset
     if found.losses is not None:

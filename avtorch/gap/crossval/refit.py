@@ -53,7 +53,9 @@ class Refit:
         z, noise = found.z, found.noise.noise
         value = -np.inf
         for _ in range(_TURNS):
-            noise = noise.seen_through({k: float(x[0]) for k, x in hypothesis.values(z[None]).items()})
+            noise = noise.seen_through(
+                hypothesis.effects, {k: float(x[0]) for k, x in hypothesis.values(z[None]).items()}
+            )
             white = whitening_filter(fits, noise, onset=onset, gust_onset=gust_onset)
             z = modes(hypothesis, white, z[None], onset=onset, iterations=4, enough=_ENOUGH)[0][0]
             errors = residuals(hypothesis, white, z, onset, coarse=False)
@@ -139,7 +141,9 @@ class Refit:
         if self.profile is None:
             return rolled
         part = hypothesis.grade_response(self.profile)
-        noise = self.noise.seen_through({k: float(x[0]) for k, x in hypothesis.values(z[None]).items()})
+        noise = self.noise.seen_through(
+            hypothesis.effects, {k: float(x[0]) for k, x in hypothesis.values(z[None]).items()}
+        )
         return rolled + sensed(record, noise, acting(whitening_filter(record, noise, onset=onset), part, onset))
 
     def around(self, steps: Float) -> Float:

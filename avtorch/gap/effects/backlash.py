@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.effect import Effect, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -40,6 +40,8 @@ class Backlash(Effect):
     memory = True
     meaning = "a play is crossed whenever the command turns back"
     equation = "y = max(u - beta, min(u + beta, y of the row before))"
+    linear = False
+    starts = fixed(half_width_mps2=(0.03, 0.07, 0.13, 0.22, 0.35))
     parameters = (
         Parameter(
             "half_width_mps2", "m/s²", 0.0, 0.02, 0.3, possible=(0.0, 1.0), beyond="no driveline has that much play"

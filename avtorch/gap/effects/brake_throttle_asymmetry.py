@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.effect import Effect, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -36,6 +36,8 @@ class BrakeThrottleAsymmetry(Effect):
     place = "actuator"
     meaning = "gain and lag differ between braking and driving"
     equation = "K_L, T_L times ratios where u < 0"
+    one_sided = True
+    starts = fixed(brake_gain_ratio=(0.6, 0.95, 1.2), brake_lag_ratio=(1.0, 2.5))
     parameters = (
         Parameter(
             "brake_gain_ratio", "-", 1.0, 0.5, 0.9, possible=(0.2, 5.0), beyond="brake and drive do not differ so"

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, NoiseChange, Row, register
+from avtorch.gap.simulator.effect import Effect, NoiseChange, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -41,6 +41,8 @@ class CommandHold(Effect):
     random = True
     meaning = "messages are lost and the last command acts on"
     equation = "u of the last row that arrived"
+    searched_as = "losses"
+    noise_parameters = fixed(loss="hold_fraction")
     parameters = (
         Parameter(
             "hold_fraction", "-", 0.0, 0.02, 0.2, "unit", possible=(0.0, 0.6), beyond="no link loses so many messages"

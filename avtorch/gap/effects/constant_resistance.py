@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.effect import Effect, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -34,6 +35,11 @@ class ConstantResistance(Effect):
     place = "body"
     meaning = "the same deceleration at every speed"
     equation = "-r while moving"
+    alias = "offset"
+    force_sign = -1
+    slow_force = True
+    commutes = True
+    starts = fixed(resistance_mps2=(0.02, 0.15))
     parameters = (
         Parameter(
             "resistance_mps2",
@@ -51,3 +57,7 @@ class ConstantResistance(Effect):
         if row.measured_speed is None:
             return force * torch.ones_like(x)
         return torch.where(row.speed > 0, force, 0.0)
+
+    @classmethod
+    def constant_accel(cls, values: Mapping[str, float] | None) -> float:
+        return -1.0 if values is None else -values["resistance_mps2"]

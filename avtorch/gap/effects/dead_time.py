@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.effect import Effect, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -42,6 +42,8 @@ class DeadTime(Effect):
     shift = "delay_s"
     meaning = "the command acts after a delay"
     equation = "u(t - tau)"
+    role = "delay"
+    starts = fixed(delay_s=(0.03, 0.07, 0.13, 0.22, 0.35, 0.55))
     parameters = (Parameter("delay_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.5), beyond="no command takes that long"),)
 
     def start(self, x: Tensor, row: Row) -> list[Tensor]:

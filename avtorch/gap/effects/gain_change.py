@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.effect import Effect, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
+
+_CHANGES = 12  # moments to begin with, over a drive
+_MOMENTS = 60  # tried one at a time
 
 
 @register
@@ -45,6 +50,10 @@ class GainChange(Effect):
     place = "actuator"
     meaning = "from some moment on the car realises another share of the command"
     equation = "K_L (1 + (ratio - 1) clip((t - t_change) / ramp, 0, 1))"
+    own_onset = "change_s"
+    of_the_drive = True
+    commutes = True
+    starts = fixed(ramp_s=(0.3, 3.0, 30.0))
     parameters = (
         Parameter("gain_ratio", "-", 1.0, 0.65, 1.4, possible=(0.2, 5.0), beyond="payload and fading brakes do less"),
         Parameter("change_s", "s", None, 0.0, 60.0, "interval", possible=(-math.inf, math.inf)),
@@ -61,6 +70,20 @@ class GainChange(Effect):
         since = row.time - tensor(self.change_s)
         share = (_area(since + row.dt, ramp) - _area(since, ramp)) / row.dt
         return 1 + (tensor(self.gain_ratio) - 1) * share, 1.0
+
+    @classmethod
+    def starts_in(cls, first: float, last: float) -> Mapping[str, tuple[float, ...]]:
+        times = first + (last - first) * (np.arange(_CHANGES) + 0.5) / _CHANGES
+        return {"gain_ratio": (0.85, 1.15), "change_s": tuple(times.tolist()), "ramp_s": (1.0, 0.12 * (last - first))}
+
+    @classmethod
+    def retried_in(cls, first: float, last: float) -> Mapping[str, tuple[float, ...]]:
+        """In a quiet drive only a few moments show a change, so many are tried."""
+        moments = torch.linspace(first, last, _MOMENTS + 2)[1:-1].tolist()
+        return {**cls.starts, "change_s": tuple(moments)}
+
+    def settled(self) -> Mapping[str, float]:
+        return {"change_s": -1e3, "ramp_s": 0.0}
 
     def coordinates(self) -> tuple[Parameter, ...]:
         ratio, change, ramp = self.parameters

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.effect import Effect, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -39,6 +39,9 @@ class LowSpeedCreep(Effect):
     needs_speed = True
     meaning = "the car is pushed forward at walking speed"
     equation = "creep / (1 + exp((v - 3) / 0.5))"
+    force_sign = 1
+    pictured = 1.0
+    starts = fixed(creep_mps2=(0.05, 0.3))
     parameters = (
         Parameter("creep_mps2", "m/s²", 0.0, 0.1, 0.5, possible=(0.0, 1.5), beyond="no car creeps like that"),
     )

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect, NoiseChange, Row, register
+from avtorch.gap.simulator.effect import Effect, NoiseChange, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -43,6 +44,9 @@ class Outliers(Effect):
     random = True
     meaning = "single samples of the accelerometer are far off"
     equation = "a + scale sigma e, with probability fraction"
+    commutes = True
+    searched_as = "tails"
+    noise_parameters = fixed(tail_fraction="fraction", tail_scale="scale")
     parameters = (
         Parameter(
             "fraction", "-", 0.0, 0.005, 0.05, "unit", possible=(0.0, 0.3), beyond="so many are no single samples"
@@ -61,6 +65,9 @@ class Outliers(Effect):
         again = torch.where(hit, level / torch.where(hit, fraction, 1.0), 0.5)
         error = torch.special.ndtri(again.clamp(1e-12, 1 - 1e-12))
         return x + torch.where(hit, tensor(self.scale) * self.noise_sd * error, 0.0)
+
+    def in_noise(self, accel_sd: float) -> Self:
+        return replace(self, noise_sd=accel_sd)
 
     def noise(self, u: Tensor) -> NoiseChange:
         return NoiseChange(tail_fraction=tensor(self.fraction), tail_scale=tensor(self.scale))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.effect import Effect, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.vehicle.arguments import Number
+from avtorch.vehicle.arguments import Number, tensor
 
 
 @register
@@ -37,6 +38,8 @@ class RateLimit(Effect):
     order = 2
     meaning = "the actuator's jerk is bounded"
     equation = "da/dt = (K u - a) / T_L within ± jerk_max"
+    linear = False
+    starts = fixed(jerk_max_mps3=(0.4, 0.7, 1.1, 1.8, 3.0, 5.0))
     parameters = (
         Parameter(
             "jerk_max_mps3",
@@ -51,3 +54,6 @@ class RateLimit(Effect):
 
     def apply(self, x: Tensor, row: Row) -> tuple[float, float]:
         return 1.0, 1.0  # the bound is the actuator's own affair, see `actuator.py`
+
+    def actuator_parameters(self) -> Mapping[str, Tensor]:
+        return {"jerk": tensor(self.jerk_max_mps3)}

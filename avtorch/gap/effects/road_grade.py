@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.effect import Row, register
+from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -23,7 +24,7 @@ _SMOOTH_M = 180.0  # correlation length of the slope (Matern 3/2) [m]
 
 @register
 @dataclass(frozen=True)
-class RoadGrade(Effect):
+class RoadGrade(Integrated):
     """`-g sin(slope(position))`; the slope is a Gaussian process over position of size `grade_rms`; neutral at 0.
 
     Cubic B-splines every `knot_m` [m] carry it; `profile` (..., knots) holds their coefficients, a priori independent
@@ -54,6 +55,8 @@ class RoadGrade(Effect):
     gravity = True
     meaning = "slopes that the log does not record"
     equation = "-g sin(slope(x)), slope a smooth random function of position"
+    of_the_drive = True
+    size = "grade_rms"
     parameters = (Parameter("grade_rms", "-", 0.0, 0.02, 0.06, possible=(0.0, 0.2), beyond="no road is that steep"),)
     settings = (
         Domain("profile", -100.0, 100.0, least=4, most=4096),
@@ -81,6 +84,10 @@ class RoadGrade(Effect):
             return self
         return replace(self, profile=torch.randn(self.knots, generator=generator, dtype=torch.float64))
 
+    @property
+    def count(self) -> int:
+        return self.knots
+
     def columns(self, position: Tensor) -> Tensor:
         """Acceleration (time, knot) per unit of each coefficient at `grade_rms` 1, `position` (time,) [m]."""
         lower = _lower(self.knots, self.knot_m)
@@ -90,6 +97,14 @@ class RoadGrade(Effect):
         """Acceleration (..., time) of a slope of `coefficients` (..., knot), linear in them; `position` (time,) [m]."""
         lower = _lower(self.knots, self.knot_m)
         return -GRAVITY * _spline(position, coefficients @ lower.T, self.knot_m, True)
+
+    def magnitude(self, position: Tensor, coefficients: Tensor) -> Tensor:
+        """The slope [-]."""
+        return self.force(position, coefficients) / GRAVITY
+
+    def along(self, coefficients: Tensor, size: float) -> Self:
+        profile = coefficients / size
+        return replace(self, grade_rms=size, profile=profile, knots=len(profile))
 
     def _coefficients(self) -> Tensor:
         profile = tensor(self.profile)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.effect import Effect, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -36,6 +36,13 @@ class Saturation(Effect):
     order = 1
     meaning = "commands beyond what drive or brakes can deliver are clipped"
     equation = "K u within [a_min, a_max]"
+    linear = False
+    one_sided = True
+    half_said = "limits that differ for driving and braking; the tool's one is the wider"
+    starts = fixed(
+        accel_max_mps2=(0.5, 0.75, 1.0, 1.25, 1.6, 2.1, 5.0),
+        accel_min_mps2=(-0.8, -1.2, -1.6, -2.1, -2.8, -8.0),
+    )
     parameters = (
         Parameter(
             "accel_max_mps2", "m/s²", float("inf"), 0.8, 2.0, possible=(0.1, 12.0), beyond="no drive is cut there"
@@ -57,3 +64,6 @@ class Saturation(Effect):
         gain = row.K_L.clamp_min(1e-9)
         high, low = tensor(self.accel_max_mps2) / gain, tensor(self.accel_min_mps2) / gain
         return torch.maximum(torch.minimum(x, high), low)
+
+    def accel_limit(self) -> float:
+        return max(float(self.accel_max_mps2), -float(self.accel_min_mps2))

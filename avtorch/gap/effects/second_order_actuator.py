@@ -11,9 +11,11 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.effect import Effect, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
+
+_DAMPED = 0.85  # a fit is off by 0.1 or so
 
 
 @register
@@ -47,6 +49,9 @@ class SecondOrderActuator(Effect):
     order = 1
     meaning = "the actuator has inertia and may overshoot"
     equation = "a'' = omega² (K u - a) - 2 zeta omega a'"
+    alias = "pole"
+    half_said = "its overshoot; the time constant is that of the two poles together"
+    starts = fixed(inverse_frequency_s=(0.05, 0.15, 0.4))
     parameters = (
         Parameter("inverse_frequency_s", "s", 0.0, 1 / 12, 1 / 3, reported=False),
         Parameter("lag_ratio", "-", 1.0, 0.65, 1 / 0.65, reported=False, of_onset=True),
@@ -61,6 +66,15 @@ class SecondOrderActuator(Effect):
 
     def apply(self, x: Tensor, row: Row) -> tuple[float, Tensor]:
         return 1.0, tensor(self.lag_ratio)  # the second derivative is the actuator's own affair, see `actuator.py`
+
+    def actuator_parameters(self) -> Mapping[str, Tensor]:
+        return {"tau": tensor(self.inverse_frequency_s)}
+
+    @classmethod
+    def aliased(cls, values: Mapping[str, float]) -> bool:
+        """Two real poles, as another first-order lag makes them, have a damping of 1 or more."""
+        damping = values["T_L"] / max(2 * values["inverse_frequency_s"], 1e-9)
+        return damping >= _DAMPED
 
     def report(self, T_L: Tensor) -> dict[str, Tensor]:
         tau = tensor(self.inverse_frequency_s)

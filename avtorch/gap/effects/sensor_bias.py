@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.effect import Effect, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -34,6 +35,10 @@ class SensorBias(Effect):
     order = 2
     meaning = "the accelerometer has a constant offset"
     equation = "a + b"
+    alias = "offset"
+    slow_force = True
+    commutes = True
+    starts = fixed(bias_mps2=(0.02, -0.02))
     parameters = (
         Parameter(
             "bias_mps2",
@@ -49,3 +54,7 @@ class SensorBias(Effect):
 
     def apply(self, x: Tensor, row: Row) -> Tensor:
         return x + tensor(self.bias_mps2)
+
+    @classmethod
+    def constant_accel(cls, values: Mapping[str, float] | None) -> float | None:
+        return None if values is None else values["bias_mps2"]

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.effect import Effect, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.recursion import scan
 from avtorch.vehicle.arguments import Number, tensor
@@ -40,6 +40,9 @@ class SensorLag(Effect):
     memory = True
     meaning = "the accelerometer lags the car's acceleration"
     equation = "s' = (a - s) / lag"
+    alias = "pole"
+    reading = fixed(lag="lag_s")
+    starts = fixed(lag_s=(0.03, 0.1, 0.2, 0.4))
     parameters = (Parameter("lag_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.0), beyond="no accelerometer is that late"),)
 
     def start(self, x: Tensor, row: Row) -> Any:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.effect import Effect, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -34,6 +34,9 @@ class SensorScale(Effect):
     order = 1
     meaning = "the accelerometer's gain is wrong"
     equation = "scale a"
+    alias = "K_L"
+    reading = fixed(scale="scale")
+    starts = fixed(scale=(0.95, 1.05))
     parameters = (
         Parameter("scale", "-", 1.0, 0.83, 1.2, possible=(0.5, 2.0), beyond="no accelerometer is off like that"),
     )

@@ -8,7 +8,7 @@ from typing import Self
 from torch import Tensor
 
 from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect, Row, register
+from avtorch.gap.simulator.effect import Effect, Row, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
@@ -45,6 +45,7 @@ class SpeedDependentLag(Effect):
     needs_speed = True
     meaning = "the actuator is slower at some speeds"
     equation = "T_L (1 + slope (v - v_mean) / v_mean)"
+    starts = fixed(lag_slope=(-0.4, 0.4))
     parameters = (
         Parameter("lag_slope", "-", 0.0, -0.7, 0.7, "real", possible=(-2.0, 2.0), beyond="no lag depends on speed so"),
         Parameter("pivot", "-", None, 0.6, 1 / 0.6, reported=False, of_onset=True),

@@ -18,10 +18,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from avtorch.gap.effects.road_grade import GRAVITY, RoadGrade
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.simulator.drive import Drive, Response
 from avtorch.gap.simulator.effect import Effect, effect_class
+from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.simulator.rollout_from_onset import rollout_from_onset
@@ -47,8 +47,8 @@ class Coordinate:
         return float(np.clip(z, -4.0, 4.0))
 
 
-_MEANS: WeakKeyDictionary[Record, Float] = WeakKeyDictionary()
-_ROWS: WeakKeyDictionary[Record, Float] = WeakKeyDictionary()
+_MEANS: WeakKeyDictionary[Record, dict[type[Integrated], Float]] = WeakKeyDictionary()
+_ROWS: WeakKeyDictionary[Record, dict[type[Integrated], Float]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +80,13 @@ class Hypothesis:
     @cached_property
     def coordinates(self) -> tuple[Coordinate, ...]:
         """`T_L`, `K_L`, then the effects'; vectors (a slope's profile) and baseline effects are left out."""
-        own = {e.name for e in self.effects}
+        own = {e.name: e for e in self.effects}
         found = []
         for key, p in self.plant.parameters().items():
             effect = key.partition(".")[0]
             if p.size > 1 or ("." in key and effect not in own):
                 continue
-            if effect == "road_grade":
+            if effect in own and issubclass(own[effect], Integrated):
                 continue
             sized = "." in key and p.neutral is not None and p.constraint != "interval"
             found.append(Coordinate(key, p, _WIDER if sized else 1.0))
@@ -147,29 +147,38 @@ class Hypothesis:
         measured = self.record.measured
         return (measured.mean(-1, keepdims=True) if coarse else measured) - self.rollouts(z, onset, coarse=coarse)
 
+    @property
+    def integrated(self) -> type[Integrated] | None:
+        """The effect among its own whose coefficients are integrated out."""
+        return next((e for e in self.effects if issubclass(e, Integrated)), None)
+
     @cached_property
     def grade_columns(self) -> Float | None:
         """Rollouts (knot, channel, counted, group) per unit of each coefficient of the slope at `grade_rms` 1.
 
         Every segment has coefficients of its own: where one began on the other's road is not known.
         """
-        if not self._roads:
+        kind = self.integrated
+        if kind is None or not self._roads:
             return None
-        if self.record not in _ROWS:
-            _ROWS[self.record] = self._columns(self.record.drives, coarse=False)
-        return _ROWS[self.record]
+        known = _ROWS.setdefault(self.record, {})
+        if kind not in known:
+            known[kind] = self._columns(self.record.drives, coarse=False)
+        return known[kind]
 
     @cached_property
     def grade_means(self) -> Float | None:
         """The same of each group's mean, (knot, channel, counted, 1): within a group no slope changes."""
-        if not self._roads:
+        kind = self.integrated
+        if kind is None or not self._roads:
             return None
-        if self.record not in _MEANS:
-            _MEANS[self.record] = self._columns(self.record.coarse, coarse=True)
-        return _MEANS[self.record]
+        known = _MEANS.setdefault(self.record, {})
+        if kind not in known:
+            known[kind] = self._columns(self.record.coarse, coarse=True)
+        return known[kind]
 
     def _columns(self, drives: Sequence[Drive], *, coarse: bool) -> Float:
-        knots = sum(road.knots for road in self._roads)
+        knots = sum(road.count for road in self._roads)
         forces = []
         for drive, road, own in zip(drives, *self._places, strict=True):
             force = road.columns(_position(drive)).T
@@ -184,15 +193,15 @@ class Hypothesis:
 
     def _each_road(
         self, drives: Sequence[Drive], coefficients: Float
-    ) -> Iterator[tuple[RoadGrade, Drive, torch.Tensor]]:
+    ) -> Iterator[tuple[Integrated, Drive, torch.Tensor]]:
         """Each drive with its road and that road's part of `coefficients` (..., knot)."""
         for drive, road, own in zip(drives, *self._places, strict=True):
             yield road, drive, torch.as_tensor(coefficients[..., own])
 
     @property
-    def _places(self) -> tuple[list[RoadGrade], list[slice]]:
+    def _places(self) -> tuple[list[Integrated], list[slice]]:
         """Of each drive the road, and where its coefficients stand among those of all roads."""
-        ends = np.cumsum([0, *(road.knots for road in self._roads)]).tolist()
+        ends = np.cumsum([0, *(road.count for road in self._roads)]).tolist()
         own = [slice(*part) for part in pairwise(ends)]
         numbers = self.record.segment
         return [self._roads[n] for n in numbers], [own[n] for n in numbers]
@@ -202,18 +211,18 @@ class Hypothesis:
         accel, speed = [], []
         for drive, force in zip(drives, forces, strict=True):
             gained = torch.cumsum(0.5 * drive.dt[:-1] * (force[:, 1:] + force[:, :-1]), -1)
-            # an accelerometer does not feel gravity
-            accel.append(torch.zeros_like(force) if drive.specific_force else force)
+            hidden = drive.specific_force and self.integrated is not None and self.integrated.gravity
+            accel.append(torch.zeros_like(force) if hidden else force)  # an accelerometer does not feel gravity
             speed.append(torch.cat([torch.zeros_like(force[:, :1]), gained], -1))
         seen = {"accel": accel, "speed": speed}
         return np.stack([self.record.seen(seen[name], coarse=coarse) for name in self.record.channels], 1)
 
     @cached_property
-    def _roads(self) -> list[RoadGrade]:
-        """The slope with as many knots as each segment's road needs; empty where it is none of the effects."""
-        grade = next((e for e in self.plant.effects if isinstance(e, RoadGrade)), None)
-        if grade is None or RoadGrade not in self.effects or self.record.speed is None:
+    def _roads(self) -> list[Integrated]:
+        """The integrated effect with as many knots as each segment's road needs; empty where there is none."""
+        if self.integrated is None or self.record.speed is None:
             return []
+        grade = next(e for e in self.plant.effects if isinstance(e, self.integrated))
         made = []
         for drives in self.record.segments:
             positions = torch.cat([_position(drive) for drive in drives])
@@ -224,7 +233,7 @@ class Hypothesis:
         """Root mean square of the slope along all drives, (column,), for coefficients (column, knot)."""
         drives = self.record.coarse
         squares = [
-            (road.force(_position(drive), own) / GRAVITY).square().mean(-1) * len(drive.time)
+            road.magnitude(_position(drive), own).square().mean(-1) * len(drive.time)
             for road, drive, own in self._each_road(drives, coefficients)
         ]
         return torch.stack(squares).sum(0).div(sum(len(d.time) for d in drives)).sqrt().numpy()

@@ -4,7 +4,7 @@ The error of a rollout is what no deterministic response foretells,
 
     dw/dt = p + d            error of the speed
     p: white jerk noise through the actuator's lag, an Ornstein-Uhlenbeck process (sd, time constant)
-    d: a slow coloured force, the nuisance of every candidate and the cause called `gust`, likewise
+    d: a slow coloured force, the nuisance of every candidate and the cause where a random force is one, likewise
     accel measured = p + d + white,   speed measured = w + white
 
 A random effect of the user's may add a further force to `p + d`, of the same kind.
@@ -12,10 +12,12 @@ A random effect of the user's may add a further force to `p + d`, of the same ki
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+
+from avtorch.gap.simulator.effect import Effect
 
 _NO_LAG = 2e-3  # [s], of which no log tells
 
@@ -51,14 +53,15 @@ class NoiseModel:
     def replaced(self, **values: float) -> NoiseModel:
         return replace(self, **values)
 
-    def seen_through(self, values: Mapping[str, float]) -> NoiseModel:
-        """With the accelerometer that a candidate's parameter `values`, by key, speak of."""
-        lag = values.get("sensor_lag.lag_s", 0.0)
-        return replace(
-            self,
-            sensor_scale=values.get("sensor_scale.scale", 1.0),
-            sensor_lag=lag if lag > _NO_LAG else 0.0,
-        )
+    def seen_through(self, effects: Iterable[type[Effect]], values: Mapping[str, float]) -> NoiseModel:
+        """With the accelerometer that `effects` describe at parameter `values`, by key."""
+        lag, scale = 0.0, 1.0
+        for e in effects:
+            if "lag" in e.reading:
+                lag = values[f"{e.name}.{e.reading['lag']}"]
+            if "scale" in e.reading:
+                scale = values[f"{e.name}.{e.reading['scale']}"]
+        return replace(self, sensor_scale=scale, sensor_lag=lag if lag > _NO_LAG else 0.0)
 
     def of_means(self, group: int) -> NoiseModel:
         """Of the means of `group` rows."""

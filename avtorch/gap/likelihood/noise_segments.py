@@ -12,7 +12,7 @@ CALM = 0.005
 
 def before_onset(noise: NoiseModel, *, onset: int | None = None, gust_onset: int | None = None) -> Until:
     """What `noise` was up to a row, in order: `onset` is that of a sensor's lag and scale, `gust_onset` a gust's."""
-    plain = noise.seen_through({})
+    plain = noise.seen_through((), {})
     shaped = onset if plain != noise else None
     out = []
     for row in sorted({row for row in (shaped, gust_onset) if row}):

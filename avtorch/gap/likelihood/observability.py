@@ -11,4 +11,4 @@ def is_observable(effect: type[Effect], channels: Collection[str]) -> bool:
     """Whether a log with these channels can speak for or against an effect."""
     if "accel" not in channels:
         return effect.place != "sensor"
-    return "speed" in channels or not (effect.needs_speed or effect.name == "sensor_scale")
+    return "speed" in channels or not (effect.needs_speed or effect.alias == "K_L")

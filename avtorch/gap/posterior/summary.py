@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import TypeVar
 
@@ -12,13 +11,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from avtorch.gap.effects import CommandHold, Gust, Outliers, RoadGrade
 from avtorch.gap.likelihood.hypothesis import Coordinate
 from avtorch.gap.posterior.density import RolloutDensity, root
 from avtorch.gap.posterior.draws import Draws
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.plant import GapPlant, plant
 
 Float = NDArray[np.float64]
@@ -75,23 +74,17 @@ def repaired(found: FittedModel, baseline: GapPlant | None = None, draws: Draws 
     own = {kind.name for kind in found.hypothesis.effects}
     effects: list[Effect] = [_plain(e) for e in filled.effects if e.name in own]
     for i, effect in enumerate(effects):
-        if isinstance(effect, RoadGrade) and found.profile is not None:
-            rms = _deterministic(found, draws).get("road_grade.grade_rms")
+        if isinstance(effect, Integrated) and found.profile is not None:
+            rms = _deterministic(found, draws).get(f"{effect.name}.{effect.size}")
             size = float(rms.mean()) if rms is not None else float(found.grade_rms or 1.0)
-            profile = torch.as_tensor(np.asarray(found.profile[: effect.knots]) / size)
-            effects[i] = replace(effect, grade_rms=size, profile=profile, knots=len(profile))
+            effects[i] = effect.along(torch.as_tensor(np.asarray(found.profile[: effect.count])), size)
     told = {name: float(Quantity.of_normal(*law).mean) for name, law in _random(found).items()}
-    if "gust.sd_mps2" in told:
-        effects.append(Gust(told["gust.sd_mps2"], told["gust.time_constant_s"]))
-    if "outliers.fraction" in told:
-        own_sd = noise.accel_sd
-        effects.append(Outliers(told["outliers.fraction"], told["outliers.scale"], noise_sd=float(own_sd)))
-    if "command_hold.hold_fraction" in told:
-        effects.append(CommandHold(told["command_hold.hold_fraction"]))
+    chance: list[Effect] = [kind() for kind in found.searched]
     if found.by_chance is not None:
-        chance = found.by_chance.law.at(found.by_chance.z)
-        given = {key.partition(".")[2]: x for key, x in told.items() if key.startswith(f"{chance.name}.")}
-        effects.append(_plain(chance.replaced(given)))
+        chance.append(found.by_chance.law.at(found.by_chance.z))
+    for effect in chance:
+        given = {key.partition(".")[2]: x for key, x in told.items() if key.startswith(f"{effect.name}.")}
+        effects.append(_plain(effect.replaced(given).in_noise(float(noise.accel_sd))))
     process_sd = noise.process_sd
     if found.by_chance is not None and found.by_chance.process_sd is not None:
         process_sd = found.by_chance.process_sd
@@ -133,12 +126,13 @@ def _deterministic(found: FittedModel, draws: Draws | None) -> dict[str, Float]:
     for kind in found.hypothesis.effects:
         for key, x in report[kind.name].items():
             out[f"{kind.name}.{key}"] = x.expand(shape).numpy()
-    if any(issubclass(kind, RoadGrade) for kind in found.hypothesis.effects):
+    integrated = found.hypothesis.integrated
+    if integrated is not None:
         rms = None if draws is None else draws.grade_rms
         if rms is None:
             rms = _grade_rms(found)
         if rms is not None:
-            out["road_grade.grade_rms"] = rms
+            out[f"{integrated.name}.{integrated.size}"] = rms
     return out
 
 
@@ -155,25 +149,34 @@ def _grade_rms(found: FittedModel) -> Float | None:
 def _random(found: FittedModel) -> dict[str, tuple[float, float, Link]]:
     """Mean, sd and link of the random effects' parameters, by `effect.parameter`."""
     out: dict[str, tuple[float, float, Link]] = {}
-    names = found.name.split("+")
-    if "gust" in names and found.gust:
-        noise, sds = found.noise.noise, found.noise.sds
-        out["gust.sd_mps2"] = (float(np.log(noise.force_sd)), sds["force_sd"], torch.exp)
-        out["gust.time_constant_s"] = (float(np.log(noise.force_time)), sds["force_time"], torch.exp)
-    if "outliers" in names and found.tails is not None and found.by_chance is None:
-        tails = found.tails
-        fraction = float(np.log(max(tails.fraction, 1e-9)))
-        out["outliers.fraction"] = (fraction, tails.sds[0], lambda x: x.exp().clamp_max(0.5))
-        out["outliers.scale"] = (float(np.log(tails.scale)), tails.sds[1], torch.exp)
-    if "command_hold" in names and found.losses is not None:
-        p = float(np.clip(found.losses.fraction, 1e-6, 1 - 1e-6))
-        out["command_hold.hold_fraction"] = (float(np.log(p / (1 - p))), found.losses.sd, torch.sigmoid)
+    for kind in found.searched:
+        told = _searched(found, kind)
+        out |= {f"{kind.name}.{parameter}": told[own] for own, parameter in kind.noise_parameters.items()}
     if found.by_chance is not None:
         law, sds = found.by_chance.law, np.sqrt(np.diag(found.by_chance.covariance))
         for c, z, sd in zip(law.coordinates, found.by_chance.z.tolist(), sds.tolist(), strict=True):
             if c.parameter.reported:
                 out[c.key] = (z, sd, partial(_valued, c))
     return out
+
+
+def _searched(found: FittedModel, kind: type[Effect]) -> dict[str, tuple[float, float, Link]]:
+    """Likewise what the own search of an effect found, by the names in its `noise_parameters`."""
+    form = kind.own_search()
+    if form == "force":
+        noise, sds = found.noise.noise, found.noise.sds
+        return {
+            name: (float(np.log(getattr(noise, name))), sds[name], torch.exp) for name in ("force_sd", "force_time")
+        }
+    if form == "tails" and found.tails is not None:
+        fraction = float(np.log(max(found.tails.fraction, 1e-9)))
+        return {
+            "tail_fraction": (fraction, found.tails.sds[0], lambda x: x.exp().clamp_max(0.5)),
+            "tail_scale": (float(np.log(found.tails.scale)), found.tails.sds[1], torch.exp),
+        }
+    assert found.losses is not None
+    p = float(np.clip(found.losses.fraction, 1e-6, 1 - 1e-6))
+    return {"loss": (float(np.log(p / (1 - p))), found.losses.sd, torch.sigmoid)}
 
 
 def _valued(coordinate: Coordinate, z: Tensor) -> Tensor:

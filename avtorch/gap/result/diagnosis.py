@@ -188,7 +188,7 @@ class Diagnosis:
         """Publish `diagnosis.json` and, where there is a plant, `plant.toml` at the same moment; returns the files.
 
         The plant's effects act from the start, also where the log shows them from an onset on; a comment in
-        `plant.toml` then says so (a `gain_change` has its moment among its parameters).
+        `plant.toml` then says so (one with an onset of its own has the moment among its parameters).
         All files of an earlier diagnosis in the folder go at that moment, its page, exports and manoeuvre too: write
         these after it, or all of them within one `avtorch.io.answer_set(folder, DIAGNOSIS_FILES)`. Raises `InputError`
         where the folder cannot be written or a number is not finite; the earlier diagnosis then stays.
@@ -203,7 +203,8 @@ class Diagnosis:
 
     def _late(self) -> str:
         """A comment for `plant.toml` where the effects set in within the log."""
-        late = " and ".join(name for name in self.verdict.names if name != "gain_change")
+        own = set() if self.plant is None else {e.name for e in self.plant.effects if e.own_onset is not None}
+        late = " and ".join(name for name in self.verdict.names if name not in own)
         if self.onset_s is None or not late:
             return ""
         return f"# In the log {late} from {sentences.moment(self)} on; in this plant from the start.\n"

@@ -40,7 +40,7 @@ class PredictiveModel:
     def of(cls, found: FittedModel) -> PredictiveModel:
         """From what a search found."""
         record = found.hypothesis.record
-        grade = found.grade_rms if "road_grade" in found.name.split("+") else None
+        grade = found.grade_rms if found.hypothesis.integrated is not None else None
         return cls(
             name=found.name,
             plant=found.hypothesis.plant,

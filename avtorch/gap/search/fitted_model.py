@@ -79,8 +79,8 @@ class FittedModel:
     """A hypothesis fitted: `name`, `z` and parameter `values` at the mode, `log_evidence` [nats], `errors`.
 
     `onset`, `gust_onset`: counted rows from which its effects act and a gust blows, None: from the start. `tails`,
-    `losses`: what random effects among its names found; `by_chance`: likewise, one of the user's. `delays`: all that
-    fit alike, under a command that repeats itself.
+    `losses`: what random effects among its names found; `searched`: the classes of these and of a gust. `by_chance`:
+    the random effect without a search of its own. `delays`: all that fit alike, under a command that repeats itself.
     """
 
     name: str
@@ -101,6 +101,11 @@ class FittedModel:
     gust_onset: int | None = None
     delays: Delays | None = field(default=None, repr=False)
     by_chance: ByChance | None = field(default=None, repr=False)
+    searched: tuple[type[Effect], ...] = ()
+
+    def name_with(self, effect: str) -> str:
+        """With the random effect of this name on top."""
+        return "+".join(sorted([*([] if self.name == "none" else self.name.split("+")), effect]))
 
     @property
     def blown(self) -> bool:

@@ -13,27 +13,28 @@ from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.noise_segments import CALM, whitening_filter
 from avtorch.gap.search.fitted_model import FittedModel, with_or_without_onset
 from avtorch.gap.search.onset import allowed, profile
+from avtorch.gap.simulator.effect import Effect
 
 Float = NDArray[np.float64]
 
 
-def gust(base: FittedModel) -> FittedModel:
-    """A coloured force on top of `base`, over the whole drive and from an onset on."""
+def gust(base: FittedModel, kind: type[Effect]) -> FittedModel:
+    """The coloured force of an effect of this `kind` on top of `base`, over the whole drive and from an onset on."""
     record = base.hypothesis.record
     forms = []
     lag = base.values["T_L"]
     start = base.noise.noise.replaced(force_sd=0.08, force_time=2.0)
-    whole = _blown(base, start, lag, None)
+    whole = _blown(base, kind, start, lag, None)
     forms.append(whole)
     within = allowed(record.rows, record.dt)
     along = _along(whole)
     onset = within.start + int(np.argmax(along[within]))
     if along[onset] - along[0] > 3:
-        late = _blown(base, whole.noise.noise, lag, onset)
+        late = _blown(base, kind, whole.noise.noise, lag, onset)
         along = _along(late)
         moved = within.start + int(np.argmax(along[within]))
         if abs(moved - onset) * record.dt > 1:
-            late = _blown(base, late.noise.noise, lag, moved)
+            late = _blown(base, kind, late.noise.noise, lag, moved)
         mass = float(np.log(np.exp(along[within] - along[moved]).sum() / record.rows))
         forms.append(replace(late, log_evidence=late.log_evidence + mass))
     return with_or_without_onset(forms)
@@ -52,7 +53,7 @@ def _along(blown: FittedModel) -> Float:
     return profile(calm, strong)
 
 
-def _blown(base: FittedModel, start: NoiseModel, lag: float, onset: int | None) -> FittedModel:
+def _blown(base: FittedModel, kind: type[Effect], start: NoiseModel, lag: float, onset: int | None) -> FittedModel:
     record, candidate = base.hypothesis.record, base.hypothesis
     z, errors, fitted = base.z, base.errors, None
     evidence = 0.0
@@ -69,10 +70,9 @@ def _blown(base: FittedModel, start: NoiseModel, lag: float, onset: int | None) 
         evidence = fit.log_evidence + fitted.log_prior
         rows = white.row_likelihoods(errors)
     assert fitted is not None
-    name = "+".join(sorted([*([] if base.name == "none" else base.name.split("+")), "gust"]))
     return replace(
         base,
-        name=name,
+        name=base.name_with(kind.name),
         z=z,
         values={k: float(v) for k, v in candidate.values(z[None]).items()},
         noise=fitted,
@@ -80,5 +80,6 @@ def _blown(base: FittedModel, start: NoiseModel, lag: float, onset: int | None) 
         log_evidence=evidence,
         log_likelihood=float(rows.sum()),
         gust=True,
+        searched=(*base.searched, kind),
         gust_onset=onset,
     )

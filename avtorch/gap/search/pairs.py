@@ -17,6 +17,7 @@ from avtorch.gap.search.initial_values import effect_starts, starts
 from avtorch.gap.search.onset import allowed
 from avtorch.gap.search.screening import Screened, converge, refine, screen
 from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.integrated import Integrated
 
 Float = NDArray[np.float64]
 
@@ -103,7 +104,12 @@ class Base:
     ) -> list[tuple[Hypothesis, Float]]:
         """Hypotheses with one of `kinds` besides, and where to begin: the `most` best, of `least` nats or more."""
         record, baseline, own = self.hypothesis.record, self.hypothesis.baseline, self.hypothesis.effects
-        pairs = [Hypothesis(record, (*own, kind), baseline) for kind in kinds if kind not in own]
+        roads = self.hypothesis.integrated is not None  # a hypothesis integrates one effect at most
+        pairs = [
+            Hypothesis(record, (*own, kind), baseline)
+            for kind in kinds
+            if kind not in own and not (roads and issubclass(kind, Integrated))
+        ]
         scored = sorted(((*self.score(pair, alone), pair) for pair in pairs), key=lambda s: -s[0])
         return [(pair, start) for gain, start, pair in scored[:most] if gain > least]
 

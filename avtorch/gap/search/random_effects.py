@@ -1,21 +1,19 @@
 """Random effects as candidates, by what their `noise` says: on top of what a find's rollout leaves over.
 
-Three have a search of their own (`OWN_SEARCH`), which also finds from when on they act. Any other is fitted by the
-likelihood whose noise its `noise` changes, over the whole drive: a force with the lag, the gain and the rest of the
-noise; errors of the command with the jerk noise that they resemble; tails row by row.
+One of each kind may have a search of its own (`Effect.searched_as`), which also finds from when on it acts. Any other
+is fitted by the likelihood whose noise its `noise` changes, over the whole drive: a force with the lag, the gain and
+the rest of the noise; errors of the command with the jerk noise that they resemble; tails row by row.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from avtorch.gap.effects import CommandHold, Gust, Outliers
 from avtorch.gap.likelihood.gauss_newton import finish, modes
 from avtorch.gap.likelihood.noise_fit import PRIORS, fit_noise
 from avtorch.gap.likelihood.noise_segments import whitening_filter
@@ -27,36 +25,35 @@ from avtorch.gap.search.command_errors import rows_gained
 from avtorch.gap.search.fitted_model import ByChance, FittedModel
 from avtorch.gap.search.full_rate import full_rate_errors, full_rate_filter
 from avtorch.gap.search.outliers import HeavyTails, hessian_of
-from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.effect import Effect, SearchedAs
 from avtorch.gap.simulator.plant import GapPlant
 
 Float = NDArray[np.float64]
-
-OWN_SEARCH: Mapping[type[Effect], Literal["force", "tails", "losses"]] = {
-    Gust: "force",
-    Outliers: "tails",
-    CommandHold: "losses",
-}
-"""Random effects with a search of their own; a class derived from one of them is a user's like any other."""
 
 _TURNS = 4  # of parameters and noise
 _ENOUGH = 0.1  # nats
 _SIMPLEX = -0.7  # prior standard deviations, to begin with
 
 
+def own_searches(effects: Sequence[type[Effect]]) -> dict[SearchedAs, type[Effect]]:
+    """Random effects with a search of their own, the first of each kind."""
+    out: dict[SearchedAs, type[Effect]] = {}
+    for kind in effects:
+        form = kind.own_search()
+        if form is not None:
+            out.setdefault(form, kind)
+    return out
+
+
 def users_own(effects: Sequence[type[Effect]], raw: Record, baseline: GapPlant) -> dict[Form, list[RandomLaw]]:
     """Random effects without a search of their own, by what they do to the noise."""
     laws: dict[Form, list[RandomLaw]] = {"force": [], "tails": [], "command": []}
+    searched = own_searches(effects).values()
     for kind in effects:
-        if kind.random and kind not in OWN_SEARCH and is_observable(kind, raw.channels):
+        if kind.random and kind not in searched and is_observable(kind, raw.channels):
             law = RandomLaw.of(kind, raw, baseline)
             laws[law.form].append(law)
     return laws
-
-
-def named(base: FittedModel, law: RandomLaw) -> str:
-    """Of the base with the random effect on top."""
-    return "+".join(sorted([*([] if base.name == "none" else base.name.split("+")), law.name]))
 
 
 def forced(base: FittedModel, law: RandomLaw) -> FittedModel:
@@ -83,7 +80,7 @@ def forced(base: FittedModel, law: RandomLaw) -> FittedModel:
         assert fitted.law_covariance is not None
         found = replace(
             base,
-            name=named(base, law),
+            name=base.name_with(law.name),
             z=z,
             covariance=fit.covariance,
             values={k: float(v) for k, v in candidate.values(z[None]).items()},
@@ -107,25 +104,27 @@ def tailed(base: FittedModel, law: RandomLaw, tails: HeavyTails) -> FittedModel:
     assert tails.covariance is not None
     by_chance = ByChance(law, tails.z, tails.covariance)
     evidence = base.log_evidence + tails.evidence
-    return replace(base, name=named(base, law), log_evidence=evidence, tails=tails, by_chance=by_chance)
+    return replace(base, name=base.name_with(law.name), log_evidence=evidence, tails=tails, by_chance=by_chance)
 
 
 def glitched(
-    found: Sequence[FittedModel], glitches: Sequence[tuple[RandomLaw | None, HeavyTails]], *, pairs: bool
+    found: Sequence[FittedModel], glitches: Sequence[tuple[RandomLaw | type[Effect], HeavyTails]], *, pairs: bool
 ) -> list[FittedModel]:
-    """Tails alone and, where pairs are tried, on top of every single effect."""
+    """Tails alone and, where pairs are tried, on top of every single effect.
+
+    Each with the law of the effect that has them, or its class where it has a search of its own.
+    """
     out = []
     for f in found:
         names = [] if f.name == "none" else f.name.split("+")
         if len(names) > 1 or (names and not pairs):
             continue
-        for law, seen in glitches:
-            name = "+".join(sorted([*names, "outliers"]))
-            plain = replace(f, name=name, log_evidence=f.log_evidence + seen.evidence, tails=seen)
-            if law is None:
-                out.append(plain)
+        for of, seen in glitches:
+            if not isinstance(of, RandomLaw):
+                own = {"name": f.name_with(of.name), "searched": (*f.searched, of), "tails": seen}
+                out.append(replace(f, log_evidence=f.log_evidence + seen.evidence, **own))
             elif f.by_chance is None:
-                out.append(tailed(f, law, seen))
+                out.append(tailed(f, of, seen))
     return out
 
 
@@ -163,7 +162,7 @@ def commanded(base: FittedModel, law: RandomLaw, raw: Record) -> FittedModel:
     covariance = np.asarray(np.linalg.inv(hessian)[1:, 1:], np.float64)
     sd = own * float(np.exp(spread * best.x[0]))
     by_chance = ByChance(law, best.x[1:], covariance, explained=evidence, process_sd=sd)
-    return replace(base, name=named(base, law), log_evidence=base.log_evidence + evidence, by_chance=by_chance)
+    return replace(base, name=base.name_with(law.name), log_evidence=base.log_evidence + evidence, by_chance=by_chance)
 
 
 def variance_of(law: RandomLaw, z: Float, base: FittedModel, raw: Record) -> Float:

@@ -15,7 +15,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from avtorch.gap.effects.road_grade import RoadGrade
 from avtorch.gap.likelihood.gauss_newton import finish, modes, residuals
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import fit_noise
@@ -43,9 +42,10 @@ from avtorch.gap.search.lost_messages import lost_messages
 from avtorch.gap.search.onset import onset_evidence, refined_onset
 from avtorch.gap.search.outliers import HeavyTails, heavy_tails
 from avtorch.gap.search.pairs import Base, exchanged, joint_fit
-from avtorch.gap.search.random_effects import OWN_SEARCH, commanded, forced, glitched, users_own
+from avtorch.gap.search.random_effects import commanded, forced, glitched, own_searches, users_own
 from avtorch.gap.search.screening import ENOUGH, Screened, refine, screen
 from avtorch.gap.simulator.effect import EFFECTS, Effect
+from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log
 
@@ -86,9 +86,9 @@ class Search:
         self.complete = True
         self._seen: set[str] = set()  # effects rolled out, also those whose evidence is not kept
         self._paired = False
-        self._own = {OWN_SEARCH[e] for e in self.effects if e in OWN_SEARCH}
+        self._own = own_searches(self.effects)
         self._laws: dict[Form, list[RandomLaw]] = {"force": [], "tails": [], "command": []}
-        self._glitches: list[tuple[RandomLaw | None, HeavyTails]] = []
+        self._glitches: list[tuple[RandomLaw | type[Effect], HeavyTails]] = []
         work = None if checkpoint is None else fitted_work(self.logs, baseline, self.effects, pairs=pairs)
         self.checkpoint = Checkpoint(checkpoint, work)
 
@@ -137,7 +137,8 @@ class Search:
 
     def _blowing(self, on: FittedModel) -> list[FittedModel]:
         """Every random force on top of a find."""
-        return [*([gust(on)] if "force" in self._own else []), *(forced(on, law) for law in self._laws["force"])]
+        own = [gust(on, self._own["force"])] if "force" in self._own else []
+        return [*own, *(forced(on, law) for law in self._laws["force"])]
 
     def _late(self) -> bool:
         if self.until is not None and time.monotonic() > self.until:
@@ -176,7 +177,7 @@ class Search:
             value, best = -np.inf, (z, noise)
             usual = 2 if record.group > 1 and not coarse else rounds + 1
             for turn in range(_TURNS):
-                noise = noise.seen_through(self._values(hypothesis, z))
+                noise = noise.seen_through(hypothesis.effects, self._values(hypothesis, z))
                 white = whitening_filter(record, noise, onset=onset)
                 enough = ENOUGH if coarse else 0.05
                 if turn < 2:  # once under the noise one came with, and once under its own
@@ -222,7 +223,7 @@ class Search:
                 break
             hypothesis = Hypothesis(record, (kind,), self.baseline)
             begin = starts(hypothesis, none.values)
-            found = screen(hypothesis, white, begin, onsets=kind.name != "gain_change", floor=coarse_floor)
+            found = screen(hypothesis, white, begin, onsets=kind.own_onset is None, floor=coarse_floor)
             seen += [refine(look, white) for look in found]
         best: dict[str, float] = {}
         self._seen |= {look.hypothesis.name for look in seen}
@@ -292,12 +293,11 @@ class Search:
         made = {f.name: f for base in bases[:2] for f in self._blowing(base)}
         for base in bases[:2]:
             # what drifts slowly is a gust or a road, and the noise that was fitted without either hides the road
-            name = "+".join(sorted([base.name, "gust"]))
-            gusty = made.get(name)
-            if gusty is None or RoadGrade not in kinds or RoadGrade in base.hypothesis.effects:
+            gusty = made.get(base.name_with(self._own["force"].name)) if "force" in self._own else None
+            if gusty is None or gusty.log_evidence <= base.log_evidence + _SECOND or base.hypothesis.integrated:
                 continue
-            if gusty.log_evidence > base.log_evidence + _SECOND:
-                hypothesis = Hypothesis(record, (*base.hypothesis.effects, RoadGrade), self.baseline)
+            for road in (kind for kind in kinds if issubclass(kind, Integrated)):
+                hypothesis = Hypothesis(record, (*base.hypothesis.effects, road), self.baseline)
                 look = Screened(hypothesis, hypothesis.z_of(base.values), 0.0, base.onset)
                 self._settle_pairs([look], 1, gusty.noise.noise.replaced(force_sd=CALM), made)
         # a gust's noise is too quiet for causes that explain less
@@ -337,10 +337,10 @@ class Search:
         for hypothesis, z in on.partners(kinds, {}, most=_BASES, least=_LEAST):
             if self._late():
                 break
-            forms = screen(hypothesis, blown.white, z[None], onsets=hypothesis.name != "gain_change")
+            forms = screen(hypothesis, blown.white, z[None], onsets=hypothesis.effects[-1].own_onset is None)
             look = max((refine(form, blown.white) for form in forms), key=lambda form: form.value)
             under = Kept(look.z, blown.noise.noise, 0.0).found(look.hypothesis, look.onset)
-            both = gust(under) if blown.by_chance is None else forced(under, blown.by_chance.law)
+            both = gust(under, self._own["force"]) if blown.by_chance is None else forced(under, blown.by_chance.law)
             if both.name not in made or made[both.name].log_evidence < both.log_evidence:
                 made[both.name] = both
 
@@ -380,9 +380,9 @@ class Search:
 
     # chance --------------------------------------------------------------------------------------------------------
     def _tails(self, raw: Record, of: FittedModel) -> HeavyTails:
-        """The best of all tails; `_glitches` are those of each effect, None for the one with a search of its own."""
+        """The best of all tails; `_glitches` are those of each effect."""
         errors = full_rate_errors(raw, of)[0, :, 0]
-        self._glitches = [(None, heavy_tails(errors, raw.dt))] if "tails" in self._own else []
+        self._glitches = [(self._own["tails"], heavy_tails(errors, raw.dt))] if "tails" in self._own else []
         for law in self._laws["tails"]:
             self._glitches.append((law, heavy_tails(errors, raw.dt, law=law.tails, size=law.size)))
         return max((found for _, found in self._glitches), key=lambda found: found.evidence)
@@ -395,11 +395,11 @@ class Search:
 
     def _held(self, raw: Record, found: list[FittedModel], none: FittedModel) -> list[FittedModel]:
         """Lost messages alone and, where pairs are tried, on top of the best single effect."""
-        out = []
+        out, kind = [], self._own["losses"]
         for f in self._alone_and_best(found, none):
             errors = full_rate_errors(raw, f)
             white = full_rate_filter(raw, f)
             lost = lost_messages(white, errors, raw.command[raw.source], f.values["T_L"], f.values["K_L"])
-            name = "+".join(sorted([*([] if f is none else [f.name]), "command_hold"]))
-            out.append(replace(f, name=name, log_evidence=f.log_evidence + lost.evidence, losses=lost))
+            own = {"name": f.name_with(kind.name), "searched": (*f.searched, kind), "losses": lost}
+            out.append(replace(f, log_evidence=f.log_evidence + lost.evidence, **own))
         return out

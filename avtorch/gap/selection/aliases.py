@@ -17,99 +17,105 @@ from avtorch.gap.selection.plausibility import implausible
 from avtorch.gap.selection.verdict import ALIAS_RATIO, Candidate, candidate_name, near
 from avtorch.gap.simulator.effect import EFFECTS, Effect
 
-_OFFSETS = ("sensor_bias", "constant_resistance")
-_LAGS = ("sensor_lag", "second_order_actuator")
-_SLOW = (*_OFFSETS, "gust")
-_PUSH = {"aerodynamic_drag": -1, "low_speed_creep": 1}  # the only way such a force can point
-_ANY_ORDER = (
-    "gain_change",
-    "outliers",
-    *_OFFSETS,
-)  # beside commands: what two poles in a row treat alike, wherever they are
-_DAMPED = 0.85  # a fit is off by 0.1 or so, and two real poles have a damping of 1 or more
-
 Values = Mapping[str, float]
+Kinds = Iterable[type[Effect]]
 
 
-def exact_aliases(name: str, channels: Collection[str], values: Values | None = None) -> set[str]:
+def exact_aliases(name: str, channels: Collection[str], values: Values | None = None, among: Kinds = ()) -> set[str]:
     """Candidates that respond to every command as `name` does, as far as the `channels` show; `name` among them.
 
     `values`: parameters fitted, by the plant's keys; a resistance can only be an offset below 0, and a sensor's lag
-    only an actuator that does not overshoot. Without them every alias counts.
+    only an actuator that does not overshoot. Without them every alias counts. `among`: effects beside those registered.
     """
+    known = _known(among)
     parts = name.split("+")
     same = {name}
     if set(channels) != {"accel"}:
         return same
     for one in parts:
         others = [p for p in parts if p != one]
-        for other in _instead(one, others, values):
+        for other in _instead(one, others, values, known):
             if other not in parts:
                 same.add(candidate_name([*others, other]))
     return same
 
 
-def _instead(one: str, others: Sequence[str], values: Values | None) -> Iterable[str]:
-    if one in _OFFSETS:
-        below = _offset([one], values)
-        return _OFFSETS if below is None or below < 0 else ()
-    linear = all(p in _ANY_ORDER or (p in EFFECTS and EFFECTS[p].place == "command") for p in others)
-    if one in _LAGS and linear:
-        damping = 1.0
-        if one == "second_order_actuator" and values is not None:
-            damping = values["T_L"] / max(2 * values[f"{one}.inverse_frequency_s"], 1e-9)
-        return _LAGS if damping >= _DAMPED else ()
-    return ()
+def _known(among: Kinds) -> dict[str, type[Effect]]:
+    return {**EFFECTS, **{e.name: e for e in among}}
 
 
-def _offset(parts: Iterable[str], values: Values | None) -> float | None:
-    """The constant part [m/s²] of what `parts` add to the acceleration; None where they say nothing of it."""
-    for part in parts:
-        if part == "constant_resistance":
-            return -1.0 if values is None else -values["constant_resistance.resistance_mps2"]
-        if part == "sensor_bias" and values is not None:
-            return values["sensor_bias.bias_mps2"]
-    return None
+def _instead(
+    one: str, others: Sequence[str], values: Values | None, known: Mapping[str, type[Effect]]
+) -> Iterable[str]:
+    """Effects that may stand for `one` beside the `others`."""
+    kind = known.get(one)
+    if kind is None or kind.alias is None:
+        return ()
+    same = [e for e in known.values() if e.alias == kind.alias]
+    if kind.alias == "offset":
+        constant = kind.constant_accel(_own(one, values))
+        return [e.name for e in same if constant is None or e.force_sign * constant >= 0]
+    if kind.alias == "pole":
+        linear = all(p in known and (known[p].commutes or known[p].place == "command") for p in others)
+        own = _own(one, values)
+        return [e.name for e in same] if linear and (own is None or kind.aliased(own)) else ()
+    return ()  # another K_L is no candidate: it cannot be observed at all
+
+
+def _own(name: str, values: Values | None) -> Values | None:
+    """`values` of the effect by its own parameters' names, with the plant's `T_L` and `K_L`."""
+    if values is None:
+        return None
+    own = {key.removeprefix(f"{name}."): x for key, x in values.items() if key.startswith(f"{name}.")}
+    return own | {key: values[key] for key in ("T_L", "K_L") if key in values}
 
 
 def lookalikes(
-    name: str, channels: Collection[str], values: Values | None = None, *, specific_force: bool = False
+    name: str,
+    channels: Collection[str],
+    values: Values | None = None,
+    *,
+    specific_force: bool = False,
+    among: Kinds = (),
 ) -> set[str]:
     """Candidates that were not judged, for want of speed, and whose force may be what `name` takes for a slow one.
 
     One such force in place of all slow parts of `name` (an offset, a gust), where its direction allows it.
     """
-    parts = name.split("+")
-    slow = [p for p in parts if p in _SLOW]
+    parts, known = name.split("+"), _known(among)
+    slow = [known[p] for p in parts if p in known and known[p].slow_force]
     if set(channels) != {"accel"} or not slow:
         return set()
-    offset = _offset(slow, values)
-    others = [p for p in parts if p not in slow]
-    forces = [e for e in EFFECTS.values() if e.place == "body" and e.needs_speed]
+    constants = (e.constant_accel(_own(e.name, values)) for e in slow)
+    offset = next((x for x in constants if x is not None), None)
+    others = [p for p in parts if p not in {e.name for e in slow}]
+    forces = [e for e in known.values() if e.place == "body" and e.needs_speed]
     return {
         candidate_name([*others, e.name])
         for e in forces
-        if not (e.gravity and specific_force) and (offset is None or _PUSH.get(e.name, 0) * offset >= 0)
+        if not (e.gravity and specific_force) and (offset is None or e.force_sign * offset >= 0)
     }
 
 
 def note(channels: Collection[str], effects: Iterable[type[Effect]]) -> str | None:
     """One sentence on what the log cannot judge of `effects`; None where that is nothing."""
-    names = sorted(e.name for e in effects if not is_observable(e, channels))
-    if not names:
+    hidden = sorted((e for e in effects if not is_observable(e, channels)), key=lambda e: e.name)
+    if not hidden:
         return None
     if "accel" not in channels:
-        return (
-            f"Without accel in the log these effects cannot be tested, as speed does not show them: {', '.join(names)}."
-        )
+        names = ", ".join(e.name for e in hidden)
+        return f"Without accel in the log these effects cannot be tested, as speed does not show them: {names}."
     told = []
-    need = [n for n in names if n != "sensor_scale"]
+    need = [e.name for e in hidden if e.alias != "K_L"]
     if need:
         told.append(
             f"Without speed in the log these effects cannot be tested and appear as others: {', '.join(need)}."
         )  # fmt: skip
-    if "sensor_scale" in names:
-        told.append("Without speed in the log sensor_scale is equivalent to another K_L and cannot be tested.")
+    told += [
+        f"Without speed in the log {e.name} is equivalent to another K_L and cannot be tested."
+        for e in hidden
+        if e.alias == "K_L"
+    ]
     return " ".join(told)
 
 
@@ -170,7 +176,8 @@ class Identifiability:
         """
         names = near(ALIAS_RATIO)(candidates)
         first = max(candidates, key=lambda c: c.probability).name
-        like = lookalikes(first, self.channels, self.values.get(first), specific_force=self.specific_force)
+        more = {"specific_force": self.specific_force, "among": self.among}
+        like = lookalikes(first, self.channels, self.values.get(first), **more)
         more = [*sorted(self._group(first)), *sorted(n for n in like if self._allowed(n))]
         if not self.complete:
             more.append("unknown")  # any candidate that the budget left untried
@@ -183,11 +190,11 @@ class Identifiability:
 
     def _group(self, name: str) -> set[str]:
         """Exact aliases, each of which also reaches the other's fit; `name` among them."""
-        group = exact_aliases(name, self.channels, self.values.get(name))
+        group = exact_aliases(name, self.channels, self.values.get(name), self.among)
         return {name} | {
             n
             for n in group
-            if self._allowed(n) and name in exact_aliases(n, self.channels, self.values.get(n))
+            if self._allowed(n) and name in exact_aliases(n, self.channels, self.values.get(n), self.among)
         }  # fmt: skip
 
     def _allowed(self, name: str) -> bool:

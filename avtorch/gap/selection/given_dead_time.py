@@ -1,4 +1,4 @@
-"""What remains once the delay is in: bare GLVD as the baseline makes nearly every car's answer `dead_time`."""
+"""What remains once the delay is in: bare GLVD as the baseline makes nearly every car's answer the delay."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from avtorch.gap.selection.verdict import Candidate, Verdict
+from avtorch.gap.simulator.effect import delay_effect
 from avtorch.gap.simulator.plant import GapPlant
-
-DELAY = "dead_time"
 
 
 def given_dead_time(
     candidates: Sequence[Candidate], verdict: Verdict, baseline: GapPlant | None = None
 ) -> tuple[Candidate, ...] | None:
-    """The candidates for what else there is, given that `dead_time` is one of the causes; the most probable first.
+    """The candidates for what else there is, given that the delay is one of the causes; the most probable first.
 
     `none` is the delay alone, an effect's name its pair with the delay. Probabilities are those of `candidates` with
     the delay in them, so a second cause pays the price that it paid there; `unknown` keeps its own. They sum to 1.
@@ -22,15 +21,16 @@ def given_dead_time(
 
     None where the baseline is more than the bare GLVD, the verdict does not contain the delay, or no pair was tried.
     """
-    late = [c for c in candidates if DELAY in c.effects]
-    alone = next((c for c in late if c.name == DELAY), None)
-    if DELAY not in verdict.names or alone is None or len(late) < 2 or (baseline is not None and baseline.effects):
+    delay = delay_effect().name
+    late = [c for c in candidates if delay in c.effects]
+    alone = next((c for c in late if c.name == delay), None)
+    if delay not in verdict.names or alone is None or len(late) < 2 or (baseline is not None and baseline.effects):
         return None
     total = sum(c.probability for c in late)
     unknown = next((c.probability for c in candidates if c.name == "unknown"), 0.0)
     out = [Candidate("unknown", unknown)]
     for c in late:
-        second = "+".join(name for name in c.effects if name != DELAY)
+        second = "+".join(name for name in c.effects if name != delay)
         own = {k.removeprefix(f"{second}."): q for k, q in c.parameters.items() if k.startswith(f"{second}.")}
         out.append(
             replace(

@@ -24,9 +24,7 @@ import numpy as np
 from avtorch.errors import InputError
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.selection.adequacy import Adequacy
-
-CHANCE = frozenset({"gust", "outliers", "command_hold"})
-"""Effects that chance decides, beside any of the user's: a second one of these has a price of its own."""
+from avtorch.gap.simulator.effect import EFFECTS
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ def favourite(found: Sequence[FittedModel]) -> FittedModel:
 def complexity_penalties(found: Sequence[FittedModel]) -> dict[str, float]:
     """What each candidate has to gain over none before it counts for anything [nats]."""
     gained = {f.name: f.log_evidence - _none(found).log_evidence for f in found}
-    by_chance = {f.name for f in found if CHANCE & set(f.name.split("+")) or f.by_chance is not None}
+    by_chance = {f.name for f in found if f.by_chance is not None or _by_chance(f.name)}
     paid = {}
     for name in gained:
         parts = name.split("+")
@@ -107,6 +105,11 @@ def complexity_penalties(found: Sequence[FittedModel]) -> dict[str, float]:
             price = SECOND_BY_CHANCE if name in by_chance else SECOND
             paid[name] += price.of(max(gained.get(part, 0.0) for part in parts))
     return paid
+
+
+def _by_chance(name: str) -> bool:
+    """Whether a random effect is among the candidate's: a second one has a price of its own."""
+    return any(part in EFFECTS and EFFECTS[part].random for part in name.split("+"))
 
 
 def _none(found: Sequence[FittedModel]) -> FittedModel:

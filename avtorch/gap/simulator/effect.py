@@ -13,6 +13,23 @@ command → actuator → body → sensor, and its one hook means there:
 Without memory the hook is `apply(x, row)`, and one definition serves a single step of a simulation and a whole drive
 at once: only the shapes differ. With memory (`memory = True`) it is `start` and `advance`, one row at a time, and
 `over`, a whole drive; `over` may be left out, then rows are looped over: right, but slow.
+
+An effect also brings what the rest of the package has to know of it, so that no file outside `effects/` names one. The
+defaults are right for an ordinary effect:
+
+| asked by             | declared by                                            | default                           |
+|----------------------|--------------------------------------------------------|-----------------------------------|
+| search: first values | `starts`; of a drive `starts_in`, `retried_in`         | sizes typical, and one sd fainter |
+| search: onset        | `own_onset`; after it `settled`                        | any row is tried                  |
+| search: randomness   | `noise`; `searched_as`, `noise_parameters`, `in_noise` | fitted by its `noise`             |
+| likelihood           | `reading`; `integrated.Integrated`                     | the accelerometer is true         |
+| actuator             | `actuator_parameters`                                  | first order, no rate limit        |
+| aliases: which       | `alias`, `aliased`, `constant_accel`, `force_sign`     | no other responds as it does      |
+| aliases: beside what | `slow_force`, `commutes`                               | its force follows the command     |
+| cross-validation     | `of_the_drive`                                         | parameters are the car's          |
+| linearisation        | `linear`, `one_sided`                                  | a multiple of the command         |
+| delay                | `shift`, `role`                                        | none                              |
+| exports, pictures    | `accel_limit`, `half_said`, `pictured`                 | no word for it; drawn at 12 m/s   |
 """
 
 from __future__ import annotations
@@ -20,6 +37,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import torch
@@ -31,6 +49,9 @@ from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
 
 Place = Literal["command", "actuator", "body", "sensor"]
+Alias = Literal["offset", "pole", "K_L"]
+"""What an effect adds to the measured acceleration: a constant, one more real pole, or a factor."""
+SearchedAs = Literal["force", "tails", "losses"]
 PLACES: tuple[Place, ...] = ("command", "actuator", "body", "sensor")
 """Places in the chain, in its order.
 
@@ -39,6 +60,14 @@ Example:
     >>> {place: sum(effect.place == place for effect in EFFECTS.values()) for place in PLACES}
     {'command': 5, 'actuator': 7, 'body': 6, 'sensor': 4}
 """
+
+V = TypeVar("V")
+
+
+def fixed(**values: V) -> Mapping[str, V]:
+    """`values` by name, for a class attribute that nobody can change by mistake."""
+    return MappingProxyType(values)
+
 
 _LARGEST = 1e12  # of a number in a text whose domain nobody said
 _NAME = 60  # characters of a name that may be an effect's, mistyped
@@ -120,6 +149,26 @@ class Effect:
     parameter [s], if there is one, by which it makes commands late and does nothing else. `settings`: what fields that
     are no parameters may hold in a text; a field without a domain takes any single finite number.
 
+    Search. `starts`: first values of some parameters, all combinations of which are tried, then each one at a time.
+    `own_onset`: the parameter [s] that is the moment at which it sets in; no other onset is tried. `of_the_drive`: its
+    parameters belong to a drive and not to the car, so it is no placebo in a cross-validation.
+
+    Randomness. `searched_as`: the search of its own that a random effect has, which also finds an onset; a derived
+    class does not inherit it. `noise_parameters`: its parameter by the name that this search has for it
+    (`force_sd` and `force_time`, `tail_fraction` and `tail_scale`, or `loss`).
+
+    Sensor. `reading`: its parameter for `"lag"` [s] or `"scale"` [-], where the accelerometer treats the car's random
+    motion likewise.
+
+    Aliases, where the log has no speed. `alias`: effects with the same word respond alike, as far as `aliased` and
+    `force_sign` allow; one with `"K_L"` cannot be observed there. `force_sign`: the only sign its force can have, 0:
+    either. `slow_force`: its force does not follow the command, so one that depends on speed may pass for it.
+    `commutes`: it passes two poles in a row alike, wherever it stands among them.
+
+    Elsewhere. `linear` False: the response to a step is no multiple of it. `one_sided`: it differs between driving
+    and braking. `role`: `"delay"` for the effect that stands for a bare delay wherever one is needed. `half_said`: of
+    an effect that other tools have half a word for, what they cannot say. `pictured`: speed [m/s] at which it shows.
+
     Example:
         >>> from dataclasses import dataclass
         >>> from avtorch.gap import Effect, Parameter, plant
@@ -147,6 +196,22 @@ class Effect:
     gravity: ClassVar[bool] = False
     derived: ClassVar[tuple[Parameter, ...]] = ()
     shift: ClassVar[str | None] = None
+
+    starts: ClassVar[Mapping[str, tuple[float, ...]]] = fixed()
+    own_onset: ClassVar[str | None] = None
+    of_the_drive: ClassVar[bool] = False
+    searched_as: ClassVar[SearchedAs | None] = None
+    noise_parameters: ClassVar[Mapping[str, str]] = fixed()
+    reading: ClassVar[Mapping[str, str]] = fixed()
+    alias: ClassVar[Alias | None] = None
+    force_sign: ClassVar[Literal[-1, 0, 1]] = 0
+    slow_force: ClassVar[bool] = False
+    commutes: ClassVar[bool] = False
+    linear: ClassVar[bool] = True
+    one_sided: ClassVar[bool] = False
+    role: ClassVar[Literal["delay"] | None] = None
+    half_said: ClassVar[str] = ""
+    pictured: ClassVar[float] = 12.0
 
     # the hook ------------------------------------------------------------------------------------------------------
     def apply(self, x: Tensor, row: Row) -> Any:
@@ -180,6 +245,50 @@ class Effect:
         None for a deterministic effect.
         """
         return None
+
+    def in_noise(self, accel_sd: float) -> Self:
+        """This effect with what it takes from the accelerometer's white noise `accel_sd` [m/s²] of a log."""
+        return self
+
+    def actuator_parameters(self) -> Mapping[str, Tensor]:
+        """Fields of `Actuator` that it sets: `tau` [s], `jerk` [m/s³]."""
+        return {}
+
+    def accel_limit(self) -> float | None:
+        """Largest acceleration either way [m/s²] that it lets the car reach; None: no limit."""
+        return None
+
+    def settled(self) -> Mapping[str, float]:
+        """Values at which whatever it changes in the course of a drive has changed long before."""
+        return {}
+
+    @classmethod
+    def starts_in(cls, first: float, last: float) -> Mapping[str, tuple[float, ...]]:
+        """First values for a drive from `first` to `last` [s]."""
+        return cls.starts
+
+    @classmethod
+    def retried_in(cls, first: float, last: float) -> Mapping[str, tuple[float, ...]]:
+        """Values that one parameter at a time is put to, once the others have found their place."""
+        return cls.starts
+
+    @classmethod
+    def aliased(cls, values: Mapping[str, float]) -> bool:
+        """Whether it responds as its `alias` says at these `values` of its parameters and of `T_L` [s]."""
+        return True
+
+    @classmethod
+    def constant_accel(cls, values: Mapping[str, float] | None) -> float | None:
+        """The constant [m/s²] that it adds to the acceleration shown, at `values` of its parameters (None: unknown).
+
+        Where they are unknown, any number of the only sign it can have. None where nothing is known of it.
+        """
+        return None
+
+    @classmethod
+    def own_search(cls) -> SearchedAs | None:
+        """`searched_as`, where this very class says so: what derives from it has another name, and is a user's own."""
+        return vars(cls).get("searched_as")
 
     def coordinates(self) -> tuple[Parameter, ...]:
         """The parameters of a fit; as `parameters`, unless settings of this very effect enter them."""
@@ -297,3 +406,14 @@ def effect_class(name: str, more: Iterable[type[Effect]] = ()) -> type[Effect]:
         need = f"an effect's name; perhaps {close[0]}" if close else f"one of {', '.join(sorted(known))}"
         raise InputError(f"effect: found {quoted(name)}, needs {need}")
     return known[name]
+
+
+def delay_effect() -> type[Effect]:
+    """The effect that stands for a bare delay: the first one registered with that role."""
+    return next(cls for cls in EFFECTS.values() if cls.role == "delay")
+
+
+def delay_key() -> str:
+    """That delay [s] among a plant's parameters."""
+    kind = delay_effect()
+    return f"{kind.name}.{kind.shift}"

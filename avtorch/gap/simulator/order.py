@@ -9,7 +9,6 @@ from torch import Tensor
 
 from avtorch.gap.simulator.actuator import Actuator, Substep
 from avtorch.gap.simulator.effect import PLACES, Effect, Place, Row
-from avtorch.vehicle.arguments import tensor
 
 Hook = Callable[[Effect, Tensor], Any]
 """How an effect with memory is run: `hook(effect, x) -> output`, for one row or a whole drive."""
@@ -50,9 +49,7 @@ def substeps(effects: Iterable[Effect], u: Tensor, row: Row, hook: Hook) -> list
 
 def actuator_of(effects: Iterable[Effect]) -> Actuator:
     """What moves to the target: first order, unless effects say otherwise."""
-    known = {e.name: e for e in effects}
-    second, limit = known.get("second_order_actuator"), known.get("rate_limit")
-    return Actuator(
-        None if second is None else tensor(second.inverse_frequency_s),  # type: ignore[attr-defined]
-        None if limit is None else tensor(limit.jerk_max_mps3),  # type: ignore[attr-defined]
-    )
+    given: dict[str, Tensor] = {}
+    for e in effects:
+        given |= e.actuator_parameters()
+    return Actuator(**given)

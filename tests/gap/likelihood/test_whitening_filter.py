@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_are
 
+from avtorch.gap import DeadTime, SensorLag, SensorScale
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.noise_segments import CALM, before_onset
 from avtorch.gap.likelihood.record import Record
@@ -382,12 +383,12 @@ def test_the_covariance_at_rest_solves_the_riccati_equation(noise: NoiseModel, c
 
 def test_the_sensor_is_the_candidates() -> None:
     noise = NOISES["windy"]
-    assert noise.seen_through({"T_L": 0.3, "K_L": 1.0}) == noise
-    late = noise.seen_through({"T_L": 0.3, "sensor_lag.lag_s": 0.2, "sensor_scale.scale": 1.1})
+    assert noise.seen_through((DeadTime,), {"T_L": 0.3, "K_L": 1.0, "dead_time.delay_s": 0.2}) == noise
+    late = noise.seen_through((SensorLag, SensorScale), {"sensor_lag.lag_s": 0.2, "sensor_scale.scale": 1.1})
     assert late == replace(noise, sensor_lag=0.2, sensor_scale=1.1)
     # what the last candidate's was is forgotten, and no lag is told from one of a millisecond
-    assert late.seen_through({"T_L": 0.3}) == noise
-    assert noise.seen_through({"sensor_lag.lag_s": 1e-3}) == noise
+    assert late.seen_through((), {"T_L": 0.3}) == noise
+    assert noise.seen_through((SensorLag,), {"sensor_lag.lag_s": 1e-3}) == noise
 
 
 def test_means_have_less_white_noise() -> None:

@@ -10,7 +10,7 @@ import torch
 
 import avtorch
 from avtorch.errors import InputError
-from avtorch.gap import EFFECTS, Drive, GapPlant, effect_class, plant
+from avtorch.gap import EFFECTS, Drive, Effect, GapPlant, effect_class, plant
 from tests.gap.drives import drive_of, driven
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "own-effect.md"
@@ -53,14 +53,31 @@ def test_it_is_neutral_and_differentiable(shown: dict) -> None:
 
 
 def test_one_with_memory_needs_no_second_form(shown: dict) -> None:
-    car = plant([shown["StickyPedal"](0.3)], sigma=0.0)
+    car = plant([shown["HotMotor"](0.3)], sigma=0.0)
     block = driven(car, seconds=3.0)
     response = car.response(drive_of(block))
     torch.testing.assert_close(response.accel_measured[1:], block.accel[0, 1:], rtol=0, atol=1e-9)
-    steps = torch.tensor([0.1, 0.3], dtype=torch.float64)
-    both = car.response(drive_of(block), {"sticky_pedal.step_mps2": steps})
-    assert torch.equal(both.accel[1], response.accel)
+    fades = torch.tensor([0.1, 0.3], dtype=torch.float64)
+    both = car.response(drive_of(block), {"hot_motor.fade": fades})
+    torch.testing.assert_close(both.accel[1], response.accel, rtol=0, atol=1e-12)
+    # without `over`, rows are looped over
+    rows = type("Rows", (shown["HotMotor"],), {"over": Effect.over})
+    looped = plant([rows(0.3)], sigma=0.0).response(drive_of(block))
+    torch.testing.assert_close(looped.accel, response.accel, rtol=0, atol=1e-12)
     assert float((block.accel - driven(plant(sigma=0.0), seconds=3.0).accel).abs().max()) > 0.05
+
+
+def test_one_with_speed_pulls_less_the_faster_it_is(shown: dict) -> None:
+    car = plant([shown["MotorPower"](8.0)], sigma=0.0)
+    block = driven(car, seconds=3.0)
+    response = car.response(drive_of(block))
+    torch.testing.assert_close(response.accel_measured[1:], block.accel[0, 1:], rtol=0, atol=1e-9)
+    assert torch.equal(driven(plant([shown["MotorPower"].neutral()])).accel, driven(plant()).accel)
+    time = torch.arange(200, dtype=torch.float64) * 0.1
+    drives = [Drive(time, torch.full_like(time, 1.5), torch.full_like(time, speed)) for speed in (4.0, 8.0, 16.0)]
+    reached = [float(car.response(drive).accel[..., -1]) for drive in drives]
+    # power over speed, once the lag is over; 1.5 where the bound is 2
+    assert reached == pytest.approx([1.5, 1.0, 0.5], abs=1e-6)
 
 
 def test_names_are_taken_once(shown: dict) -> None:

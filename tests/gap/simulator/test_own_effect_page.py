@@ -15,7 +15,7 @@ from tests.gap.records import log_of
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "own-effect.md"
 
 
-def test_the_random_effect_is_named_by_the_pages_own_code(capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_of_each_kind_is_named_by_the_pages_own_code(capsys: pytest.CaptureFixture[str]) -> None:
     before = dict(EFFECTS)
     names: dict = {}
     try:
@@ -24,14 +24,23 @@ def test_the_random_effect_is_named_by_the_pages_own_code(capsys: pytest.Capture
     finally:
         EFFECTS.clear()
         EFFECTS.update(before)
-    assert capsys.readouterr().out.startswith("crosstalk explains the log")
-    found = names["found"]
-    assert found.verdict.names == ("crosstalk",)
-    # some 2000 nats, as the page says
-    assert 1000 < (found.winner.log_evidence or 0.0) < 4000
-    assert found.winner.parameters["share"].mean == pytest.approx(0.03, abs=0.012)
-    assert found.plant is not None
-    assert "[crosstalk]" in found.plant.to_toml()
+    said = capsys.readouterr().out
+    # nats as the page says them, and the parameter that was put in; the noise is that of one seed
+    for key, effect, (least, most), (parameter, true, within) in (
+        ("weak", "motor_power", (2400, 9600), ("power_wpkg", 8.0, 0.25)),
+        ("hot", "hot_motor", (90, 360), ("fade", 0.15, 0.025)),
+        ("found", "crosstalk", (1000, 4000), ("share", 0.03, 0.012)),
+    ):
+        found = names[key]
+        assert f"{effect} explains the log" in said
+        assert found.verdict.names == (effect,)
+        assert least < (found.winner.log_evidence or 0.0) < most
+        assert found.winner.parameters[parameter].mean == pytest.approx(true, abs=within)
+        assert found.plant is not None
+        assert f"[{effect}]" in found.plant.to_toml()
+    noise = names["found"].plant.effects[0].noise_sd
+    assert noise != 0.02  # the log's, not the class's
+    assert noise == pytest.approx(0.02, rel=0.1)
 
 
 @pytest.fixture

@@ -1,0 +1,81 @@
+"""What is known of an effect stands in its own file: no other file of the package names one, by string or by import."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from avtorch.gap import EFFECTS
+
+PACKAGE = Path(__file__).resolve().parents[1] / "avtorch"
+HOME = PACKAGE / "gap" / "effects"
+
+ALLOWED = {
+    "blindtest": "an independent catalogue, which shares no code with the diagnosis it tests",
+    "trial/rivals": "rival methods have models of their own, which share no code with the diagnosis they are held to",
+    "gap/__init__.py": "offers the classes to the user by name",
+    "cli/estimate.py": "the dead time is an argument of the estimators, no effect",
+    "cli/stability.py": "the dead time is an argument of the stability functions, no effect",
+    "vehicle/stability/belief.py": "likewise",
+    "vehicle/stability/setting.py": "likewise",
+}
+
+
+def names_in(path: Path) -> list[str]:
+    """Line and text of each string that is an effect's name or a key of its, and of each import of one's class."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    bodies = [node.body for node in ast.walk(tree) if isinstance(getattr(node, "body", None), list)]  # type: ignore[attr-defined]
+    docstrings = {id(line.value) for body in bodies for line in body if isinstance(line, ast.Expr)}
+    keys = tuple(f"{name}." for name in EFFECTS)
+    classes = {kind.__name__ for kind in EFFECTS.values()}
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+            if node.value in EFFECTS or node.value.startswith(keys):
+                found.append(f"line {node.lineno}: {node.value!r}")
+        elif isinstance(node, ast.ImportFrom):
+            home = (node.module or "").startswith("avtorch.gap.effects")
+            found += [f"line {node.lineno}: import of {a.name}" for a in node.names if home or a.name in classes]
+        elif isinstance(node, ast.Import):
+            modules = [a.name for a in node.names if a.name.startswith("avtorch.gap.effects")]
+            found += [f"line {node.lineno}: import of {name}" for name in modules]
+    return found
+
+
+def files(allowed: bool) -> list[Path]:
+    places = [PACKAGE / place for place in ALLOWED]
+    every = [p for p in sorted(PACKAGE.rglob("*.py")) if HOME not in p.parents]
+    return [p for p in every if any(p == place or place in p.parents for place in places) == allowed]
+
+
+@pytest.mark.parametrize("path", files(allowed=False), ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_no_other_file_names_an_effect(path: Path) -> None:
+    assert not names_in(path)
+
+
+@pytest.mark.parametrize("place", ALLOWED)
+def test_an_exception_is_still_needed(place: str) -> None:
+    at = PACKAGE / place
+    assert any(names_in(path) for path in ([at] if at.is_file() else at.glob("*.py")))
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        ('x = "gust"', True),
+        ('x = f"gust.{name}"', True),
+        ('x = values["dead_time.delay_s"]', True),
+        ("from avtorch.gap import Gust", True),
+        ("from avtorch.gap.effects.gust import _DAMPED", True),
+        ("import avtorch.gap.effects.gust", True),
+        ('"gust"', False),
+        ('x = "gusts blow"', False),
+        ("from avtorch.gap import Effect", False),
+    ],
+)
+def test_what_counts_as_naming_one(line: str, found: bool, tmp_path: Path) -> None:
+    path = tmp_path / "some.py"
+    path.write_text(f'"""Of a gust."""\n\n\ndef some():\n    """gust"""\n\n\n{line}\n', encoding="utf-8")
+    assert bool(names_in(path)) == found
