@@ -91,7 +91,7 @@ def diagnose(
     ).run()
     top = favourite(race.found)
     apart = Identifiability.of(race, kinds, prior)
-    chances = apart.shared(model_probabilities(race.found, _left(top, race), prior))
+    chances = apart.shared(model_probabilities(race.found, left_over(top, race), prior))
     untold = delays.untold(race.found)
     chances = delays.shared(chances, untold)
     candidates = [_told(f, race, chances[f.name], kinds) for f in race.found]
@@ -159,7 +159,7 @@ def diagnose(
     )
 
 
-def _left(top: FittedModel, race: SearchResult) -> Adequacy:
+def left_over(top: FittedModel, race: SearchResult) -> Adequacy:
     """What the favourite leaves over, less what lost messages explain row by row."""
     measured = race.record.measured
     explained = (top.losses.evidence if top.losses else 0.0) + (top.by_chance.explained if top.by_chance else 0.0)

@@ -23,11 +23,15 @@ from scipy.ndimage import gaussian_filter1d
 
 from avtorch.gap.likelihood.basis import linear_splines, lowpass
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
+from avtorch.gap.selection.calibration import CALIBRATION
 
 Float = NDArray[np.float64]
 
-_SIZES = (1.5, 5.0, 15.0, 50.0)  # of coefficients, in standard errors of a typical one
-_DELAYS = 20  # of an impulse response, 0.15 s apart
+SCALES = CALIBRATION.remainder
+"""Chosen before `unknown` was fitted, whose weights hold for these only. Numbers below are numerics: they keep a
+division from 0, a block from a single row, and one far row or line from drowning the others."""
+
+_DELAYS = SCALES.response_delays
 
 
 @dataclass(frozen=True)
@@ -96,7 +100,7 @@ class _Look:
         self.jerk = np.diff(self.a, prepend=self.a[0]) / self.dt
         self.v = np.zeros(self.rows)
         if "speed" in self.channels:
-            self.v = lowpass(_late(record.measured[-1].mean(-1), 1), 0.5, self.dt)
+            self.v = lowpass(_late(record.measured[-1].mean(-1), 1), SCALES.speed_lag, self.dt)
         self.t = np.linspace(0.0, 1.0, self.rows)
 
     def _force(self, x: Float) -> Float:
@@ -123,26 +127,29 @@ class _Look:
         e, both = self.e.ravel(), len(self.channels) == 2
         a, v, t = self.a, self.v, self.t
         told = []
-        late = np.stack([_late(self.jerk, k * max(1, round(0.15 / self.dt))) for k in range(_DELAYS)])
+        apart = max(1, round(SCALES.response_spacing / self.dt))
+        late = np.stack([_late(self.jerk, k * apart) for k in range(_DELAYS)])
         responses = [self._force(late)]
         if both:
             responses += [self._reading(late, "accel"), self._reading(late, "speed")]
         for response in responses:
-            told.append(_mean([_evidence(_decaying(keep).T @ response, e) for keep in (0.6, 0.9)]))
-        of_a, of_v, of_t = linear_splines(a, 9), linear_splines(v, 7), linear_splines(t, 7)
+            told.append(_mean([_evidence(_decaying(keep).T @ response, e) for keep in SCALES.response_decays]))
+        counts = (SCALES.accel_knots, SCALES.speed_knots, SCALES.time_knots)
+        of_a, of_v, of_t = (linear_splines(x, knots) for x, knots in zip((a, v, t), counts, strict=True))
         forces = [self._force(x) for x in (of_a, of_v, of_t, a * of_v, a * of_t)]
-        told += [_evidence(x, e) for x in (*forces, np.concatenate(forces), self._force(linear_splines(self.u, 9)))]
+        commands = self._force(linear_splines(self.u, SCALES.command_knots))
+        told += [_evidence(x, e) for x in (*forces, np.concatenate(forces), commands)]
         if both:
             told += [_evidence(self._reading(x, "accel"), e) for x in (of_a, of_v, of_t, a * of_v, a * of_t)]
             told += [_evidence(self._reading(x, "speed"), e) for x in (of_a, of_v)]
         push, brake = np.maximum(a, 0), np.minimum(a, 0)
-        pushes, brakes = ([lowpass(x, s, self.dt) for s in (0.2, 0.6, 2.0, 6.0, 20.0)] for x in (push, brake))
+        pushes, brakes = ([lowpass(x, s, self.dt) for s in SCALES.push_lags] for x in (push, brake))
         told.append(_evidence(self._force(np.stack([push, brake, *pushes, *brakes])), e))
         products = [x * y for x in (push, brake) for y in (*pushes, *brakes)]
         told.append(_evidence(self._force(np.stack(products)), e))
-        turns, away = [np.tanh(self.jerk / s) for s in (0.1, 0.5, 2.0)], self.u - a
+        turns, away = [np.tanh(self.jerk / s) for s in SCALES.jerk_turns], self.u - a
         play = [*turns, *(a * x for x in turns), np.abs(self.jerk), np.abs(away), away * np.abs(away)]
-        play += [np.tanh(away / s) for s in (0.05, 0.2)]
+        play += [np.tanh(away / s) for s in SCALES.accel_turns]
         told.append(_evidence(self._force(np.stack(play)), e))
         return _mean(told)
 
@@ -156,10 +163,10 @@ class _Look:
         for x in np.concatenate(columns):
             square, cross = ((x * y).reshape(-1, self.rows).sum(0) for y in (x, self.e.ravel()))
             of_x = []
-            for seconds in (1.5, 5.0, 15.0):
+            for seconds in SCALES.drift_blocks:
                 starts = np.arange(0, self.rows, max(2, round(seconds / self.dt)))
                 part, match = np.add.reduceat(square, starts), np.add.reduceat(cross, starts)
-                for size in (0.3, 1.0, 3.0, 10.0):
+                for size in SCALES.drift_sizes:
                     of_x.append(_scattered(part, match, size**2 / max(part.mean(), 1e-12)))
             told.append(_mean(of_x))
         return _mean(told)
@@ -174,7 +181,7 @@ class _Look:
         grid = grid.reshape(count, -1)
         span = grid.shape[1]
         f = np.fft.rfftfreq(2 * span, dt)
-        use = (f > 0.05) & (f < 0.49 / self.dt)
+        use = (f > SCALES.line_from) & (f < SCALES.line_to / self.dt)
         seen, f = np.fft.rfft(grid, n=2 * span, axis=-1)[:, use], f[use]
         length = min(span, 2048 * self.group)
         through = []
@@ -194,10 +201,11 @@ class _Look:
             power = np.abs((answer.conj() * seen).sum(0)) ** 2 / weight / (self.rows * self.group)
             # against the level of the spectrum around, or a broad hump would pass for lines
             power /= np.maximum(gaussian_filter1d(np.minimum(power, 6.0), 60), 1.0)
-            told += [_mean(power * s / (1 + s) - np.log1p(s)) for s in (5.0, 30.0, 200.0)]
+            told += [_mean(power * s / (1 + s) - np.log1p(s)) for s in SCALES.line_sizes]
         return _mean(told)
 
-    def memory(self, order: int = 8) -> float:
+    def memory(self) -> float:
+        order = SCALES.memory_order
         late = np.concatenate([[_late(x, k) for k in range(1, order + 1)] for x in self.e])
         columns = np.zeros((len(self.e), len(late), *self.e.shape))
         for i in range(len(self.e)):
@@ -207,18 +215,18 @@ class _Look:
     def bursts(self) -> float:
         square = np.minimum(self.e**2 / self.e.var(-1, keepdims=True), 9.0)
         square = (square - square.mean(-1, keepdims=True)) / square.std(-1, keepdims=True)
-        a, brisk = np.abs(self.a), lowpass(np.abs(self.jerk), 0.3, self.dt)
+        a, brisk = np.abs(self.a), lowpass(np.abs(self.jerk), SCALES.burst_lag, self.dt)
         told = []
         for x in (a, brisk, np.abs(self.u - self.a), self.v, self.t, a * self.v):
             if x.std() > 1e-9:
                 each = [_evidence(((x - x.mean()) / x.std())[None], y) for y in square]
                 told.append(_mean([*each, sum(each)]))
         local = []
-        for seconds in (2.0, 6.0, 20.0):
+        for seconds in SCALES.burst_blocks:
             starts = np.arange(0, self.rows, max(4, round(seconds / self.dt)))
             sums = np.add.reduceat(square, starts, axis=-1)
             sizes = np.diff(np.append(starts, self.rows)).astype(np.float64)
-            for size in (0.3, 1.0, 3.0):
+            for size in SCALES.burst_sizes:
                 local.append(sum(_scattered(sizes, y, size**2 / sizes[0]) for y in sums))
         return _mean([*told, _mean(local)])
 
@@ -246,7 +254,7 @@ def _evidence(columns: Float, e: Float) -> float:
         return 0.0
     values, vectors = np.linalg.eigh(gram / typical)
     values, match = np.maximum(values, 0.0), (vectors.T @ (columns @ e)) ** 2 / typical
-    wide = [s * s for s in _SIZES]
+    wide = [s * s for s in SCALES.sizes]
     return _mean([float(0.5 * (match * s / (1 + s * values) - np.log1p(s * values)).sum()) for s in wide])
 
 

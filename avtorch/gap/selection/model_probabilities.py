@@ -7,24 +7,36 @@ things are put right, all of them growing with the square root of the nats at st
 - differences are compressed to a logarithm: `g` nats behind become odds of `(1 + g / unit) ** -power`
 - what the most probable candidate leaves over (`Adequacy`) tells the probability of `unknown`
 
-The numbers were fitted by penalised maximum likelihood on 170 drives of the blind test's reference vehicle (seed
-515151: 20 % without a cause, 40 % with one, 14 % with two, 26 % with one outside the table, of the families that serve
-to calibrate), each weighed by the share of its kind in the blind test. What an effect must gain is held near 4 nats, so
-that a car without any is seldom blamed. Fitted on three quarters and judged on the last: calibration error 0.064, area
-under the ROC curve of `unknown` 0.91.
+The constants come from `calibration.json` (`calibration.Calibration`), which says what each one means and which
+simulated cases it was fitted to; docs/calibration.md says how to fit them anew.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from avtorch.errors import InputError
-from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.selection.adequacy import Adequacy
+from avtorch.gap.selection.calibration import CALIBRATION, Calibration, Odds, UnknownWeights
 from avtorch.gap.simulator.effect import EFFECTS
+
+
+class Weighed(Protocol):
+    """What of a candidate counts here, be it just fitted or kept from an earlier search."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def log_evidence(self) -> float: ...
+    @property
+    def by_chance(self) -> object | None: ...
+
+
+_Kind = TypeVar("_Kind", bound=Weighed)
 
 
 @dataclass(frozen=True)
@@ -38,25 +50,16 @@ class ComplexityPenalty:
         return self.fixed + self.share * float(np.sqrt(max(partner, 0.0)))
 
 
-EFFECT = ComplexityPenalty(3.89)
-SECOND = ComplexityPenalty(10.5, 0.092)
-SECOND_BY_CHANCE = ComplexityPenalty(6.77, 0.359)
-UNIT, UNIT_SHARE, POWER = 2.64, 0.114, 4.01
-
-_ROUND_OFF = 1e-6  # nats, of sums of up to some 1e9 of them
-
-UNKNOWN: Mapping[str, float] = {
-    "constant": 0.543,
-    "most": 2.493,
-    "against gain": 1.504,
-    "gain": -1.983,
-    "none": -2.975,
-}
-"""Weights of the logistic regression that tells `unknown`; see `_score`."""
+# numerics, not fitted: the round-off [nats] of sums of up to some 1e9 of them
+_ROUND_OFF = 1e-6
 
 
 def model_probabilities(
-    found: Sequence[FittedModel], left: Adequacy, prior: Mapping[str, float] | None = None
+    found: Sequence[Weighed],
+    left: Adequacy,
+    prior: Mapping[str, float] | None = None,
+    *,
+    calibration: Calibration = CALIBRATION,
 ) -> dict[str, float]:
     """Probability by candidate's name, `unknown` among them; sums to 1.
 
@@ -68,7 +71,7 @@ def model_probabilities(
     for name, weight in weigh.items():
         if not (np.isfinite(weight) and weight >= 0):
             raise InputError(f"prior: found {name}={weight!r}, needs a weight of 0 or more")
-    shares = _shares(found)
+    shares = relative(found, calibration.odds)
     for f in found:
         parts = f.name.split("+")
         for part in parts:
@@ -76,7 +79,9 @@ def model_probabilities(
         if len(parts) > 1:
             shares[f.name] *= weigh.get("pair", 1.0)
     total = sum(shares.values())
-    odds = float(np.exp(_score(favourite(found), _none(found), left))) * weigh.get("unknown", 1.0)
+    seen = signs(favourite(found, calibration.odds), _none(found), left)
+    weights = [getattr(calibration.unknown, f.name) for f in fields(UnknownWeights)]
+    odds = float(np.exp(sum(w * x for w, x in zip(weights, seen, strict=True)))) * weigh.get("unknown", 1.0)
     unknown = odds / (1 + odds)
     if not total > 0:
         if not unknown > 0:
@@ -85,59 +90,74 @@ def model_probabilities(
     return {name: (1 - unknown) * share / total for name, share in shares.items()} | {"unknown": unknown}
 
 
-def favourite(found: Sequence[FittedModel]) -> FittedModel:
+def favourite(found: Sequence[_Kind], odds: Odds = CALIBRATION.odds) -> _Kind:
     """The most probable of the named candidates; of those that differ by round-off the plainest."""
-    worth = _worth(found)
+    worth = _worth(found, odds)
     best = max(worth.values())
     tied = [f for f in found if worth[f.name] >= best - _ROUND_OFF]
     return min(tied, key=lambda f: (f.name != "none", f.name.count("+"), -worth[f.name]))
 
 
-def complexity_penalties(found: Sequence[FittedModel]) -> dict[str, float]:
+def complexity_penalties(found: Sequence[Weighed], odds: Odds = CALIBRATION.odds) -> dict[str, float]:
     """What each candidate has to gain over none before it counts for anything [nats]."""
-    gained = {f.name: f.log_evidence - _none(found).log_evidence for f in found}
-    by_chance = {f.name for f in found if f.by_chance is not None or _by_chance(f.name)}
-    paid = {}
-    for name in gained:
-        parts = name.split("+")
-        paid[name] = 0.0 if name == "none" else EFFECT.of(0.0)
-        if len(parts) > 1:
-            price = SECOND_BY_CHANCE if name in by_chance else SECOND
-            paid[name] += price.of(max(gained.get(part, 0.0) for part in parts))
+    second = ComplexityPenalty(odds.second, odds.second_share)
+    second_by_chance = ComplexityPenalty(odds.second_by_chance, odds.second_by_chance_share)
+    paid, gained = {"none": 0.0}, gains(found)
+    for f in found:
+        if f.name == "none":
+            continue
+        paid[f.name] = odds.effect
+        if "+" in f.name:
+            paid[f.name] += (second_by_chance if by_chance(f) else second).of(partner(f.name, gained))
     return paid
 
 
-def _by_chance(name: str) -> bool:
-    """Whether a random effect is among the candidate's: a second one has a price of its own."""
-    return any(part in EFFECTS and EFFECTS[part].random for part in name.split("+"))
+def by_chance(f: Weighed) -> bool:
+    """Whether an effect that chance decides is among its causes."""
+    return f.by_chance is not None or any(part in EFFECTS and EFFECTS[part].random for part in f.name.split("+"))
 
 
-def _none(found: Sequence[FittedModel]) -> FittedModel:
+def gains(found: Sequence[Weighed]) -> dict[str, float]:
+    """Log evidence over none by name [nats]."""
+    flat = _none(found).log_evidence
+    return {f.name: f.log_evidence - flat for f in found}
+
+
+def partner(pair: str, gained: Mapping[str, float]) -> float:
+    """What the stronger half of a pair gains alone [nats]; 0 for a half that was not fitted alone."""
+    return max(gained.get(part, 0.0) for part in pair.split("+"))
+
+
+def _none(found: Sequence[Weighed]) -> Weighed:
     return next(f for f in found if f.name == "none")
 
 
-def _worth(found: Sequence[FittedModel]) -> dict[str, float]:
+def _worth(found: Sequence[Weighed], odds: Odds) -> dict[str, float]:
     """Log evidence over none less what each candidate pays [nats]."""
-    flat, paid = _none(found).log_evidence, complexity_penalties(found)
-    return {f.name: f.log_evidence - flat - paid[f.name] for f in found}
+    paid = complexity_penalties(found, odds)
+    return {name: gained - paid[name] for name, gained in gains(found).items()}
 
 
-def _shares(found: Sequence[FittedModel]) -> dict[str, float]:
-    worth = _worth(found)
+def relative(found: Sequence[Weighed], odds: Odds = CALIBRATION.odds) -> dict[str, float]:
+    """Probability of each named candidate in units of the most probable one's, before the user's prior."""
+    worth = _worth(found, odds)
     best = max(worth.values())
-    unit = UNIT + UNIT_SHARE * float(np.sqrt(max(best, 0.0)))
-    return {name: float((1 + (best - w) / unit) ** -POWER) for name, w in worth.items()}
+    unit = odds.unit + odds.unit_share * float(np.sqrt(max(best, 0.0)))
+    return {name: float((1 + (best - w) / unit) ** -odds.power) for name, w in worth.items()}
 
 
-def _score(top: FittedModel, none: FittedModel, left: Adequacy) -> float:
-    """Log odds of `unknown`: the strongest structure left, all of it against what the favourite gains, that gain."""
+def signs(top: Weighed, none: Weighed, left: Adequacy) -> tuple[float, ...]:
+    """What the log odds of `unknown` are a weighted sum of, in the order of `UnknownWeights`.
+
+    1, the strongest structure left, all of it against what the favourite `top` gains, that gain, whether it is none.
+    The divisors only bring logarithms of nats to the order of 1, at which one prior serves all weights.
+    """
     gain = float(np.log1p(max(top.log_evidence - none.log_evidence, 0.0)))
     most = max(left.flexible, left.drift, left.line, left.memory, left.bursts)
-    seen = {
-        "constant": 1.0,
-        "most": float(np.log1p(max(most, 0.0))) / 3,
-        "against gain": (float(np.log1p(max(left.total, 0.0))) - gain) / 5,
-        "gain": gain / 5,
-        "none": float(top.name == "none"),
-    }
-    return sum(UNKNOWN[k] * x for k, x in seen.items())
+    return (
+        1.0,
+        float(np.log1p(max(most, 0.0))) / 3,
+        (float(np.log1p(max(left.total, 0.0))) - gain) / 5,
+        gain / 5,
+        float(top.name == "none"),
+    )

@@ -9,6 +9,7 @@ from typing import Any
 
 from avtorch.errors import InputError
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.selection.calibration import CALIBRATION
 from avtorch.gap.simulator.effect import EFFECTS
 
 ALWAYS = ("none", "unknown")
@@ -116,9 +117,9 @@ class Verdict:
         }
 
 
-ALIAS_RATIO = 0.03
+ALIAS_RATIO = CALIBRATION.alias_sets.ratio
 """Candidates at least this probable, in units of the most probable one, are not told apart from it."""
-UNKNOWN_RATIO = 0.5
+UNKNOWN_RATIO = CALIBRATION.alias_sets.unknown_ratio
 """The same for `unknown`. It foretells nothing, so no log ever rules it out: below this it is a doubt, no rival."""
 
 

@@ -13,6 +13,7 @@ from avtorch.errors import InputError
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.selection import model_probabilities as odds
 from avtorch.gap.selection.adequacy import Adequacy
+from avtorch.gap.selection.calibration import CALIBRATION
 
 NOTHING = Adequacy(-1.0, -1.0, -1.0, -1.0, -1.0, 0.0)
 
@@ -41,7 +42,7 @@ def test_they_sum_to_one(dead_time: float, gust: float, pair: float, left: float
 
 
 @given(dead_time=nats, shift=st.floats(-1e4, 1e4))
-@example(dead_time=odds.EFFECT.fixed, shift=1.0)  # as probable as none but for round-off, on either side of it
+@example(dead_time=CALIBRATION.odds.effect, shift=1.0)  # as probable as none but for round-off, on either side of it
 def test_only_differences_of_evidence_count(dead_time: float, shift: float) -> None:
     there = odds.model_probabilities(race(none=0.0, dead_time=dead_time), NOTHING)
     moved = odds.model_probabilities(race(none=shift, dead_time=dead_time + shift), NOTHING)
