@@ -37,10 +37,11 @@ from avtorch.gap.effects import (
 )
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.drive import Drive, Response
-from avtorch.gap.simulator.effect import EFFECTS, PLACES, Effect, NoiseChange, Row, effect_class, register
+from avtorch.gap.simulator.effect import EFFECTS, PLACES, Effect, NoiseChange, effect_class, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.plant import BASELINE, GapPlant, plant
 from avtorch.gap.simulator.recursion import scan, scan_pair
+from avtorch.gap.simulator.row import Row
 
 __all__ = [
     "BASELINE",

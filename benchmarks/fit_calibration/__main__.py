@@ -1,6 +1,6 @@
 """Fit the constants behind probabilities to simulated cases, and write them with where they come from.
 
-``python -m benchmarks.fit_calibration --seed 515151 --cases 170 --out avtorch/gap/selection/calibration.json [--resume]``
+``python -m benchmarks.fit_calibration --seed 515151 --cases 170 --out FILE [--resume]``
 
 Draws cases of the blind test's reference vehicle with the families outside the table that serve to calibrate, searches
 each once (hours: a minute or more of processor time a case) and keeps what the fit needs in `--kept`. Then it fits the

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, NoiseChange, Row, fixed, register
+from avtorch.gap.simulator.effect import Effect, NoiseChange, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 _ROWS_BACK = 12  # at a loss of 0.5 the older commands weigh 0.5^12

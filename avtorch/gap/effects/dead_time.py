@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, Row, fixed, register
+from avtorch.gap.simulator.effect import Effect, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.actuator import modes_over
-from avtorch.gap.simulator.effect import Effect, Row, fixed, register
+from avtorch.gap.simulator.effect import Effect, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.recursion import scan_pair
+from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 

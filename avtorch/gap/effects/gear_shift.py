@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect, Row, fixed, register
+from avtorch.gap.simulator.effect import Effect, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 _REARMED = 1.5  # [m/s] below a shift speed the gear counts as changed back, without interruption

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Row, register
+from avtorch.gap.simulator.effect import register
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 GRAVITY = 9.80665

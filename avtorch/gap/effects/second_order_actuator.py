@@ -11,8 +11,9 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect, Row, fixed, register
+from avtorch.gap.simulator.effect import Effect, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 _DAMPED = 0.85  # a fit is off by 0.1 or so

@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.effect import Effect, Row, fixed, register
+from avtorch.gap.simulator.effect import Effect, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.recursion import scan
+from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 

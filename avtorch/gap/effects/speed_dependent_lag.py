@@ -8,8 +8,9 @@ from typing import Self
 from torch import Tensor
 
 from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.effect import Effect, Row, fixed, register
+from avtorch.gap.simulator.effect import Effect, fixed, register
 from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 _LEAST = 0.05  # the factor's least value, out of a drive's range of speeds

@@ -94,8 +94,7 @@ class Search:
 
     # the whole ---------------------------------------------------------------------------------------------------
     def run(self) -> SearchResult:
-        glitches = None
-        logs = self.logs
+        glitches, logs = None, self.logs
         record = Record.of(logs)
         raw = Record.of(logs, rate_hz=1e9, multiple=record.group)
         none = self._none(record)
@@ -105,8 +104,7 @@ class Search:
             glitches = self._tails(raw, none)
             if glitches.plain:
                 logs = without_outliers(logs, raw, glitches)
-                record = Record.of(logs)
-                none = self._none(record)
+                none = self._none(record := Record.of(logs))
         found = self._deterministic(record, none)
         if with_tails:
             again = self._tails(raw, max(found, key=lambda f: f.log_evidence))
@@ -115,8 +113,7 @@ class Search:
             changed |= again.plain and abs(before - int(again.hit.sum())) > 0.3 * before + 3
             if changed and not self._late():
                 logs = without_outliers(self.logs, raw, again) if again.plain else self.logs
-                record = Record.of(logs)
-                none = self._none(record)
+                none = self._none(record := Record.of(logs))
                 found = self._deterministic(record, none)
             glitches = again
         if "losses" in self._own and not self._late():
@@ -125,8 +122,7 @@ class Search:
             if not self._late():
                 rows = Record.of(logs, rate_hz=1e9, multiple=record.group)
                 found += [commanded(f, law, rows) for f in self._alone_and_best(found, none)]
-        if glitches is not None:
-            found += glitched(found, self._glitches, pairs=self._paired)
+        found += [] if glitches is None else glitched(found, self._glitches, pairs=self._paired)
         best: dict[str, FittedModel] = {}
         for f in sorted(found, key=lambda f: -f.log_evidence):
             best.setdefault(f.name, f)
@@ -141,10 +137,9 @@ class Search:
         return [*own, *(forced(on, law) for law in self._laws["force"])]
 
     def _late(self) -> bool:
-        if self.until is not None and time.monotonic() > self.until:
-            self.complete = False
-            return True
-        return False
+        late = self.until is not None and time.monotonic() > self.until
+        self.complete &= not late
+        return late
 
     # deterministic causes and gusts --------------------------------------------------------------------------------
     def _none(self, record: Record) -> FittedModel:

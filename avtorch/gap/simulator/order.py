@@ -8,7 +8,8 @@ from typing import Any
 from torch import Tensor
 
 from avtorch.gap.simulator.actuator import Actuator, Substep
-from avtorch.gap.simulator.effect import PLACES, Effect, Place, Row
+from avtorch.gap.simulator.effect import PLACES, Effect, Place
+from avtorch.gap.simulator.row import Row
 
 Hook = Callable[[Effect, Tensor], Any]
 """How an effect with memory is run: `hook(effect, x) -> output`, for one row or a whole drive."""

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.drive import Drive, Response
-from avtorch.gap.simulator.effect import Effect, Row, row_at
+from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.order import actuator_of, at_place, substeps
+from avtorch.gap.simulator.row import Row, row_at
 
 STANDS_MPS = 0.1
 """Below this measured speed the car stands and its acceleration is nought [m/s]."""

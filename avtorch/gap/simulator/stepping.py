@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.actuator import ActuatorState
-from avtorch.gap.simulator.effect import Effect, Row
+from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.order import actuator_of, at_place, substeps
+from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.noise import Noise
 from avtorch.vehicle.plant import Motion
 

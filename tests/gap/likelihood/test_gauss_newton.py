@@ -17,7 +17,7 @@ from avtorch.gap.likelihood.grade_marginal import SIZES
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.simulator.effect import Row
+from avtorch.gap.simulator.row import Row
 from tests.gap.records import QUIET, Float, log_of
 
 

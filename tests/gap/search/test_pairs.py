@@ -32,8 +32,8 @@ from avtorch.gap.search import pairs
 from avtorch.gap.search.initial_values import effect_starts, starts
 from avtorch.gap.search.pairs import Base, exchanged, joint_fit
 from avtorch.gap.search.screening import Screened
-from avtorch.gap.simulator.effect import Row
 from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 from tests.gap.records import QUIET, Float, log_of
 
