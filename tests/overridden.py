@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from avtorch.io import Log
 from tests.gap.records import command_over
-
-Float = NDArray[np.float64]
 
 _STEPS = 10  # of the car between two rows
 _DRIVER_LAG_S = 0.25

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 import avtorch
 from avtorch.follower import diagnose_follower
@@ -36,7 +35,6 @@ from avtorch.validation.windows import windows_of_log
 from tests.follower.loops import CTG, followed_log
 from tests.gap.records import log_of
 
-Float = NDArray[np.float64]
 Numbers = dict[str, Any]
 
 OFFSETS = (1.2e9, 1.7e9 + 0.123, -5e8)

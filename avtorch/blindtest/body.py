@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from avtorch.arrays import FloatArray
 from avtorch.blindtest.car import STEP_S
 from avtorch.blindtest.command import Parameters
 
@@ -25,9 +25,7 @@ def forces(effects: Parameters, rng: Streams, *, reach: float) -> list[Force]:
     return [make(effects[name], rng(name), reach) for name, make in _FORCES.items() if name in effects]
 
 
-def coloured(
-    rng: np.random.Generator, steps: int, sd: float, memory: float, step: float = STEP_S
-) -> NDArray[np.float64]:
+def coloured(rng: np.random.Generator, steps: int, sd: float, memory: float, step: float = STEP_S) -> FloatArray:
     """A stationary Ornstein-Uhlenbeck process, (step,), of standard deviation `sd` and time constant `memory` [s]."""
     stay = math.exp(-step / memory)
     draws = rng.standard_normal(steps)
@@ -35,7 +33,7 @@ def coloured(
     return sd * np.asarray(lfilter([1.0], [1.0, -stay], draws))
 
 
-def profile(rng: np.random.Generator, reach: float, length: float) -> NDArray[np.float64]:
+def profile(rng: np.random.Generator, reach: float, length: float) -> FloatArray:
     """A smooth random profile over distance with unit variance and correlation length `length` [m], every 4 m."""
     points = int(reach / _GRID_M) + 2
     width = length / _GRID_M
@@ -45,7 +43,7 @@ def profile(rng: np.random.Generator, reach: float, length: float) -> NDArray[np
     return np.convolve(rng.standard_normal(points + 2 * half), kernel, mode="valid")
 
 
-def along(values: NDArray[np.float64]) -> Callable[[float], float]:
+def along(values: FloatArray) -> Callable[[float], float]:
     """A profile as a function of position [m], linear between its points, held at its end."""
     table, last = values.tolist(), len(values) - 2
 

@@ -8,9 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from avtorch.arrays import FloatArray
 from avtorch.blindtest.car import Car
 from avtorch.blindtest.catalogue import family
 from avtorch.blindtest.command import Parameters
@@ -20,7 +18,6 @@ from avtorch.blindtest.visibility import Oracle, Sight, exact_gain
 from avtorch.errors import InputError
 from avtorch.io import Log, write_json
 
-Float = NDArray[np.float64]
 _MOVING_MPS = 0.3  # slower rows are masked
 
 Kind = Literal["none", "single", "pair", "outside"]
@@ -71,12 +68,12 @@ class Case:
         return {"none": "none", "outside": "unknown"}.get(self.kind, "+".join(self.names))
 
     @property
-    def without(self) -> Float:
+    def without(self) -> FloatArray:
         dt = 1 / self.drive.rate_hz
         return self.car.K_L * exact_gain(self.run.command, dt, self.car.T_L)[0]
 
     @property
-    def with_cause(self) -> Float:
+    def with_cause(self) -> FloatArray:
         if self.names and all(family(name).by_chance for name in self.names):
             return self.without
         return self.run.accel - self.run.noise_accel - self.run.chance_accel

@@ -15,14 +15,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
+from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError
 from avtorch.io import Log
 
-Float = NDArray[np.float64]
 Truth = dict[str, float]
 
 _MOVING_MPS = 0.3
@@ -35,7 +34,7 @@ class _Bench:
     """What an effect needs to know of the log: one array per signal, `T_L` [s], `K_L` [-], draws, size."""
 
     log: Log
-    command: Float
+    command: FloatArray
     T_L: float
     K_L: float
     size: float
@@ -51,7 +50,7 @@ class _Bench:
         return float(self.command[self.log.usable].std())
 
     @property
-    def speed(self) -> Float:
+    def speed(self) -> FloatArray:
         """Measured speed without most of its noise [m/s]."""
         if self.log.speed is None:
             raise InputError(f"{self.log.name}: has no speed, which this effect needs")
@@ -60,7 +59,7 @@ class _Bench:
             smooth[part] = gaussian_filter1d(smooth[part], _SMOOTH_S / self.step, mode="nearest")
         return np.maximum(smooth, 0.0)
 
-    def along(self) -> Float:
+    def along(self) -> FloatArray:
         """Distance from the start of each segment [m]."""
         out = np.zeros(self.log.rows)
         for part in self.log.segments():
@@ -68,7 +67,7 @@ class _Bench:
             out[part] = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(t))])
         return out
 
-    def pushed(self, force: Float) -> Log:
+    def pushed(self, force: FloatArray) -> Log:
         """The log of a car on which `force` (row,) [m/s²] acts besides."""
         slope = np.zeros_like(force)
         for part in self.log.segments():
@@ -201,7 +200,7 @@ def _gust(x: _Bench) -> tuple[Log, Truth]:
 
 
 # --- effects of the accelerometer -------------------------------------------------------------------------------------
-def _accel(x: _Bench) -> Float:
+def _accel(x: _Bench) -> FloatArray:
     if x.log.accel is None:
         raise InputError(f"{x.log.name}: has no accel, on which this effect acts")
     return x.log.accel
@@ -262,7 +261,7 @@ Example:
 """
 
 
-def _rows(log: Log, kept: NDArray[np.bool_]) -> Log:
+def _rows(log: Log, kept: BoolArray) -> Log:
     """The log with only the rows `kept` (row,)."""
     columns = {name: value[kept] for name, value in vars(log).items() if isinstance(value, np.ndarray)}
     columns = {name: value for name, value in columns.items() if name in log.__dataclass_fields__}

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import NDArray
+
+from avtorch.arrays import IntArray
 
 Interval = tuple[float, float]
 LEVEL = 0.90
@@ -25,7 +26,7 @@ def wilson(hits: int, trials: int, level: float = LEVEL) -> Interval | None:
 
 
 def bootstrap(
-    measure: Callable[[NDArray[np.int64]], float | None],
+    measure: Callable[[IntArray], float | None],
     cases: int,
     *,
     resamples: int,

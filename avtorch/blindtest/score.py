@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import rankdata
 
+from avtorch.arrays import FloatArray
 from avtorch.blindtest.answers import Answered, read
 from avtorch.blindtest.intervals import Interval, bootstrap, wilson
 from avtorch.blindtest.visibility import TIERS
@@ -119,7 +119,7 @@ def fpr95(rows: Rows) -> float | None:
     return float(np.mean(unknown[~outside] >= threshold))
 
 
-def _unknown(rows: Rows) -> NDArray[np.float64]:
+def _unknown(rows: Rows) -> FloatArray:
     return np.array([r.probabilities.get("unknown", 0.0) for r in rows])
 
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from avtorch.arrays import FloatArray
 from avtorch.blindtest.body import coloured
 from avtorch.io.us06 import US06_SPEED_MPS
 
-Float = NDArray[np.float64]
 _SMOOTH_S = 0.7
 
 
-def trip(rng: np.random.Generator, seconds: float, dt: float) -> Float:
+def trip(rng: np.random.Generator, seconds: float, dt: float) -> FloatArray:
     """Town, road and motorway in turn, (row,) [m/s]: pulls, holds that wander, slow-downs, now and then a stop."""
     knots, speeds, time = [0.0], [float(rng.uniform(8, 20))], 0.0
     kind = int(rng.integers(3))
@@ -36,7 +35,7 @@ def trip(rng: np.random.Generator, seconds: float, dt: float) -> Float:
     return _smooth(np.interp(np.arange(0, seconds + 1, dt), knots, speeds), rng, dt)
 
 
-def queue(rng: np.random.Generator, seconds: float, dt: float) -> Float:
+def queue(rng: np.random.Generator, seconds: float, dt: float) -> FloatArray:
     """Stop-and-go, (row,) [m/s]: short pulls to 2 to 12 m/s, stops of a few seconds."""
     knots, speeds, time = [0.0], [float(rng.uniform(3, 8))], 0.0
     while time < seconds:
@@ -51,7 +50,7 @@ def queue(rng: np.random.Generator, seconds: float, dt: float) -> Float:
     return _smooth(np.interp(np.arange(0, seconds + 1, dt), knots, speeds), rng, dt)
 
 
-def us06(rng: np.random.Generator, seconds: float, dt: float) -> Float:
+def us06(rng: np.random.Generator, seconds: float, dt: float) -> FloatArray:
     """A stretch of the US06 cycle that begins anywhere and starts anew at its end, (row,) [m/s]."""
     grid = np.arange(0, seconds + 1, dt) + rng.uniform(0, len(US06_SPEED_MPS))
     table = np.asarray(US06_SPEED_MPS, float)
@@ -59,7 +58,7 @@ def us06(rng: np.random.Generator, seconds: float, dt: float) -> Float:
     return np.asarray(np.maximum(gaussian_filter1d(speed, _SMOOTH_S / dt), 0.0))
 
 
-def _smooth(speed: Float, rng: np.random.Generator, dt: float) -> Float:
+def _smooth(speed: FloatArray, rng: np.random.Generator, dt: float) -> FloatArray:
     """Rounded corners, and a driver's small wandering, which dies away towards a stop."""
     wander = gaussian_filter1d(coloured(rng, len(speed), float(rng.uniform(0.2, 0.7)), 6.0, dt), 0.8 / dt)
     rounded = gaussian_filter1d(speed, _SMOOTH_S / dt)

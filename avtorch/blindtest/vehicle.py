@@ -17,16 +17,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.blindtest.actuator import actuator
 from avtorch.blindtest.body import coloured, driveline, forces
 from avtorch.blindtest.car import STEP_S, Car
 from avtorch.blindtest.command import Command, losses
 from avtorch.blindtest.sensors import Readings, filters
 from avtorch.errors import InputError
-
-Float = NDArray[np.float64]
 
 
 class Pilot(Protocol):
@@ -58,19 +56,19 @@ class Run:
         True
     """
 
-    time: Float
-    command: Float
-    accel: Float
-    speed: Float
-    noise_accel: Float
-    noise_speed: Float
-    drift_speed: Float
-    chance_accel: Float
-    chance_speed: Float
-    felt_accel: Float
-    true_accel: Float
-    true_speed: Float
-    position: Float
+    time: FloatArray
+    command: FloatArray
+    accel: FloatArray
+    speed: FloatArray
+    noise_accel: FloatArray
+    noise_speed: FloatArray
+    drift_speed: FloatArray
+    chance_accel: FloatArray
+    chance_speed: FloatArray
+    felt_accel: FloatArray
+    true_accel: FloatArray
+    true_speed: FloatArray
+    position: FloatArray
 
 
 def simulate(
@@ -249,7 +247,7 @@ class _Drive:
             a, v, raw, place = (x[i] + share * (x[i - 1] - x[i]) for x in (filtered, speeds, accels, places))
         return sensors.accel(a, place, time), sensors.speed(v, raw, place, time)
 
-    def _felt(self) -> Float:
+    def _felt(self) -> FloatArray:
         """(row,): process noise and gusts through the accelerometer's lag and scale, less themselves."""
         begin, rows = self.first * self.per_row, np.arange(self.rows) * self.per_row
         motion = self.process + self.gust
@@ -274,7 +272,7 @@ class _Drive:
         accel, speed = np.array(seen_a), np.array(seen_v)
         true_v = np.array(speeds)[rows]
 
-        def summed(x: Float) -> Float:
+        def summed(x: FloatArray) -> FloatArray:
             return (np.cumsum(x) * STEP_S - 0.5 * STEP_S * (x + x[0]))[rows]
 
         quantised = 0.0

@@ -21,14 +21,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
+from avtorch.arrays import BoolArray, FloatArray
 from avtorch.blindtest.vehicle import Run
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
+Bool = BoolArray
 
 TIERS = {"easy": (3.0, np.inf), "medium": (1.6, 3.0), "hard": (1.15, 1.6), "faint": (1.02, 1.15)}
 """Bounds of visibility by tier: how many times larger the error of rollouts is without the effect than with it.
@@ -55,7 +54,7 @@ def tier_of(visibility: float) -> str | None:
     return next((name for name, (low, high) in TIERS.items() if low <= visibility < high), None)
 
 
-def glvd_response(command: Float, dt: float, T_L: float, K_L: float) -> Float:
+def glvd_response(command: FloatArray, dt: float, T_L: float, K_L: float) -> FloatArray:
     """Acceleration (row,) of GLVD from rest under commands (row,) held for `dt` [s] each, zero-order hold, exact."""
     alpha = np.exp(-dt / T_L)
     answer = lfilter([0.0, -np.expm1(-dt / T_L) * K_L], [1.0, -alpha], command)
@@ -114,18 +113,18 @@ class _Witnesses:
             first[part] = part.start
         self.inside, self._first = inside, first
 
-    def since_start(self, speed: Float) -> Float:
+    def since_start(self, speed: FloatArray) -> FloatArray:
         """Change of a speed since the stretch began."""
         return speed - speed[self._first]
 
-    def rms_accel(self, error: Float) -> float:
+    def rms_accel(self, error: FloatArray) -> float:
         return float(np.sqrt(np.mean(error[self.moving] ** 2))) if self.moving.any() else 0.0
 
-    def rms_speed(self, error: Float) -> float:
+    def rms_speed(self, error: FloatArray) -> float:
         return float(np.sqrt(np.mean(error[self.inside] ** 2))) if self.inside.any() else 0.0
 
 
-def exact_gain(command: Float, dt: float, T_L: float) -> tuple[Float, Float]:
+def exact_gain(command: FloatArray, dt: float, T_L: float) -> tuple[FloatArray, FloatArray]:
     """Acceleration and speed (row,) of GLVD with gain 1 from rest: both exact, also where the command jumps."""
     accel = glvd_response(command, dt, T_L, 1.0)
     # dv = u dt - T (a_next - a): the integral of GLVD's equation over a row
@@ -224,7 +223,7 @@ def oracles(run: Run, fitted: Sight, *, foretold: bool) -> dict[str, Oracle]:
     }
 
 
-def _from_all_starts(error: Float, rows: Bool, dt: float, keeps: float = 1.0) -> float:
+def _from_all_starts(error: FloatArray, rows: Bool, dt: float, keeps: float = 1.0) -> float:
     """RMS of the error over rollouts of up to 10 s, begun at a measured value at every one of the `rows`, of which a
     share `keeps` is left after each.
 
@@ -244,7 +243,7 @@ def _from_all_starts(error: Float, rows: Bool, dt: float, keeps: float = 1.0) ->
     return float(np.sqrt(squares / count)) if count else 0.0
 
 
-def _faded(x: Float, length: int, keeps: float) -> Float:
+def _faded(x: FloatArray, length: int, keeps: float) -> FloatArray:
     """Sums over the last `length` rows, each times `keeps` to the power of its age."""
     if keeps == 1.0:
         total = np.concatenate([[0.0], np.cumsum(x)])

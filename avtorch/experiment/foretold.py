@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.experiment.manoeuvres import Manoeuvre
 from avtorch.gap.likelihood.noise_draws import noise_draws
 from avtorch.gap.likelihood.record import Record
@@ -21,8 +21,6 @@ from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.gap.simulator.drive import Drive, Response
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.io import Log
-
-Float = NDArray[np.float64]
 
 _SLOWEST_MPS = 0.5
 
@@ -48,10 +46,10 @@ class PredictiveLaw:
     """Of one manoeuvre by one contender: `mean` (channel, row), `spread` (direction, channel, row), and its noise."""
 
     white: WhiteningFilter = field(repr=False)
-    mean: Float = field(repr=False)
-    spread: Float = field(repr=False)
+    mean: FloatArray = field(repr=False)
+    spread: FloatArray = field(repr=False)
 
-    def log_density(self, measured: Float) -> Float:
+    def log_density(self, measured: FloatArray) -> FloatArray:
         """Of rows (draw, channel, row): (draw,) [nats]."""
         e = self._white(measured - self.mean)
         u = self._white(self.spread)
@@ -62,7 +60,7 @@ class PredictiveLaw:
         size = float(np.linalg.slogdet(gram)[1])
         return constant - 0.5 * ((e**2).sum(-1) - (match * taken).sum(-1) + size)
 
-    def _white(self, errors: Float) -> Float:
+    def _white(self, errors: FloatArray) -> FloatArray:
         """(column, white row) of errors (column, channel, row)."""
         if not len(errors):
             return np.zeros((0, 1))
@@ -78,7 +76,7 @@ class Prediction:
     contender: PredictiveModel
     channels: tuple[str, ...]
     manoeuvres: Sequence[Manoeuvre] = field(repr=False)
-    rollouts: Float = field(repr=False)
+    rollouts: FloatArray = field(repr=False)
     group: int
 
     @classmethod
@@ -109,7 +107,7 @@ class Prediction:
         )
         return PredictiveLaw(white, mean, spread if road is None else np.concatenate([spread, road]))
 
-    def examples(self, number: int, rng: np.random.Generator) -> Float:
+    def examples(self, number: int, rng: np.random.Generator) -> FloatArray:
         """What would be measured, (draw, channel, row)."""
         some = self.rollouts[number, 1::2]
         count, _, rows = some.shape
@@ -119,7 +117,7 @@ class Prediction:
         road = self._road(number)
         return seen if road is None else seen + np.einsum("dk,kwr->dwr", rng.standard_normal((count, len(road))), road)
 
-    def _road(self, number: int) -> Float | None:
+    def _road(self, number: int) -> FloatArray | None:
         """Directions (knot, channel, row) in which an unknown slope moves what is measured."""
         size = self.contender.grade_rms
         if not size:

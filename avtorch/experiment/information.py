@@ -6,12 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from avtorch.experiment.foretold import Prediction
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import chirp
 
+from avtorch.arrays import FloatArray, IntArray
 from avtorch.experiment.limits import Limits
 
-Float = NDArray[np.float64]
-Pattern = Callable[[Float], Float]
+Pattern = Callable[[FloatArray], FloatArray]
 
 _BEFORE_S, _AFTER_S = 3.0, 2.0
 _SPEEDS = (0.2, 0.5, 0.8)  # of the span between slowest and fastest
@@ -42,9 +41,9 @@ class Manoeuvre:
     """
 
     name: str
-    time: Float = field(repr=False)
-    command: Float = field(repr=False)
-    speed: Float = field(repr=False)
+    time: FloatArray = field(repr=False)
+    command: FloatArray = field(repr=False)
+    speed: FloatArray = field(repr=False)
 
     @property
     def metres(self) -> float:
@@ -69,7 +68,7 @@ class Manoeuvre:
             and self.time[-1] <= limits.seconds + 1e-9
         )
 
-    def expecting(self, speed: Float) -> Manoeuvre:
+    def expecting(self, speed: FloatArray) -> Manoeuvre:
         """The same with another expected speed (row,)."""
         return replace(self, speed=speed)
 
@@ -144,7 +143,7 @@ def _all(limits: Limits, rate_hz: float) -> Iterator[Manoeuvre]:
         yield from made(name, low + 0.5 * step, lambda t, a=size: _slow_and_go(t, a, gain), 2 * gain * 2 / size + 5.0)
 
 
-def _made(name: str, time: Float, start: float, pattern: Pattern, lasts: float) -> Manoeuvre:
+def _made(name: str, time: FloatArray, start: float, pattern: Pattern, lasts: float) -> Manoeuvre:
     t = time - _BEFORE_S
     active = (t >= -1e-9) & (t < lasts - 1e-9)
     u = np.zeros_like(time)
@@ -154,12 +153,12 @@ def _made(name: str, time: Float, start: float, pattern: Pattern, lasts: float) 
     return made.trimmed(-float(u.sum() * dt), start)
 
 
-def _steps(t: Float, size: float, hold: float) -> Float:
+def _steps(t: FloatArray, size: float, hold: float) -> FloatArray:
     """+, 0, -, 0, -, 0, +, 0: every level meets rest, both signs begin."""
     return size * np.array([1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0, 0.0])[(t / hold + 1e-9).astype(int) % 8]
 
 
-def _pedals(t: Float, push: float, brake: float, gain: float) -> Float:
+def _pedals(t: FloatArray, push: float, brake: float, gain: float) -> FloatArray:
     """The whole of one pedal after the whole of the other, then half of each, as long as gives back the speed."""
     on, off = gain / push, gain / brake
     ends = np.cumsum([on, off, 1.0, 2 * off, 2 * on, 1.0])
@@ -167,33 +166,33 @@ def _pedals(t: Float, push: float, brake: float, gain: float) -> Float:
     return levels[_stage(t, ends)]
 
 
-def _sweep(t: Float, size: float) -> Float:
+def _sweep(t: FloatArray, size: float) -> FloatArray:
     return size * np.asarray(chirp(t, 0.05, float(t[-1]), 2.0, method="logarithmic", phi=-90))
 
 
-def _reversals(t: Float, whole: float) -> Float:
+def _reversals(t: FloatArray, whole: float) -> FloatArray:
     """Steps smaller than a dead band or play, ever larger."""
     sizes = np.array([0.05, 0.1, 0.15, 0.2, 0.3, 0.4])
     part = np.minimum((t // 6.0 * 6.0 / whole * len(sizes)).astype(int), len(sizes) - 1)
     return sizes[part] * np.array([1.0, -1.0, -1.0, 1.0])[(t / 1.5 + 1e-9).astype(int) % 4]
 
 
-def _ramps(t: Float, slope: float, top: float) -> Float:
+def _ramps(t: FloatArray, slope: float, top: float) -> FloatArray:
     phase = (t * slope / (4 * top)) % 1.0
     return 4 * top * np.where(phase < 0.25, phase, np.where(phase < 0.75, 0.5 - phase, phase - 1.0))
 
 
-def _holds(t: Float, size: float, each: float, rest: float) -> Float:
+def _holds(t: FloatArray, size: float, each: float, rest: float) -> FloatArray:
     """Up in three stages and down in three, without a command between."""
     return np.array([size, 0.0] * 3 + [-size, 0.0] * 3)[_stage(t, np.cumsum([each, rest] * 6))]
 
 
-def _slow_and_go(t: Float, size: float, gain: float) -> Float:
+def _slow_and_go(t: FloatArray, size: float, gain: float) -> FloatArray:
     """From walking pace up and back, and some seconds of rolling."""
     each = 2 * gain / size
     return np.array([size, 0.0, -size, 0.0])[_stage(t, np.cumsum([each, 1.0, each, 4.0]))]
 
 
-def _stage(t: Float, ends: Float) -> NDArray[np.int64]:
+def _stage(t: FloatArray, ends: FloatArray) -> IntArray:
     """Number of the stage at each moment, over and over."""
     return np.searchsorted(ends, t % ends[-1] + 1e-9, side="right").clip(0, len(ends) - 1)

@@ -7,12 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.follower.laws import Law, Seen, tensors
 from avtorch.gap.simulator.effect import delay_key
-
-Float = NDArray[np.float64]
 
 
 class LoopErrors(NamedTuple):
@@ -93,6 +91,6 @@ def keeps_speed(seen: Sequence[Seen], dt: float, *, seconds: float = 60.0) -> fl
     return float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
 
 
-def _spread(x: Float) -> float:
+def _spread(x: FloatArray) -> float:
     """About each stretch's own mean, (row, stretch)."""
     return float(np.sqrt(np.mean((x - x.mean(0)) ** 2))) + 1e-12

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.follower.closed_loop import LoopErrors, keeps_speed, loop_errors
 from avtorch.follower.followed import Followed, car_of, followed, seen_in
@@ -26,8 +26,6 @@ from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.effect import delay_effect, delay_key
 from avtorch.io import Log
-
-Float = NDArray[np.float64]
 
 _LEAST_S = 40.0
 _LOWEST, _HIGHEST = -8.0, 5.0  # of a command [m/s²]; what a law asks beyond, no car is sent
@@ -57,7 +55,7 @@ class FollowerDiagnosis:
     name: str
     law: Law
     identified: Identified = field(repr=False)
-    draws: Mapping[str, Float] = field(repr=False)
+    draws: Mapping[str, FloatArray] = field(repr=False)
     parameters: Mapping[str, Quantity]
     loops: Mapping[str, LoopErrors]
     keeps_speed: float
@@ -197,7 +195,7 @@ def _cause(
     return diagnose(late, baseline=car_of(first.values), effects=effects, seed=seed, progress=progress)
 
 
-def _parameters(law: Law, draws: Mapping[str, Float], speed: float) -> dict[str, Quantity]:
+def _parameters(law: Law, draws: Mapping[str, FloatArray], speed: float) -> dict[str, Quantity]:
     told = {
         k.removeprefix("law.").removeprefix(f"{delay_effect().name}."): Quantity.of_draws(x) for k, x in draws.items()
     }

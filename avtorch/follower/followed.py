@@ -14,8 +14,8 @@ from typing import cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.follower.laws import Law, Seen
 from avtorch.gap.likelihood.hypothesis import Coordinate, Hypothesis
@@ -24,8 +24,6 @@ from avtorch.gap.simulator.drive import Drive
 from avtorch.gap.simulator.effect import delay_effect, delay_key
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log
-
-Float = NDArray[np.float64]
 
 NEEDED = ("speed", "spacing", "lead_speed")
 
@@ -44,7 +42,7 @@ class Followed(Hypothesis):
         law = tuple(Coordinate(f"law.{p.name}", p, 1.0) for p in self.law.parameters)
         return law + tuple(c for c in super().coordinates if c.key != "K_L")
 
-    def rollouts(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
+    def rollouts(self, z: FloatArray, onset: int | None = None, *, coarse: bool = False) -> FloatArray:
         values = self.values(z)
         law = {k.partition(".")[2]: v[:, None] for k, v in values.items() if k.startswith("law.")}
         car = {k: v for k, v in values.items() if not k.startswith("law.")} | {"K_L": torch.ones(len(z)).double()}

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.follower.followed import Followed
 from avtorch.gap.likelihood.gauss_newton import finish, modes, residuals
 from avtorch.gap.likelihood.noise_fit import GUST, fit_noise
@@ -21,8 +21,6 @@ from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.posterior.density import root
 from avtorch.gap.simulator.effect import delay_key
-
-Float = NDArray[np.float64]
 
 _START = NoiseModel(process_sd=0.05, force_sd=0.1, speed_sd=0.02)
 _TURNS = 5
@@ -47,8 +45,8 @@ class Identified:
     """
 
     candidate: Followed = field(repr=False)
-    z: Float
-    covariance: Float = field(repr=False)
+    z: FloatArray
+    covariance: FloatArray = field(repr=False)
     noise: NoiseModel
     log_evidence: float
 
@@ -57,14 +55,16 @@ class Identified:
         """Parameters at the mode, by key: `law.*`, `T_L` [s], `dead_time.delay_s` [s]."""
         return {k: float(v[0]) for k, v in self.candidate.values(self.z[None]).items()}
 
-    def draws(self, covariance: Float | None = None, *, count: int = _DRAWS, seed: int = 0) -> dict[str, Float]:
+    def draws(
+        self, covariance: FloatArray | None = None, *, count: int = _DRAWS, seed: int = 0
+    ) -> dict[str, FloatArray]:
         """Parameters (draw,) of a normal posterior in `z`."""
         noise = np.random.default_rng(seed).standard_normal((count, len(self.z)))
         spread = root(self.covariance if covariance is None else covariance).numpy()
         z = np.clip(self.z + noise @ spread.T, -8.0, 8.0)
         return {k: x.numpy() for k, x in self.candidate.values(z).items()}
 
-    def errors(self, record: Record) -> Float:
+    def errors(self, record: Record) -> FloatArray:
         """Measured less rolled out (channel, counted, group) at the rows of `record`."""
         return self.candidate.on(record).errors(self.z[None])[0]
 
@@ -91,7 +91,7 @@ def identified(candidate: Followed, record: Record | None = None, *, start: Iden
     return Identified(candidate, fit.z, fit.covariance, noise, fit.log_evidence + fitted.log_prior)
 
 
-def widened(found: Identified, record: Record) -> Float:
+def widened(found: Identified, record: Record) -> FloatArray:
     """Its covariance, each coordinate wider by what fits to parts of `record` differ by beyond it."""
     count = int(min(_PARTS, record.rows * record.dt // _PART_S))
     if count < 2:
@@ -111,7 +111,7 @@ def widened(found: Identified, record: Record) -> Float:
     return found.covariance * np.outer(wider, wider)
 
 
-def _starts(candidate: Followed) -> Float:
+def _starts(candidate: Followed) -> FloatArray:
     centre = np.zeros(candidate.size)
     keys = [c.key for c in candidate.coordinates]
     if delay_key() not in keys:

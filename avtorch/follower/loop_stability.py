@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.follower.laws import Law
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.effect import delay_key
 from avtorch.vehicle.stability import chain_verdict, frequencies
 from avtorch.vehicle.stability.chain import actuator
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,7 @@ class LoopStability:
     peak_gain: Quantity | None
 
 
-def loop_stability(law: Law, draws: Mapping[str, Float], speeds: Sequence[float]) -> list[LoopStability]:
+def loop_stability(law: Law, draws: Mapping[str, FloatArray], speeds: Sequence[float]) -> list[LoopStability]:
     """For small motions about `speeds` [m/s], of draws (draw,) by key.
 
     What holds of the loop holds whatever of it is controller or car: of gains and `K_L` only the product counts.

@@ -17,10 +17,10 @@ from dataclasses import dataclass, field
 from os import PathLike
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.crossval.folds import blocks_of
 from avtorch.gap.crossval.rollout_errors import HORIZON_S, Measure, products, reached
@@ -35,7 +35,6 @@ from avtorch.gap.search.search import Search
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log
 
-Float = NDArray[np.float64]
 Simulator = GapPlant | str | PathLike[str] | None
 
 LEVEL = 0.04
@@ -122,8 +121,8 @@ class _Side:
 
     search: Search = field(repr=False)
     found: FittedModel
-    mean: Float
-    covariance: Float = field(repr=False)
+    mean: FloatArray
+    covariance: FloatArray = field(repr=False)
     blocks: int
 
     @classmethod
@@ -189,7 +188,7 @@ def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float
     }
 
 
-def _rolled(record: Record, simulator: GapPlant) -> Float:
+def _rolled(record: Record, simulator: GapPlant) -> FloatArray:
     responses = []
     for drives in record.segments:
         own = simulator.prepared(*drives)
@@ -198,7 +197,9 @@ def _rolled(record: Record, simulator: GapPlant) -> Float:
     return np.stack([record.seen(seen[name]) for name in record.channels])
 
 
-def _squares(record: Record, errors: Float, blocks: Sequence[slice], lag: float, horizon: float) -> dict[str, Float]:
+def _squares(
+    record: Record, errors: FloatArray, blocks: Sequence[slice], lag: float, horizon: float
+) -> dict[str, FloatArray]:
     """Under the names of the whole `HORIZON_S`, whatever of it the drives hold."""
     out = {}
     for channel in record.channels:
@@ -207,7 +208,7 @@ def _squares(record: Record, errors: Float, blocks: Sequence[slice], lag: float,
     return out
 
 
-def _of_draws(x: Float) -> Quantity:
+def _of_draws(x: FloatArray) -> Quantity:
     q05, q95 = np.quantile(x[1:], (0.05, 0.95))
     return Quantity(float(x[0]), float(x[1:].std()), min(float(q05), float(x[0])), max(float(q95), float(x[0])))
 

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.crossval.folds import blocks_of
 from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
 from avtorch.gap.quantity import Quantity
@@ -24,8 +24,6 @@ from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
 from avtorch.gap.simulator.effect import delay_effect, delay_key
 
-Float = NDArray[np.float64]
-
 _FELT_S = 0.03  # below it the delay's own scale, a logarithm, has no slope to go by
 
 
@@ -33,8 +31,8 @@ _FELT_S = 0.03  # below it the delay's own scale, a logarithm, has no slope to g
 class WithDelay:
     """One set of drives: `mean` and `covariance` of ln T_L, ln K_L and the dead time [s], from so many `blocks`."""
 
-    mean: Float
-    covariance: Float = field(repr=False)
+    mean: FloatArray
+    covariance: FloatArray = field(repr=False)
     blocks: int
 
     @classmethod
@@ -87,7 +85,7 @@ def later_answer(before: WithDelay, after: WithDelay, *, level: float) -> LaterA
     )
 
 
-def _chance(away: Float, covariance: Float, which: Sequence[int], blocks: int) -> float:
+def _chance(away: FloatArray, covariance: FloatArray, which: Sequence[int], blocks: int) -> float:
     """Of a difference as large in these numbers, where they are the same (Hotelling)."""
     part, count = away[list(which)], len(which)
     square = float(part @ np.linalg.solve(covariance[np.ix_(which, which)], part))
@@ -99,7 +97,7 @@ def _keys() -> tuple[str, str, str]:
     return "T_L", "K_L", delay_key()
 
 
-def _slopes(found: FittedModel, z: Float) -> list[float]:
+def _slopes(found: FittedModel, z: FloatArray) -> list[float]:
     """Of ln T_L, ln K_L and the dead time [s] by their own coordinates at `z`."""
     step = 1e-4
     keys = [c.key for c in found.hypothesis.coordinates]

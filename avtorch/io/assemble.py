@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.clock import clock_words, since, since_start
 from avtorch.io.mapping import SIGNALS, SignalMap
@@ -19,8 +20,6 @@ from avtorch.io.tables import Table, read_table
 from avtorch.io.units import to_si
 from avtorch.io.validity import check_range, check_rate, check_time
 
-Float = NDArray[np.float64]
-
 _NAME = 40  # characters of the longest column name that may be a signal's, mistyped
 
 
@@ -28,8 +27,8 @@ _NAME = 40  # characters of the longest column name that may be a signal's, mist
 class Assembled:
     """Signals ``(time,)`` in SI units by name, segment numbers from 0, columns not used, and what merging left out."""
 
-    signals: dict[str, Float]
-    segment: NDArray[np.int64]
+    signals: dict[str, FloatArray]
+    segment: IntArray
     ignored: tuple[str, ...]
     remarks: tuple[str, ...]
 
@@ -47,8 +46,8 @@ def assemble(table: Table, mapping: SignalMap, *, folder: Path, following: bool)
     if table.rows < 2:
         found = "one row" if table.rows == 1 else "a header but no rows"
         raise InputError(f"{source}: has {found}; a log needs at least two rows")
-    signals: dict[str, Float] = {}
-    arrivals: dict[str, tuple[Float, Float]] = {}
+    signals: dict[str, FloatArray] = {}
+    arrivals: dict[str, tuple[FloatArray, FloatArray]] = {}
     for signal in SIGNALS:
         column = mapping.column.get(signal, signal)
         if signal in mapping.elsewhere:
@@ -139,7 +138,7 @@ def _place(table: Table, signal: str, column: str, rows: NDArray | None = None) 
     return lambda row: table.where(row if rows is None else int(rows[row]), column) + suffix
 
 
-def _signal(table: Table, signal: str, column: str, mapping: SignalMap) -> Float:
+def _signal(table: Table, signal: str, column: str, mapping: SignalMap) -> FloatArray:
     values = table.numbers(column)
     if signal in mapping.unit:
         values = to_si(signal, mapping.unit[signal])(values)
@@ -147,7 +146,7 @@ def _signal(table: Table, signal: str, column: str, mapping: SignalMap) -> Float
     return values
 
 
-def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tuple[Float, Float]:
+def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tuple[FloatArray, FloatArray]:
     """Arrivals of a signal with a time column of its own in the log's table; rows empty in it brought nothing."""
     clock = mapping.stamp[signal]
     values = table.numbers(column, empty_is_nan=True)
@@ -163,7 +162,7 @@ def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tupl
     return _arrivals(table, signal, column, clock, values, stamps, rows, unit, mapping.unit.get(signal))
 
 
-def _from_elsewhere(signal: str, mapping: SignalMap, folder: Path) -> tuple[Float, Float]:
+def _from_elsewhere(signal: str, mapping: SignalMap, folder: Path) -> tuple[FloatArray, FloatArray]:
     """Arrivals of a signal that lies in a file of its own, beside the log."""
     there = mapping.elsewhere[signal]
     column = there.column or mapping.column.get(signal, signal)
@@ -190,9 +189,9 @@ def _within(folder: Path, file: str, signal: str) -> Path:
 
 
 def _arrivals(
-    table: Table, signal: str, column: str, clock: str, values: Float, stamps: Float, rows: NDArray,
+    table: Table, signal: str, column: str, clock: str, values: FloatArray, stamps: FloatArray, rows: NDArray,
     time_unit: str | None, unit: str | None,
-) -> tuple[Float, Float]:  # fmt: skip
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     if len(rows) == 0:
         raise InputError(f"{table.source}: column {column!r} ({signal}): holds no value at all")
     values, stamps = values[rows], stamps[rows]

@@ -15,9 +15,8 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from avtorch.arrays import FloatArray, IntArray
 
 UNIX_S = (946_684_800.0, 4_102_444_800.0)
 """Stamps in here may count seconds since 1970: the years 2000 to 2099."""
@@ -38,7 +37,7 @@ def decimals(largest: float) -> int:
     return min(_FINEST, math.floor(-math.log10(2.0 * float(np.spacing(max(abs(largest), 1.0))))))
 
 
-def since(stamps: Float, origin: float, *, largest: float | None = None) -> Float:
+def since(stamps: FloatArray, origin: float, *, largest: float | None = None) -> FloatArray:
     """`stamps` (row,) [s] as seconds from `origin`, free of the rounding of stamps of that size.
 
     `largest`: size of the stamps where more are to be rounded alike. Stamps closer than the decimals tell are left
@@ -52,7 +51,7 @@ def since(stamps: Float, origin: float, *, largest: float | None = None) -> Floa
     return away if bool(((np.diff(told) <= 0) & (np.diff(away) > 0)).any()) else told
 
 
-def since_start(stamps: Float, segment: NDArray[np.int64]) -> Float:
+def since_start(stamps: FloatArray, segment: IntArray) -> FloatArray:
     """Seconds (row,) from the first row of a log; `segment` (row,) numbers its drives, within each of which rows that
     are even as far as the stamps tell become even.
 
@@ -73,7 +72,7 @@ def since_start(stamps: Float, segment: NDArray[np.int64]) -> Float:
     return out
 
 
-def _even(time: Float, finest: float) -> Float:
+def _even(time: FloatArray, finest: float) -> FloatArray:
     """`time` (row,) on an even grid, some of whose rows may be lost, where it is off that only by its own rounding."""
     steps = np.diff(time)
     usual = float(np.median(steps)) if len(steps) else 0.0

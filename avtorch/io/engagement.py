@@ -8,19 +8,15 @@ forgotten.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import BoolArray, FloatArray
 from avtorch.io.clock import ROUNDING_S
-
-Float = NDArray[np.float64]
 
 SETTLE_S = 2.0
 """From a drive's start or a return to `engaged` until the state of actuator and sensors is known: dead time and lag."""
 
 
-def settled(
-    time: Float, engaged: NDArray[np.bool_], driven: Float | float = -np.inf
-) -> tuple[NDArray[np.bool_], Float]:
+def settled(time: FloatArray, engaged: BoolArray, driven: FloatArray | float = -np.inf) -> tuple[BoolArray, FloatArray]:
     """Rows `SETTLE_S` or more past the return, (..., time), and when the driver was last in charge [s], (...).
 
     `time` (time,) [s], rising; `engaged` (..., time); `driven` (...): when the driver was last in charge before the

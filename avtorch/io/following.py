@@ -7,16 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed
 from avtorch.io import i24, openacc
 from avtorch.io.log import Log
 from avtorch.io.mapping import Pairs
 from avtorch.io.recorded_columns import recorded
 from avtorch.io.tables import Table, read_table
-
-Float = NDArray[np.float64]
 
 _LONG_STEP_S = 0.25
 _DRIFT_M, _DRIFT_MPS = 5.0, 0.15  # by which gap and speeds may differ over a stretch
@@ -94,7 +92,7 @@ def _chosen(source: str, vehicle: int | None, followers: list[int]) -> int:
 
 
 def _log(table: Table, speed: str, spacing: str, lead: str, who: str) -> Log:
-    def column(name: str) -> Float:
+    def column(name: str) -> FloatArray:
         return table.numbers(name, empty_is_nan=True)
 
     name = f"{Path(table.source).stem}, {who}"
@@ -120,7 +118,7 @@ def _event(table: Table, event: int | None) -> Log:
     return _whole(f"NGSIM {own}", time, speed, spacing, lead)
 
 
-def _whole(name: str, time: Float, speed: Float, spacing: Float, lead: Float) -> Log:
+def _whole(name: str, time: FloatArray, speed: FloatArray, spacing: FloatArray, lead: FloatArray) -> Log:
     """The longest stretch in which everything is known, as a log."""
     known = np.isfinite(speed) & np.isfinite(lead) & np.isfinite(spacing) & (np.nan_to_num(spacing) > 0)
     steps = np.diff(time)

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.io.assemble import assemble
 from avtorch.io.atomic import atomic
@@ -36,7 +37,6 @@ Example:
     True
 """
 
-Float = NDArray[np.float64]
 AccelKind = Literal["kinematic", "specific-force"]
 
 
@@ -62,17 +62,17 @@ class Log:
         (400, 20.0, 20.0)
     """
 
-    time: Float
-    accel_cmd: Float | None
-    accel: Float | None
-    speed: Float | None
-    jerk: Float | None
-    engaged: NDArray[np.bool_]
-    spacing: Float | None
-    lead_speed: Float | None
-    lead_accel: Float | None
-    grade: Float | None
-    segment: NDArray[np.int64]
+    time: FloatArray
+    accel_cmd: FloatArray | None
+    accel: FloatArray | None
+    speed: FloatArray | None
+    jerk: FloatArray | None
+    engaged: BoolArray
+    spacing: FloatArray | None
+    lead_speed: FloatArray | None
+    lead_accel: FloatArray | None
+    grade: FloatArray | None
+    segment: IntArray
     name: str = "log"
     ignored: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -179,7 +179,7 @@ class Log:
         return float(self.time[0])
 
     @cached_property
-    def elapsed(self) -> Float:
+    def elapsed(self) -> FloatArray:
         """Seconds from the log's start, ``(time,)``: what every computation uses, free of what rounding does to stamps
         as large as Unix time (`avtorch.io.clock`)."""
         return since_start(self.time, self.segment)
@@ -195,7 +195,7 @@ class Log:
         return 1 / median_step(self.elapsed, np.diff(self.segment) == 0)
 
     @cached_property
-    def moving(self) -> NDArray[np.bool_]:
+    def moving(self) -> BoolArray:
         """Rows not at standstill, ``(time,)``; without speed as the answer to the brake tells (``standing``)."""
         if self.speed is not None:
             return self.speed >= STANDSTILL_MPS
@@ -209,12 +209,12 @@ class Log:
         return moving
 
     @property
-    def usable(self) -> NDArray[np.bool_]:
+    def usable(self) -> BoolArray:
         """Rows that belief may use, ``(time,)``: engaged, settled since the driver let go, and not at standstill."""
         return self.engaged & self.settled & self.moving
 
     @cached_property
-    def settled(self) -> NDArray[np.bool_]:
+    def settled(self) -> BoolArray:
         """Rows ``(time,)`` that do not follow so closely on a return to ``engaged`` that the car's state is unknown."""
         out = np.ones(self.rows, bool)
         if self.engaged.all():

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 
 
-def held(
-    clock: NDArray[np.float64], stamps: NDArray[np.float64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def held(clock: FloatArray, stamps: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The last value that had arrived at each tick of ``clock``, and its age [s].
 
     ``clock`` is ``(time,)``, ``stamps`` and ``values`` are ``(message,)``, stamps strictly rising; both answers are

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.io.raw_leader import RawLeader, checked
 from avtorch.io.tables import Table
@@ -84,7 +85,7 @@ def _parsed(table: Table) -> Table:
     return Table(table.source, names, tuple(table.numbers(name) for name in names), table.lines)
 
 
-def _numbers(table: Table) -> NDArray[np.float64]:
+def _numbers(table: Table) -> FloatArray:
     numbers = table.numbers("event")
     bad = numbers != np.round(numbers)
     if bad.any():

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError
 from avtorch.io.tables import Table
 from avtorch.io.validity import check_range, check_time
 
-Float = NDArray[np.float64]
 LONG_STEP_S = 1.5
 """A recording with a longer step between rows is cut there: the drive cycles come at 1 Hz, everything else at 10 Hz."""
 
@@ -34,10 +33,10 @@ class RawLeader:
         ('braking', (50,))
     """
 
-    time: Float
-    speed: Float
-    accel: Float | None
-    spacing: Float | None
+    time: FloatArray
+    speed: FloatArray
+    accel: FloatArray | None
+    spacing: FloatArray | None
     name: str
     note: str = ""
     events: tuple[int, ...] = ()
@@ -45,10 +44,10 @@ class RawLeader:
 
 def checked(
     table: Table,
-    time: Float,
-    speed: Float,
-    accel: Float | None,
-    spacing: Float | None,
+    time: FloatArray,
+    speed: FloatArray,
+    accel: FloatArray | None,
+    spacing: FloatArray | None,
     *,
     columns: dict[str, str],
     name: str = "",
@@ -89,7 +88,7 @@ def checked(
     return RawLeader(time[whole], np.maximum(speed, 0.0), accel, spacing, name, "; ".join(notes))
 
 
-def _longest(known: NDArray[np.bool_], near: NDArray[np.bool_]) -> slice | None:
+def _longest(known: BoolArray, near: BoolArray) -> slice | None:
     """The longest run of rows that are known and near to each other, at least two."""
     linked = known[1:] & known[:-1] & near
     edges = np.flatnonzero(np.diff(np.concatenate([[False], linked, [False]]).astype(int)))

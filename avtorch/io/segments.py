@@ -5,8 +5,8 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.io.clock import ROUNDING_S
 
 GAP_STEPS = 3.0
@@ -14,7 +14,7 @@ GAP_SECONDS = 0.1
 """A step longer than both GAP_STEPS median steps and GAP_SECONDS is a gap: what is shorter is jitter or a lost row."""
 
 
-def stretches(mask: NDArray[np.bool_], segment: NDArray[np.int64]) -> list[slice]:
+def stretches(mask: BoolArray, segment: IntArray) -> list[slice]:
     """Unbroken runs of rows, within one segment each, where ``mask`` holds."""
     key = np.where(mask, segment, -1)
     cuts = np.flatnonzero(np.diff(key)) + 1
@@ -22,7 +22,7 @@ def stretches(mask: NDArray[np.bool_], segment: NDArray[np.int64]) -> list[slice
     return [slice(a, b) for a, b in pairwise(edges) if mask[a]]
 
 
-def median_step(time: NDArray[np.float64], same_drive: NDArray[np.bool_]) -> float:
+def median_step(time: FloatArray, same_drive: BoolArray) -> float:
     """Median time between rows [s], steps across drives left out."""
     steps = np.diff(time)
     return float(np.median(steps[same_drive] if same_drive.any() else np.abs(steps)))

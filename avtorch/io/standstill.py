@@ -9,11 +9,11 @@ slows down on the way did not stand. A stop that asks for hardly any braking is 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
-Float = NDArray[np.float64]
-Rows = NDArray[np.bool_]
+from avtorch.arrays import BoolArray, FloatArray
+
+Rows = BoolArray
 
 _BRAKED_MPS2 = -0.5  # more than a dead band hides or a hill of 5 % takes
 _RESTS = 0.15  # of the demand at most is felt
@@ -27,7 +27,7 @@ _SINCE_S = 1.8
 _EASED_MPS2 = 0.2
 
 
-def standing(accel_cmd: Float, accel: Float, dt: float, below: float) -> Rows:
+def standing(accel_cmd: FloatArray, accel: FloatArray, dt: float, below: float) -> Rows:
     """Rows (time,) of one drive, `dt` [s] apart, in which the car is slower than `below` [m/s].
 
     `accel_cmd`, `accel` (time,) [m/s²].
@@ -46,7 +46,7 @@ def standing(accel_cmd: Float, accel: Float, dt: float, below: float) -> Rows:
     return out
 
 
-def _braked_at_rest(accel_cmd: Float, accel: Float, dt: float) -> Rows:
+def _braked_at_rest(accel_cmd: FloatArray, accel: FloatArray, dt: float) -> Rows:
     """Braked for longer than the slowest car takes to answer, and at rest."""
     brakes = accel_cmd < _BRAKED_MPS2
     rows = np.arange(len(brakes))
@@ -57,7 +57,7 @@ def _braked_at_rest(accel_cmd: Float, accel: Float, dt: float) -> Rows:
     return minimum_filter1d(rests, _count(_REST_S, dt), mode="nearest").astype(bool)
 
 
-def _halted(accel_cmd: Float, accel: Float, dt: float) -> Rows:
+def _halted(accel_cmd: FloatArray, accel: FloatArray, dt: float) -> Rows:
     """The `_FELT_S` after a deceleration ended from one row to the next but one, the brake on and not eased."""
     n, rows = _count(_FELT_S, dt), len(accel)
     if rows < 2 * n + 3:
@@ -77,7 +77,7 @@ def _halted(accel_cmd: Float, accel: Float, dt: float) -> Rows:
     return _latest_max(found.astype(float), n - 1) > 0
 
 
-def _felt(accel: Float, dt: float) -> Float:
+def _felt(accel: FloatArray, dt: float) -> FloatArray:
     return np.asarray(uniform_filter1d(accel, _count(_FELT_S, dt), mode="nearest"))
 
 
@@ -85,18 +85,18 @@ def _count(seconds: float, dt: float) -> int:
     return max(round(seconds / dt), 1)
 
 
-def _latest_max(x: Float, width: int) -> Float:
+def _latest_max(x: FloatArray, width: int) -> FloatArray:
     """The largest of each row and the `width` rows before it."""
     padded = np.concatenate([np.full(2 * width + 1, -np.inf), x])
     return np.asarray(maximum_filter1d(padded, width + 1, origin=width // 2)[2 * width + 1 :])
 
 
-def _latest_min(x: Float, width: int) -> Float:
+def _latest_min(x: FloatArray, width: int) -> FloatArray:
     """The smallest of each row and the `width` rows before it."""
     return -_latest_max(-x, width)
 
 
-def _slow(accel: Float, dt: float, below: float) -> int:
+def _slow(accel: FloatArray, dt: float, below: float) -> int:
     """Rows until a car at rest, which never rolls back, is at `below`."""
     gained = np.cumsum(accel) * dt
     speed = gained - np.minimum(np.minimum.accumulate(gained), 0.0)

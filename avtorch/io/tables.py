@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
 from avtorch.io.opening import place, read_regular
 from avtorch.io.size import MOST_BYTES, MOST_CELLS, MOST_COLUMNS
@@ -55,7 +56,7 @@ class Table:
         line = f" (line {self.lines[row]})" if self.lines is not None else ""
         return f"{self.source}: row {self.first + row + 1}{line}, column {quoted(column)}"
 
-    def numbers(self, column: str, *, empty_is_nan: bool = False) -> NDArray[np.float64]:
+    def numbers(self, column: str, *, empty_is_nan: bool = False) -> FloatArray:
         """A column as float64, ``(row,)``.
 
         Raises InputError naming row and column for an empty cell (unless ``empty_is_nan``), text, NaN and infinity.
@@ -79,7 +80,7 @@ class Table:
             raise InputError(f"{self.where(row, column)}: is {word}; a finite number is needed")
         return values
 
-    def _parse(self, cells: Sequence[Any], column: str, empty_is_nan: bool) -> tuple[NDArray[np.float64], NDArray]:
+    def _parse(self, cells: Sequence[Any], column: str, empty_is_nan: bool) -> tuple[FloatArray, NDArray]:
         values = np.empty(len(cells))
         empty = np.zeros(len(cells), dtype=bool)
         for row, cell in enumerate(cells):

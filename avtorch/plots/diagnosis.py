@@ -7,16 +7,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.crossval.localisation import UNITS, Axis
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.io.clock import time_label
 from avtorch.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILLION, styled
 from avtorch.vehicle.stability import Chain, chain_gain
-
-Float = NDArray[np.float64]
 
 _SECONDS = 25.0  # of a drive that a picture holds
 _NAMES = {"accel": "acceleration [m/s²]", "speed": "speed [m/s]"}
@@ -55,7 +53,7 @@ def gap_on_the_road(ax: Axes, found: Diagnosis, *, seconds: float = _SECONDS) ->
     return ax
 
 
-def _liveliest(time: Float, stretch: NDArray[np.int64], size: Float, seconds: float) -> slice:
+def _liveliest(time: FloatArray, stretch: IntArray, size: FloatArray, seconds: float) -> slice:
     """The window within one stretch in which `size` (row,) is largest."""
     best, worth = slice(0, len(time)), -1.0
     for number in np.unique(stretch):

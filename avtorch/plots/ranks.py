@@ -10,9 +10,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.stats import binom
 
+from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, PURPLE, VERMILLION
 
@@ -26,7 +27,7 @@ LOOKS = [
     {"color": BLACK, "linestyle": (0, (5, 1, 1, 1, 1, 1))},
 ]
 
-Counts = NDArray[np.int64]
+Counts = IntArray
 
 
 def pooled_rank_counts(groups: Mapping[str, ArrayLike], *, bins: int = 20) -> dict[str, Counts]:
@@ -173,7 +174,7 @@ def ecdf_difference(
     return ax
 
 
-def ecdf_of(values: ArrayLike, points: int = 100) -> NDArray[np.float64]:
+def ecdf_of(values: ArrayLike, points: int = 100) -> FloatArray:
     """Share of ``values`` in [0, 1] (PIT values) below ``1/points, 2/points, ..., 1``.
 
     Example:

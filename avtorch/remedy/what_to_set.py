@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from avtorch.arrays import FloatArray
 from avtorch.decision import Setting
 from avtorch.decision.algorithm2 import ACCEPTED_CHANGE
 from avtorch.decision.grid import GAINS_GRID, Grid
@@ -91,10 +91,10 @@ class WhatToSet:
 
 def what_to_set(
     plant: GapPlant,
-    belief: Mapping[str, NDArray[np.float64] | Tensor],
+    belief: Mapping[str, FloatArray | Tensor],
     *,
-    assumed: Mapping[str, NDArray[np.float64] | Tensor] | None = None,
-    commands: Sequence[float] | NDArray[np.float64] | None = None,
+    assumed: Mapping[str, FloatArray | Tensor] | None = None,
+    commands: Sequence[float] | FloatArray | None = None,
     in_force: Setting | None = None,
     grid: Grid | None = None,
     required: float = 0.95,
@@ -182,7 +182,7 @@ def what_to_set(
 
 
 def setting_for(
-    found: Diagnosis, commands: Sequence[float] | NDArray[np.float64] | None = None, **more: Any
+    found: Diagnosis, commands: Sequence[float] | FloatArray | None = None, **more: Any
 ) -> WhatToSet | None:
     """Call `what_to_set` for the car of a diagnosis; None where the verdict is `unknown`.
 
@@ -248,7 +248,7 @@ def _lower(settings: Setting) -> tuple[Tensor, Tensor]:
     return lower.raw_command(one, zero), lower.raw_command(zero, one)
 
 
-def _clipped(settings: Setting, commands: NDArray[np.float64], low: float, high: float) -> list[float]:
+def _clipped(settings: Setting, commands: FloatArray, low: float, high: float) -> list[float]:
     """Share of the log's commands that each setting would have clipped, as much larger as its inversion makes them."""
     if not len(commands):
         return [0.0] * len(settings.T_hat)

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.io import Log
 
 
@@ -83,7 +83,7 @@ def normal(mean: float, sd: float) -> dict[str, float]:
     return {"mean": mean, "sd": sd, "q05": mean - 1.6448536269514722 * sd, "q95": mean + 1.6448536269514722 * sd}
 
 
-def softmax(scores: Sequence[float]) -> NDArray[np.float64]:
+def softmax(scores: Sequence[float]) -> FloatArray:
     """Weights that sum to 1, in proportion to the exponentials."""
     x = np.asarray(scores, float)
     grown = np.exp(x - x.max())

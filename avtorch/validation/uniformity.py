@@ -12,19 +12,19 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.stats import binom, chi2, norm, poisson
 from torch import Tensor
 
+from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
 
-Array = NDArray[np.float64]
+Array = FloatArray
 
 LEAST = 1e-15
 """Pointwise probabilities below this are this: the corridor's own is known to some 1e-12 only."""
 
 
-def _counts(ranks: Tensor, draws: int) -> NDArray[np.int64]:
+def _counts(ranks: Tensor, draws: int) -> IntArray:
     """How often each rank occurs, ``(quantity, draws + 1)``."""
     if ranks.ndim != 2 or not len(ranks):
         raise InputError(f"ranks: found shape {tuple(ranks.shape)}, need (replication, quantity)")
@@ -98,7 +98,7 @@ def _cdf(draws: int) -> Array:
 
 
 @lru_cache(maxsize=64)
-def _band_counts(n: int, draws: int, level: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _band_counts(n: int, draws: int, level: float) -> tuple[IntArray, IntArray]:
     # pointwise level: no higher than the simultaneous, no lower than Bonferroni's
     low, high = np.log((1 - level) / draws) - 1e-3, np.log1p(-level)
     for _ in range(40):
@@ -108,7 +108,7 @@ def _band_counts(n: int, draws: int, level: float) -> tuple[NDArray[np.int64], N
     return _open_corridor(n, draws, np.exp(low))
 
 
-def _open_corridor(n: int, draws: int, pointwise: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _open_corridor(n: int, draws: int, pointwise: float) -> tuple[IntArray, IntArray]:
     """Least and greatest count at each rank whose two-sided pointwise p-value is above ``pointwise``."""
     cdf, pointwise = _cdf(draws), max(pointwise, LEAST)
     # ppf returns the least count with cdf >= q; nudged so that equality, which is outside, moves one on
@@ -119,7 +119,7 @@ def _open_corridor(n: int, draws: int, pointwise: float) -> tuple[NDArray[np.int
     return np.clip(low, 0, n), np.clip(high, 0, n)
 
 
-def _within(low: NDArray[np.int64], high: NDArray[np.int64], n: int, draws: int) -> float:
+def _within(low: IntArray, high: IntArray, n: int, draws: int) -> float:
     """Probability that the cumulated counts of ``n`` uniform ranks stay in ``low..high`` at every rank.
 
     Counts of a multinomial are independent Poisson counts given their sum: walk through the ranks with Poisson

@@ -8,12 +8,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from avtorch.arrays import FloatArray
 from avtorch.io import Log
-
-Float = NDArray[np.float64]
 
 _LAG_S, _GAIN, _GRAVITY = 0.35, 0.95, 9.81
 _PROCESS, _ACCEL, _SPEED = 0.05, 0.05, 0.02  # noise [m/s², m/s², m/s]
@@ -58,7 +56,7 @@ def drive(
     return Log.from_arrays(name=f"drive {seed}", time=time, accel_cmd=command, accel=read, speed=speed)
 
 
-def normal(seed: int, *shape: int) -> Float:
+def normal(seed: int, *shape: int) -> FloatArray:
     """Standard normal numbers from the bits of PCG64: NumPy promises those to stay, those of a `Generator` not."""
     bits = np.random.PCG64(seed).random_raw(int(np.prod(shape)))
     return np.asarray(ndtri(((np.asarray(bits) >> 11) + 0.5) / 2.0**53), np.float64).reshape(shape)

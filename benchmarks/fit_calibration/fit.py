@@ -12,15 +12,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.selection import model_probabilities as odds
 from avtorch.gap.selection.calibration import Odds, UnknownWeights
 from benchmarks.fit_calibration.cases import KeptCase
-
-Float = NDArray[np.float64]
 
 PRIORS: Mapping[str, tuple[float, float]] = {
     "effect": (4.0, 0.5),
@@ -49,8 +47,8 @@ class Fitted:
 
     odds: Odds
     unknown: UnknownWeights
-    z: Float
-    covariance: Float
+    z: FloatArray
+    covariance: FloatArray
 
 
 def fit(cases: Sequence[KeptCase], weights: Mapping[str, float]) -> Fitted:
@@ -72,7 +70,7 @@ def fit(cases: Sequence[KeptCase], weights: Mapping[str, float]) -> Fitted:
     return Fitted(constants, UnknownWeights(*learnt.tolist()), np.concatenate([means + sds * best, learnt]), covariance)
 
 
-def loss_of(cases: Sequence[KeptCase], weights: Mapping[str, float]) -> Callable[[Float], float]:
+def loss_of(cases: Sequence[KeptCase], weights: Mapping[str, float]) -> Callable[[FloatArray], float]:
     """Negative log posterior, but for a constant, of the eight constants of the odds [nats].
 
     Its argument (8,) are their coordinates in prior sds from the prior's means.
@@ -80,7 +78,7 @@ def loss_of(cases: Sequence[KeptCase], weights: Mapping[str, float]) -> Callable
     means, sds = (np.array([PRIORS[f.name][k] for f in fields(Odds)]) for k in (0, 1))
     named = [(case, weights[case.kind]) for case in cases if case.truth != "unknown"]
 
-    def loss(x: Float) -> float:
+    def loss(x: FloatArray) -> float:
         found = odds_at(means + sds * x)
         told = sum(w * np.log((1 - MISSED) * _share(case, found) + MISSED) for case, w in named)
         return 0.5 * float(x @ x) - float(told)
@@ -88,7 +86,7 @@ def loss_of(cases: Sequence[KeptCase], weights: Mapping[str, float]) -> Callable
     return loss
 
 
-def odds_at(z: Float) -> Odds:
+def odds_at(z: FloatArray) -> Odds:
     """Constants at coordinates (8,), see `PRIORS`."""
     return Odds(float(z[0]), *np.exp(z[1:]).tolist())
 
@@ -99,7 +97,7 @@ def regressors(case: KeptCase, constants: Odds) -> tuple[float, ...]:
     return odds.signs(top, case.none, case.left[top.name])
 
 
-def logistic(seen: Float, outside: NDArray[np.bool_], weigh: Float) -> tuple[Float, Float]:
+def logistic(seen: FloatArray, outside: BoolArray, weigh: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Weights (column,) and their covariance for regressors (case, column), by Newton's steps."""
     learnt = np.zeros(seen.shape[1])
     for _ in range(100):
@@ -120,7 +118,7 @@ def _share(case: KeptCase, constants: Odds) -> float:
     return shares.get(case.truth, 0.0) / sum(shares.values())
 
 
-def _lowest(loss: Callable[[Float], float], size: int) -> Float:
+def _lowest(loss: Callable[[FloatArray], float], size: int) -> FloatArray:
     """Where `loss` (size,) is least. It has a kink wherever two candidates are worth the same: slopes stall there, so
     lines along which no slope is needed take over, in turn until neither gains."""
     x, value = np.zeros(size), np.inf
@@ -133,7 +131,7 @@ def _lowest(loss: Callable[[Float], float], size: int) -> Float:
     return x
 
 
-def _curvature(loss: Callable[[Float], float], at: Float) -> Float:
+def _curvature(loss: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
     """Second derivatives by central differences over about one standard error, no less than the prior's own.
 
     A shorter step would take a kink for curvature, a longer one leave where the loss is a parabola.

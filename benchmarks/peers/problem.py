@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from avtorch.arrays import FloatArray
+
+Array = FloatArray
 
 NAMES = ("T_L", "K_L", "sigma")
 #: SPEC of the priors: ``log T_L``, ``log K_L`` normal with these medians and SDs, ``sigma`` half-normal [m/s^3].

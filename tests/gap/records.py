@@ -6,20 +6,18 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap import Drive, GapPlant, plant
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
 from avtorch.io import Log
 
-Float = NDArray[np.float64]
-
 BOTH = ("accel", "speed")
 QUIET = NoiseModel(force_sd=0.005)
 
 
-def command_over(time: Float) -> Float:
+def command_over(time: FloatArray) -> FloatArray:
     """[m/s²] a demand with steps and two sines, of mean near 0."""
     steps = np.array([0.7, -0.6, 0.3, -0.4])[(time / 3.5).astype(int) % 4]
     return steps + 0.5 * np.sin(0.9 * time) + 0.3 * np.sin(2.7 * time + 1)
@@ -53,7 +51,7 @@ def log_of(
     return Log.from_arrays(name=name, time=time, accel_cmd=command, **{w: given[w] for w in channels})
 
 
-def drawn_errors(noise: NoiseModel, rows: int, dt: float, rng: np.random.Generator) -> Float:
+def drawn_errors(noise: NoiseModel, rows: int, dt: float, rng: np.random.Generator) -> FloatArray:
     """Errors (2, rows) of acceleration and speed, the Ornstein-Uhlenbeck processes and their integrals exact."""
     p, w = np.zeros(rows), np.zeros(rows)
     for sd, lag in ((noise.process_sd, noise.process_time), (noise.force_sd, noise.force_time)):
@@ -62,7 +60,7 @@ def drawn_errors(noise: NoiseModel, rows: int, dt: float, rng: np.random.Generat
     return np.stack([p + noise.accel_sd * rng.standard_normal(rows), w + noise.speed_sd * rng.standard_normal(rows)])
 
 
-def errors_of(noise: NoiseModel, record: Record, rng: np.random.Generator) -> Float:
+def errors_of(noise: NoiseModel, record: Record, rng: np.random.Generator) -> FloatArray:
     """(channel, counted, 1) drawn from `noise`, every stretch by itself, from any speed."""
     parts = []
     for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
@@ -72,7 +70,7 @@ def errors_of(noise: NoiseModel, record: Record, rng: np.random.Generator) -> Fl
     return np.concatenate(parts, 1)[[BOTH.index(w) for w in record.channels], :, None]
 
 
-def ornstein(sd: float, lag: float, rows: int, dt: float, rng: np.random.Generator) -> tuple[Float, Float]:
+def ornstein(sd: float, lag: float, rows: int, dt: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """A stationary Ornstein-Uhlenbeck process at rows `dt` apart, and its integral from the first row."""
     one = covariance(sd, lag, np.array([0.0, dt]))  # p0, p1, w0, w1
     root = np.linalg.cholesky(one[np.ix_([0, 1, 3], [0, 1, 3])] + 1e-18 * np.eye(3))
@@ -86,7 +84,7 @@ def ornstein(sd: float, lag: float, rows: int, dt: float, rng: np.random.Generat
     return p, w
 
 
-def covariance(sd: float, lag: float, time: Float) -> Float:
+def covariance(sd: float, lag: float, time: FloatArray) -> FloatArray:
     """Of a stationary Ornstein-Uhlenbeck process at `time` and of its integral from 0: (2 time, 2 time)."""
     t, s = time[:, None], time[None]
     between = np.exp(-np.abs(t - s) / lag)
@@ -100,8 +98,8 @@ def covariance(sd: float, lag: float, time: Float) -> Float:
 
 
 def dense_covariance(
-    noise: NoiseModel, time: Float, channels: Sequence[str] = BOTH, *, offset_sd: float = 0.0
-) -> Float:
+    noise: NoiseModel, time: FloatArray, channels: Sequence[str] = BOTH, *, offset_sd: float = 0.0
+) -> FloatArray:
     """Covariance of the errors of `channels`, one after another, at `time` of one stretch."""
     n = len(time)
     whole = covariance(noise.process_sd, noise.process_time, time - time[0])
@@ -112,7 +110,7 @@ def dense_covariance(
     return whole[np.ix_(use, use)]
 
 
-def log_normal_density(x: Float, covariance: Float) -> float:
+def log_normal_density(x: FloatArray, covariance: FloatArray) -> float:
     root = np.linalg.cholesky(covariance)
     z = np.linalg.solve(root, x)
     return float(-0.5 * z @ z - np.log(np.diag(root)).sum() - 0.5 * len(x) * np.log(2 * np.pi))

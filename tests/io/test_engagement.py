@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from avtorch.arrays import BoolArray, IntArray
 from avtorch.io import Log, check
 from avtorch.io.engagement import SETTLE_S, settled
 
 RATE_HZ = 10
 
 
-def log_of(engaged: NDArray[np.bool_], *, segment: NDArray[np.int64] | None = None, clock: float = 0.0) -> Log:
+def log_of(engaged: BoolArray, *, segment: IntArray | None = None, clock: float = 0.0) -> Log:
     """A car at 20 m/s that does what it is told, in whoever's hands."""
     time = clock + np.arange(len(engaged)) / RATE_HZ
     command = np.sin(time)

@@ -10,15 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.crossval.random_effect_density import random_effect_density
 from avtorch.gap.crossval.refit import Refit
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 from avtorch.gap.selection.model_probabilities import complexity_penalties
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,11 +30,11 @@ class RowAttribution:
     """
 
     record: Record
-    gained: Float = field(repr=False)
+    gained: FloatArray = field(repr=False)
     paid: float
-    does: Float = field(repr=False)
-    felt: Float = field(repr=False)
-    moved: Float = field(repr=False)
+    does: FloatArray = field(repr=False)
+    felt: FloatArray = field(repr=False)
+    moved: FloatArray = field(repr=False)
 
     @classmethod
     def of(cls, race: SearchResult, found: FittedModel) -> RowAttribution:
@@ -62,6 +60,6 @@ class RowAttribution:
         return float(np.exp(-np.clip(self.gained.sum() - self.paid, 0.0, 700.0)))
 
 
-def _worth(e: Float) -> Float:
+def _worth(e: FloatArray) -> FloatArray:
     """Half the squares (counted,) of white images (channel, counted, group)."""
     return np.asarray(0.5 * (e**2).sum((0, 2)), np.float64)

@@ -11,13 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.basis import linear_splines, lowpass
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-
-Float = NDArray[np.float64]
 
 _SIZES = np.exp(np.linspace(np.log(1e-3), np.log(10.0), 25))
 _LAGS_S = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
@@ -28,10 +26,10 @@ class BlackBoxRegression:
     """Columns (column, channel, counted, 1): what unit forces and unit faults of the accelerometer show."""
 
     record: Record
-    columns: Float
+    columns: FloatArray
 
     @classmethod
-    def of(cls, record: Record, rollout: Float) -> BlackBoxRegression:
+    def of(cls, record: Record, rollout: FloatArray) -> BlackBoxRegression:
         """From a rollout (channel, counted, group) over the record."""
         forces = _shapes(record, rollout.mean(-1))
         seen = []
@@ -45,7 +43,7 @@ class BlackBoxRegression:
             columns = np.concatenate([columns, faults])
         return cls(record, columns[..., None])
 
-    def foretold(self, errors: Float, white: WhiteningFilter) -> Float:
+    def foretold(self, errors: FloatArray, white: WhiteningFilter) -> FloatArray:
         """What the regression makes of `errors` (channel, counted, group), seen only where the `white` one's record
         counts: (channel, counted, 1) over the whole record.
         """
@@ -68,7 +66,7 @@ class BlackBoxRegression:
         return (coefficients @ columns.reshape(len(columns), -1)).reshape(columns.shape[1:])
 
 
-def _shapes(record: Record, rollout: Float) -> Float:
+def _shapes(record: Record, rollout: FloatArray) -> FloatArray:
     """Forces (column, counted) [m/s²]; nothing that a row's own noise has touched."""
     dt = record.dt
     a = rollout[0] if "accel" in record.channels else np.gradient(rollout[-1]) / dt

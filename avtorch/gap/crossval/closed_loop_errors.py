@@ -17,12 +17,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import bilinear, lfilter
 
+from avtorch.arrays import FloatArray
 from avtorch.vehicle.controllers import NOMINAL_GAINS
-
-Float = NDArray[np.float64]
 
 _LEAST_DECAY = 0.02  # [1/s], slower than which a loop does not forget within a block
 
@@ -61,7 +59,7 @@ class LoopMeasure:
         """Whether the loop forgets."""
         return bool(np.roots(self._transfer[1]).real.max() < -_LEAST_DECAY)
 
-    def products(self, x: Float, blocks: Sequence[slice], dt: float, lag: float) -> Float:
+    def products(self, x: FloatArray, blocks: Sequence[slice], dt: float, lag: float) -> FloatArray:
         """(block, one, other): sums over each block of products of errors in the loop.
 
         From those of long rollouts, `x` (one, row); `dt` [s] between rows. `lag` is not used: the loop has its own.
@@ -69,7 +67,7 @@ class LoopMeasure:
         off = self.of(x, dt)
         return np.stack([off[:, b] @ off[:, b].T for b in blocks])
 
-    def of(self, errors: Float, dt: float) -> Float:
+    def of(self, errors: FloatArray, dt: float) -> FloatArray:
         """Errors (..., row) in the loop from those of a long rollout (..., row), both nothing at the first row.
 
         `dt` [s] between rows.

@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.crossval.black_box import BlackBoxRegression
 from avtorch.gap.crossval.closed_loop_errors import LoopMeasure, loop_measures
 from avtorch.gap.crossval.folds import Fold, folds, whole_drive_folds
@@ -28,7 +28,6 @@ from avtorch.gap.search.initial_values import effect_starts
 from avtorch.gap.selection.model_probabilities import complexity_penalties
 from avtorch.gap.simulator.effect import EFFECTS, Effect
 
-Float = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
 _RIVALS = 2  # besides the bare baseline and the verdict
@@ -51,7 +50,7 @@ class CrossValidation:
     measures: Sequence[Measure | LoopMeasure]
     sums: Mapping[str, FoldScores]
     floor: NoiseFloor
-    rows: Float
+    rows: FloatArray
     chosen: float
     sham: type[Effect] | None
     by_chance: bool = False
@@ -133,7 +132,7 @@ def _contenders(race: SearchResult, verdict: FittedModel, price: Mapping[str, fl
     return [race.none, *([] if verdict is race.none else [verdict]), *rivals]
 
 
-def _foretold(refit: Refit, part: Fold) -> Float:
+def _foretold(refit: Refit, part: Fold) -> FloatArray:
     """What a black box makes of a refit's errors."""
     record = refit.found.hypothesis.record
     return BlackBoxRegression.of(record, record.measured - refit.errors).foretold(refit.errors, refit.white(part.fits))

@@ -14,9 +14,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from avtorch.arrays import BoolArray, IntArray
 from avtorch.gap.likelihood.record import Record
 
-Rows = NDArray[np.bool_]
+Rows = BoolArray
 
 FOLDS = 5
 _BLOCKS = 20  # of a long drive
@@ -65,7 +66,7 @@ def whole_drive_folds(record: Record, parts: int = FOLDS) -> list[set[int]]:
     return groups
 
 
-def _drive_of(record: Record) -> NDArray[np.int64]:
+def _drive_of(record: Record) -> IntArray:
     """Number of the segment that each counted row is of."""
     each = 1 if record.coarse is record.drives else record.group
     ends = np.cumsum([len(d.time) * each // record.group for d in record.coarse])

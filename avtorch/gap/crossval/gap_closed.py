@@ -13,16 +13,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm as normal
 from scipy.stats import t as student
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.crossval.cross_validate import CrossValidation
 from avtorch.gap.crossval.noise_floor import drawn, expected
 from avtorch.gap.crossval.rollout_errors import HORIZON_S, reached
 from avtorch.gap.quantity import Quantity
-
-Float = NDArray[np.float64]
 
 DENSITY = "log_predictive_density"
 _DRAWS = 2000
@@ -129,7 +127,9 @@ def gap_closed(held: CrossValidation) -> Shrinkage:
     )
 
 
-def _floors(sums: Mapping[str, Float], mean: Float, draws: Float, rng: np.random.Generator, *, better: int) -> Float:
+def _floors(
+    sums: Mapping[str, FloatArray], mean: FloatArray, draws: FloatArray, rng: np.random.Generator, *, better: int
+) -> FloatArray:
     """(1 + draw, block), the mean first.
 
     The flexible regression's, where by more than blocks differ it beats the model by a tenth of the gap or more: where
@@ -151,10 +151,10 @@ class _Told:
     """By one measure: sums by name (block,), `floors` (1 + draw, block), rows (block,), and how often each block is
     drawn (draw, block). `better` -1: sums are of squares, of whose means the roots count."""
 
-    sums: Mapping[str, Float]
-    floors: Float
-    rows: Float
-    again: Float
+    sums: Mapping[str, FloatArray]
+    floors: FloatArray
+    rows: FloatArray
+    again: FloatArray
     better: int
 
     def all_in(self, name: str) -> float:
@@ -179,7 +179,7 @@ class _Told:
             return before > _TELLS * floor
         return (floor - before) * self.rows.sum() > _TELLS_NATS
 
-    def _mean(self, sums: Float, weights: Float) -> Float:
+    def _mean(self, sums: FloatArray, weights: FloatArray) -> FloatArray:
         """Of a row, over blocks (..., block) weighed (..., block)."""
         mean = (weights * sums).sum(-1) / (weights * self.rows).sum(-1)
         return np.sqrt(np.maximum(mean, 0.0)) if self.better < 0 else mean
@@ -187,7 +187,7 @@ class _Told:
     def _share(self, one: str, other: str) -> Quantity:
         """Of the reducible gap, what lies between two sums."""
 
-        def share(weights: Float, floors: Float) -> Float:
+        def share(weights: FloatArray, floors: FloatArray) -> FloatArray:
             before, a, b = (self._mean(self.sums[name], weights) for name in ("before", one, other))
             whole = before - self._mean(floors, weights)
             return (a - b) / np.where(np.abs(whole) > 1e-12, whole, np.nan)

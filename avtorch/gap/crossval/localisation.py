@@ -13,12 +13,10 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.crossval.attribution import RowAttribution
-
-Float = NDArray[np.float64]
 
 _MOST = 0.95  # of the sizes of what the cause does
 _PLAINLY = 0.6  # of the rows since it set in, for more of which a stretch is no part
@@ -84,7 +82,7 @@ def _stretches(shown: RowAttribution, onset_s: float | None, lag: float) -> Iter
         yield _part(shown, "time", time, onset_s, float(time[-1]), since_then)
     if not does.any():
         return
-    axes: list[tuple[Axis, Float]] = [("time", time)] if onset_s is None and one_clock else []
+    axes: list[tuple[Axis, FloatArray]] = [("time", time)] if onset_s is None and one_clock else []
     if record.speed is not None:
         axes.append(("speed", record.speed.mean(-1)[record.source]))
     # what the car is about to do: an effect of the command shows when the actuator has followed
@@ -100,7 +98,7 @@ def _stretches(shown: RowAttribution, onset_s: float | None, lag: float) -> Iter
             yield part if axis != "command" else (axis, *_own_ends(x, low, high, record.command), *part[3:])
 
 
-def _own_ends(x: Float, low: float, high: float, command: Float) -> tuple[float, float]:
+def _own_ends(x: FloatArray, low: float, high: float, command: FloatArray) -> tuple[float, float]:
     """`low` and `high` of an answered command `x`; where it goes no further, as far as the `command` itself goes."""
     return (
         float(command.min()) if low <= x.min() + 1e-9 else low,
@@ -108,12 +106,12 @@ def _own_ends(x: Float, low: float, high: float, command: Float) -> tuple[float,
     )
 
 
-def _part(shown: RowAttribution, axis: Axis, x: Float, low: float, high: float, does: Float) -> Part:
+def _part(shown: RowAttribution, axis: Axis, x: FloatArray, low: float, high: float, does: FloatArray) -> Part:
     inside = (x >= low) & (x <= high)
     return axis, low, high, float(does[inside].sum() / does.sum()), float(shown.gained[inside].sum())
 
 
-def shortest(x: Float, weight: Float, share: float) -> tuple[float, float]:
+def shortest(x: FloatArray, weight: FloatArray, share: float) -> tuple[float, float]:
     """Ends of the shortest interval of `x` (row,) that holds `share` of the `weight` (row,)."""
     order = np.argsort(x)
     x, total = x[order], np.concatenate([[0.0], np.cumsum(weight[order])])

@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from avtorch.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +23,8 @@ class NoiseFloor:
     density falls short of the best that it might be.
     """
 
-    squares: Float
-    nats: Float
+    squares: FloatArray
+    nats: FloatArray
 
     @classmethod
     def joined(cls, parts: Sequence[NoiseFloor]) -> NoiseFloor:
@@ -37,12 +36,12 @@ class NoiseFloor:
         return self.nats.shape[-1] - 1
 
 
-def expected(form: Float) -> Float:
+def expected(form: FloatArray) -> FloatArray:
     """Mean (...,) of a form (..., 1 + axis, 1 + axis) over `z`."""
     return np.trace(form, axis1=-2, axis2=-1)
 
 
-def drawn(form: Float, z: Float) -> Float:
+def drawn(form: FloatArray, z: FloatArray) -> FloatArray:
     """Values (draw, ...) of a form (..., 1 + axis, 1 + axis) at `z` (draw, axis)."""
     known = np.concatenate([np.ones((len(z), 1)), z], 1)
     return np.einsum("di,...ij,dj->d...", known, form, known, optimize=True)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search import command_errors
@@ -14,10 +14,8 @@ from avtorch.gap.search.lost_messages import rows_gained
 from avtorch.gap.search.outliers import heavy_tails
 from avtorch.gap.search.random_effects import variance_of
 
-Float = NDArray[np.float64]
 
-
-def random_effect_density(found: FittedModel, raw: Record, fits: Record) -> Float:
+def random_effect_density(found: FittedModel, raw: Record, fits: Record) -> FloatArray:
     """Log density (counted,) [nats] that the find's glitches or losses gain in each row of its record.
 
     Fractions and sizes are those of the rows that count in `fits`, but for a user's errors of the command, which are

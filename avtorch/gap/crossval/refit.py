@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.gauss_newton import GaussNewtonFit, acting, finish, grade_marginal, modes, residuals
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import GUST, PRIORS, fit_noise
@@ -20,8 +20,6 @@ from avtorch.gap.likelihood.noise_segments import whitening_filter
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter, sensed
 from avtorch.gap.search.fitted_model import FittedModel
-
-Float = NDArray[np.float64]
 
 _TURNS = 3  # of parameters and noise
 _ENOUGH = 0.1  # nats
@@ -36,13 +34,13 @@ class Refit:
 
     found: FittedModel = field(repr=False)
     fits: Record = field(repr=False)
-    z: Float
-    covariance: Float = field(repr=False)
+    z: FloatArray
+    covariance: FloatArray = field(repr=False)
     noise: NoiseModel
     log_evidence: float
     onset: int | None
     gust_onset: int | None
-    profile: Float | None = field(default=None, repr=False)
+    profile: FloatArray | None = field(default=None, repr=False)
 
     @classmethod
     def of(cls, found: FittedModel, fits: Record) -> Refit:
@@ -113,19 +111,19 @@ class Refit:
         return {k: float(v[0]) for k, v in self.found.hypothesis.values(self.z[None]).items()}
 
     @cached_property
-    def errors(self) -> Float:
+    def errors(self) -> FloatArray:
         """Measured less rolled out over the whole record, (channel, counted, group)."""
         hypothesis = self.found.hypothesis
         return hypothesis.record.measured - self._rolled(hypothesis, self.z)
 
     @cached_property
-    def effect(self) -> Float:
+    def effect(self) -> FloatArray:
         """What its effects do over the whole record, (channel, counted, group): its rollout less one without them."""
         hypothesis = self.found.hypothesis
         return self._rolled(hypothesis, self.z) - hypothesis.baseline_rollouts(self.z[None])[0]
 
     @cached_property
-    def felt(self) -> Float:
+    def felt(self) -> FloatArray:
         """What of that is the accelerometer's alone, (channel, counted, group)."""
         hypothesis = self.found.hypothesis
         others = tuple(e for e in hypothesis.effects if e.place != "sensor")
@@ -134,7 +132,7 @@ class Refit:
         car = Hypothesis(hypothesis.record, others, hypothesis.baseline)
         return self._rolled(hypothesis, self.z) - self._rolled(car, car.z_of(self.values))
 
-    def _rolled(self, hypothesis: Hypothesis, z: Float) -> Float:
+    def _rolled(self, hypothesis: Hypothesis, z: FloatArray) -> FloatArray:
         """Rollout (channel, counted, group) with the slope that was found, where the hypothesis has one."""
         record, onset = hypothesis.record, self.onset if hypothesis.effects else None
         rolled = hypothesis.rollouts(z[None], onset)[0]
@@ -146,11 +144,11 @@ class Refit:
         )
         return rolled + sensed(record, noise, acting(whitening_filter(record, noise, onset=onset), part, onset))
 
-    def around(self, steps: Float) -> Float:
+    def around(self, steps: FloatArray) -> FloatArray:
         """Rollouts over the whole record at `z` plus `steps` (step, coordinate): (step, channel, counted, group)."""
         return self.found.hypothesis.rollouts(self.z + steps, self.onset)
 
-    def slope_spread(self, white: WhiteningFilter) -> Float:
+    def slope_spread(self, white: WhiteningFilter) -> FloatArray:
         """Standard deviations (axis, channel, counted, group) along the axes of the slope's posterior.
 
         As errors made `white` on the rows that fit tell it.

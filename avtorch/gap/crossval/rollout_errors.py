@@ -17,13 +17,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.crossval.closed_loop_errors import LoopMeasure
 from avtorch.gap.likelihood.record import Record
-
-Float = NDArray[np.float64]
 
 HORIZON_S = 10.0
 """The horizon of all that has no other in its name, of both channels: the speed of a whole drive's rollout wanders off
@@ -43,7 +41,7 @@ class Measure:
         over = {HORIZON_S: "", None: "_whole"}.get(self.horizon_s, f"_{self.horizon_s or 0:g}s")
         return f"rollout_rmse_{self.channel}{over}"
 
-    def products(self, x: Float, blocks: Sequence[slice], dt: float, lag: float) -> Float:
+    def products(self, x: FloatArray, blocks: Sequence[slice], dt: float, lag: float) -> FloatArray:
         """(block, one, other): sums over each block of products of the errors of rollouts within a stretch.
 
         From those of a long one, `x` (one, row) of this channel; `dt` [s] between rows, `lag` [s] of the actuator.
@@ -69,7 +67,7 @@ class Measure:
         return np.stack(out)
 
 
-def _window(x: Float, length: int, keeps: float) -> Float:
+def _window(x: FloatArray, length: int, keeps: float) -> FloatArray:
     """Sums (..., row) over the last `length` rows of `x`, each weighed by `keeps` to the power of its age."""
     if keeps < 1.0:
         ended = np.zeros_like(x)
@@ -81,8 +79,8 @@ def _window(x: Float, length: int, keeps: float) -> Float:
 
 
 def products(
-    measure: Measure | LoopMeasure, record: Record, errors: Float, blocks: Sequence[slice], lag: float
-) -> Float:
+    measure: Measure | LoopMeasure, record: Record, errors: FloatArray, blocks: Sequence[slice], lag: float
+) -> FloatArray:
     """(block, one, other): sums of products of `errors` (one, channel, counted, group) of long rollouts, by a measure.
 
     `blocks` of counted rows, each within a stretch; `lag` [s]. Rollouts begin wherever a stretch was measured, whether
@@ -99,7 +97,7 @@ def products(
     return out
 
 
-def rms(measure: Measure, record: Record, errors: Float, lag: float) -> float:
+def rms(measure: Measure, record: Record, errors: FloatArray, lag: float) -> float:
     """Root mean square of a long rollout's `errors` (channel, counted, group) by a measure, over all rows that count;
     `lag` [s]."""
     edges = [*record.starts.tolist(), record.rows]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from avtorch.arrays import BoolArray, FloatArray
 from avtorch.gap.crossval.closed_loop_errors import LoopMeasure
 from avtorch.gap.crossval.folds import Fold
 from avtorch.gap.crossval.noise_floor import NoiseFloor
@@ -17,15 +18,13 @@ from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.posterior.density import root
 
-Float = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class FoldScores:
     """Sums over the rows of each block: `squares` (measure, block) of rollout errors, log density `nats` (block,)."""
 
-    squares: Float
-    nats: Float
+    squares: FloatArray
+    nats: FloatArray
 
     @classmethod
     def joined(cls, parts: Sequence[FoldScores]) -> FoldScores:
@@ -42,11 +41,11 @@ class FoldScorer:
     measures: Sequence[Measure | LoopMeasure]
     lag: float
 
-    def products(self, errors: Float) -> Float:
+    def products(self, errors: FloatArray) -> FloatArray:
         """(measure, block, one, other) of errors (one, channel, counted, group)."""
         return np.stack([products(m, self.record, errors, self.part.blocks, self.lag) for m in self.measures])
 
-    def judged(self, refit: Refit, *, less: Float | None = None, chance: Float | None = None) -> FoldScores:
+    def judged(self, refit: Refit, *, less: FloatArray | None = None, chance: FloatArray | None = None) -> FoldScores:
         """A refit; `less`: what else (channel, counted, 1) is taken off its errors, `chance` (counted,) [nats]: what
         else is added to the density of each row."""
         errors = refit.errors if less is None else refit.errors - less
@@ -55,7 +54,7 @@ class FoldScorer:
             self.products(errors[None])[..., 0, 0], self._by_block(nats if chance is None else nats + chance)
         )
 
-    def row_nats(self, refit: Refit, *, less: Float | None = None) -> Float:
+    def row_nats(self, refit: Refit, *, less: FloatArray | None = None) -> FloatArray:
         """Log density (counted,) of each row that judges, 0 elsewhere."""
         errors = refit.errors if less is None else refit.errors - less
         out = np.zeros(self.record.rows)
@@ -63,7 +62,7 @@ class FoldScorer:
         out[rows] = self._white(refit).row_likelihoods(errors[:, rows])
         return out
 
-    def floor(self, refit: Refit, images: Float) -> NoiseFloor:
+    def floor(self, refit: Refit, images: FloatArray) -> NoiseFloor:
         """What noise leaves over of a refit, whose parameters move its errors by `images` (axis, channel, counted,
         group) (`parameter_spread`)."""
         errors = np.concatenate([refit.errors[None], images])
@@ -76,7 +75,7 @@ class FoldScorer:
             nats[j] = 0.5 * some @ some.T
         return NoiseFloor(self.products(errors), nats)
 
-    def _by_block(self, nats: Float) -> Float:
+    def _by_block(self, nats: FloatArray) -> FloatArray:
         """Sums (block,) over rows (counted,)."""
         return np.array([nats[b].sum() for b in self.part.blocks])
 
@@ -89,14 +88,14 @@ class FoldScorer:
         return number
 
     @property
-    def inside(self) -> NDArray[np.bool_]:
+    def inside(self) -> BoolArray:
         """Which counted rows (counted,) lie in the blocks."""
         inside = np.zeros(self.record.rows, bool)
         inside[self.part.rows] = True
         return inside
 
     @property
-    def rows(self) -> Float:
+    def rows(self) -> FloatArray:
         """Rows (block,), single ones."""
         return np.array([(b.stop - b.start) * self.record.group for b in self.part.blocks], float)
 
@@ -104,7 +103,7 @@ class FoldScorer:
         return refit.white(self.part.judges)
 
 
-def parameter_spread(refit: Refit) -> Float:
+def parameter_spread(refit: Refit) -> FloatArray:
     """What a standard deviation along each axis of the posterior moves, (axis, channel, counted, group).
 
     By the curvature on the rows that fit. A step that leaves the joint density lower than a normal posterior would have

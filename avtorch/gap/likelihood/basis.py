@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-Float = NDArray[np.float64]
+from avtorch.arrays import FloatArray
 
 
-def lowpass(x: Float, seconds: float, dt: float) -> Float:
+def lowpass(x: FloatArray, seconds: float, dt: float) -> FloatArray:
     """x (row,) through a first-order lag, settled at its first value."""
     share = -np.expm1(-dt / seconds)
     return np.asarray(lfilter([share], [1, share - 1], x - x[0])) + x[0]
 
 
-def linear_splines(x: Float, knots: int) -> Float:
+def linear_splines(x: FloatArray, knots: int) -> FloatArray:
     """Piecewise linear functions (function, row) of x (row,), each 1 at one of its quantiles."""
     at = np.unique(np.quantile(x, np.linspace(0.01, 0.99, knots)))
     if len(at) < 2:

@@ -10,13 +10,11 @@ from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.grade_marginal import GradeMarginal
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter, sensed
-
-Float = NDArray[np.float64]
 
 _STEP = 1e-4
 _LONGEST = 1.0
@@ -30,25 +28,25 @@ class GaussNewtonFit:
     `grade_rms`, `profile`: of a road's slope.
     """
 
-    z: Float
-    covariance: Float = field(repr=False)
-    errors: Float = field(repr=False)
+    z: FloatArray
+    covariance: FloatArray = field(repr=False)
+    errors: FloatArray = field(repr=False)
     log_joint: float
     log_evidence: float
     grade_rms: float | None = None
-    profile: Float | None = None
+    profile: FloatArray | None = None
 
 
 def modes(
     hypothesis: Hypothesis,
     white: WhiteningFilter,
-    starts: Float,
+    starts: FloatArray,
     *,
     onset: int | None = None,
     iterations: int = 8,
     coarse: bool = False,
     enough: float = 0.01,
-) -> tuple[Float, Float]:
+) -> tuple[FloatArray, FloatArray]:
     """Modes (start, coordinate) and their log joint densities (start,), from `starts` (start, coordinate).
 
     `coarse`: on rollouts of averaged commands, several times as fast, good for a first look. A start has arrived once
@@ -82,8 +80,8 @@ def modes(
 
 
 def _quadratic(
-    hypothesis: Hypothesis, white: WhiteningFilter, z: Float, onset: int | None, coarse: bool = False
-) -> tuple[Float, Float, Float]:
+    hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int | None, coarse: bool = False
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Gradient, Gauss-Newton matrix and value of the negative log joint density (less its constant) at `z`."""
     count, size = z.shape
     moved = np.repeat(z[:, None], size + 1, 1)
@@ -102,7 +100,9 @@ def _quadratic(
     return cross + z, square + np.eye(size), value + 0.5 * (z**2).sum(1)
 
 
-def whitened_jacobian(hypothesis: Hypothesis, white: WhiteningFilter, z: Float, onset: int | None = None) -> Float:
+def whitened_jacobian(
+    hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int | None = None
+) -> FloatArray:
     """White directions (direction, row) in which its parameters and its road's slope move a rollout from `z`."""
     moved = np.repeat(z[None], len(z) + 1, 0)
     moved[1:] += _STEP * np.eye(len(z))
@@ -114,8 +114,13 @@ def whitened_jacobian(hypothesis: Hypothesis, white: WhiteningFilter, z: Float, 
 
 
 def _integrated(
-    slope: GradeMarginal, columns: Float, base: Float, square: Float, cross: Float, value: Float
-) -> tuple[Float, Float, Float]:
+    slope: GradeMarginal,
+    columns: FloatArray,
+    base: FloatArray,
+    square: FloatArray,
+    cross: FloatArray,
+    value: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The quadratic with the slope's coefficients and size integrated out, (start, ...)."""
     match = base @ slope.image.T
     towards = columns @ slope.image.T
@@ -125,7 +130,7 @@ def _integrated(
     return square, cross, value - total
 
 
-_LAST: WeakKeyDictionary[WhiteningFilter, tuple[Float, int | None, GradeMarginal]] = WeakKeyDictionary()
+_LAST: WeakKeyDictionary[WhiteningFilter, tuple[FloatArray, int | None, GradeMarginal]] = WeakKeyDictionary()
 
 
 def grade_marginal(white: WhiteningFilter, hypothesis: Hypothesis, onset: int | None, *, coarse: bool) -> GradeMarginal:
@@ -141,7 +146,7 @@ def grade_marginal(white: WhiteningFilter, hypothesis: Hypothesis, onset: int | 
     return made
 
 
-def acting(white: WhiteningFilter, force: Float, onset: int | None) -> Float:
+def acting(white: WhiteningFilter, force: FloatArray, onset: int | None) -> FloatArray:
     """What a slope does (..., channel, counted, group), if only from `onset` on."""
     if onset is None:
         return force
@@ -153,16 +158,16 @@ def acting(white: WhiteningFilter, force: Float, onset: int | None) -> Float:
 
 
 def residuals(
-    hypothesis: Hypothesis, white: WhiteningFilter, z: Float, onset: int | None = None, *, coarse: bool
-) -> Float:
+    hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int | None = None, *, coarse: bool
+) -> FloatArray:
     """Errors (channel, counted, group) at `z` (coordinate,), less what a road's slope explains of them."""
     errors = hypothesis.errors(z[None], onset, coarse=coarse)[0]
     return errors if hypothesis.grade_means is None else errors - _sloped(hypothesis, white, errors, onset)[2]
 
 
 def _sloped(
-    hypothesis: Hypothesis, white: WhiteningFilter, errors: Float, onset: int | None
-) -> tuple[float, Float, Float]:
+    hypothesis: Hypothesis, white: WhiteningFilter, errors: FloatArray, onset: int | None
+) -> tuple[float, FloatArray, FloatArray]:
     """`grade_rms`, coefficients (knot,), and what they do to the errors."""
     rms, profile = grade_marginal(white, hypothesis, onset, coarse=errors.shape[-1] == 1).told(white(errors).ravel())
     part = hypothesis.grade_response(profile)
@@ -170,7 +175,7 @@ def _sloped(
     return rms, profile, sensed(white.record, white.noise, acting(white, part, onset))
 
 
-def finish(hypothesis: Hypothesis, white: WhiteningFilter, z: Float, onset: int | None = None) -> GaussNewtonFit:
+def finish(hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int | None = None) -> GaussNewtonFit:
     """Covariance, errors and Laplace evidence at a mode `z` (coordinate,)."""
     size = len(z)
     _, square, value = (x[0] for x in _quadratic(hypothesis, white, z[None], onset))

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-Float = NDArray[np.float64]
+from avtorch.arrays import FloatArray
 
 SIZES = np.exp(np.linspace(np.log(2e-4), np.log(0.1), 97))
 """Values of `grade_rms` over which is integrated."""
@@ -21,60 +20,60 @@ _CENTRE, _SPREAD = 0.012, 1.2  # log-normal prior of `grade_rms`: about 1.2 %, w
 class GradeMarginal:
     """White `image` (knot, row) of the slope's columns turned to principal `axes` (knot, axis), and their squares."""
 
-    image: Float = field(repr=False)
-    squares: Float
-    axes: Float = field(repr=False)
+    image: FloatArray = field(repr=False)
+    squares: FloatArray
+    axes: FloatArray = field(repr=False)
 
     @classmethod
-    def of(cls, image: Float) -> GradeMarginal:
+    def of(cls, image: FloatArray) -> GradeMarginal:
         """From the white image (knot, row) of each coefficient at `grade_rms` 1."""
         squares, axes = np.linalg.eigh(image @ image.T)
         return cls(axes.T @ image, np.maximum(squares, 0.0), axes)
 
     @property
-    def shrinkage(self) -> Float:
+    def shrinkage(self) -> FloatArray:
         """(size, knot): how much of each axis' match is taken for slope."""
         square = SIZES[:, None] ** 2
         return square / (1 + square * self.squares)
 
     @property
-    def prior(self) -> Float:
+    def prior(self) -> FloatArray:
         """(size,): log prior mass of each size, with what its coefficients' spread costs."""
         away = (np.log(SIZES) - np.log(_CENTRE)) / _SPREAD
         mass = np.log(np.log(SIZES[1] / SIZES[0]) / (_SPREAD * np.sqrt(2 * np.pi)))
         return mass - 0.5 * away**2 - 0.5 * np.log1p(SIZES[:, None] ** 2 * self.squares).sum(1)
 
-    def by_size(self, match: Float) -> Float:
+    def by_size(self, match: FloatArray) -> FloatArray:
         """Log likelihood gained (column, size) by errors whose `match` with the axes is (column, knot)."""
         return self.prior + 0.5 * match**2 @ self.shrinkage.T
 
-    def weighed(self, match: Float) -> tuple[Float, Float]:
+    def weighed(self, match: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Log likelihood gained (column,) for a `match` (column, knot), and the share of each axis' taken for slope."""
         gains = self.by_size(match)
-        total: Float = np.asarray(logsumexp(gains, axis=1))
+        total: FloatArray = np.asarray(logsumexp(gains, axis=1))
         return total, np.exp(gains - total[:, None]) @ self.shrinkage
 
-    def told(self, errors: Float) -> tuple[float, Float]:
+    def told(self, errors: FloatArray) -> tuple[float, FloatArray]:
         """The best `grade_rms`, and the posterior mean of the coefficients (knot,), given white errors (row,)."""
         match = (errors @ self.image.T)[None]
         _, taken = self.weighed(match)
         return float(SIZES[self.by_size(match)[0].argmax()]), (taken * match)[0] @ self.axes.T
 
-    def gained(self, errors: Float) -> tuple[Float, Float]:
+    def gained(self, errors: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Log likelihood gained (column,) by white errors (column, row), and what part of them is taken for slope."""
         match = errors @ self.image.T
         total, taken = self.weighed(match)
         return total, (taken * match) @ self.image
 
-    def from_rows(self, errors: Float, rows: Sequence[int]) -> Float:
+    def from_rows(self, errors: FloatArray, rows: Sequence[int]) -> FloatArray:
         """Log likelihood gained (onset,) by white errors (channel, row) if the slope acts from each of `rows` on only.
 
         What a coefficient does before an onset is cut off its image, which is as good as exact some rows after it.
         """
         image = self.image.reshape(len(self.image), *errors.shape)
         ends = [*sorted(rows), errors.shape[-1]]
-        gram: Float = np.zeros((len(image), len(image)))
-        match: Float = np.zeros(len(image))
+        gram: FloatArray = np.zeros((len(image), len(image)))
+        match: FloatArray = np.zeros(len(image))
         found: dict[int, float] = {}
         for begin, end in reversed(list(pairwise(ends))):
             part = image[..., begin:end].reshape(len(image), -1)
@@ -84,7 +83,7 @@ class GradeMarginal:
             found[begin] = float(late.weighed((match @ axes)[None])[0][0])
         return np.array([found[row] for row in rows])
 
-    def sampled(self, match: Float, rng: np.random.Generator) -> Float:
+    def sampled(self, match: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Coefficients (column, knot) drawn given what errors have in common with the axes, (column, knot)."""
         gains = self.by_size(match)
         taken = self.shrinkage[(gains + rng.gumbel(size=gains.shape)).argmax(1)]

@@ -16,8 +16,8 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.simulator.drive import Drive, Response
 from avtorch.gap.simulator.effect import Effect, effect_class
@@ -25,8 +25,6 @@ from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.simulator.rollout_from_onset import rollout_from_onset
-
-Float = NDArray[np.float64]
 
 _WIDER = 2.0
 
@@ -39,7 +37,7 @@ class Coordinate:
     parameter: Parameter
     wider: float
 
-    def value(self, z: Float) -> torch.Tensor:
+    def value(self, z: FloatArray) -> torch.Tensor:
         return self.parameter.constrain(torch.as_tensor(self.wider * z))
 
     def z_of(self, value: float) -> float:
@@ -47,8 +45,8 @@ class Coordinate:
         return float(np.clip(z, -4.0, 4.0))
 
 
-_MEANS: WeakKeyDictionary[Record, dict[type[Integrated], Float]] = WeakKeyDictionary()
-_ROWS: WeakKeyDictionary[Record, dict[type[Integrated], Float]] = WeakKeyDictionary()
+_MEANS: WeakKeyDictionary[Record, dict[type[Integrated], FloatArray]] = WeakKeyDictionary()
+_ROWS: WeakKeyDictionary[Record, dict[type[Integrated], FloatArray]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,20 +94,20 @@ class Hypothesis:
     def size(self) -> int:
         return len(self.coordinates)
 
-    def values(self, z: Float) -> dict[str, torch.Tensor]:
+    def values(self, z: FloatArray) -> dict[str, torch.Tensor]:
         """Parameters by key, (column,), for `z` (column, coordinate)."""
         return {c.key: c.value(z[:, i]) for i, c in enumerate(self.coordinates)}
 
-    def held(self, z: Float, onset: int | None) -> Float:
+    def held(self, z: FloatArray, onset: int | None) -> FloatArray:
         """`z` (column, coordinate) with what only an onset can tell put to its prior's centre where there is none."""
         rests = [c.parameter.of_onset for c in self.coordinates]
         return np.where(rests, 0.0, z) if onset is None and any(rests) else z
 
-    def z_of(self, values: Mapping[str, float]) -> Float:
+    def z_of(self, values: Mapping[str, float]) -> FloatArray:
         """Coordinates for values by key; what is missing gets its prior's centre."""
         return np.array([c.z_of(values[c.key]) if c.key in values else 0.0 for c in self.coordinates])
 
-    def rollouts(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
+    def rollouts(self, z: FloatArray, onset: int | None = None, *, coarse: bool = False) -> FloatArray:
         """Responses for `z` (column, coordinate): (column, channel, counted, group)."""
         values = self.values(self.held(z, onset))
         if onset is None:
@@ -120,7 +118,7 @@ class Hypothesis:
             responses = rollout_from_onset(self.plant, self._without, drives, values, place)
         return self._seen(responses, len(z), coarse)
 
-    def baseline_rollouts(self, z: Float, *, coarse: bool = False) -> Float:
+    def baseline_rollouts(self, z: FloatArray, *, coarse: bool = False) -> FloatArray:
         """What the baseline alone does with the `T_L` and `K_L` of `z` (column, coordinate); one column if all
         agree."""
         lags = z[:, [c.key in ("T_L", "K_L") for c in self.coordinates]]
@@ -128,13 +126,13 @@ class Hypothesis:
         values = {k: v for k, v in self.values(z).items() if k in ("T_L", "K_L")}
         return self._rollouts(self._without, values, coarse)
 
-    def _rollouts(self, of: GapPlant, values: Mapping[str, torch.Tensor], coarse: bool = False) -> Float:
+    def _rollouts(self, of: GapPlant, values: Mapping[str, torch.Tensor], coarse: bool = False) -> FloatArray:
         record = self.record
         with torch.inference_mode():  # no derivatives: faster recursions
             responses = [of.response(drive, values) for drive in (record.coarse if coarse else record.drives)]
         return self._seen(responses, max(len(v) for v in values.values()), coarse)
 
-    def _seen(self, responses: Sequence[Response], columns: int, coarse: bool) -> Float:
+    def _seen(self, responses: Sequence[Response], columns: int, coarse: bool) -> FloatArray:
         record, parts = self.record, []
         if record.accel is not None:
             parts.append(record.seen([r.accel_measured for r in responses], coarse=coarse))
@@ -142,7 +140,7 @@ class Hypothesis:
             parts.append(record.seen([r.speed for r in responses], coarse=coarse))
         return np.stack([np.broadcast_to(p, (columns, *p.shape[-2:])) for p in parts], 1)
 
-    def errors(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
+    def errors(self, z: FloatArray, onset: int | None = None, *, coarse: bool = False) -> FloatArray:
         """Measured less rolled out, (column, channel, counted, group)."""
         measured = self.record.measured
         return (measured.mean(-1, keepdims=True) if coarse else measured) - self.rollouts(z, onset, coarse=coarse)
@@ -153,7 +151,7 @@ class Hypothesis:
         return next((e for e in self.effects if issubclass(e, Integrated)), None)
 
     @cached_property
-    def grade_columns(self) -> Float | None:
+    def grade_columns(self) -> FloatArray | None:
         """Rollouts (knot, channel, counted, group) per unit of each coefficient of the slope at `grade_rms` 1.
 
         Every segment has coefficients of its own: where one began on the other's road is not known.
@@ -167,7 +165,7 @@ class Hypothesis:
         return known[kind]
 
     @cached_property
-    def grade_means(self) -> Float | None:
+    def grade_means(self) -> FloatArray | None:
         """The same of each group's mean, (knot, channel, counted, 1): within a group no slope changes."""
         kind = self.integrated
         if kind is None or not self._roads:
@@ -177,7 +175,7 @@ class Hypothesis:
             known[kind] = self._columns(self.record.coarse, coarse=True)
         return known[kind]
 
-    def _columns(self, drives: Sequence[Drive], *, coarse: bool) -> Float:
+    def _columns(self, drives: Sequence[Drive], *, coarse: bool) -> FloatArray:
         knots = sum(road.count for road in self._roads)
         forces = []
         for drive, road, own in zip(drives, *self._places, strict=True):
@@ -185,14 +183,14 @@ class Hypothesis:
             forces.append(torch.nn.functional.pad(force, (0, 0, own.start, knots - own.stop)))
         return self._seen_forces(drives, forces, coarse=coarse)
 
-    def grade_response(self, coefficients: Float) -> Float:
+    def grade_response(self, coefficients: FloatArray) -> FloatArray:
         """What a slope of `coefficients` (knot,) does, (channel, counted, group)."""
         drives = self.record.drives
         forces = [road.force(_position(d), own)[None] for road, d, own in self._each_road(drives, coefficients)]
         return self._seen_forces(drives, forces, coarse=False)[0]
 
     def _each_road(
-        self, drives: Sequence[Drive], coefficients: Float
+        self, drives: Sequence[Drive], coefficients: FloatArray
     ) -> Iterator[tuple[Integrated, Drive, torch.Tensor]]:
         """Each drive with its road and that road's part of `coefficients` (..., knot)."""
         for drive, road, own in zip(drives, *self._places, strict=True):
@@ -206,7 +204,7 @@ class Hypothesis:
         numbers = self.record.segment
         return [self._roads[n] for n in numbers], [own[n] for n in numbers]
 
-    def _seen_forces(self, drives: Sequence[Drive], forces: Sequence[torch.Tensor], *, coarse: bool) -> Float:
+    def _seen_forces(self, drives: Sequence[Drive], forces: Sequence[torch.Tensor], *, coarse: bool) -> FloatArray:
         """Forces (column, time) of each drive as both channels see them, (column, channel, counted, group)."""
         accel, speed = [], []
         for drive, force in zip(drives, forces, strict=True):
@@ -229,7 +227,7 @@ class Hypothesis:
             made.append(grade.prepared(drives[0].time, drives[0].speed, positions))
         return made
 
-    def grade_along(self, coefficients: Float) -> Float:
+    def grade_along(self, coefficients: FloatArray) -> FloatArray:
         """Root mean square of the slope along all drives, (column,), for coefficients (column, knot)."""
         drives = self.record.coarse
         squares = [

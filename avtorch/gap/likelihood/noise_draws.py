@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_lyapunov
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.steady_kalman import motion
-
-Float = NDArray[np.float64]
 
 
 def noise_draws(
     noise: NoiseModel, rows: int, dt: float, channels: tuple[str, ...], count: int, rng: np.random.Generator
-) -> Float:
+) -> FloatArray:
     """(draw, channel, row) at rows `dt` [s] apart; the error of the speed begins at 0, its sensor's noise apart."""
     move, driven = motion(noise, dt)
     # what forgets is in its steady state when the drive begins
@@ -32,6 +30,6 @@ def noise_draws(
     return np.stack([clean[w].T + sds[w] * rng.standard_normal((count, rows)) for w in channels], 1)
 
 
-def _root(covariance: Float) -> Float:
+def _root(covariance: FloatArray) -> FloatArray:
     values, axes = np.linalg.eigh(covariance)
     return np.asarray(axes * np.sqrt(np.maximum(values, 0.0)))

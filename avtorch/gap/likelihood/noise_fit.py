@@ -7,15 +7,13 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.noise_model import NAMES, NoiseModel
 from avtorch.gap.likelihood.noise_segments import before_onset, whitening_filter
 from avtorch.gap.likelihood.random_law import RandomLaw
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-
-Float = NDArray[np.float64]
 
 Prior = tuple[float, float, float]
 
@@ -56,15 +54,15 @@ class NoiseFit:
 
     noise: NoiseModel
     log_prior: float
-    rows: Float = field(repr=False)
+    rows: FloatArray = field(repr=False)
     sds: Mapping[str, float] = field(repr=False)
-    law_z: Float | None = field(default=None, repr=False)
-    law_covariance: Float | None = field(default=None, repr=False)
+    law_z: FloatArray | None = field(default=None, repr=False)
+    law_covariance: FloatArray | None = field(default=None, repr=False)
 
 
 def fit_noise(
     record: Record,
-    errors: Float,
+    errors: FloatArray,
     start: NoiseModel,
     *,
     T_L: float,
@@ -73,7 +71,7 @@ def fit_noise(
     gust_onset: int | None = None,
     iterations: int = 6,
     law: RandomLaw | None = None,
-    law_z: Float | None = None,
+    law_z: FloatArray | None = None,
 ) -> NoiseFit:
     """Mode of the noise's parameters given the errors (channel, counted, group) of a rollout; `T_L` [s].
 
@@ -88,13 +86,13 @@ def fit_noise(
 
     onsets = {"onset": onset, "gust_onset": gust_onset}
 
-    def model(z: Float) -> NoiseModel:
+    def model(z: FloatArray) -> NoiseModel:
         own = {n: float(x) for n, x in zip(NAMES, np.exp(means + sds * z[:size]), strict=True)}
         # nothing of a force would leave its state without a use
         more = {} if law is None else {k: max(x, 1e-6) for k, x in law.force(z[size:]).items()}
         return replace(start, **own, **more)
 
-    def white(z: Float) -> WhiteningFilter:
+    def white(z: FloatArray) -> WhiteningFilter:
         return whitening_filter(record, model(z), **onsets)
 
     begin = np.log([getattr(start, n) for n in NAMES])

@@ -15,9 +15,9 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.likelihood.hypothesis import Coordinate, Hypothesis
 from avtorch.gap.likelihood.record import Record
@@ -25,7 +25,6 @@ from avtorch.gap.simulator.drive import Drive
 from avtorch.gap.simulator.effect import Effect, NoiseChange
 from avtorch.gap.simulator.plant import GapPlant
 
-Float = NDArray[np.float64]
 Form = Literal["force", "tails", "command"]
 
 _PARTS: dict[Form, tuple[str, ...]] = {
@@ -69,25 +68,25 @@ class RandomLaw:
     def size(self) -> int:
         return len(self.coordinates)
 
-    def at(self, z: Float) -> Effect:
+    def at(self, z: FloatArray) -> Effect:
         """The effect at `z` (coordinate,)."""
         each = zip(self.coordinates, z, strict=True)
         values = {c.key.partition(".")[2]: float(c.value(np.array(x))) for c, x in each}
         return self.effect.replaced(values) if values else self.effect
 
-    def force(self, z: Float) -> dict[str, float]:
+    def force(self, z: FloatArray) -> dict[str, float]:
         """The noise model's `more_sd` [m/s²] and `more_time` [s]."""
         change = self._change(z, torch.zeros(1, dtype=torch.float64))
         sd, time = self._single("force_sd", change.force_sd), self._single("force_time", change.force_time, above=True)
         return {"more_sd": sd, "more_time": time}
 
-    def tails(self, z: Float) -> tuple[float, float]:
+    def tails(self, z: FloatArray) -> tuple[float, float]:
         """`(fraction, scale)`, at most a half and in units of the accelerometer's standard deviation."""
         change = self._change(z, torch.zeros(1, dtype=torch.float64))
         fraction = self._single("tail_fraction", change.tail_fraction)
         return min(fraction, 0.5), self._single("tail_scale", change.tail_scale)
 
-    def command_variance(self, z: Float, drives: Sequence[Drive]) -> Float:
+    def command_variance(self, z: FloatArray, drives: Sequence[Drive]) -> FloatArray:
         """[(m/s²)²], of every row of all drives one after another."""
         parts = []
         for drive in drives:
@@ -99,7 +98,7 @@ class RandomLaw:
             raise InputError(f"{self.name}.noise: found a command_variance below 0 or not finite, needs 0 or more")
         return whole
 
-    def _change(self, z: Float, command: Tensor) -> NoiseChange:
+    def _change(self, z: FloatArray, command: Tensor) -> NoiseChange:
         change = self.at(z).noise(command)
         if change is None:
             raise InputError(f"{self.name}.noise: found nothing, needs a NoiseChange at every value of its parameters")

@@ -19,17 +19,15 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.simulator.drive import Drive, Place
 from avtorch.io import Log
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import AccelKind
-
-Float = NDArray[np.float64]
 
 RATE_HZ = 20.0
 """Rows are averaged as long as at least this many a second are left [Hz]."""
@@ -62,16 +60,16 @@ class Record:
     drives: tuple[Drive, ...]
     cuts: tuple[Cut, ...]
     coarse: tuple[Drive, ...]
-    time: Float
-    stamp: Float
-    log: NDArray[np.int64]
-    accel: Float | None
-    speed: Float | None
-    command: Float
+    time: FloatArray
+    stamp: FloatArray
+    log: IntArray
+    accel: FloatArray | None
+    speed: FloatArray | None
+    command: FloatArray
     dt: float
-    source: NDArray[np.int64]
-    target: NDArray[np.int64]
-    stretch: NDArray[np.int64]
+    source: IntArray
+    target: IntArray
+    stretch: IntArray
     length: int
     group: int
 
@@ -90,7 +88,7 @@ class Record:
         return tuple(name for name in ("accel", "speed") if getattr(self, name) is not None)
 
     @property
-    def starts(self) -> NDArray[np.int64]:
+    def starts(self) -> IntArray:
         """Where among the counted rows each stretch begins."""
         return np.flatnonzero(np.diff(self.stretch, prepend=-1))
 
@@ -105,7 +103,7 @@ class Record:
         drives: list[Drive] = []
         cuts: list[Cut] = []
         coarse: list[Drive] = []
-        columns: dict[str, list[Float]] = {
+        columns: dict[str, list[FloatArray]] = {
             "time": [],
             "stamp": [],
             "log": [],
@@ -139,7 +137,7 @@ class Record:
                 cuts.append(begun)
                 rows = (cut.stop - cut.start) // group
 
-                def mean(x: Float, cut: slice = cut, rows: int = rows) -> Float:
+                def mean(x: FloatArray, cut: slice = cut, rows: int = rows) -> FloatArray:
                     return x[cut].reshape(rows, group).mean(1)
 
                 time = log.elapsed[cut][::group]
@@ -175,7 +173,7 @@ class Record:
                 f"2 s into each drive{each_return}), needs 10 s or more"
             )
 
-        def whole(name: str) -> Float | None:
+        def whole(name: str) -> FloatArray | None:
             return np.concatenate(columns[name]) if columns[name] else None
 
         whole_drives = tuple(drives)
@@ -214,7 +212,7 @@ class Record:
         numbers = {n: i for i, n in enumerate(dict.fromkeys(cut.segment for cut in self.cuts))}
         return tuple(numbers[cut.segment] for cut in self.cuts)
 
-    def only(self, rows: NDArray[np.bool_]) -> Record:
+    def only(self, rows: BoolArray) -> Record:
         """The same drives of which only these `rows` (counted,) still count, in stretches of 2 s or more.
 
         Rollouts go over whole drives as before; what counts no more is neither fitted nor judged.
@@ -236,13 +234,13 @@ class Record:
             number += 1
         return Place(number, place)
 
-    def padded(self, values: Float) -> Float:
+    def padded(self, values: FloatArray) -> FloatArray:
         """Counted rows' `values` (..., counted, group) at their places in (..., length * group), zeros between."""
         out = np.zeros((*values.shape[:-2], self.length, values.shape[-1]))
         out[..., self.target, :] = values
         return out.reshape(*values.shape[:-2], -1)
 
-    def seen(self, responses: Sequence[Tensor], *, coarse: bool = False) -> Float:
+    def seen(self, responses: Sequence[Tensor], *, coarse: bool = False) -> FloatArray:
         """Responses by drive, (..., time) each, at rows that count: (..., counted, group), `coarse` with group 1."""
         parts = []
         for x in responses:
@@ -257,7 +255,7 @@ class Record:
         return whole.numpy()[..., self.source, :]
 
     @cached_property
-    def measured(self) -> Float:
+    def measured(self) -> FloatArray:
         """What the channels saw, (channel, counted, group)."""
         return np.stack([x[self.source] for x in (self.accel, self.speed) if x is not None])
 
@@ -279,7 +277,12 @@ def rolled(log: Log, group: int) -> Iterator[slice]:
 
 
 def _drive(
-    time: Float, command: Float, speed: Float | None, accel0: float | None, specific: bool, position0: float
+    time: FloatArray,
+    command: FloatArray,
+    speed: FloatArray | None,
+    accel0: float | None,
+    specific: bool,
+    position0: float,
 ) -> Drive:
     quiet = None if speed is None else torch.as_tensor(_quiet(speed, float(np.median(np.diff(time)))))
     return Drive(torch.as_tensor(_even(time)), torch.as_tensor(command), quiet, accel0, specific, position0)
@@ -296,20 +299,20 @@ def _position(log: Log, drives: Sequence[Drive], cuts: Sequence[Cut], begun: Cut
     return float(position[-1]) + min(float(moved), _FAR_M)
 
 
-def _even(time: Float) -> Float:
+def _even(time: FloatArray) -> FloatArray:
     """Stamps that only jitter in their last digits are made even, so that drives are uniform."""
     even = np.linspace(time[0], time[-1], len(time))
     return even if np.abs(even - time).max() < 0.02 * (even[1] - even[0]) else time
 
 
-def _quiet(speed: Float, dt: float) -> Float:
+def _quiet(speed: FloatArray, dt: float) -> FloatArray:
     """The measured speed without most of its noise, for what depends on speed."""
     from scipy.ndimage import gaussian_filter1d
 
     return np.asarray(np.maximum(gaussian_filter1d(speed, 0.15 / dt, mode="nearest"), 0.0))
 
 
-def _places(use: list[Float], dt: float) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], int]:
+def _places(use: list[FloatArray], dt: float) -> tuple[IntArray, IntArray, IntArray, int]:
     source, target, stretch = [], [], []
     offset, place, number = 0, 0, 0
     gap = round(_GAP_S / dt)

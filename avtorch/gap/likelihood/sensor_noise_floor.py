@@ -10,13 +10,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.io import Log
-
-Float = NDArray[np.float64]
 
 FINER = {"accel": 1e-3, "speed": 4e-4}
 """Less scatter from row to row than this [m/s², m/s] is no sensor's; rounding to three decimals leaves 3e-4."""
@@ -50,7 +48,7 @@ def with_sensor_noise(log: Log) -> tuple[Log, str | None]:
     return replace(log, **read), f"No sensor noise in {' and '.join(bare)}, as if simulated: {added}."
 
 
-def _force(log: Log, rng: np.random.Generator) -> tuple[Float, Float]:
+def _force(log: Log, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """An Ornstein-Uhlenbeck force [m/s²] and the speed [m/s] that it gains, (time,), anew in each drive."""
     force, gained = np.zeros(log.rows), np.zeros(log.rows)
     for part in _drives(log):
@@ -68,7 +66,7 @@ def _drives(log: Log) -> list[slice]:
     return [part for part in log.drives() if part.stop - part.start > 3]
 
 
-def _scatter(log: Log, signal: Float) -> float:
+def _scatter(log: Log, signal: FloatArray) -> float:
     """SD of white noise that would bend `signal` from row to row as much as it is bent in a fifth of them or more.
 
     Half of them would do, but for signals that were interpolated from few rows: those bend at each of the few only.

@@ -8,14 +8,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.noise_model import NoiseModel
 
-Float = NDArray[np.float64]
-
-Filter = tuple[list[list[Float]], Float, float]
+Filter = tuple[list[list[FloatArray]], FloatArray, float]
 """Numerators by (out, in), the denominator, log det of the innovations' covariance."""
 
 
@@ -59,7 +57,7 @@ def designed(noises: Sequence[NoiseModel], dt: float, channels: tuple[str, ...])
     return [([list(row) for row in mixed[i]], bottom[i], float(sizes[i])) for i in range(len(noises))]
 
 
-def motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
+def motion(n: NoiseModel, dt: float) -> tuple[FloatArray, FloatArray]:
     """State (error of the speed, p, d) over `dt`: its transition and the covariance that is added, both exact.
 
     Ornstein-Uhlenbeck processes (a third where a random effect adds one) and the integral of their sum. Behind a late
@@ -80,7 +78,7 @@ def motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
     return move, driven
 
 
-def _late_motion(n: NoiseModel, dt: float) -> tuple[Float, Float]:
+def _late_motion(n: NoiseModel, dt: float) -> tuple[FloatArray, FloatArray]:
     """By van Loan's matrix exponential."""
     size = 2 + len(n.forces)
     drift = np.diag([0.0, *(-1 / time for _, time in n.forces), -1 / n.sensor_lag])
@@ -104,7 +102,7 @@ def _integral(x: float) -> float:
     return 2 * x - 3 + 4 * float(np.exp(-x)) - float(np.exp(-2 * x))
 
 
-def _steady(move: Float, see: Float, driven: Float, white: Float) -> Float:
+def _steady(move: FloatArray, see: FloatArray, driven: FloatArray, white: FloatArray) -> FloatArray:
     """Covariances (model, state, state) ahead of a reading, once they have settled: the Riccati equation by doubling.
 
     Structure-preserving doubling (Anderson 1978): each round covers twice as many rows as the last.

@@ -14,14 +14,12 @@ from itertools import pairwise
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.steady_kalman import Filter, designed
-
-Float = NDArray[np.float64]
 
 Until = tuple[tuple[int, NoiseModel], ...]
 """Noise of earlier parts of a record, each up to a counted row, in order."""
@@ -70,7 +68,7 @@ class WhiteningFilter:
         rows = [0, *(row for row, _ in self.until), self.record.rows]
         return [(f, slice(*ends)) for f, ends in zip(self._filters[coarse], pairwise(rows), strict=True)]
 
-    def _filtered(self, errors: Float) -> Float:
+    def _filtered(self, errors: FloatArray) -> FloatArray:
         """Errors (..., channel, counted, group) through the filter."""
         count, group = errors.shape[-3], errors.shape[-1]
         record = self.record
@@ -85,7 +83,7 @@ class WhiteningFilter:
                 out[..., o, part, :] = rows[..., target, :]
         return out
 
-    def turned(self, images: Float) -> Float:
+    def turned(self, images: FloatArray) -> FloatArray:
         """The transpose of the map, of images (..., channel, counted, group): the filter run backward in time."""
         record, (count, group) = self.record, images.shape[-3::2]
         images = np.array(images)
@@ -105,7 +103,7 @@ class WhiteningFilter:
             total[..., -1, record.starts, 0] -= np.add.reduceat(total[..., -1, :, :].sum(-1), record.starts, -1)
         return total
 
-    def response(self, errors: Float) -> Float:
+    def response(self, errors: FloatArray) -> FloatArray:
         """White image of errors (channel, time) at consecutive rows that begin with the first, offset and all."""
         tops, bottom, _ = self._parts(False)[-1][0]
         count = len(errors)
@@ -114,10 +112,10 @@ class WhiteningFilter:
         )
 
     @cached_property
-    def _offsets(self) -> dict[bool, tuple[Float, Float]]:
+    def _offsets(self) -> dict[bool, tuple[FloatArray, FloatArray]]:
         return {}
 
-    def _offset(self, coarse: bool) -> tuple[Float, Float]:
+    def _offset(self, coarse: bool) -> tuple[FloatArray, FloatArray]:
         """White image of a unit offset of the speed from each stretch's start (channel, counted, group), its square."""
         coarse = coarse and self.record.group > 1
         if coarse not in self._offsets:
@@ -127,12 +125,12 @@ class WhiteningFilter:
             self._offsets[coarse] = image, np.add.reduceat((image**2).sum((0, 2)), self.record.starts)
         return self._offsets[coarse]
 
-    def _without_offset(self, e: Float) -> Float:
+    def _without_offset(self, e: FloatArray) -> FloatArray:
         image, square = self._offset(e.shape[-1] == 1)
         part = np.add.reduceat((e * image).sum((-3, -1)), self.record.starts, -1) / square
         return e - image * part[..., None, self.record.stretch, None]
 
-    def __call__(self, errors: Float) -> Float:
+    def __call__(self, errors: FloatArray) -> FloatArray:
         """Errors (..., channel, counted, group) made white, of unit variance, the same shape.
 
         Errors of groups' means come with group 1.
@@ -143,7 +141,7 @@ class WhiteningFilter:
         errors[..., -1, :, :] -= errors[..., -1, self.record.starts, :1][..., self.record.stretch, :]
         return self._without_offset(self._filtered(errors))
 
-    def constants(self, *, coarse: bool) -> Float:
+    def constants(self, *, coarse: bool) -> FloatArray:
         """Each row's part (counted,) of what the log likelihood has that does not depend on the errors."""
         record = self.record
         each, count = 1 if coarse else record.group, len(record.channels)
@@ -158,17 +156,17 @@ class WhiteningFilter:
         """What the log likelihood has that does not depend on the errors."""
         return float(self.constants(coarse=coarse).sum())
 
-    def log_likelihood(self, errors: Float) -> Float:
+    def log_likelihood(self, errors: FloatArray) -> FloatArray:
         """Of errors (..., channel, counted, group): (...)."""
         e = self(errors)
         return self.constant_of(coarse=errors.shape[-1] == 1) - 0.5 * (e**2).sum((-1, -2, -3))
 
-    def row_likelihoods(self, errors: Float) -> Float:
+    def row_likelihoods(self, errors: FloatArray) -> FloatArray:
         """Log likelihood (counted,) of each row of errors (channel, counted, group); sums to the whole."""
         return self.constants(coarse=errors.shape[-1] == 1) - 0.5 * (self(errors) ** 2).sum((0, 2))
 
 
-def sensed(record: Record, noise: NoiseModel, motion: Float) -> Float:
+def sensed(record: Record, noise: NoiseModel, motion: FloatArray) -> FloatArray:
     """What the channels show of a motion (..., channel, counted, group), the accelerometer with its scale and lag."""
     if "accel" not in record.channels or (noise.sensor_scale == 1.0 and noise.sensor_lag == 0.0):
         return motion

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.gauss_newton import acting
 from avtorch.gap.likelihood.grade_marginal import GradeMarginal
 from avtorch.gap.likelihood.hypothesis import Hypothesis
@@ -25,8 +25,6 @@ from avtorch.inference.priors import LogSpaceNormal
 
 if TYPE_CHECKING:
     from avtorch.gap.search.fitted_model import FittedModel
-
-Float = NDArray[np.float64]
 
 _FURTHEST = 10.0
 """Beyond so many standard deviations of the prior the likelihood stays what it is there: no rollout of infinities."""
@@ -44,7 +42,7 @@ class RolloutDensity:
 
     hypothesis: Hypothesis
     white: WhiteningFilter
-    centre: Float
+    centre: FloatArray
     onset: int | None = None
 
     windows = 1
@@ -110,7 +108,7 @@ class RolloutDensity:
         return torch.cat(values).reshape(z.shape[:-1]) + self._prior(z)
 
     # what it is made of ----------------------------------------------------------------------------------------------
-    def images(self, z: Tensor) -> Float:
+    def images(self, z: Tensor) -> FloatArray:
         """White errors (column, row) for `z` (column, coordinate)."""
         with torch.no_grad():
             return np.concatenate([self._image(self._errors(self._rolled(b).numpy())) for b in self._blocks(z)])
@@ -161,14 +159,14 @@ class RolloutDensity:
             parts.append(part.expand(columns, *part.shape[-2:]))
         return torch.stack(parts, 1)
 
-    def _errors(self, rolled: Float) -> Float:
+    def _errors(self, rolled: FloatArray) -> FloatArray:
         return self.hypothesis.record.measured - rolled
 
-    def _image(self, errors: Float) -> Float:
+    def _image(self, errors: FloatArray) -> FloatArray:
         """White errors, every row once: (column, row)."""
         return self.white(errors).reshape(len(errors), -1)
 
-    def _judged(self, rolled: Float, *, slope: bool = False) -> tuple[Float, Float | None]:
+    def _judged(self, rolled: FloatArray, *, slope: bool = False) -> tuple[FloatArray, FloatArray | None]:
         """Log likelihood (column,) of rollouts and, if asked for its `slope`, the derivative in them."""
         errors = self._errors(rolled)
         flat = self._image(errors)
@@ -198,7 +196,7 @@ class _Exact(torch.autograd.Function):
         return gradient[..., None] * score, None
 
 
-def root(covariance: Float) -> Tensor:
+def root(covariance: FloatArray) -> Tensor:
     """A lower triangular root of a covariance, sound also where rounding left it without one."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     half = vectors * np.sqrt(np.maximum(values, 1e-14))

@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
-Float = NDArray[np.float64]
+from avtorch.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,10 +18,10 @@ class Draws:
     """
 
     names: tuple[str, ...]
-    z: Float = field(repr=False)
-    values: Mapping[str, Float] = field(repr=False)
+    z: FloatArray = field(repr=False)
+    values: Mapping[str, FloatArray] = field(repr=False)
     method: str = "sgld"
     effective: float = float("nan")
-    grade_rms: Float | None = field(default=None, repr=False)
+    grade_rms: FloatArray | None = field(default=None, repr=False)
     exact_share: float = 1.0
     why: str = ""

@@ -10,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
-Float = NDArray[np.float64]
+from avtorch.arrays import FloatArray
 
 _DEGREES = 5.0  # of the t distributions proposed from
 _KERNELS = 60
@@ -21,8 +20,15 @@ _CARRIED = 20.0  # effective places that shape the next round
 
 
 def importance(
-    log_prob: Callable[[Float], Float], centre: Float, scale: Float, *, rounds: int, size: int, enough: float, seed: int
-) -> tuple[Float, Float]:
+    log_prob: Callable[[FloatArray], FloatArray],
+    centre: FloatArray,
+    scale: FloatArray,
+    *,
+    rounds: int,
+    size: int,
+    enough: float,
+    seed: int,
+) -> tuple[FloatArray, FloatArray]:
     """Places (place, coordinate) and their weights (place,), which sum to one.
 
     `log_prob`: of (place, coordinate), (place,). `scale`: a triangular root of Laplace's covariance at `centre`.
@@ -56,12 +62,12 @@ def importance(
     return places, weights
 
 
-def effective(weights: Float) -> float:
+def effective(weights: FloatArray) -> float:
     """How many equal draws the weights are worth."""
     return float(1 / np.sum(weights**2))
 
 
-def _tempered(ratios: Float) -> Float:
+def _tempered(ratios: FloatArray) -> FloatArray:
     power = 1.0
     for _ in range(40):
         weights = np.exp(power * (ratios - ratios.max()))
@@ -72,7 +78,7 @@ def _tempered(ratios: Float) -> Float:
     return weights
 
 
-def _density(places: Float, centres: Float, root: Float) -> Float:
+def _density(places: FloatArray, centres: FloatArray, root: FloatArray) -> FloatArray:
     """Log density (place,) of an equal mixture of t distributions about `centres` (kernel, coordinate)."""
     dim = places.shape[1]
     turned = np.linalg.solve(root, places.T).T[:, None] - np.linalg.solve(root, centres.T).T

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.posterior.density import RolloutDensity, root
 from avtorch.gap.posterior.draws import Draws
@@ -24,8 +24,6 @@ from avtorch.inference.sampler import SamplerSettings, sample
 from avtorch.inference.whitening import Coordinates, stiffness
 
 __all__ = ["Draws", "drawn", "exact_one_in", "fitted", "moved", "posterior", "repaired", "reported"]
-
-Float = NDArray[np.float64]
 
 STEP = 2.0
 """SGLD's step in whitened coordinates; see `SamplerSettings`."""
@@ -131,7 +129,7 @@ def _weighted(density: RolloutDensity, mode: Mode, chains: int, draws: int, seed
     rows = sum(len(d.time) for d in density.hypothesis.record.drives)
     size = int(min(400, max(80, 2 * _ROWS / rows / _ROUNDS)))  # no gradients, half as dear
 
-    def log_prob(z: Float) -> Float:
+    def log_prob(z: FloatArray) -> FloatArray:
         return density.value(torch.as_tensor(z)[:, None])[:, 0].numpy()
 
     centre, scale = mode.z[0].numpy(), mode.scale[0].numpy()
@@ -153,7 +151,7 @@ def _worth(z: Tensor) -> float:
     return float((chains * draws) / (draws * between).clamp_min(1.0).max())
 
 
-def fitted(density: RolloutDensity, covariance: Float) -> tuple[Surrogate, Mode]:
+def fitted(density: RolloutDensity, covariance: FloatArray) -> tuple[Surrogate, Mode]:
     """A surrogate about the density's mode, and that mode; `covariance`: Laplace's, as far as it is known."""
     centre, scale = torch.as_tensor(density.centre), root(covariance)
     for turn in range(3):
@@ -197,7 +195,7 @@ def exact_one_in(density: RolloutDensity, surrogate: Surrogate, mode: Mode, gene
     return int(min(_RAREST, 1 + 4 * _INFLATED / (STEP * typical), 1 + _THROWN / farthest))
 
 
-def _grade(density: RolloutDensity, z: Tensor, seed: int) -> Float | None:
+def _grade(density: RolloutDensity, z: Tensor, seed: int) -> FloatArray | None:
     """Root mean square of the slope found, (chain, draw), for draws of `z` (chain, draw, coordinate)."""
     slope = density.slope
     if slope is None:

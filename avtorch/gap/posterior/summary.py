@@ -8,9 +8,9 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.hypothesis import Coordinate
 from avtorch.gap.posterior.density import RolloutDensity, root
 from avtorch.gap.posterior.draws import Draws
@@ -20,7 +20,6 @@ from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.plant import GapPlant, plant
 
-Float = NDArray[np.float64]
 Link = Callable[[Tensor], Tensor]
 T = TypeVar("T")
 
@@ -44,14 +43,14 @@ def moved(found: FittedModel, draws: Draws | None = None) -> dict[str, Quantity]
     return {name: Quantity.of_draws(values[name]) for name in ("T_L", "K_L")}
 
 
-def belief(found: FittedModel, draws: Draws | None = None, *, count: int = 64) -> dict[str, Float]:
+def belief(found: FittedModel, draws: Draws | None = None, *, count: int = 64) -> dict[str, FloatArray]:
     """Draws (draw,) of the repaired simulator's parameters, by its own names."""
     values = {key: x.reshape(-1) for key, x in _values(found, draws).items()}
     every = max(1, len(values["T_L"]) // count)
     return {key: x[::every][:count] for key, x in values.items()}
 
 
-def drawn(found: FittedModel, draws: Draws) -> dict[str, Float]:
+def drawn(found: FittedModel, draws: Draws) -> dict[str, FloatArray]:
     """Draws (chain, draw) under the names of `reported`, `T_L` and `K_L` first."""
     rng = np.random.default_rng(0)
     shape = draws.z.shape[:2]
@@ -98,7 +97,7 @@ def repaired(found: FittedModel, baseline: GapPlant | None = None, draws: Draws 
     )
 
 
-def _values(found: FittedModel, draws: Draws | None) -> dict[str, Float]:
+def _values(found: FittedModel, draws: Draws | None) -> dict[str, FloatArray]:
     """Coordinates' values by key: (chain, draw), or (draw,) from Laplace's approximation."""
     if draws is not None:
         rests = {c.key for c in found.hypothesis.coordinates if c.parameter.of_onset and found.onset is None}
@@ -116,7 +115,7 @@ def _values(found: FittedModel, draws: Draws | None) -> dict[str, Float]:
     return {key: x.numpy() for key, x in found.hypothesis.values(found.hypothesis.held(z, found.onset)).items()}
 
 
-def _deterministic(found: FittedModel, draws: Draws | None) -> dict[str, Float]:
+def _deterministic(found: FittedModel, draws: Draws | None) -> dict[str, FloatArray]:
     """Draws by `effect.parameter`."""
     values = _values(found, draws)
     tensors = {key: torch.as_tensor(x) for key, x in values.items()}
@@ -136,7 +135,7 @@ def _deterministic(found: FittedModel, draws: Draws | None) -> dict[str, Float]:
     return out
 
 
-def _grade_rms(found: FittedModel) -> Float | None:
+def _grade_rms(found: FittedModel) -> FloatArray | None:
     """Draws of the slope's root mean square along the road, at the mode of the other parameters."""
     density = RolloutDensity.of(found)
     slope = density.slope

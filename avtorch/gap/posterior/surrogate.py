@@ -14,13 +14,10 @@ from itertools import combinations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from avtorch.gap.posterior.density import RolloutDensity
 from avtorch.inference.map import Mode
-
-Float = NDArray[np.float64]
 
 _REACH = 1.3  # posterior standard deviations from the centre at which the quadratics are fitted
 

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.crossval.rollout_errors import HORIZON_S, Measure, reached, rms
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.result.repeatability import Repeatability, repeatability
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ def gap_size(race: SearchResult, best: FittedModel, *, detected: bool, p_value: 
     )
 
 
-def _one_step(record: Record, errors: Float, lag: float) -> float:
+def _one_step(record: Record, errors: FloatArray, lag: float) -> float:
     """Of the acceleration foretold for a row from the one measured a row before.
 
     An error of the rollout dies away with the lag, so the error of one step is `e[k+1] - exp(-dt / T_L) e[k]`: of GLVD
@@ -87,10 +85,10 @@ def _one_step(record: Record, errors: Float, lag: float) -> float:
     return _size(np.concatenate(steps))
 
 
-def _stretches(record: Record, values: Float) -> list[Float]:
+def _stretches(record: Record, values: FloatArray) -> list[FloatArray]:
     """`values` (counted, ...) of each stretch without gaps."""
     return np.split(values, record.starts[1:])
 
 
-def _size(x: Float) -> float:
+def _size(x: FloatArray) -> float:
     return float(np.sqrt((x**2).mean()))

@@ -5,16 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.posterior.summary import belief
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 from avtorch.gap.selection.verdict import Verdict
 from avtorch.gap.simulator.plant import GapPlant
-
-Float = NDArray[np.float64]
 
 _DRAWS = 64
 _MOST = 5
@@ -31,7 +27,7 @@ class PredictiveModel:
 
     name: str
     plant: GapPlant = field(repr=False)
-    belief: Mapping[str, Float] = field(repr=False)
+    belief: Mapping[str, FloatArray] = field(repr=False)
     noise: NoiseModel
     grade_rms: float | None = None
     specific_force: bool = False

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.record import Record
-
-Float = NDArray[np.float64]
 
 WINDOW_S = 10.0
 SETTLED_S = 3.0
@@ -66,7 +65,7 @@ def repeatability(record: Record) -> Repeatability | None:
     return Repeatability(len(found), seconds, floors.get("accel"), floors.get("speed"))
 
 
-def _pairs(command: Float, stretch: NDArray[np.intp], rows: int) -> list[tuple[int, int]]:
+def _pairs(command: FloatArray, stretch: NDArray[np.intp], rows: int) -> list[tuple[int, int]]:
     """Where windows of so many rows begin that have the same commands; no row is in two windows."""
     last = len(command) - rows
     if last < rows:

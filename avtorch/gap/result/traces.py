@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
-Float = NDArray[np.float64]
+from avtorch.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,16 +16,16 @@ class Traces:
     effect does to each row. `stretch` (row,) numbers parts without gaps.
     """
 
-    time: Float
-    command: Float
+    time: FloatArray
+    command: FloatArray
     channels: tuple[str, ...]
-    measured: Float = field(repr=False)
-    before: Float = field(repr=False)
-    after: Float = field(repr=False)
-    does: Float = field(repr=False)
-    stretch: NDArray[np.int64] = field(repr=False)
+    measured: FloatArray = field(repr=False)
+    before: FloatArray = field(repr=False)
+    after: FloatArray = field(repr=False)
+    does: FloatArray = field(repr=False)
+    stretch: IntArray = field(repr=False)
 
     @property
-    def speed(self) -> Float | None:
+    def speed(self) -> FloatArray | None:
         """Measured, (row,); None where it was not."""
         return self.measured[self.channels.index("speed")] if "speed" in self.channels else None

@@ -15,8 +15,8 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.likelihood.gauss_newton import finish
 from avtorch.gap.likelihood.hypothesis import Hypothesis
@@ -27,8 +27,6 @@ from avtorch.gap.likelihood.record import Record
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.fitted_work import difference
 from avtorch.io import fingerprint, read_sealed, write_sealed
-
-Float = NDArray[np.float64]
 
 SCHEMA = "avtorch.fits/2"
 MOST = 16 * 2**20
@@ -44,7 +42,7 @@ _LARGEST = 64  # coordinates of a fit
 class Kept:
     """A fit that has come to rest: the mode `z` (coordinate,), its `noise`, and the noise's `log_prior`."""
 
-    z: Float
+    z: FloatArray
     noise: NoiseModel
     log_prior: float
 
@@ -68,7 +66,7 @@ class Start:
     inputs: str
 
     @classmethod
-    def of(cls, hypothesis: Hypothesis, z: Float, noise: NoiseModel, onset: int | None, rounds: int) -> Start:
+    def of(cls, hypothesis: Hypothesis, z: FloatArray, noise: NoiseModel, onset: int | None, rounds: int) -> Start:
         record = hypothesis.record
         if record not in _RECORDS:
             _RECORDS[record] = fingerprint(record)
@@ -103,7 +101,7 @@ class Checkpoint:
         return Kept(np.array(entry["z"]), NoiseModel(**entry["noise"]), float(entry["log_prior"]))
 
     def start(
-        self, hypothesis: Hypothesis, z: Float, noise: NoiseModel, onset: int | None, rounds: int
+        self, hypothesis: Hypothesis, z: FloatArray, noise: NoiseModel, onset: int | None, rounds: int
     ) -> Start | None:
         """Where a fit begins; None where nothing is kept."""
         return None if self.path is None else Start.of(hypothesis, z, noise, onset, rounds)

@@ -8,15 +8,13 @@ density, given the rows before it. Stretches go side by side in chunks, each beg
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.lost_messages import image_of_row, states_of
 
-Float = NDArray[np.float64]
 
-
-def rows_gained(white: WhiteningFilter, errors: Float, variance: Float, T_L: float, K_L: float) -> Float:
+def rows_gained(white: WhiteningFilter, errors: FloatArray, variance: FloatArray, T_L: float, K_L: float) -> FloatArray:
     """Log likelihood ratio (counted,) of each row, commands with errors of this `variance` over commands as logged.
 
     Args: `errors` (channel, counted, 1) of a rollout with `T_L` [s] and `K_L` at the log's own rate; `variance`

@@ -11,15 +11,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.gauss_newton import finish, modes
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.fitted_model import ALIKE, Delays, FittedModel
 from avtorch.gap.simulator.drive import Drive
-
-Float = NDArray[np.float64]
 
 _LONGEST_S = 1.0  # twice the longest that is typical
 _TRIED = 40
@@ -125,7 +123,7 @@ def with_delays(found: FittedModel, without: FittedModel, period: float) -> Fitt
     )
 
 
-def _settled(white: WhiteningFilter, errors: Float) -> float:
+def _settled(white: WhiteningFilter, errors: FloatArray) -> float:
     """Log likelihood of errors (channel, counted, group), less the rows at the start of each stretch."""
     record = white.record
     since = np.arange(record.rows) - record.starts[record.stretch]

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.gauss_newton import GaussNewtonFit
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import NoiseFit
@@ -23,8 +23,6 @@ from avtorch.gap.search.outliers import HeavyTails
 from avtorch.gap.simulator.effect import EFFECTS, Effect
 from avtorch.io import Log
 
-Float = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class ByChance:
@@ -35,8 +33,8 @@ class ByChance:
     """
 
     law: RandomLaw
-    z: Float = field(repr=False)
-    covariance: Float = field(repr=False)
+    z: FloatArray = field(repr=False)
+    covariance: FloatArray = field(repr=False)
     explained: float = 0.0
     process_sd: float | None = None
 
@@ -52,10 +50,10 @@ class Delays:
 
     period: float
     row: float
-    lengths: Float
-    shares: Float
-    z: Float = field(repr=False)
-    covariances: Float = field(repr=False)
+    lengths: FloatArray
+    shares: FloatArray
+    z: FloatArray = field(repr=False)
+    covariances: FloatArray = field(repr=False)
     gain: float
     without: str
 
@@ -86,16 +84,16 @@ class FittedModel:
 
     name: str
     hypothesis: Hypothesis
-    z: Float = field(repr=False)
-    covariance: Float = field(repr=False)
+    z: FloatArray = field(repr=False)
+    covariance: FloatArray = field(repr=False)
     values: Mapping[str, float]
     noise: NoiseFit = field(repr=False)
     log_evidence: float
     log_likelihood: float
-    errors: Float = field(repr=False)
+    errors: FloatArray = field(repr=False)
     onset: int | None = None
     grade_rms: float | None = None
-    profile: Float | None = field(default=None, repr=False)
+    profile: FloatArray | None = field(default=None, repr=False)
     tails: HeavyTails | None = field(default=None, repr=False)
     losses: LostMessages | None = field(default=None, repr=False)
     gust: bool = False

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.fitted_model import FittedModel
 
-Float = NDArray[np.float64]
 
-
-def full_rate_errors(raw: Record, of: FittedModel) -> Float:
+def full_rate_errors(raw: Record, of: FittedModel) -> FloatArray:
     """Errors (channel, counted, 1) of a find's rollout over `raw`, the same drives in rows of their own."""
     hypothesis = Hypothesis(raw, of.hypothesis.effects, of.hypothesis.baseline)
     errors = hypothesis.errors(of.z[None])[0]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.gauss_newton import finish, modes
 from avtorch.gap.likelihood.noise_fit import GUST, fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
@@ -14,8 +14,6 @@ from avtorch.gap.likelihood.noise_segments import CALM, whitening_filter
 from avtorch.gap.search.fitted_model import FittedModel, with_or_without_onset
 from avtorch.gap.search.onset import allowed, profile
 from avtorch.gap.simulator.effect import Effect
-
-Float = NDArray[np.float64]
 
 
 def gust(base: FittedModel, kind: type[Effect]) -> FittedModel:
@@ -40,7 +38,7 @@ def gust(base: FittedModel, kind: type[Effect]) -> FittedModel:
     return with_or_without_onset(forms)
 
 
-def _along(blown: FittedModel) -> Float:
+def _along(blown: FittedModel) -> FloatArray:
     """Log likelihood (counted,) if the gust sets in at each row.
 
     Against the same noise without the gust; the base's own noise has made room for it.

@@ -7,12 +7,10 @@ from itertools import product
 from math import prod
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.simulator.integrated import Integrated
-
-Float = NDArray[np.float64]
 
 _TRADES = tuple(s * k for k in (0.012, 0.025, 0.04, 0.06, 0.085, 0.12) for s in (-1, 1))
 """Of a delay for lag [s]."""
@@ -40,7 +38,7 @@ def _span(hypothesis: Hypothesis) -> tuple[float, float]:
     return float(time[0]), float(time[-1])
 
 
-def one_at_a_time(hypothesis: Hypothesis, z: Float) -> Float:
+def one_at_a_time(hypothesis: Hypothesis, z: FloatArray) -> FloatArray:
     """Places (start, coordinate) that differ from `z` in one parameter of an effect, put to one of its starts.
 
     A limit that is never reached has no slope to follow, and a hill may be climbed from its wrong side.
@@ -58,7 +56,7 @@ def one_at_a_time(hypothesis: Hypothesis, z: Float) -> Float:
     return np.array(places).reshape(-1, len(z))
 
 
-def lag_delay_starts(hypothesis: Hypothesis, z: Float) -> Float:
+def lag_delay_starts(hypothesis: Hypothesis, z: FloatArray) -> FloatArray:
     """Places (start, coordinate) with more of a delay and less lag than at `z`, or the other way round.
 
     Along this valley the likelihood is rough: a held command that arrives between two rows makes a kink at every row.
@@ -72,7 +70,7 @@ def lag_delay_starts(hypothesis: Hypothesis, z: Float) -> Float:
     return np.array(places).reshape(-1, len(z))
 
 
-def starts(hypothesis: Hypothesis, base: Mapping[str, float]) -> Float:
+def starts(hypothesis: Hypothesis, base: Mapping[str, float]) -> FloatArray:
     """(start, coordinate): `base` (T_L, K_L and what is known of some effects) with every effect's own starts."""
     sets: list[dict[str, float]] = [dict(base)]
     for effect in hypothesis.effects:

@@ -18,12 +18,10 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.outliers import onset_of
-
-Float = NDArray[np.float64]
 
 _CENTRE, _SD = float(np.log(0.08 / 0.92)), 1.0  # of the prior of the fraction's logit
 _FIRST = np.array([-3.0, -1.0, 1.0, 3.0])  # fractions tried first, in sds of the prior
@@ -43,7 +41,9 @@ class LostMessages:
     onset: int | None
 
 
-def lost_messages(white: WhiteningFilter, errors: Float, command: Float, T_L: float, K_L: float) -> LostMessages:
+def lost_messages(
+    white: WhiteningFilter, errors: FloatArray, command: FloatArray, T_L: float, K_L: float
+) -> LostMessages:
     """How much speaks for lost messages, and which fraction of them.
 
     Args: `errors` (channel, counted, 1) of a rollout with `T_L` [s] and `K_L`, at the log's own rate; `command`
@@ -54,7 +54,7 @@ def lost_messages(white: WhiteningFilter, errors: Float, command: Float, T_L: fl
     if not len(bank.place):
         return LostMessages(-2.0, 0.0, 1.0, None)  # the command never moves
 
-    def tried(z: Float) -> tuple[Float, list[tuple[int, float]]]:
+    def tried(z: FloatArray) -> tuple[FloatArray, list[tuple[int, float]]]:
         rows = bank.ratios(_fraction(z))
         onsets = [onset_of(row, record.dt) for row in rows]
         # over the whole drive or from any row on, both as likely
@@ -80,8 +80,8 @@ def lost_messages(white: WhiteningFilter, errors: Float, command: Float, T_L: fl
 
 
 def rows_gained(
-    white: WhiteningFilter, errors: Float, command: Float, T_L: float, K_L: float, fits: NDArray[np.bool_]
-) -> Float:
+    white: WhiteningFilter, errors: FloatArray, command: FloatArray, T_L: float, K_L: float, fits: BoolArray
+) -> FloatArray:
     """Log likelihood ratio (counted,) of each row, losses over none, at the fraction that the rows in `fits` like best.
 
     Arguments as of `lost_messages`.
@@ -94,7 +94,7 @@ def rows_gained(
     return rows[int((rows[:, fits].sum(1) - 0.5 * z**2).argmax())]
 
 
-def _fraction(z: Float) -> Float:
+def _fraction(z: FloatArray) -> FloatArray:
     return 1 / (1 + np.exp(-_CENTRE - _SD * z))
 
 
@@ -107,11 +107,11 @@ class _Posterior:
     evidence: float
 
 
-def _posterior(z: Float, value: Float) -> _Posterior:
+def _posterior(z: FloatArray, value: FloatArray) -> _Posterior:
     """From log likelihoods `value` at three `z`, between which it runs as if so many messages were known to be lost
     and so many to have arrived, or where that does not fit as a parabola."""
 
-    def counted(z: Float) -> Float:
+    def counted(z: FloatArray) -> FloatArray:
         p = _fraction(z)
         return np.stack([np.log(p), np.log1p(-p), np.ones_like(p)], -1)
 
@@ -137,17 +137,17 @@ class Bank:
     them only to get the paths going; `valid` where within the stretch. `error` (channel, counted).
     """
 
-    move: Float
-    push: Float
-    see: Float
-    place: NDArray[np.int64]
-    valid: NDArray[np.bool_]
+    move: FloatArray
+    push: FloatArray
+    see: FloatArray
+    place: IntArray
+    valid: BoolArray
     warm: int
-    error: Float
-    command: Float
+    error: FloatArray
+    command: FloatArray
 
     @classmethod
-    def of(cls, white: WhiteningFilter, error: Float, command: Float, T_L: float, K_L: float) -> Bank:
+    def of(cls, white: WhiteningFilter, error: FloatArray, command: FloatArray, T_L: float, K_L: float) -> Bank:
         record = white.record
         image = image_of_row(white, T_L, K_L)
         move, push, see = states_of(image)
@@ -167,7 +167,7 @@ class Bank:
         rows = np.array(place, np.int64).reshape(-1, warm + size)
         return cls(move, push, see, rows, np.array(valid, bool).reshape(rows.shape), warm, error, command)
 
-    def ratios(self, fractions: Float) -> Float:
+    def ratios(self, fractions: FloatArray) -> FloatArray:
         """Log likelihood ratio of each row given those before it, losses over none: (fraction, counted)."""
         count, steps = self.place.shape
         order, total = len(self.push), len(fractions) * count
@@ -209,7 +209,7 @@ class Bank:
         return rows
 
 
-def _merged(weight: Float, path: Float, scale: Float) -> tuple[Float, Float]:
+def _merged(weight: FloatArray, path: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Half as many paths: those whose merging with a heavier one changes least go to the nearest that is kept."""
     count = weight.shape[1]
     keep = count // 2
@@ -236,7 +236,7 @@ def _merged(weight: Float, path: Float, scale: Float) -> tuple[Float, Float]:
 _HEAVIER = np.triu(np.full((2 * _PATHS, 2 * _PATHS), 1e30))
 
 
-def image_of_row(white: WhiteningFilter, T_L: float, K_L: float) -> Float:
+def image_of_row(white: WhiteningFilter, T_L: float, K_L: float) -> FloatArray:
     """White errors (channel, time) of one row whose command is one unit larger than logged."""
     dt = white.record.dt
     length = 2 * max(16, round(6 * T_L / dt) + 8)
@@ -249,7 +249,7 @@ def image_of_row(white: WhiteningFilter, T_L: float, K_L: float) -> Float:
     return white.response(np.stack([{"accel": accel, "speed": speed}[name] for name in white.record.channels]))
 
 
-def states_of(image: Float) -> tuple[Float, Float, Float]:
+def states_of(image: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """A few states whose response to a unit pulse is `image` (channel, time): (move, push, see) of `Bank`.
 
     Singular vectors of the image's Hankel matrix (Kung 1978), in output-normal coordinates.

@@ -6,20 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.gauss_newton import grade_marginal
 from avtorch.gap.likelihood.grade_marginal import GradeMarginal
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 
-Float = NDArray[np.float64]
-
 _PLACES = 12  # where a slope is first asked
 _NEAREST_S = 4.0  # an onset this close to the start or the end is none
 
 
-def profile(without: Float, with_cause: Float) -> Float:
+def profile(without: FloatArray, with_cause: FloatArray) -> FloatArray:
     """Log likelihood (row,) if the cause sets in at each row, from those of single rows (row,)."""
     before = np.concatenate([[0.0], np.cumsum(without)[:-1]])
     after = np.cumsum(with_cause[::-1])[::-1]
@@ -32,7 +30,7 @@ def allowed(rows: int, dt: float) -> slice:
     return slice(edge, rows - edge)
 
 
-def rough_onset(white: WhiteningFilter, hypothesis: Hypothesis, z: Float) -> tuple[int, float]:
+def rough_onset(white: WhiteningFilter, hypothesis: Hypothesis, z: FloatArray) -> tuple[int, float]:
     """Best onset row for parameters `z` of a fit over the whole drive, and what it gains [nats] over none."""
     if hypothesis.grade_means is not None:
         return _Road.of(white, hypothesis, z).best(allowed(hypothesis.record.rows, white.record.dt))
@@ -44,7 +42,7 @@ def rough_onset(white: WhiteningFilter, hypothesis: Hypothesis, z: Float) -> tup
     return best, float(rows[best] - rows[0])
 
 
-def refined_onset(white: WhiteningFilter, hypothesis: Hypothesis, z: Float, onset: int) -> tuple[int, Float]:
+def refined_onset(white: WhiteningFilter, hypothesis: Hypothesis, z: FloatArray, onset: int) -> tuple[int, FloatArray]:
     """Best onset row near `onset`, and the log likelihood over all rows tried, (row,), -inf elsewhere."""
     record = white.record
     within = allowed(record.rows, record.dt)
@@ -73,11 +71,11 @@ class _Road:
     """
 
     slope: GradeMarginal
-    full: Float
-    along: Float
+    full: FloatArray
+    along: FloatArray
 
     @classmethod
-    def of(cls, white: WhiteningFilter, hypothesis: Hypothesis, z: Float) -> _Road:
+    def of(cls, white: WhiteningFilter, hypothesis: Hypothesis, z: FloatArray) -> _Road:
         full = white(hypothesis.errors(z[None], coarse=True)[0])[..., 0]
         silent = white(
             hypothesis.record.measured.mean(-1, keepdims=True) - hypothesis.baseline_rollouts(z[None], coarse=True)[0]
@@ -85,7 +83,7 @@ class _Road:
         along = profile(-0.5 * (silent**2).sum(0), -0.5 * (full**2).sum(0))
         return cls(grade_marginal(white, hypothesis, None, coarse=True), full, along)
 
-    def at(self, rows: Sequence[int]) -> Float:
+    def at(self, rows: Sequence[int]) -> FloatArray:
         return self.along[list(rows)] + self.slope.from_rows(self.full, rows)
 
     def best(self, within: slice) -> tuple[int, float]:
@@ -102,7 +100,7 @@ class _Road:
         return best, found[best] - float(self.at([0])[0])
 
 
-def onset_evidence(found: Float, dt: float) -> float:
+def onset_evidence(found: FloatArray, dt: float) -> float:
     """What not knowing the onset costs [nats]: mean over a uniform prior against the best row."""
     tried = np.flatnonzero(np.isfinite(found))
     if len(tried) < 2:

@@ -11,12 +11,10 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from avtorch.arrays import BoolArray, FloatArray
 from avtorch.gap.search.onset import allowed
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +29,11 @@ class HeavyTails:
     fraction: float
     scale: float
     sds: tuple[float, float]
-    hit: NDArray[np.bool_]
-    ratios: Float = field(repr=False)
+    hit: BoolArray
+    ratios: FloatArray = field(repr=False)
     onset: int | None = None
-    z: Float | None = field(default=None, repr=False)
-    covariance: Float | None = field(default=None, repr=False)
+    z: FloatArray | None = field(default=None, repr=False)
+    covariance: FloatArray | None = field(default=None, repr=False)
 
     @property
     def plain(self) -> bool:
@@ -50,7 +48,7 @@ _TAIL_PRIOR = ((np.log(0.01), 1.5), (np.log(7.0), 0.4))
 _LEVEL_S = 20.0  # of a drive in which noise has one size: a gust that sets in makes it rougher, which is no glitch
 
 
-def _level(x: Float, size: int) -> Float:
+def _level(x: FloatArray, size: int) -> FloatArray:
     """Running median (row,) of x (row,) over blocks of about `size` rows, straight between their middles.
 
     Each block counts as its roughest neighbour, so that where the level rises no row is held against the lower one.
@@ -61,18 +59,18 @@ def _level(x: Float, size: int) -> Float:
     return np.asarray(np.interp(np.arange(len(x)), 0.5 * (ends[1:] + ends[:-1]), medians))
 
 
-def _outliers(z: Float) -> tuple[float, float]:
+def _outliers(z: FloatArray) -> tuple[float, float]:
     """`(fraction, scale)` of the effect `outliers`."""
     fraction, scale = (float(np.exp(centre + sd * x)) for (centre, sd), x in zip(_TAIL_PRIOR, z, strict=True))
     return min(fraction, 0.5), scale
 
 
 def heavy_tails(
-    errors: Float,
+    errors: FloatArray,
     dt: float,
     *,
-    fits: NDArray[np.bool_] | None = None,
-    law: Callable[[Float], tuple[float, float]] = _outliers,
+    fits: BoolArray | None = None,
+    law: Callable[[FloatArray], tuple[float, float]] = _outliers,
     size: int = 2,
 ) -> HeavyTails:
     """Outliers among accelerometer errors (row,), by their distance from the rows beside them.
@@ -91,14 +89,14 @@ def heavy_tails(
     rough = np.sort(spread, 0)[1]  # of four neighbours, those nearest to their median
     away = away / np.maximum(sd, rough)
 
-    def ratios(z: Float) -> Float:
+    def ratios(z: FloatArray) -> FloatArray:
         fraction, scale = law(z)
         # in units of the distances' own sd, which is some 1.15 of the noise's
         wide = 1 + (scale / 1.15) ** 2
         gain = -0.5 * np.log(wide) + 0.5 * away**2 * (1 - 1 / wide)
         return np.log1p(fraction * np.expm1(np.minimum(gain, 500.0)))
 
-    def cost(z: Float) -> float:
+    def cost(z: FloatArray) -> float:
         return -float(ratios(z)[fits].sum()) + 0.5 * float(z @ z)
 
     begin = [np.eye(1, size)[0] * a for a in (-1.5, 0.5)] if size else []
@@ -126,7 +124,7 @@ def heavy_tails(
     )
 
 
-def hessian_of(cost, z: Float, h: float = 0.05) -> Float:  # type: ignore[no-untyped-def]
+def hessian_of(cost, z: FloatArray, h: float = 0.05) -> FloatArray:  # type: ignore[no-untyped-def]
     size = len(z)
     out = np.empty((size, size))
     for i in range(size):
@@ -138,7 +136,7 @@ def hessian_of(cost, z: Float, h: float = 0.05) -> Float:  # type: ignore[no-unt
     return (vectors * np.maximum(values, 1.0)) @ vectors.T
 
 
-def onset_of(ratios: Float, dt: float) -> tuple[int, float]:
+def onset_of(ratios: FloatArray, dt: float) -> tuple[int, float]:
     """Best onset row of per-row ratios, and what it gains net of not knowing it [nats]."""
     after = np.cumsum(ratios[::-1])[::-1]
     within = allowed(len(ratios), dt)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.gauss_newton import modes, whitened_jacobian
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.record import Record
@@ -18,8 +18,6 @@ from avtorch.gap.search.onset import allowed
 from avtorch.gap.search.screening import Screened, converge, refine, screen
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.integrated import Integrated
-
-Float = NDArray[np.float64]
 
 _AT_ONCE = 32
 _MANY = 50  # starts of one effect, more than which are left to the fit of that effect alone
@@ -31,13 +29,13 @@ class Base:
     """What a second effect is tried on: a `hypothesis` at `z` (coordinate,), its parameter `values`, under `white`."""
 
     hypothesis: Hypothesis
-    z: Float
+    z: FloatArray
     values: Mapping[str, float]
     onset: int | None
     white: WhiteningFilter
 
     @cached_property
-    def _rested(self) -> tuple[Float, float]:
+    def _rested(self) -> tuple[FloatArray, float]:
         """Where the base comes to rest under this noise, and its log joint density there."""
         z, value = modes(self.hypothesis, self.white, self.z[None], onset=self.onset, iterations=4)
         return z[0], float(value[0])
@@ -48,28 +46,28 @@ class Base:
         return self._rested[1]
 
     @cached_property
-    def _silent(self) -> Float:
+    def _silent(self) -> FloatArray:
         return self.hypothesis.rollouts(self._rested[0][None], self.onset)[0]
 
     @cached_property
-    def _errors(self) -> Float:
+    def _errors(self) -> FloatArray:
         """White errors (row,), less whatever the base's own parameters can do."""
         return self._apart(self.white(self.hypothesis.record.measured - self._silent).reshape(1, -1))[0]
 
     @cached_property
-    def _own(self) -> tuple[Float, Float]:
+    def _own(self) -> tuple[FloatArray, FloatArray]:
         """White directions (direction, row) in which the base's own parameters move its rollout; their inverse Gram."""
         columns = whitened_jacobian(self.hypothesis, self.white, self._rested[0], self.onset)
         columns = columns[np.linalg.norm(columns, axis=1) > 1e-9]
         gram = columns @ columns.T
         return columns, np.asarray(np.linalg.pinv(gram, rcond=1e-10, hermitian=True), np.float64)
 
-    def _apart(self, images: Float) -> Float:
+    def _apart(self, images: FloatArray) -> FloatArray:
         """White `images` (column, row) less whatever the base's own parameters can do."""
         columns, inverse = self._own
         return images - (images @ columns.T) @ inverse @ columns
 
-    def score(self, hypothesis: Hypothesis, alone: Mapping[str, Mapping[str, float]]) -> tuple[float, Float]:
+    def score(self, hypothesis: Hypothesis, alone: Mapping[str, Mapping[str, float]]) -> tuple[float, FloatArray]:
         """Nats a `hypothesis` of one effect more could gain, and from which start of its.
 
         By one linear step from each start, with whatever the base's own parameters can do taken out. `alone`: where
@@ -101,7 +99,7 @@ class Base:
 
     def partners(
         self, kinds: Sequence[type[Effect]], alone: Mapping[str, Mapping[str, float]], *, most: int, least: float
-    ) -> list[tuple[Hypothesis, Float]]:
+    ) -> list[tuple[Hypothesis, FloatArray]]:
         """Hypotheses with one of `kinds` besides, and where to begin: the `most` best, of `least` nats or more."""
         record, baseline, own = self.hypothesis.record, self.hypothesis.baseline, self.hypothesis.effects
         roads = self.hypothesis.integrated is not None  # a hypothesis integrates one effect at most
@@ -114,7 +112,7 @@ class Base:
         return [(pair, start) for gain, start, pair in scored[:most] if gain > least]
 
 
-def _gained(squares: Float, crosses: Float, onsets: bool, record: Record) -> Float:
+def _gained(squares: FloatArray, crosses: FloatArray, onsets: bool, record: Record) -> FloatArray:
     """Nats (column,) along a direction of the best size, from rows' parts (column, row).
 
     Over the whole drive or, with `onsets`, from any row on.
@@ -131,7 +129,13 @@ def _gained(squares: Float, crosses: Float, onsets: bool, record: Record) -> Flo
 
 
 def joint_fit(
-    hypothesis: Hypothesis, first: type[Effect], z: Float, onset: int | None, white: WhiteningFilter, *, onsets: bool
+    hypothesis: Hypothesis,
+    first: type[Effect],
+    z: FloatArray,
+    onset: int | None,
+    white: WhiteningFilter,
+    *,
+    onsets: bool,
 ) -> Screened:
     """Where a pair comes to rest: from `z`, and with the `first` effect begun anew.
 

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.gauss_newton import finish, modes
 from avtorch.gap.likelihood.noise_fit import PRIORS, fit_noise
 from avtorch.gap.likelihood.noise_segments import whitening_filter
@@ -27,8 +27,6 @@ from avtorch.gap.search.full_rate import full_rate_errors, full_rate_filter
 from avtorch.gap.search.outliers import HeavyTails, hessian_of
 from avtorch.gap.simulator.effect import Effect, SearchedAs
 from avtorch.gap.simulator.plant import GapPlant
-
-Float = NDArray[np.float64]
 
 _TURNS = 4  # of parameters and noise
 _ENOUGH = 0.1  # nats
@@ -62,7 +60,7 @@ def forced(base: FittedModel, law: RandomLaw) -> FittedModel:
     best: FittedModel | None = None
     for begin in (0.0, -1.0):  # typical, and fainter
         z, noise, errors = base.z, base.noise.noise, base.errors
-        law_z: Float = np.full(law.size, begin)
+        law_z: FloatArray = np.full(law.size, begin)
         value = -np.inf
         for _ in range(_TURNS):
             lag = float(candidate.values(z[None])["T_L"][0])
@@ -140,10 +138,10 @@ def commanded(base: FittedModel, law: RandomLaw, raw: Record) -> FittedModel:
     def white(shift: float) -> WhiteningFilter:
         return WhiteningFilter(raw, plain.noise.replaced(process_sd=own * float(np.exp(spread * shift))))
 
-    def without(x: Float) -> float:
+    def without(x: FloatArray) -> float:
         return flat - float(white(x[0]).row_likelihoods(errors).sum()) + 0.5 * ((centre + x[0]) ** 2 - centre**2)
 
-    def cost(x: Float) -> float:
+    def cost(x: FloatArray) -> float:
         if abs(x[0]) > 3 or np.abs(x[1:]).max(initial=0.0) > 5:
             return 1e9 * (1 + float(np.abs(x).max()))
         variance = variance_of(law, x[1:], base, raw)
@@ -165,7 +163,7 @@ def commanded(base: FittedModel, law: RandomLaw, raw: Record) -> FittedModel:
     return replace(base, name=base.name_with(law.name), log_evidence=base.log_evidence + evidence, by_chance=by_chance)
 
 
-def variance_of(law: RandomLaw, z: Float, base: FittedModel, raw: Record) -> Float:
+def variance_of(law: RandomLaw, z: FloatArray, base: FittedModel, raw: Record) -> FloatArray:
     """Of the command's errors as they reach the actuator, (counted,) [(m/s²)²]: behind a delay of the base's, late."""
     late = 0.0
     for e in base.hypothesis.effects:

@@ -6,15 +6,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.gauss_newton import modes
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.initial_values import one_at_a_time
 from avtorch.gap.search.onset import allowed, profile, rough_onset
-
-Float = NDArray[np.float64]
 
 ENOUGH = 0.3
 """Nats a step gains at least, or the look is over."""
@@ -29,7 +27,7 @@ class Screened:
     """Where a `hypothesis` came to: `z` (coordinate,), its log joint density `value`, from row `onset` on."""
 
     hypothesis: Hypothesis = field(repr=False)
-    z: Float = field(repr=False)
+    z: FloatArray = field(repr=False)
     value: float
     onset: int | None = None
 
@@ -37,7 +35,7 @@ class Screened:
 def screen(
     hypothesis: Hypothesis,
     white: WhiteningFilter,
-    starts: Float,
+    starts: FloatArray,
     *,
     onsets: bool = True,
     floor: float = -np.inf,
@@ -80,7 +78,7 @@ def refine(look: Screened, white: WhiteningFilter) -> Screened:
     return replace(look, z=z[0], value=float(value[0]))
 
 
-def _from(hypothesis: Hypothesis, white: WhiteningFilter, z: Float, onset: int) -> Screened:
+def _from(hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int) -> Screened:
     """Parameters and onset in turn."""
     value = -np.inf
     for _ in range(2):
@@ -93,8 +91,8 @@ def _from(hypothesis: Hypothesis, white: WhiteningFilter, z: Float, onset: int) 
 
 
 def _best(
-    hypothesis: Hypothesis, white: WhiteningFilter, z: Float, onset: int | None, iterations: int
-) -> tuple[Float, float]:
+    hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int | None, iterations: int
+) -> tuple[FloatArray, float]:
     """The best mode from starts `z` (start, coordinate), also of those beside it."""
     found, values = modes(hypothesis, white, z, onset=onset, iterations=iterations, coarse=True, enough=ENOUGH)
     best, value = found[values.argmax()], float(values.max())
@@ -113,13 +111,15 @@ def _best(
     return best, value
 
 
-def converge(hypothesis: Hypothesis, white: WhiteningFilter, z: Float, onset: int | None) -> Screened:
+def converge(hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int | None) -> Screened:
     """Where a hypothesis comes to rest from `z` (coordinate,), its onset held."""
     best, value = _best(hypothesis, white, z[None], onset, 6)
     return Screened(hypothesis, best, value, onset)
 
 
-def _tried(hypothesis: Hypothesis, white: WhiteningFilter, starts: Float, onsets: bool) -> tuple[Float, Float, Float]:
+def _tried(
+    hypothesis: Hypothesis, white: WhiteningFilter, starts: FloatArray, onsets: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Log joint densities (start,) over the whole drive, with the best onset, and which row that is."""
     record = hypothesis.record
     within = allowed(record.rows, record.dt)

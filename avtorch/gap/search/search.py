@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.gauss_newton import finish, modes, residuals
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import fit_noise
@@ -49,7 +49,6 @@ from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log
 
-Float = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
 Kinds = Sequence[type[Effect]]
@@ -159,7 +158,7 @@ class Search:
         return self._settled(hypothesis, places[values.argmax()], none.noise.noise)
 
     def _settled(
-        self, hypothesis: Hypothesis, z: Float, noise: NoiseModel, *, onset: int | None = None, rounds: int = 2
+        self, hypothesis: Hypothesis, z: FloatArray, noise: NoiseModel, *, onset: int | None = None, rounds: int = 2
     ) -> FittedModel:
         """Parameters and noise in turn until both rest."""
         record = hypothesis.record
@@ -193,7 +192,9 @@ class Search:
         return Kept(z, noise, log_prior).found(hypothesis, onset)
 
     @staticmethod
-    def _traded(hypothesis: Hypothesis, z: Float, white: WhiteningFilter, onset: int | None, coarse: bool) -> Float:
+    def _traded(
+        hypothesis: Hypothesis, z: FloatArray, white: WhiteningFilter, onset: int | None, coarse: bool
+    ) -> FloatArray:
         """`z`, or the best place from which a dead time and the lag are told apart better."""
         places = np.concatenate([z[None], lag_delay_starts(hypothesis, z)])
         if len(places) == 1:
@@ -202,7 +203,7 @@ class Search:
         return moved[values.argmax()]
 
     @staticmethod
-    def _values(hypothesis: Hypothesis, z: Float) -> dict[str, float]:
+    def _values(hypothesis: Hypothesis, z: FloatArray) -> dict[str, float]:
         return {key: float(x[0]) for key, x in hypothesis.values(z[None]).items()}
 
     def _deterministic(self, record: Record, none: FittedModel) -> list[FittedModel]:
@@ -260,7 +261,7 @@ class Search:
         """One cause over the whole drive and from an onset on; both weigh the same a priori."""
         return with_or_without_onset([self._from_onset(f.hypothesis, f.z, noise, f.onset) for f in forms])
 
-    def _from_onset(self, hypothesis: Hypothesis, z: Float, noise: NoiseModel, onset: int | None) -> FittedModel:
+    def _from_onset(self, hypothesis: Hypothesis, z: FloatArray, noise: NoiseModel, onset: int | None) -> FittedModel:
         if onset is None:
             return self._settled(hypothesis, z, noise)
         record = hypothesis.record

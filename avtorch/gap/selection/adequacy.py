@@ -18,14 +18,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.basis import linear_splines, lowpass
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.selection.calibration import CALIBRATION
-
-Float = NDArray[np.float64]
 
 SCALES = CALIBRATION.remainder
 """Chosen before `unknown` was fitted, whose weights hold for these only. Numbers below are numerics: they keep a
@@ -54,7 +52,7 @@ class Adequacy:
     bursts: float
     tails: float
 
-    def vector(self) -> Float:
+    def vector(self) -> FloatArray:
         return np.array([getattr(self, f.name) for f in fields(self)])
 
     @property
@@ -65,8 +63,8 @@ class Adequacy:
 
 def adequacy(
     white: WhiteningFilter,
-    errors: Float,
-    rollout: Float,
+    errors: FloatArray,
+    rollout: FloatArray,
     *,
     explained: float = 0.0,
 ) -> Adequacy:
@@ -87,7 +85,7 @@ def adequacy(
 class _Look:
     """The white errors and the regressors that all questions share."""
 
-    def __init__(self, white: WhiteningFilter, errors: Float, rollout: Float) -> None:
+    def __init__(self, white: WhiteningFilter, errors: FloatArray, rollout: FloatArray) -> None:
         record = white.record
         self.white, self.dt, self.channels, self.group = white, record.dt, record.channels, errors.shape[-1]
         self.each = white(errors)
@@ -103,15 +101,15 @@ class _Look:
             self.v = lowpass(_late(record.measured[-1].mean(-1), 1), SCALES.speed_lag, self.dt)
         self.t = np.linspace(0.0, 1.0, self.rows)
 
-    def _force(self, x: Float) -> Float:
+    def _force(self, x: FloatArray) -> FloatArray:
         """White image (column, channel * counted) of accelerations (column, counted) of the car itself."""
         return self._image(x, True, self.channels)
 
-    def _reading(self, x: Float, channel: str) -> Float:
+    def _reading(self, x: FloatArray, channel: str) -> FloatArray:
         """Likewise of what only one channel shows."""
         return self._image(x, False, (channel,))
 
-    def _image(self, x: Float, moves: bool, seen: Sequence[str]) -> Float:
+    def _image(self, x: FloatArray, moves: bool, seen: Sequence[str]) -> FloatArray:
         out = np.empty((len(x), len(self.channels), self.rows))
         for i, column in enumerate(x):
             rows = np.zeros((len(self.channels), self.rows, self.group))
@@ -236,17 +234,17 @@ class _Look:
         return float(np.maximum(self.rows * excess**2 / 48 * np.sign(excess), 0).sum())
 
 
-def _summed(e: Float) -> Float:
+def _summed(e: FloatArray) -> FloatArray:
     """White rows (..., counted, group) summed over groups to white ones (..., counted)."""
     return e.sum(-1) / np.sqrt(e.shape[-1])
 
 
-def _mean(nats: Sequence[float] | Float) -> float:
+def _mean(nats: Sequence[float] | FloatArray) -> float:
     """Log of the mean of Bayes factors given by their logarithms."""
     return float(np.logaddexp.reduce(np.asarray(nats, float)) - np.log(len(nats)))
 
 
-def _evidence(columns: Float, e: Float) -> float:
+def _evidence(columns: FloatArray, e: FloatArray) -> float:
     """Log Bayes factor of e (row,) = coefficients (column,) of one unknown size @ columns (column, row) + white."""
     gram = columns @ columns.T
     typical = np.trace(gram) / max(len(columns), 1)
@@ -258,17 +256,17 @@ def _evidence(columns: Float, e: Float) -> float:
     return _mean([float(0.5 * (match * s / (1 + s * values) - np.log1p(s * values)).sum()) for s in wide])
 
 
-def _scattered(square: Float, match: Float, variance: float) -> float:
+def _scattered(square: FloatArray, match: FloatArray, variance: float) -> float:
     """Log Bayes factor of one column with a coefficient of its own in every block, independent, of this variance."""
     return float(0.5 * (match**2 * variance / (1 + variance * square) - np.log1p(variance * square)).sum())
 
 
-def _late(x: Float, rows: int) -> Float:
+def _late(x: FloatArray, rows: int) -> FloatArray:
     rows = min(rows, len(x))
     return np.concatenate([np.full(rows, x[0]), x[: len(x) - rows]])
 
 
-def _decaying(keep: float) -> Float:
+def _decaying(keep: float) -> FloatArray:
     """Root of the stable-spline prior of impulse responses: smooth, and `keep` times smaller with every delay.
 
     Pillonetto and De Nicolao (2010), first-order kernel.

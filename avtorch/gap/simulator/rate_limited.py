@@ -12,11 +12,11 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-Float = NDArray[np.float64]
-RowStep = Callable[[Float, Float, Float, Float, Float], Float]
+from avtorch.arrays import FloatArray
+
+RowStep = Callable[[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
 
 _STRETCHES, _SHORTEST = 128, 128  # rows of the shortest stretch
 _SAME = 1e-13  # [m/s²]
@@ -33,7 +33,7 @@ class Held(Protocol):
     def length(self) -> Tensor: ...
 
 
-def limited_row(a: Float, g: Float, T: Float, h: Float, J: Float) -> Float:
+def limited_row(a: FloatArray, g: FloatArray, T: FloatArray, h: FloatArray, J: FloatArray) -> FloatArray:
     """First-order lag with rate limit `J` over `h`: at the limit while it binds, then exponential."""
     d = g - a
     at_limit = np.minimum(np.maximum(np.abs(d) / J - T, 0.0), h)
@@ -41,7 +41,7 @@ def limited_row(a: Float, g: Float, T: Float, h: Float, J: Float) -> Float:
     return g - left * np.exp((at_limit - h) / T)
 
 
-def slewed_row(r: Float, g: Float, T: Float, h: Float, J: Float) -> Float:
+def slewed_row(r: FloatArray, g: FloatArray, T: FloatArray, h: FloatArray, J: FloatArray) -> FloatArray:
     """A target slewed at no more than `J`."""
     reach = J * h
     return r + np.minimum(np.maximum(g - r, -reach), reach)

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from avtorch.arrays import FloatArray
 from avtorch.io import Log
 from avtorch.trial.reply import reply
 from avtorch.trial.rivals.maximum_likelihood import Fitter
 from avtorch.trial.rivals.residuals import Residuals
 
-Float = NDArray[np.float64]
 _BLOCKS = 20
 _MEMORY_S, _ORDER = 0.3, 8
 _LAGS_S = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
@@ -48,7 +48,7 @@ def black_box(log: Log) -> dict[str, Any]:
     )
 
 
-def held_out_gains(fitter: Fitter, transformed: NDArray[np.complex128], ridge: float) -> Float:
+def held_out_gains(fitter: Fitter, transformed: NDArray[np.complex128], ridge: float) -> FloatArray:
     """Gain in log likelihood (block,) of the flexible regression over autoregression, each block held out in turn."""
     drive = fitter.drive
     valid = drive.valid
@@ -72,7 +72,7 @@ def held_out_gains(fitter: Fitter, transformed: NDArray[np.complex128], ridge: f
     return gains
 
 
-def _features(drive: Residuals, residual: Float, rows: NDArray[np.intp]) -> Float:
+def _features(drive: Residuals, residual: FloatArray, rows: NDArray[np.intp]) -> FloatArray:
     """Lagged commands and responses to them, bent and times speed; nothing that the row's own noise has touched."""
     command = np.concatenate([one.command.numpy() for one in drive.drives])
     speed = np.concatenate(
@@ -90,7 +90,7 @@ def _features(drive: Residuals, residual: Float, rows: NDArray[np.intp]) -> Floa
     return np.stack(columns, 1)
 
 
-def _held_out(features: Float, target: Float, block: NDArray[np.intp], free: int, ridge: float) -> Float:
+def _held_out(features: FloatArray, target: FloatArray, block: NDArray[np.intp], free: int, ridge: float) -> FloatArray:
     """Errors of regressions that have not seen the block; all but the first `free` columns are priced."""
     scaled = features / np.maximum(np.sqrt(np.mean(features**2, 0)), 1e-9)
     edges = np.searchsorted(block, np.arange(_BLOCKS + 1))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap import RoadGrade
 from avtorch.trial.rivals.maximum_likelihood import Fitter, MaximumLikelihoodFit
 
-Float = NDArray[np.float64]
 _ROAD_HZ = 3.0  # what a road does to a car is slower
 
 
@@ -93,7 +93,7 @@ def road_grade(fitter: Fitter, fit: MaximumLikelihoodFit) -> float | None:
     return best
 
 
-def _innovations(fitter: Fitter, fit: MaximumLikelihoodFit, order: int = 8) -> tuple[Float, NDArray[np.intp]]:
+def _innovations(fitter: Fitter, fit: MaximumLikelihoodFit, order: int = 8) -> tuple[FloatArray, NDArray[np.intp]]:
     """What the rows before do not foretell of the first channel's residual, and the rows it is of.
 
     By autoregression on all channels: the controller acts on noise, so a filter that looks ahead would take the

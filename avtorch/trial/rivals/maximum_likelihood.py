@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.gap import EFFECTS, GapPlant, plant
 from avtorch.trial.rivals.residuals import Residuals
 from avtorch.trial.rivals.spectrum import Complex, Spectrum
 
-Float = NDArray[np.float64]
 _STEPS = 12
 _WIDE = 0.05  # half of the width of differences, in the prior's SDs
 _REACH = 6.0  # how far from its prior's middle a coordinate may go, in the prior's SDs
@@ -34,7 +33,7 @@ class MaximumLikelihoodFit:
     z: Mapping[str, float]
     loss: float
     transformed: Complex
-    sizes: Float
+    sizes: FloatArray
     gust_time: float | None
     inverse: Complex
     lag: float
@@ -119,7 +118,7 @@ class Fitter:
             tuple(effects), made, named, loss, transformed, sizes, gust_time, inverse, lag, slope_at
         )
 
-    def _starts(self, names: Sequence[str], begin: Float, known: Mapping[str, float]) -> Float:
+    def _starts(self, names: Sequence[str], begin: FloatArray, known: Mapping[str, float]) -> FloatArray:
         """Coordinates (start, coordinate) at which to begin."""
         new = [i for i, name in enumerate(names) if name not in known and "." in name]
         if not new:
@@ -138,17 +137,23 @@ class Fitter:
                 starts.append(z)
         return np.stack(starts)
 
-    def _misses(self, made: GapPlant, names: Sequence[str], z: Float) -> Float:
+    def _misses(self, made: GapPlant, names: Sequence[str], z: FloatArray) -> FloatArray:
         own = made.parameters()
         values = {name: own[name].constrain(torch.as_tensor(z[:, i].copy())) for i, name in enumerate(names)}
         return self.drive.misses(made, values)
 
-    def _quadratic(self, misses: Float, inverse: Complex) -> Float:
+    def _quadratic(self, misses: FloatArray, inverse: Complex) -> FloatArray:
         transformed = self.spectrum.transform(misses)
         return np.einsum("skc,kcd,skd->s", transformed.conj(), inverse, transformed, optimize=True).real
 
     def _state(
-        self, made: GapPlant, names: Sequence[str], z: Float, missed: Float, sizes: Float | None, gust: bool
+        self,
+        made: GapPlant,
+        names: Sequence[str],
+        z: FloatArray,
+        missed: FloatArray,
+        sizes: FloatArray | None,
+        gust: bool,
     ) -> Any:
         lag = float(made.parameters()["T_L"].constrain(torch.tensor(z[0], dtype=torch.float64)))
         transformed = self.spectrum.transform(missed)
@@ -158,7 +163,7 @@ class Fitter:
         loss, sizes, gust_time = self.spectrum.fit_noise(bands, lag, sizes, gust)
         return loss, transformed, sizes, gust_time, self.spectrum.inverse(lag, sizes, gust_time), lag
 
-    def _slope(self, made: GapPlant, names: Sequence[str], z: Float) -> Complex:
+    def _slope(self, made: GapPlant, names: Sequence[str], z: FloatArray) -> Complex:
         """Derivative of the transformed response, (coordinate, frequency, channel), by central differences.
 
         They are wide, for a response that has kinks (a delay of whole rows) draws a narrower one into the kink.
@@ -168,7 +173,7 @@ class Fitter:
         return self.spectrum.transform((missed[: len(names)] - missed[len(names) :]) / (2 * _WIDE))
 
 
-def _normal(slope: Complex, inverse: Complex, transformed: Complex) -> tuple[Float, Float]:
+def _normal(slope: Complex, inverse: Complex, transformed: Complex) -> tuple[FloatArray, FloatArray]:
     """Gauss and Newton's matrix, and the direction downhill."""
     weighed = np.einsum("kcd,pkd->pkc", inverse, slope)
     flat = weighed.reshape(len(slope), -1).conj()

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError
 from avtorch.gap import Drive, GapPlant
 from avtorch.io import Log
 
-Float = NDArray[np.float64]
 _SETTLE_S = 1.0
 
 
@@ -33,9 +32,9 @@ class Residuals:
 
     drives: tuple[Drive, ...]
     channels: tuple[str, ...]
-    seen: Float
-    valid: NDArray[np.bool_]
-    push: Float
+    seen: FloatArray
+    valid: BoolArray
+    push: FloatArray
     step: float
 
     @classmethod
@@ -73,7 +72,7 @@ class Residuals:
         return cls(tuple(drives), channels, np.concatenate(seen, 1), np.concatenate(valid), np.concatenate(push), step)
 
     @torch.no_grad()
-    def misses(self, plant: GapPlant, values: Mapping[str, Tensor]) -> Float:
+    def misses(self, plant: GapPlant, values: Mapping[str, Tensor]) -> FloatArray:
         """Residuals (batch, channel, row), 0 where not valid; `values` as of `GapPlant.response`, batch first."""
         parts = []
         for drive in self.drives:
@@ -85,7 +84,7 @@ class Residuals:
         missed = self.seen - np.concatenate(parts, -1)
         return np.where(self.valid, missed, 0.0)
 
-    def forced(self, columns: Float) -> Float:
+    def forced(self, columns: FloatArray) -> FloatArray:
         """What accelerations (column, row) [m/s²] of the body put into the channels: (column, channel, row)."""
         gained = np.zeros_like(columns)
         gained[:, :-1] = 0.5 * self.step * (columns[:, 1:] + columns[:, :-1])
@@ -93,7 +92,7 @@ class Residuals:
         return np.where(self.valid, np.stack([told[name] for name in self.channels], 1), 0.0)
 
 
-def _after(fit: NDArray[np.bool_], wait: int) -> NDArray[np.bool_]:
+def _after(fit: BoolArray, wait: int) -> BoolArray:
     """Rows with `wait` fit rows before them."""
     at = np.arange(len(fit))
     return at - np.maximum.accumulate(np.where(fit, -1, at)) > wait

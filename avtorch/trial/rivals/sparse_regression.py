@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError
 from avtorch.io import Log
 from avtorch.trial.reply import reply, softmax
 from avtorch.trial.rivals.terms import lagged, terms
 
-Float = NDArray[np.float64]
 _RATE_HZ = 20.0
 _BLOCKS = 10
 _SMOOTH_S = 0.1
@@ -84,11 +84,11 @@ def sparse_regression(log: Log) -> dict[str, Any]:
     )
 
 
-def _thin(x: Float, every: int) -> Float:
+def _thin(x: FloatArray, every: int) -> FloatArray:
     return x[: len(x) // every * every].reshape(-1, every).mean(1)
 
 
-def _best_lag(u: Float, a: Float | None, v: Float | None, moving: NDArray[np.bool_], step: float) -> float:
+def _best_lag(u: FloatArray, a: FloatArray | None, v: FloatArray | None, moving: BoolArray, step: float) -> float:
     """The lag [s] whose response to the command is nearest to the acceleration, up to a gain."""
     assert a is not None or v is not None
     seen = gaussian_filter1d(v, _SMOOTH_S / step, order=1) / step if a is None and v is not None else a
@@ -103,12 +103,12 @@ def _best_lag(u: Float, a: Float | None, v: Float | None, moving: NDArray[np.boo
 
 def _held_out(
     package: ModuleType,
-    slope: Float,
-    columns: list[Float],
+    slope: FloatArray,
+    columns: list[FloatArray],
     block: NDArray[np.intp],
-    moving: NDArray[np.bool_],
+    moving: BoolArray,
     step: float,
-) -> Float:
+) -> FloatArray:
     """Errors of the sparse model at rows that it was not fitted to."""
     if not columns:
         return slope[moving]
@@ -137,7 +137,7 @@ def _held_out(
     return np.concatenate(errors)
 
 
-def _worth(errors: Float) -> float:
+def _worth(errors: FloatArray) -> float:
     """How many independent rows they are worth, by their first autocorrelations."""
     e = errors - errors.mean()
     lags = [float(e[i:] @ e[: len(e) - i] / (e @ e)) for i in range(1, 20)]

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 from scipy.optimize import minimize
 
-Float = NDArray[np.float64]
+from avtorch.arrays import BoolArray, FloatArray
+
 Complex = NDArray[Any]  # complex, or real where it happens to be
 
 
@@ -29,7 +30,7 @@ class Shapes:
 
     parts: Complex
 
-    def total(self, sizes: Float) -> Complex:
+    def total(self, sizes: FloatArray) -> Complex:
         """The noise's spectrum at these sizes (part,)."""
         return np.tensordot(sizes, self.parts, 1)
 
@@ -37,7 +38,7 @@ class Shapes:
 class Spectrum:
     """Frequencies of residuals (channel, row) of which `valid` rows are not 0, `step` [s] apart."""
 
-    def __init__(self, valid: NDArray[np.bool_], step: float, channels: tuple[str, ...]) -> None:
+    def __init__(self, valid: BoolArray, step: float, channels: tuple[str, ...]) -> None:
         self.rows, self.step, self.channels = int(valid.sum()), step, channels
         self.length = int(next_fast_len(len(valid), real=True) or len(valid))
         count = self.length // 2 + 1
@@ -52,7 +53,7 @@ class Spectrum:
         self._band_weight = np.add.reduceat(self.weight, self._starts)
         self._middle = np.add.reduceat(self.weight * self.frequency, self._starts) / self._band_weight
 
-    def transform(self, residual: Float) -> Complex:
+    def transform(self, residual: FloatArray) -> Complex:
         """(..., channel, row) to (..., frequency, channel)."""
         return np.moveaxis(np.fft.rfft(residual, self.length), -1, -2)
 
@@ -84,15 +85,15 @@ class Spectrum:
         return float(self.rows / self.length * np.sum(self._band_weight * (log_det + fit)))
 
     def fit_noise(
-        self, bands: Complex, lag: float, start: Float | None, gust: bool
-    ) -> tuple[float, Float, float | None]:
+        self, bands: Complex, lag: float, start: FloatArray | None, gust: bool
+    ) -> tuple[float, FloatArray, float | None]:
         """Sizes (part,) of the noise that make these bands most likely: loss, sizes, time constant of the gusts."""
         if not gust:
             return *self._fit(bands, self.shapes(lag, None, banded=True), start), None
         tries = [(*self._fit(bands, self.shapes(lag, t, banded=True), None), t) for t in (1.0, 2.0, 4.0)]
         return min(tries, key=lambda one: one[0])
 
-    def _fit(self, bands: Complex, shapes: Shapes, start: Float | None) -> tuple[float, Float]:
+    def _fit(self, bands: Complex, shapes: Shapes, start: FloatArray | None) -> tuple[float, FloatArray]:
         weight = self.rows / self.length * self._band_weight
         parts = shapes.parts
         if start is None or len(start) != len(parts):
@@ -100,7 +101,7 @@ class Spectrum:
             start[1 : 1 + len(self.channels)] = 1e-3
         floor = np.log(1e-8)
 
-        def value(logs: Float) -> tuple[float, Float]:
+        def value(logs: FloatArray) -> tuple[float, FloatArray]:
             sizes = np.exp(logs)
             inverse, log_det = _inverse(np.tensordot(sizes, parts, 1))
             middle = inverse - inverse @ bands @ inverse
@@ -118,19 +119,19 @@ class Spectrum:
         )
         return float(found.fun), np.exp(found.x)
 
-    def inverse(self, lag: float, sizes: Float, gust_time: float | None) -> Complex:
+    def inverse(self, lag: float, sizes: FloatArray, gust_time: float | None) -> Complex:
         """`S^-1` (frequency, channel, channel), weighed so that `sum R* S^-1 R` is the quadratic form of -log L."""
         inverse, _ = _inverse(self.shapes(lag, gust_time, banded=False).total(sizes))
         return inverse * (self.weight / self.length)[:, None, None]
 
 
-def _coloured(turn: Complex, ratio: float) -> Float:
+def _coloured(turn: Complex, ratio: float) -> FloatArray:
     """Spectrum of an Ornstein-Uhlenbeck process of variance 1 whose time constant is `1 / ratio` rows."""
     keep = np.exp(-ratio)
     return (1 - keep**2) / np.abs(1 - keep / turn) ** 2
 
 
-def _inverse(matrix: Complex) -> tuple[Complex, Float]:
+def _inverse(matrix: Complex) -> tuple[Complex, FloatArray]:
     """Inverse and log determinant of Hermitian matrices (..., n, n), n at most 2."""
     if matrix.shape[-1] == 1:
         return 1 / matrix, np.log(np.real(matrix[..., 0, 0]))

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-Float = NDArray[np.float64]
+from avtorch.arrays import FloatArray
 
 
 def terms(
-    command: Float, response: Float, speed: Float | None, step: float, channels: int
-) -> Iterator[tuple[str, str, list[Float]]]:
+    command: FloatArray, response: FloatArray, speed: FloatArray | None, step: float, channels: int
+) -> Iterator[tuple[str, str, list[FloatArray]]]:
     """Effect, the equation it stands in and its columns (row,): `motion`, and with two channels their `difference`.
 
     Columns come from the command, from the lag's `response` to it and from the measured speed, never from the measured
@@ -33,7 +32,7 @@ def terms(
         yield "sensor_lag", "difference", [np.gradient(a, step)]
 
 
-def _of_command(u: Float, a: Float, step: float) -> Iterator[tuple[str, list[Float]]]:
+def _of_command(u: FloatArray, a: FloatArray, step: float) -> Iterator[tuple[str, list[FloatArray]]]:
     yield "dead_time", [_late(u, lag, step) - u for lag in (0.1, 0.2, 0.4)]
     yield "dead_band", [np.clip(u, -0.1, 0.1)]
     yield "backlash", [_play(u, 0.1) - u]
@@ -48,7 +47,7 @@ def _of_command(u: Float, a: Float, step: float) -> Iterator[tuple[str, list[Flo
     yield "driveline_oscillation", [x for hertz in (1.5, 3.0) for x in _resonance(a, hertz, step)]
 
 
-def _of_speed(u: Float, a: Float, v: Float, step: float) -> Iterator[tuple[str, list[Float]]]:
+def _of_speed(u: FloatArray, a: FloatArray, v: FloatArray, step: float) -> Iterator[tuple[str, list[FloatArray]]]:
     middle = max(float(v.mean()), 1.0)
     yield "speed_dependent_lag", [(v / middle - 1) * (u - a)]
     yield "speed_dependent_gain", [(v / middle - 1) * u]
@@ -62,12 +61,12 @@ def _of_speed(u: Float, a: Float, v: Float, step: float) -> Iterator[tuple[str, 
     yield "low_speed_creep", [np.clip(1 - v / 3, 0.0, 1.0)]
 
 
-def _late(x: Float, lag: float, step: float) -> Float:
+def _late(x: FloatArray, lag: float, step: float) -> FloatArray:
     rows = max(1, round(lag / step))
     return np.concatenate([np.full(rows, x[0]), x[:-rows]])
 
 
-def _play(u: Float, half: float) -> Float:
+def _play(u: FloatArray, half: float) -> FloatArray:
     at, out = u[0], []
     for x in u.tolist():
         at = min(max(at, x - half), x + half)
@@ -75,13 +74,13 @@ def _play(u: Float, half: float) -> Float:
     return np.array(out)
 
 
-def lagged(u: Float, lag: float, step: float) -> Float:
+def lagged(u: FloatArray, lag: float, step: float) -> FloatArray:
     """A command (row,) past a first-order lag [s], settled at its first value."""
     keep = float(np.exp(-step / lag))
     return np.asarray(lfilter([0.0, 1 - keep], [1.0, -keep], u - u[0]) + u[0])
 
 
-def _resonance(x: Float, hertz: float, step: float, damping: float = 0.08) -> list[Float]:
+def _resonance(x: FloatArray, hertz: float, step: float, damping: float = 0.08) -> list[FloatArray]:
     """Both phases of a lightly damped mode driven by `x`."""
     pole = np.exp((-damping + 1j * np.sqrt(1 - damping**2)) * 2 * np.pi * hertz * step)
     rung = lfilter([0.0, 1.0], [1.0, -pole], np.diff(x, prepend=x[0]))

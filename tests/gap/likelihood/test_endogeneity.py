@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from avtorch.arrays import FloatArray
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest import DrivePlan as BlindDrive
 from avtorch.gap import plant
@@ -19,7 +20,6 @@ from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.search import Search
 from avtorch.io import Log
-from tests.gap.records import Float
 
 CAUSES = {
     "dead_time": ("dead_time.delay_s", (0.02, 0.1)),
@@ -30,11 +30,11 @@ CAUSES = {
 class _Means(Hypothesis):
     """Looks at the groups' means alone."""
 
-    def errors(self, z: Float, onset: int | None = None, *, coarse: bool = False) -> Float:
+    def errors(self, z: FloatArray, onset: int | None = None, *, coarse: bool = False) -> FloatArray:
         return super().errors(z, onset, coarse=coarse).mean(-1, keepdims=True)
 
 
-def _gains(record: Record, kind: type[Hypothesis], noise: NoiseModel) -> Float:
+def _gains(record: Record, kind: type[Hypothesis], noise: NoiseModel) -> FloatArray:
     """Evidence [nats] of each cause over none, all under one noise."""
     white = WhiteningFilter(record, noise)
     base = {"T_L": 0.4, "K_L": 1.0}

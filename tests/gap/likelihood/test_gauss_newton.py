@@ -10,6 +10,7 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
+from avtorch.arrays import FloatArray
 from avtorch.gap import AerodynamicDrag, ConstantResistance, DeadTime, Drive, GapPlant, RoadGrade, SensorBias, plant
 from avtorch.gap.effects.road_grade import GRAVITY
 from avtorch.gap.likelihood.gauss_newton import finish, modes
@@ -18,10 +19,10 @@ from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.simulator.row import Row
-from tests.gap.records import QUIET, Float, log_of
+from tests.gap.records import QUIET, log_of
 
 
-def _log_joint(hypothesis: Hypothesis, white: WhiteningFilter, z: Float, onset: int | None = None) -> Float:
+def _log_joint(hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int | None = None) -> FloatArray:
     """Log likelihood plus log prior (its constant left out), z (column, coordinate)."""
     return white.log_likelihood(hypothesis.errors(z, onset)) - 0.5 * (z**2).sum(1)
 
@@ -52,7 +53,7 @@ def test_the_mode_is_the_optimisers(name: str, rate_hz: int, rotating_seed: int)
     fit = finish(hypothesis, white, found[0])
     root = np.linalg.cholesky(fit.covariance)
 
-    def cost(w: Float) -> float:
+    def cost(w: FloatArray) -> float:
         return -float(_log_joint(hypothesis, white, (found[0] + root @ w)[None])[0])
 
     # from half a standard deviation off, in the posterior's own coordinates
@@ -101,7 +102,7 @@ def test_a_coarse_look_is_near(rotating_seed: int) -> None:
 
 
 def _by_quadrature(
-    hypothesis: Hypothesis, white: WhiteningFilter, z: Float, covariance: Float, nodes: int = 7
+    hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, covariance: FloatArray, nodes: int = 7
 ) -> float:
     """Log evidence by Gauss-Hermite nodes about the mode."""
     x, w = np.polynomial.hermite_e.hermegauss(nodes)
@@ -172,7 +173,7 @@ def _hills(rng: np.random.Generator, rms: float = 0.015) -> GapPlant:
     return plant([RoadGrade(rms, profile=torch.randn(20, generator=generator, dtype=torch.float64))])
 
 
-def _white_columns(hypothesis: Hypothesis, white: WhiteningFilter, onset: int | None) -> Float:
+def _white_columns(hypothesis: Hypothesis, white: WhiteningFilter, onset: int | None) -> FloatArray:
     columns = hypothesis.grade_columns
     assert columns is not None
     if onset is not None:

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.noise_fit import GUST, PRIORS, Prior, fit_noise
 from avtorch.gap.likelihood.noise_model import NAMES, NoiseModel
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.onset import allowed, profile
-from tests.gap.records import BOTH, Float, drawn_errors, errors_of, log_of, ornstein, record_of
+from tests.gap.records import BOTH, drawn_errors, errors_of, log_of, ornstein, record_of
 
 
 def _drawn(rng: np.random.Generator, priors: dict[str, Prior], T_L: float) -> NoiseModel:
@@ -22,13 +23,15 @@ def _drawn(rng: np.random.Generator, priors: dict[str, Prior], T_L: float) -> No
     return NoiseModel(**values)
 
 
-def _log_posterior(noise: NoiseModel, record: Record, errors: Float, priors: dict[str, Prior], T_L: float) -> float:
+def _log_posterior(
+    noise: NoiseModel, record: Record, errors: FloatArray, priors: dict[str, Prior], T_L: float
+) -> float:
     centres = {n: m + (np.log(T_L) if n == "process_time" else 0.0) for n, (m, _, _) in priors.items()}
     z = np.array([(np.log(getattr(noise, n)) - centres[n]) / priors[n][1] for n in NAMES])
     return float(WhiteningFilter(record, noise).row_likelihoods(errors).sum() - 0.5 * z @ z)
 
 
-def _away(fit, truth: NoiseModel) -> Float:  # type: ignore[no-untyped-def]
+def _away(fit, truth: NoiseModel) -> FloatArray:  # type: ignore[no-untyped-def]
     """By parameter, in its own standard deviations."""
     return np.array([np.log(getattr(fit.noise, n) / getattr(truth, n)) / fit.sds[n] for n in NAMES])
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from avtorch.errors import InputError
 from avtorch.gap import plant
@@ -21,8 +20,6 @@ from avtorch.gap.search.outliers import HeavyTails
 from avtorch.io import Log
 from tests.gap.records import log_of
 from tests.overridden import deleted
-
-Float = NDArray[np.float64]
 
 OVERRIDES = ((12.0, 15.0), (22.5, 22.6), (31.0, 36.2))
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_are
 
+from avtorch.arrays import FloatArray
 from avtorch.gap import DeadTime, SensorLag, SensorScale
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.noise_segments import CALM, before_onset
@@ -16,7 +17,7 @@ from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.steady_kalman import _steady, motion
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from tests.bars import BAR
-from tests.gap.records import BOTH, Float, dense_covariance, errors_of, log_normal_density, log_of, record_of
+from tests.gap.records import BOTH, dense_covariance, errors_of, log_normal_density, log_of, record_of
 
 NOISES = {
     "usual": NoiseModel(),
@@ -28,7 +29,7 @@ WITNESSES = [BOTH, ("accel",), ("speed",)]
 _WIDE = 1e3
 
 
-def _dense(noise: NoiseModel, record: Record, errors: Float) -> float:
+def _dense(noise: NoiseModel, record: Record, errors: FloatArray) -> float:
     """Exact log density, an offset of the speed under a flat prior of height 1 / sqrt(2 pi) in each stretch."""
     total = 0.0
     for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
@@ -164,7 +165,7 @@ SENSORS = {
 }
 
 
-def _process(noise: NoiseModel) -> tuple[Float, Float, Float]:
+def _process(noise: NoiseModel) -> tuple[FloatArray, FloatArray, FloatArray]:
     """State (error of the speed, p, d, what the sensor shows): its drift, spectrum, and how both channels see it."""
     lag = noise.sensor_lag or np.inf
     drift = np.zeros((4, 4))
@@ -181,7 +182,7 @@ def _process(noise: NoiseModel) -> tuple[Float, Float, Float]:
     return (drift, spectrum, see) if noise.sensor_lag else (drift[:3, :3], spectrum[:3, :3], see[:, :3])
 
 
-def _over(noise: NoiseModel, dt: float) -> tuple[Float, Float]:
+def _over(noise: NoiseModel, dt: float) -> tuple[FloatArray, FloatArray]:
     """Transition and added covariance over `dt`: the integral of exp(drift s) spectrum exp(drift s)' by Gauss nodes,
     on panels that grow from the shortest time there is."""
     drift, spectrum, _ = _process(noise)
@@ -196,7 +197,7 @@ def _over(noise: NoiseModel, dt: float) -> tuple[Float, Float]:
     return expm(drift * dt), total
 
 
-def _drawn(noise: NoiseModel, record: Record, rng: np.random.Generator) -> Float:
+def _drawn(noise: NoiseModel, record: Record, rng: np.random.Generator) -> FloatArray:
     """(channel, counted, 1) of one stretch, begun stationary."""
     move, driven = _over(noise, record.dt)
     drift, spectrum, see = _process(noise)
@@ -214,7 +215,7 @@ def _drawn(noise: NoiseModel, record: Record, rng: np.random.Generator) -> Float
     return (see @ out.T + white)[[BOTH.index(w) for w in record.channels], :, None]
 
 
-def _settled(noise: NoiseModel, record: Record) -> tuple[Float, Float, Float, Float, Float]:
+def _settled(noise: NoiseModel, record: Record) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Transition, added covariance, the channels' sight and noise, and the covariance ahead of a reading at rest."""
     move, driven = _over(noise, record.dt)
     see = _process(noise)[2]

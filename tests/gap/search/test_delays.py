@@ -8,14 +8,14 @@ import pytest
 import torch
 
 import avtorch
+from avtorch.arrays import FloatArray
 from avtorch.gap import DeadTime, Drive, plant
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.search.delays import repeats_after
 from avtorch.io import Log
-from tests.gap.records import Float
 
 
-def _command(shape: str, period: float, time: Float) -> Float:
+def _command(shape: str, period: float, time: FloatArray) -> FloatArray:
     phase = (time / period + 1e-6) % 1
     return 3 * np.sin(2 * np.pi * phase) if shape == "sine" else np.where(phase < 0.5, 3.0, -3.0)
 
@@ -94,7 +94,7 @@ def test_a_delay_within_the_period_is_known_up_to_the_period() -> None:
 
 
 def test_periods() -> None:
-    def after(command: Float, dt: float) -> float | None:
+    def after(command: FloatArray, dt: float) -> float | None:
         time = torch.arange(len(command), dtype=torch.float64) * dt
         return repeats_after([Drive(time, torch.as_tensor(command))])
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from avtorch.arrays import FloatArray
 from avtorch.gap import CommandHold, DeadTime, Drive, Effect, RateLimit, Saturation, plant
 from avtorch.gap.likelihood.gauss_newton import modes
 from avtorch.gap.likelihood.hypothesis import Hypothesis
@@ -19,13 +20,15 @@ from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.lost_messages import Bank, LostMessages, lost_messages
 from avtorch.io import Log
 from tests.bars import BAR
-from tests.gap.records import Float, command_over, drawn_errors
+from tests.gap.records import command_over, drawn_errors
 
 NOISE = NoiseModel(process_sd=0.03, process_time=0.3, force_sd=0.003, accel_sd=0.03, speed_sd=0.01)
 BARE = {"T_L": 0.3, "K_L": 1.0}
 
 
-def _record(command: Float, effects: Sequence[Effect], rng: np.random.Generator, rate_hz: int, **more: Float) -> Record:
+def _record(
+    command: FloatArray, effects: Sequence[Effect], rng: np.random.Generator, rate_hz: int, **more: FloatArray
+) -> Record:
     time = np.arange(len(command)) / rate_hz
     speed = torch.full((len(time),), 20.0, dtype=torch.float64)
     drive = Drive(torch.as_tensor(time), torch.as_tensor(command), speed, 0.0)
@@ -35,7 +38,9 @@ def _record(command: Float, effects: Sequence[Effect], rng: np.random.Generator,
     return Record.of(Log.from_arrays(time=time, accel_cmd=command, accel=accel, speed=speeds, **more), rate_hz=1e9)
 
 
-def _found(command: Float, fraction: float, rng: np.random.Generator, rate_hz: int, **more: Float) -> LostMessages:
+def _found(
+    command: FloatArray, fraction: float, rng: np.random.Generator, rate_hz: int, **more: FloatArray
+) -> LostMessages:
     """What is found on a drive of which `fraction` of the messages are lost, under its own lag and noise."""
     record = _record(command, [CommandHold(fraction)] if fraction else [], rng, rate_hz, **more)
     none = Hypothesis.named(record, "none", plant())
@@ -43,11 +48,11 @@ def _found(command: Float, fraction: float, rng: np.random.Generator, rate_hz: i
     return lost_messages(WhiteningFilter(record, NOISE), errors, record.command[record.source], **BARE)
 
 
-def _steps(rng: np.random.Generator, rate_hz: int, seconds: float = 100.0) -> Float:
+def _steps(rng: np.random.Generator, rate_hz: int, seconds: float = 100.0) -> FloatArray:
     return np.repeat(rng.uniform(-1, 1, round(2 * seconds)), round(0.5 * rate_hz))
 
 
-def _smooth(rate_hz: int, seconds: float = 100.0) -> Float:
+def _smooth(rate_hz: int, seconds: float = 100.0) -> FloatArray:
     return command_over(np.arange(round(seconds * rate_hz)) / rate_hz)
 
 

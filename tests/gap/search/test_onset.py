@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from avtorch.arrays import FloatArray
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest.drives import Recorded
 from avtorch.gap import DeadTime, SensorBias, plant
@@ -15,7 +16,7 @@ from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.onset import allowed, onset_evidence, profile, refined_onset, rough_onset
 from avtorch.io import Log
-from tests.gap.records import Float, command_over, log_of
+from tests.gap.records import command_over, log_of
 
 NOISE = NoiseModel(process_sd=0.03, process_time=0.4, force_sd=0.004, accel_sd=0.05, speed_sd=0.02)
 CASES = {
@@ -134,7 +135,7 @@ def test_what_only_an_onset_tells_rests_without_one(name: str) -> None:
     assert np.abs(late[0, 0, 300:] - late[1, 0, 300:]).max() > 0.01
 
 
-def _slope_that_sets_in(rng: np.random.Generator) -> tuple[float, float, Float]:
+def _slope_that_sets_in(rng: np.random.Generator) -> tuple[float, float, FloatArray]:
     """Error of the onset [s], what it gained [nats], and how the cut images' gains compare with the exact ones."""
     effects = {"road_grade": {"grade_rms": 0.03, "length_m": 120.0}}
     command = command_over(np.arange(120 * 20) / 20)

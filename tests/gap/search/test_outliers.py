@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from avtorch.arrays import BoolArray, FloatArray
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.search.outliers import heavy_tails
 from tests.bars import log_odds
-from tests.gap.records import Float, drawn_errors
+from tests.gap.records import drawn_errors
 
 pytestmark = pytest.mark.statistical
 
 ROWS = 6000
 
 
-def _glitched(fraction: float, scale: float, rng: np.random.Generator) -> tuple[Float, NDArray[np.bool_]]:
+def _glitched(fraction: float, scale: float, rng: np.random.Generator) -> tuple[FloatArray, BoolArray]:
     errors = 0.05 * rng.standard_normal(ROWS)
     hit = rng.random(ROWS) < fraction
     return errors + np.where(hit, 0.05 * scale * rng.standard_normal(ROWS), 0.0), hit

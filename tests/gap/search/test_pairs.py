@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from avtorch.arrays import FloatArray
 from avtorch.gap import (
     AerodynamicDrag,
     ConstantResistance,
@@ -35,12 +36,14 @@ from avtorch.gap.search.screening import Screened
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
-from tests.gap.records import QUIET, Float, log_of
+from tests.gap.records import QUIET, log_of
 
 KINDS = (AerodynamicDrag, ConstantResistance, DeadTime, LowSpeedCreep, SensorBias, SensorScale, SpeedDependentLag)
 
 
-def _alone(record: Record, white: WhiteningFilter, kind: type[Effect]) -> tuple[Hypothesis, Float, dict[str, float]]:
+def _alone(
+    record: Record, white: WhiteningFilter, kind: type[Effect]
+) -> tuple[Hypothesis, FloatArray, dict[str, float]]:
     """One effect fitted alone, as a search does it."""
     base = Hypothesis(record, (kind,), plant())
     found, values = modes(base, white, starts(base, {"T_L": 0.3, "K_L": 1.0}), iterations=10, coarse=True)
@@ -48,7 +51,7 @@ def _alone(record: Record, white: WhiteningFilter, kind: type[Effect]) -> tuple[
     return base, z, _values(base, z)
 
 
-def _values(hypothesis: Hypothesis, z: Float) -> dict[str, float]:
+def _values(hypothesis: Hypothesis, z: FloatArray) -> dict[str, float]:
     return {k: float(v) for k, v in hypothesis.values(z[None]).items()}
 
 
@@ -254,7 +257,7 @@ def test_a_pair_that_sets_in_late_keeps_its_onset(rotating_seed: int) -> None:
     )
 
 
-def _with(record: Record, measured: Float) -> Record:
+def _with(record: Record, measured: FloatArray) -> Record:
     """The record with other measurements at the rows that count."""
     columns = {}
     for name, old, new in zip(record.channels, (record.accel, record.speed), measured, strict=True):

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 import avtorch
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap import DeadTime, Drive, Effect, GapPlant, Gust, NoiseChange, Outliers, Parameter, Row, plant
 from avtorch.gap.likelihood.noise_model import NoiseModel
@@ -20,7 +21,7 @@ from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.command_errors import rows_gained
 from avtorch.gap.search.lost_messages import image_of_row
 from avtorch.io import Log
-from tests.gap.records import QUIET, Float, covariance, drawn_errors
+from tests.gap.records import QUIET, covariance, drawn_errors
 
 
 @dataclass(frozen=True)
@@ -218,7 +219,7 @@ def test_errors_of_the_command_against_the_whole_covariance() -> None:
     white = WhiteningFilter(record, noise)
     rng = np.random.default_rng(4)
     errors = 0.05 * rng.standard_normal((2, record.rows, 1))
-    variance: Float = rng.uniform(0.0, 0.4, record.rows)
+    variance: FloatArray = rng.uniform(0.0, 0.4, record.rows)
     gained = rows_gained(white, errors, variance, 0.3, 1.0)
     image = image_of_row(white, 0.3, 1.0)
     rows, length = record.rows, image.shape[1]

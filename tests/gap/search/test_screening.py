@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from avtorch.arrays import FloatArray
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest.drives import Recorded
 from avtorch.gap import Saturation
@@ -18,7 +19,7 @@ from avtorch.gap.search.initial_values import starts
 from avtorch.gap.search.screening import Screened, screen
 from avtorch.gap.simulator.plant import plant
 from avtorch.io import Log
-from tests.gap.records import QUIET, Float, command_over, log_of
+from tests.gap.records import QUIET, command_over, log_of
 
 NOISE = NoiseModel(process_sd=0.03, process_time=0.4, force_sd=0.004, accel_sd=0.05, speed_sd=0.02)
 CASES = {
@@ -44,7 +45,7 @@ def _drive(name: str, parameters: dict[str, float], onset: float, seed: int, sec
     return Record.of(Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed))
 
 
-def _begin(record: Record, white: WhiteningFilter, name: str) -> tuple[Hypothesis, Float, float]:
+def _begin(record: Record, white: WhiteningFilter, name: str) -> tuple[Hypothesis, FloatArray, float]:
     """The hypothesis, its starts as a search makes them, and what the bare baseline comes to."""
     none, hypothesis = (Hypothesis.named(record, n, plant()) for n in ("none", name))
     z, value = modes(none, white, none.z_of({"T_L": 0.3, "K_L": 1.0})[None], coarse=True)
@@ -90,9 +91,9 @@ def test_starts_show_an_onset_of_which_the_whole_fit_tells_nothing(
     white = WhiteningFilter(record, NOISE)
     hypothesis, begin, floor = _begin(record, white, name)
     told = screening.rough_onset
-    asked: list[Float] = []
+    asked: list[FloatArray] = []
 
-    def nothing_of_the_whole(white: WhiteningFilter, hypothesis: Hypothesis, z: Float) -> tuple[int, float]:
+    def nothing_of_the_whole(white: WhiteningFilter, hypothesis: Hypothesis, z: FloatArray) -> tuple[int, float]:
         asked.append(z)
         return told(white, hypothesis, z) if len(asked) > 1 else (100, -1.0)
 
@@ -128,7 +129,7 @@ def test_none_is_looked_for_unless_asked(fresh_seed: int) -> None:
     assert only.value == both[0].value
 
 
-def _faint(size: float) -> tuple[Hypothesis, WhiteningFilter, Float, float]:
+def _faint(size: float) -> tuple[Hypothesis, WhiteningFilter, FloatArray, float]:
     """A bias of `size` [m/s²] from the middle of a drive on, no noise at all: what it tells is no matter of chance."""
     log = log_of(seconds=50.0, noise=None, speed0=25.0)
     accel = log.accel + size * (log.time > 26)
@@ -159,9 +160,11 @@ def test_the_best_starts_are_followed_and_no_others(monkeypatch: pytest.MonkeyPa
     hypothesis = Hypothesis.named(record, "dead_time", plant())
     delays = (0.5, 0.02, 0.3, 0.1)
     begin = np.stack([hypothesis.z_of({"T_L": 0.4, "K_L": 1.0, "dead_time.delay_s": d}) for d in delays])
-    followed: list[Float] = []
+    followed: list[FloatArray] = []
 
-    def kept(hypothesis: Hypothesis, white: WhiteningFilter, z: Float, **options: object) -> tuple[Float, Float]:
+    def kept(
+        hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, **options: object
+    ) -> tuple[FloatArray, FloatArray]:
         followed.append(z)
         return modes(hypothesis, white, z, **options)  # type: ignore[arg-type]
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from avtorch.arrays import FloatArray
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest.drives import Recorded
 from avtorch.gap import (
@@ -27,7 +28,7 @@ from avtorch.gap.likelihood.record import Record
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 from avtorch.gap.search.search import Search
 from avtorch.io import Log
-from tests.gap.records import Float, command_over
+from tests.gap.records import command_over
 
 SENSOR = (SensorBias, SensorScale)
 
@@ -38,7 +39,7 @@ def _log(
     *,
     onset: float = 0.0,
     seconds: float = 50.0,
-    command: Float | None = None,
+    command: FloatArray | None = None,
 ) -> Log:
     """A drive of the reference vehicle, which shares no code with this, at 20 Hz."""
     command = command_over(np.arange(round(seconds * 20)) / 20) if command is None else command
@@ -138,7 +139,7 @@ def test_the_best_of_equal_names_is_kept(fresh_seed: int, monkeypatch: pytest.Mo
     assert race.best.grade_rms == 5.0
 
 
-def _steps(rng: np.random.Generator, seconds: float = 50.0) -> Float:
+def _steps(rng: np.random.Generator, seconds: float = 50.0) -> FloatArray:
     """A demand that moves twice a second, so that a lost message shows."""
     return np.repeat(rng.uniform(-1.5, 1.5, round(2 * seconds)), 10)
 

@@ -7,11 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.selection.adequacy import Adequacy, adequacy
 from avtorch.io import Log
-from tests.gap.records import BOTH, QUIET, Float, errors_of, log_of, ornstein, record_of
+from tests.gap.records import BOTH, QUIET, errors_of, log_of, ornstein, record_of
 
 CHANCE = 15.0
 """Nats that a Bayes factor exceeds by chance with probability below exp(-15) = 3e-7."""
@@ -19,7 +20,7 @@ CHANCE = 15.0
 NAMES = ("flexible", "drift", "line", "memory", "bursts")
 
 
-def _left(record: Record, errors: Float, rollout: Float | None = None, explained: float = 0.0) -> Adequacy:
+def _left(record: Record, errors: FloatArray, rollout: FloatArray | None = None, explained: float = 0.0) -> Adequacy:
     rollout = record.measured if rollout is None else rollout
     return adequacy(WhiteningFilter(record, QUIET), errors, rollout, explained=explained)
 
@@ -64,32 +65,32 @@ def test_a_loop_that_feeds_noise_back_feigns_nothing(rotating_seed: int) -> None
     assert max(getattr(left, n) for n in NAMES) < CHANCE
 
 
-def _pushed(record: Record, force: Float) -> Float:
+def _pushed(record: Record, force: FloatArray) -> FloatArray:
     return np.stack([force, np.cumsum(force) * record.dt])[..., None]
 
 
-def _bent(record: Record, rng: np.random.Generator) -> Float:
+def _bent(record: Record, rng: np.random.Generator) -> FloatArray:
     a = record.measured[0, :, 0]
     return _pushed(record, 0.1 * a * np.abs(a))
 
 
-def _late_now_and_then(record: Record, rng: np.random.Generator) -> Float:
+def _late_now_and_then(record: Record, rng: np.random.Generator) -> FloatArray:
     """Half a second late in every other stretch of ten seconds, early in the rest."""
     jerk = np.gradient(record.measured[0, :, 0]) / record.dt
     turn = np.sign(np.sin(2 * np.pi * np.arange(record.rows) * record.dt / 20.0))
     return _pushed(record, 0.15 * jerk * turn)
 
 
-def _swinging(record: Record, rng: np.random.Generator) -> Float:
+def _swinging(record: Record, rng: np.random.Generator) -> FloatArray:
     return _pushed(record, 0.05 * np.sin(2.3 * record.dt * np.arange(record.rows) + 1.0))
 
 
-def _slow_sensor(record: Record, rng: np.random.Generator) -> Float:
+def _slow_sensor(record: Record, rng: np.random.Generator) -> FloatArray:
     """Readings of the accelerometer with an error that lasts."""
     return np.stack([ornstein(0.05, 1.0, record.rows, record.dt, rng)[0], np.zeros(record.rows)])[..., None]
 
 
-def _rough(record: Record, rng: np.random.Generator) -> Float:
+def _rough(record: Record, rng: np.random.Generator) -> FloatArray:
     """More noise the harder the car pulls."""
     size = 0.15 * np.abs(record.measured[0, :, 0])
     return np.stack([size * rng.standard_normal(record.rows), np.zeros(record.rows)])[..., None]
@@ -107,7 +108,7 @@ def _rough(record: Record, rng: np.random.Generator) -> Float:
     ],
 )
 def test_structure_is_seen_by_its_own_question(
-    put_in: Callable[[Record, np.random.Generator], Float], name: str, quiet: Record, rotating_seed: int
+    put_in: Callable[[Record, np.random.Generator], FloatArray], name: str, quiet: Record, rotating_seed: int
 ) -> None:
     rng = np.random.default_rng(rotating_seed)
     left = _left(quiet, errors_of(QUIET, quiet, rng) + put_in(quiet, rng))
