@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from tests import shapes
+
+shapes.install()
+
 pytest_plugins = ("tests.redraws", "pytester")
 
 

@@ -59,6 +59,14 @@ def test_no_rooms_without_a_name() -> None:
     assert not [p for p in SOURCES if p.stem in ("utils", "helpers", "common", "misc")]
 
 
+def test_types_of_arrays_are_defined_once() -> None:
+    alias = re.compile(r"^\w+ = NDArray\[np\.(?:bool_|float64|int64)\]$", re.M)
+    tests = (ROOT / "tests").rglob("*.py")
+    assert [path for path in [*SOURCES, *tests] if alias.search(path.read_text(encoding="utf-8"))] == [
+        PACKAGE / "arrays.py"
+    ]
+
+
 def imports() -> dict[str, set[str]]:
     """Which files a file imports, anywhere in it: within functions and for types only, too."""
     names = {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in SOURCES}

@@ -27,8 +27,6 @@ from scipy.signal import lfilter
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.blindtest.vehicle import Run
 
-Bool = BoolArray
-
 TIERS = {"easy": (3.0, np.inf), "medium": (1.6, 3.0), "hard": (1.15, 1.6), "faint": (1.02, 1.15)}
 """Bounds of visibility by tier: how many times larger the error of rollouts is without the effect than with it.
 
@@ -223,7 +221,7 @@ def oracles(run: Run, fitted: Sight, *, foretold: bool) -> dict[str, Oracle]:
     }
 
 
-def _from_all_starts(error: FloatArray, rows: Bool, dt: float, keeps: float = 1.0) -> float:
+def _from_all_starts(error: FloatArray, rows: BoolArray, dt: float, keeps: float = 1.0) -> float:
     """RMS of the error over rollouts of up to 10 s, begun at a measured value at every one of the `rows`, of which a
     share `keeps` is left after each.
 

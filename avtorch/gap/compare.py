@@ -17,8 +17,8 @@ from dataclasses import dataclass, field
 from os import PathLike
 
 import numpy as np
-from scipy.stats import f as fisher
-from scipy.stats import t as student
+from scipy.stats import f as fisher  # pyright: ignore[reportMissingTypeStubs]
+from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
@@ -32,6 +32,7 @@ from avtorch.gap.result.comparison import Comparison, LaterAnswer, Moved, Tellin
 from avtorch.gap.result.diagnosis import LogFacts
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
+from avtorch.gap.simulator.drive import Response
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log
 
@@ -84,8 +85,9 @@ def compare(
     # Hotelling's: two numbers, spreads known from so many blocks
     square = float(away @ np.linalg.solve(covariance, away))
     count = len(_CAR)
-    p_value = float(fisher.sf(square * (blocks - count) / (count * (blocks - 1)), count, blocks - count))
-    sure = float(student.ppf(0.95, blocks - 1))
+    statistic = square * (blocks - count) / (count * (blocks - 1))
+    p_value = float(fisher.sf(statistic, count, blocks - count))  # pyright: ignore[reportUnknownMemberType]
+    sure = float(student.ppf(0.95, blocks - 1))  # pyright: ignore[reportUnknownMemberType]
     car = {
         name: Moved(
             _log_quantity(one.mean[i], one.covariance[i, i], sure),
@@ -171,7 +173,7 @@ def _horizon(sides: Sequence[_Side]) -> float:
 
 def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float, *, same: bool) -> dict[str, Moved]:
     """Blocks are drawn alike for both sides where these are the `same` drives."""
-    drawn = []
+    drawn: list[dict[str, FloatArray]] = []
     for i, (side, simulator) in enumerate(zip(sides, simulators, strict=True)):
         rng = np.random.default_rng(0 if same else i)
         record = side.found.hypothesis.record
@@ -189,7 +191,7 @@ def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float
 
 
 def _rolled(record: Record, simulator: GapPlant) -> FloatArray:
-    responses = []
+    responses: list[Response] = []
     for drives in record.segments:
         own = simulator.prepared(*drives)
         responses += [own.response(drive) for drive in drives]
@@ -201,7 +203,7 @@ def _squares(
     record: Record, errors: FloatArray, blocks: Sequence[slice], lag: float, horizon: float
 ) -> dict[str, FloatArray]:
     """Under the names of the whole `HORIZON_S`, whatever of it the drives hold."""
-    out = {}
+    out: dict[str, FloatArray] = {}
     for channel in record.channels:
         squares = products(Measure(channel, horizon), record, errors[None], blocks, lag)
         out[Measure(channel, HORIZON_S).name] = squares[:, 0, 0]
@@ -234,7 +236,7 @@ def _sentence(
     if same:
         of_two = {"closer": "The second simulator is closer", "farther": "The second simulator is farther from it"}
         return f"One drive, two simulators. {of_two.get(telling, 'Neither simulator is measurably closer to it')}."
-    parts = []
+    parts: list[str] = []
     for name, unit in (("T_L", " s"), ("K_L", "")):
         m = car[name]
         parts.append(f"{name} {m.before.mean:.2f} to {m.after.mean:.2f}{unit}")

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
 from avtorch.inference.posterior import sorted_quantile
 from avtorch.inference.priors import Prior
@@ -20,14 +21,20 @@ Z90 = 1.6448536269514722
 class Summary(NamedTuple):
     """Of some vehicles: ``draws`` ``(draw, vehicle, parameter)``, the rest ``(vehicle, parameter)``."""
 
-    mean: Tensor
-    sd: Tensor
-    q05: Tensor
-    q95: Tensor
-    draws: Tensor
+    mean: Float[Tensor, "vehicle parameter"]
+    sd: Float[Tensor, "vehicle parameter"]
+    q05: Float[Tensor, "vehicle parameter"]
+    q95: Float[Tensor, "vehicle parameter"]
+    draws: Float[Tensor, "draw vehicle parameter"]
 
     @classmethod
-    def log_normal(cls, mean_z: Tensor, cov_z: Tensor, kept: int, generator: torch.Generator) -> Summary:
+    def log_normal(
+        cls,
+        mean_z: Float[Tensor, "vehicle parameter"],
+        cov_z: Float[Tensor, "vehicle parameter parameter"],
+        kept: int,
+        generator: torch.Generator,
+    ) -> Summary:
         """Of parameters whose logarithms are normal: moments and quantiles in closed form, and ``kept`` draws.
 
         Args:
@@ -64,13 +71,13 @@ class Belief:
     """
 
     names: tuple[str, ...]
-    mean: Tensor
-    sd: Tensor
-    q05: Tensor
-    q95: Tensor
-    draws: Tensor
-    excited: Tensor
-    converged: Tensor
+    mean: Float[Tensor, "vehicle parameter"]
+    sd: Float[Tensor, "vehicle parameter"]
+    q05: Float[Tensor, "vehicle parameter"]
+    q95: Float[Tensor, "vehicle parameter"]
+    draws: Float[Tensor, "draw vehicle parameter"]
+    excited: Bool[Tensor, " vehicle"]
+    converged: Bool[Tensor, " vehicle"]
 
     def stat(self, name: str, vehicle: int = 0) -> dict[str, float]:
         """``{"mean", "sd", "q05", "q95"}`` of one parameter of one vehicle."""

@@ -6,6 +6,8 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
+from avtorch.arrays import Float, Int
+
 
 @runtime_checkable
 class Density(Protocol):
@@ -37,14 +39,14 @@ class Density(Protocol):
         """Number of windows, each with a posterior of its own."""
         ...
 
-    def log_prob(self, z: Tensor) -> Tensor:
+    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
         """Log posterior density of ``z`` with shape ``(..., window, parameter)``; returns ``(..., window)``.
 
         The prior and the Jacobian of ``z`` are counted; constants of the likelihood are kept.
         """
         ...
 
-    def initial(self) -> Tensor:
+    def initial(self) -> Float[Tensor, "window parameter"]:
         """Where the search for the mode starts, shape ``(window, parameter)``."""
         ...
 
@@ -69,7 +71,9 @@ class SubsampledDensity(Density, Protocol):
         """Number of points N of a window."""
         ...
 
-    def log_prob_minibatch(self, z: Tensor, index: Tensor) -> Tensor:
+    def log_prob_minibatch(
+        self, z: Float[Tensor, "*draw window parameter"], index: Int[Tensor, " point"]
+    ) -> Float[Tensor, "*draw window"]:
         """Unbiased estimate ``log p(z) + (N/n) sum_i log p(D_i | z)`` over the ``n`` points named by ``index``."""
         ...
 
@@ -89,7 +93,7 @@ class ScoredDensity(Density, Protocol):
         True
     """
 
-    def score(self, z: Tensor) -> Tensor:
+    def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
         """Gradient of ``log_prob`` in ``z``, shape ``(..., window, parameter)``."""
         ...
 
@@ -126,11 +130,11 @@ class ConstrainedDensity(Density, Protocol):
         [[0.5]]
     """
 
-    def constrain(self, z: Tensor) -> Tensor:
+    def constrain(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
         """Parameters in their own units, each from its own entry of ``z``, shape of ``z``."""
         ...
 
 
-def constrained(density: Density, z: Tensor) -> Tensor:
+def constrained(density: Density, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
     """Parameters of ``density`` in their own units: ``exp(z)`` unless it says otherwise."""
     return density.constrain(z) if isinstance(density, ConstrainedDensity) else z.exp()

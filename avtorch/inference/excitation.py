@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
 from avtorch.inference.jerk import JerkStatistics
 
 
@@ -41,7 +42,7 @@ class ExcitationRule:
     sd_K: float = 0.15
     share: float = 0.5
 
-    def predicted_sd(self, statistics: JerkStatistics) -> tuple[Tensor, Tensor]:
+    def predicted_sd(self, statistics: JerkStatistics) -> tuple[Float[Tensor, " window"], Float[Tensor, " window"]]:
         """Predicted SDs of ``T_L`` [s] and ``K_L`` [-] at the reference vehicle, each ``(window,)``.
 
         Infinite where ``a`` and ``u`` are constant zero or collinear.
@@ -58,7 +59,7 @@ class ExcitationRule:
         sd_K = var_K.clamp_min(0.0).sqrt()
         return torch.where(solvable, sd_T, torch.inf), torch.where(solvable, sd_K, torch.inf)
 
-    def __call__(self, statistics: JerkStatistics, rows: float) -> Tensor:
+    def __call__(self, statistics: JerkStatistics, rows: float) -> Bool[Tensor, " window"]:
         """Excited or not, ``(window,)`` bool; ``rows`` is how many rows a full window has."""
         sd_T, sd_K = self.predicted_sd(statistics)
         return (sd_T <= self.sd_T) & (sd_K <= self.sd_K) & (statistics.n >= max(4.0, self.share * rows))

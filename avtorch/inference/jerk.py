@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float, Int, Real
 from avtorch.inference.planes import as_planes, from_planes, to_planes
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
 from avtorch.vehicle.glvd import glvd_jerk
@@ -22,7 +23,14 @@ RESOLUTION = 1e-4
 squared over noise squared, then keeps eight digits, enough for Newton's method to see the mode."""
 
 
-def jerk_log_likelihood(T_L: Tensor, K_L: Tensor, sigma: Tensor, a: Tensor, u: Tensor, jerk: Tensor) -> Tensor:
+def jerk_log_likelihood(
+    T_L: Float[Tensor, "*#batch"],
+    K_L: Float[Tensor, "*#batch"],
+    sigma: Float[Tensor, "*#batch"],
+    a: Float[Tensor, "*#batch time"],
+    u: Float[Tensor, "*#batch time"],
+    jerk: Float[Tensor, "*#batch time"],
+) -> Float[Tensor, "*batch"]:
     """Log likelihood of a window of measured jerk (Eq. 4 with Eq. 1), differentiable in every argument.
 
     Args:
@@ -62,16 +70,22 @@ class JerkStatistics:
         (0.5, 0.9)
     """
 
-    n: Tensor
-    jj: Tensor
-    aj: Tensor
-    uj: Tensor
-    aa: Tensor
-    au: Tensor
-    uu: Tensor
+    n: Float[Tensor, " window"]
+    jj: Float[Tensor, " window"]
+    aj: Float[Tensor, " window"]
+    uj: Float[Tensor, " window"]
+    aa: Float[Tensor, " window"]
+    au: Float[Tensor, " window"]
+    uu: Float[Tensor, " window"]
 
     @classmethod
-    def from_samples(cls, a: Tensor, u: Tensor, jerk: Tensor, mask: Tensor | None = None) -> JerkStatistics:
+    def from_samples(
+        cls,
+        a: Real[Tensor, "window time"],
+        u: Real[Tensor, "window time"],
+        jerk: Real[Tensor, "window time"],
+        mask: Bool[Tensor, "window time"] | None = None,
+    ) -> JerkStatistics:
         """Sums over the last dimension of ``a, u, jerk``, each ``(window, time)``, where ``mask`` is true."""
         a, u, jerk = (torch.as_tensor(x, dtype=torch.float64) for x in (a, u, jerk))
         weight = torch.ones_like(a) if mask is None else mask.to(a)
@@ -92,7 +106,7 @@ class JerkStatistics:
         lacking = (share**2 * self.jj - self.n * self.least_squares()[2].square()).clamp_min(0.0)
         return replace(self, jj=self.jj + lacking)
 
-    def least_squares(self) -> tuple[Tensor, Tensor, Tensor]:
+    def least_squares(self) -> tuple[Float[Tensor, " window"], Float[Tensor, " window"], Float[Tensor, " window"]]:
         """Least squares of jerk on ``(-a, u)``: estimates of ``1/T_L`` and ``K_L/T_L`` and the residual's SD [m/s^3].
 
         Where ``a`` and ``u`` are collinear (or constant zero) the estimates are NaN; the SD is then that of the jerk.
@@ -143,7 +157,7 @@ class JerkDensity:
         """The windows named by ``index``."""
         return JerkDensity(self.statistics.select(index), self.prior.select(index))
 
-    def log_likelihood(self, z: Tensor) -> Tensor:
+    def log_likelihood(self, z: Float[Tensor, "*draw window 3"]) -> Float[Tensor, "*draw window"]:
         """Eq. 4 from the sums; ``z = log(T_L, K_L, sigma)``, ``(..., window, 3)``; returns ``(..., window)``."""
         scaled = self._scaled_coefficients(z)
         half_chi2 = (torch.einsum("wij,...wj->...wi", self._half_form, scaled) * scaled).sum(-1)
@@ -155,10 +169,10 @@ class JerkDensity:
         log_T, log_K, log_sigma = z.unbind(-1)
         return torch.stack([-log_sigma, -log_sigma - log_T, log_K - log_T - log_sigma], -1).exp()
 
-    def log_prob(self, z: Tensor) -> Tensor:
+    def log_prob(self, z: Float[Tensor, "*draw window 3"]) -> Float[Tensor, "*draw window"]:
         return self.log_likelihood(z) + self.prior.log_prob(z)
 
-    def score(self, z: Tensor) -> Tensor:
+    def score(self, z: Float[Tensor, "*draw window 3"]) -> Float[Tensor, "*draw window 3"]:
         """Gradient of :meth:`log_prob` in ``z``, in closed form, parameter by parameter (see :func:`as_planes`)."""
         if self.windows == 1:
             return self._score_of_one(z)
@@ -184,7 +198,7 @@ class JerkDensity:
         score = torch.addmm(self._points_of_one, _LOG_SCALED.T, by_log, alpha=-1)
         return from_planes(score.view(planes.shape)).add_(self.prior.score(z))
 
-    def initial(self) -> Tensor:
+    def initial(self) -> Float[Tensor, "window 3"]:
         """Least squares where it gives positive values near the plausible range, else the prior's centre."""
         inverse_lag, gain_over_lag, residual_sd = self.statistics.least_squares()
         center = self.prior.center().expand(self.windows, 3)
@@ -209,7 +223,13 @@ class JerkPoints(JerkDensity):
         [0.5, 0.9, 0.1]
     """
 
-    def __init__(self, a: Tensor, u: Tensor, jerk: Tensor, prior: Prior | None = None) -> None:
+    def __init__(
+        self,
+        a: Real[Tensor, "window time"],
+        u: Real[Tensor, "window time"],
+        jerk: Real[Tensor, "window time"],
+        prior: Prior | None = None,
+    ) -> None:
         """``a, u, jerk``: shape ``(window, time)``, units as in :func:`jerk_log_likelihood`."""
         super().__init__(JerkStatistics.from_samples(a, u, jerk), prior)
         self._columns = torch.stack([jerk, a, u], -1).to(torch.float64)
@@ -223,7 +243,9 @@ class JerkPoints(JerkDensity):
         jerk, a, u = self._columns[index].unbind(-1)
         return JerkPoints(a, u, jerk, self.prior.select(index))
 
-    def log_prob_minibatch(self, z: Tensor, index: Tensor) -> Tensor:
+    def log_prob_minibatch(
+        self, z: Float[Tensor, "*draw window 3"], index: Int[Tensor, " point"]
+    ) -> Float[Tensor, "*draw window"]:
         jerk, a, u = self._columns[:, index].unbind(-1)
         T, K, sigma = z.exp().unbind(-1)
         return self.prior.log_prob(z) + self.points / len(index) * jerk_log_likelihood(T, K, sigma, a, u, jerk)

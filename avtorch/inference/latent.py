@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.latent_filter import latent_log_likelihood
 from avtorch.inference.latent_steady import EvenRows, steady_log_likelihood
@@ -48,7 +49,9 @@ def latent_names(*, accel: bool, speed: bool) -> tuple[str, ...]:
     return ("T_L", "K_L", "process_noise", *sensors, "coloured_sd", "coloured_time")
 
 
-def run_log_likelihood(p: dict[str, Tensor], runs: LatentWindow, even: EvenRows | None) -> Tensor:
+def run_log_likelihood(
+    p: dict[str, Float[Tensor, "*draw run"]], runs: LatentWindow, even: EvenRows | None
+) -> Float[Tensor, "*draw run"]:
     """Log likelihood ``(..., run)`` of parameters by name, each ``(..., run)``; ``even`` is ``even_rows(runs)``."""
     noise = {name: (p[name].square() + FINEST**2).sqrt() for name in ("accel_noise", "speed_noise") if name in p}
     noise |= {name: p[name] for name in ("road_noise",) if name in p}
@@ -101,7 +104,7 @@ class LatentDensity:
         """The windows named by ``index``."""
         return LatentDensity(self.data.select(index), self.prior.select(index), temper=self.temper)
 
-    def log_likelihood(self, z: Tensor) -> Tensor:
+    def log_likelihood(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
         """``z`` ``(..., window, parameter)``; returns ``(..., window)`` [nats], not tempered."""
         p = dict(zip(self.names, z[..., self._owner, :].exp().unbind(-1), strict=True))
         per_run = run_log_likelihood(p, self._runs, self._even)
@@ -109,10 +112,10 @@ class LatentDensity:
             return per_run
         return per_run.new_zeros(*per_run.shape[:-1], self.windows).index_add(-1, self._owner, per_run)
 
-    def log_prob(self, z: Tensor) -> Tensor:
+    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
         return self.temper * self.log_likelihood(z) + self.prior.log_prob(z)
 
-    def initial(self) -> Tensor:
+    def initial(self) -> Float[Tensor, "window parameter"]:
         """The best of a coarse grid over lag, gain and process noise, the rest at the prior's centre."""
         center = self.prior.center().expand(self.windows, len(self.names))
         lag = torch.tensor([0.1, 0.2, 0.4, 0.8, 1.6], dtype=torch.float64)
@@ -129,7 +132,7 @@ class LatentDensity:
         return z[best, torch.arange(self.windows)]
 
 
-def _speed_noise(runs: LatentWindow, owner: Tensor, windows: int) -> Tensor:
+def _speed_noise(runs: LatentWindow, owner: Int[Tensor, " run"], windows: int) -> Float[Tensor, " window"]:
     """Rough speed noise [m/s] ``(window,)`` from second differences of the speed: a start, not an estimate."""
     assert runs.speed is not None
     bend = runs.speed.diff(n=2).abs() * runs.mask[:, 2:]

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
 from avtorch.inference.latent import NOISE_PRIOR, even_rows, latent_names, run_log_likelihood
 from avtorch.inference.latent_window import LatentWindow
 
@@ -27,7 +28,7 @@ def latent_excitation(
     noise: Mapping[str, float] | None = None,
     reference: tuple[float, float] = REFERENCE,
     least_bits: float = LEAST_BITS,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Bool[Tensor, " window"], Float[Tensor, " window"]]:
     """Which windows are excited, ``(window,)`` bool, and the information they promise, ``(window,)`` [bit].
 
     The figure is the expected information about ``(log T_L, log K_L)`` that the *command* brings, at a fixed reference

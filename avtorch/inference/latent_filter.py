@@ -10,6 +10,7 @@ import math
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
 from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, discretise, initial_covariance
 
@@ -19,21 +20,21 @@ def _tensor(value: Tensor | float, like: Tensor) -> Tensor:
 
 
 def latent_log_likelihood(
-    T_L: Tensor | float,
-    K_L: Tensor | float,
-    process_noise: Tensor | float,
-    coloured_sd: Tensor | float,
-    coloured_time: Tensor | float,
-    time: Tensor,
-    u: Tensor,
+    T_L: float | Float[Tensor, "*#batch"],
+    K_L: float | Float[Tensor, "*#batch"],
+    process_noise: float | Float[Tensor, "*#batch"],
+    coloured_sd: float | Float[Tensor, "*#batch"],
+    coloured_time: float | Float[Tensor, "*#batch"],
+    time: Float[Tensor, "*#batch time"],
+    u: Float[Tensor, "*#batch time"],
     *,
-    accel: Tensor | None = None,
-    speed: Tensor | None = None,
-    accel_noise: Tensor | float | None = None,
-    speed_noise: Tensor | float | None = None,
-    road_noise: Tensor | float = 0.0,
-    mask: Tensor | None = None,
-) -> Tensor:
+    accel: Float[Tensor, "*#batch time"] | None = None,
+    speed: Float[Tensor, "*#batch time"] | None = None,
+    accel_noise: float | Float[Tensor, "*#batch"] | None = None,
+    speed_noise: float | Float[Tensor, "*#batch"] | None = None,
+    road_noise: float | Float[Tensor, "*#batch"] = 0.0,
+    mask: Bool[Tensor, "*#batch time"] | None = None,
+) -> Float[Tensor, "*batch"]:
     """Log likelihood ``(...)`` [nats] of measured acceleration and/or speed, by Kalman innovations.
 
     Parameters of shape ``(...)`` or broadcasting to it: ``T_L`` [s], ``K_L`` [-], ``process_noise`` [m/s²/√s],

@@ -28,6 +28,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
+
 #: Prior standard deviation of the first speed about the first measured one [m/s]: as good as diffuse.
 SPEED_SD0 = 10.0
 #: Prior standard deviation of the first actuator acceleration about zero [m/s²]: wider than what cars do in ACC use.
@@ -50,9 +52,9 @@ class Step:
     Shapes ``(..., 4, 4)``, ``(..., 4)``, ``(..., 4, 4)`` over the state ``(v, a, c, e)``.
     """
 
-    transition: Tensor
-    gain: Tensor
-    noise: Tensor
+    transition: Float[Tensor, "*batch 4 4"]
+    gain: Float[Tensor, "*batch 4"]
+    noise: Float[Tensor, "*batch 4 4"]
 
 
 def _integral_squared(x: Tensor) -> Tensor:
@@ -82,13 +84,13 @@ def _ou(time: Tensor, density: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tens
 
 
 def discretise(
-    T_L: Tensor,
-    K_L: Tensor,
-    process_noise: Tensor,
-    road_noise: Tensor,
-    coloured_sd: Tensor,
-    coloured_time: Tensor,
-    dt: Tensor,
+    T_L: Float[Tensor, "*#batch"],
+    K_L: Float[Tensor, "*#batch"],
+    process_noise: Float[Tensor, "*#batch"],
+    road_noise: Float[Tensor, "*#batch"],
+    coloured_sd: Float[Tensor, "*#batch"],
+    coloured_time: Float[Tensor, "*#batch"],
+    dt: Float[Tensor, "*#batch"],
 ) -> Step:
     """Exact discretisation with the command held over ``dt``; all arguments broadcast to ``(...)``.
 
@@ -135,7 +137,9 @@ def _lower_gamma(y: Tensor) -> Tensor:
     return torch.where(small, torch.exp(-ys) * series * ys**3, 1.0 - torch.exp(-yl) * (1.0 + yl + 0.5 * yl**2))
 
 
-def initial_covariance(coloured_sd: Tensor, coloured_time: Tensor) -> Tensor:
+def initial_covariance(
+    coloured_sd: Float[Tensor, "*batch"], coloured_time: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 4 4"]:
     """Covariance ``(..., 4, 4)`` of ``(v, a, c, e)`` at the first row, before its measurement.
 
     The mean is (first measured speed, 0, 0, 0). ``v`` is nearly diffuse, so that its centre carries no information;

@@ -21,6 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, discretise, initial_covariance
 
 BLOCK = 32
@@ -106,7 +107,12 @@ class _Stationary(torch.autograd.Function):
         return 2.0 * G @ phi @ (P - K @ H @ P), None, G, push.mT @ G @ push
 
 
-def stationary_covariance(phi: Tensor, H: Tensor, Q: Tensor, R: Tensor) -> Tensor:
+def stationary_covariance(
+    phi: Float[Tensor, "*batch n n"],
+    H: Float[Tensor, "m n"],
+    Q: Float[Tensor, "*batch n n"],
+    R: Float[Tensor, "*batch m m"],
+) -> Float[Tensor, "*batch n n"]:
     """Predicted covariance ``P = φ(P - P Hᵀ S⁻¹ H P)φᵀ + Q``, ``(..., n, n)``; differentiable in ``φ, Q, R``.
 
     ``H (m, n)`` is constant, ``R (..., m, m)`` diagonal.
@@ -126,7 +132,7 @@ def _powers(M: Tensor, count: int) -> Tensor:
     return out[..., :count, :, :]
 
 
-def _scan(A: Tensor, r: Tensor) -> Tensor:
+def _scan(A: Float[Tensor, "... n n"], r: Float[Tensor, "*all block n"]) -> Float[Tensor, "*all block n"]:
     """States at the block starts, ``s_0 = 0``, ``s_{b+1} = A s_b + r_b``; ``r`` ``(..., block, n)``."""
     s = torch.nn.functional.pad(r[..., :-1, :], (0, 0, 1, 0))
     leap, hop = A, 1
@@ -137,17 +143,17 @@ def _scan(A: Tensor, r: Tensor) -> Tensor:
 
 
 def steady_log_likelihood(
-    T_L: Tensor,
-    K_L: Tensor,
-    process_noise: Tensor,
-    coloured_sd: Tensor,
-    coloured_time: Tensor,
+    T_L: Float[Tensor, "*draw run"],
+    K_L: Float[Tensor, "*draw run"],
+    process_noise: Float[Tensor, "*draw run"],
+    coloured_sd: Float[Tensor, "*draw run"],
+    coloured_time: Float[Tensor, "*draw run"],
     data: EvenRows,
     *,
-    accel_noise: Tensor | None = None,
-    speed_noise: Tensor | None = None,
-    road_noise: Tensor | None = None,
-) -> Tensor:
+    accel_noise: Float[Tensor, "*draw run"] | None = None,
+    speed_noise: Float[Tensor, "*draw run"] | None = None,
+    road_noise: Float[Tensor, "*draw run"] | None = None,
+) -> Float[Tensor, "*draw run"]:
     """Log likelihood ``(..., run)``; parameters ``(..., run)``, float64: `latent_log_likelihood` on even rows."""
     lead = T_L.shape[:-1]
     runs = T_L.shape[-1]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 
 #: A step longer than this many median steps is a gap: the filter starts afresh behind it.
@@ -22,11 +23,11 @@ class LatentWindow:
     None; ``mask`` True where a row may be used (engaged, moving).
     """
 
-    time: Tensor
-    u: Tensor
-    accel: Tensor | None
-    speed: Tensor | None
-    mask: Tensor
+    time: Float[Tensor, "window time"]
+    u: Float[Tensor, "window time"]
+    accel: Float[Tensor, "window time"] | None
+    speed: Float[Tensor, "window time"] | None
+    mask: Bool[Tensor, "window time"]
 
     def __post_init__(self) -> None:
         if self.accel is None and self.speed is None:
@@ -91,7 +92,7 @@ class LatentWindow:
         speed = None if self.speed is None else self.speed[index]
         return LatentWindow(self.time[index], self.u[index], accel, speed, self.mask[index])
 
-    def runs(self) -> tuple[LatentWindow, Tensor]:
+    def runs(self) -> tuple[LatentWindow, Int[Tensor, " run"]]:
         """Stretches without a gap or an unused row, one a row, and the window ``(run,)`` each comes from.
 
         Behind a gap, a standstill or a driver's override the acceleration is anybody's, so each run starts afresh.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
 from avtorch.inference.density import Density, ScoredDensity
 
 
@@ -29,13 +30,13 @@ class Mode:
         ((4, 3), (4, 3, 3), True)
     """
 
-    z: Tensor
-    scale: Tensor
-    log_prob: Tensor
-    converged: Tensor
+    z: Float[Tensor, "window parameter"]
+    scale: Float[Tensor, "window parameter parameter"]
+    log_prob: Float[Tensor, " window"]
+    converged: Bool[Tensor, " window"]
 
     @property
-    def covariance(self) -> Tensor:
+    def covariance(self) -> Float[Tensor, "window parameter parameter"]:
         """Laplace covariance in ``z``, ``(window, parameter, parameter)``."""
         return self.scale @ self.scale.mT
 
@@ -43,7 +44,7 @@ class Mode:
         """The windows named by ``index``."""
         return Mode(self.z[index], self.scale[index], self.log_prob[index], self.converged[index])
 
-    def refitted(self, z: Tensor) -> Mode:
+    def refitted(self, z: Float[Tensor, "draw window parameter"]) -> Mode:
         """The same with mean and covariance of draws ``z`` ``(draw, window, parameter)``, where they are sound."""
         mean = z.mean(0)
         centred = (z - mean).permute(1, 2, 0)
@@ -60,7 +61,13 @@ class Mode:
         return Mode(z, scale, self.log_prob, self.converged)
 
 
-def find_mode(density: Density, *, start: Tensor | None = None, iterations: int = 60, tolerance: float = 1e-8) -> Mode:
+def find_mode(
+    density: Density,
+    *,
+    start: Float[Tensor, "window parameter"] | None = None,
+    iterations: int = 60,
+    tolerance: float = 1e-8,
+) -> Mode:
     """Damped Newton ascent of the log density, batched over windows.
 
     Directions of negative curvature are turned into descent by the curvature's absolute value; a step is at most one
@@ -109,7 +116,9 @@ def find_mode(density: Density, *, start: Tensor | None = None, iterations: int 
     return Mode(z, scale, -potential, converged)
 
 
-def _expand(density: Density, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _expand(
+    density: Density, z: Float[Tensor, "window d"]
+) -> tuple[Float[Tensor, " window"], Float[Tensor, "window d"], Float[Tensor, "window d d"]]:
     """Potential ``(window,)``, gradient ``(window, d)`` and Hessian ``(window, d, d)``; infinite where not defined."""
     z = z.detach()
     if isinstance(density, ScoredDensity):

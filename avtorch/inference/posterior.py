@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
 from avtorch.inference.exactness import Exactness
 
 
@@ -33,65 +34,65 @@ class Posterior:
     """
 
     names: tuple[str, ...]
-    draws: Tensor
-    converged: Tensor
+    draws: Float[Tensor, "chain draw window parameter"]
+    converged: Bool[Tensor, " window"]
     why: tuple[str, ...] = ()
     exactness: Exactness | None = None
 
-    def __getitem__(self, name: str) -> Tensor:
+    def __getitem__(self, name: str) -> Float[Tensor, "chain draw window"]:
         """Draws of one parameter, shape ``(chain, draw, window)``."""
         return self.draws[..., self.names.index(name)]
 
     @property
-    def flat(self) -> Tensor:
+    def flat(self) -> Float[Tensor, "all_draws window parameter"]:
         """All draws, chains behind one another: ``(chain * draw, window, parameter)``."""
         return self.draws.flatten(0, 1)
 
     @property
-    def mean(self) -> Tensor:
+    def mean(self) -> Float[Tensor, "window parameter"]:
         """Posterior means, ``(window, parameter)``."""
         return self.flat.mean(0)
 
     @property
-    def sd(self) -> Tensor:
+    def sd(self) -> Float[Tensor, "window parameter"]:
         """Posterior standard deviations, ``(window, parameter)``."""
         return self.flat.std(0)
 
     @property
-    def rhat(self) -> Tensor:
+    def rhat(self) -> Float[Tensor, "window parameter"]:
         """Nested R-hat (:func:`nested_rhat`), ``(window, parameter)``."""
         return nested_rhat(self.draws)
 
     @property
-    def ess_bulk(self) -> Tensor:
+    def ess_bulk(self) -> Float[Tensor, "window parameter"]:
         """Effective draws behind the bulk, from their ranks, ``(window, parameter)``."""
         return effective(normal_scores(self.draws))
 
     @property
-    def ess_tail(self) -> Tensor:
+    def ess_tail(self) -> Float[Tensor, "window parameter"]:
         """Effective draws behind the 5 % or the 95 % quantile, whichever are fewer, ``(window, parameter)``."""
         below = (effective((self.draws <= self.quantile(q)).to(self.draws)) for q in (0.05, 0.95))
         return torch.minimum(*below)
 
     @property
-    def pareto_k(self) -> Tensor:
+    def pareto_k(self) -> Float[Tensor, " window"]:
         """Shape of the tail of ``density / normal fit`` over the fit, ``(window,)``; NaN where it was not computed."""
         if self.exactness is None:
             return self.draws.new_full((self.draws.shape[2],), torch.nan)
         return self.exactness.pareto_k
 
-    def quantile(self, q: float) -> Tensor:
+    def quantile(self, q: float) -> Float[Tensor, "window parameter"]:
         """Posterior quantiles, ``(window, parameter)``."""
         return sorted_quantile(self.flat.sort(0).values, q)
 
-    def log_moments(self) -> tuple[Tensor, Tensor]:
+    def log_moments(self) -> tuple[Float[Tensor, "window parameter"], Float[Tensor, "window parameter parameter"]]:
         """Mean ``(window, parameter)`` and covariance ``(window, parameter, parameter)`` of the log parameters."""
         z = self.flat.log()
         centred = z - z.mean(0)
         return z.mean(0), torch.einsum("nwi,nwj->wij", centred, centred) / (len(z) - 1)
 
 
-def sorted_quantile(ordered: Tensor, q: float) -> Tensor:
+def sorted_quantile(ordered: Float[Tensor, "draw *rest"], q: float) -> Float[Tensor, "*rest"]:
     """Quantile along the first dimension of sorted draws, linear between order statistics."""
     position = q * (len(ordered) - 1)
     low = int(position)
@@ -99,7 +100,7 @@ def sorted_quantile(ordered: Tensor, q: float) -> Tensor:
     return torch.lerp(ordered[low], ordered[high], position - low)
 
 
-def nested_rhat(draws: Tensor, groups: int = 8) -> Tensor:
+def nested_rhat(draws: Float[Tensor, "chain draw *rest"], groups: int = 8) -> Float[Tensor, "*rest"]:
     """Split nested R-hat (Margossian et al. 2024) over ``(chain, draw, ...)``; returns the remaining shape.
 
     Many short chains are joined into ``groups`` superchains, cut into halves: chains of a few autocorrelation times
@@ -129,14 +130,14 @@ def nested_rhat(draws: Tensor, groups: int = 8) -> Tensor:
     return (1 + between / within.clamp_min(torch.finfo(draws.dtype).tiny)).sqrt()
 
 
-def normal_scores(draws: Tensor) -> Tensor:
+def normal_scores(draws: Float[Tensor, "chain draw *rest"]) -> Float[Tensor, "chain draw *rest"]:
     """Each number's normal quantile by its rank among all chains' and draws', shape of ``draws``; ties as they come."""
     flat = draws.flatten(0, 1)
     rank = flat.argsort(0).argsort(0) + 1
     return torch.special.ndtri((rank - 0.375) / (len(flat) + 0.25)).unflatten(0, draws.shape[:2])
 
 
-def effective(values: Tensor) -> Tensor:
+def effective(values: Float[Tensor, "chain draw *rest"]) -> Float[Tensor, "*rest"]:
     """How many independent values ``(chain, draw, ...)`` would know the mean as well; returns the remaining shape.
 
     By the means of independent chains, each cut into pieces where there are fewer than sixteen: short chains say little

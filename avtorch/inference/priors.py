@@ -13,6 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
 from avtorch.inference.planes import join_planes
 
@@ -160,8 +161,8 @@ class LogSpaceNormal:
         cov_z: shape ``(window, parameter, parameter)``.
     """
 
-    mean_z: Tensor
-    cov_z: Tensor
+    mean_z: Float[Tensor, "window parameter"]
+    cov_z: Float[Tensor, "window parameter parameter"]
     _inverse: Tensor = field(init=False, repr=False)
     _half_log_det: Tensor = field(init=False, repr=False)
 
@@ -219,7 +220,7 @@ class Joint:
 class Switch:
     """Window by window one of two priors: ``later`` where ``started``, shape ``(window,)``, else ``first``."""
 
-    started: Tensor
+    started: Bool[Tensor, " window"]
     first: Prior
     later: Prior
 

@@ -13,6 +13,7 @@ import torch
 from scipy.special import sici
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
 from avtorch.inference.density import Density
 from avtorch.inference.map import Mode, find_mode
@@ -56,16 +57,16 @@ class Quadrature:
     """
 
     names: tuple[str, ...]
-    mean: Tensor
-    sd: Tensor
-    log_evidence: Tensor
-    error: Tensor
-    edge: Tensor
-    converged: Tensor
-    nodes: Tensor
-    mass: Tensor
+    mean: Float[Tensor, "window parameter"]
+    sd: Float[Tensor, "window parameter"]
+    log_evidence: Float[Tensor, " window"]
+    error: Float[Tensor, " window"]
+    edge: Float[Tensor, " window"]
+    converged: Bool[Tensor, " window"]
+    nodes: Float[Tensor, "window parameter node"]
+    mass: Float[Tensor, "window parameter node"]
 
-    def cdf(self, values: Tensor) -> Tensor:
+    def cdf(self, values: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
         """Posterior probability of a parameter below ``values`` ``(..., window, parameter)``, in their own units.
 
         It integrates the band-limited interpolant of the marginal, as accurate as the grid itself.
@@ -75,7 +76,7 @@ class Quadrature:
         sine_integral = torch.from_numpy(sici(distance.numpy())[0])
         return (self.mass * (0.5 + sine_integral / torch.pi)).sum(-1)
 
-    def quantile(self, q: float) -> Tensor:
+    def quantile(self, q: float) -> Float[Tensor, "window parameter"]:
         """Posterior quantiles ``(window, parameter)``, by bisection of :meth:`cdf`.
 
         Raises:
@@ -159,7 +160,9 @@ def integrate(density: Density, *, mode: Mode | None = None, nodes: int = 49, to
     return Quadrature(density.names, mean, sd, evidence.mean(-1), error, reached, good, z, mass)
 
 
-def _moments(z: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
+def _moments(
+    z: Float[Tensor, "window parameter node"], mass: Float[Tensor, "window parameter node"]
+) -> tuple[Float[Tensor, "window parameter"], Float[Tensor, "window parameter"]]:
     """Mean and SD of ``exp(z)``, each ``(window, parameter)``."""
     value = z.exp()
     mean = (mass * value).sum(-1)
@@ -174,18 +177,18 @@ class _Sums:
     of the first axis on every second node of all axes, ``(window, node // 2 + 1)``.
     """
 
-    total: Tensor
-    mean: Tensor
-    cov: Tensor
-    marginals: Tensor
-    coarse: Tensor
+    total: Float[Tensor, " window"]
+    mean: Float[Tensor, "window d"]
+    cov: Float[Tensor, "window d d"]
+    marginals: Float[Tensor, "window d node"]
+    coarse: Float[Tensor, "window half"]
 
     def edge(self) -> Tensor:
         """Marginal at both ends of every axis over its peak, ``(window, axis, 2)``."""
         ends = torch.stack([self.marginals[..., 0], self.marginals[..., -1]], -1)
         return ends / self.marginals.amax(-1, keepdim=True)
 
-    def short(self) -> Tensor:
+    def short(self) -> Bool[Tensor, "window d 2"]:
         """Where a side still shows mass, ``(window, axis, 2)`` bool."""
         return self.edge() > FACE
 
@@ -204,9 +207,9 @@ class _Place:
     ``x`` is in SDs. center ``(window, d)``, cov ``(window, d, d)``, reach ``(window, d, 2)``, all in ``order``.
     """
 
-    center: Tensor
-    cov: Tensor
-    reach: Tensor
+    center: Float[Tensor, "window d"]
+    cov: Float[Tensor, "window d d"]
+    reach: Float[Tensor, "window d 2"]
     order: tuple[int, ...]
 
     @classmethod
@@ -215,7 +218,7 @@ class _Place:
         return cls(mode.z, mode.covariance, torch.full((*mode.z.shape, 2), REACH, dtype=mode.z.dtype), tuple(range(d)))
 
     @property
-    def lower(self) -> Tensor:
+    def lower(self) -> Float[Tensor, "window d d"]:
         return torch.linalg.cholesky(self.cov)
 
     def led_by(self, i: int) -> _Place:
@@ -223,16 +226,16 @@ class _Place:
         order = [i, *(j for j in range(len(self.order)) if j != i)]
         return _Place(self.center[:, order], self.cov[:, order][:, :, order], self.reach[:, order], tuple(order))
 
-    def x(self, nodes: int) -> Tensor:
+    def x(self, nodes: int) -> Float[Tensor, "window d node"]:
         """Coordinates of the nodes of every axis, ``(window, axis, node)``."""
         share = torch.linspace(0, 1, nodes, dtype=self.center.dtype)
         return -self.reach[..., :1] + self.reach.sum(-1, keepdim=True) * share
 
-    def first_axis(self, nodes: int) -> Tensor:
+    def first_axis(self, nodes: int) -> Float[Tensor, "window node"]:
         """Log of the first parameter of the order at its nodes, ``(window, node)``."""
         return self.center[:, :1] + self.cov[:, 0, 0].sqrt()[:, None] * self.x(nodes)[:, 0]
 
-    def cell(self, nodes: int) -> Tensor:
+    def cell(self, nodes: int) -> Float[Tensor, " window"]:
         """Volume of a cell in ``z``, ``(window,)``."""
         spacing = self.reach.sum(-1) / (nodes - 1)
         return (self.lower.diagonal(dim1=-2, dim2=-1) * spacing).prod(-1)
@@ -261,7 +264,7 @@ class _Place:
         return replace(self.trimmed(sums).grown(sums), center=center, cov=cov)
 
 
-def _integrate(density: Density, place: _Place, nodes: int, reference: Tensor) -> _Sums:
+def _integrate(density: Density, place: _Place, nodes: int, reference: Float[Tensor, " window"]) -> _Sums:
     """One pass, slab by slab of the first axis so that the memory stays bounded."""
     windows, d = place.center.shape
     x, lower = place.x(nodes), place.lower

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
+from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
 from avtorch.inference.density import Density, ScoredDensity, SelectableDensity, SubsampledDensity, constrained
 from avtorch.inference.exactness import Exactness, compare
@@ -219,7 +220,9 @@ def _why(mode_found: bool, strayed: bool, apart: bool, stuck: bool, off: str) ->
     return "chains disagree, also with the shortest step tried" if apart else off
 
 
-def _too_wide(mode: Mode, settings: SamplerSettings, pace: Tensor, times: float) -> Tensor:
+def _too_wide(
+    mode: Mode, settings: SamplerSettings, pace: Float[Tensor, " window"], times: float
+) -> Bool[Tensor, " window"]:
     """Where the burn-in is too short for the widest direction of a space left unwhitened, ``(window,)`` bool.
 
     Along a direction of SD ``s`` a step forgets ``h/(2 s^2)`` of what was; chains that begin at the mode reach 99 % of
@@ -231,7 +234,7 @@ def _too_wide(mode: Mode, settings: SamplerSettings, pace: Tensor, times: float)
     return settings.slower(times).burn_in < 2 * (2 / settings.step) * pace * widest.square()
 
 
-def _longer(pace: Tensor) -> Tensor:
+def _longer(pace: Float[Tensor, "*window"]) -> Float[Tensor, "*window"]:
     """How many times as many steps a window of this pace gets: the nearest of 1, sqrt 2, 2, ... 64."""
     return 2.0 ** (0.5 * (2 * pace.log2()).round().clamp(0, 12))
 
@@ -259,7 +262,9 @@ def _select(density: Density, index: Tensor) -> Density:
     return density.select(index)
 
 
-def _strayed(density: Density, mode: Mode, coordinates: Coordinates, w: Tensor, depth: float = 50.0) -> Tensor:
+def _strayed(
+    density: Density, mode: Mode, coordinates: Coordinates, w: Float[Tensor, "chain draw window d"], depth: float = 50.0
+) -> Bool[Tensor, " window"]:
     """Where some chain's furthest draw lies ``depth`` nats and one a parameter off the mode, ``(window,)`` bool.
 
     R-hat alone overlooks the few chains that diverge: they blow up the variance within as much as that between. A draw
@@ -277,9 +282,9 @@ def walk(
     mode: Mode,
     settings: SamplerSettings,
     *,
-    pace: Tensor | None = None,
+    pace: Float[Tensor, " window"] | None = None,
     generator: torch.Generator | None = None,
-) -> Tensor:
+) -> Float[Tensor, "chain draw window d"]:
     """One run of Algorithm 1 in the whitened coordinates, with step ``settings.step / pace``.
 
     ``pace``, ``(window,)``, is the :func:`stiffness` by default. Returns draws of ``z``, ``(chain, draw, window, d)``.

@@ -14,6 +14,9 @@ from avtorch.inference.langevin import LangevinOptimizer
 
 Noise = Literal["independent", "averaged"]
 
+# torch.optim's own way to the fused arithmetic
+_add_to_each = torch._foreach_add_  # pyright: ignore[reportPrivateImportUsage, reportPrivateUsage]
+
 
 class SGLD(LangevinOptimizer):
     r"""Samples from :math:`\exp(-U)` by noisy gradient steps.
@@ -145,7 +148,11 @@ class SGLD(LangevinOptimizer):
                 return potential, None
             wanted = [p for p in parameters if p.requires_grad]
             twice = any(group["preconditioner"] for group in self.param_groups)
-            gradients = torch.autograd.grad(potential.sum(), wanted, create_graph=twice, allow_unused=True)
+            # torch's types leave out the None of what is unused
+            gradients = cast(
+                "tuple[Tensor | None, ...]",
+                torch.autograd.grad(potential.sum(), wanted, create_graph=twice, allow_unused=True),
+            )
             curvature = None
             if twice:
                 dims = {p: group["chain_dims"] for group in self.param_groups for p in group["params"]}
@@ -169,9 +176,9 @@ class SGLD(LangevinOptimizer):
                 if noises is not None:
                     noises[i] = noises[i] * scale.sqrt()
         if group["foreach"]:
-            torch._foreach_add_(params, drifts, alpha=-0.5 * h * sign)  # pyright: ignore[reportPrivateImportUsage]
+            _add_to_each(params, drifts, alpha=-0.5 * h * sign)
             if noises is not None:
-                torch._foreach_add_(params, noises, alpha=amplitude)  # pyright: ignore[reportPrivateImportUsage]
+                _add_to_each(params, noises, alpha=amplitude)
             return
         for i, p in enumerate(params):
             p.add_(drifts[i], alpha=-0.5 * h * sign)
@@ -217,9 +224,12 @@ def _hessian_diagonal(p: Tensor, gradient: Tensor, chain_dims: int) -> Tensor:
     if not gradient.requires_grad:  # U is linear
         return torch.zeros_like(p)
     flat = gradient.flatten(chain_dims) if p.dim() > chain_dims else gradient.unsqueeze(-1)
-    columns = []
+    columns: list[Tensor] = []
     for i in range(flat.shape[-1]):
-        (row,) = torch.autograd.grad(flat[..., i].sum(), p, retain_graph=True, allow_unused=True)
-        row = torch.zeros_like(p) if row is None else row
+        (derivative,) = cast(
+            "tuple[Tensor | None]",  # None where U does not depend on it, which torch's types leave out
+            torch.autograd.grad(flat[..., i].sum(), p, retain_graph=True, allow_unused=True),
+        )
+        row = torch.zeros_like(p) if derivative is None else derivative
         columns.append((row.flatten(chain_dims) if p.dim() > chain_dims else row.unsqueeze(-1))[..., i])
     return torch.stack(columns, -1).reshape(p.shape)

@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.inference.density import Density, ScoredDensity
 from avtorch.inference.map import Mode
 from avtorch.inference.planes import lower_times, lower_transposed_times
@@ -24,8 +25,8 @@ class Coordinates:
         lower: lower triangular, ``(window, d, d)``.
     """
 
-    mode: Tensor
-    lower: Tensor
+    mode: Float[Tensor, "window d"]
+    lower: Float[Tensor, "window d d"]
 
     @classmethod
     def of(cls, mode: Mode, whitening: Whitening = "full") -> Coordinates:
@@ -47,17 +48,17 @@ class Coordinates:
         """A gradient in ``z`` as one in ``w``."""
         return lower_transposed_times(self.lower, score)
 
-    def widest(self, mode: Mode) -> Tensor:
+    def widest(self, mode: Mode) -> Float[Tensor, " window"]:
         """Largest SD that the Laplace approximation has along any direction of ``w``, ``(window,)``; 1 if whitened."""
         seen = torch.linalg.solve_triangular(self.lower, mode.scale, upper=False)
         return torch.linalg.matrix_norm(seen, ord=2)
 
-    def slowed(self, pace: Tensor) -> Coordinates:
+    def slowed(self, pace: Float[Tensor, " window"]) -> Coordinates:
         """A step ``h/pace`` in ``w`` is a step ``h`` in these; ``pace`` ``(window,)``."""
         return Coordinates(self.mode, self.lower / pace.sqrt()[:, None, None])
 
 
-def stiffness(density: Density, coordinates: Coordinates, *, radius: float = 3.0) -> Tensor:
+def stiffness(density: Density, coordinates: Coordinates, *, radius: float = 3.0) -> Float[Tensor, " window"]:
     """How much steeper than its Laplace approximation the potential gets ``radius`` SDs out: ``(window,)``, at least 1.
 
     A skewed posterior (a weak window) has a steep side on which the step that suits the mode overshoots; dividing the
@@ -71,7 +72,7 @@ def stiffness(density: Density, coordinates: Coordinates, *, radius: float = 3.0
     return slope.nan_to_num(nan=1e6, posinf=1e6).amax(0).clamp(1.0, 1e6)
 
 
-def score_of(density: Density, z: Tensor) -> Tensor:
+def score_of(density: Density, z: Float[Tensor, "*draw window d"]) -> Float[Tensor, "*draw window d"]:
     """Gradient of the log density, in closed form where there is one; shape of ``z``."""
     if isinstance(density, ScoredDensity):
         with torch.no_grad():

@@ -13,8 +13,6 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from avtorch.arrays import BoolArray, FloatArray
 
-Rows = BoolArray
-
 _BRAKED_MPS2 = -0.5  # more than a dead band hides or a hill of 5 % takes
 _RESTS = 0.15  # of the demand at most is felt
 _SLOWEST_S = 2.0  # dead time and lag of a car slower than any
@@ -27,7 +25,7 @@ _SINCE_S = 1.8
 _EASED_MPS2 = 0.2
 
 
-def standing(accel_cmd: FloatArray, accel: FloatArray, dt: float, below: float) -> Rows:
+def standing(accel_cmd: FloatArray, accel: FloatArray, dt: float, below: float) -> BoolArray:
     """Rows (time,) of one drive, `dt` [s] apart, in which the car is slower than `below` [m/s].
 
     `accel_cmd`, `accel` (time,) [m/s²].
@@ -46,7 +44,7 @@ def standing(accel_cmd: FloatArray, accel: FloatArray, dt: float, below: float) 
     return out
 
 
-def _braked_at_rest(accel_cmd: FloatArray, accel: FloatArray, dt: float) -> Rows:
+def _braked_at_rest(accel_cmd: FloatArray, accel: FloatArray, dt: float) -> BoolArray:
     """Braked for longer than the slowest car takes to answer, and at rest."""
     brakes = accel_cmd < _BRAKED_MPS2
     rows = np.arange(len(brakes))
@@ -57,7 +55,7 @@ def _braked_at_rest(accel_cmd: FloatArray, accel: FloatArray, dt: float) -> Rows
     return minimum_filter1d(rests, _count(_REST_S, dt), mode="nearest").astype(bool)
 
 
-def _halted(accel_cmd: FloatArray, accel: FloatArray, dt: float) -> Rows:
+def _halted(accel_cmd: FloatArray, accel: FloatArray, dt: float) -> BoolArray:
     """The `_FELT_S` after a deceleration ended from one row to the next but one, the brake on and not eased."""
     n, rows = _count(_FELT_S, dt), len(accel)
     if rows < 2 * n + 3:

@@ -27,10 +27,8 @@ LOOKS = [
     {"color": BLACK, "linestyle": (0, (5, 1, 1, 1, 1, 1))},
 ]
 
-Counts = IntArray
 
-
-def pooled_rank_counts(groups: Mapping[str, ArrayLike], *, bins: int = 20) -> dict[str, Counts]:
+def pooled_rank_counts(groups: Mapping[str, ArrayLike], *, bins: int = 20) -> dict[str, IntArray]:
     """Rank all draws among each other and count, per group, how many ranks fall into each of ``bins`` equal bins.
 
     Groups that follow one law have the same, uniform counts (Vehtari et al. 2021, section 4.3).

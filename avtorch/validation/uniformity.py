@@ -18,8 +18,6 @@ from torch import Tensor
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
 
-Array = FloatArray
-
 LEAST = 1e-15
 """Pointwise probabilities below this are this: the corridor's own is known to some 1e-12 only."""
 
@@ -92,7 +90,7 @@ def bonferroni(p_values: Tensor) -> float:
     return float((p_values.min() * p_values.numel()).clamp_max(1.0))
 
 
-def _cdf(draws: int) -> Array:
+def _cdf(draws: int) -> FloatArray:
     """CDF of a uniform rank at ``0..draws - 1``; at ``draws`` it is one whatever the posterior."""
     return np.arange(1, draws + 1) / (draws + 1)
 

@@ -7,9 +7,13 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Real
 from avtorch.errors import InputError
 
 Number: TypeAlias = float | int | Tensor
+
+Batched: TypeAlias = float | int | Real[Tensor, "*#batch"]
+"""A number, or a tensor that broadcasts with the others of a call."""
 
 
 def tensor(value: object, *, dtype: torch.dtype | None = None) -> Tensor:

@@ -16,11 +16,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import torch
-from scipy.optimize import brentq
+from scipy.optimize import (  # pyright: ignore[reportMissingTypeStubs]
+    brentq,  # pyright: ignore[reportUnknownVariableType]
+)
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.vehicle.controllers import Controller, FollowerState
 from avtorch.vehicle.leader import Leader
@@ -75,7 +79,7 @@ def linearise(controller: Controller, speed: float, *, step: float = 0.02) -> Li
     rest = (spacing, speed, 0.0, speed, 0.0)
 
     def slopes(h: float) -> list[float]:
-        out = []
+        out: list[float] = []
         for i in range(5):
             up, down = ([x + sign * h * (j == i) for j, x in enumerate(rest)] for sign in (1.0, -1.0))
             out.append((_demand(controller, up) - _demand(controller, down)) / (2.0 * h))
@@ -103,7 +107,7 @@ def _equilibrium(controller: Controller, speed: float) -> float:
 
     if not demand(low) < 0.0 < demand(high):
         raise InputError(f"controller: has no equilibrium spacing at {speed:g} m/s between {low:g} and {high:g} m")
-    return float(brentq(demand, low, high, xtol=1e-9))  # type: ignore[arg-type]
+    return cast(float, brentq(demand, low, high, xtol=1e-9))
 
 
 def _demand(controller: Controller, state: Sequence[float]) -> float:
@@ -130,7 +134,7 @@ def measured_gain(
     cycles: int = 3,
     spacing: float | None = None,
     dt: float = 0.01,
-) -> Tensor:
+) -> Float[Tensor, " frequency"]:
     """Swing of the follower's speed over that of its leader's, (frequency,), at each `omega` [rad/s].
 
     The leader drives `speed` + `amplitude` sin(omega t) [m/s]; all frequencies run side by side, one a scenario, so a
@@ -178,12 +182,14 @@ def measured_gain(
     )
     run = loop.advance(count)
     lost = run.collided | (run.speed <= 0.0).any(-1)
-    gains = []
-    for i, frequency in enumerate(w.tolist()):
+    gains: list[float] = []
+    for i, frequency in enumerate(map(float, w)):
         period = 2.0 * math.pi / frequency
         rows = round(math.floor((count * dt - settle) / period + 1e-9) * period / dt)
         part = slice(count - rows, count)
         basis = torch.stack([angle[i, part].sin(), angle[i, part].cos(), torch.ones(rows, dtype=torch.float64)], -1)
-        fit = torch.linalg.lstsq(basis, run.speed[i, part, None]).solution[:2, 0]
-        gains.append(float(fit.norm()) / amplitude)
+        # torch.linalg has no types
+        squares = torch.linalg.lstsq  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+        fit = cast(Tensor, squares(basis, run.speed[i, part, None]).solution)  # pyright: ignore[reportUnknownMemberType]
+        gains.append(math.hypot(float(fit[0, 0]), float(fit[1, 0])) / amplitude)
     return torch.where(lost, torch.inf, torch.tensor(gains, dtype=torch.float64))

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
+
 if TYPE_CHECKING:
     from avtorch.io import Log
 
@@ -34,16 +36,16 @@ class Block:
         >>> log = whole.log()  # as the car would have recorded it
     """
 
-    time: Tensor
-    accel_cmd: Tensor
-    accel: Tensor
-    speed: Tensor
-    jerk: Tensor
-    spacing: Tensor
-    lead_speed: Tensor
-    lead_accel: Tensor
-    demanded: Tensor
-    clipped: Tensor
+    time: Float[Tensor, " time"]
+    accel_cmd: Float[Tensor, "*scenario time"]
+    accel: Float[Tensor, "*scenario time"]
+    speed: Float[Tensor, "*scenario time"]
+    jerk: Float[Tensor, "*scenario time"]
+    spacing: Float[Tensor, "*scenario time"]
+    lead_speed: Float[Tensor, "*scenario time"]
+    lead_accel: Float[Tensor, "*scenario time"]
+    demanded: Float[Tensor, "*scenario time"]
+    clipped: Bool[Tensor, "*scenario time"]
 
     @classmethod
     def concatenate(cls: type[B], blocks: Sequence[B]) -> B:
@@ -55,7 +57,7 @@ class Block:
         return type(self)(*(getattr(self, f.name)[..., part] for f in fields(self)))
 
     @property
-    def collided(self) -> Tensor:
+    def collided(self) -> Bool[Tensor, "*scenario"]:
         """Whether the spacing was ever zero or less, (scenario,) or (scenario, vehicle)."""
         return (self.spacing <= 0).any(-1)
 

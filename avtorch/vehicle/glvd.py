@@ -15,13 +15,15 @@ check theirs once. Everything broadcasts over leading dimensions and keeps the d
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float, Real
 from avtorch.errors import InputError
-from avtorch.vehicle.arguments import Number, checked, tensor
+from avtorch.vehicle.arguments import Batched, Number, checked, tensor
+from avtorch.vehicle.broadcasting import broadcast_shape
 
 Method = Literal["zoh", "euler"]
 
@@ -54,7 +56,7 @@ def _check_dt(dt: Number) -> None:
         raise InputError(f"dt: found {dt!r}, needs a finite time step > 0 s")
 
 
-def glvd_jerk(a: Number, u: Number, T_L: Number, K_L: Number) -> Tensor:
+def glvd_jerk(a: Batched, u: Batched, T_L: Batched, K_L: Batched) -> Float[Tensor, "*batch"]:
     """Noise-free jerk `(K_L u - a) / T_L` [m/s³] (Eq. 1); all arguments broadcast.
 
     Example:
@@ -62,11 +64,13 @@ def glvd_jerk(a: Number, u: Number, T_L: Number, K_L: Number) -> Tensor:
         >>> float(glvd_jerk(a=0.5, u=2.0, T_L=0.3, K_L=0.8).round(decimals=3))
         3.667
     """
-    a, u, T_L, K_L = _with_dtype(a, u, T_L, K_L)
-    return (K_L * u - a) / T_L
+    a, u, lag, gain = _with_dtype(a, u, T_L, K_L)
+    return (gain * u - a) / lag
 
 
-def glvd_step(a: Number, u: Number, T_L: Number, K_L: Number, dt: Number, *, method: Method = "zoh") -> Tensor:
+def glvd_step(
+    a: Batched, u: Batched, T_L: Batched, K_L: Batched, dt: Number, *, method: Method = "zoh"
+) -> Float[Tensor, "*batch"]:
     """Acceleration [m/s²] after one step of `dt` [s] with `u` held; all arguments broadcast.
 
     Raises `InputError` for an unknown `method` or a `dt` that is no positive number.
@@ -77,12 +81,14 @@ def glvd_step(a: Number, u: Number, T_L: Number, K_L: Number, dt: Number, *, met
         [0.632, 1.0]
     """
     _check_dt(dt)
-    a, u, T_L, K_L = _with_dtype(a, u, T_L, K_L)
-    alpha, rest = _decay(T_L, dt, method)
-    return alpha * a + rest * (K_L * u)
+    a, u, lag, gain = _with_dtype(a, u, T_L, K_L)
+    alpha, rest = _decay(lag, dt, method)
+    return alpha * a + rest * (gain * u)
 
 
-def glvd_rollout(a0: Number, u: Tensor, T_L: Number, K_L: Number, dt: Number, *, method: Method = "zoh") -> Tensor:
+def glvd_rollout(
+    a0: Batched, u: Real[Tensor, "*#batch time"], T_L: Batched, K_L: Batched, dt: Number, *, method: Method = "zoh"
+) -> Float[Tensor, "*batch time"]:
     """Accelerations [m/s²] at steps 1…N from `a0` (...) under commands `u` (..., time), each held for `dt` [s].
 
     Args: `a0`, `T_L`, `K_L` of any shapes that broadcast with `u.shape[:-1]`. Returns (..., time).
@@ -103,13 +109,13 @@ def glvd_rollout(a0: Number, u: Tensor, T_L: Number, K_L: Number, dt: Number, *,
         ((2, 150), [0.993, 0.632])
     """
     _check_dt(dt)
-    a0, u, T_L, K_L = _with_dtype(a0, u, T_L, K_L)
+    a0, u, lag, gain = _with_dtype(a0, u, T_L, K_L)
     if u.dim() == 0:
         raise InputError("u: found a single number, needs commands along a last dimension of time")
-    alpha, rest = _decay(T_L, dt, method)
-    x = (rest * K_L).unsqueeze(-1) * u
+    alpha, rest = _decay(lag, dt, method)
+    x = (rest * gain).unsqueeze(-1) * u
     first = alpha * a0
-    x = x.expand(torch.broadcast_shapes(x.shape, (*first.shape, 1)))
+    x = x.expand(broadcast_shape(x.shape, (*first.shape, 1)))
     steps = x.shape[-1]
     if steps == 0:
         return x
@@ -120,11 +126,13 @@ def glvd_rollout(a0: Number, u: Tensor, T_L: Number, K_L: Number, dt: Number, *,
         x = torch.cat([x[..., :reach], x[..., reach:] + power * x[..., :-reach]], dim=-1)
         reach *= 2
         # exp(-reach dt/T) rather than repeated squaring: keeps float32 right to its last digits
-        power = torch.exp(-reach * dt / T_L).unsqueeze(-1) if method == "zoh" else power * power
+        power = torch.exp(-reach * dt / lag).unsqueeze(-1) if method == "zoh" else power * power
     return x
 
 
-def motion_coefficients(T_L: Tensor, dt: float) -> tuple[Tensor, Tensor, Tensor]:
+def motion_coefficients(
+    T_L: Float[Tensor, "*batch"], dt: float
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """`(alpha, m1, m2)`: a step's exact share of `a - a_inf` in acceleration [-], speed [s] and position [s²]."""
     ratio = dt / T_L
     m1 = -T_L * torch.expm1(-ratio)
@@ -134,8 +142,14 @@ def motion_coefficients(T_L: Tensor, dt: float) -> tuple[Tensor, Tensor, Tensor]
 
 
 def exact_motion(
-    a: Tensor, v: Tensor, u: Tensor, eps: Tensor, dt: float, T_L: Tensor, K_L: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+    a: Float[Tensor, "*#batch"],
+    v: Float[Tensor, "*#batch"],
+    u: Float[Tensor, "*#batch"],
+    eps: Float[Tensor, "*#batch"],
+    dt: float,
+    T_L: Float[Tensor, "*#batch"],
+    K_L: Float[Tensor, "*#batch"],
+) -> tuple[Float[Tensor, "..."], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """Exact integration of Eq. 1 over one step with command `u` and jerk noise `eps` held; all broadcast.
 
     Args: `a` [m/s²], `v` [m/s], `u` [m/s²], `eps` [m/s³], `dt` [s], `T_L` [s], `K_L` [-].
@@ -178,7 +192,7 @@ class GLVD(torch.nn.Module):
         lag = checked("T_L", T_L, unit="s", above=0.0, dtype=dtype)
         gain = checked("K_L", K_L, least=0.0, dtype=dtype)
         try:
-            torch.broadcast_shapes(lag.shape, gain.shape)
+            broadcast_shape(lag.shape, gain.shape)
         except RuntimeError:
             raise InputError(
                 f"K_L: found shape {tuple(gain.shape)}, needs one that broadcasts with T_L {tuple(lag.shape)}"
@@ -203,4 +217,9 @@ class GLVD(torch.nn.Module):
         return self.rollout(a0, u, dt, method)
 
     def extra_repr(self) -> str:
-        return f"T_L={self.T_L.tolist()}, K_L={self.K_L.tolist()}"
+        return f"T_L={_plain(self.T_L)}, K_L={_plain(self.K_L)}"
+
+
+def _plain(x: Tensor) -> object:
+    """Nested lists of numbers, or the number."""
+    return cast(object, x.tolist())  # pyright: ignore[reportUnknownMemberType]

@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
-from scipy.interpolate import PchipInterpolator
-from scipy.ndimage import gaussian_filter1d
+from scipy.interpolate import PchipInterpolator  # pyright: ignore[reportMissingTypeStubs]
+from scipy.ndimage import (  # pyright: ignore[reportMissingTypeStubs]
+    gaussian_filter1d,  # pyright: ignore[reportUnknownVariableType]
+)
 from torch import Tensor
 
+from avtorch.arrays import Float, FloatArray
 from avtorch.errors import InputError
 
 #: Standard deviation of the Gaussian that smooths the acceleration [s]. The drive cycles are given once a second, so
@@ -35,10 +39,10 @@ class Leader:
         [-1.0, 1.0]
     """
 
-    time: Tensor
-    position: Tensor
-    speed: Tensor
-    accel: Tensor
+    time: Float[Tensor, " time"]
+    position: Float[Tensor, "*scenario time"]
+    speed: Float[Tensor, "*scenario time"]
+    accel: Float[Tensor, "*scenario time"]
     dt: float
     name: str = "leader"
 
@@ -89,15 +93,15 @@ class Leader:
         grid = np.arange(steps + 1) * dt
         raw = PchipInterpolator(t, v)(np.minimum(t[0] + grid, t[-1]))
         # mean acceleration of each step: summing these gives back the speed exactly
-        mean_accel = np.diff(raw) / dt
+        mean_accel: FloatArray = np.diff(raw) / dt
         if smooth_s > 0:
-            mean_accel = gaussian_filter1d(mean_accel, smooth_s / dt, mode="reflect", truncate=6.0)
+            mean_accel = cast(FloatArray, gaussian_filter1d(mean_accel, smooth_s / dt, mode="reflect", truncate=6.0))
         smooth = np.maximum(raw[0] + np.concatenate([[0.0], np.cumsum(mean_accel) * dt]), 0.0)  # rounding only
         accel = np.concatenate([mean_accel[:1], 0.5 * (mean_accel[1:] + mean_accel[:-1]), mean_accel[-1:]])
         # trapezoid with the end correction of Euler and Maclaurin: fourth order
         moved = 0.5 * dt * (smooth[1:] + smooth[:-1]) - dt * dt / 12 * np.diff(accel)
         position = np.concatenate([[0.0], np.cumsum(moved)])
-        return cls(*(torch.from_numpy(x) for x in (grid, position, smooth, accel)), dt=dt, name=name)
+        return cls(*(torch.as_tensor(x) for x in (grid, position, smooth, accel)), dt=dt, name=name)
 
     @classmethod
     def default(cls, *, start: float = 0.0, duration: float | None = None, dt: float = 0.01) -> Leader:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.vehicle.arguments import Number, checked, tensor
 from avtorch.vehicle.block import Block, Trajectory
@@ -87,7 +88,7 @@ class ClosedLoop:
         self.plant: Plant | PlantFunction = GLVDPlant() if plant is None else plant
         self.dt = leader.dt
         self.scenarios, self.vehicles = scenarios, vehicles
-        self.steps_done = 0
+        self.steps_done: int = 0
         self._noise = Noise(seeds, scenarios, vehicles)
         shape = (scenarios,) if vehicles is None else (vehicles, scenarios)
         lead_speed = leader.speed[..., 0].expand(shape)
@@ -152,7 +153,7 @@ class ClosedLoop:
         span = slice(first, first + steps)
         lead = [s[..., span].unbind(-1) for s in (self.leader.position, self.leader.speed, self.leader.accel)]
         plant, lower = self.plant, self.lower_level
-        move: PlantFunction = getattr(plant, "step", plant)  # type: ignore[arg-type]
+        move = cast(PlantFunction, getattr(plant, "step", plant))
         sigma = tensor(getattr(plant, "sigma", 0.0))
         noise = self._noise.steps(first, steps)
         eps_all = sigma * _time_first(noise, max(noise.dim(), sigma.dim() + 1))
@@ -233,12 +234,14 @@ class ClosedLoop:
         return (jerk(a.movedim(-1, 0), u.movedim(-1, 0)) + _time_first(eps, a.dim())).movedim(0, -1)
 
 
-def _time_first(eps: Tensor, dims: int) -> Tensor:
+def _time_first(eps: Float[Tensor, "time ... scenario"], dims: int) -> Float[Tensor, "time ... scenario"]:
     """(time, scenario) → (time, 1, …, scenario) of `dims` dimensions."""
     return eps.reshape(eps.shape[0], *([1] * (dims - eps.dim())), *eps.shape[1:])
 
 
-def _stop(v: Tensor, v_next: Tensor, moved: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+def _stop(
+    v: Float[Tensor, "*state"], v_next: Float[Tensor, "*state"], moved: Float[Tensor, "*state"], dt: float
+) -> tuple[Float[Tensor, "*state"], Float[Tensor, "*state"]]:
     """A step that would end rolling back ends at rest, after the way to the stop at that step's mean deceleration."""
     back = v_next < 0
     # an actuator that turns positive within the step has pulled backward before, on a car that stood
@@ -274,8 +277,9 @@ def simulate(
     """
     steps = leader.time.shape[-1] - 1 if duration is None else round(duration / leader.dt)
     loop = ClosedLoop(leader, controller, vehicles=vehicles, scenarios=scenarios, **settings)
-    blocks = []
-    for time, change in [*sorted(schedule, key=lambda entry: entry[0]), (steps * leader.dt, {})]:
+    blocks: list[Block] = []
+    end: tuple[float, Mapping[str, Any]] = (steps * leader.dt, {})
+    for time, change in [*sorted(schedule, key=lambda entry: entry[0]), end]:
         until = min(round(time / leader.dt), steps)
         if until > loop.steps_done:
             blocks.append(loop.advance(until - loop.steps_done))

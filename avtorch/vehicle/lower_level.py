@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
-from avtorch.vehicle.arguments import Number, checked, tensor
+from avtorch.vehicle.arguments import Batched, Number, checked, tensor
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class LowerLevel:
     _on_accel: Tensor = field(init=False, repr=False, compare=False)
     _on_demand: Tensor = field(init=False, repr=False, compare=False)
     _inverts: bool = field(init=False, repr=False, compare=False)
-    _limits: tuple = field(init=False, repr=False, compare=False)
+    _limits: tuple[float, float] | tuple[Tensor, Tensor] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         T_hat = checked("T_hat", self.T_hat, unit="s", above=0.0)
@@ -64,17 +65,18 @@ class LowerLevel:
         object.__setattr__(self, "_inverts", bool((on_accel != 0).any() or (on_demand != 1).any()))
         object.__setattr__(self, "_limits", limits)
 
-    def raw_command(self, a: Tensor, u: Tensor) -> Tensor:
+    def raw_command(self, a: Float[Tensor, "*#batch"], u: Float[Tensor, "*#batch"]) -> Tensor:
         """The command before clipping [m/s²] for measured acceleration `a` and demand `u` [m/s²], (..., scenario)."""
         if not self._inverts:
             return u
         return torch.addcmul(self._on_accel * a, self._on_demand, u)
 
-    def clip(self, raw: Tensor) -> Tensor:
+    def clip(self, raw: Float[Tensor, "*#batch"]) -> Tensor:
         """`raw` [m/s²] within the vehicle's limits."""
-        return torch.clamp(raw, self._limits[0], self._limits[1])  # type: ignore[call-overload]
+        # torch takes two floats or two tensors, and its types ask for one of the two by itself
+        return torch.clamp(raw, *self._limits)  # pyright: ignore[reportCallIssue, reportArgumentType, reportUnknownVariableType]
 
-    def at_limit(self, command: Tensor) -> Tensor:
+    def at_limit(self, command: Float[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
         """Where a command sits at the vehicle's limits, whoever put it there (an MPC keeps to them by itself), bool."""
         low, high = self._limits
         slack = 1e-6  # [m/s²], what a solver leaves
@@ -88,7 +90,7 @@ class LowerLevel:
         """Command effort `T_hat K_d / (K_hat T_d)` [-]: how much louder a fast demand leaves than it came."""
         return self._on_demand
 
-    def effective(self, T_L: Number, K_L: Number) -> tuple[Tensor, Tensor]:
+    def effective(self, T_L: Batched, K_L: Batched) -> tuple[Tensor, Tensor]:
         """`(T_e [s], K_e [-])` the loop behaves as, unclipped, with a plant `(T_L, K_L)`; broadcasts.
 
         `1/T_e = 1/T - r (1/T_hat - 1/T_d)`, `r = K T_hat / (T K_hat)`. Where the model promises more than the plant

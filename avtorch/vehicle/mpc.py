@@ -20,12 +20,15 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.vehicle.arguments import checked
+from avtorch.vehicle.broadcasting import broadcast
 from avtorch.vehicle.controllers import FollowerState
 from avtorch.vehicle.time_gap import RAMP_RATE, TimeGap
 
@@ -82,14 +85,14 @@ class MPC:
         if q.shape != (4,) or float(q[3]) <= 0:
             raise InputError(f"weights: found {tuple(weights)!r}, needs q_s, q_v, q_a >= 0 and r > 0")
         self.accel_min, self.accel_max = float(accel_min), float(accel_max)
-        self.T, self.K, self.horizon, self.weights = lag, gain, horizon, tuple(q.tolist())
+        self.T, self.K, self.horizon, self.weights = lag, gain, horizon, tuple(float(x) for x in q)
         self.ramp: TimeGap | None = None
         self._condense(moves, q)
 
-    def _condense(self, moves: int, q: Tensor) -> None:
+    def _condense(self, moves: int, q: Float[Tensor, "4"]) -> None:
         tau, T, K, h = self.time_gap, self.T, self.K, self.step
         drift = torch.tensor([[0, 1, -tau, 0], [0, 0, -1, 0], [0, 0, -1 / T, K / T], [0, 0, 0, 0]], dtype=torch.float64)
-        held = torch.linalg.matrix_exp(drift * h)
+        held = torch.matrix_exp(drift * h)
         A, B = held[:3, :3], held[:3, 3]
         powers = [torch.eye(3, dtype=torch.float64)]
         for _ in range(moves):
@@ -103,10 +106,11 @@ class MPC:
         weight = q[:3, None]
         self._H = 2 * (torch.einsum("jsi,jsk->ik", forced, weight * forced) + q[3] * torch.eye(moves, dtype=q.dtype))
         self._F = 2 * torch.einsum("jsi,jsk->ik", forced, weight * free)  # (move, 3)
-        self._law = -torch.linalg.solve(self._H, self._F)
+        self._law = -_solved(self._H, self._F)
         scale = self._H.diagonal().rsqrt()
         self._scale, self._scaled_H = scale, scale[:, None] * self._H * scale
-        eigenvalues = torch.linalg.eigvalsh(self._scaled_H)
+        # torch.linalg has no types
+        eigenvalues = cast(Tensor, torch.linalg.eigvalsh(self._scaled_H))  # pyright: ignore[reportUnknownMemberType]
         self._lipschitz = float(eigenvalues[-1])
         root = math.sqrt(self._lipschitz / float(eigenvalues[0]))
         self._momentum = (root - 1) / (root + 1)
@@ -118,10 +122,10 @@ class MPC:
         if self.ramp is not None and state.time < self.ramp.done_at:
             gap = self.ramp.at(state.time)
         error = state.spacing - (gap * state.speed + self.standstill)
-        seen = torch.broadcast_tensors(error, state.lead_speed - state.speed, state.accel)
+        seen = broadcast(error, state.lead_speed - state.speed, state.accel)
         return self.plan(torch.stack(seen, -1))[..., 0]
 
-    def plan(self, x: Tensor) -> Tensor:
+    def plan(self, x: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch move"]:
         """Optimal moves (..., move) [m/s²] from states `x` = (Δs [m], Δv [m/s], a [m/s²]), (..., 3)."""
         free = x @ self._law.T
         outside = ((free < self.accel_min) | (free > self.accel_max)).any(-1)
@@ -131,17 +135,19 @@ class MPC:
         out[outside] = self._solve(x[outside] @ self._F.T, free[outside])
         return torch.clamp(out, self.accel_min, self.accel_max)  # rounding: a limit kept is not a command clipped
 
-    def _solve(self, linear: Tensor, guess: Tensor) -> Tensor:
+    def _solve(
+        self, linear: Float[Tensor, "problem move"], guess: Float[Tensor, "problem move"]
+    ) -> Float[Tensor, "problem move"]:
         """Minimiser in the box for `linear` = F x, (problem, move); `guess` is the unconstrained one."""
         above, below = guess > self.accel_max, guess < self.accel_min
         eye = torch.eye(linear.shape[-1], dtype=linear.dtype)
-        out = guess
+        out, moved = guess, (above | below).any(-1)
         for _ in range(_ROUNDS):
             # one linear system: the free moves' gradient vanishes, the others sit on their bound
             bound = torch.where(above, self.accel_max, self.accel_min)
             pinned = above | below
             rows = torch.where(pinned.unsqueeze(-1), eye, self._H)
-            out = torch.linalg.solve(rows, torch.where(pinned, bound, -linear))
+            out = _solved(rows, torch.where(pinned, bound, -linear))
             out = torch.where(pinned, bound, out)
             push = -(out @ self._H + linear) / self._H.diagonal()
             was = above, below
@@ -152,7 +158,9 @@ class MPC:
                 return out
         return torch.where(moved.unsqueeze(-1), self._descend(linear, guess), out)
 
-    def _descend(self, linear: Tensor, guess: Tensor) -> Tensor:
+    def _descend(
+        self, linear: Float[Tensor, "problem move"], guess: Float[Tensor, "problem move"]
+    ) -> Float[Tensor, "problem move"]:
         """The same by projected gradient with constant momentum, in variables `U / scale` of unit diagonal."""
         low, high = self.accel_min / self._scale, self.accel_max / self._scale
         step = 1 / self._lipschitz
@@ -170,7 +178,7 @@ class MPC:
 
         With these the stability analysis of the linear controller holds for the MPC (small motions).
         """
-        k_s, k_v, k_a = self._law[0].tolist()
+        k_s, k_v, k_a = (float(x) for x in self._law[0])
         return k_s, k_v, k_a
 
     @property
@@ -202,3 +210,8 @@ class MPC:
         )
         new.ramp = TimeGap(target=time_gap, start=self.time_gap_at(at), since=at, rate=rate)
         return new
+
+
+def _solved(matrix: Tensor, right: Tensor) -> Tensor:
+    """`torch.linalg.solve`, which has no types."""
+    return torch.linalg.solve(matrix, right)  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.errors import InputError
 
 _CHUNK = 1024  # steps drawn together: amortises the set-up of a stream
@@ -33,19 +34,19 @@ class Noise:
         self.vehicles = vehicles
         self._cached: tuple[int, Tensor] | None = None
 
-    def _chunk(self, number: int) -> Tensor:
+    def _chunk(self, number: int) -> Float[Tensor, "time *vehicle scenario"]:
         if self._cached is None or self._cached[0] != number:
             rows = [
                 [np.random.Generator(np.random.Philox(key=s, counter=[0, 0, i, number])) for s in self.seeds]
                 for i in range(self.vehicles or 1)
             ]
             drawn = np.stack([np.stack([g.standard_normal(_CHUNK) for g in row], -1) for row in rows], -2)
-            self._cached = number, torch.from_numpy(drawn if self.vehicles else drawn[:, 0])
+            self._cached = number, torch.as_tensor(drawn if self.vehicles else drawn[:, 0])
         return self._cached[1]
 
-    def steps(self, first: int, count: int) -> Tensor:
+    def steps(self, first: int, count: int) -> Float[Tensor, "time *vehicle scenario"]:
         """Draws of steps `first` … `first + count - 1`, (time, scenario), or (time, vehicle, scenario) in a platoon."""
-        parts = []
+        parts: list[Tensor] = []
         while count > 0:
             number, offset = divmod(first, _CHUNK)
             part = self._chunk(number)[offset : offset + count]

@@ -8,7 +8,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from avtorch.vehicle.arguments import Number, checked, tensor
+from avtorch.arrays import Float
+from avtorch.vehicle.arguments import Batched, Number, checked, tensor
 from avtorch.vehicle.block import Block
 
 #: Bounds of comfort: 2 m/s² and, as ISO 15622 asks of adaptive cruise control, 2.5 m/s³.
@@ -50,16 +51,16 @@ class Performance:
         True
     """
 
-    speed_rms_ratio: Tensor
-    accel_rms_ratio: Tensor
-    min_spacing_m: Tensor
-    min_ttc_s: Tensor
-    safe_share: Tensor
-    jerk_rms_mps3: Tensor
-    clipped_share: Tensor
-    comfort_share: Tensor
-    energy_jpkgm: Tensor
-    throughput_vph: Tensor
+    speed_rms_ratio: Float[Tensor, "*scenario"]
+    accel_rms_ratio: Float[Tensor, "*scenario"]
+    min_spacing_m: Float[Tensor, "*scenario"]
+    min_ttc_s: Float[Tensor, "*scenario"]
+    safe_share: Float[Tensor, "*scenario"]
+    jerk_rms_mps3: Float[Tensor, "*scenario"]
+    clipped_share: Float[Tensor, "*scenario"]
+    comfort_share: Float[Tensor, "*scenario"]
+    energy_jpkgm: Float[Tensor, "*scenario"]
+    throughput_vph: Float[Tensor, "*scenario"]
 
     def row(self, *index: int) -> dict[str, float | None]:
         """One scenario's (or vehicle's) figures by name; what is not finite is None, as JSON has no other word."""
@@ -111,8 +112,8 @@ def performance(
 
 
 def equilibrium_throughput(
-    speed: Number, time_gap: Number, *, standstill: Number = 5.0, length: float = VEHICLE_LENGTH_M
-) -> Tensor:
+    speed: Batched, time_gap: Batched, *, standstill: Batched = 5.0, length: float = VEHICLE_LENGTH_M
+) -> Float[Tensor, "*batch"]:
     """Vehicles an hour past a point when all drive at `speed` [m/s] and `time_gap` [s]; arguments broadcast.
 
     `3600 v / (time_gap v + standstill + length)`. Raises `InputError` for negative values.

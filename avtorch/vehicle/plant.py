@@ -15,6 +15,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.vehicle.arguments import Number, checked
 from avtorch.vehicle.glvd import Method, motion_coefficients
@@ -70,7 +71,7 @@ class GLVDPlant:
     accel_max: float | None = None
     _lag: Tensor = field(init=False, repr=False, compare=False)
     _gain: Tensor = field(init=False, repr=False, compare=False)
-    _coefficients: dict = field(init=False, repr=False, compare=False)
+    _coefficients: dict[float, tuple[Tensor, Tensor, Tensor]] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_lag", checked("T_L", self.T_L, unit="s", above=0.0))
@@ -90,7 +91,7 @@ class GLVDPlant:
             return wanted
         return torch.clamp(wanted, self.accel_min, self.accel_max)
 
-    def jerk(self, a: Tensor, u: Tensor) -> Tensor:
+    def jerk(self, a: Float[Tensor, "*#batch"], u: Float[Tensor, "*#batch"]) -> Tensor:
         """Noise-free instantaneous jerk [m/s³]."""
         return (self.target(u) - a) / self._lag
 

@@ -19,17 +19,29 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float, Real
 from avtorch.errors import InputError
 from avtorch.vehicle.arguments import Number, checked
+from avtorch.vehicle.broadcasting import broadcast
 from avtorch.vehicle.glvd import glvd_rollout
 
 
-def speed_lag_accel(v: Tensor, v_cmd: Tensor, T_V: Tensor, K_V: Tensor) -> Tensor:
+def speed_lag_accel(
+    v: Float[Tensor, "*#batch"],
+    v_cmd: Float[Tensor, "*#batch"],
+    T_V: Float[Tensor, "*#batch"],
+    K_V: Float[Tensor, "*#batch"],
+) -> Float[Tensor, "*batch"]:
     """Noise-free acceleration ``(K_V v_cmd - v)/T_V`` [m/s²] of speeds [m/s]; all broadcast."""
     return (K_V * v_cmd - v) / T_V
 
 
-def position_lag_accel(error: Tensor, v: Tensor, T_P: Tensor, zeta: Tensor) -> Tensor:
+def position_lag_accel(
+    error: Float[Tensor, "*#batch"],
+    v: Float[Tensor, "*#batch"],
+    T_P: Float[Tensor, "*#batch"],
+    zeta: Float[Tensor, "*#batch"],
+) -> Float[Tensor, "*batch"]:
     """Noise-free acceleration ``error/T_P² - 2 zeta v/T_P`` [m/s²], ``error = x_cmd - x`` [m]; all broadcast."""
     return error / T_P**2 - 2 * zeta / T_P * v
 
@@ -58,7 +70,7 @@ class SpeedLag(torch.nn.Module):
         """See :func:`speed_lag_accel`."""
         return speed_lag_accel(v, v_cmd, self.T_V, self.K_V)
 
-    def rollout(self, v0: Number, v_cmd: Tensor, dt: float) -> Tensor:
+    def rollout(self, v0: Number, v_cmd: Real[Tensor, "*#batch time"], dt: float) -> Float[Tensor, "*all time"]:
         """Speeds at steps 1…N under commands ``(..., time)``, each held for ``dt`` [s]; exact, ``(..., time)``.
 
         The recursion is Eq. 1's with speed in place of acceleration.
@@ -94,7 +106,13 @@ class PositionLag(torch.nn.Module):
         """See :func:`position_lag_accel`."""
         return position_lag_accel(error, v, self.T_P, self.zeta)
 
-    def rollout(self, x0: Tensor, v0: Tensor, x_cmd: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+    def rollout(
+        self,
+        x0: Float[Tensor, "*#batch"],
+        v0: Float[Tensor, "*#batch"],
+        x_cmd: Float[Tensor, "*#batch time"],
+        dt: float,
+    ) -> tuple[Float[Tensor, "*all time"], Float[Tensor, "*all time"]]:
         """Positions [m] and speeds [m/s] at steps 1…N, each ``(..., time)``, under held commands ``(..., time)``.
 
         Exact: the step is the exponential of the 2 by 2 system, which is differentiable through critical damping too.
@@ -104,13 +122,13 @@ class PositionLag(torch.nn.Module):
         """
         if not 0 < dt < float("inf"):
             raise InputError(f"dt: found {dt!r}, needs a finite time step > 0 s")
-        T, zeta = torch.broadcast_tensors(self.T_P, self.zeta)
+        T, zeta = broadcast(self.T_P, self.zeta)
         zero = torch.zeros_like(T)
         rates = torch.stack([torch.stack([zero, zero + 1], -1), torch.stack([-(T**-2), -2 * zeta / T], -1)], -2)
-        step = torch.linalg.matrix_exp(dt * rates)
-        state = torch.stack(torch.broadcast_tensors(x0, v0), -1)
+        step = torch.matrix_exp(dt * rates)
+        state = torch.stack(broadcast(x0, v0), -1)
         rest = torch.stack([x_cmd, torch.zeros_like(x_cmd)], -1)  # where each command would come to rest
-        out = []
+        out: list[Tensor] = []
         for target in rest.unbind(-2):
             state = target + (step @ (state - target).unsqueeze(-1)).squeeze(-1)
             out.append(state)

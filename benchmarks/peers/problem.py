@@ -12,8 +12,6 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 
-Array = FloatArray
-
 NAMES = ("T_L", "K_L", "sigma")
 #: SPEC of the priors: ``log T_L``, ``log K_L`` normal with these medians and SDs, ``sigma`` half-normal [m/s^3].
 MEDIAN, LOG_SD, SIGMA_SCALE = (0.3, 1.0), (0.7, 0.3), 1.0
@@ -29,10 +27,10 @@ class Windows:
         truth: ``(T_L [s], K_L [-], sigma [m/s^3])`` that made them, ``(window, 3)``.
     """
 
-    a: Array
-    u: Array
-    jerk: Array
-    truth: Array
+    a: FloatArray
+    u: FloatArray
+    jerk: FloatArray
+    truth: FloatArray
 
     def __len__(self) -> int:
         return len(self.a)
@@ -40,7 +38,7 @@ class Windows:
     def select(self, index: slice) -> Windows:
         return Windows(self.a[index], self.u[index], self.jerk[index], self.truth[index])
 
-    def sums(self) -> Array:
+    def sums(self) -> FloatArray:
         """``(n, jj, aj, uj, aa, au, uu)`` of every window, ``(window, 7)``: all that Eq. 4 needs."""
         pairs = (
             (self.jerk, self.jerk),

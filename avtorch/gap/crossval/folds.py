@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from avtorch.arrays import BoolArray, IntArray
 from avtorch.gap.likelihood.record import Record
 
-Rows = BoolArray
-
 FOLDS = 5
 _BLOCKS = 20  # of a long drive
 _DRIVES = 3  # or more, for whole ones to be held out
@@ -87,8 +85,8 @@ def _blocks(record: Record) -> Iterator[slice]:
 
 
 def _part(record: Record, blocks: tuple[slice, ...], apart_s: float) -> Fold:
-    judges: Rows = np.zeros(record.rows, bool)
-    fits: Rows = np.ones(record.rows, bool)
+    judges: BoolArray = np.zeros(record.rows, bool)
+    fits: BoolArray = np.ones(record.rows, bool)
     apart = round(apart_s / record.dt)
     for block in blocks:
         judges[block] = True

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import lfilter
 
-from avtorch.arrays import FloatArray
+from avtorch.arrays import Float, FloatArray
 
 
-def lowpass(x: FloatArray, seconds: float, dt: float) -> FloatArray:
+def lowpass(x: Float[FloatArray, " row"], seconds: float, dt: float) -> Float[FloatArray, " row"]:
     """x (row,) through a first-order lag, settled at its first value."""
     share = -np.expm1(-dt / seconds)
     return np.asarray(lfilter([share], [1, share - 1], x - x[0])) + x[0]
 
 
-def linear_splines(x: FloatArray, knots: int) -> FloatArray:
+def linear_splines(x: Float[FloatArray, " row"], knots: int) -> Float[FloatArray, "function row"]:
     """Piecewise linear functions (function, row) of x (row,), each 1 at one of its quantiles."""
     at = np.unique(np.quantile(x, np.linspace(0.01, 0.99, knots)))
     if len(at) < 2:

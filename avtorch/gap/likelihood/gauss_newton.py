@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from avtorch.arrays import FloatArray
+from avtorch.arrays import Float, FloatArray
 from avtorch.gap.likelihood.grade_marginal import GradeMarginal
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter, sensed
@@ -28,9 +28,9 @@ class GaussNewtonFit:
     `grade_rms`, `profile`: of a road's slope.
     """
 
-    z: FloatArray
-    covariance: FloatArray = field(repr=False)
-    errors: FloatArray = field(repr=False)
+    z: Float[FloatArray, " coordinate"]
+    covariance: Float[FloatArray, "coordinate coordinate"] = field(repr=False)
+    errors: Float[FloatArray, "channel counted group"] = field(repr=False)
     log_joint: float
     log_evidence: float
     grade_rms: float | None = None
@@ -40,13 +40,13 @@ class GaussNewtonFit:
 def modes(
     hypothesis: Hypothesis,
     white: WhiteningFilter,
-    starts: FloatArray,
+    starts: Float[FloatArray, "start coordinate"],
     *,
     onset: int | None = None,
     iterations: int = 8,
     coarse: bool = False,
     enough: float = 0.01,
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Float[FloatArray, "start coordinate"], Float[FloatArray, " start"]]:
     """Modes (start, coordinate) and their log joint densities (start,), from `starts` (start, coordinate).
 
     `coarse`: on rollouts of averaged commands, several times as fast, good for a first look. A start has arrived once
@@ -80,8 +80,14 @@ def modes(
 
 
 def _quadratic(
-    hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int | None, coarse: bool = False
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+    hypothesis: Hypothesis,
+    white: WhiteningFilter,
+    z: Float[FloatArray, "start coordinate"],
+    onset: int | None,
+    coarse: bool = False,
+) -> tuple[
+    Float[FloatArray, "start coordinate"], Float[FloatArray, "start coordinate coordinate"], Float[FloatArray, " start"]
+]:
     """Gradient, Gauss-Newton matrix and value of the negative log joint density (less its constant) at `z`."""
     count, size = z.shape
     moved = np.repeat(z[:, None], size + 1, 1)
@@ -101,8 +107,8 @@ def _quadratic(
 
 
 def whitened_jacobian(
-    hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int | None = None
-) -> FloatArray:
+    hypothesis: Hypothesis, white: WhiteningFilter, z: Float[FloatArray, " coordinate"], onset: int | None = None
+) -> Float[FloatArray, "direction row"]:
     """White directions (direction, row) in which its parameters and its road's slope move a rollout from `z`."""
     moved = np.repeat(z[None], len(z) + 1, 0)
     moved[1:] += _STEP * np.eye(len(z))
@@ -146,7 +152,9 @@ def grade_marginal(white: WhiteningFilter, hypothesis: Hypothesis, onset: int | 
     return made
 
 
-def acting(white: WhiteningFilter, force: FloatArray, onset: int | None) -> FloatArray:
+def acting(
+    white: WhiteningFilter, force: Float[FloatArray, "*column channel counted group"], onset: int | None
+) -> Float[FloatArray, "*column channel counted group"]:
     """What a slope does (..., channel, counted, group), if only from `onset` on."""
     if onset is None:
         return force
@@ -158,16 +166,24 @@ def acting(white: WhiteningFilter, force: FloatArray, onset: int | None) -> Floa
 
 
 def residuals(
-    hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int | None = None, *, coarse: bool
-) -> FloatArray:
+    hypothesis: Hypothesis,
+    white: WhiteningFilter,
+    z: Float[FloatArray, " coordinate"],
+    onset: int | None = None,
+    *,
+    coarse: bool,
+) -> Float[FloatArray, "channel counted group"]:
     """Errors (channel, counted, group) at `z` (coordinate,), less what a road's slope explains of them."""
     errors = hypothesis.errors(z[None], onset, coarse=coarse)[0]
     return errors if hypothesis.grade_means is None else errors - _sloped(hypothesis, white, errors, onset)[2]
 
 
 def _sloped(
-    hypothesis: Hypothesis, white: WhiteningFilter, errors: FloatArray, onset: int | None
-) -> tuple[float, FloatArray, FloatArray]:
+    hypothesis: Hypothesis,
+    white: WhiteningFilter,
+    errors: Float[FloatArray, "channel counted group"],
+    onset: int | None,
+) -> tuple[float, Float[FloatArray, " knot"], Float[FloatArray, "channel counted group"]]:
     """`grade_rms`, coefficients (knot,), and what they do to the errors."""
     rms, profile = grade_marginal(white, hypothesis, onset, coarse=errors.shape[-1] == 1).told(white(errors).ravel())
     part = hypothesis.grade_response(profile)
@@ -175,7 +191,9 @@ def _sloped(
     return rms, profile, sensed(white.record, white.noise, acting(white, part, onset))
 
 
-def finish(hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int | None = None) -> GaussNewtonFit:
+def finish(
+    hypothesis: Hypothesis, white: WhiteningFilter, z: Float[FloatArray, " coordinate"], onset: int | None = None
+) -> GaussNewtonFit:
     """Covariance, errors and Laplace evidence at a mode `z` (coordinate,)."""
     size = len(z)
     _, square, value = (x[0] for x in _quadratic(hypothesis, white, z[None], onset))

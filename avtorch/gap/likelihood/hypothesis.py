@@ -17,7 +17,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 
-from avtorch.arrays import FloatArray
+from avtorch.arrays import Float, FloatArray
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.simulator.drive import Drive, Response
 from avtorch.gap.simulator.effect import Effect, effect_class
@@ -94,20 +94,24 @@ class Hypothesis:
     def size(self) -> int:
         return len(self.coordinates)
 
-    def values(self, z: FloatArray) -> dict[str, torch.Tensor]:
+    def values(self, z: Float[FloatArray, "column coordinate"]) -> dict[str, torch.Tensor]:
         """Parameters by key, (column,), for `z` (column, coordinate)."""
         return {c.key: c.value(z[:, i]) for i, c in enumerate(self.coordinates)}
 
-    def held(self, z: FloatArray, onset: int | None) -> FloatArray:
+    def held(
+        self, z: Float[FloatArray, "column coordinate"], onset: int | None
+    ) -> Float[FloatArray, "column coordinate"]:
         """`z` (column, coordinate) with what only an onset can tell put to its prior's centre where there is none."""
         rests = [c.parameter.of_onset for c in self.coordinates]
         return np.where(rests, 0.0, z) if onset is None and any(rests) else z
 
-    def z_of(self, values: Mapping[str, float]) -> FloatArray:
+    def z_of(self, values: Mapping[str, float]) -> Float[FloatArray, " coordinate"]:
         """Coordinates for values by key; what is missing gets its prior's centre."""
         return np.array([c.z_of(values[c.key]) if c.key in values else 0.0 for c in self.coordinates])
 
-    def rollouts(self, z: FloatArray, onset: int | None = None, *, coarse: bool = False) -> FloatArray:
+    def rollouts(
+        self, z: Float[FloatArray, "column coordinate"], onset: int | None = None, *, coarse: bool = False
+    ) -> Float[FloatArray, "column channel counted group"]:
         """Responses for `z` (column, coordinate): (column, channel, counted, group)."""
         values = self.values(self.held(z, onset))
         if onset is None:
@@ -118,7 +122,9 @@ class Hypothesis:
             responses = rollout_from_onset(self.plant, self._without, drives, values, place)
         return self._seen(responses, len(z), coarse)
 
-    def baseline_rollouts(self, z: FloatArray, *, coarse: bool = False) -> FloatArray:
+    def baseline_rollouts(
+        self, z: Float[FloatArray, "column coordinate"], *, coarse: bool = False
+    ) -> Float[FloatArray, "some channel counted group"]:
         """What the baseline alone does with the `T_L` and `K_L` of `z` (column, coordinate); one column if all
         agree."""
         lags = z[:, [c.key in ("T_L", "K_L") for c in self.coordinates]]
@@ -140,7 +146,9 @@ class Hypothesis:
             parts.append(record.seen([r.speed for r in responses], coarse=coarse))
         return np.stack([np.broadcast_to(p, (columns, *p.shape[-2:])) for p in parts], 1)
 
-    def errors(self, z: FloatArray, onset: int | None = None, *, coarse: bool = False) -> FloatArray:
+    def errors(
+        self, z: Float[FloatArray, "column coordinate"], onset: int | None = None, *, coarse: bool = False
+    ) -> Float[FloatArray, "column channel counted group"]:
         """Measured less rolled out, (column, channel, counted, group)."""
         measured = self.record.measured
         return (measured.mean(-1, keepdims=True) if coarse else measured) - self.rollouts(z, onset, coarse=coarse)
@@ -151,7 +159,7 @@ class Hypothesis:
         return next((e for e in self.effects if issubclass(e, Integrated)), None)
 
     @cached_property
-    def grade_columns(self) -> FloatArray | None:
+    def grade_columns(self) -> Float[FloatArray, "knot channel counted group"] | None:
         """Rollouts (knot, channel, counted, group) per unit of each coefficient of the slope at `grade_rms` 1.
 
         Every segment has coefficients of its own: where one began on the other's road is not known.
@@ -165,7 +173,7 @@ class Hypothesis:
         return known[kind]
 
     @cached_property
-    def grade_means(self) -> FloatArray | None:
+    def grade_means(self) -> Float[FloatArray, "knot channel counted 1"] | None:
         """The same of each group's mean, (knot, channel, counted, 1): within a group no slope changes."""
         kind = self.integrated
         if kind is None or not self._roads:
@@ -183,7 +191,7 @@ class Hypothesis:
             forces.append(torch.nn.functional.pad(force, (0, 0, own.start, knots - own.stop)))
         return self._seen_forces(drives, forces, coarse=coarse)
 
-    def grade_response(self, coefficients: FloatArray) -> FloatArray:
+    def grade_response(self, coefficients: Float[FloatArray, " knot"]) -> Float[FloatArray, "channel counted group"]:
         """What a slope of `coefficients` (knot,) does, (channel, counted, group)."""
         drives = self.record.drives
         forces = [road.force(_position(d), own)[None] for road, d, own in self._each_road(drives, coefficients)]
@@ -227,7 +235,7 @@ class Hypothesis:
             made.append(grade.prepared(drives[0].time, drives[0].speed, positions))
         return made
 
-    def grade_along(self, coefficients: FloatArray) -> FloatArray:
+    def grade_along(self, coefficients: Float[FloatArray, "column knot"]) -> Float[FloatArray, " column"]:
         """Root mean square of the slope along all drives, (column,), for coefficients (column, knot)."""
         drives = self.record.coarse
         squares = [

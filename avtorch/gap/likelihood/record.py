@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.arrays import BoolArray, FloatArray, IntArray
+from avtorch.arrays import BoolArray, Float, FloatArray, Int, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.simulator.drive import Drive, Place
 from avtorch.io import Log
@@ -60,16 +60,16 @@ class Record:
     drives: tuple[Drive, ...]
     cuts: tuple[Cut, ...]
     coarse: tuple[Drive, ...]
-    time: FloatArray
-    stamp: FloatArray
-    log: IntArray
-    accel: FloatArray | None
-    speed: FloatArray | None
-    command: FloatArray
+    time: Float[FloatArray, " row"]
+    stamp: Float[FloatArray, " row"]
+    log: Int[IntArray, " row"]
+    accel: Float[FloatArray, "row group"] | None
+    speed: Float[FloatArray, "row group"] | None
+    command: Float[FloatArray, " row"]
     dt: float
-    source: IntArray
-    target: IntArray
-    stretch: IntArray
+    source: Int[IntArray, " counted"]
+    target: Int[IntArray, " counted"]
+    stretch: Int[IntArray, " counted"]
     length: int
     group: int
 
@@ -234,13 +234,13 @@ class Record:
             number += 1
         return Place(number, place)
 
-    def padded(self, values: FloatArray) -> FloatArray:
+    def padded(self, values: Float[FloatArray, "*column counted group"]) -> Float[FloatArray, "*column padded"]:
         """Counted rows' `values` (..., counted, group) at their places in (..., length * group), zeros between."""
         out = np.zeros((*values.shape[:-2], self.length, values.shape[-1]))
         out[..., self.target, :] = values
         return out.reshape(*values.shape[:-2], -1)
 
-    def seen(self, responses: Sequence[Tensor], *, coarse: bool = False) -> FloatArray:
+    def seen(self, responses: Sequence[Tensor], *, coarse: bool = False) -> Float[FloatArray, "*column counted group"]:
         """Responses by drive, (..., time) each, at rows that count: (..., counted, group), `coarse` with group 1."""
         parts = []
         for x in responses:
@@ -255,7 +255,7 @@ class Record:
         return whole.numpy()[..., self.source, :]
 
     @cached_property
-    def measured(self) -> FloatArray:
+    def measured(self) -> Float[FloatArray, "channel counted group"]:
         """What the channels saw, (channel, counted, group)."""
         return np.stack([x[self.source] for x in (self.accel, self.speed) if x is not None])
 

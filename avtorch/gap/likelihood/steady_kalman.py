@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import expm
 
-from avtorch.arrays import FloatArray
+from avtorch.arrays import Float, FloatArray
 from avtorch.gap.likelihood.noise_model import NoiseModel
 
 Filter = tuple[list[list[FloatArray]], FloatArray, float]
@@ -57,7 +57,7 @@ def designed(noises: Sequence[NoiseModel], dt: float, channels: tuple[str, ...])
     return [([list(row) for row in mixed[i]], bottom[i], float(sizes[i])) for i in range(len(noises))]
 
 
-def motion(n: NoiseModel, dt: float) -> tuple[FloatArray, FloatArray]:
+def motion(n: NoiseModel, dt: float) -> tuple[Float[FloatArray, "state state"], Float[FloatArray, "state state"]]:
     """State (error of the speed, p, d) over `dt`: its transition and the covariance that is added, both exact.
 
     Ornstein-Uhlenbeck processes (a third where a random effect adds one) and the integral of their sum. Behind a late
@@ -102,7 +102,12 @@ def _integral(x: float) -> float:
     return 2 * x - 3 + 4 * float(np.exp(-x)) - float(np.exp(-2 * x))
 
 
-def _steady(move: FloatArray, see: FloatArray, driven: FloatArray, white: FloatArray) -> FloatArray:
+def _steady(
+    move: Float[FloatArray, "model state state"],
+    see: Float[FloatArray, "model seen state"],
+    driven: Float[FloatArray, "model state state"],
+    white: Float[FloatArray, "model seen seen"],
+) -> Float[FloatArray, "model state state"]:
     """Covariances (model, state, state) ahead of a reading, once they have settled: the Riccati equation by doubling.
 
     Structure-preserving doubling (Anderson 1978): each round covers twice as many rows as the last.

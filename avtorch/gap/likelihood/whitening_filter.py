@@ -16,7 +16,7 @@ from typing import Self
 import numpy as np
 from scipy.signal import lfilter
 
-from avtorch.arrays import FloatArray
+from avtorch.arrays import Float, FloatArray
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.steady_kalman import Filter, designed
@@ -68,7 +68,9 @@ class WhiteningFilter:
         rows = [0, *(row for row, _ in self.until), self.record.rows]
         return [(f, slice(*ends)) for f, ends in zip(self._filters[coarse], pairwise(rows), strict=True)]
 
-    def _filtered(self, errors: FloatArray) -> FloatArray:
+    def _filtered(
+        self, errors: Float[FloatArray, "*column channel counted group"]
+    ) -> Float[FloatArray, "*column channel counted group"]:
         """Errors (..., channel, counted, group) through the filter."""
         count, group = errors.shape[-3], errors.shape[-1]
         record = self.record
@@ -83,7 +85,9 @@ class WhiteningFilter:
                 out[..., o, part, :] = rows[..., target, :]
         return out
 
-    def turned(self, images: FloatArray) -> FloatArray:
+    def turned(
+        self, images: Float[FloatArray, "*column channel counted group"]
+    ) -> Float[FloatArray, "*column channel counted group"]:
         """The transpose of the map, of images (..., channel, counted, group): the filter run backward in time."""
         record, (count, group) = self.record, images.shape[-3::2]
         images = np.array(images)
@@ -103,7 +107,7 @@ class WhiteningFilter:
             total[..., -1, record.starts, 0] -= np.add.reduceat(total[..., -1, :, :].sum(-1), record.starts, -1)
         return total
 
-    def response(self, errors: FloatArray) -> FloatArray:
+    def response(self, errors: Float[FloatArray, "channel time"]) -> Float[FloatArray, "channel time"]:
         """White image of errors (channel, time) at consecutive rows that begin with the first, offset and all."""
         tops, bottom, _ = self._parts(False)[-1][0]
         count = len(errors)
@@ -125,12 +129,16 @@ class WhiteningFilter:
             self._offsets[coarse] = image, np.add.reduceat((image**2).sum((0, 2)), self.record.starts)
         return self._offsets[coarse]
 
-    def _without_offset(self, e: FloatArray) -> FloatArray:
+    def _without_offset(
+        self, e: Float[FloatArray, "*column channel counted group"]
+    ) -> Float[FloatArray, "*column channel counted group"]:
         image, square = self._offset(e.shape[-1] == 1)
         part = np.add.reduceat((e * image).sum((-3, -1)), self.record.starts, -1) / square
         return e - image * part[..., None, self.record.stretch, None]
 
-    def __call__(self, errors: FloatArray) -> FloatArray:
+    def __call__(
+        self, errors: Float[FloatArray, "*column channel counted group"]
+    ) -> Float[FloatArray, "*column channel counted group"]:
         """Errors (..., channel, counted, group) made white, of unit variance, the same shape.
 
         Errors of groups' means come with group 1.
@@ -141,7 +149,7 @@ class WhiteningFilter:
         errors[..., -1, :, :] -= errors[..., -1, self.record.starts, :1][..., self.record.stretch, :]
         return self._without_offset(self._filtered(errors))
 
-    def constants(self, *, coarse: bool) -> FloatArray:
+    def constants(self, *, coarse: bool) -> Float[FloatArray, " counted"]:
         """Each row's part (counted,) of what the log likelihood has that does not depend on the errors."""
         record = self.record
         each, count = 1 if coarse else record.group, len(record.channels)
@@ -156,17 +164,19 @@ class WhiteningFilter:
         """What the log likelihood has that does not depend on the errors."""
         return float(self.constants(coarse=coarse).sum())
 
-    def log_likelihood(self, errors: FloatArray) -> FloatArray:
+    def log_likelihood(self, errors: Float[FloatArray, "*column channel counted group"]) -> FloatArray:
         """Of errors (..., channel, counted, group): (...)."""
         e = self(errors)
         return self.constant_of(coarse=errors.shape[-1] == 1) - 0.5 * (e**2).sum((-1, -2, -3))
 
-    def row_likelihoods(self, errors: FloatArray) -> FloatArray:
+    def row_likelihoods(self, errors: Float[FloatArray, "channel counted group"]) -> Float[FloatArray, " counted"]:
         """Log likelihood (counted,) of each row of errors (channel, counted, group); sums to the whole."""
         return self.constants(coarse=errors.shape[-1] == 1) - 0.5 * (self(errors) ** 2).sum((0, 2))
 
 
-def sensed(record: Record, noise: NoiseModel, motion: FloatArray) -> FloatArray:
+def sensed(
+    record: Record, noise: NoiseModel, motion: Float[FloatArray, "*column channel counted group"]
+) -> Float[FloatArray, "*column channel counted group"]:
     """What the channels show of a motion (..., channel, counted, group), the accelerometer with its scale and lag."""
     if "accel" not in record.channels or (noise.sensor_scale == 1.0 and noise.sensor_lag == 0.0):
         return motion

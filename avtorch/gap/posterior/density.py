@@ -26,6 +26,7 @@ from avtorch.inference.priors import LogSpaceNormal
 if TYPE_CHECKING:
     from avtorch.gap.search.fitted_model import FittedModel
 
+
 _FURTHEST = 10.0
 """Beyond so many standard deviations of the prior the likelihood stays what it is there: no rollout of infinities."""
 _BLOCK = 2**18

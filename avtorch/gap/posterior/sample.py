@@ -25,6 +25,7 @@ from avtorch.inference.whitening import Coordinates, stiffness
 
 __all__ = ["Draws", "drawn", "exact_one_in", "fitted", "moved", "posterior", "repaired", "reported"]
 
+
 STEP = 2.0
 """SGLD's step in whitened coordinates; see `SamplerSettings`."""
 _INFLATED = 0.02  # of a variance, by the noise of gradients

@@ -136,8 +136,7 @@ class Search:
         return [*own, *(forced(on, law) for law in self._laws["force"])]
 
     def _late(self) -> bool:
-        late = self.until is not None and time.monotonic() > self.until
-        self.complete &= not late
+        self.complete &= not (late := self.until is not None and time.monotonic() > self.until)
         return late
 
     # deterministic causes and gusts --------------------------------------------------------------------------------

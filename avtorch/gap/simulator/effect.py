@@ -48,6 +48,7 @@ from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.row import Row, row_at
 from avtorch.vehicle.arguments import Number, tensor
+from avtorch.vehicle.broadcasting import broadcast
 
 Place = Literal["command", "actuator", "body", "sensor"]
 Alias = Literal["offset", "pole", "K_L"]
@@ -191,13 +192,15 @@ class Effect:
         """Output over whole drives, `x` (..., time)."""
         if not self.memory:
             return self.apply(x, row)
-        state, outputs = self.start(x[..., 0], row_at(row, 0)), []
+        state = self.start(x[..., 0], row_at(row, 0))
+        outputs: list[Tensor | tuple[Number, ...]] = []
         for k in range(x.shape[-1]):
             y, state = self.advance(x[..., k], row_at(row, k), state)
             outputs.append(y)
-        if isinstance(outputs[0], tuple):
-            return tuple(_stacked([tensor(y[i]) for y in outputs]) for i in range(len(outputs[0])))
-        return _stacked(outputs)
+        factors = [y for y in outputs if isinstance(y, tuple)]
+        if factors:
+            return tuple(_stacked([tensor(y) for y in of_rows]) for of_rows in zip(*factors, strict=True))
+        return _stacked([y for y in outputs if isinstance(y, Tensor)])
 
     # around it -----------------------------------------------------------------------------------------------------
     def noise(self, u: Tensor) -> NoiseChange | None:
@@ -306,7 +309,7 @@ class Effect:
 
 
 def _stacked(rows: list[Tensor]) -> Tensor:
-    return torch.stack(torch.broadcast_tensors(*rows), -1)
+    return torch.stack(broadcast(*rows), -1)
 
 
 EFFECTS: dict[str, type[Effect]] = {}

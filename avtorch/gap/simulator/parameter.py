@@ -7,8 +7,9 @@ Every prior is a standard normal `z` seen through a link, `value = link(location
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from torch import Tensor
@@ -20,6 +21,10 @@ Constraint = Literal["real", "positive", "negative", "unit", "interval"]
 _CENTRAL_80 = 1.2815515655446004  # normal quantile of 0.9
 _LOG_2PI = math.log(2 * math.pi)
 _AS_FAR = 3.0  # times the typical range, where an effect does not say what is possible
+
+# torch.special has no types
+_normal_distribution = cast(Callable[[Tensor], Tensor], torch.special.ndtr)  # pyright: ignore[reportUnknownMemberType]
+_normal_quantile = cast(Callable[[Tensor], Tensor], torch.special.ndtri)  # pyright: ignore[reportUnknownMemberType]
 
 
 @dataclass(frozen=True)
@@ -88,7 +93,7 @@ class Parameter:
         if self.constraint == "interval":
             return self.low, self.high
         z = _AS_FAR * _CENTRAL_80 * torch.tensor([-1.0, 1.0], dtype=torch.float64)
-        low, high = sorted(self.constrain(z).tolist())
+        low, high = sorted(float(x) for x in self.constrain(z))
         return low, high
 
     def _ends(self) -> tuple[float, float]:
@@ -103,7 +108,7 @@ class Parameter:
         if self.constraint == "unit":
             return torch.logit(value)
         if self.constraint == "interval":
-            return torch.special.ndtri((value - self.low) / (self.high - self.low))
+            return _normal_quantile((value - self.low) / (self.high - self.low))
         return value
 
     def constrain(self, z: Tensor) -> Tensor:
@@ -116,7 +121,7 @@ class Parameter:
         if self.constraint == "unit":
             return torch.sigmoid(x)
         if self.constraint == "interval":
-            return self.low + (self.high - self.low) * torch.special.ndtr(x)
+            return self.low + (self.high - self.low) * _normal_distribution(x)
         return x
 
     def unconstrain(self, value: Tensor) -> Tensor:

@@ -9,11 +9,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float, Real
 from avtorch.errors import InputError
 from avtorch.vehicle.stability.exact import coefficients
 from avtorch.vehicle.stability.nyquist import lost_at
 from avtorch.vehicle.stability.setting import Gains, Setting, Value, as_tensor, read_setting
 from avtorch.vehicle.stability.verdict import locally_stable, peak_gain_of, string_stable_of
+
+Drawn = float | Real[Tensor, ""] | Real[Tensor, "*#setting #draw"]
 
 BLOCK = 1 << 15  # (setting, draw) pairs held at a time: the temporaries then stay in the cache
 
@@ -58,13 +61,15 @@ class StabilityBelief:
         ['B', 'C_over_K', 'dead_time', 'local', 'peak_gain']
     """
 
-    p_locally_stable: Tensor
-    p_string_stable: Tensor
-    error: Tensor
+    p_locally_stable: Float[Tensor, "*setting"]
+    p_string_stable: Float[Tensor, "*setting"]
+    error: Float[Tensor, "*setting"]
     margins: dict[str, Interval]
 
 
-def p_locally_stable(T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, dead_time: Value = 0.0) -> Tensor:
+def p_locally_stable(
+    T_L: Drawn, K_L: Drawn, time_gap: Value, gains: Gains, *, dead_time: Drawn = 0.0
+) -> Float[Tensor, "*setting"]:
     """P(locally stable) of every setting under draws of the actuation, shape (setting,) or whatever the settings have.
 
     The vehicle, T_L [s], K_L [-] and dead_time [s], has its draws on the last dimension: (draw,) for all settings
@@ -85,15 +90,15 @@ def p_locally_stable(T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, d
 
 
 def p_string_stable(
-    T_L: Value,
-    K_L: Value,
+    T_L: Drawn,
+    K_L: Drawn,
     time_gap: Value,
     gains: Gains,
     *,
-    dead_time: Value = 0.0,
+    dead_time: Drawn = 0.0,
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
-) -> Tensor:
+) -> Float[Tensor, "*setting"]:
     """P(string stable), arguments as in `p_locally_stable`; feedforward [-] and its delay [s] belong to the setting.
 
     Example:
@@ -108,12 +113,12 @@ def p_string_stable(
 
 
 def stability_belief(
-    T_L: Value,
-    K_L: Value,
+    T_L: Drawn,
+    K_L: Drawn,
     time_gap: Value,
     gains: Gains,
     *,
-    dead_time: Value = 0.0,
+    dead_time: Drawn = 0.0,
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
 ) -> StabilityBelief:
@@ -128,7 +133,9 @@ def stability_belief(
         (0.86, 1.024)
     """
     blocks = _Blocks(T_L, K_L, time_gap, gains, dead_time, feedforward, feedforward_delay)
-    local, string, n = [], [], blocks.draws
+    local: list[Tensor] = []
+    string: list[Tensor] = []
+    n = blocks.draws
     margins: dict[str, list[Interval]] = {}
     for s in blocks:
         local.append(s.full(locally_stable(s)).double().mean(-1))
@@ -157,13 +164,13 @@ def _margins(s: Setting) -> dict[str, Tensor]:
     return rows | {"peak_gain": peak_gain_of(s)}
 
 
-def _interval(draws: Tensor) -> Interval:
+def _interval(draws: Float[Tensor, "setting draw"]) -> Interval:
     ordered = draws.sort(-1).values
     n = ordered.shape[-1]
     return Interval(*(ordered[..., min(n - 1, int(q * n))] for q in (0.05, 0.5, 0.95)))
 
 
-def _share(verdict: Callable[[Setting], Tensor], blocks: _Blocks) -> Tensor:
+def _share(verdict: Callable[[Setting], Tensor], blocks: _Blocks) -> Float[Tensor, "*setting"]:
     return blocks.join([s.full(verdict(s)).double().mean(-1) for s in blocks])
 
 
@@ -172,11 +179,11 @@ class _Blocks:
 
     def __init__(
         self,
-        T_L: Value,
-        K_L: Value,
+        T_L: Drawn,
+        K_L: Drawn,
         time_gap: Value,
         gains: Gains,
-        dead_time: Value,
+        dead_time: Drawn,
         feedforward: Value,
         feedforward_delay: Value,
     ) -> None:

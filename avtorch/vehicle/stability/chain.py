@@ -18,7 +18,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Complex, Float, Inexact
 from avtorch.errors import InputError
+from avtorch.vehicle.broadcasting import broadcast
 
 SLACK = 1e-4
 """A gain above one by less than this is one: responses that were measured on a grid are no better known."""
@@ -42,10 +44,10 @@ class Chain:
         True
     """
 
-    omega: Tensor
-    motion: Tensor
-    sensed: Tensor
-    drag: Tensor
+    omega: Float[Tensor, " frequency"]
+    motion: Complex[Tensor, "*#batch frequency"]
+    sensed: Inexact[Tensor, "*#batch frequency"]
+    drag: Float[Tensor, "*#batch"]
 
     def __post_init__(self) -> None:
         rises = bool((self.omega[1:] > self.omega[:-1]).all()) and float(self.omega[0]) > 0
@@ -70,12 +72,12 @@ class ChainVerdict:
         ([True, False], [1.0, 2.24])
     """
 
-    locally_stable: Tensor
-    string_stable: Tensor
-    peak_gain: Tensor
+    locally_stable: Bool[Tensor, "*batch"]
+    string_stable: Bool[Tensor, "*batch"]
+    peak_gain: Float[Tensor, "*batch"]
 
 
-def frequencies(*, points: int = 600, least: float = 0.01, most: float = 200.0) -> Tensor:
+def frequencies(*, points: int = 600, least: float = 0.01, most: float = 200.0) -> Float[Tensor, " frequency"]:
     """A grid [rad/s] for `Chain.omega`: 1.7 % apart, from far below a platoon's modes to far above an actuator's.
 
     Example:
@@ -87,7 +89,12 @@ def frequencies(*, points: int = 600, least: float = 0.01, most: float = 200.0) 
     return torch.logspace(math.log10(least), math.log10(most), points, dtype=torch.float64)
 
 
-def actuator(omega: Tensor, T_L: Tensor, K_L: Tensor, dead_time: Tensor | float = 0.0) -> Chain:
+def actuator(
+    omega: Float[Tensor, " frequency"],
+    T_L: Float[Tensor, "*#batch"],
+    K_L: Float[Tensor, "*#batch"],
+    dead_time: float | Float[Tensor, "*#batch"] = 0.0,
+) -> Chain:
     """GLVD with a dead time [s] as a chain, parameters (...).
 
     Example:
@@ -98,19 +105,19 @@ def actuator(omega: Tensor, T_L: Tensor, K_L: Tensor, dead_time: Tensor | float 
         (torch.complex128, 1.0)
     """
     s = 1j * omega
-    T, K, theta = torch.broadcast_tensors(T_L, K_L, torch.as_tensor(dead_time, dtype=torch.float64))
+    T, K, theta = broadcast(T_L, K_L, torch.as_tensor(dead_time, dtype=torch.float64))
     motion = K[..., None] * torch.exp(-s * theta[..., None]) / (1 + s * T[..., None])
     return Chain(omega, motion, torch.ones_like(motion), torch.zeros_like(T))
 
 
 def chain_verdict(
     chain: Chain,
-    time_gap: Tensor,
-    gains: Tensor,
+    time_gap: Float[Tensor, "*#batch"],
+    gains: Float[Tensor, "*#batch 3"],
     *,
-    inner: Tensor | float = 0.0,
-    forward: Tensor | float = 1.0,
-    feedforward: Tensor | float = 0.0,
+    inner: float | Float[Tensor, "*#batch"] = 0.0,
+    forward: float | Float[Tensor, "*#batch"] = 1.0,
+    feedforward: float | Float[Tensor, "*#batch"] = 0.0,
     feedforward_delay: float = 0.0,
 ) -> ChainVerdict:
     """Stability of a linear controller around `chain`; batches broadcast with each other.
@@ -138,14 +145,14 @@ def chain_verdict(
 
 def chain_gain(
     chain: Chain,
-    time_gap: Tensor,
-    gains: Tensor,
+    time_gap: Float[Tensor, "*#batch"],
+    gains: Float[Tensor, "*#batch 3"],
     *,
-    inner: Tensor | float = 0.0,
-    forward: Tensor | float = 1.0,
-    feedforward: Tensor | float = 0.0,
+    inner: float | Float[Tensor, "*#batch"] = 0.0,
+    forward: float | Float[Tensor, "*#batch"] = 1.0,
+    feedforward: float | Float[Tensor, "*#batch"] = 0.0,
     feedforward_delay: float = 0.0,
-) -> Tensor:
+) -> Float[Tensor, "*all frequency"]:
     """`|V / V_lead|` (..., frequency), arguments as in `chain_verdict`; formal where the loop is locally unstable.
 
     Example:
@@ -181,7 +188,7 @@ def _loop(
     return loop, beta * chain.motion * (ks + kv * s + kf * s**2 * torch.exp(-s * feedforward_delay))
 
 
-def _growing(curve: Tensor) -> Tensor:
+def _growing(curve: Complex[Tensor, "*batch frequency"]) -> Float[Tensor, "*batch"]:
     """How many modes grow, (...): half turns that `curve` (..., frequency) makes clockwise from above to below."""
     turns = torch.angle(curve[..., 1:] / curve[..., :-1]).sum(-1)
     # from the real axis at omega 0 and back to it at the top

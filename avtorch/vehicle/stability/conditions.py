@@ -8,7 +8,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
+from avtorch.vehicle.broadcasting import broadcast
 from avtorch.vehicle.stability.setting import Gains, Setting, Value, read_setting
 
 Form = Literal["rigorous", "print"]
@@ -29,10 +31,10 @@ class Conditions:
     """
 
     names: tuple[str, ...]
-    values: Tensor
+    values: Float[Tensor, "*setting condition"]
 
     @property
-    def holds(self) -> Tensor:
+    def holds(self) -> Bool[Tensor, "*setting"]:
         """True where every condition holds, shape (...)."""
         return (self.values > 0).all(-1)
 
@@ -106,7 +108,7 @@ def string_conditions(
 
 def string_sufficient(
     T_L: PointOrBox, K_L: PointOrBox, time_gap: Value, gains: Gains, *, form: Form = "rigorous"
-) -> Tensor:
+) -> Bool[Tensor, "*setting"]:
     """True where Eq. 3 holds over the point or box, shape (...).
 
     form="rigorous" asks for Eq. 2 as well, for the gain condition alone also passes locally unstable loops; so every
@@ -159,6 +161,6 @@ def _bounds(value: PointOrBox, name: str) -> tuple[Value, Value]:
 
 
 def _stack(rows: dict[str, Tensor], low: Setting, high: Setting) -> Conditions:
-    values = torch.stack(torch.broadcast_tensors(*rows.values()), -1)
+    values = torch.stack(broadcast(*rows.values()), -1)
     valid = (low.valid & high.valid).unsqueeze(-1)
     return Conditions(tuple(rows), torch.where(valid, values, torch.full_like(values, -torch.inf)))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
+from avtorch.vehicle.broadcasting import broadcast
 from avtorch.vehicle.stability.setting import Gains, Setting, Value, read_setting
 
 # A loop on the boundary (C = 0 on paper) must not fall off it by rounding: the sums below have some ten roundings.
@@ -13,7 +15,7 @@ ROUNDINGS = 16
 
 def string_margins(
     T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, feedforward: Value = 0.0
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Float[Tensor, "*setting"], Float[Tensor, "*setting"]]:
     """(B, C) of the exact string condition: `|G|^2` <= 1 at omega iff `T^2 omega^4 + B omega^2 + C >= 0`.
 
     B = (1 - K k_a)^2 - 2 T K g [-] is Eq. 3's first line at one point, C / K [1/s^2] its last. With a feed-forward gain
@@ -28,12 +30,14 @@ def string_margins(
         True
     """
     s = read_setting(T_L, K_L, time_gap, gains, feedforward=feedforward)
-    B, C = torch.broadcast_tensors(*coefficients(s))
+    B, C = broadcast(*coefficients(s))
     low = torch.full_like(B, -torch.inf)
     return s.full(torch.where(s.valid, B, low)), s.full(torch.where(s.valid, C, low))
 
 
-def string_margin(T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, feedforward: Value = 0.0) -> Tensor:
+def string_margin(
+    T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, feedforward: Value = 0.0
+) -> Float[Tensor, "*setting"]:
     """The least of T^2 x^2 + B x + C over x = omega^2 >= 0: the gain condition holds iff it is >= 0.
 
     T_L [s], K_L [-], time_gap [s] and feedforward [-] broadcast with the leading dimensions of gains (..., 3); returns
@@ -83,7 +87,7 @@ def peak_omega(s: Setting) -> Tensor:
     """
     B, C = coefficients(s)
     n0, n1, T2 = s.ks**2, s.kv**2, s.T**2
-    c3, c2, c1, c0 = torch.broadcast_tensors(2 * n1 * T2, 3 * T2 * n0 + B * n1, 2 * B * n0, C * n0)
+    c3, c2, c1, c0 = broadcast(2 * n1 * T2, 3 * T2 * n0 + B * n1, 2 * B * n0, C * n0)
     x = _above_roots(c3, c2, c1, c0)
     for _ in range(24):
         f, df = ((c3 * x + c2) * x + c1) * x + c0, (3 * c3 * x + 2 * c2) * x + c1
@@ -92,7 +96,12 @@ def peak_omega(s: Setting) -> Tensor:
     return torch.where(above, x, torch.zeros_like(x)).sqrt()
 
 
-def _above_roots(c3: Tensor, c2: Tensor, c1: Tensor, c0: Tensor) -> Tensor:
+def _above_roots(
+    c3: Float[Tensor, "*setting"],
+    c2: Float[Tensor, "*setting"],
+    c1: Float[Tensor, "*setting"],
+    c0: Float[Tensor, "*setting"],
+) -> Float[Tensor, "*setting"]:
     """A number at or above every positive root, where some leading coefficient is positive.
 
     Each negative term is outweighed by a third of one positive term of higher degree, the cheapest at hand.

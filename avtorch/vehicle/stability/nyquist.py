@@ -7,15 +7,19 @@ import math
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
+from avtorch.vehicle.broadcasting import broadcast
 from avtorch.vehicle.stability.setting import Setting
 
 
-def hurwitz(s: Setting) -> Tensor:
+def hurwitz(s: Setting) -> Bool[Tensor, "..."]:
     """Eq. 2 at one point (Routh-Hurwitz, the dead time ignored): all roots of the cubic in the open left half plane."""
     return s.valid & (s.b > 0) & (s.g > 0) & (s.ks > 0) & (s.b * s.g > s.T * s.ks)
 
 
-def crossings(s: Setting) -> tuple[Tensor, Tensor, Tensor]:
+def crossings(
+    s: Setting,
+) -> tuple[Float[Tensor, "*setting 3"], Float[Tensor, "*setting 3"], Float[Tensor, "*setting 3"]]:
     """Where the open loop L = K q / p, p = s^2 (T s + 1), q = -k_a s^2 + g s + k_s, has |L(j omega)| = 1.
 
     Returns (omega, phase, sign), each (..., 3): the frequency [rad/s]; the phase lag in [0, 2 pi) that turns L onto -1
@@ -29,7 +33,7 @@ def crossings(s: Setting) -> tuple[Tensor, Tensor, Tensor]:
     c2 = s.K**2 * (2 * s.ks * s.ka + s.g**2) / k2
     c1 = ((s.K * s.ka) ** 2 - 1) / k2
     c0 = -(s.T**2) / k2
-    z = _real_roots(*torch.broadcast_tensors(c2, c1, c0))
+    z = _real_roots(*broadcast(c2, c1, c0))
     c2, c1, c0 = (c.unsqueeze(-1) for c in (c2, c1, c0))
     slope = (3 * z + 2 * c2) * z + c1
     # Without lag one root is z = 0 (omega infinite) and no crossing; rounding must not make it one.
@@ -42,7 +46,7 @@ def crossings(s: Setting) -> tuple[Tensor, Tensor, Tensor]:
     return omega, phase, torch.where(real, torch.sign(slope), torch.zeros_like(slope))
 
 
-def nyquist(s: Setting) -> Tensor:
+def nyquist(s: Setting) -> Bool[Tensor, "..."]:
     """Locally stable with the dead time: no root of T s^3 + s^2 + K exp(-theta s) q(s) with Re s >= 0, shape (...).
 
     The roots on the right are counted, not sampled: those of the delay-free loop (Routh-Hurwitz: none, or two when
@@ -66,7 +70,9 @@ def lost_at(s: Setting) -> Tensor:
     return torch.where(hurwitz(s) & ~neutral, first, torch.zeros_like(first))
 
 
-def _real_roots(c2: Tensor, c1: Tensor, c0: Tensor) -> Tensor:
+def _real_roots(
+    c2: Float[Tensor, "*setting"], c1: Float[Tensor, "*setting"], c0: Float[Tensor, "*setting"]
+) -> Float[Tensor, "*setting 3"]:
     """Real roots of z^3 + c2 z^2 + c1 z + c0, (..., 3), NaN in the places of complex ones (trigonometric form)."""
     shift = c2 / 3
     p = c1 - c2 * shift

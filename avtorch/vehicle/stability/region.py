@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
 from avtorch.vehicle.stability.conditions import PointOrBox, local_conditions, string_sufficient
 from avtorch.vehicle.stability.setting import Gains, Value
@@ -35,13 +36,13 @@ class Region:
     """
 
     x_name: str
-    x: Tensor
+    x: Float[Tensor, " x"]
     y_name: str
-    y: Tensor
+    y: Float[Tensor, " y"]
     form: str
-    local: Tensor
-    string: Tensor
-    peak_gain: Tensor | None
+    local: Bool[Tensor, "y x"]
+    string: Bool[Tensor, "y x"]
+    peak_gain: Float[Tensor, "y x"] | None
 
     @property
     def local_share(self) -> float:

@@ -8,10 +8,13 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float, Real
 from avtorch.errors import InputError
+from avtorch.vehicle.broadcasting import broadcast_shape
 
-Value = float | Tensor
-Gains = Sequence[float] | Tensor
+Value = float | Real[Tensor, "*#setting"]
+Gains = Sequence[float] | Real[Tensor, "*#setting 3"]
+Loose = float | Sequence[float] | Tensor
 
 
 @dataclass(frozen=True)
@@ -24,16 +27,16 @@ class Setting:
     T_L = 0, the paper's ideal actuator, is valid and means the limit from above.
     """
 
-    T: Tensor
-    K: Tensor
-    tau: Tensor
-    ks: Tensor
-    kv: Tensor
-    ka: Tensor
-    theta: Tensor
-    kf: Tensor
-    theta_f: Tensor
-    valid: Tensor
+    T: Float[Tensor, "*#setting"]
+    K: Float[Tensor, "*#setting"]
+    tau: Float[Tensor, "*#setting"]
+    ks: Float[Tensor, "*#setting"]
+    kv: Float[Tensor, "*#setting"]
+    ka: Float[Tensor, "*#setting"]
+    theta: Float[Tensor, "*#setting"]
+    kf: Float[Tensor, "*#setting"]
+    theta_f: Float[Tensor, "*#setting"]
+    valid: Bool[Tensor, "*#setting"]
 
     @property
     def g(self) -> Tensor:
@@ -47,7 +50,7 @@ class Setting:
 
     @property
     def shape(self) -> torch.Size:
-        return torch.broadcast_shapes(*(getattr(self, f.name).shape for f in fields(self)))
+        return broadcast_shape(*(getattr(self, f.name).shape for f in fields(self)))
 
     def full(self, x: Tensor) -> Tensor:
         """`x` broadcast to the shape of the whole setting."""
@@ -67,7 +70,7 @@ class Setting:
         return self.map(lambda x: x.unsqueeze(-1))
 
 
-def as_tensor(x: Value | Gains, like: Sequence[Value | Gains], name: str) -> Tensor:
+def as_tensor(x: Loose, like: Sequence[Loose], name: str) -> Tensor:
     """`x` as a floating tensor: the dtype and device of the floating tensors in `like`, else float64 (ints too)."""
     given = [t for t in like if isinstance(t, Tensor)]
     floating = [t.dtype for t in given if t.is_floating_point()]
@@ -115,7 +118,7 @@ def read_setting(
         if not bool((torch.isfinite(delay) & (delay >= 0)).all()):
             raise InputError(f"{name}: expected finite seconds >= 0, found {_first_bad(delay)}")
     try:
-        torch.broadcast_shapes(T.shape, K.shape, tau.shape, k.shape[:-1], theta.shape, kf.shape, theta_f.shape)
+        broadcast_shape(T.shape, K.shape, tau.shape, k.shape[:-1], theta.shape, kf.shape, theta_f.shape)
     except RuntimeError as error:
         found = zip(given, (T, K, tau, k, theta, kf, theta_f), strict=True)
         shapes = ", ".join(f"{name} {tuple(x.shape)}" for name, x in found)
@@ -125,9 +128,9 @@ def read_setting(
     law = torch.isfinite(tau) & torch.isfinite(k).all(-1) & torch.isfinite(kf)
     one = torch.ones((), dtype=T.dtype, device=T.device)
     # Stand-ins by torch.where, on each side alone, keep values and gradients finite and the shapes small.
-    T, K = (torch.where(actuator, x, one) for x in (T, K))
+    lag, share = (torch.where(actuator, x, one) for x in (T, K))
     tau, ks, kv, ka, kf = (torch.where(torch.isfinite(x), x, one) for x in (tau, ks, kv, ka, kf))
-    return Setting(T, K, tau, ks, kv, ka, theta, kf, theta_f, actuator & law)
+    return Setting(lag, share, tau, ks, kv, ka, theta, kf, theta_f, actuator & law)
 
 
 def _first_bad(delay: Tensor) -> float:

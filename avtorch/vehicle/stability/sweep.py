@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
 from avtorch.vehicle.stability.exact import ROUNDINGS
 from avtorch.vehicle.stability.setting import Setting
 from avtorch.vehicle.stability.transfer import excess
@@ -19,7 +21,7 @@ BLOCK = 1 << 17  # numbers held at a time: the temporaries stay in the cache
 GOLDEN = (math.sqrt(5) - 1) / 2
 
 
-def sweep(s: Setting) -> tuple[Tensor, Tensor]:
+def sweep(s: Setting) -> tuple[Float[Tensor, " setting"], Bool[Tensor, " setting"]]:
     """(omega, above) of a flat batch (setting,): the frequency of the largest |G| [rad/s] and whether |G| > 1 there.
 
     omega is 0 where |G| nowhere exceeds one. What is minimised is omega^2 h / N = |G|^-2 - 1, which keeps its sign
@@ -28,19 +30,21 @@ def sweep(s: Setting) -> tuple[Tensor, Tensor]:
     count = s.T.shape[0]
     if count == 0:
         return s.T.new_zeros(0), torch.zeros(0, dtype=torch.bool, device=s.T.device)
-    parts = []
+    parts: list[tuple[Tensor, Tensor, Tensor]] = []
     top = _band(s)
     points = _points(s, top)
     # Settings whose delay turns many times in the band need a finer sweep: handled apart, so that few do not cost all.
-    for n in torch.unique(points).tolist():
+    # torch gives `unique` no type
+    sizes = cast(Tensor, torch.unique(points))  # pyright: ignore[reportUnknownMemberType]
+    for n in map(int, sizes):
         rows = torch.nonzero(points == n).squeeze(-1)
-        for chunk in rows.split(max(1, BLOCK // int(n))):
-            parts.append((chunk, *_sweep(s.map(lambda x, rows=chunk: x[rows]), top[chunk], int(n))))
+        for chunk in torch.split(rows, max(1, BLOCK // n)):
+            parts.append((chunk, *_sweep(s.map(lambda x, rows=chunk: x[rows]), top[chunk], n)))
     order = torch.cat([p[0] for p in parts]).argsort()
     return torch.cat([p[1] for p in parts])[order], torch.cat([p[2] for p in parts])[order]
 
 
-def exceeds_anywhere(s: Setting) -> Tensor:
+def exceeds_anywhere(s: Setting) -> Bool[Tensor, " setting"]:
     """Whether |G| > 1 at any frequency, for a flat batch (setting,); as `sweep`, but settled on few points if possible.
 
     In ln(omega) no term of h bends more than (4 + omega theta)^2 times its own size, so between points `step` apart h
@@ -50,8 +54,8 @@ def exceeds_anywhere(s: Setting) -> Tensor:
     above = torch.zeros(s.T.shape, dtype=torch.bool, device=s.T.device)
     grid = torch.logspace(-DECADES, 0, FEW_POINTS, dtype=s.T.dtype, device=s.T.device)
     step = DECADES * math.log(10) / (FEW_POINTS - 1)
-    unsure = []
-    for rows in torch.arange(s.T.shape[0], device=s.T.device).split(max(1, BLOCK // FEW_POINTS)):
+    unsure: list[Tensor] = []
+    for rows in torch.split(torch.arange(s.T.shape[0], device=s.T.device), max(1, BLOCK // FEW_POINTS)):
         col = s.map(lambda x, rows=rows: x[rows].unsqueeze(-1))
         omega = _band(col) * grid
         h, size = excess(col, omega)[0], _size(col, omega)
@@ -66,7 +70,9 @@ def exceeds_anywhere(s: Setting) -> Tensor:
     return above
 
 
-def _sweep(s: Setting, top: Tensor, points: int) -> tuple[Tensor, Tensor]:
+def _sweep(
+    s: Setting, top: Float[Tensor, " setting"], points: int
+) -> tuple[Float[Tensor, " setting"], Bool[Tensor, " setting"]]:
     col = s.column()
     grid = torch.logspace(-DECADES, 0, points, dtype=top.dtype, device=top.device)
     omega = top.unsqueeze(-1) * grid
@@ -86,7 +92,9 @@ def _sweep(s: Setting, top: Tensor, points: int) -> tuple[Tensor, Tensor]:
     return torch.where(above, best, torch.zeros_like(best)), above | low
 
 
-def _golden(col: Setting, a: Tensor, d: Tensor) -> Tensor:
+def _golden(
+    col: Setting, a: Float[Tensor, "setting dip"], d: Float[Tensor, "setting dip"]
+) -> Float[Tensor, "setting dip"]:
     """Minimum of the shortfall between a and d, (setting, dip), to about 1e-8 of the bracket."""
     b, c = d - GOLDEN * (d - a), a + GOLDEN * (d - a)
     fb, fc = _shortfall(col, b), _shortfall(col, c)

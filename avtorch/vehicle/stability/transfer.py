@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Complex, Float
+from avtorch.vehicle.broadcasting import broadcast
 from avtorch.vehicle.stability.setting import Gains, Setting, Value, as_tensor, read_setting
 
 
@@ -18,7 +20,7 @@ def transfer_function(
     dead_time: Value = 0.0,
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
-) -> Tensor:
+) -> Complex[Tensor, "*setting"]:
     """G(j omega) = V / V_lead, complex, of the shape that omega [rad/s] and the setting broadcast to.
 
     With E = exp(-j omega theta): G = K E (k_f s^2 E_f + k_v s + k_s) / (T s^3 + s^2 + K E (-k_a s^2 + g s + k_s)).
@@ -37,7 +39,7 @@ def transfer_function(
     (nr, ni), (fr, fi) = _numerator(s, w), _denominator(s, w)
     # The common factor exp(-j omega theta) of the numerator is left out of |G| but belongs to G.
     turn = torch.exp(torch.complex(torch.zeros_like(w * s.theta), -w * s.theta))
-    response = turn * torch.complex(*torch.broadcast_tensors(nr, ni)) / torch.complex(*torch.broadcast_tensors(fr, fi))
+    response = turn * torch.complex(*broadcast(nr, ni)) / torch.complex(*broadcast(fr, fi))
     return torch.where(s.valid, response, torch.zeros_like(response))
 
 
@@ -51,7 +53,7 @@ def gain(
     dead_time: Value = 0.0,
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
-) -> Tensor:
+) -> Float[Tensor, "*setting"]:
     """`|G(j omega)|` [-], as `transfer_function`.
 
     Example:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
 from avtorch.vehicle.stability.exact import gain_condition, peak_omega
 from avtorch.vehicle.stability.nyquist import hurwitz, lost_at, nyquist
 from avtorch.vehicle.stability.setting import Gains, Setting, Value, read_setting
@@ -12,7 +13,9 @@ from avtorch.vehicle.stability.sweep import exceeds_anywhere, sweep
 from avtorch.vehicle.stability.transfer import magnitude
 
 
-def local_stable(T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, dead_time: Value = 0.0) -> Tensor:
+def local_stable(
+    T_L: Value, K_L: Value, time_gap: Value, gains: Gains, *, dead_time: Value = 0.0
+) -> Bool[Tensor, "*setting"]:
     """True where disturbances die out: Eq. 2 at one point, or a Nyquist count where dead_time [s] > 0.
 
     T_L [s], K_L [-], time_gap [s] and dead_time broadcast with the leading dimensions of gains (..., 3) =
@@ -37,7 +40,7 @@ def string_stable(
     dead_time: Value = 0.0,
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
-) -> Tensor:
+) -> Bool[Tensor, "*setting"]:
     """True where the loop is locally stable and `|G(j omega)| <= 1` at every omega; arguments as in `local_stable`.
 
     Without dead time in closed form (the signs of B and C); with it, or with a feed-forward gain k_f [-] on the
@@ -64,7 +67,7 @@ def peak_gain(
     dead_time: Value = 0.0,
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
-) -> Tensor:
+) -> Float[Tensor, "*setting"]:
     """Supremum of `|G(j omega)|` over omega > 0 [-].
 
     1 where string stable (G -> 1 as omega -> 0), inf where locally unstable.
@@ -97,7 +100,7 @@ def peak_frequency(
     dead_time: Value = 0.0,
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
-) -> Tensor:
+) -> Float[Tensor, "*setting"]:
     """Frequency [rad/s] of the largest `|G(j omega)|`; 0 where string stable, for the supremum then lies at omega -> 0.
 
     Arguments as in `string_stable`. Where the loop is locally unstable it is the largest formal `|G|` on the axis (near
@@ -115,7 +118,7 @@ def peak_frequency(
         return _peak_frequency(s, s.full(s.valid & (s.ks > 0)))
 
 
-def dead_time_margin(T_L: Value, K_L: Value, time_gap: Value, gains: Gains) -> Tensor:
+def dead_time_margin(T_L: Value, K_L: Value, time_gap: Value, gains: Gains) -> Float[Tensor, "*setting"]:
     """Smallest dead time [s] that costs the loop its local stability, in closed form; 0 where it has none to lose.
 
     Example:
@@ -127,14 +130,14 @@ def dead_time_margin(T_L: Value, K_L: Value, time_gap: Value, gains: Gains) -> T
     return s.full(lost_at(s))
 
 
-def locally_stable(s: Setting) -> Tensor:
+def locally_stable(s: Setting) -> Bool[Tensor, "..."]:
     """`local_stable` of a setting, in whatever smaller shape suffices."""
     if not bool((s.theta > 0).any()):
         return hurwitz(s)
     return torch.where(s.theta > 0, nyquist(s), hurwitz(s))
 
 
-def string_stable_of(s: Setting) -> Tensor:
+def string_stable_of(s: Setting) -> Bool[Tensor, "..."]:
     """`string_stable` of a setting, likewise."""
     with torch.no_grad():
         delayed = (s.theta > 0) | ((s.kf != 0) & (s.theta_f > 0))
@@ -166,7 +169,7 @@ def _level(s: Setting) -> Tensor:
     return s.full(C + 1e-9 * (1 + C.abs()) >= 0)
 
 
-def _peak_frequency(s: Setting, wanted: Tensor) -> Tensor:
+def _peak_frequency(s: Setting, wanted: Bool[Tensor, "*setting"]) -> Float[Tensor, "*setting"]:
     """Peak frequency of the full shape where `wanted`, else 0."""
     s = s.map(torch.detach)
     swept = s.full((s.theta > 0) | (s.kf != 0))

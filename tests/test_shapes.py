@@ -1,0 +1,81 @@
+"""The check of shapes is alive: it refuses what contradicts an annotation, and only that."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from avtorch.arrays import Float
+from avtorch.errors import InputError
+from avtorch.gap.likelihood.basis import lowpass
+from avtorch.inference import JerkStatistics
+from avtorch.vehicle import Block
+from avtorch.vehicle.stability import local_stable
+from tests.shapes import ShapeError, checked
+
+
+def _total(u: Float[Tensor, "window time"], weight: Float[Tensor, " time"]) -> Float[Tensor, " window"]:
+    return (u * weight).sum(-1)
+
+
+def _turned(x: Float[Tensor, "window time"]) -> Float[Tensor, "time window"]:
+    return x
+
+
+def test_one_name_is_one_length_within_a_call() -> None:
+    total = checked(_total)
+    assert total(torch.ones(2, 3), torch.ones(3)).tolist() == [3.0, 3.0]
+    with pytest.raises(ShapeError, match=r"_total, weight: found \(torch.Size\(\[1\]\)"):
+        total(torch.ones(2, 3), torch.ones(1))
+
+
+def test_integers_are_no_floats() -> None:
+    with pytest.raises(ShapeError, match="weight"):
+        checked(_total)(torch.ones(2, 3), torch.ones(3, dtype=torch.int64))
+
+
+def test_what_is_returned_is_checked_against_what_was_given() -> None:
+    checked(_turned)(torch.ones(2, 2))
+    with pytest.raises(ShapeError, match="return"):
+        checked(_turned)(torch.ones(2, 3))
+
+
+def test_what_has_passed_once_is_not_what_else_may_pass() -> None:
+    turned = checked(_turned)
+    turned(torch.ones(2, 2))
+    turned(torch.ones(2, 2))
+    with pytest.raises(ShapeError):
+        turned(torch.ones(3, 2))
+
+
+def test_a_function_that_names_no_shape_is_left_as_it_is() -> None:
+    assert checked(math.hypot) is math.hypot
+
+
+def test_what_a_function_refuses_it_refuses_in_its_own_words() -> None:
+    with pytest.raises(InputError, match="shapes do not broadcast"):
+        local_stable(torch.ones(3), torch.ones(2), 1.0, (1.0, 1.0, 0.0))
+
+
+def test_vehicle_is_under_the_check() -> None:
+    row = torch.zeros(1, 5, dtype=torch.float64)
+    Block(row[0], *[row] * 8, row > 0)
+    with pytest.raises(ShapeError, match=r"Block\.__init__, accel_cmd"):
+        Block(row[0, :4], *[row] * 8, row > 0)
+
+
+def test_inference_is_under_the_check() -> None:
+    sums = torch.ones(2, dtype=torch.float64)
+    JerkStatistics(*[sums] * 7)
+    with pytest.raises(ShapeError, match=r"JerkStatistics\.__init__, uu"):
+        JerkStatistics(*[sums] * 6, torch.ones(3, dtype=torch.float64))
+
+
+def test_likelihood_is_under_the_check() -> None:
+    lowpass(np.zeros(5), 1.0, 0.1)
+    with pytest.raises(ShapeError, match="lowpass, x"):
+        lowpass(np.zeros((3, 5)), 1.0, 0.1)
