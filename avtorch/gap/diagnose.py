@@ -55,7 +55,7 @@ def diagnose(
     """Name the effect, or the two, that `baseline` lacks on these drives of one car.
 
     Args: `baseline`: the user's simulator (default: bare GLVD); its effects keep their values, `T_L` and `K_L` are
-    fitted. `prior`: weights over causes, see `odds.probabilities`. `effects`: candidates, by name or class (default:
+    fitted. `prior`: weights over causes, see `model_probabilities`. `effects`: candidates, by name or class (default:
     all registered). `pairs`: also try two at once. `posterior` of the verdict's parameters: by SGLD, or Laplace's
     approximation. `budget_s`: after so many seconds no new candidate is begun, `complete` is False and the verdict
     provisional: `scope` has what was tried, and the verdict is distinguished only from that.

@@ -131,7 +131,7 @@ def glvd_rollout(
 
 
 def motion_coefficients(
-    T_L: Float[Tensor, "*batch"], dt: float
+    T_L: Float[Tensor, "*#batch"], dt: float | Float[Tensor, "*#batch"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """`(alpha, m1, m2)`: a step's exact share of `a - a_inf` in acceleration [-], speed [s] and position [s²]."""
     ratio = dt / T_L

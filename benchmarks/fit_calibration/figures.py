@@ -37,7 +37,7 @@ def answered(case: KeptCase, found: Fitted) -> Answered:
     """The probabilities of a case; of a verdict's other parts the figures know nothing."""
     calibration = replace(CALIBRATION, odds=found.odds, unknown=found.unknown)
     left = case.left[odds.favourite(case.found, found.odds).name]
-    chances = odds.probabilities(case.found, left, calibration=calibration)
+    chances = odds.model_probabilities(case.found, left, calibration=calibration)
     first = max(chances, key=lambda name: chances[name])
     return Answered(
         truth=case.truth,

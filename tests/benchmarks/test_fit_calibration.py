@@ -49,7 +49,7 @@ def drawn(count: int, z: np.ndarray, rng: np.random.Generator) -> list[KeptCase]
         nats = [0.0, *single.tolist(), *pairs.tolist()]
         found = tuple(KeptCandidate(name, x) for name, x in zip(NAMES, nats, strict=True))
         over = Adequacy(*(np.exp(rng.uniform(-2.0, 5.0, 6)) - 1).tolist())
-        chances = odds.probabilities(found, over, calibration=calibration)
+        chances = odds.model_probabilities(found, over, calibration=calibration)
         truth = str(rng.choice(list(chances), p=list(chances.values())))
         kind = {"none": "none", "unknown": "outside"}.get(truth, "pair" if "+" in truth else "single")
         cases.append(KeptCase(index, kind, truth, found, dict.fromkeys(NAMES, over)))
@@ -177,4 +177,4 @@ def test_real_cases_are_drawn_searched_and_kept(tmp_path: Path) -> None:
         assert case.none.log_evidence == 0
         assert {"none", "dead_time", "gust"} <= {c.name for c in case.found}
         top = odds.favourite(case.found)
-        assert sum(odds.probabilities(case.found, case.left[top.name]).values()) == pytest.approx(1)
+        assert sum(odds.model_probabilities(case.found, case.left[top.name]).values()) == pytest.approx(1)

@@ -32,6 +32,7 @@ from avtorch.gap.selection.verdict import (
     plausibility,
     verdict_of,
 )
+from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import answer_set, atomic, write_json
 
@@ -203,7 +204,8 @@ class Diagnosis:
 
     def _late(self) -> str:
         """A comment for `plant.toml` where the effects set in within the log."""
-        own = set() if self.plant is None else {e.name for e in self.plant.effects if e.own_onset is not None}
+        kinds = [*EFFECTS.values(), *(() if self.plant is None else self.plant.effects)]
+        own = {e.name for e in kinds if e.own_onset is not None}
         late = " and ".join(name for name in self.verdict.names if name not in own)
         if self.onset_s is None or not late:
             return ""

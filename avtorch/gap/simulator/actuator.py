@@ -99,7 +99,7 @@ class Actuator:
         g, T, h = part.target, part.lag, part.length
         if self.tau is None:
             if self.jerk is None:
-                alpha, m1, m2 = motion_coefficients(T, h)  # type: ignore[arg-type]
+                alpha, m1, m2 = motion_coefficients(T, h)
                 d = state.accel - g
                 return ActuatorState(g + alpha * d), h * g + m1 * d, 0.5 * h * h * g + m2 * d
             accel, _, speed, place = _limited(state.accel, part, self.jerk)
@@ -176,7 +176,7 @@ def _limited(a: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor, Te
     at_limit = torch.minimum((d.abs() / J - T).clamp_min(0.0), h)  # so long at the limit, then exponential
     cut = torch.sign(d) * J * at_limit
     rest, left = h - at_limit, d - cut
-    alpha, m1, m2 = motion_coefficients(T, rest)  # type: ignore[arg-type]
+    alpha, m1, m2 = motion_coefficients(T, rest)
     first = a * at_limit + 0.5 * cut * at_limit
     place = at_limit * at_limit * (0.5 * a + cut / 6) + first * rest
     place = place + 0.5 * rest * rest * g - m2 * left

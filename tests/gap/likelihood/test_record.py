@@ -215,11 +215,11 @@ def test_bad_input_is_one_clear_error() -> None:
     _refused(log_of(seconds=9.0), "7.0 s", "10 s")
     _refused(replace(log, speed=np.zeros(log.rows)), "0.0 s", "moving")
     _refused(replace(log, engaged=np.zeros(log.rows, bool)), "0.0 s", "engaged")
-    _refused([log, log_of(seconds=30.0, name="other", channels=("speed",))], "drive", "other", "witnesses")
+    _refused([log, log_of(seconds=30.0, name="other", channels=("speed",))], "drive", "other", "channels")
 
 
-def test_logs_of_one_name_with_other_witnesses_are_refused() -> None:
-    _refused([log_of(seconds=30.0), log_of(seconds=30.0, channels=("speed",))], "witnesses")
+def test_logs_of_one_name_with_other_channels_are_refused() -> None:
+    _refused([log_of(seconds=30.0), log_of(seconds=30.0, channels=("speed",))], "channels")
 
 
 def test_logs_of_different_rates_are_refused() -> None:

@@ -91,7 +91,7 @@ def test_what_is_not_judged_is_said() -> None:
     assert said is not None
     for name in ("aerodynamic_drag", "gear_shift", "low_speed_creep", "road_grade", "speed_dependent_lag"):
         assert name in said
-    assert "sensor_scale is the same as another K_L" in said
+    assert "sensor_scale is equivalent to another K_L" in said
     assert "constant_resistance" not in said
     assert note(ACCEL, [DeadTime]) is None
 
