@@ -51,8 +51,8 @@ class DrivePlan:
     Raises `InputError` for an unknown manoeuvre.
 
     Example:
-        >>> from avtorch.blindtest import Car, Drive, simulate
-        >>> drive = Drive("steps", seconds=10.0, rate_hz=50, seed=3)
+        >>> from avtorch.blindtest import Car, DrivePlan, simulate
+        >>> drive = DrivePlan("steps", seconds=10.0, rate_hz=50, seed=3)
         >>> run = simulate(Car(), drive.pilot(), seconds=drive.seconds, rate_hz=drive.rate_hz)
         >>> len(run.time) == 500
         True

@@ -135,8 +135,8 @@ def sight(run: Run, signals: Sequence[str] = ("accel", "speed")) -> Sight:
     """How plainly the drive differs from any GLVD in the channels `signals`; the head of this file says how.
 
     Example:
-        >>> from avtorch.blindtest import Car, Drive, sight, simulate
-        >>> drive, effect = Drive("steps", seconds=20.0, rate_hz=50, seed=3), {"dead_time": {"delay_s": 0.5}}
+        >>> from avtorch.blindtest import Car, DrivePlan, sight, simulate
+        >>> drive, effect = DrivePlan("steps", seconds=20.0, rate_hz=50, seed=3), {"dead_time": {"delay_s": 0.5}}
         >>> run = simulate(Car(), drive.pilot(), seconds=20.0, rate_hz=50, effects=effect)
         >>> sight(run).accel > 1.15
         True

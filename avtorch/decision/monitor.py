@@ -66,7 +66,7 @@ class MonitorReport:
         >>> report.any.tolist(), report.p_string_stable.tolist()
         ([True], [0.0])
         >>> print(report.why("accepted_change"))
-        T_L 1.50 s, K_L 0.50 left what was accepted (0.30 s, 1.00) with probability 1.000
+        T_L 1.50 s, K_L 0.50 left the accepted values (0.30 s, 1.00) with probability 1.000
     """
 
     alerts: dict[str, Tensor]

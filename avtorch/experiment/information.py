@@ -38,12 +38,12 @@ def information(foretold: Sequence[Prediction], number: int, prior: Sequence[flo
     Example:
         >>> from avtorch import Leader, diagnose, simulate
         >>> from avtorch.experiment import information, library
-        >>> from avtorch.experiment.foretold import Foretold
+        >>> from avtorch.experiment.foretold import Prediction
         >>> from avtorch.gap import DeadTime, plant
         >>> late = plant([DeadTime(0.4)], sigma=0.0)
         >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
         >>> cause = diagnose(log, effects=["dead_time"], pairs=False).contenders[0]
-        >>> one = Foretold.of(cause, library(), ("accel", "speed"), group=1, draws=20)
+        >>> one = Prediction.of(cause, library(), ("accel", "speed"), group=1, draws=20)
         >>> round(information([one, one], 0, prior=[0.5, 0.5]).nats, 3)  # two causes that do the same
         0.0
     """

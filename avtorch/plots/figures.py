@@ -170,7 +170,7 @@ def overview_figure(
         >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
         >>> answer = {**estimates_answer(estimate(log, estimator="map")), "alerts": [], "actions": []}
         >>> traces = {"accel": {"leader": log.lead_accel, "with action": log.accel}}
-        >>> len(overview_figure(answer, log.time, traces).axes)
+        >>> len(overview_figure(answer, log.elapsed, traces).axes)
         4
     """
     figure = Figure(figsize=(9, 8.4), layout="constrained")

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import torch
 
+from avtorch.arrays import FloatArray
 from avtorch.inference import SamplerSettings, sample
 from benchmarks.peers.contract import Answer, Settings
-from benchmarks.peers.problem import Array, Windows
+from benchmarks.peers.problem import Windows
 from benchmarks.peers.torch_rows import density_of, own_log_density
 
 
@@ -14,7 +15,7 @@ class Runner:
     def __init__(self, settings: Settings) -> None:
         self.settings = SamplerSettings(**settings)
 
-    def log_density(self, windows: Windows, z: Array) -> Array:
+    def log_density(self, windows: Windows, z: FloatArray) -> FloatArray:
         return own_log_density(windows, z)
 
     def run(self, windows: Windows, seed: int) -> Answer:

@@ -17,9 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from avtorch.arrays import FloatArray
 from benchmarks.peers.contract import Answer, Settings
 from benchmarks.peers.jax_density import log_densities, log_density, mode, stiffness
-from benchmarks.peers.problem import Array, Windows
+from benchmarks.peers.problem import Windows
 
 
 class Runner:
@@ -28,7 +29,7 @@ class Runner:
         self._random = settings["random"]
         self._one, self._many = jax.jit(sampler), jax.jit(jax.vmap(sampler))
 
-    def log_density(self, windows: Windows, z: Array) -> Array:
+    def log_density(self, windows: Windows, z: FloatArray) -> FloatArray:
         return np.asarray(log_densities(z, windows.sums()[0]))
 
     def run(self, windows: Windows, seed: int) -> Answer:
@@ -40,7 +41,7 @@ class Runner:
         return Answer(np.exp(draws.transpose(1, 2, 0, 3)))
 
 
-def _sample(s: Settings, key: jax.Array, sums: jax.Array) -> jax.Array:
+def _sample(s: Settings, key: jax.FloatArray, sums: jax.FloatArray) -> jax.FloatArray:
     """Draws of ``z``, ``(chain, draw, 3)``."""
     center, scale = mode(sums)
     if s["whitened"]:
@@ -50,11 +51,11 @@ def _sample(s: Settings, key: jax.Array, sums: jax.Array) -> jax.Array:
     gradient = jax.vmap(jax.grad(lambda w: log_density(center + scale @ w, sums)))
     sgld = blackjax.sgld(lambda w, _: gradient(w))  # all chains are one position: one key a step
 
-    def move(w: jax.Array, key: jax.Array):
+    def move(w: jax.FloatArray, key: jax.FloatArray):
         # its step size is that of w + e grad + sqrt(2 e) noise
         return sgld.step(key, w, 0.0, 0.5 * s["step"]), None
 
-    def collect(w: jax.Array, key: jax.Array):
+    def collect(w: jax.FloatArray, key: jax.FloatArray):
         w, _ = jax.lax.scan(move, w, jax.random.split(key, s["thinning"]))
         return w, w
 

@@ -9,7 +9,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from benchmarks.peers.problem import Array, Windows
+from avtorch.arrays import FloatArray
+from benchmarks.peers.problem import Windows
 
 Settings = dict[str, Any]
 
@@ -25,16 +26,16 @@ class Answer:
         ess: a ceiling on the effective draws of every window, ``(window,)``, for weighted draws.
     """
 
-    draws: Array | None = None
-    mean: Array | None = None
-    sd: Array | None = None
-    ess: Array | None = None
+    draws: FloatArray | None = None
+    mean: FloatArray | None = None
+    sd: FloatArray | None = None
+    ess: FloatArray | None = None
 
 
 class Runner(Protocol):
     """A method with its settings, built in its own process. What it compiled it keeps from call to call."""
 
-    def log_density(self, windows: Windows, z: Array) -> Array | None:
+    def log_density(self, windows: Windows, z: FloatArray) -> FloatArray | None:
         """Its log density of the first window at ``z = log(parameter)``, ``(point, 3)`` to ``(point,)``.
 
         ``None`` if the method does not work on that density.
@@ -89,7 +90,7 @@ class Method:
         return import_module(f"benchmarks.peers.{self.module}").build(settings)
 
 
-def moments(answer: Answer) -> tuple[Array, Array]:
+def moments(answer: Answer) -> tuple[FloatArray, FloatArray]:
     """Means and SDs, ``(window, parameter)``."""
     if answer.draws is None:
         assert answer.mean is not None
@@ -99,7 +100,7 @@ def moments(answer: Answer) -> tuple[Array, Array]:
     return flat.mean(0), flat.std(0, ddof=1)
 
 
-def as_log(windows: Windows) -> Array:
+def as_log(windows: Windows) -> FloatArray:
     """Random places around the truth in ``z``, ``(point, 3)``, for comparing densities."""
     g = np.random.default_rng(len(windows))
     return np.log(windows.truth[0]) + 0.5 * g.standard_normal((20, 3))

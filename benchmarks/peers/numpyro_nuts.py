@@ -21,10 +21,10 @@ from numpyro.infer.util import potential_energy
 
 from benchmarks.peers.contract import Answer, Settings
 from benchmarks.peers.jax_density import mode, prior_center
-from benchmarks.peers.problem import LOG_SD, MEDIAN, NAMES, SIGMA_SCALE, Array, Windows
+from benchmarks.peers.problem import LOG_SD, MEDIAN, NAMES, SIGMA_SCALE, FloatArray, Windows
 
 
-def model(sums: jax.Array) -> None:
+def model(sums: jax.FloatArray) -> None:
     """Priors as statements, Eq. 4 from the sums as a factor."""
     lag = numpyro.sample("T_L", dist.LogNormal(np.log(MEDIAN[0]), LOG_SD[0]))
     gain = numpyro.sample("K_L", dist.LogNormal(np.log(MEDIAN[1]), LOG_SD[1]))
@@ -35,7 +35,7 @@ def model(sums: jax.Array) -> None:
     numpyro.factor("jerk", -0.5 * chi2 - n * (jnp.log(sigma) + 0.5 * np.log(2 * np.pi)))
 
 
-def potential(z: jax.Array, sums: jax.Array) -> jax.Array:
+def potential(z: jax.FloatArray, sums: jax.FloatArray) -> jax.FloatArray:
     """What NumPyro makes of the model, at its own unconstrained parameters, the logarithms ``(3,)``."""
     return potential_energy(model, (sums,), {}, dict(zip(NAMES, z, strict=True)))
 
@@ -45,7 +45,7 @@ class Runner:
         self._one = jax.jit(partial(_sample, settings))
         self._density = jax.jit(jax.vmap(lambda z, sums: -potential(z, sums), in_axes=(0, None)))
 
-    def log_density(self, windows: Windows, z: Array) -> Array:
+    def log_density(self, windows: Windows, z: FloatArray) -> FloatArray:
         return np.asarray(self._density(z, windows.sums()[0]))
 
     def run(self, windows: Windows, seed: int) -> Answer:
@@ -53,11 +53,11 @@ class Runner:
         return Answer(np.exp(draws)[:, :, None])
 
 
-def _sample(s: Settings, key: jax.Array, sums: jax.Array) -> jax.Array:
+def _sample(s: Settings, key: jax.FloatArray, sums: jax.FloatArray) -> jax.FloatArray:
     """Draws of ``z``, ``(chain, draw, 3)``."""
     center, scale = mode(sums) if s["mode"] else (prior_center(), 0.1 * jnp.eye(3))
 
-    def chain(key: jax.Array) -> jax.Array:
+    def chain(key: jax.FloatArray) -> jax.FloatArray:
         key_start, key_walk = jax.random.split(key)
         kernel = NUTS(potential_fn=lambda z: potential(z, sums), dense_mass=True)
         start = center + scale @ jax.random.normal(key_start, (3,))

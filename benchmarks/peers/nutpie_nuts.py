@@ -12,7 +12,7 @@ import nutpie
 import pymc as pm
 
 from benchmarks.peers.contract import Answer, Settings
-from benchmarks.peers.problem import LOG_SD, MEDIAN, NAMES, SIGMA_SCALE, Array, Windows
+from benchmarks.peers.problem import LOG_SD, MEDIAN, NAMES, SIGMA_SCALE, FloatArray, Windows
 
 
 def _model() -> pm.Model:
@@ -35,7 +35,7 @@ class Runner:
         self.settings = settings
         self._compiled = None
 
-    def log_density(self, windows: Windows, z: Array) -> Array:
+    def log_density(self, windows: Windows, z: FloatArray) -> FloatArray:
         model = _model()
         with model:
             pm.set_data(dict(zip(_SUMS, windows.sums()[0], strict=True)))

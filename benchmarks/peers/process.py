@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from avtorch.arrays import FloatArray
 from benchmarks.peers.contract import Answer, Method, Settings
-from benchmarks.peers.problem import Array
 
 
 class PeerFailed(RuntimeError):
@@ -70,7 +70,7 @@ class Worker:
         self._process.stdin.flush()
         return self._read()
 
-    def log_density(self, windows: str) -> Array | None:
+    def log_density(self, windows: str) -> FloatArray | None:
         """Its log density at ``contract.as_log`` of the windows in that file."""
         value = self._order(do="density", windows=windows)["value"]
         return None if value is None else np.asarray(value)

@@ -8,9 +8,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from avtorch.arrays import FloatArray
 from avtorch.inference.nuts import PyroModel, nuts
 from benchmarks.peers.contract import Answer, Settings
-from benchmarks.peers.problem import Array, Windows
+from benchmarks.peers.problem import Windows
 from benchmarks.peers.torch_rows import density_of
 
 
@@ -18,7 +19,7 @@ class Runner:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
 
-    def log_density(self, windows: Windows, z: Array) -> Array:
+    def log_density(self, windows: Windows, z: FloatArray) -> FloatArray:
         model = PyroModel(density_of(windows.select(slice(0, 1))))
         return np.array([float(model.log_prob(torch.from_numpy(x))) for x in z])
 

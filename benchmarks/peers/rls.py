@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from avtorch.arrays import FloatArray
 from benchmarks.peers.contract import Answer, Settings
-from benchmarks.peers.problem import Array, Windows
+from benchmarks.peers.problem import Windows
 
 
 class Runner:
-    def log_density(self, windows: Windows, z: Array) -> None:
+    def log_density(self, windows: Windows, z: FloatArray) -> None:
         return None
 
     def run(self, windows: Windows, seed: int) -> Answer:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.peers.contract import Answer, Settings
-from benchmarks.peers.problem import LOG_SD, MEDIAN, SIGMA_SCALE, Array, Windows
+from benchmarks.peers.problem import LOG_SD, MEDIAN, SIGMA_SCALE, FloatArray, Windows
 
 _MEDIAN = torch.tensor(MEDIAN, dtype=torch.float64)
 _LOG_SD = torch.tensor(LOG_SD, dtype=torch.float64)
@@ -35,7 +35,7 @@ class Runner:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
 
-    def log_density(self, windows: Windows, z: Array) -> Array:
+    def log_density(self, windows: Windows, z: FloatArray) -> FloatArray:
         rows = _rows(windows)
         return np.array([float(log_posterior(torch.from_numpy(x), *rows)) for x in z])
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from avtorch.arrays import FloatArray
 from benchmarks.peers.contract import Answer, moments
-from benchmarks.peers.problem import Array, Windows
+from benchmarks.peers.problem import Windows
 
 #: Effective draws that every sampler is asked for.
 WANTED = 2000
@@ -23,8 +24,8 @@ LEAST_CHAINS = 64
 class Exact:
     """Means and SDs by quadrature, ``(window, 3)``."""
 
-    mean: Array
-    sd: Array
+    mean: FloatArray
+    sd: FloatArray
 
     @classmethod
     def of(cls, windows: Windows) -> Exact:
@@ -49,10 +50,10 @@ class Score:
         shift: mean difference in exact SDs, and ``ratio``: SD over the exact SD; ``(window, parameter)``.
     """
 
-    bulk: Array
-    tail: Array
-    shift: Array
-    ratio: Array
+    bulk: FloatArray
+    tail: FloatArray
+    shift: FloatArray
+    ratio: FloatArray
 
     @classmethod
     def of(cls, answer: Answer, exact: Exact) -> Score:
@@ -68,7 +69,7 @@ class Score:
         return cls(*(np.concatenate([getattr(s, name) for s in scores]) for name in cls.__dataclass_fields__))
 
 
-def effective(draws: Array) -> tuple[Array, Array]:
+def effective(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Bulk and tail effective draws of the worst parameter, each ``(window,)``; never above the number of draws.
 
     ArviZ's, but for many chains of fewer than ``SHORT`` draws: there its estimate saturates, and the variance of the
@@ -91,12 +92,12 @@ def effective(draws: Array) -> tuple[Array, Array]:
     return np.minimum(bulk.min(-1), total), np.minimum(tail.min(-1), total)
 
 
-def _between(x: Array) -> float:
+def _between(x: FloatArray) -> float:
     """Effective draws from the means of independent chains: ``chains * variance / variance of the chain means``."""
     return float(len(x) * x.var() / max(x.mean(1).var(ddof=1), 1e-300))
 
 
-def _normal_ranks(x: Array) -> Array:
+def _normal_ranks(x: FloatArray) -> FloatArray:
     from scipy.stats import norm, rankdata
 
     return norm.ppf((rankdata(x).reshape(x.shape) - 0.375) / (x.size + 0.25))

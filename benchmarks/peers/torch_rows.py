@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import torch
 
+from avtorch.arrays import FloatArray
 from avtorch.inference import JerkDensity, JerkStatistics
-from benchmarks.peers.problem import Array, Windows
+from benchmarks.peers.problem import Windows
 
 
 def density_of(windows: Windows) -> JerkDensity:
@@ -14,7 +15,7 @@ def density_of(windows: Windows) -> JerkDensity:
     return JerkDensity(JerkStatistics.from_samples(*rows))
 
 
-def own_log_density(windows: Windows, z: Array) -> Array:
+def own_log_density(windows: Windows, z: FloatArray) -> FloatArray:
     """avtorch's log density of the first window at ``z``, ``(point, 3)`` to ``(point,)``."""
     first = density_of(windows.select(slice(0, 1)))
     return first.log_prob(torch.from_numpy(z)[:, None])[:, 0].numpy()

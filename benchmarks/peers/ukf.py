@@ -10,11 +10,11 @@ import numpy as np
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from benchmarks.peers.contract import Answer, Settings
-from benchmarks.peers.problem import LOG_SD, MEDIAN, Array, Windows
+from benchmarks.peers.problem import LOG_SD, MEDIAN, FloatArray, Windows
 
 
 class Runner:
-    def log_density(self, windows: Windows, z: Array) -> None:
+    def log_density(self, windows: Windows, z: FloatArray) -> None:
         return None
 
     def run(self, windows: Windows, seed: int) -> Answer:
@@ -23,7 +23,7 @@ class Runner:
         residual = jerk - design @ np.linalg.lstsq(design, jerk)[0]
         points = MerweScaledSigmaPoints(2, alpha=0.5, beta=2.0, kappa=1.0)
 
-        def observed(x: Array, a: float, u: float) -> Array:
+        def observed(x: FloatArray, a: float, u: float) -> FloatArray:
             lag, gain = np.exp(x)
             return np.array([(gain * u - a) / lag])
 

@@ -56,6 +56,7 @@ def drawn(count: int, z: np.ndarray, rng: np.random.Generator) -> list[KeptCase]
     return cases
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 def test_constants_are_found_again(rotating_seed: int) -> None:
     """Each within five standard errors, of which 400 cases leave no more than two thirds of the prior's in most."""
@@ -68,6 +69,7 @@ def test_constants_are_found_again(rotating_seed: int) -> None:
     assert np.median(errors / sds) < 2 / 3
 
 
+@pytest.mark.statistical
 @pytest.mark.slow
 def test_nothing_fits_better_and_the_truth_hardly_worse(rotating_seed: int) -> None:
     """Whatever the constants were, also where a price near 0 makes its logarithm's posterior anything but normal."""
@@ -97,17 +99,17 @@ def test_kinds_weigh_as_in_the_blind_test() -> None:
     assert weights(cases) == pytest.approx({"none": 4 * 0.25, "single": 4 * 0.4 / 2, "pair": 4 * 0.2})
 
 
-def test_a_fit_needs_both_kinds(rotating_seed: int) -> None:
-    cases = drawn(30, shipped(), np.random.default_rng(rotating_seed))
+def test_a_fit_needs_both_kinds(fresh_seed: int) -> None:
+    cases = drawn(30, shipped(), np.random.default_rng(fresh_seed))
     with pytest.raises(InputError, match="needs both kinds"):
         fit([case for case in cases if case.kind != "outside"], dict.fromkeys(MIX, 1.0))
 
 
 @pytest.fixture
-def stub(monkeypatch: pytest.MonkeyPatch, rotating_seed: int) -> list[int]:
+def stub(monkeypatch: pytest.MonkeyPatch, fresh_seed: int) -> list[int]:
     """Cases that are drawn in no time, and a list of those that were."""
     asked: list[int] = []
-    cases = drawn(8, shipped(), np.random.default_rng(rotating_seed))
+    cases = drawn(8, shipped(), np.random.default_rng(fresh_seed))
 
     def draw(index: int, seed: int, **options: object) -> KeptCase:
         asked.append(index)
@@ -146,8 +148,8 @@ def test_cases_of_another_seed_or_likelihood_are_refused(tmp_path: Path, stub: l
 
 
 @pytest.mark.slow
-def test_the_file_is_made_and_read(rotating_seed: int) -> None:
-    cases = drawn(120, shipped(), np.random.default_rng(rotating_seed))
+def test_the_file_is_made_and_read(fresh_seed: int) -> None:
+    cases = drawn(120, shipped(), np.random.default_rng(fresh_seed))
     found = fit(cases, weights(cases))
     provenance = origin(cases, 7, commit="0" * 40, today="2026-01-01")
     new = made(document(), found, provenance, NUMBERS)

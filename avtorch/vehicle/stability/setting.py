@@ -12,7 +12,7 @@ from avtorch.arrays import Bool, Float, Real
 from avtorch.errors import InputError
 from avtorch.vehicle.broadcasting import broadcast_shape
 
-Value = float | Real[Tensor, "*#setting"]
+Value = float | Sequence[float] | Real[Tensor, "*#setting"]
 Gains = Sequence[float] | Real[Tensor, "*#setting 3"]
 Loose = float | Sequence[float] | Tensor
 
