@@ -136,6 +136,7 @@ def test_windows_that_did_not_settle_are_told_apart() -> None:
 # --- run
 
 
+@pytest.mark.slow
 def test_run_sees_the_change_and_acts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["run", "--duration", "36", "--seed", "3", "--out", str(tmp_path)]
     assert main(arguments) == 0
@@ -172,6 +173,7 @@ def test_run_otherwise(tmp_path: Path, extra: list[str]) -> None:
         assert answer["performance"]["without_action"] == answer["performance"]["with_action"]
 
 
+@pytest.mark.slow
 def test_run_behind_a_recording(data_dir: Path, tmp_path: Path) -> None:
     leader = data_dir / "openacc_astazero/ASta_040719_platoon7.csv"
     arguments = ["run", "--leader", str(leader), "--duration", "10", "--change-at", "4", "-q", "--out", str(tmp_path)]

@@ -101,6 +101,7 @@ def test_seal_on_disk(cases: list[Case], tmp_path) -> None:
     assert truth["names"] == list(case.names)
 
 
+@pytest.mark.slow
 def test_a_case_depends_on_seed_and_index_alone(cases: list[Case]) -> None:
     again = draw_case(7, 5, seconds=60.0)
     assert again.truth() == cases[7].truth()

@@ -241,6 +241,7 @@ class Answers:
         assert self.seen() == self.new
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("onwards", [False, True], ids=["one call fails", "all fail from there on"])
 def test_a_disk_that_fails_at_the_nth_call(command: Command, onwards: bool, capsys: pytest.CaptureFixture[str]) -> None:
     answers = Answers(command)

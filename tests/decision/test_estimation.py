@@ -137,6 +137,7 @@ def test_a_gap_restarts_the_grid(healthy):
     assert len(found.quality.gaps) == 1
 
 
+@pytest.mark.slow
 def test_a_clock_that_starts_anew_with_a_segment(healthy):
     """Two drives in one file, both on a clock from zero: the windows tell each drive's own time."""
     again = drive(seed=2, seconds=12.0)
@@ -244,6 +245,7 @@ def test_the_jerk_form_as_it_is_answered(healthy):
         assert set(window["sigma"]) == {"mean", "sd", "q05", "q95"}
 
 
+@pytest.mark.slow
 def test_behind_a_recorded_leader_rest_and_cruise_teach_nothing(data_dir):
     """A production car at AstaZero stands, pulls off to 19 m/s and cruises: only the pull-off tells of the actuator."""
     path = data_dir / "openacc_astazero" / "ASta_040719_platoon7.csv"
@@ -372,6 +374,7 @@ def test_a_dead_time_out_of_range_is_refused(healthy, seconds):
         estimate(healthy, dead_time=seconds)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("form", ["jerk", "latent"])
 def test_a_driver_who_acts_against_the_command_teaches_nothing(form, rotating_seed):
@@ -393,6 +396,7 @@ def test_a_driver_who_acts_against_the_command_teaches_nothing(form, rotating_se
     assert any("3 returns to engaged" in note for note in found.quality.notes)
 
 
+@pytest.mark.slow
 def test_a_dead_time_reaches_for_no_command_that_nobody_obeyed(healthy):
     """A log whose commands under the driver are rubbish says the same, also where they would act after the return."""
     given = columns(healthy)

@@ -58,6 +58,7 @@ def test_it_is_offered_only_where_something_is_heard():
     assert count(Grid(feedforward=(0.5,), allowed=frozenset({2, 3}))) == count(Grid(allowed=frozenset({2, 3})))
 
 
+@pytest.mark.slow
 def test_it_is_chosen_before_a_longer_gap_and_not_with_a_late_link():
     near = decide(1.0, 0.8, Strategist(LINKED, link_delay=DELAY))
     assert near.strategies == [{4}]

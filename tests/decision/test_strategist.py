@@ -103,6 +103,7 @@ def test_clipping_rules_out_what_would_win_on_paper():
     assert bool(weak.sufficient[0])
 
 
+@pytest.mark.slow
 def test_all_strategies_occur_and_hold_at_the_truth():
     T, K = torch.cartesian_prod(torch.tensor([0.1, 0.6, 1.0, 1.5, 2.0]), torch.tensor([0.4, 0.6, 0.8, 1.1])).double().T
     used = set()
@@ -122,6 +123,7 @@ def test_all_strategies_occur_and_hold_at_the_truth():
     assert any(2 in s and 3 not in s for s in used)
 
 
+@pytest.mark.slow
 def test_gains_are_taken_where_the_driver_leaves_no_gap_to_open():
     decision = decide([1.5], [0.6], default=Setting(time_gap=2.5), strategist=Strategist(grid=Grid(time_gaps=(2.5,))))
     assert 2 not in decision.strategies[0]

@@ -221,6 +221,7 @@ def test_the_strategist_is_asked_for_alarmed_scenarios_only():
     assert supervisor.setting.T_hat[[1, 3]].tolist() == T_L.mean(1).tolist()
 
 
+@pytest.mark.slow
 def test_the_strategist_replays_the_last_seconds():
     strategist = Spy()
     supervisor = Supervisor(make_loop(2), strategist=strategist)
@@ -247,6 +248,7 @@ def test_the_strategist_replays_the_last_seconds():
     assert sum(len(b.time) for b in supervisor._recent) <= round(HISTORY_S / 0.01) + 1 + 200
 
 
+@pytest.mark.slow
 def test_a_run_may_be_cut_anywhere():
     """Pieces equal the whole, actions at a cut included, also where a piece is one row."""
     change = (8.0, becomes(1.5, 0.5))
@@ -291,6 +293,7 @@ def test_a_scenario_sees_the_same_noise_in_any_company():
             assert bool(((one.mean[1] - other.mean[0]).abs() < 0.2 * other.sd[0]).all())
 
 
+@pytest.mark.slow
 def test_an_action_leaves_the_other_scenarios_alone():
     """Scenario 0 is on its way to a longer gap when scenario 1 is changed: it goes on as if nothing were."""
 

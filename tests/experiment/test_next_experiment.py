@@ -171,6 +171,7 @@ def test_the_table_is_written_and_an_old_one_goes(tmp_path: Path, fresh_seed: in
     assert not path.exists()
 
 
+@pytest.mark.slow
 def test_a_slow_car_is_offered_what_it_can_drive(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     found = left([contender([], rng=rng), contender([SensorBias(0.3)], rng=rng)], [0.6, 0.3])
@@ -185,6 +186,7 @@ def test_a_slow_car_is_offered_what_it_can_drive(fresh_seed: int) -> None:
     assert "Limits, from the log: 0.24 to 3.66 m/s, -1.6 to 5.21 m/s²." in line
 
 
+@pytest.mark.slow
 def test_drag_on_a_fast_road_leaves_manoeuvres_that_come_back(fresh_seed: int) -> None:
     """What drag takes depends on the speed that is left once it is made up for."""
     rng = np.random.default_rng(fresh_seed)

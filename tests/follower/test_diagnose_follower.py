@@ -70,6 +70,7 @@ def test_a_gap_that_was_changed_midway_is_not_told_to_a_hair(rotating_seed: int)
     assert found.draws(wide)["law.time_gap_s"].std() > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_a_driver_who_falls_back_is_no_part_of_the_law(rotating_seed: int) -> None:
     """He brakes while the law asks for more; rolled out through, he came out as half a second of delay."""

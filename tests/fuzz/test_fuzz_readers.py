@@ -85,6 +85,7 @@ def check_log(log: Log, head: list[str], rows: list[list[Any]]) -> None:
     assert not others or any(note.startswith("columns ignored: ") for note in notes)
 
 
+@pytest.mark.slow
 @fuzzed("csv")
 @given(raw=mutated(CSVS))
 def test_damaged_csv(folder: Path, raw: bytes) -> None:

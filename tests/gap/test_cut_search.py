@@ -79,6 +79,7 @@ def test_what_the_budget_kept_from_a_closer_fit_keeps_its_first_figure(monkeypat
     assert found.scope.pairs == "none"
 
 
+@pytest.mark.slow
 def test_without_pairs_nothing_holds_a_pair() -> None:
     found = avtorch.diagnose(_log(outliers=True), effects=AMONG, pairs=False)
     assert found.complete

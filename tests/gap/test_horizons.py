@@ -94,6 +94,7 @@ def test_sentences_and_page_name_it(late: tuple[Log, Diagnosis]) -> None:
         assert page.count(label) == 1
 
 
+@pytest.mark.slow
 def test_stretches_shorter_than_10_s_are_not_called_10_s() -> None:
     """Between overrides every 8 s: the sentence said 6 s, the page's table and its picture 10 s."""
     overrides = [(8.0 + 9 * k, 10.0 + 9 * k) for k in range(7)]

@@ -77,6 +77,7 @@ def walked(density: TorchDensity, seed: int, **options) -> Posterior:
     return sample(density, SamplerSettings(**{"attempts": 2, "longest": 16.0, **options}), generator=generator(seed))
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("order", ["xy", "yx"])
 def test_the_banana_of_the_issue_is_not_claimed(order, rotating_seed):
@@ -103,6 +104,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("target", WRONG)
 def test_what_the_walk_gets_wrong_is_not_claimed(target, rotating_seed):
@@ -162,6 +164,7 @@ def test_what_is_claimed_is_right(target, rotating_seed):
         assert (wide.abs() < 0.05 + BAR * error).all()
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_an_sd_that_few_draws_carry_is_no_excuse(rotating_seed):
     """Student's t of 2.3 degrees: chains arrive late in its tails, at 0.65 to 0.72 of its SD, and the error of such an

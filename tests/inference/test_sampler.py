@@ -249,6 +249,7 @@ def test_a_walk_too_short_for_a_space_left_unwhitened_is_said(whitening, make_wi
     torch.testing.assert_close(Coordinates.of(mode).widest(mode), torch.ones(3, dtype=torch.float64))
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("wall", [1e4, math.nan, math.inf, -3.0])
 def test_divergence_is_said(wall, rotating_seed):

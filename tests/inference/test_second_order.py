@@ -53,6 +53,7 @@ def test_sgld_is_quadrature_s(kind, rotating_seed):
     assert (found.sd / exact.sd - 1).abs().max() < 0.07
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", KINDS)
 def test_intervals_cover_truths_of_the_prior(kind, rotating_seed, draws_factor):

@@ -54,6 +54,7 @@ def test_windows_lie_on_the_logs_own_clock(drive):
     assert windows[0].belief.names == ("T_L", "K_L", "sigma")
 
 
+@pytest.mark.slow
 @settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.integers(0, 600), max_size=12), st.integers(0, 12))
 def test_neither_cuts_nor_saving_change_a_bit(drive, tmp_path_factory, cuts, save_at):
@@ -220,6 +221,7 @@ def test_a_state_of_another_stream_is_refused():
             new(**options).load_state_dict(state)
 
 
+@pytest.mark.slow
 @settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.integers(0, 1000), max_size=8), st.integers(0, 8))
 def test_a_driver_masks_his_rows_and_the_settling_after_them(drive, tmp_path_factory, cuts, save_at):

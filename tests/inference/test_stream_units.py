@@ -137,6 +137,7 @@ def stream(**options) -> BeliefStream:
     return BeliefStream(**{"settings": SMALL, "kept": 50, "seed": 4, **options})
 
 
+@pytest.mark.slow
 def test_a_sign_flip_is_not_believed(fresh_seed):
     """Before it was: T_L 2.94 s and K_L 0.06. The stream is left as it was, and goes on with the right sign."""
     time, given = drive(fresh_seed, seconds=20.0)

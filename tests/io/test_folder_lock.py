@@ -110,6 +110,7 @@ def test_a_file_system_without_locks_lets_work_go_on(
         assert not locked
 
 
+@pytest.mark.slow
 def test_whatever_the_lock_file_says_the_answer_is_one_line(tmp_path: Path) -> None:
     broken = [b"", b"[" * 5000, b'{"pid": 1}', b"\xff", b'{"pid": 1, "host": "\\n", "work": [], "since": 0}']
     with another_process(tmp_path):

@@ -37,6 +37,7 @@ STRONG = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", STRONG)
 def test_maximum_likelihood_names_a_strong_cause(name: str, rotating_seed: int) -> None:

@@ -21,6 +21,7 @@ def uniform(rotating_seed, draws_factor) -> torch.Tensor:
     return torch.from_numpy(np.random.default_rng(rotating_seed).integers(0, DRAWS + 1, (N, RUNS * draws_factor)))
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("test", [chi2_p_value, ecdf_p_value, dispersion_p_value])
 def test_level_is_kept(test, uniform):
@@ -33,6 +34,7 @@ def test_level_is_kept(test, uniform):
         assert rejected >= 0.7 * level - BAR * error
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("level", [0.5, 0.95])
 def test_band_holds_all_points_as_often_as_it_says(level, uniform):

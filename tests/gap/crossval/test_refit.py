@@ -33,6 +33,7 @@ def test_the_whole_is_the_find_itself() -> None:
     assert refit.values == pytest.approx(found.values)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_what_is_owed_is_what_draws_of_the_posterior_cost(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)

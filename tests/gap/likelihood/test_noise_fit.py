@@ -62,6 +62,7 @@ def test_parameters_are_found_within_their_own_bars(
     assert np.sqrt((np.clip(away, -4, 4) ** 2).mean()) < 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_the_mode_is_found_from_afar(rotating_seed: int) -> None:
     """From the usual start, whatever the sensors are: never thousands of nats short."""

@@ -94,6 +94,7 @@ def test_a_search_goes_on_to_the_same_answer(log: Log, diagnosed: tuple[dict[str
     assert avtorch.diagnose(log, checkpoint=kept, **ONLY).to_dict() == diagnosed[0]
 
 
+@pytest.mark.slow
 def test_a_spent_budget_is_gone_on_from_to_the_same_answer(
     log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -107,6 +107,7 @@ def _log(effects: list[Effect], seed: int, *, seconds: float = 50.0, rate: int =
     return Log.from_arrays(time=time, accel_cmd=command, accel=accel, speed=speed)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ALL)
 def test_it_is_named_where_it_acts(kind: type[Effect], rotating_seed: int) -> None:
@@ -126,6 +127,7 @@ def test_it_is_named_where_it_acts(kind: type[Effect], rotating_seed: int) -> No
         assert [e.name for e in again.effects] == [kind.name]
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 @pytest.mark.parametrize("kind", ALL)
 def test_it_is_not_named_where_it_does_not(kind: type[Effect], rotating_seed: int) -> None:
@@ -151,6 +153,7 @@ def test_a_pair_with_the_leading_effect(kind: type[Effect], rotating_seed: int) 
     assert f"{kind.name}.{kind.parameters[0].name}" in told
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_one_derived_from_a_built_in_is_a_users_own(rotating_seed: int) -> None:
     """It has the built-in's class behind it, not its name: it must not be searched, and reported, under that."""

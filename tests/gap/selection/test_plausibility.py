@@ -67,6 +67,7 @@ def test_a_gain_of_a_sixteenth_is_remarked() -> None:
     said_everywhere(found, "no actuator makes that of a command")
 
 
+@pytest.mark.slow
 def test_a_usual_gust_is_not() -> None:
     log = log_of(plant(T_L=0.4, K_L=0.9), noise=NoiseModel(force_sd=0.3, force_time=1.5))
     found = avtorch.diagnose(log, effects=["gust"], pairs=False)

@@ -15,6 +15,7 @@ from tests.gap.records import log_of
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "own-effect.md"
 
 
+@pytest.mark.slow
 def test_one_of_each_kind_is_named_by_the_pages_own_code(capsys: pytest.CaptureFixture[str]) -> None:
     before = dict(EFFECTS)
     names: dict = {}
