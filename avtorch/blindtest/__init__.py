@@ -1,4 +1,4 @@
-"""The honest check: a reference vehicle that shares no code with the diagnosis, sealed cases, and their score.
+"""The blind test: a reference vehicle that shares no code with the diagnosis, sealed cases, and their scores.
 
 Example:
     >>> from avtorch.blindtest import draw_case

@@ -1,8 +1,8 @@
-"""The powertrain and the brake: torque map, limits, gears, lags.
+"""Powertrain and brake: torque map, limits, gears and lags.
 
-Positive demand goes through the engine path, negative demand through the brake path; each is a first-order lag and
-their sum is the acceleration. With equal lags the sum is GLVD. Exact per millisecond for a first-order lag, fourth
-order Runge-Kutta for a second-order one.
+Positive demand passes the engine path, negative demand the brake path. Each path is a first-order lag and the
+acceleration is their sum, which is GLVD where the lags are equal. A first-order lag is integrated exactly over each
+millisecond, a second-order one by fourth-order Runge-Kutta.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ Factor = Callable[[float, float, float], float]
 
 
 def actuator(car: Car, effects: Parameters, start: float) -> Step:
-    """`step(command, speed, time)` advances one millisecond; returns the actuator's acceleration at its end [m/s²].
+    """Return `step(command, speed, time)`, which advances the actuator by 1 ms and returns its acceleration [m/s²].
 
-    `start`: the acceleration it has now.
+    `start`: the initial acceleration [m/s²].
     """
     shape = [make(effects[name]) for name, make in _TARGETS.items() if name in effects]
     lags = [make(effects[name]) for name, make in _LAGS.items() if name in effects]
@@ -42,7 +42,7 @@ def actuator(car: Car, effects: Parameters, start: float) -> Step:
 
 
 def _paths(car: Car, effects: Parameters, start: float, shape: list[Factor], lags: list[Factor]) -> Step:
-    """The general actuator: two paths, or one second-order servo, under a bound on the rate."""
+    """The general actuator: two paths, or one second-order servo, with a rate limit."""
     brake = effects.get("brake_throttle_asymmetry", {})
     brake_gain, brake_lag = brake.get("brake_gain_ratio", 1.0), brake.get("brake_lag_ratio", 1.0)
     bound = effects.get("rate_limit", {}).get("jerk_max_mps3", math.inf) * STEP_S
@@ -57,7 +57,7 @@ def _paths(car: Car, effects: Parameters, start: float, shape: list[Factor], lag
         stretch = 1.0
         for lag in lags:
             stretch *= lag(target, speed, time)
-        # pressure is built through the brake's own lag and let go as fast as the engine answers
+        # brake pressure builds up with the brake's own lag and is released as fast as the engine responds
         slow = brake_lag if target < 0 else 1.0
         if target < 0:
             target *= brake_gain
@@ -75,7 +75,7 @@ def _paths(car: Car, effects: Parameters, start: float, shape: list[Factor], lag
         up = quick * (max(target, 0.0) - engine)
         down = late * (min(target, 0.0) - pads)
         if abs(up + down) > bound:
-            # the excess is taken from the whole of the change, and what both paths hold is kept consistent with it
+            # the rate limit applies to the sum of both paths; their states are reset to match the limited sum
             now = engine + pads + math.copysign(bound, up + down)
             engine, pads = max(now, 0.0), min(now, 0.0)
             return now
@@ -99,7 +99,7 @@ def _servo(a: float, rate: float, target: float, p: Mapping[str, float], h: floa
     return a + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), rate + h / 6 * (l1 + 2 * l2 + 2 * l3 + l4)
 
 
-# What becomes of the target acceleration, in the order of the chain.
+# Factors on the target acceleration, in the order of the chain.
 
 
 def _speed_gain(p: Mapping[str, float]) -> Factor:
@@ -108,7 +108,7 @@ def _speed_gain(p: Mapping[str, float]) -> Factor:
 
 
 def _map(speed: float, middle: float) -> float:
-    """A torque map's position in speed: (v - v̄)/v̄ around v̄, a little flatter far from it, as real maps are."""
+    """Position in speed on a torque map: (v - v̄)/v̄ near v̄, slightly flatter far from it, as in real maps."""
     z = (speed - middle) / middle
     return z / math.sqrt(1 + 0.15 * z * z)
 
@@ -128,7 +128,7 @@ def _saturation(p: Mapping[str, float]) -> Factor:
     high, low = p["accel_max_mps2"], p["accel_min_mps2"]
 
     def limit(target: float, speed: float, time: float) -> float:
-        # a knee of 4 % of the limit: torque runs out gradually
+        # a smooth knee of 4 % of the limit: torque saturates gradually
         if target > 0.96 * high:
             over = (target - 0.96 * high) / (0.04 * high)
             return high * (0.96 + 0.04 * (1 - math.exp(-over)))
@@ -141,7 +141,7 @@ def _saturation(p: Mapping[str, float]) -> Factor:
 
 
 def _gear_shift(p: Mapping[str, float]) -> Factor:
-    """Drive is cut while the gear changes: a clutch opens and closes over a fifth of the time each."""
+    """The drive is interrupted while the gear changes: the clutch opens and closes in a fifth of that time each."""
     depth, lasts = p["depth"], p["duration_s"]
     shifts = [p["first_shift_mps"] * p["shift_ratio"] ** i for i in range(6)]
     gear: int | None = None
@@ -164,7 +164,7 @@ def _gear_shift(p: Mapping[str, float]) -> Factor:
 
 
 def _turbo_lag(p: Mapping[str, float]) -> Factor:
-    """Full torque needs boost, and boost needs a history of demand; it is lost faster than won."""
+    """Full torque needs boost, which builds up slowly under demand and is lost faster than it builds up."""
     share, spool, boost = p["missing_share"], p["spool_s"], 0.0
 
     def pull(target: float, speed: float, time: float) -> float:
@@ -177,7 +177,7 @@ def _turbo_lag(p: Mapping[str, float]) -> Factor:
 
 
 def _brake_blending(p: Mapping[str, float]) -> Factor:
-    """Regeneration brakes first and fades at low speed; friction pads take the rest, weaker and with hysteresis."""
+    """Regeneration brakes first and fades at low speed; friction pads do the rest, weaker and with hysteresis."""
     regen_max, width, weaker = p["regen_mps2"], p["hysteresis_mps2"], p["friction_gain"]
     held = 0.0
 
@@ -193,7 +193,7 @@ def _brake_blending(p: Mapping[str, float]) -> Factor:
 
 
 def _brake_heat(p: Mapping[str, float]) -> Factor:
-    """Brakes fade as they heat, by the work they did, and recover as they cool."""
+    """Brakes lose gain as their work heats them, and recover as they cool."""
     loss, cool, heat = p["loss_when_hot"], p["cooling_s"], 0.0
 
     def fade(target: float, speed: float, time: float) -> float:
@@ -205,7 +205,7 @@ def _brake_heat(p: Mapping[str, float]) -> Factor:
 
 
 def _abs_cycling(p: Mapping[str, float]) -> Factor:
-    """Anti-lock control releases and builds pressure in a cycle once the brake is applied beyond a threshold."""
+    """Anti-lock control releases and rebuilds pressure in a cycle while braking exceeds a threshold."""
     depth, above, hertz = p["depth"], p["threshold_mps2"], p["frequency_hz"]
 
     def cycle(target: float, speed: float, time: float) -> float:

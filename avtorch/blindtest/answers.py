@@ -1,4 +1,4 @@
-"""One case and what a diagnosis said of it, side by side, read from plain dicts (`avtorch.diagnosis/1`)."""
+"""One case beside the diagnosis's answer to it, read from plain dicts (`avtorch.diagnosis/1`)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 from avtorch.errors import InputError
 
 FAILED = "failed"
-"""Verdict of a diagnosis that gave no answer; it is wrong whatever the truth is."""
+"""Verdict of a diagnosis that gave no answer; it counts as wrong for every truth."""
 
 
 def joined(names: Any) -> str:
-    """The names of a verdict, or of one candidate (`"b+a"`), in the one way to write them: `"a+b"`."""
+    """The names of a verdict, or of one hypothesis (`"b+a"`), in the canonical order: `"a+b"`."""
     parts = names.split("+") if isinstance(names, str) else list(names)
     return "+".join(sorted(parts))
 
@@ -22,10 +22,10 @@ def joined(names: Any) -> str:
 class Answered:
     """A case with its answer.
 
-    `truth`: `none`, `unknown` (a cause outside the table), an effect or two joined by `+`; `kind`, `tier` of the
-    case. `verdict` likewise; `probabilities` by candidate; `alias_set`. `closed_error`, `closed_covered`, `placebo`
-    (mean, q05), `onset_error` [s]: None where the case or the answer has none. `overlaps` of each true part with the
-    named one on its axis; `parts_named`: how many.
+    `truth`: `none`, `unknown` (a cause outside the table), an effect, or two joined by `+`; `kind`, `tier` of the case.
+    `verdict` takes the same values; `probabilities` by hypothesis; `alias_set`. `closed_error`, `closed_covered`,
+    `placebo` (mean, q05), `onset_error` [s]: None where the case or the answer has none. `overlaps`: overlap of each
+    true part of the gap with the part named on its axis; `parts_named`: how many parts are named.
     """
 
     truth: str
@@ -47,33 +47,34 @@ class Answered:
 
     @property
     def confidence(self) -> float:
-        """Probability of the most probable candidate, 0 where there is no answer."""
+        """Probability of the most probable hypothesis, 0 where there is no answer."""
         return max(self.probabilities.values(), default=0.0)
 
     @property
     def favourite(self) -> str:
-        """The most probable candidate; the verdict where that is as probable."""
+        """The most probable hypothesis; the verdict in case of a tie."""
         if self.probabilities.get(self.verdict, -1.0) >= self.confidence:
             return self.verdict
         return max(self.probabilities, key=lambda name: self.probabilities[name], default=FAILED)
 
     @property
     def blamed(self) -> float:
-        """The highest probability given to any effect or pair by name."""
+        """The highest probability given to any named effect or pair."""
         return max((p for name, p in self.probabilities.items() if name not in ("none", "unknown")), default=0.0)
 
     @property
     def brier(self) -> float:
-        """Sum of squared errors over the candidates; a truth that was not listed counts as given 0."""
+        """Sum of squared errors over the hypotheses; a truth that the answer does not list has probability 0."""
         missed = 0.0 if self.truth in self.probabilities else 1.0
         return missed + sum((p - (name == self.truth)) ** 2 for name, p in self.probabilities.items())
 
 
 def read(truth: Mapping[str, Any], answer: Mapping[str, Any] | None) -> Answered:
-    """A truth (`Case.truth()`) and the answer to its log (None: there was none).
+    """Read a truth (`Case.truth()`) and the answer to its log (None: no answer).
 
-    Beside the schema's fields, `answer["shrinkage"]["placebo"]["closed"]` may hold what adding a wrong effect closed of
-    the held-out gap. Raises `InputError` for probabilities that do not sum to 1, or `none` and `unknown` missing.
+    Beside the schema's fields, `answer["shrinkage"]["placebo"]["closed"]` may hold the share of the held-out gap that a
+    wrong effect closed. Raises `InputError` for probabilities that do not sum to 1, or where `none` or `unknown` is
+    missing.
     """
     of = str(truth.get("case", "answer"))
     if answer is None:
@@ -104,22 +105,21 @@ def read(truth: Mapping[str, Any], answer: Mapping[str, Any] | None) -> Answered
 
 
 def _closed_error(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> float | None:
-    """How far the answer's `closed` lies from the oracle's."""
+    """Absolute difference between the answer's `closed` and the oracle's."""
     oracle, said = _oracle_closed(truth, answer), _closed(answer)
     return None if oracle is None or said is None else abs(float(said["mean"]) - oracle)
 
 
 def _closed_covered(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> bool | None:
-    """Whether the 90 % interval of the answer's `closed` holds the oracle's."""
+    """Whether the 90 % interval of the answer's `closed` covers the oracle's."""
     oracle, said = _oracle_closed(truth, answer), _closed(answer)
     return None if oracle is None or said is None else bool(said["q05"] <= oracle <= said["q95"])
 
 
 def _oracle_closed(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> float | None:
-    """What was closed, by one who knows the cause, and so what of the error is noise.
+    """The share closed, computed with the true noise floor, which follows from the known cause.
 
-    It takes the answer's own error before and after, every block of the drive held out once, and puts the floor where
-    the truth has it. None where there was nothing to close.
+    It uses the answer's own held-out errors before and after. None where there was nothing to close.
     """
     shrinkage = answer.get("shrinkage") or {}
     oracle = (truth.get("oracle") or {}).get(shrinkage.get("metric"))
@@ -134,7 +134,7 @@ def _closed(answer: Mapping[str, Any]) -> Mapping[str, float] | None:
 
 
 def _onset_error(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> float | None:
-    """Distance of the onset told from the true one [s]; the whole drive where the answer sees none."""
+    """Difference between reported and true onset [s]; the length of the drive where the answer reports none."""
     if truth["onset_s"] is None or not truth["onset_scored"]:
         return None
     said = answer.get("onset_s")
@@ -146,7 +146,7 @@ def _placebo(answer: Mapping[str, Any]) -> Mapping[str, float] | None:
 
 
 def _overlap(part: Mapping[str, Any], answer: Mapping[str, Any]) -> float:
-    """Intersection over union of a true part with the answer's on the same axis, 0 where it names none."""
+    """Intersection over union of a true part and the part named on the same axis; 0 where none is named."""
     named = next((w for w in answer.get("where") or () if w["axis"] == part["axis"]), None)
     if named is None:
         return 0.0

@@ -1,4 +1,4 @@
-"""What acts on the body beside the actuator: air, road, resistance, creep, gusts, the driveline's own mode."""
+"""Forces on the body besides the actuator's: air, road, resistance, creep, gusts, and the driveline's mode."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _GRID_M = 4.0  # of profiles over distance
 
 Force = Callable[[float, float, float], float]
 Streams = Callable[[str], np.random.Generator]
-"""Random numbers by name of the effect, so that it draws the same ones whatever else is on the car."""
+"""Random streams by effect name: an effect draws the same numbers whatever other effects the car has."""
 
 
 def forces(effects: Parameters, rng: Streams, *, reach: float) -> list[Force]:
-    """`force(speed, position, time)` [m/s²] of each effect that depends on the state; `reach` [m] of the drive."""
+    """`force(speed, position, time)` [m/s²] of each state-dependent effect; `reach` [m]: length of the drive."""
     return [make(effects[name], rng(name), reach) for name, make in _FORCES.items() if name in effects]
 
 
@@ -34,7 +34,7 @@ def coloured(rng: np.random.Generator, steps: int, sd: float, memory: float, ste
 
 
 def profile(rng: np.random.Generator, reach: float, length: float) -> FloatArray:
-    """A smooth random profile over distance with unit variance and correlation length `length` [m], every 4 m."""
+    """A smooth random profile over distance, of unit variance and correlation length `length` [m], every 4 m."""
     points = int(reach / _GRID_M) + 2
     width = length / _GRID_M
     half = int(4 * width)
@@ -44,7 +44,7 @@ def profile(rng: np.random.Generator, reach: float, length: float) -> FloatArray
 
 
 def along(values: FloatArray) -> Callable[[float], float]:
-    """A profile as a function of position [m], linear between its points, held at its end."""
+    """A profile as a function of position [m]: linear between its points, constant beyond the last."""
     table, last = values.tolist(), len(values) - 2
 
     def at(position: float) -> float:
@@ -56,9 +56,9 @@ def along(values: FloatArray) -> Callable[[float], float]:
 
 
 def driveline(p: Mapping[str, float]) -> Callable[[float], float]:
-    """`step(change of the actuator's acceleration)`: what the shaft's twist adds to it, one millisecond on [m/s²].
+    """`step(change of the actuator's acceleration)`: acceleration of the shaft's torsional mode 1 ms later [m/s²].
 
-    A lightly damped mode that jerk excites. Solved exactly between impulses of jerk.
+    A lightly damped mode excited by jerk, solved exactly between impulses of jerk.
     """
     omega, zeta, amplitude = 2 * math.pi * p["frequency_hz"], p["damping_ratio"], p["amplitude"]
     damped, decay = omega * math.sqrt(1 - zeta**2), math.exp(-zeta * omega * STEP_S)
@@ -103,14 +103,14 @@ def _creep(p: Mapping[str, float], rng: np.random.Generator, reach: float) -> Fo
     push, ends = p["creep_mps2"], p["ends_mps"]
 
     def creep(speed: float, position: float, time: float) -> float:
-        # a torque converter: the push falls with the square of the ratio of speeds
+        # a torque converter: its push falls with the square of the speed ratio
         return push * (1 - (speed / ends) ** 2) if speed < ends else 0.0
 
     return creep
 
 
 def _curve_drag(p: Mapping[str, float], rng: np.random.Generator, reach: float) -> Force:
-    """Tyres that steer through a curve also brake: with the square of the lateral acceleration."""
+    """Cornering drag: tyre forces in a curve brake with the square of the lateral acceleration."""
     share = p["drag_at_3mps2"]
     bend = along(np.maximum(np.abs(profile(rng, reach, 60.0)) - 0.8, 0.0))
     quick = p["reference_speed_mps"]

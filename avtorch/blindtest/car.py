@@ -1,4 +1,4 @@
-"""The car of a case: its GLVD parameters and its noise. Without effects the reference vehicle is just this."""
+"""The car of a case: its GLVD parameters and its noise; without effects it is the whole reference vehicle."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ STEP_S = 1e-3
 class Car:
     """`T_L` [s], `K_L` [-]; standard deviations of the noise.
 
-    `process_sd` [m/s²] is that of the acceleration which white jerk noise makes once it has passed the actuation lag
-    (an Ornstein-Uhlenbeck process of time constant `T_L`); `accel_sd` [m/s²] and `speed_sd` [m/s] are white sensor
-    noise, one draw a row; `speed_quantum` [m/s] is the speed signal's last digit (0: none). Raises `InputError` for
-    values that are negative, and for a lag of zero.
+    `process_sd` [m/s²]: standard deviation of the acceleration that white jerk noise causes after the actuation lag (an
+    Ornstein-Uhlenbeck process of time constant `T_L`). `accel_sd` [m/s²], `speed_sd` [m/s]: white sensor noise, one
+    draw per row. `speed_quantum` [m/s]: resolution of the speed signal (0: no rounding). Raises `InputError` for
+    negative values and for a lag of zero.
 
     Example:
         >>> from avtorch.blindtest import Car

@@ -1,4 +1,4 @@
-"""One sealed case: a log as the car would have written it, and apart from it the cause, its size and its time."""
+"""One sealed case: a log as the car would have written it, and, kept apart from it, the cause, its size and onset."""
 
 from __future__ import annotations
 
@@ -27,12 +27,11 @@ Kind = Literal["none", "single", "pair", "outside"]
 class Case:
     """One sealed case.
 
-    `kind` and `names` (alphabetical; empty for `none`) are the truth, `parameters` by name, `onset_s` the moment from
-    which the cause is there (None: from the start; for a lone `gain_change` the moment of the change). `visibility`
-    and `tier`: see `avtorch.blindtest.visibility`; `visibility_each`: of each effect of a pair alone on the same
-    drive. `oracles`: rollout errors by metric of GLVD and of one who knows the cause. `without`, `with_cause`
-    (row,) [m/s²]: noise-free measured acceleration under the log's own command of this car without the cause, and
-    with it as far as it can be foretold.
+    `kind` and `names` (alphabetical; empty for `none`) are the truth; `parameters` by name; `onset_s`: when the cause
+    begins to act (None: from the start; for `gain_change` alone, the time of the change). `visibility`, `tier`: see
+    `avtorch.blindtest.visibility`; `visibility_each`: visibility of each effect of a pair, alone on the same drive.
+    `oracles`: rollout errors, by metric, of GLVD and of a model that knows the cause. `without`, `with_cause` (row,)
+    [m/s²]: noise-free measured acceleration under the logged command, without the cause and with its predictable part.
 
     Example:
         >>> from avtorch.blindtest import draw_case
@@ -59,12 +58,12 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Of the case, telling nothing of its cause."""
+        """Name of the case, independent of its cause."""
         return f"case_{self.index:05d}"
 
     @property
     def truth_name(self) -> str:
-        """As a diagnosis would have to answer: `none`, `unknown`, an effect, or two joined by `+`."""
+        """The correct verdict: `none`, `unknown`, an effect, or two joined by `+`."""
         return {"none": "none", "outside": "unknown"}.get(self.kind, "+".join(self.names))
 
     @property
@@ -80,7 +79,7 @@ class Case:
 
     @property
     def parts(self) -> list[dict[str, Any]]:
-        """Where the cause is known to act, by axis: since its onset, below a speed, braking."""
+        """Where the cause is known to act, by axis: since its onset, below a speed, while braking."""
         run, parts = self.run, []
         if self.onset_s is not None and self.onset_scored:
             parts.append({"axis": "time", "from": self.onset_s, "to": float(run.time[-1])})
@@ -92,7 +91,7 @@ class Case:
         return parts
 
     def log(self, *, signals: Sequence[str] = ("accel", "speed")) -> Log:
-        """The log a diagnosis sees: `time`, `accel_cmd` and the channels in `signals`."""
+        """The log given to a diagnosis: `time`, `accel_cmd` and the channels in `signals`."""
         columns = {"accel": self.run.accel, "speed": self.run.speed}
         if not signals or set(signals) - columns.keys():
             raise InputError(f"signals: found {tuple(signals)}, needs accel, speed or both")
@@ -100,7 +99,7 @@ class Case:
         return Log.from_arrays(name=self.name, time=self.run.time, accel_cmd=self.run.command, accel=accel, speed=speed)
 
     def truth(self) -> dict[str, Any]:
-        """What is hidden, as plain numbers and strings: what `avtorch.blindtest.score` takes."""
+        """The hidden truth as plain numbers and strings: the input of `avtorch.blindtest.score`."""
         return {
             "schema": "avtorch.blindtest.truth/1",
             "case": self.name,
@@ -125,9 +124,9 @@ class Case:
 
 
 def write(case: Case, folder: str | os.PathLike[str]) -> Path:
-    """Write `folder/logs/NAME.csv`, which a diagnosis may see, and `folder/truth/NAME.json`, which it may not.
+    """Write `folder/logs/NAME.csv`, which a diagnosis may read, and `folder/truth/NAME.json`, which it may not.
 
-    Returns the path of the log. Both files appear whole or not at all, the truth first.
+    Returns the path of the log. Each file is written whole or not at all, the truth first.
 
     Example:
         >>> from avtorch.blindtest import draw_case, write

@@ -1,8 +1,8 @@
-"""Sealed cases, drawn so that an answer cannot be guessed from the outside.
+"""Sealed cases, drawn so that nothing but the log identifies the cause.
 
-Kinds come in fixed shares in shuffled order, every effect in every tier equally often, half of the causes from a
-moment within the drive on. A case depends on `(seed, index)` and the settings alone, so a set of cases can be drawn in
-parts and in any order.
+Kinds come in fixed shares in shuffled order, every effect in every tier equally often; half of the causes have an onset
+within the drive. A case depends only on `(seed, index)` and the settings, so a set of cases can be drawn in parts and
+in any order.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from avtorch.errors import InputError
 _ATTEMPTS = 10
 SIGNALS = ("accel", "speed")
 _PAIR_EXCESS = (1.25, 8.0)
-"""Each effect of a pair, alone on the drive, shows between these: plainly enough that two can be asked for."""
+"""Visibility range of each effect of a pair, alone on the drive: visible enough that both can be identified."""
 _TOP_SPEED_MPS = 44.0
 
 
@@ -45,12 +45,12 @@ def draw_cases(
 ) -> Iterator[Case]:
     """Cases `start` to `start + n - 1` of the set `seed`, one after another.
 
-    Args: `mix`: shares of the kinds (default 25 % none, 40 % single, 20 % pair, 15 % outside), kept in every 20
-    cases. `tiers` and `effects`: single cases run through all their combinations in random order; causes outside are
-    drawn from all `tiers`. `outside`: which of the two groups of families outside the table. `seconds`, `manoeuvre`:
-    instead of drawing them. `signals`: the channels that the logs are to have, in which a cause must show. A cause
-    that cannot show as asked on the drive drawn gets another drive; one that showed in none of ten gives way to another
-    cause, or else its plainest drive stands, in the tier it has.
+    Args: `mix`: shares of the kinds (default 25 % none, 40 % single, 20 % pair, 15 % outside), kept in every 20 cases.
+    `tiers`, `effects`: single cases cover all their combinations in random order; causes outside the table are drawn
+    from all `tiers`. `outside`: which of the two groups of families outside the table. `seconds`, `manoeuvre`: fixed
+    instead of drawn. `signals`: the channels of the logs, in which a cause must be visible. Where a cause cannot reach
+    the visibility asked for on a drive, another drive is drawn; after ten drives another cause takes its place, or else
+    the case keeps the drive where it is most visible, in the tier that it has there.
 
     Raises `InputError` for unknown kinds, tiers, effects or signals.
 
@@ -85,7 +85,7 @@ def draw_case(
     manoeuvre: str | None = None,
     signals: Sequence[str] = SIGNALS,
 ) -> Case:
-    """Draw case `index` of the set `seed`; the other arguments, and what raises `InputError`, as in `draw_cases`.
+    """Draw case `index` of the set `seed`; other arguments and errors are those of `draw_cases`.
 
     Example:
         >>> from avtorch.blindtest import draw_case
@@ -107,7 +107,7 @@ def draw_case(
         if attempt % _ATTEMPTS == 0:
             if best is not None and best.tier is not None:
                 return best
-            # at first the cause that is due; one that showed in none of ten drives gives way to any other
+            # first the cause that is due; after ten drives in which it is not visible, any other
             due = count if attempt == 0 else int(rng.integers(2**31))
             families, tier = _causes(kind, due, seed, rng, effects, tiers, group)
         case = _attempt(index, seed, kind, families, tier, rng, seconds, manoeuvre, signals)
@@ -131,7 +131,7 @@ def _causes(
     tiers: Sequence[str],
     group: Mapping[str, Family],
 ) -> tuple[list[Family], str]:
-    """The causes of the `count`-th case of its kind, and the tier it is to show in."""
+    """The causes of the `count`-th case of its kind, and the tier of their visibility."""
     if kind == "single":
         tier, effect = divmod(card(count, seed, len(effects) * len(tiers)), len(effects))
         return [EFFECTS[effects[effect]]], tiers[tier]
@@ -139,7 +139,7 @@ def _causes(
         tier, which = divmod(card(count, seed, len(group) * len(tiers)), len(group))
         return [list(group.values())[which]], tiers[tier]
     if kind == "pair":
-        # lost messages are too faint to be one of two
+        # lost messages are too faint for one half of a pair
         able = sorted(set(effects) - {"command_hold"})
         if len(able) < 2:
             raise InputError(f"effects: found {tuple(effects)}, pairs need two that are not command_hold")
@@ -158,12 +158,12 @@ def _attempt(
     manoeuvre: str | None,
     signals: Sequence[str],
 ) -> Case | None:
-    """A case on a drive drawn anew; None where the drive is no drive, or one of a pair cannot show on it."""
+    """A case on a newly drawn drive; None where the drive is unusable or one of a pair cannot be visible on it."""
     car, drive = draw_car(rng), draw_drive(rng, seconds=seconds, manoeuvre=manoeuvre)
     noise, late, when = int(rng.integers(2**31)), rng.random() < 0.5, float(rng.uniform(0.2, 0.7))
     draws = {f.name: f.draw(rng, car, drive) for f in families}
     aims = {f.name: float(rng.random()) for f in families}
-    # trials begin at no strength in particular, or the first to do would be the same in many cases
+    # a random first strength: otherwise the first trial to fit would be the same in many cases
     begins = {f.name: float(np.exp(rng.uniform(-1, 1))) for f in families}
     if any(f.suits and drive.manoeuvre not in f.suits for f in families):
         return None
@@ -180,7 +180,7 @@ def _attempt(
         return run, sight(run, signals)
 
     def alone(f: Family) -> tuple[Parameters, Run, Sight] | None:
-        """The effect by itself, as strong as it takes."""
+        """The effect by itself, at the strength that the tier requires."""
         low, high = excess_range(tier) if kind != "pair" else _PAIR_EXCESS
         aim = low * (high / low) ** (0.1 + 0.8 * aims[f.name])
 
@@ -189,7 +189,7 @@ def _attempt(
             run, seen = made(parameters)
             return seen.excess, (parameters, run, seen)
 
-        # where it cannot show as asked, its strongest stands
+        # where it cannot reach the tier, keep its strongest form
         found = solve(trial, aim, low, high, begin=begins[f.name], strongest=f.strongest)
         return found or (trial(f.strongest)[1] if kind != "pair" else None)
 
@@ -229,7 +229,7 @@ def _attempt(
 
 
 def _sound(run: Run, pilot: Pilot) -> bool:
-    """Whether this is a drive: moves half of the time, stays below 44 m/s, hits nothing, does not rock to and fro."""
+    """Whether a drive is usable: moves half of the time, stays below 44 m/s, no collision, no oscillation."""
     moving = np.mean(run.true_speed > 0.3) > 0.5
     hit = getattr(pilot, "nearest", 1.0) <= 0
     return bool(moving and not hit and run.true_speed.max() < _TOP_SPEED_MPS and np.abs(run.true_accel).max() < 9.0)

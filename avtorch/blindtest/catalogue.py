@@ -1,8 +1,8 @@
-"""The causes a case may hide: the 22 effects of the table, and families outside of it that a diagnosis cannot name.
+"""The causes that a case may contain: the 22 effects of the table, and families outside the table.
 
-A cause is drawn for a car and a drive with everything but its strength, a number that scales it: 1 is the middle of
-what cars show, towards 0 it vanishes, `strongest` is as far as it goes. Families outside the table are split for
-good: the ones in `CALIBRATION` may serve to calibrate `unknown`, the ones in `SEALED` never do.
+A cause is drawn for a car and a drive, all but its strength, which scales it: 1 is the middle of what cars have, 0 no
+effect, `strongest` the upper limit. Families outside the table are split permanently: those in `CALIBRATION` may serve
+to calibrate `unknown`, those in `SEALED` never do.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ Draw = Callable[[np.random.Generator, Car, DrivePlan], AtStrength]
 class Family:
     """A cause: its `name`, its `place` in the chain, how it is drawn, its `strongest`.
 
-    `by_chance`: nobody can foretell what it does row by row, so no rollout shows it, only the predictive density.
-    `suits`: the manoeuvres in which it can show at all (empty: all of them).
+    `by_chance`: its effect on single rows is random, so no rollout predicts it, only the predictive density shows it.
+    `suits`: the manoeuvres in which it can be visible (empty: all of them).
 
     Example:
         >>> from avtorch.blindtest import Family, family
@@ -52,7 +52,7 @@ def _sign(rng: np.random.Generator) -> float:
 
 
 def _fixed(**keys: float) -> Draw:
-    """Parameters that all grow with the strength."""
+    """Parameters that all scale with the strength."""
     return lambda rng, car, drive: lambda s: {key: value * s for key, value in keys.items()}
 
 
@@ -67,7 +67,7 @@ def _asymmetry(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStreng
 
 
 def _second_order(rng: np.random.Generator, car: Car, drive: DrivePlan) -> AtStrength:
-    # the sum of both lags stays at T_L, so that strength 0 is the car itself
+    # the sum of both lags stays at T_L, so that strength 0 is the unchanged car
     zeta = rng.uniform(0.35, 0.75)
     omega = 2 * zeta / car.T_L
     return lambda s: {"natural_frequency_radps": omega / s, "damping_ratio": zeta / s}
@@ -245,7 +245,7 @@ CALIBRATION: dict[str, Family] = {
         Family("wheel_slip", "sensor", _fixed(slip_s=0.15), 8.0),
     )
 }
-"""Families outside the table that may serve to calibrate `unknown`, by name.
+"""Families outside the table that may be used to calibrate `unknown`, by name.
 
 Example:
     >>> from avtorch.blindtest import CALIBRATION, EFFECTS, SEALED
@@ -265,7 +265,7 @@ SEALED: dict[str, Family] = {
         Family("tyre_radius", "sensor", _fixed(growth=0.03), 5.0),
     )
 }
-"""Families outside the table that never do, by name.
+"""Families outside the table that are never used for calibration, by name.
 
 Example:
     >>> from avtorch.blindtest import SEALED, draw_case

@@ -1,7 +1,7 @@
-"""From the sender to the actuator: a bus that loses and delays messages, and the conditioning of what arrives.
+"""From sender to actuator: a bus that loses and delays messages, and the conditioning of what arrives.
 
-A message is sent with every row of the log. It arrives after a delay of any fraction of a millisecond, in order;
-a lost one never does, and the last value holds. Conditioning sees a value only when it changes.
+One message is sent with every row of the log. Messages arrive in order, each after a delay with sub-millisecond
+resolution; where one is lost, the last value is held. Conditioning is applied only when the value changes.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ Parameters = Mapping[str, Mapping[str, float]]
 class Command:
     """The bus and the conditioning behind it.
 
-    Args: `effects` by name; `lost` (row,) bool, the rows whose message is lost; `start` what acts before the first
-    message arrives [m/s²]; `phase` of a delay that varies [rad].
+    Args: `effects` by name; `lost` (row,) bool, the rows whose message is lost; `start`: command in force before the
+    first message arrives [m/s²]; `phase` of a delay that varies [rad].
     """
 
     def __init__(self, effects: Parameters, *, lost: list[bool] | None, start: float = 0.0, phase: float = 0.0) -> None:
@@ -39,7 +39,7 @@ class Command:
         self.acts = self._conditioned(start)
 
     def take_over(self, earlier: Command) -> Command:
-        """Go on from where `earlier` stands: its value acts until this bus delivers, its queue is not lost."""
+        """Continue from the state of `earlier`: its value is held until this bus delivers, its queue is kept."""
         self._queue = earlier._queue
         self._last = earlier._last
         self.raw, self.acts = earlier.raw, self._conditioned(earlier.raw)
@@ -62,7 +62,7 @@ class Command:
         self._queue.append((self._last, value))
 
     def over(self, time: float) -> float:
-        """What acts in the mean of the millisecond that begins at `time`."""
+        """Mean command in force over the millisecond that begins at `time`."""
         queue = self._queue
         if not queue or queue[0][0] >= time + STEP_S - 1e-12:
             return self.acts
@@ -77,7 +77,7 @@ class Command:
 
 
 def losses(rng: np.random.Generator, rows: int, fraction: float) -> list[bool]:
-    """Which messages are lost: `fraction` of them, in bursts of 1.3 on average (a Gilbert channel)."""
+    """Rows whose message is lost: `fraction` of them, in bursts of 1.3 on average (a Gilbert channel)."""
     if fraction <= 0:
         return [False] * rows
     stay = 1 - 1 / 1.3

@@ -1,4 +1,4 @@
-"""Shuffled decks: shares are kept exactly in every round, the order is random, and any card is known by its place."""
+"""Shuffled decks: exact shares in every round, random order, and any card computed from its index alone."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ROUND = 20
 
 
 def kind_of(index: int, seed: int, mix: Mapping[str, float] = MIX) -> tuple[str, int]:
-    """The kind of case `index`, and how many of its kind come before it in the set `seed`.
+    """The kind of case `index`, and the number of earlier cases of that kind in the set `seed`.
 
     `mix`: shares that sum to 1, kept in every 20 cases (largest remainders). Raises `InputError` for other shares.
     """
@@ -38,6 +38,6 @@ def kind_of(index: int, seed: int, mix: Mapping[str, float] = MIX) -> tuple[str,
 
 
 def card(count: int, seed: int, size: int) -> int:
-    """The `count`-th card of a deck of `size` that is shuffled anew every round."""
+    """The `count`-th card of a deck of `size` that is reshuffled every round."""
     turn, place = divmod(count, size)
     return int(np.random.default_rng([seed, turn, 2]).permutation(size)[place])

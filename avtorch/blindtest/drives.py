@@ -1,4 +1,4 @@
-"""Manoeuvres and who drives them: cruise, following, stop-and-go, steps on a test track, and a recorded command."""
+"""Manoeuvres and their drivers: cruise, following, stop-and-go, steps on a test track, and a recorded command."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ Example:
     [0, 0, 0, 0, 0]
 """
 TYPICAL_SPEED_MPS = {"cruise": 25.0, "following": 16.0, "stop_and_go": 5.0, "steps": 17.0}
-"""Speed around which an effect that depends on speed is drawn."""
+"""Reference speed for effects that depend on speed."""
 ACCEL_MAX_MPS2, ACCEL_MIN_MPS2 = 2.0, -3.5
 
 
 @dataclass(frozen=True)
 class DrivePlan:
-    """A drive to be made: `manoeuvre`, `seconds`, `rate_hz` of the log, `seed` of what the road has in store.
+    """A drive to simulate: `manoeuvre`, `seconds`, `rate_hz` of the log, `seed` of its random events.
 
     Raises `InputError` for an unknown manoeuvre.
 
@@ -68,7 +68,7 @@ class DrivePlan:
             raise InputError(f"manoeuvre: found {self.manoeuvre!r}, needs one of {', '.join(MANOEUVRES)}")
 
     def pilot(self) -> Pilot:
-        """A fresh pilot; two of the same drive do the same as long as the car does."""
+        """A fresh pilot; two pilots of the same drive act identically as long as the car does."""
         rng = np.random.default_rng([self.seed, MANOEUVRES.index(self.manoeuvre)])
         dt = 1 / self.rate_hz
         if self.manoeuvre == "cruise":
@@ -81,7 +81,7 @@ class DrivePlan:
 
 
 def draw_drive(rng: np.random.Generator, *, seconds: float | None = None, manoeuvre: str | None = None) -> DrivePlan:
-    """A drive of any kind; `seconds` and `manoeuvre` narrow it.
+    """Draw a drive; `seconds` and `manoeuvre` fix these instead of drawing them.
 
     Example:
         >>> import numpy as np
@@ -103,7 +103,7 @@ def _clip(u: float) -> float:
 
 
 class _Cruise:
-    """Holds a set speed that the driver changes now and then, by a few metres per second."""
+    """Holds a set speed, which the driver changes occasionally by a few metres per second."""
 
     def __init__(self, rng: np.random.Generator, seconds: float, dt: float) -> None:
         speed, time, knots, speeds = float(rng.uniform(18, 30)), 0.0, [0.0], []
@@ -127,7 +127,7 @@ class _Cruise:
 
 
 class _Follow:
-    """Keeps a time gap behind a vehicle: a linear law on spacing, speeds and its own measured acceleration."""
+    """Keeps a time gap to a leader: a linear law on spacing, both speeds and the measured own acceleration."""
 
     def __init__(self, rng: np.random.Generator, lead: np.ndarray, dt: float) -> None:
         self._lead = lead.tolist()
@@ -138,19 +138,19 @@ class _Follow:
         begin = self._still + self._gap * self.start_speed + float(rng.uniform(-2, 5))
         self._place = (begin + np.concatenate([[0.0], np.cumsum(0.5 * dt * (lead[1:] + lead[:-1]))])).tolist()
         self._radar = (0.1 * rng.standard_normal(len(lead))).tolist()
-        self.nearest = begin  # spacing so far [m]; a collision makes it negative
+        self.nearest = begin  # smallest spacing so far [m]; negative after a collision
 
     def command(self, row: int, time: float, speed: float, accel: float, position: float) -> float:
         spacing = self._place[row] - position
         self.nearest = min(self.nearest, spacing)
         seen, lead = spacing + self._radar[row], self._lead[row]
         if lead < 0.2 and speed < 0.5 and seen < self._still + 2.0:
-            return -0.8  # waits, brake on
+            return -0.8  # stands with the brake on
         pull = self._spring * (seen - self._still - self._gap * speed) + self._match * (lead - speed)
         wish = min(pull, 1.6) - self._damping * accel
         closing = speed - lead
         if closing > 0:
-            # what it takes to match the speed in front with 2 m to spare; a driver does not wait longer than this
+            # deceleration that matches the leader's speed with 2 m to spare; a driver brakes no later than this
             needed = closing * closing / (2 * max(seen - 2.0, 0.3))
             if needed > 0.7:
                 wish = min(wish, -1.3 * needed)
@@ -158,7 +158,7 @@ class _Follow:
 
 
 class _Steps:
-    """Open steps of the command, held for one to six seconds, kept between walking pace and motorway speed."""
+    """Open-loop command steps held for one to six seconds, kept between walking pace and motorway speed."""
 
     def __init__(self, rng: np.random.Generator, seconds: float) -> None:
         count = int(seconds) + 2
@@ -182,7 +182,7 @@ class _Steps:
 
 
 class Recorded:
-    """Sends a recorded command row by row, whatever the car does: an open loop.
+    """Sends a recorded command row by row, whatever the car does: open loop.
 
     Args: `command` (row,) [m/s²]; `start_speed` [m/s].
 

@@ -1,12 +1,13 @@
-"""An effect in front of a recorded car: the command is rewritten, every sample of the response stays real.
+"""Add a known effect to a recorded car: the command is rewritten, and the measured response is kept.
 
-A car with the log `(u, y)` is also, exactly, a car with the effect `E` in front of it and the log `(u', y)`, where
-`E(u') = u`. So a known effect meets a real response, its noise and its sensors, and the untouched log is the control:
-what a diagnosis says of the one and not of the other is what was put in, whatever else the car lacks.
+A car with the log `(u, y)` is exactly equivalent to a car with an effect `E` upstream of it and the log `(u', y)`,
+where `E(u') = u`. This gives a known effect together with a real response, its noise and its sensors; the unchanged log
+is the control. Where the diagnosis of the changed log differs from that of the unchanged one, the difference is due to
+the added effect, whatever else the car lacks.
 
-Effects of the command are inverted exactly. A force `f` on the body is what the car would have done without it,
-`u' = u - (f + T_L df/dt) / K_L` with the lag and gain of the car, which must be given. Effects of the accelerometer
-are put on its reading. Sizes are shares of what the log itself shows, so that size 1 is as plain in any car.
+Effects of the command are inverted exactly. A force `f` on the body is replaced by the equivalent command `u' = u - (f
++ T_L df/dt) / K_L`, with the car's lag and gain, which must be given. Effects of the accelerometer are applied to its
+reading. Sizes are relative to the spread of the logged signals, so that size 1 is equally visible in any car.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from avtorch.io import Log
 Truth = dict[str, float]
 
 _MOVING_MPS = 0.3
-_SMOOTH_S = 0.3  # of the measured speed, before a force is made of it and differentiated
+_SMOOTH_S = 0.3  # smooths the measured speed before a force is computed from it and differentiated
 _GRAVITY = 9.81
 
 
 @dataclass(frozen=True)
 class _Bench:
-    """What an effect needs to know of the log: one array per signal, `T_L` [s], `K_L` [-], draws, size."""
+    """The log as the effects need it: one array per signal, `T_L` [s], `K_L` [-], random draws, size."""
 
     log: Log
     command: FloatArray
@@ -51,7 +52,7 @@ class _Bench:
 
     @property
     def speed(self) -> FloatArray:
-        """Measured speed without most of its noise [m/s]."""
+        """Measured speed with most of its noise filtered out [m/s]."""
         if self.log.speed is None:
             raise InputError(f"{self.log.name}: has no speed, which this effect needs")
         smooth = self.log.speed.copy()
@@ -68,7 +69,7 @@ class _Bench:
         return out
 
     def pushed(self, force: FloatArray) -> Log:
-        """The log of a car on which `force` (row,) [m/s²] acts besides."""
+        """The log of a car with the additional `force` (row,) [m/s²]."""
         slope = np.zeros_like(force)
         for part in self.log.segments():
             if part.stop - part.start > 1:
@@ -79,13 +80,13 @@ class _Bench:
 def put_in_front(
     log: Log, effect: str, *, T_L: float, K_L: float, size: float = 1.0, seed: int = 0
 ) -> tuple[Log, Truth]:
-    """`log` as a car with `effect` besides would have written it, and the effect's parameters.
+    """The log that a car with the additional `effect` would have written, and the effect's parameters.
 
     Args:
         effect: a name of `IN_FRONT`.
-        T_L, K_L: lag [s] and gain [-] of the car, as fitted to the untouched log.
-        size: 1 is plain; see the functions below for what it scales.
-        seed: of what is drawn (moments, roads, gusts, glitches).
+        T_L, K_L: lag [s] and gain [-] of the car, as fitted to the unchanged log.
+        size: 1 is clearly visible; the functions below state what it scales.
+        seed: of the random draws (times, roads, gusts, glitches).
 
     Raises `InputError` for an unknown effect, a log that lacks what it acts on, or a lag, gain or size out of range.
 
@@ -110,7 +111,7 @@ def put_in_front(
 
 # --- effects of the command -------------------------------------------------------------------------------------------
 def _dead_time(x: _Bench) -> tuple[Log, Truth]:
-    """`u'(t) = u(t + delay)`, 0.3 s at size 1, in whole rows; the last rows, whose command is not known, go."""
+    """`u'(t) = u(t + delay)`, 0.3 s at size 1, in whole rows; the last rows, whose command is unknown, are dropped."""
     rows = max(1, round(0.3 * x.size / x.step))
     command, kept = x.command.copy(), np.ones(x.log.rows, bool)
     for part in x.log.segments():
@@ -127,7 +128,7 @@ def _dead_band(x: _Bench) -> tuple[Log, Truth]:
 
 
 def _backlash(x: _Bench) -> tuple[Log, Truth]:
-    """`u' = u + w sign(du/dt)`, w a fifth of the command's SD; where the command rests, the side it came from."""
+    """`u' = u + w sign(du/dt)`, w a fifth of the command's SD; where the command is constant, its last direction."""
     w = 0.2 * x.size * x.spread
     command = x.command.copy()
     for part in x.log.segments():
@@ -148,7 +149,7 @@ def _asymmetry(x: _Bench) -> tuple[Log, Truth]:
 
 # --- effects of the actuator's gain -----------------------------------------------------------------------------------
 def _gain_change(x: _Bench) -> tuple[Log, Truth]:
-    """The gain falls to 0.7 at a moment between 35 and 65 % of the drive."""
+    """The gain falls to 0.7 at a time between 35 and 65 % of the drive."""
     ratio = 0.7**x.size
     first, last = float(x.log.elapsed[0]), float(x.log.elapsed[-1])
     when = first + (last - first) * float(x.rng.uniform(0.35, 0.65))
@@ -157,7 +158,7 @@ def _gain_change(x: _Bench) -> tuple[Log, Truth]:
 
 
 def _speed_dependent_gain(x: _Bench) -> tuple[Log, Truth]:
-    """The gain rises or falls by half over one mean speed; nowhere below 0.3."""
+    """The gain changes by half over one mean speed, up or down; never below 0.3."""
     v = x.speed
     slope = 0.5 * x.size * (1 if x.rng.random() < 0.5 else -1)
     mean = float(v[x.log.usable].mean())
@@ -167,7 +168,7 @@ def _speed_dependent_gain(x: _Bench) -> tuple[Log, Truth]:
 
 # --- forces on the body -----------------------------------------------------------------------------------------------
 def _resistance(x: _Bench) -> tuple[Log, Truth]:
-    """A quarter of the command's SD, while moving."""
+    """Resistance of a quarter of the command's SD while the car moves."""
     r = 0.25 * x.size * x.spread
     force = np.full(x.log.rows, -r)
     if x.log.speed is not None:
@@ -176,14 +177,14 @@ def _resistance(x: _Bench) -> tuple[Log, Truth]:
 
 
 def _drag(x: _Bench) -> tuple[Log, Truth]:
-    """0.3 of the command's SD at the 90th percentile of speed."""
+    """Drag of 0.3 of the command's SD at the 90th percentile of speed."""
     v = x.speed
     c = 0.3 * x.size * x.spread / float(np.quantile(v[x.log.usable], 0.9)) ** 2
     return x.pushed(-c * v**2), {"drag_per_m": c}
 
 
 def _grade(x: _Bench) -> tuple[Log, Truth]:
-    """A sine over the way, a sixth to a third of it long, with 0.35 of the command's SD in amplitude."""
+    """A sine over distance, its wavelength a sixth to a third of the drive, its amplitude 0.35 of the command's SD."""
     way = x.along()
     wave = float(way.max()) * float(x.rng.uniform(1 / 6, 1 / 3))
     pull = 0.35 * x.size * x.spread
@@ -192,7 +193,7 @@ def _grade(x: _Bench) -> tuple[Log, Truth]:
 
 
 def _gust(x: _Bench) -> tuple[Log, Truth]:
-    """A coloured force of 0.3 of the command's SD and 3 s."""
+    """A coloured force: SD 0.3 of the command's, time constant 3 s."""
     sd, keep = 0.3 * x.size * x.spread, float(np.exp(-x.step / 3.0))
     kicks = x.rng.normal(size=x.log.rows) * sd * np.sqrt(1 - keep**2)
     kicks[0] = x.rng.normal() * sd
@@ -207,20 +208,20 @@ def _accel(x: _Bench) -> FloatArray:
 
 
 def _sensor_bias(x: _Bench) -> tuple[Log, Truth]:
-    """A quarter of the reading's SD."""
+    """An offset of a quarter of the reading's SD."""
     a = _accel(x)
     bias = 0.25 * x.size * float(a[x.log.usable].std())
     return replace(x.log, accel=a + bias), {"bias_mps2": bias}
 
 
 def _sensor_scale(x: _Bench) -> tuple[Log, Truth]:
-    """1.2 of what it should read."""
+    """A reading of 1.2 times the true value."""
     scale = 1.2**x.size
     return replace(x.log, accel=_accel(x) * scale), {"scale": scale}
 
 
 def _sensor_lag(x: _Bench) -> tuple[Log, Truth]:
-    """A first-order filter of 0.4 s."""
+    """A first-order filter with a time constant of 0.4 s."""
     a, lag = _accel(x).copy(), 0.4 * x.size
     keep = float(np.exp(-x.step / lag))
     for part in x.log.segments():
@@ -229,7 +230,7 @@ def _sensor_lag(x: _Bench) -> tuple[Log, Truth]:
 
 
 def _outliers(x: _Bench) -> tuple[Log, Truth]:
-    """One row in fifty with twice the reading's SD on top."""
+    """One row in fifty is off by about twice the reading's SD."""
     a = _accel(x)
     sd = 2.0 * x.size * float(a[x.log.usable].std())
     hit = x.rng.random(x.log.rows) < 0.02
@@ -252,7 +253,7 @@ IN_FRONT: Mapping[str, Callable[[_Bench], tuple[Log, Truth]]] = {
     "sensor_lag": _sensor_lag,
     "outliers": _outliers,
 }
-"""Effects that can be put in front of a recording, by name; the last four need `accel`.
+"""Effects that can be added to a recording, by name; the last four need `accel`.
 
 Example:
     >>> from avtorch.blindtest import EFFECTS, IN_FRONT

@@ -1,4 +1,4 @@
-"""Intervals of 90 % around what a test of finite size found: Wilson for shares, the bootstrap for the rest."""
+"""90 % intervals of test results: Wilson's for shares, the bootstrap for other measures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LEVEL = 0.90
 
 
 def wilson(hits: int, trials: int, level: float = LEVEL) -> Interval | None:
-    """Wilson's score interval of a share; None without a trial. Wilson, J. Am. Stat. Assoc. 22 (1927) 209."""
+    """Wilson's score interval of a share; None without trials. Wilson, J. Am. Stat. Assoc. 22 (1927) 209."""
     if trials == 0:
         return None
     z = NormalDist().inv_cdf(0.5 + level / 2)
@@ -33,7 +33,7 @@ def bootstrap(
     seed: int,
     level: float = LEVEL,
 ) -> Interval | None:
-    """Percentile bootstrap of `measure(index)` over `cases` drawn with replacement; None where it has no value."""
+    """Percentile bootstrap of `measure(index)` over `cases` drawn with replacement; None where it is undefined."""
     if cases == 0:
         return None
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""What a set of answers to sealed cases is worth: every measure of `blindtest.json`, with its 90 % interval."""
+"""Scores of a set of answers to sealed cases: every measure of `blindtest.json`, with its 90 % interval."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ def score(
 ) -> dict[str, Any]:
     """Measures of the answers (dicts of `avtorch.diagnosis/1`, None where there is none) to the cases of `truths`.
 
-    Keys as in `blindtest.json`, and beside them `confident_errors`, `alias_set.by_tier`, `counts` (how many cases
-    stand behind a measure) and `intervals` (the same keys, `[low, high]` of 90 %). None where no case bears on a
-    measure.
+    The keys are those of `blindtest.json`, and also `confident_errors`, `alias_set.by_tier`, `counts` (the number of
+    cases behind each measure) and `intervals` (the same keys, `[low, high]` of 90 %). A measure to which no case
+    applies is None.
 
-    - `top1` by tier, `alias_set`: single effects only. `false_alarm`: cases without a cause answered by anything but
-      `none`. `pairs_exact`, `pairs_jaccard`: pairs.
-    - `unknown_auroc`, `unknown_fpr95`: the probability of `unknown`, causes outside the table against all other
-      cases. `unknown_confidently_blamed`: share of the former that give a named effect or pair 0.5 or more.
-    - `confident_errors`, `ece` (ten bins of the probability of the most probable candidate), `brier`: all cases.
-    - `macro_f1`: over the labels that occur, an effect found within a pair counts for that effect.
+    - `top1` by tier, `alias_set`: single effects only. `false_alarm`: share of the cases without a cause for which the
+      verdict is not `none`. `pairs_exact`, `pairs_jaccard`: pairs.
+    - `unknown_auroc`, `unknown_fpr95`: the probability of `unknown`, causes outside the table against all other cases.
+      `unknown_confidently_blamed`: share of the former in which a named effect or pair has probability 0.5 or more.
+    - `confident_errors`, `ece` (ten bins of the highest probability), `brier`: all cases.
+    - `macro_f1`: over the labels that occur; an effect found within a pair counts for that effect.
     - `closed_error`, `closed_covered` (by the 90 % interval), `onset_error_s` (median): where the verdict is right.
-      `placebo_closed`: mean over the answers that tell one, `placebo_nothing`: how often its interval reaches 0.
+      `placebo_closed`: mean over the answers that report one; `placebo_nothing`: how often its interval reaches 0.
     - `where_overlap`: median intersection over union of true and named parts, where the cause acts in a known part;
-      `where_nowhere`: share of cases without a cause of which no part is named.
+      `where_nowhere`: share of the cases without a cause in which no part is named.
 
-    Args: `seconds` each answer took. `resamples`, `seed` of the bootstrap. Raises `InputError` for lengths that
+    Args: `seconds` that each answer took. `resamples`, `seed` of the bootstrap. Raises `InputError` for lengths that
     differ and for answers that break the schema.
 
     Example:
@@ -99,7 +99,7 @@ def score(
 
 
 def auroc(rows: Rows) -> float | None:
-    """Chance that a cause outside the table is given more `unknown` than any other case is; None without both."""
+    """Probability that a cause outside the table gets more `unknown` than another case does; None without both."""
     outside = np.array([r.kind == "outside" for r in rows])
     ins, outs = int((~outside).sum()), int(outside.sum())
     if not ins or not outs:
@@ -109,7 +109,7 @@ def auroc(rows: Rows) -> float | None:
 
 
 def fpr95(rows: Rows) -> float | None:
-    """Share of the other cases that a threshold on `unknown` accuses which finds 95 % of the outside ones."""
+    """False-positive rate of the threshold on `unknown` that detects 95 % of the causes outside the table."""
     outside = np.array([r.kind == "outside" for r in rows])
     if outside.all() or not outside.any():
         return None
@@ -124,7 +124,7 @@ def _unknown(rows: Rows) -> FloatArray:
 
 
 def ece(rows: Rows, bins: int = 10) -> float | None:
-    """Expected calibration error: distance of confidence from the share of right answers, over equal bins."""
+    """Expected calibration error: mean difference between confidence and the share of right answers, in equal bins."""
     if not rows:
         return None
     confidence = np.array([r.confidence for r in rows])
@@ -152,7 +152,7 @@ def _jaccard(r: Answered) -> float:
 
 
 class _Sheet:
-    """Measures as they are taken, with how many cases stand behind each and its interval; dots make nested dicts."""
+    """Collects measures, each with its number of cases and its interval; dots in a key make nested dicts."""
 
     def __init__(self, resamples: int, seed: int) -> None:
         self.values: dict[str, Any] = {}
@@ -184,7 +184,7 @@ class _Sheet:
         self._put(key, float(known.mean()) if len(known) else None, len(known), interval)
 
     def measure(self, key: str, rows: Rows, of: Callable[[Rows], float | None]) -> None:
-        """Any measure of rows, bootstrapped over them."""
+        """Any measure of rows, with a bootstrap interval."""
         interval = bootstrap(
             lambda index: of([rows[i] for i in index.tolist()]), len(rows), resamples=self._resamples, seed=self._seed
         )

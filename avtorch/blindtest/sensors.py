@@ -1,6 +1,6 @@
-"""What the log's acceleration and speed make of the true ones: filters at 1 kHz, faults at each row.
+"""From true to logged acceleration and speed: filters at 1 kHz, sensor faults at each row.
 
-Noise is not added here, so that the same chain tells what a noise-free car would have logged.
+Noise is added elsewhere, so that the same chain also gives the readings of a noise-free car.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _lag(p: Mapping[str, float], start: float) -> Filter:
 
 
 def _pitch(p: Mapping[str, float], start: float) -> Filter:
-    """The body nods when the acceleration changes, and the sensor feels gravity's share of it."""
+    """Body pitch follows changes of acceleration; the sensor measures the resulting component of gravity."""
     omega, zeta = 2 * math.pi * p["frequency_hz"], 0.25
     damped, decay = omega * math.sqrt(1 - zeta**2), math.exp(-zeta * omega * STEP_S)
     turn = decay * complex(math.cos(damped * STEP_S), math.sin(damped * STEP_S))
@@ -52,9 +52,9 @@ _FILTERS = {"pitch_coupling": _pitch, "sensor_lag": _lag}
 
 
 class Readings:
-    """The row's readings without noise, from the records of the millisecond grid.
+    """A row's noise-free readings from the millisecond grid.
 
-    Args: `effects`; `rng` by name; `reach` [m] and `seconds` of the drive; `onset` [s], from which drifts count.
+    Args: `effects`; `rng` by name; `reach` [m] and `seconds` of the drive; `onset` [s], from which drifts grow.
     """
 
     def __init__(self, effects: Parameters, rng: Streams, *, reach: float, seconds: float, onset: float) -> None:
@@ -69,7 +69,7 @@ class Readings:
         self._seconds, self._onset = seconds, onset
 
     def lateness(self, time: float) -> float:
-        """Age of the readings [s]: 0 unless the sensors' clock drifts; it is set right now and then."""
+        """Age of the readings [s]: 0 unless the sensors' clock drifts; the drift is reset at intervals."""
         if self._clock is None:
             return 0.0
         period = self._clock["reset_s"]
@@ -78,7 +78,7 @@ class Readings:
     def accel(self, a: float, position: float, time: float) -> float:
         """Reading for the filtered acceleration `a` [m/s²]."""
         if self._hum is not None:
-            # engine order: its frequency rises with speed and lies above what the log's rate can hold
+            # engine order: its frequency rises with speed and exceeds the log's Nyquist frequency
             turns = self._hum["turns_per_m"] * position + self._hum["idle_hz"] * time
             a += self._hum["amplitude_mps2"] * math.sin(2 * math.pi * turns + self._phase)
         return self._scale * a + self._bias

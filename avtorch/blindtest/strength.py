@@ -1,4 +1,4 @@
-"""How strong a cause must be to show as plainly as asked: a search over strength, each trial a drive."""
+"""The strength at which a cause has a given visibility: a search in which each trial simulates one drive."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from avtorch.blindtest.visibility import TIERS
 
 T = TypeVar("T")
 _TRIALS = 9
-_DOMINANT = 12.0  # visibility of the most dominant cases drawn
+_DOMINANT = 12.0  # visibility of the strongest cases drawn
 
 
 def excess_range(tier: str) -> tuple[float, float]:
-    """The `excess` (cause over noise) of a tier, the easy one ended at visibility 12."""
+    """The `excess` (cause over noise) of a tier; the easy tier ends at visibility 12."""
     low, high = TIERS[tier]
     return math.sqrt(low**2 - 1), math.sqrt(min(high, _DOMINANT) ** 2 - 1)
 
@@ -22,11 +22,11 @@ def excess_range(tier: str) -> tuple[float, float]:
 def solve(
     trial: Callable[[float], tuple[float, T]], aim: float, low: float, high: float, *, begin: float, strongest: float
 ) -> T | None:
-    """The trial whose excess falls in [`low`, `high`), near `aim`; None where no strength up to `strongest` gives it.
+    """The trial whose excess falls in [`low`, `high`), near `aim`; None where no strength up to `strongest` reaches it.
 
-    `trial(strength)` returns the excess and whatever belongs to it; `begin` is the first strength tried. The excess
-    grows about in proportion to the strength: the next guess comes by proportion, then between the nearest two trials
-    in the logarithm.
+    `trial(strength)` returns the excess and the trial's result; `begin` is the first strength tried. The excess is
+    roughly proportional to the strength: the next strength is first scaled in proportion, then interpolated
+    logarithmically between the nearest two trials.
     """
     strength = min(begin, strongest)
     below: tuple[float, float] | None = None

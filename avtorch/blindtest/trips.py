@@ -1,4 +1,4 @@
-"""Speeds of a vehicle in front: made-up trips of the kind of the WLTC, stop-and-go queues, and the US06 cycle."""
+"""Leader speeds: synthetic trips similar to the WLTC, stop-and-go queues, and the US06 cycle."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SMOOTH_S = 0.7
 
 
 def trip(rng: np.random.Generator, seconds: float, dt: float) -> FloatArray:
-    """Town, road and motorway in turn, (row,) [m/s]: pulls, holds that wander, slow-downs, now and then a stop."""
+    """Town, road and motorway in turn, (row,) [m/s]: accelerations, holds with drift, slow-downs, occasional stops."""
     knots, speeds, time = [0.0], [float(rng.uniform(8, 20))], 0.0
     kind = int(rng.integers(3))
     left = float(rng.uniform(40, 120))
@@ -36,7 +36,7 @@ def trip(rng: np.random.Generator, seconds: float, dt: float) -> FloatArray:
 
 
 def queue(rng: np.random.Generator, seconds: float, dt: float) -> FloatArray:
-    """Stop-and-go, (row,) [m/s]: short pulls to 2 to 12 m/s, stops of a few seconds."""
+    """Stop-and-go, (row,) [m/s]: short accelerations to 2 to 12 m/s, stops of a few seconds."""
     knots, speeds, time = [0.0], [float(rng.uniform(3, 8))], 0.0
     while time < seconds:
         target = float(rng.uniform(2, 12)) if speeds[-1] < 1.5 or rng.random() < 0.4 else float(rng.uniform(0, 1.5))
@@ -51,7 +51,7 @@ def queue(rng: np.random.Generator, seconds: float, dt: float) -> FloatArray:
 
 
 def us06(rng: np.random.Generator, seconds: float, dt: float) -> FloatArray:
-    """A stretch of the US06 cycle that begins anywhere and starts anew at its end, (row,) [m/s]."""
+    """A stretch of the US06 cycle from a random start, repeated from its beginning after its end, (row,) [m/s]."""
     grid = np.arange(0, seconds + 1, dt) + rng.uniform(0, len(US06_SPEED_MPS))
     table = np.asarray(US06_SPEED_MPS, float)
     speed = np.interp(grid, np.arange(len(table)), table, period=len(table))
@@ -59,7 +59,7 @@ def us06(rng: np.random.Generator, seconds: float, dt: float) -> FloatArray:
 
 
 def _smooth(speed: FloatArray, rng: np.random.Generator, dt: float) -> FloatArray:
-    """Rounded corners, and a driver's small wandering, which dies away towards a stop."""
+    """Smoothed corners, and a driver's small random variation, which vanishes towards a stop."""
     wander = gaussian_filter1d(coloured(rng, len(speed), float(rng.uniform(0.2, 0.7)), 6.0, dt), 0.8 / dt)
     rounded = gaussian_filter1d(speed, _SMOOTH_S / dt)
     return np.asarray(np.maximum(rounded + wander * np.clip(rounded / 5.0, 0.0, 1.0), 0.0))

@@ -1,12 +1,12 @@
 """The reference vehicle: a car simulated millisecond by millisecond, in plain Python, with or without effects.
 
-It shares no code with the diagnosis. Every millisecond runs the chain bus, conditioning, powertrain and brake, body,
-sensors for one car in plain numbers (about 2 us each; a batch in NumPy costs as much a car and makes every case
-depend on its batch); what does not depend on the state is drawn beforehand in whole arrays. With no effect on, the
+It shares no code with the diagnosis. Every millisecond one car runs through the chain bus, conditioning, powertrain and
+brake, body, sensors in plain numbers (about 2 us each; a batch in NumPy costs as much per car and makes every case
+depend on its batch). What does not depend on the state is drawn beforehand in whole arrays. With no effect on, the
 command held and no noise, its acceleration is GLVD's zero-order-hold solution.
 
-Process noise is jerk noise through the actuation lag, added behind the actuator: in GLVD the two are the same, and so
-the noise-free answer to the very command of the log is known to the last digit, whatever the effects.
+Process noise is jerk noise through the actuation lag, added downstream of the actuator. In GLVD the two are equivalent,
+so the noise-free response to the logged command is known to machine precision, whatever the effects.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from avtorch.errors import InputError
 
 
 class Pilot(Protocol):
-    """Who drives: sees what the car measures, sends one command a row."""
+    """A driver: reads the car's measurements and sends one command per row."""
 
     start_speed: float
 
     def command(self, row: int, time: float, speed: float, accel: float, position: float) -> float:
-        """The command of a row [m/s²]; `speed` and `accel` as measured, `position` [m] true (a radar's view)."""
+        """The command of a row [m/s²]; `speed` and `accel` as measured, `position` [m] true (as from a radar)."""
         ...
 
 
@@ -41,12 +41,11 @@ class Pilot(Protocol):
 class Run:
     """A drive of the reference vehicle, every field (row,).
 
-    `time`, `command`, `accel`, `speed`: what the log shows. `noise_accel`: the part of `accel` that is process and
-    sensor noise. `noise_speed`: the part of `speed` that is sensor noise and rounding; `drift_speed`: what process
-    noise has summed to since the drive began. `chance_accel`, `chance_speed`: the part that comes of an effect but
-    that nobody can foretell (gusts, outliers), the latter summed likewise. `felt_accel`: what a late or wrongly scaled
-    accelerometer shows of process noise and gusts beyond the noise itself.
-    `true_accel`, `true_speed`, `position`: the car's own.
+    `time`, `command`, `accel`, `speed`: the logged signals. `noise_accel`: the part of `accel` that is process and
+    sensor noise. `noise_speed`: the part of `speed` that is sensor noise and rounding; `drift_speed`: process noise
+    integrated since the start of the drive. `chance_accel`, `chance_speed`: the unpredictable part of an effect (gusts,
+    outliers), the latter also integrated. `felt_accel`: how far the reading of process noise and gusts by a lagging or
+    wrongly scaled accelerometer differs from these themselves. `true_accel`, `true_speed`, `position`: the car's own.
 
     Example:
         >>> import numpy as np
@@ -84,8 +83,8 @@ def simulate(
     """Drive `car` for `seconds`, logged at `rate_hz` (a divisor of 1000); `effects` are on from `onset` [s].
 
     Args: `effects`: parameters by name (`avtorch.blindtest.catalogue` draws them). The same `seed` gives the same
-    noise, the same road and the same losses, whatever the effects are. Raises `InputError` for a rate that does not
-    divide 1000, fewer than two rows, or an onset outside the drive.
+    noise, road and lost messages, whatever the effects. Raises `InputError` for a rate that does not divide 1000, fewer
+    than two rows, or an onset outside the drive.
 
     Example:
         >>> import numpy as np
@@ -107,7 +106,7 @@ def simulate(
 
 
 class _Drive:
-    """One drive while it is being made."""
+    """The state of one simulated drive."""
 
     def __init__(
         self,
@@ -122,9 +121,9 @@ class _Drive:
         self.car, self.pilot, self.effects, self.seed = car, pilot, effects, seed
         self.rows, self.per_row, self.steps = rows, per_row, rows * per_row
         self.seconds, self.onset = self.steps * STEP_S, onset
-        # an effect begins with a row: 0 means that the car never was without it
+        # an effect begins at a row: at row 0 the car has it from the start
         self.first = int(np.ceil(onset / (per_row * STEP_S) - 1e-9))
-        # without the effects' own limits a car does 45 m/s at most
+        # without speed limits from the effects, a car reaches 45 m/s at most
         self.reach = 45.0 * self.seconds
 
     def stream(self, name: str) -> np.random.Generator:
@@ -172,7 +171,7 @@ class _Drive:
                         ahead += force(expected, position, time + STEP_S)
                 new = speed + half * (total + ahead)
                 if new <= 0.0:
-                    # at rest the brake holds whatever pushes back; it lets go when the sum pulls forward
+                    # at rest the brake balances any backward force; it is released when the sum pulls forward
                     new, shown = 0.0, 0.0
                 else:
                     shown = ahead
@@ -188,7 +187,7 @@ class _Drive:
         return self._logged(commands, seen_a, seen_v, accels, speeds, places)
 
     def _draw(self) -> None:
-        """Everything that chance decides whatever the car does."""
+        """Draw all random signals that do not depend on the car's motion."""
         car, steps = self.car, self.steps
         self.process = coloured(self.stream("process"), steps, car.process_sd, car.T_L)
         gust = self.effects.get("gust")
@@ -196,7 +195,7 @@ class _Drive:
         if gust is not None:
             begin = self.first * self.per_row
             wind = coloured(self.stream("gust"), steps, gust["sd_mps2"], gust["time_constant_s"])[begin:]
-            if begin:  # rises from a calm
+            if begin:  # wind rises gradually from zero
                 wind *= -np.expm1(-STEP_S * np.arange(len(wind)) / gust["time_constant_s"])
             self.gust[begin:] = wind
         self.base_accel = car.accel_sd * self.stream("accelerometer").standard_normal(self.rows)
@@ -206,14 +205,14 @@ class _Drive:
         if heavy is not None:
             rng = self.stream("outliers")
             hit = (rng.random(self.rows) < heavy["fraction"]) & (np.arange(self.rows) >= self.first)
-            # glitches of either sign, of a size that varies by a factor of two
+            # glitches of either sign, their size varying by about a factor of two
             size = heavy["scale"] * car.accel_sd * rng.uniform(0.6, 1.4, self.rows) * rng.choice([-1.0, 1.0], self.rows)
             self.white_accel[hit] += size[hit]
 
     def _chain(
         self, effects: Mapping[str, Mapping[str, float]], earlier: Command | None, a_out: float, shown: float
     ) -> None:
-        """The chain with these effects, in the state the earlier one is in."""
+        """Build the chain with these effects, starting from the state of the earlier chain."""
         lost = None
         if "command_hold" in effects:
             lost = losses(self.stream("command_hold"), self.rows, effects["command_hold"]["hold_fraction"])
@@ -236,7 +235,7 @@ class _Drive:
         speeds: list[float],
         places: list[float],
     ) -> tuple[float, float]:
-        """The row's readings of acceleration and speed, sensor noise apart."""
+        """The row's readings of acceleration and speed, without sensor noise."""
         late = sensors.lateness(time)
         if late <= 0.0:
             a, v, raw, place = filtered[-1], speeds[-1], accels[-1], places[-1]
@@ -248,7 +247,7 @@ class _Drive:
         return sensors.accel(a, place, time), sensors.speed(v, raw, place, time)
 
     def _felt(self) -> FloatArray:
-        """(row,): process noise and gusts through the accelerometer's lag and scale, less themselves."""
+        """(row,): accelerometer reading of process noise and gusts, with lag and scale, minus these themselves."""
         begin, rows = self.first * self.per_row, np.arange(self.rows) * self.per_row
         motion = self.process + self.gust
         shown = motion.copy()

@@ -1,16 +1,17 @@
-r"""How plainly a log shows that something is amiss: rollout error over noise.
+r"""How visible a cause is in a log: rollout error relative to noise.
 
-GLVD, refitted to the noise-free drive (`T_L`, `K_L`), answers the logged command: over the whole drive for the
-acceleration, whose start is forgotten within a few lags; for the speed, from a new true start every 10 s (and after
-every standstill). With `e` what then remains between log and rollout, noise apart, and `n` the process and sensor
-noise itself, both RMS over the rows that move (speed of 0.3 m/s or more), the visibility in one channel is
+GLVD, refitted to the noise-free drive (`T_L`, `K_L`), is rolled out over the logged command: over the whole drive for
+the acceleration, whose initial value is forgotten within a few lags; for the speed, from a new true start every 10 s
+(and after every standstill). Let `e` be the remaining difference between log and rollout, without noise, and `n` the
+process and sensor noise itself, both RMS over the rows that move (speed of 0.3 m/s or more). The visibility in one
+channel is
 
     sqrt(n² + e²) / n
 
-the rollout error of the refitted GLVD over the error it would have if the cause were not there; the larger of the two
-values counts, of those that are in the log. Drawn by chance (`gust`, `outliers`, `command_hold`), `e` is no less there,
-but no rollout of any model takes it away: for these the number says how much the predictive density loses, exp(loss of
-the mean log density of a Gaussian error whose size is refitted), which is the same ratio.
+the rollout error of the refitted GLVD over the error that it would have without the cause; the visibility of a log is
+the largest over its channels. For random effects (`gust`, `outliers`, `command_hold`), `e` is present too, but no
+model's rollout removes it: for these the number measures the loss of predictive density, exp(loss of the mean log
+density of a Gaussian error whose size is refitted), which is the same ratio.
 
 Tiers: easy from 3 on, medium 1.6 to 3, hard 1.15 to 1.6, faint 1.02 to 1.15; below 1.02 there is no tier (None).
 """
@@ -28,7 +29,7 @@ from avtorch.arrays import BoolArray, FloatArray
 from avtorch.blindtest.vehicle import Run
 
 TIERS = {"easy": (3.0, np.inf), "medium": (1.6, 3.0), "hard": (1.15, 1.6), "faint": (1.02, 1.15)}
-"""Bounds of visibility by tier: how many times larger the error of rollouts is without the effect than with it.
+"""Bounds of visibility by tier: the rollout error of a model without the effect over that of one with it.
 
 Example:
     >>> from avtorch.blindtest import TIERS, tier_of
@@ -36,7 +37,7 @@ Example:
     True
 """
 HORIZON_S = 10.0
-_SETTLED_S = 2.0  # of a drive, in which no log tells what the actuator was at before
+_SETTLED_S = 2.0  # start of a drive, in which no log identifies the actuator's initial state
 _MOVING_MPS = 0.3
 _LAGS_S = (0.02, 3.0)
 
@@ -61,8 +62,8 @@ def glvd_response(command: FloatArray, dt: float, T_L: float, K_L: float) -> Flo
 
 @dataclass(frozen=True)
 class Sight:
-    """What a drive shows. `accel`, `speed`: visibility in one channel, 1 in one that is not logged; `T_L`, `K_L`: GLVD
-    refitted to the drive.
+    """Visibility in a drive. `accel`, `speed`: visibility by channel, 1 for a channel that is not logged; `T_L`, `K_L`:
+    GLVD refitted to the drive.
 
     Example:
         >>> from avtorch.blindtest import Sight
@@ -78,17 +79,17 @@ class Sight:
 
     @property
     def most(self) -> float:
-        """Visibility in the channel that shows more."""
+        """The larger of the two visibilities."""
         return max(self.accel, self.speed)
 
     @property
     def excess(self) -> float:
-        """`e / n` of that channel: grows about in proportion to the strength of the cause."""
+        """`e / n` of that channel, roughly proportional to the strength of the cause."""
         return float(np.sqrt(max(self.most**2 - 1.0, 0.0)))
 
 
 def chunks(run: Run) -> Iterator[slice]:
-    """Stretches of a drive from which the speed is rolled out: 2 to 10 s, moving throughout."""
+    """Stretches of a drive over which the speed is rolled out: 2 to 10 s, moving throughout."""
     moving = run.true_speed >= _MOVING_MPS
     dt = float(run.time[1] - run.time[0])
     longest, shortest = round(HORIZON_S / dt), round(2.0 / dt)
@@ -112,7 +113,7 @@ class _Witnesses:
         self.inside, self._first = inside, first
 
     def since_start(self, speed: FloatArray) -> FloatArray:
-        """Change of a speed since the stretch began."""
+        """Change of a speed since the start of its stretch."""
         return speed - speed[self._first]
 
     def rms_accel(self, error: FloatArray) -> float:
@@ -123,7 +124,7 @@ class _Witnesses:
 
 
 def exact_gain(command: FloatArray, dt: float, T_L: float) -> tuple[FloatArray, FloatArray]:
-    """Acceleration and speed (row,) of GLVD with gain 1 from rest: both exact, also where the command jumps."""
+    """Acceleration and speed (row,) of GLVD with gain 1 from rest, both exact even where the command jumps."""
     accel = glvd_response(command, dt, T_L, 1.0)
     # dv = u dt - T (a_next - a): the integral of GLVD's equation over a row
     step = command * dt
@@ -132,7 +133,7 @@ def exact_gain(command: FloatArray, dt: float, T_L: float) -> tuple[FloatArray, 
 
 
 def sight(run: Run, signals: Sequence[str] = ("accel", "speed")) -> Sight:
-    """How plainly the drive differs from any GLVD in the channels `signals`; the head of this file says how.
+    """Visibility in the channels `signals`: the difference of the drive from the best-fitting GLVD (module docstring).
 
     Example:
         >>> from avtorch.blindtest import Car, DrivePlan, sight, simulate
@@ -173,8 +174,8 @@ def sight(run: Run, signals: Sequence[str] = ("accel", "speed")) -> Sight:
 class Oracle:
     """Rollout errors (RMS) of one channel: of the refitted GLVD, and of a model that knows cause and parameters.
 
-    `closed` is what knowing the cause closes of the gap, None where there is none to close (`before` within 10 % of
-    `floor`).
+    `closed`: the share of the gap that knowledge of the cause closes; None where there is no gap (`before` within 10 %
+    of `floor`).
 
     Example:
         >>> from avtorch.blindtest import Oracle
@@ -197,14 +198,14 @@ class Oracle:
 def oracles(run: Run, fitted: Sight, *, foretold: bool) -> dict[str, Oracle]:
     """`rollout_rmse_accel` [m/s²] and `rollout_rmse_speed` [m/s], over 10 s from a measured value, by metric.
 
-    Of rows that move, from 2 s on. `foretold`: False where the cause decides by chance what the car does with its
-    command (lost messages), so that knowing it helps no rollout. Gusts and outliers are left to the floor, whose share
-    of the log is known.
+    Over moving rows, from 2 s on. `foretold`: False where the response to the command is random (lost messages), so
+    that knowing the cause improves no rollout. Gusts and outliers count towards the floor, as their contribution to the
+    log is known.
     """
     dt = float(run.time[1] - run.time[0])
     judged = (run.true_speed >= _MOVING_MPS) & (run.time >= run.time[0] + _SETTLED_S)
     unit_a, unit_v = exact_gain(run.command, dt, fitted.T_L)
-    # what an acceleration began with dies away with the lag
+    # the error of an initial acceleration decays with the lag
     keeps = float(np.exp(-dt / fitted.T_L))
     before_a = _from_all_starts(run.accel - fitted.K_L * unit_a, judged, dt, keeps)
     before_v = _from_all_starts(run.speed - fitted.K_L * unit_v, judged, dt)
@@ -222,10 +223,10 @@ def oracles(run: Run, fitted: Sight, *, foretold: bool) -> dict[str, Oracle]:
 
 
 def _from_all_starts(error: FloatArray, rows: BoolArray, dt: float, keeps: float = 1.0) -> float:
-    """RMS of the error over rollouts of up to 10 s, begun at a measured value at every one of the `rows`, of which a
-    share `keeps` is left after each.
+    """RMS of the error over rollouts of up to 10 s, one from a measured value at each of the `rows`; a share `keeps` of
+    the initial error remains after each row.
 
-    A minute has six rollouts one after another, and what noise does to the speeds that they begin at would decide.
+    With rollouts one after another a minute would hold only six, and the noise of their initial speeds would dominate.
     """
     length, shortest = round(HORIZON_S / dt), round(2.0 / dt)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], rows.astype(int), [0]])))
@@ -242,7 +243,7 @@ def _from_all_starts(error: FloatArray, rows: BoolArray, dt: float, keeps: float
 
 
 def _faded(x: FloatArray, length: int, keeps: float) -> FloatArray:
-    """Sums over the last `length` rows, each times `keeps` to the power of its age."""
+    """Sums over the last `length` rows, each weighted by `keeps` to the power of its age."""
     if keeps == 1.0:
         total = np.concatenate([[0.0], np.cumsum(x)])
         at = np.arange(len(x)) + 1
