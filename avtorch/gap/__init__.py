@@ -1,4 +1,4 @@
-"""What the simulator lacks: effects along the chain command, actuator, body, sensor, and plants made of them.
+"""What the simulator lacks: effects along the chain command, actuator, body, sensor, and plants composed of them.
 
 Example:
     >>> from avtorch import Leader, diagnose, simulate

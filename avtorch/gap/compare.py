@@ -1,13 +1,13 @@
-"""Did a change to the car or to the simulator help? Two sets of drives, held against each other.
+"""Test whether a change to the car or to the simulator helped, from two sets of drives.
 
-The car: `T_L` and `K_L` are fitted to each set. How far such estimates differ between drives of one and the same car is
-told by blocks of the drives, each of which pulls at the estimate its own way (the sandwich of White 1982), never less
-than the posterior has it. So what the model lacks, and the manoeuvre brings out more or less, counts as spread and not
-as a change.
+The car: `T_L` and `K_L` are fitted to each set. Their spread between drives of one car is estimated from the blocks of
+the drives, each of which contributes its own score (the sandwich estimator of White 1982), and is never less than the
+posterior's. Differences that a missing effect causes between manoeuvres therefore count as spread, not as a change.
 
-Where they differ, a later answer of the car is tried as a rival account (`delay_rival`): it looks like a longer lag.
+Where `T_L` or `K_L` differ, a change of dead time is tested as a rival explanation (`delay_rival`), because it
+resembles a longer lag.
 
-The simulator: rollout errors over both sets, and their ratio over blocks drawn anew.
+The simulator: rollout errors over both sets, and their ratio over bootstrapped blocks.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from avtorch.io import Log
 Simulator = GapPlant | str | PathLike[str] | None
 
 LEVEL = 0.04
-"""Chance at which one car's drives are said to be of two: so that "no change" is right in more than 95 % of them."""
+"""Significance level: with one car, "no change" is the right answer in more than 95 % of comparisons."""
 _DRAWS = 2000
 _CAR = ("T_L", "K_L")
-_LEAST = 5  # blocks of 10 s
+_LEAST = 5  # fewest blocks of 10 s
 
 
 def compare(
@@ -55,9 +55,9 @@ def compare(
 ) -> Comparison:
     """What changed from the drives `before` to those `after`.
 
-    `baseline`: the simulator that both are held against (`baseline_after`: the second by another), with its own `T_L`
-    and `K_L`; default: bare GLVD as the drives before fit it. Its effects keep their values in the fits of the car.
-    `level`: chance at which drives of one car are said to differ.
+    `baseline`: the simulator with which both are compared (`baseline_after`: another one for the second set), with its
+    own `T_L` and `K_L`; default: bare GLVD fitted to the drives before. Its effects keep their values in the fits of
+    the car. `level`: significance level of a difference between the drives.
 
     Raises `InputError` for logs that cannot be diagnosed or hold less than 50 s, channels that differ, or a level out
     of range.
@@ -82,7 +82,7 @@ def compare(
     away = two.mean - one.mean
     covariance = one.covariance + two.covariance
     blocks = min(one.blocks, two.blocks)
-    # Hotelling's: two numbers, spreads known from so many blocks
+    # Hotelling's test: two parameters, spreads estimated from this many blocks
     square = float(away @ np.linalg.solve(covariance, away))
     count = len(_CAR)
     statistic = square * (blocks - count) / (count * (blocks - 1))
@@ -119,7 +119,7 @@ def compare(
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """One set of drives: `mean` and `covariance` of ln T_L and ln K_L, from so many `blocks`."""
+    """One set of drives: `mean` and `covariance` of ln T_L and ln K_L, estimated from `blocks` blocks."""
 
     search: Search = field(repr=False)
     found: FittedModel
@@ -136,7 +136,7 @@ class _Side:
         if len(blocks) < _LEAST:
             raise InputError(f"{which}: found {len(blocks)} blocks of 10 s of usable driving, needs {_LEAST} or more")
         columns = whitened_jacobian(found.hypothesis, found.white, found.z).reshape(len(found.z), -1)
-        # how each parameter moves the errors: less of the rollout
+        # derivative of the errors: minus that of the rollout
         pulls = -columns * found.white(found.errors).ravel()
         shape = (len(found.z), len(record.channels), record.rows, record.group)
         by_row = pulls.reshape(shape).sum((1, 3))
@@ -144,7 +144,7 @@ class _Side:
         scores = scores - scores.mean(1, keepdims=True)
         between = scores @ scores.T * len(blocks) / (len(blocks) - 1)
         root = np.linalg.cholesky(found.covariance)
-        # in coordinates in which the posterior is round: no direction is told better than it says
+        # in coordinates that whiten the posterior: the spread is no smaller than the posterior's in any direction
         sizes, axes = np.linalg.eigh(root.T @ between @ root)
         spread = root @ axes @ np.diag(np.maximum(sizes, 1.0)) @ axes.T @ root.T
         here = np.array([np.log(found.values[name]) for name in _CAR])
@@ -160,19 +160,19 @@ def _as_fitted(found: FittedModel) -> GapPlant:
 
 
 def _alike(one: Log, two: Log) -> bool:
-    """Whether these are the same rows."""
+    """Whether both logs hold the same rows."""
     signals = ((getattr(x, name) for x in (one, two)) for name in ("time", "accel_cmd", "accel", "speed"))
     return all(a is b if a is None or b is None else np.array_equal(a, b) for a, b in signals)
 
 
 def _horizon(sides: Sequence[_Side]) -> float:
-    """The longest rollouts [s], up to `HORIZON_S`, that the stretches of either side hold: errors grow with it."""
+    """Length of the rollouts [s], up to `HORIZON_S`, that fits the stretches of both sides: errors grow with it."""
     records = [side.found.hypothesis.record for side in sides]
     return min(reached(Measure(r.channels[0], HORIZON_S), r) or HORIZON_S for r in records)
 
 
 def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float, *, same: bool) -> dict[str, Moved]:
-    """Blocks are drawn alike for both sides where these are the `same` drives."""
+    """Rollout errors before and after, by metric; both sides use the same bootstrap draws for the `same` drives."""
     drawn: list[dict[str, FloatArray]] = []
     for i, (side, simulator) in enumerate(zip(sides, simulators, strict=True)):
         rng = np.random.default_rng(0 if same else i)
@@ -202,7 +202,7 @@ def _rolled(record: Record, simulator: GapPlant) -> FloatArray:
 def _squares(
     record: Record, errors: FloatArray, blocks: Sequence[slice], lag: float, horizon: float
 ) -> dict[str, FloatArray]:
-    """Under the names of the whole `HORIZON_S`, whatever of it the drives hold."""
+    """Squared rollout errors by metric; the metric is named after `HORIZON_S` even where the drives are shorter."""
     out: dict[str, FloatArray] = {}
     for channel in record.channels:
         squares = products(Measure(channel, horizon), record, errors[None], blocks, lag)
@@ -216,7 +216,8 @@ def _of_draws(x: FloatArray) -> Quantity:
 
 
 def _log_quantity(mean: float, variance: float, sure: float) -> Quantity:
-    """Of exp(x), x about `mean` with this `variance`; `sure`: standard deviations of the central 90 %."""
+    """The quantity exp(x) for normal x of this `mean` and `variance`; its central 90 % is `sure` standard
+    deviations."""
     sd = float(np.sqrt(variance))
     middle = float(np.exp(mean))
     return Quantity(middle, middle * sd, float(np.exp(mean - sure * sd)), float(np.exp(mean + sure * sd)))
@@ -250,7 +251,7 @@ def _sentence(
 
 
 def _account(numbers: str, chance: str, later: LaterAnswer | None) -> str:
-    """What is said of the car: the numbers of lag and gain explain the change only where a delay does not."""
+    """The sentence on the car: lag and gain are stated as the explanation only where dead time is none."""
     if later is None:
         return f"No change of the car is detected: {numbers} ({chance})"
     delays = " to ".join(f"{max(q.mean, 0.0):.2f}" for q in (later.before, later.after))

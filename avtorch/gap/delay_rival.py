@@ -1,9 +1,9 @@
-"""Do lag and gain explain what changed between two sets of drives, or would a later answer of the car do as well?
+"""Test whether a change of lag and gain, or a change of dead time, explains the difference between two sets of drives.
 
-A car that answers 0.15 s later looks to GLVD like one with a longer lag. So both sides are fitted with a dead time
-besides, and two accounts of the change are held against each other: only lag and gain differ (the dead time is one and
-the same), or only the dead time differs (lag and gain are the same). Each is what is asked of the difference of the two
-fits by Hotelling's test, whose spreads are told by blocks as those of `compare` are.
+To GLVD, a car that responds 0.15 s later resembles one with a longer lag. Both sides are therefore fitted with a dead
+time as well, and two explanations are compared: only lag and gain differ (equal dead times), or only the dead time
+differs (equal lag and gain). Each is a hypothesis on the difference of the two fits, tested by Hotelling's test with
+spreads estimated from blocks, as in `compare`.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
 from avtorch.gap.simulator.effect import delay_effect, delay_key
 
-_FELT_S = 0.03  # below it the delay's own scale, a logarithm, has no slope to go by
+_FELT_S = 0.03  # [s] shorter delays: the link's scale, a logarithm, has no usable derivative there
 
 
 @dataclass(frozen=True, eq=False)
 class WithDelay:
-    """One set of drives: `mean` and `covariance` of ln T_L, ln K_L and the dead time [s], from so many `blocks`."""
+    """One set of drives: `mean` and `covariance` of ln T_L, ln K_L and the dead time [s], from `blocks` blocks."""
 
     mean: FloatArray
     covariance: FloatArray = field(repr=False)
@@ -37,7 +37,8 @@ class WithDelay:
 
     @classmethod
     def of(cls, search: Search, none: FittedModel) -> WithDelay:
-        """With a dead time on top of what `search` found without any effect, in place of one of the baseline's."""
+        """Fit a dead time on top of `none`, which `search` fitted without effects; it replaces one of the
+        baseline's."""
         found = search.with_effects(none, [delay_effect()])
         candidate, record = found.hypothesis, found.hypothesis.record
         keys, own = [c.key for c in candidate.coordinates], _keys()
@@ -45,7 +46,7 @@ class WithDelay:
         delay = keys.index(own[2])
         here[delay] = max(here[delay], candidate.coordinates[delay].z_of(_FELT_S))
         columns = whitened_jacobian(candidate, found.white, here).reshape(len(here), -1)
-        # from the fit's own scales to logarithms and seconds
+        # from the fit's coordinates to logarithms and seconds
         columns = np.stack([columns[keys.index(k)] / slope for k, slope in zip(own, _slopes(found, here), strict=True)])
         white = found.white(found.errors).ravel()
         inverse = np.linalg.inv(columns @ columns.T)
@@ -54,7 +55,7 @@ class WithDelay:
         blocks = blocks_of(record)
         scores = np.stack([by_row[:, b].sum(1) for b in blocks], 1)
         values = [found.values[key] for key in own]
-        # a step that the prior and the scale's end at no delay have held back: an estimate that may be below 0
+        # undo the prior's shrinkage and the constraint at zero delay: the estimate may be below 0
         mean = np.array([np.log(values[0]), np.log(values[1]), values[2]]) + inverse @ scores.sum(1)
         scores = scores - scores.mean(1, keepdims=True)
         between = scores @ scores.T * len(blocks) / (len(blocks) - 1)
@@ -64,7 +65,7 @@ class WithDelay:
 
 
 def later_answer(before: WithDelay, after: WithDelay, *, level: float) -> LaterAnswer:
-    """The two accounts held against each other, rejected at `level` (`LaterAnswer`)."""
+    """Test both explanations at `level` (see `LaterAnswer`)."""
     away, covariance = after.mean - before.mean, after.covariance + before.covariance
     blocks = min(before.blocks, after.blocks)
     same_delay, same_car = _chance(away, covariance, [2], blocks), _chance(away, covariance, [0, 1], blocks)
@@ -86,19 +87,19 @@ def later_answer(before: WithDelay, after: WithDelay, *, level: float) -> LaterA
 
 
 def _chance(away: FloatArray, covariance: FloatArray, which: Sequence[int], blocks: int) -> float:
-    """Of a difference as large in these numbers, where they are the same (Hotelling)."""
+    """p-value of the difference in the parameters `which`, if they are equal (Hotelling)."""
     part, count = away[list(which)], len(which)
     square = float(part @ np.linalg.solve(covariance[np.ix_(which, which)], part))
     return float(fisher.sf(square * (blocks - count) / (count * (blocks - 1)), count, blocks - count))
 
 
 def _keys() -> tuple[str, str, str]:
-    """Lag, gain and delay among the plant's parameters."""
+    """Keys of lag, gain and delay among the plant's parameters."""
     return "T_L", "K_L", delay_key()
 
 
 def _slopes(found: FittedModel, z: FloatArray) -> list[float]:
-    """Of ln T_L, ln K_L and the dead time [s] by their own coordinates at `z`."""
+    """Derivatives of ln T_L, ln K_L and the dead time [s] by their own coordinates at `z`."""
     step = 1e-4
     keys = [c.key for c in found.hypothesis.coordinates]
     each = found.hypothesis.values(z + step * np.vstack([np.zeros(len(z)), np.eye(len(z))]))

@@ -1,4 +1,4 @@
-"""The diagnosis: which effect the simulator lacks, with what probability, or that none of the table's does it."""
+"""The diagnosis: which effect the simulator lacks, with its probability, or that the cause is not in the table."""
 
 from __future__ import annotations
 
@@ -55,16 +55,16 @@ def diagnose(
     """Name the effect, or the two, that `baseline` lacks on these drives of one car.
 
     Args: `baseline`: the user's simulator (default: bare GLVD); its effects keep their values, `T_L` and `K_L` are
-    fitted. `prior`: weights over causes, see `model_probabilities`. `effects`: candidates, by name or class (default:
-    all registered). `pairs`: also try two at once. `posterior` of the verdict's parameters: by SGLD, or Laplace's
-    approximation. `budget_s`: after so many seconds no new candidate is begun, `complete` is False and the verdict
-    provisional: `scope` has what was tried, and the verdict is distinguished only from that.
-    `accel_kind`: whether `accel` is dv/dt or an accelerometer's reading (default: as the logs say).
-    `progress(what, done, of)` is called at each step. `checkpoint`: a file in which fits are kept, and from which a
-    search of the same logs and settings goes on, to the same answer.
+    fitted. `prior`: weights over causes, see `model_probabilities`. `effects`: those to test, by name or class
+    (default: all registered). `pairs`: also test two at once. `posterior` of the verdict's parameters: by SGLD, or
+    Laplace's approximation. `budget_s`: after this time no new hypothesis is fitted; where that cuts the search short,
+    `complete` is False and the verdict provisional: `scope` lists what was tested, and the verdict is distinguished
+    only from that. `accel_kind`: whether `accel` is dv/dt or an accelerometer's reading (default: as the logs state).
+    `progress(what, done, of)` is called at each step. `checkpoint`: a file that stores fits; a later search of the same
+    logs with the same settings continues from it, to the same answer.
 
     Raises `InputError` for a log without `accel_cmd`, without 10 s of usable driving, for wrong arguments, or for a
-    `checkpoint` that is damaged or of other logs or settings.
+    `checkpoint` that is damaged or belongs to other logs or settings.
 
     Example:
         >>> from avtorch import Leader, diagnose, simulate
@@ -95,7 +95,7 @@ def diagnose(
     untold = delays.untold(race.found)
     chances = delays.shared(chances, untold)
     candidates = [_told(f, race, chances[f.name], kinds) for f in race.found]
-    # of what is unknown there is no model but the bare baseline
+    # for an unknown cause the only model is the bare baseline
     bare = implausible({}, moved(race.none))
     candidates.append(Candidate("unknown", chances["unknown"], None, {}, {}, None, bare))
     candidates += apart.mirrored(candidates, chances)
@@ -127,7 +127,7 @@ def diagnose(
     if apart.note is not None:
         noted += (apart.note,)
     named = winner is not None and winner.name != "none"
-    # what is unknown sets in where the best of the named ones does
+    # an unknown cause gets the onset of the most probable named effect
     onset = None if verdict.name == "none" else _onset(winner or top, race)
     alike = {part for name in verdict.alias_set for part in name.split("+")}
     held = cross_validate(race, winner or top, blamed=named, alike=sorted(alike), progress=progress)
@@ -160,7 +160,7 @@ def diagnose(
 
 
 def left_over(top: FittedModel, race: SearchResult) -> Adequacy:
-    """What the favourite leaves over, less what lost messages explain row by row."""
+    """Structure left in the residuals of the most probable hypothesis, less what lost messages explain row by row."""
     measured = race.record.measured
     explained = (top.losses.evidence if top.losses else 0.0) + (top.by_chance.explained if top.by_chance else 0.0)
     return adequacy(top.white, top.errors, measured - top.errors, explained=explained)
@@ -193,7 +193,7 @@ def _told(
     kinds: Sequence[type[Effect]],
     draws: Draws | None = None,
 ) -> Candidate:
-    """A candidate as the answer lists it; parameters only where they bear on anything."""
+    """A hypothesis as listed in the answer; its parameters only where they are relevant."""
     gain = float(found.log_evidence - race.none.log_evidence)
     if found.name == "none":
         return Candidate("none", probability, gain, {}, {}, None, implausible({}, moved(found)))
@@ -209,7 +209,7 @@ def _told(
 
 @dataclass(frozen=True)
 class _Onset:
-    """A moment of log number `log`: `stamp_s` on its own clock, `from_start_s` from its first row [s]."""
+    """A time in log number `log`: `stamp_s` on the log's own clock, `from_start_s` from its first row [s]."""
 
     stamp_s: float
     from_start_s: float
@@ -217,7 +217,7 @@ class _Onset:
 
     @classmethod
     def at(cls, record: Record, row: int, time: float | None = None) -> _Onset:
-        """Of a counted `row`, or at `time` [s from the start], which lies near it."""
+        """The time of a counted `row`, or a given `time` [s from the start] near that row."""
         place = record.source[row]
         start = float(record.time[place]) if time is None else time
         stamp = float(record.stamp[place]) if time is None else start + float(record.stamp[place] - record.time[place])
@@ -225,7 +225,7 @@ class _Onset:
 
 
 def _onset(found: FittedModel | None, race: SearchResult) -> _Onset | None:
-    """Of an effect that has an onset of its own, that one."""
+    """The onset of a fitted model: the effect's own onset parameter where it has one."""
     if found is None:
         return None
     own = found.hypothesis.effects[0] if len(found.hypothesis.effects) == 1 else None

@@ -1,4 +1,4 @@
-"""A number with its uncertainty, as an answer holds it."""
+"""A number with its uncertainty."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Quantity:
 
     @classmethod
     def of_draws(cls, draws: Any) -> Quantity:
-        """From draws of any shape (NumPy array, tensor or list)."""
+        """The quantity of draws of any shape (NumPy array, tensor or list)."""
         x = np.asarray(draws.detach() if isinstance(draws, Tensor) else draws, dtype=float).reshape(-1)
         if not len(x):
             raise InputError("draws: found none, needs 1 or more")
@@ -56,9 +56,9 @@ class Quantity:
 
     @classmethod
     def of_normal(cls, mean: float, sd: float, link: Callable[[Tensor], Tensor] | None = None) -> Quantity:
-        """Of `link(z)`, z normal with `mean` and `sd`; `link` is elementwise and monotone (None: z itself).
+        """The quantity `link(z)`, z normal with `mean` and `sd`; `link` is elementwise and monotone (None: z itself).
 
-        Quantiles are exact; mean and SD are by Gauss-Hermite quadrature, good to many digits for the links of
+        Quantiles are exact; mean and SD come from Gauss-Hermite quadrature, accurate to many digits for the links of
         `Parameter`. `Parameter.constrain` is such a link.
         """
         if link is None:
@@ -73,12 +73,12 @@ class Quantity:
         return cls(average, math.sqrt(variance), q05, q95)
 
     def to_dict(self) -> dict[str, float]:
-        """For a JSON answer: mean, sd, q05, q95."""
+        """The quantity as JSON: mean, sd, q05, q95."""
         return asdict(self)
 
 
 def unit_of(key: str) -> str:
-    """The unit a parameter's key ends in: `"delay_s"` has `"s"`; `"-"` for none."""
+    """The unit at the end of a parameter's key: `"delay_s"` has `"s"`; `"-"` for none."""
     if key == "T_L":
         return "s"
     return next((unit for end, unit in _UNITS.items() if key.endswith(end)), "-")

@@ -1,8 +1,9 @@
-"""What a find shows row by row, and what it has to pay before that counts.
+"""Evidence for a fitted model row by row, and the complexity cost that it must exceed.
 
-Against the bare baseline a find's Bayes factor, less the price of having been picked among many, is an e-value. Of the
-rows in some part of the drives, given all the others, the likelihood ratio is at least what they gain at the fitted
-parameters less all that the fit has cost; so it is one too, and no part is named for what flexibility alone brings.
+Relative to the bare baseline, a model's Bayes factor less the penalty for selection among many hypotheses is an
+e-value. For the rows of any part of the drives, given all other rows, the likelihood ratio is at least their gain at
+the fitted parameters less the whole cost of the fit. This bound is an e-value too, so no part is named because of the
+model's flexibility alone.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from avtorch.gap.selection.model_probabilities import complexity_penalties
 
 @dataclass(frozen=True, eq=False)
 class RowAttribution:
-    """Of every counted row (counted,), by the find that all drives fit.
+    """Gain and effect of a model fitted to all drives, for every counted row (counted,).
 
-    `gained` [nats]: what it adds to the log density of the bare baseline; `paid` [nats], of all rows together: for
-    its freedom, and for having been picked. `does` [nats]: what it is expected to add, half the square of the white
-    image of what it changes; `felt` likewise of the accelerometer's faults alone. `moved` (channel, counted): the
-    change itself.
+    `gained` [nats]: gain in log density over the bare baseline. `paid` [nats], for all rows together: the cost of the
+    fitted parameters and of the selection. `does` [nats]: expected gain, half the square of the whitened change in the
+    rollout; `felt` [nats]: the same for the accelerometer's faults alone. `moved` (channel, counted): the change
+    itself.
     """
 
     record: Record
@@ -38,7 +39,7 @@ class RowAttribution:
 
     @classmethod
     def of(cls, race: SearchResult, found: FittedModel) -> RowAttribution:
-        """Of a find of a search."""
+        """The attribution of a fitted model of a search."""
         record = race.record
         told, bare = Refit.whole(found), Refit.whole(race.none)
         white = told.white(record)
@@ -56,10 +57,10 @@ class RowAttribution:
 
     @property
     def p_value(self) -> float:
-        """A bound on it, of the bare baseline against the find: the inverse of the e-value."""
+        """Upper bound on the p-value of the bare baseline against the model: the inverse of the e-value."""
         return float(np.exp(-np.clip(self.gained.sum() - self.paid, 0.0, 700.0)))
 
 
 def _worth(e: FloatArray) -> FloatArray:
-    """Half the squares (counted,) of white images (channel, counted, group)."""
+    """Half the sum of squares (counted,) of whitened images (channel, counted, group)."""
     return np.asarray(0.5 * (e**2).sum((0, 2)), np.float64)

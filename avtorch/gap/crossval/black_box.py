@@ -1,9 +1,9 @@
-"""How far any model could go: a flexible regression of what a rollout leaves over, fitted to one part of the drives.
+"""How much any model could still predict: a flexible regression of rollout residuals, fitted to one part of the drives.
 
-It has no physics in it. Forces and sensor faults are smooth functions of commands past and present, of what the rollout
-does, of speed and of time; their coefficients are normal a priori, of one size that the fitted part chooses itself by
-its evidence, so that where nothing is left the regression is nothing. What it foretells of rows it has not seen is a
-gap that could be closed and is not: where the floor is.
+It contains no physics. Forces and sensor faults are smooth functions of past and present commands, of the rollout, of
+speed and of time. Their coefficients have a normal prior, whose common scale is estimated from the fitted part by its
+evidence, so the regression vanishes where there is no structure. What it predicts on held-out rows is a gap that a
+better model could close; this gives a bound on the noise floor.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ _LAGS_S = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
 
 @dataclass(frozen=True, eq=False)
 class BlackBoxRegression:
-    """Columns (column, channel, counted, 1): what unit forces and unit faults of the accelerometer show."""
+    """Regressors (column, channel, counted, 1): response of the channels to unit forces and unit accelerometer
+    faults."""
 
     record: Record
     columns: FloatArray
 
     @classmethod
     def of(cls, record: Record, rollout: FloatArray) -> BlackBoxRegression:
-        """From a rollout (channel, counted, group) over the record."""
+        """Regressors from a rollout (channel, counted, group) over the record."""
         forces = _shapes(record, rollout.mean(-1))
         seen = []
         if "accel" in record.channels:
@@ -44,13 +45,14 @@ class BlackBoxRegression:
         return cls(record, columns[..., None])
 
     def foretold(self, errors: FloatArray, white: WhiteningFilter) -> FloatArray:
-        """What the regression makes of `errors` (channel, counted, group), seen only where the `white` one's record
-        counts: (channel, counted, 1) over the whole record.
+        """Prediction of `errors` (channel, counted, group) over the whole record: (channel, counted, 1).
+
+        Coefficients are fitted only to the rows that count in the record of `white`.
         """
         fits = np.isin(self.record.source, white.record.source)
         left = white(errors[:, fits].mean(-1, keepdims=True)).ravel()
         images = white(self.columns[:, :, fits]).reshape(len(self.columns), -1)
-        # by what they do to the whole drive: what hardly acts where it is fitted must not grow
+        # scaled by the regressor's size over the whole drive: one that is small on the fitted rows must not be inflated
         whole = replace(white, record=self.record)(self.columns).reshape(len(self.columns), -1)
         scale = np.sqrt((whole**2).mean(-1))
         use = scale > 1e-9 * scale.max(initial=1e-300)
@@ -67,7 +69,7 @@ class BlackBoxRegression:
 
 
 def _shapes(record: Record, rollout: FloatArray) -> FloatArray:
-    """Forces (column, counted) [m/s²]; nothing that a row's own noise has touched."""
+    """Forces (column, counted) [m/s²], none of which depends on the same row's noise."""
     dt = record.dt
     a = rollout[0] if "accel" in record.channels else np.gradient(rollout[-1]) / dt
     u = record.command[record.source]

@@ -1,13 +1,13 @@
-"""What a model's errors are worth in the closed loop: how far speed and spacing would be off behind a leader.
+"""Effect of a model's errors in the closed loop: the resulting errors of speed and spacing behind a leader.
 
-A controller feeds back what goes wrong, so what a model is off by in the open loop is not what a simulated platoon is
-off by. With the actuator `P = K_L / (T_L s + 1)` and the linear controller, an error `e` of the speed rolled out in the
-open loop becomes, in the loop,
+A controller feeds errors back, so a model's open-loop errors differ from those of a simulated platoon. With the
+actuator `P = K_L / (T_L s + 1)` and the linear controller, an error `e` of the speed in an open-loop rollout becomes,
+in the loop,
 
     speed    e s^2 / (s^2 + P (k_s + g s - k_a s^2)),    g = k_s tau + k_v
-    spacing  less its integral
+    spacing  minus its integral
 
-by superposition: the loop is linear, and the leader the same for car and model.
+by superposition: the loop is linear, and the leader is the same for car and model.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from scipy.signal import bilinear, lfilter
 from avtorch.arrays import FloatArray
 from avtorch.vehicle.controllers import NOMINAL_GAINS
 
-_LEAST_DECAY = 0.02  # [1/s], slower than which a loop does not forget within a block
+_LEAST_DECAY = 0.02  # [1/s] a loop that decays more slowly does not forget its past within a block
 
 
 @dataclass(frozen=True)
 class LoopMeasure:
-    """Closed-loop error of `quantity` ("speed" [m/s] or "spacing" [m]), out of errors of a `channel`.
+    """Closed-loop error of `quantity` ("speed" [m/s] or "spacing" [m]), computed from errors of a `channel`.
 
-    `T_L` [s], `K_L`: of the loop's car. Controller: constant time gap `time_gap` [s], `gains` (k_s, k_v, k_a).
+    `T_L` [s], `K_L`: of the car in the loop. Controller: constant time gap `time_gap` [s], `gains` (k_s, k_v, k_a).
     """
 
     channel: str
@@ -39,7 +39,7 @@ class LoopMeasure:
     time_gap: float = 1.0
     gains: Sequence[float] = NOMINAL_GAINS
 
-    horizon_s = float("inf")  # nothing is restarted on the way, as with the measure over the whole drive
+    horizon_s = float("inf")  # no restarts, as in the measure over the whole drive
 
     @property
     def name(self) -> str:
@@ -47,7 +47,7 @@ class LoopMeasure:
 
     @cached_property
     def _transfer(self) -> tuple[list[float], list[float]]:
-        """Numerator and denominator in s, from the error of the speed."""
+        """Numerator and denominator in s of the transfer function from the speed's error."""
         k_s, k_v, k_a = self.gains
         K = self.K_L
         below = [self.T_L, 1.0 - K * k_a, K * (k_s * self.time_gap + k_v), K * k_s]
@@ -56,19 +56,20 @@ class LoopMeasure:
 
     @property
     def stable(self) -> bool:
-        """Whether the loop forgets."""
+        """Whether the loop is stable and decays fast enough."""
         return bool(np.roots(self._transfer[1]).real.max() < -_LEAST_DECAY)
 
     def products(self, x: FloatArray, blocks: Sequence[slice], dt: float, lag: float) -> FloatArray:
-        """(block, one, other): sums over each block of products of errors in the loop.
+        """(block, one, other): sums over each block of products of closed-loop errors.
 
-        From those of long rollouts, `x` (one, row); `dt` [s] between rows. `lag` is not used: the loop has its own.
+        Computed from errors of long rollouts, `x` (one, row); `dt` [s] between rows. `lag` is unused: the loop has its
+        own.
         """
         off = self.of(x, dt)
         return np.stack([off[:, b] @ off[:, b].T for b in blocks])
 
     def of(self, errors: FloatArray, dt: float) -> FloatArray:
-        """Errors (..., row) in the loop from those of a long rollout (..., row), both nothing at the first row.
+        """Closed-loop errors (..., row) from those of a long rollout (..., row); both are zero at the first row.
 
         `dt` [s] between rows.
         """
@@ -81,7 +82,7 @@ class LoopMeasure:
 
 
 def loop_measures(channels: Sequence[str], T_L: float, K_L: float) -> tuple[LoopMeasure, ...]:
-    """Speed and spacing behind a leader, by the better channel of motion; none where that loop is not stable."""
+    """Speed and spacing behind a leader, from the better motion channel; empty where the loop is not stable."""
     channel = "speed" if "speed" in channels else "accel"
     made = tuple(LoopMeasure(channel, quantity, T_L, K_L) for quantity in ("speed", "spacing"))
     return tuple(m for m in made if m.stable)

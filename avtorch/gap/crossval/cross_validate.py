@@ -1,7 +1,7 @@
-"""Contenders of a search fitted to one part of the drives and judged by the rest, each part in turn.
+"""Cross-validation of a search: hypotheses are refitted without each fold in turn and scored on it.
 
-The contenders are fitted anew to each part's other blocks, and those alone choose among them, as the search did among
-all. What judges has chosen neither the effect nor its parameters.
+The best hypothesis is selected anew in each fold from the other folds alone, as the search did with all data. A
+held-out fold is thus used to select neither the effect nor its parameters.
 """
 
 from __future__ import annotations
@@ -31,19 +31,20 @@ from avtorch.gap.simulator.effect import EFFECTS, Effect
 Progress = Callable[[str, int, int], None]
 
 _RIVALS = 2  # besides the bare baseline and the verdict
-_NEAR = 15.0  # nats behind the verdict, for more of which no part would choose another
+_NEAR = 15.0  # nats: no fold would select a hypothesis that is further behind the verdict
 
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """What the blocks that judge say of a `verdict`, every counted row once.
+    """Scores of a `verdict` on held-out blocks; every counted row is held out once.
 
-    - `sums` by name: `before` (the bare baseline), `after` (what the rest chose), `flexible` (a black box on top of
-      that), `ceiling` (a black box on the bare baseline), `verdict`, `placebo` (the wrong effect `sham` on top of it);
-      `fitted`: the verdict as all blocks fit it; `floor`: what that leaves over, as far as its parameters are known
-    - `rows` (block,): how many single rows judge
-    - `chosen`: share of the parts that chose the verdict; `by_chance`: it has no effect that a rollout could foretell;
-      `by_drives`: whole drives are held out, not blocks of them
+    - `sums` by name: `before` (bare baseline), `after` (hypothesis selected without the fold), `flexible` (a black box
+      on top of it), `ceiling` (a black box on the bare baseline), `verdict`, `placebo` (the wrong effect `sham` on top
+      of it); `fitted`: the verdict fitted to all blocks. `floor`: its residual noise, with the uncertainty of its
+      parameters
+    - `rows` (block,): number of single rows per block
+    - `chosen`: share of the folds that selected the verdict; `by_chance`: it has only random effects, which no rollout
+      predicts; `by_drives`: the folds are whole drives, not blocks of them
     """
 
     record: Record
@@ -65,10 +66,10 @@ def cross_validate(
     alike: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> CrossValidation | None:
-    """Of a `verdict` among the finds of a search; None where the drives are too short to be parted.
+    """Cross-validate a `verdict` among the fitted models of a search; None where the drives are too short to split.
 
-    `blamed` False: it is the best of the named ones, and not the cause. `alike`: effects that no placebo may be, as
-    they might be the cause as well.
+    `blamed` False: it is the most probable named effect but not the verdict. `alike`: effects excluded as placebo,
+    because they may be the cause as well.
     """
     record = race.record
     parts = folds(record)
@@ -81,7 +82,7 @@ def cross_validate(
     kinds = (*measures(record.channels), *loop_measures(record.channels, bare["T_L"], bare["K_L"]))
     whole = Refit.whole(verdict)
     all_in = {f.name: random_effect_density(f, race.raw, record) for f in contenders}
-    # what a part cannot tell of chance is told by all: how much less its evidence is than the gain of its rows
+    # random effects are penalised alike in every fold: by their row gains less their evidence, over all rows
     owed = {f.name: price[f.name] + all_in[f.name].sum() - _chance_evidence(f) for f in contenders}
     images = parameter_spread(whole)
     told: dict[str, list[FoldScores]] = {}
@@ -124,7 +125,7 @@ def cross_validate(
 
 
 def _contenders(race: SearchResult, verdict: FittedModel, price: Mapping[str, float]) -> list[FittedModel]:
-    """The bare baseline first, the verdict, and what might take its place."""
+    """The bare baseline first, then the verdict and the hypotheses that may replace it."""
     worth = {f.name: f.log_evidence - price[f.name] for f in race.found}
     others = [f for f in race.found if f is not verdict and f.name != "none"]
     near = [f for f in others if worth[f.name] > worth[verdict.name] - _NEAR]
@@ -133,7 +134,7 @@ def _contenders(race: SearchResult, verdict: FittedModel, price: Mapping[str, fl
 
 
 def _foretold(refit: Refit, part: Fold) -> FloatArray:
-    """What a black box makes of a refit's errors."""
+    """A black box's prediction of a refit's errors."""
     record = refit.found.hypothesis.record
     return BlackBoxRegression.of(record, record.measured - refit.errors).foretold(refit.errors, refit.white(part.fits))
 
@@ -144,7 +145,7 @@ def _chance_evidence(found: FittedModel) -> float:
 
 
 def _sham(verdict: FittedModel, taken: set[str], channels: tuple[str, ...]) -> type[Effect] | None:
-    """A wrong effect with as many parameters as the verdict's, or nearly so: the first by name after the verdict's."""
+    """A wrong effect with about as many parameters as the verdict has; ties go to the next name after the verdict's."""
     own = verdict.hypothesis.size - 2
     some = [e for e in EFFECTS.values() if not e.random and e.name not in taken and is_observable(e, channels)]
     some = [e for e in some if not e.of_the_drive]
@@ -155,7 +156,7 @@ def _sham(verdict: FittedModel, taken: set[str], channels: tuple[str, ...]) -> t
 
 
 def _with_sham(refit: Refit, sham: type[Effect], part: Fold) -> Refit:
-    """The refit with the wrong effect on top, fitted to the same blocks."""
+    """The refit with the wrong effect added, fitted to the same blocks."""
     found = refit.found
     hypothesis = Hypothesis(found.hypothesis.record, (*found.hypothesis.effects, sham), found.hypothesis.baseline)
     starts = effect_starts(hypothesis, sham.name)

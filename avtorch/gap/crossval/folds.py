@@ -1,8 +1,8 @@
-"""How drives are parted: blocks that judge, and what lies far enough from them to fit.
+"""Folds of the drives: blocks that are held out, and rows far enough from them to be fitted.
 
-Every block judges once. Rows beside a block are left out of the fit that it judges, as far as what chance did to the
-one is still felt in the other. Blocks of one part lie all over the drive, so that each part sees early and late, slow
-and fast. Where there are three drives or more, none of which is more than half of all, whole drives judge.
+Every block is held out once. Rows beside a held-out block are excluded from the fit, as noise is correlated across the
+boundary. The blocks of one fold are spread over the drive, so each fold covers early and late, slow and fast driving.
+With three or more drives, none of them longer than half of all, whole drives are held out.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from avtorch.gap.likelihood.record import Record
 
 FOLDS = 5
 _BLOCKS = 20  # of a long drive
-_DRIVES = 3  # or more, for whole ones to be held out
-_WHOLE_S = 10.0  # of which a block has one to six: rollouts of that length have to fit in
+_DRIVES = 3  # fewest drives for which whole ones are held out
+_WHOLE_S = 10.0  # a block holds one to six of these, so that rollouts of this length fit in
 
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """`fits`: what parameters are fitted to; `blocks` (begin, end) among the record's counted rows judge them."""
+    """`fits`: the record to which parameters are fitted; `blocks` (begin, end) of counted rows, held out."""
 
     fits: Record = field(repr=False)
     judges: Record = field(repr=False)
@@ -33,12 +33,12 @@ class Fold:
 
     @property
     def rows(self) -> NDArray[np.intp]:
-        """Counted rows of the whole record that judge."""
+        """Held-out rows, as counted rows of the whole record."""
         return np.concatenate([np.arange(b.start, b.stop) for b in self.blocks])
 
 
 def folds(record: Record, *, apart_s: float = 3.0, parts: int = FOLDS) -> tuple[Fold, ...]:
-    """The record's parts, `apart_s` [s] between what fits and what judges; none where there is too little for two."""
+    """The record's folds, `apart_s` [s] between fitted and held-out rows; empty where there is too little for two."""
     blocks = blocks_of(record)
     groups = whole_drive_folds(record, parts)
     if groups:
@@ -52,7 +52,7 @@ def folds(record: Record, *, apart_s: float = 3.0, parts: int = FOLDS) -> tuple[
 
 
 def whole_drive_folds(record: Record, parts: int = FOLDS) -> list[set[int]]:
-    """Numbers of the drives that judge together, about equal shares of the rows; empty where drives are too few."""
+    """Numbers of the drives held out together, about equal shares of the rows; empty where there are too few drives."""
     sizes = np.bincount(_drive_of(record), minlength=len(record.segments))
     there = [int(k) for k in np.argsort(-sizes, kind="stable") if sizes[k] > 0]
     if len(there) < _DRIVES or sizes.max() > 0.5 * record.rows:
@@ -65,14 +65,14 @@ def whole_drive_folds(record: Record, parts: int = FOLDS) -> list[set[int]]:
 
 
 def _drive_of(record: Record) -> IntArray:
-    """Number of the segment that each counted row is of."""
+    """Segment number of each counted row."""
     each = 1 if record.coarse is record.drives else record.group
     ends = np.cumsum([len(d.time) * each // record.group for d in record.coarse])
     return np.asarray(record.segment)[np.searchsorted(ends, record.source, side="right")]
 
 
 def blocks_of(record: Record) -> list[slice]:
-    """Every counted row in one block, of 10 to 60 s; short stretches are blocks of their own."""
+    """A partition of the counted rows into blocks of 10 to 60 s; short stretches are blocks of their own."""
     return list(_blocks(record))
 
 

@@ -1,9 +1,9 @@
-"""How far the gap shrinks: before, after, floor and placebo on blocks that chose neither effect nor parameters.
+"""How far the gap shrinks: before, after, floor and placebo on held-out blocks.
 
-The floor is what noise leaves over of the verdict, as far as all drives tell its parameters (`noise_floor.py`); or what
-a flexible regression leaves, where it is below by more than chance. Intervals are of floors drawn with the parameters,
-of what the regression takes, and of blocks drawn anew, with replacement, wider by what few blocks tell too little of
-their own spread (Student's t).
+The floor is the verdict's residual noise, with the uncertainty of its parameters (`noise_floor.py`); where a flexible
+regression leaves significantly less, the floor is what that leaves. Intervals combine draws of the floor over the
+parameters, the share of the regression's gain, and bootstrapped blocks; they are widened by Student's t because few
+blocks estimate their own spread poorly.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from avtorch.gap.quantity import Quantity
 
 DENSITY = "log_predictive_density"
 _DRAWS = 2000
-_TELLS = 1.1  # before over floor, for less of which there is nothing to close
-_MATERIAL = 0.1  # of the gap (of its squares), for less of which a flexible regression is not believed
-_TELLS_NATS = 5.0  # likewise of densities, over all blocks
+_TELLS = 1.1  # ratio of before to floor below which there is no gap to close
+_MATERIAL = 0.1  # share of the gap (in squares) that a flexible regression must close to replace the floor
+_TELLS_NATS = 5.0  # the same threshold for densities [nats], over all blocks
 
 
 @dataclass(frozen=True)
 class Closed:
-    """By one measure: `before` the effect is in, `after`, and the `floor` that no model gets below.
+    """Errors by one measure: `before` the effect is added, `after`, and the `floor` that no model can go below.
 
-    `closed`: (before - after) / (before - floor), None where there is next to nothing to close. Rollout errors are root
-    mean squares [m/s², m/s]; densities are mean log densities of a row [nats], of which more is better.
+    `closed`: (before - after) / (before - floor), None where there is almost nothing to close. Rollout errors are root
+    mean squares [m/s², m/s]; densities are mean log densities per row [nats], of which higher is better.
 
-    `horizon_s`: seconds that the rollouts last, None for those of whole drives and for densities.
+    `horizon_s`: length of the rollouts [s], None for those of whole drives and for densities.
     """
 
     before: float
@@ -53,12 +53,12 @@ class Closed:
 
 @dataclass(frozen=True)
 class Shrinkage:
-    """On blocks of the drives that chose neither the effect nor its parameters.
+    """How far the gap shrinks on held-out blocks of the drives.
 
-    `metric`: the one of `by_metric` in which the gap shows most. `placebo`: what `placebo_effect`, a wrong effect with
-    about as many parameters, closes on top. `ceiling`: after a flexible black box is put on top of the bare baseline,
-    by metric. `chosen`: share of the parts in which the other parts alone choose the verdict. `blocks`: how many judge.
-    `by_drives`: whole drives were held out.
+    `metric`: the one of `by_metric` in which the gap is clearest. `placebo`: what `placebo_effect`, a wrong effect with
+    about as many parameters, closes when added. `ceiling`: error after a flexible black box is added to the bare
+    baseline, by metric. `chosen`: share of the folds in which the other folds alone select the verdict. `blocks`:
+    number of held-out blocks. `by_drives`: whole drives were held out.
     """
 
     metric: str
@@ -91,7 +91,7 @@ class Shrinkage:
 
 
 def gap_closed(held: CrossValidation) -> Shrinkage:
-    """From what blocks held out say of a verdict."""
+    """The shrinkage of the gap from cross-validation scores of a verdict."""
     sums, kinds, blocks = held.sums, held.measures, len(held.rows)
     rng = np.random.default_rng(0)
     again = rng.multinomial(blocks, np.full(blocks, 1 / blocks), size=_DRAWS).astype(float)
@@ -130,11 +130,11 @@ def gap_closed(held: CrossValidation) -> Shrinkage:
 def _floors(
     sums: Mapping[str, FloatArray], mean: FloatArray, draws: FloatArray, rng: np.random.Generator, *, better: int
 ) -> FloatArray:
-    """(1 + draw, block), the mean first.
+    """Floors (1 + draw, block), the mean first.
 
-    The flexible regression's, where by more than blocks differ it beats the model by a tenth of the gap or more: where
-    a controller feeds noise back into its commands a regression foretells a little of the noise itself. How much of
-    what it takes could be had is not known: any share, in the draws.
+    The mean is the flexible regression's where it beats the model significantly over blocks and by a tenth of the gap
+    or more: where a controller feeds noise back into its commands, a regression predicts a little of the noise itself.
+    What share of the regression's gain a model could reach is unknown, so the draws take a uniform share.
     """
     gain = better * (sums["flexible"] - mean)
     count = len(gain)
@@ -148,8 +148,8 @@ def _floors(
 
 @dataclass(frozen=True, eq=False)
 class _Told:
-    """By one measure: sums by name (block,), `floors` (1 + draw, block), rows (block,), and how often each block is
-    drawn (draw, block). `better` -1: sums are of squares, of whose means the roots count."""
+    """Scores by one measure: sums by name (block,), `floors` (1 + draw, block), rows (block,), and bootstrap counts
+    `again` (draw, block). `better` -1: sums are of squares, reported as root mean squares."""
 
     sums: Mapping[str, FloatArray]
     floors: FloatArray
@@ -158,7 +158,7 @@ class _Told:
     better: int
 
     def all_in(self, name: str) -> float:
-        """Of all blocks once."""
+        """Mean over all blocks, without the bootstrap."""
         return float(self._mean(self.sums[name], np.ones(len(self.rows))))
 
     @property
@@ -180,12 +180,12 @@ class _Told:
         return (floor - before) * self.rows.sum() > _TELLS_NATS
 
     def _mean(self, sums: FloatArray, weights: FloatArray) -> FloatArray:
-        """Of a row, over blocks (..., block) weighed (..., block)."""
+        """Mean per row, over blocks (..., block) with weights (..., block)."""
         mean = (weights * sums).sum(-1) / (weights * self.rows).sum(-1)
         return np.sqrt(np.maximum(mean, 0.0)) if self.better < 0 else mean
 
     def _share(self, one: str, other: str) -> Quantity:
-        """Of the reducible gap, what lies between two sums."""
+        """Difference between two sums as a share of the reducible gap."""
 
         def share(weights: FloatArray, floors: FloatArray) -> FloatArray:
             before, a, b = (self._mean(self.sums[name], weights) for name in ("before", one, other))

@@ -1,9 +1,9 @@
-"""Where the gap lies: in time, speed, command, frequency, and whether the car moves or the sensor shows it otherwise.
+"""Where the gap lies: in time, speed, command and frequency, and whether in the car's motion or in the sensor.
 
-What a cause does to each row is half the square of the white image of its change, the nats it is expected to bring. On
-each axis the part named is the shortest stretch that holds nearly all of it, if plainly fewer rows lie there. A part is
-named on the strength of what its rows gain, less all that the find has paid (`attribution.py`): an e-value, for which
-the procedure of Wang and Ramdas (2022) keeps the false-discovery rate whatever the dependence between parts.
+The contribution of a cause in each row is half the square of its whitened change, its expected gain in nats. On each
+axis the part named is the shortest stretch that holds nearly all of it, if clearly fewer rows lie there. Each part is
+tested by the gain of its rows less the whole cost of the model (`attribution.py`). This is an e-value, for which the
+procedure of Wang and Ramdas (2022) controls the false-discovery rate under any dependence between parts.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from scipy.signal import lfilter
 from avtorch.arrays import FloatArray
 from avtorch.gap.crossval.attribution import RowAttribution
 
-_MOST = 0.95  # of the sizes of what the cause does
-_PLAINLY = 0.6  # of the rows since it set in, for more of which a stretch is no part
-_BAND = 0.9  # of the power
-_RATE = 0.05  # of false discoveries
+_MOST = 0.95  # share of the cause's effect that a part holds
+_PLAINLY = 0.6  # largest share of the rows since the onset that a part may cover
+_BAND = 0.9  # share of the power
+_RATE = 0.05  # false-discovery rate
 
 Axis = Literal["time", "speed", "command", "frequency", "signal"]
 
@@ -30,11 +30,11 @@ UNITS: dict[Axis, str] = {"time": "s", "speed": "m/s", "command": "m/s²", "freq
 
 @dataclass(frozen=True)
 class Location:
-    """A part of the gap: `begin` to `end` on an `axis`, with its `share` of what the cause does to the log.
+    """A part of the gap: `begin` to `end` on an `axis`, with its `share` of the cause's contribution.
 
-    Times are on the log's own clock [s], the others [m/s, m/s², Hz]; of the axis `signal` both are `"actuation"` (the
-    car moves otherwise) or `"sensing"` (the accelerometer shows it otherwise).
-    `q_value`: the false-discovery rate at which all parts with one as small are named.
+    Times are on the log's own clock [s], the others [m/s, m/s², Hz]; on the axis `signal` both are `"actuation"` (the
+    car's motion differs) or `"sensing"` (the accelerometer's reading differs). `q_value`: the false-discovery rate at
+    which all parts with a q-value as small are named.
     """
 
     axis: Axis
@@ -50,7 +50,8 @@ class Location:
 
 
 def localise(shown: RowAttribution, *, onset_s: float | None, lag: float) -> tuple[Location, ...]:
-    """The parts, the surest first. `onset_s`: when the cause set in, from the start; `lag` [s] of the actuator."""
+    """The significant parts, most significant first. `onset_s`: onset from the log's start; `lag` [s] of the
+    actuator."""
     parts: list[Part] = [*_stretches(shown, onset_s, lag), *_signals(shown), *_band(shown)]
     q_values = _q_values([gain - shown.paid for *_, gain in parts])
     parts = [(axis, *_stamps(shown, axis, a, b), share, gain) for axis, a, b, share, gain in parts]
@@ -59,7 +60,7 @@ def localise(shown: RowAttribution, *, onset_s: float | None, lag: float) -> tup
 
 
 def _stamps(shown: RowAttribution, axis: Axis, begin: float | str, end: float | str) -> tuple[float | str, float | str]:
-    """Both ends; times from the log's start become times on the log's own clock."""
+    """Both ends, with times converted from the log's start to the log's own clock."""
     if axis != "time" or isinstance(begin, str) or isinstance(end, str):
         return begin, end
     record = shown.record
@@ -69,7 +70,7 @@ def _stamps(shown: RowAttribution, axis: Axis, begin: float | str, end: float | 
 
 
 Part = tuple[Axis, float | str, float | str, float, float]
-"""Axis, ends, share of what the cause does, and what was gained there [nats]."""
+"""Axis, ends, share of the cause's contribution, and gain within the part [nats]."""
 
 
 def _stretches(shown: RowAttribution, onset_s: float | None, lag: float) -> Iterator[Part]:
@@ -77,7 +78,7 @@ def _stretches(shown: RowAttribution, onset_s: float | None, lag: float) -> Iter
     time = record.time[record.source]
     one_clock = bool((np.diff(time) > 0).all()) and len(np.unique(record.log)) == 1
     if onset_s is not None and one_clock:
-        # what chance decides (glitches, lost messages) has an onset, and nothing that is known beforehand
+        # random effects (glitches, lost messages) have an onset but no predictable contribution
         since_then = does if does.any() else np.ones(len(time))
         yield _part(shown, "time", time, onset_s, float(time[-1]), since_then)
     if not does.any():
@@ -85,13 +86,13 @@ def _stretches(shown: RowAttribution, onset_s: float | None, lag: float) -> Iter
     axes: list[tuple[Axis, FloatArray]] = [("time", time)] if onset_s is None and one_clock else []
     if record.speed is not None:
         axes.append(("speed", record.speed.mean(-1)[record.source]))
-    # what the car is about to do: an effect of the command shows when the actuator has followed
+    # the command filtered by the lag: an effect of the command is visible once the actuator has followed
     share = -np.expm1(-record.dt / lag)
     command = np.asarray(lfilter([share], [1, share - 1], record.command))[record.source]
     axes.append(("command", command))
     since = time >= onset_s if onset_s is not None and one_clock else np.ones(len(time), bool)
     for axis, x in axes:
-        # by sizes and not by squares, or the edges of where it acts would not count
+        # weighted by size, not by square, or the edges of the active region would be lost
         low, high = shortest(x, np.sqrt(does), _MOST)
         if ((x >= low) & (x <= high))[since].mean() <= _PLAINLY:
             part = _part(shown, axis, x, low, high, does)
@@ -99,7 +100,7 @@ def _stretches(shown: RowAttribution, onset_s: float | None, lag: float) -> Iter
 
 
 def _own_ends(x: FloatArray, low: float, high: float, command: FloatArray) -> tuple[float, float]:
-    """`low` and `high` of an answered command `x`; where it goes no further, as far as the `command` itself goes."""
+    """`low` and `high` of a filtered command `x`; an end at the range's limit becomes that of the raw `command`."""
     return (
         float(command.min()) if low <= x.min() + 1e-9 else low,
         float(command.max()) if high >= x.max() - 1e-9 else high,
@@ -134,7 +135,7 @@ def _signals(shown: RowAttribution) -> Iterator[Part]:
 
 
 def _band(shown: RowAttribution) -> Iterator[Part]:
-    """The band of frequencies of what the cause does to the acceleration."""
+    """The frequency band of the cause's change of acceleration."""
     record = shown.record
     accel = shown.moved[0] if "accel" in record.channels else np.gradient(shown.moved[-1]) / record.dt
     power, f = np.zeros(0), np.zeros(0)
@@ -147,14 +148,14 @@ def _band(shown: RowAttribution) -> Iterator[Part]:
     low, high = shortest(np.log(f), power, _BAND)
     if high - low <= 0.75 * np.ptp(np.log(f)):
         share = float(power[(np.log(f) >= low) & (np.log(f) <= high)].sum() / power.sum())
-        # the slowest that a drive holds is as good as steady
+        # the lowest frequency that a drive resolves includes the steady part
         slowest = low <= np.log(f.min()) + 1e-9
         begin, end = 0.0 if slowest else float(np.exp(low)), float(np.exp(high))
         yield "frequency", begin, end, share, share * float(shown.gained.sum())
 
 
 def _q_values(gains: Sequence[float]) -> list[float]:
-    """Of e-values given by their logarithms."""
+    """q-values from e-values, given by their logarithms."""
     if not gains:
         return []
     order = np.argsort(-np.asarray(gains))

@@ -1,8 +1,8 @@
-"""The floor: what the verdict would be off by with its parameters known, as far as the drives tell them.
+"""The noise floor: residual error of the verdict, with the uncertainty of its parameters.
 
-The parameters' posterior makes every rollout uncertain, so that what noise leaves over is known only so well. Along the
-axes of the posterior the errors move by images `I`; with `z` standard normal the noise is `e + I z`, and its sum of
-squares in each block a quadratic form of `(1, z)`.
+The parameters' posterior makes every rollout uncertain, and so the residual noise. Along the posterior's axes the
+errors change by images `I`; with `z` standard normal the noise is `e + I z`, and its sum of squares in each block is a
+quadratic form of `(1, z)`.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from avtorch.arrays import FloatArray
 class NoiseFloor:
     """Quadratic forms of `(1, z)`, `z` along the axes of the posterior.
 
-    `squares` (measure, block, 1 + axis, 1 + axis): of rollout errors. `nats` (block, 1 + axis, 1 + axis): what the log
-    density falls short of the best that it might be.
+    `squares` (measure, block, 1 + axis, 1 + axis): of rollout errors. `nats` (block, 1 + axis, 1 + axis): shortfall of
+    the log density from its best value.
     """
 
     squares: FloatArray
@@ -28,7 +28,7 @@ class NoiseFloor:
 
     @classmethod
     def joined(cls, parts: Sequence[NoiseFloor]) -> NoiseFloor:
-        """Blocks of several parts, one after another."""
+        """The blocks of several folds, concatenated."""
         return cls(np.concatenate([p.squares for p in parts], 1), np.concatenate([p.nats for p in parts]))
 
     @property
@@ -37,7 +37,7 @@ class NoiseFloor:
 
 
 def expected(form: FloatArray) -> FloatArray:
-    """Mean (...,) of a form (..., 1 + axis, 1 + axis) over `z`."""
+    """Mean (...,) over `z` of a form (..., 1 + axis, 1 + axis)."""
     return np.trace(form, axis1=-2, axis2=-1)
 
 

@@ -1,4 +1,4 @@
-"""What glitches and lost messages add to the density of rows that had no say in how many of them there are."""
+"""Gain in held-out log density from random effects, whose parameters are fitted to other rows."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from avtorch.gap.search.random_effects import variance_of
 
 
 def random_effect_density(found: FittedModel, raw: Record, fits: Record) -> FloatArray:
-    """Log density (counted,) [nats] that the find's glitches or losses gain in each row of its record.
+    """Log density (counted,) [nats] that a model's outliers, lost messages or command errors gain in each row.
 
-    Fractions and sizes are those of the rows that count in `fits`, but for a user's errors of the command, which are
-    those of all rows. `raw`: the same drives in rows of their own.
+    Fractions and sizes are fitted to the rows that count in `fits`; only a user-defined command error uses all rows.
+    `raw`: the same drives without averaging of rows.
     """
     record, own = found.hypothesis.record, found.by_chance
     if found.tails is None and found.losses is None and (own is None or own.process_sd is None):

@@ -1,6 +1,6 @@
-"""A find fitted anew to part of a record, to be judged by the rest.
+"""A fitted model refitted to part of a record, to be scored on the rest.
 
-When its effects set in is taken from all of the drive: that is a fact of this drive, and no parameter of a simulator.
+Onsets are taken from the whole drive: they are facts of this drive, not parameters of a simulator.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter, sensed
 from avtorch.gap.search.fitted_model import FittedModel
 
-_TURNS = 3  # of parameters and noise
+_TURNS = 3  # alternations of parameters and noise
 _ENOUGH = 0.1  # nats
 
 
 @dataclass(frozen=True, eq=False)
 class Refit:
-    """`z` (coordinate,) and `noise` of a find as part of its record has them; `log_evidence` [nats] on that part.
+    """`z` (coordinate,) and `noise` of a model fitted to part of its record; `log_evidence` [nats] on that part.
 
     `onset`, `gust_onset`: counted rows of the whole record.
     """
@@ -44,7 +44,7 @@ class Refit:
 
     @classmethod
     def of(cls, found: FittedModel, fits: Record) -> Refit:
-        """To those rows that count in `fits`, from where the whole record's fit has come to rest."""
+        """Refit to the rows that count in `fits`, starting from the fit of the whole record."""
         whole = found.hypothesis
         hypothesis = Hypothesis(fits, whole.effects, whole.baseline)
         onset, gust_onset = (_row(r, whole.record, fits) for r in (found.onset, found.gust_onset))
@@ -88,7 +88,7 @@ class Refit:
 
     @classmethod
     def whole(cls, found: FittedModel) -> Refit:
-        """As it was found, on all of its record."""
+        """The model as fitted to its whole record."""
         return cls(
             found=found,
             fits=found.hypothesis.record,
@@ -112,19 +112,20 @@ class Refit:
 
     @cached_property
     def errors(self) -> FloatArray:
-        """Measured less rolled out over the whole record, (channel, counted, group)."""
+        """Measurement minus rollout over the whole record, (channel, counted, group)."""
         hypothesis = self.found.hypothesis
         return hypothesis.record.measured - self._rolled(hypothesis, self.z)
 
     @cached_property
     def effect(self) -> FloatArray:
-        """What its effects do over the whole record, (channel, counted, group): its rollout less one without them."""
+        """Effect of its causes over the whole record, (channel, counted, group): rollout with minus rollout without
+        them."""
         hypothesis = self.found.hypothesis
         return self._rolled(hypothesis, self.z) - hypothesis.baseline_rollouts(self.z[None])[0]
 
     @cached_property
     def felt(self) -> FloatArray:
-        """What of that is the accelerometer's alone, (channel, counted, group)."""
+        """The part of `effect` that is due to the accelerometer alone, (channel, counted, group)."""
         hypothesis = self.found.hypothesis
         others = tuple(e for e in hypothesis.effects if e.place != "sensor")
         if len(others) == len(hypothesis.effects):
@@ -133,7 +134,7 @@ class Refit:
         return self._rolled(hypothesis, self.z) - self._rolled(car, car.z_of(self.values))
 
     def _rolled(self, hypothesis: Hypothesis, z: FloatArray) -> FloatArray:
-        """Rollout (channel, counted, group) with the slope that was found, where the hypothesis has one."""
+        """Rollout (channel, counted, group), with the estimated road grade where the hypothesis has one."""
         record, onset = hypothesis.record, self.onset if hypothesis.effects else None
         rolled = hypothesis.rollouts(z[None], onset)[0]
         if self.profile is None:
@@ -149,9 +150,9 @@ class Refit:
         return self.found.hypothesis.rollouts(self.z + steps, self.onset)
 
     def slope_spread(self, white: WhiteningFilter) -> FloatArray:
-        """Standard deviations (axis, channel, counted, group) along the axes of the slope's posterior.
+        """Standard deviations (axis, channel, counted, group) along the axes of the road grade's posterior.
 
-        As errors made `white` on the rows that fit tell it.
+        The posterior is that of the fitted rows, with errors whitened by `white`.
         """
         whole = self.found.hypothesis
         hypothesis = Hypothesis(self.fits, whole.effects, whole.baseline)
@@ -166,14 +167,14 @@ class Refit:
         return sensed(whole.record, self.noise, np.einsum("ak,kwrg->awrg", axes, columns))
 
     def white(self, record: Record) -> WhiteningFilter:
-        """Of errors on the rows that count in `record`."""
+        """The whitening filter on the rows that count in `record`."""
         whole = self.found.hypothesis.record
         onset, gust_onset = (_row(r, whole, record) for r in (self.onset, self.gust_onset))
         return whitening_filter(record, self.noise, onset=onset, gust_onset=gust_onset)
 
 
 def _row(row: int | None, of: Record, other: Record) -> int | None:
-    """A counted row of one record among those of another of the same drives; None for none, or for the very first."""
+    """A counted row of one record as a row of another of the same drives; None for None, and for the very first row."""
     if row is None:
         return None
     place = int(np.searchsorted(other.source, of.source[min(row, of.rows - 1)]))

@@ -1,13 +1,13 @@
-"""Errors of rollouts over horizons, from those of one long rollout.
+"""Errors of rollouts over horizons, computed from one long rollout.
 
-A rollout begun anew in the middle of a drive starts at what is measured there: of the acceleration at the measured one,
-of the speed at the measured one with the actuator where the commands have brought it. What the long rollout was wrong
-by at that moment `t0` is then gone: of the speed for good, of the acceleration it would have died away with the lag
-anyway. So the errors are `e(t) - e(t0) w(t - t0)`, where `e` is the long one's and `w` is 1 or `exp(-(t - t0) / T_L)`.
+A rollout that restarts within a drive starts from the measurement: the acceleration from the measured one; the speed
+from the measured one, with the actuator state that the commands have produced. The restart removes the error of the
+long rollout at that time `t0`: permanently for the speed; for the acceleration it would have decayed with the lag. The
+errors are thus `e(t) - e(t0) w(t - t0)`, where `e` is that of the long rollout and `w` is 1 or `exp(-(t - t0) / T_L)`.
 
-One start is as good as another, and what is measured there is noisy: rollouts begin at every row. Of two errors `x`
-and `y` the mean over all starts within a horizon of `t` is `x y - x M(y) - M(x) y + M2(x y)`, with moving averages `M`
-weighed by `w` and `M2` by its square.
+All starts are equivalent and each measurement is noisy, so rollouts start at every row. For two errors `x` and `y` the
+mean over all starts within a horizon of `t` is `x y - x M(y) - M(x) y + M2(x y)`, with moving averages `M` weighted by
+`w` and `M2` by its square.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from avtorch.gap.crossval.closed_loop_errors import LoopMeasure
 from avtorch.gap.likelihood.record import Record
 
 HORIZON_S = 10.0
-"""The horizon of all that has no other in its name, of both channels: the speed of a whole drive's rollout wanders off
-whatever the model."""
+"""The default horizon of both channels, used where a name states none: over a whole drive the speed of any model's
+rollout drifts away."""
 HORIZONS_S = (0.5, 2.0, HORIZON_S)
 
 
 @dataclass(frozen=True)
 class Measure:
-    """One way to measure: of a `channel`, over rollouts of `horizon_s` [s]; None: the whole drive's."""
+    """A measure of rollout error: of a `channel`, over rollouts of `horizon_s` [s]; None: the whole drive's."""
 
     channel: str
     horizon_s: float | None
@@ -44,8 +44,8 @@ class Measure:
     def products(self, x: FloatArray, blocks: Sequence[slice], dt: float, lag: float) -> FloatArray:
         """(block, one, other): sums over each block of products of the errors of rollouts within a stretch.
 
-        From those of a long one, `x` (one, row) of this channel; `dt` [s] between rows, `lag` [s] of the actuator.
-        Where a horizon does not fit before a row, rollouts begin as early as the stretch does.
+        Computed from errors of a long rollout, `x` (one, row) of this channel; `dt` [s] between rows, `lag` [s] of the
+        actuator. Where a row has less than a horizon before it, rollouts start at the beginning of the stretch.
         """
         if self.horizon_s is None:
             whole = x - x[:, :1] if self.channel == "speed" else x
@@ -56,7 +56,7 @@ class Measure:
         mean = _window(x, length, keeps) / starts
         out = []
         for b in blocks:
-            # how often each row is a start of what is judged in this block
+            # how often each row is a start for the errors scored in this block
             judged = np.zeros(x.shape[1])
             judged[b] = 1.0 / starts[b]
             often = _window(judged[::-1], length, keeps**2)[::-1]
@@ -68,7 +68,7 @@ class Measure:
 
 
 def _window(x: FloatArray, length: int, keeps: float) -> FloatArray:
-    """Sums (..., row) over the last `length` rows of `x`, each weighed by `keeps` to the power of its age."""
+    """Sums (..., row) over the last `length` rows of `x`, each weighted by `keeps` to the power of its age."""
     if keeps < 1.0:
         ended = np.zeros_like(x)
         ended[..., length:] = keeps**length * x[..., :-length]
@@ -83,8 +83,8 @@ def products(
 ) -> FloatArray:
     """(block, one, other): sums of products of `errors` (one, channel, counted, group) of long rollouts, by a measure.
 
-    `blocks` of counted rows, each within a stretch; `lag` [s]. Rollouts begin wherever a stretch was measured, whether
-    or not a block judges there.
+    `blocks` of counted rows, each within a stretch; `lag` [s]. Rollouts start at every measured row of a stretch,
+    inside a held-out block or not.
     """
     long = errors[:, record.channels.index(measure.channel)]
     group, out = record.group, np.zeros((len(blocks), len(errors), len(errors)))
@@ -98,7 +98,7 @@ def products(
 
 
 def rms(measure: Measure, record: Record, errors: FloatArray, lag: float) -> float:
-    """Root mean square of a long rollout's `errors` (channel, counted, group) by a measure, over all rows that count;
+    """Root mean square of a long rollout's `errors` (channel, counted, group) by a measure, over all counted rows;
     `lag` [s]."""
     edges = [*record.starts.tolist(), record.rows]
     total = products(measure, record, errors[None], [slice(a, b) for a, b in pairwise(edges)], lag).sum()
@@ -106,7 +106,7 @@ def rms(measure: Measure, record: Record, errors: FloatArray, lag: float) -> flo
 
 
 def reached(measure: Measure | LoopMeasure, record: Record) -> float | None:
-    """Seconds that rollouts of a measure last at most, which no stretch outlasts; None: as long as the stretches."""
+    """Longest rollouts [s] of a measure that the stretches hold; None: as long as the stretches."""
     if measure.horizon_s is None or not np.isfinite(measure.horizon_s):
         return None
     longest = int(np.diff([*record.starts.tolist(), record.rows]).max()) * record.dt
@@ -114,5 +114,5 @@ def reached(measure: Measure | LoopMeasure, record: Record) -> float | None:
 
 
 def measures(channels: Iterable[str]) -> tuple[Measure, ...]:
-    """All that these channels allow: a speed known at the start of a drive says little at its end."""
+    """All measures of these channels: over each horizon, and over whole drives."""
     return tuple(Measure(w, h) for w in channels for h in (*HORIZONS_S, None))

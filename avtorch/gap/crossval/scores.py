@@ -1,4 +1,4 @@
-"""What rollouts and densities of a refitted find are worth on the blocks that judge it."""
+"""Rollout errors and log densities of a refitted model on held-out blocks."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class FoldScores:
 
     @classmethod
     def joined(cls, parts: Sequence[FoldScores]) -> FoldScores:
-        """Blocks of several parts, one after another."""
+        """The blocks of several folds, concatenated."""
         return cls(np.concatenate([p.squares for p in parts], 1), np.concatenate([p.nats for p in parts]))
 
 
 @dataclass(frozen=True)
 class FoldScorer:
-    """The blocks of one part. `lag` [s]: how fast an actuator forgets where a rollout began."""
+    """Scores models on the blocks of one fold. `lag` [s]: time constant with which an initial state is forgotten."""
 
     record: Record
     part: Fold
@@ -46,8 +46,8 @@ class FoldScorer:
         return np.stack([products(m, self.record, errors, self.part.blocks, self.lag) for m in self.measures])
 
     def judged(self, refit: Refit, *, less: FloatArray | None = None, chance: FloatArray | None = None) -> FoldScores:
-        """A refit; `less`: what else (channel, counted, 1) is taken off its errors, `chance` (counted,) [nats]: what
-        else is added to the density of each row."""
+        """Scores of a refit; `less`: prediction (channel, counted, 1) to subtract from its errors, `chance` (counted,)
+        [nats]: term to add to the density of each row."""
         errors = refit.errors if less is None else refit.errors - less
         nats = self.row_nats(refit, less=less)
         return FoldScores(
@@ -55,7 +55,7 @@ class FoldScorer:
         )
 
     def row_nats(self, refit: Refit, *, less: FloatArray | None = None) -> FloatArray:
-        """Log density (counted,) of each row that judges, 0 elsewhere."""
+        """Log density (counted,) of each held-out row, 0 elsewhere."""
         errors = refit.errors if less is None else refit.errors - less
         out = np.zeros(self.record.rows)
         rows = np.isin(self.record.source, self.part.judges.source)
@@ -63,8 +63,8 @@ class FoldScorer:
         return out
 
     def floor(self, refit: Refit, images: FloatArray) -> NoiseFloor:
-        """What noise leaves over of a refit, whose parameters move its errors by `images` (axis, channel, counted,
-        group) (`parameter_spread`)."""
+        """Noise floor of a refit whose parameters change its errors by `images` (axis, channel, counted, group)
+        (`parameter_spread`)."""
         errors = np.concatenate([refit.errors[None], images])
         rows = np.isin(self.record.source, self.part.judges.source)
         white = self._white(refit)(errors[:, :, rows])
@@ -81,7 +81,7 @@ class FoldScorer:
 
     @property
     def _block_of(self) -> NDArray[np.intp]:
-        """Number (counted,) of each row's block, -1 outside."""
+        """Block number (counted,) of each row, -1 outside."""
         number = np.full(self.record.rows, -1)
         for j, block in enumerate(self.part.blocks):
             number[block] = j
@@ -89,14 +89,14 @@ class FoldScorer:
 
     @property
     def inside(self) -> BoolArray:
-        """Which counted rows (counted,) lie in the blocks."""
+        """Whether each counted row lies in one of the blocks (counted,)."""
         inside = np.zeros(self.record.rows, bool)
         inside[self.part.rows] = True
         return inside
 
     @property
     def rows(self) -> FloatArray:
-        """Rows (block,), single ones."""
+        """Number of single rows per block, (block,)."""
         return np.array([(b.stop - b.start) * self.record.group for b in self.part.blocks], float)
 
     def _white(self, refit: Refit) -> WhiteningFilter:
@@ -104,10 +104,10 @@ class FoldScorer:
 
 
 def parameter_spread(refit: Refit) -> FloatArray:
-    """What a standard deviation along each axis of the posterior moves, (axis, channel, counted, group).
+    """Change of the errors by one standard deviation along each axis of the posterior, (axis, channel, counted, group).
 
-    By the curvature on the rows that fit. A step that leaves the joint density lower than a normal posterior would have
-    it counts for less.
+    From the curvature on the fitted rows. A step is shortened where the joint density falls further than under a normal
+    posterior.
     """
     count = len(refit.z)
     steps = root(refit.covariance).numpy().T
@@ -117,7 +117,7 @@ def parameter_spread(refit: Refit) -> FloatArray:
     fits = np.isin(refit.found.hypothesis.record.source, refit.fits.source)
     here, there = refit.errors[:, fits], moved[:, :, fits]
     lost = 0.5 * ((white(here - there) ** 2).sum((1, 2, 3)) - (white(here) ** 2).sum())
-    # at one standard deviation half a nat, the mean of both sides
+    # a standard deviation costs half a nat; mean of both signs
     lost = lost.reshape(2, -1).mean(0)
     images = 0.5 * (moved[:count] - moved[count:])
     images = images * np.sqrt(np.minimum(1.0, 0.5 / np.maximum(lost, 0.5)))[:, None, None, None]

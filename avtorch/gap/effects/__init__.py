@@ -1,4 +1,4 @@
-"""The effects that the diagnosis knows, one file each, in the order of the chain.
+"""The effects that the diagnosis can name, one file each, in the order of the chain.
 
 Example:
     >>> from avtorch.gap import effects

@@ -17,12 +17,12 @@ from avtorch.vehicle.arguments import Number, tensor
 @register
 @dataclass(frozen=True)
 class Backlash(Effect):
-    """Play operator of `half_width_mps2`: what acts follows `u` at that distance; neutral at 0.
+    """Play operator of `half_width_mps2`: the output follows `u` at that distance; neutral at 0.
 
-    Each row clamps the last output to `u ± half width`. Clamps compose to a clamp, so whole drives are scanned in
-    blocks; which rows moved is then known, and the output of those is `u ± half width`, to be differentiated.
+    Each row clamps the last output to `u ± half width`. A composition of clamps is a clamp, so whole drives are scanned
+    in blocks. The scan identifies the rows that moved; their output is `u ± half width`, which is differentiable.
 
-    Possible up to 1 m/s²: more play than that is no play of a driveline or pedal.
+    Possible up to 1 m/s²: no driveline or pedal has more play.
 
     Example:
         >>> import torch
@@ -63,7 +63,7 @@ class Backlash(Effect):
         with torch.no_grad():
             y = _clamped(low, high, x[..., 0])
             before = torch.cat([x[..., :1].expand_as(y[..., :1]), y[..., :-1]], -1)
-            # rising rows sit at the lower edge, falling ones at the upper; the others repeat the last that moved
+            # rising rows lie on the lower edge, falling ones on the upper; the others repeat the last row that moved
             side = torch.sign(y - before)
             last = torch.where(side != 0, torch.arange(x.shape[-1]), 0).cummax(-1).values
             side = side.gather(-1, last)

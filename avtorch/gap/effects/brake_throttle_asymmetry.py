@@ -1,4 +1,4 @@
-"""Brakes and engine answer differently."""
+"""Brake-throttle asymmetry: brakes and engine have different gain and lag."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from avtorch.vehicle.arguments import Number, tensor
 class BrakeThrottleAsymmetry(Effect):
     """Gain and lag times `brake_gain_ratio`, `brake_lag_ratio` where the command is negative; neutral at 1, 1.
 
-    Possible are five times either way for the gain and ten times for the lag, as between air brakes and a motor.
+    Possible are ratios up to five either way for the gain and ten for the lag, as between air brakes and a motor.
 
     Example:
         >>> import torch

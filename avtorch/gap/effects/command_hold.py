@@ -13,17 +13,18 @@ from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
-_ROWS_BACK = 12  # at a loss of 0.5 the older commands weigh 0.5^12
+_ROWS_BACK = 12  # older commands have a weight of 0.5^12 at most, at a loss fraction of 0.5
 
 
 @register
 @dataclass(frozen=True)
 class CommandHold(Effect):
-    """Each row's command is lost with probability `hold_fraction`, the last one that arrived acts on; neutral at 0.
+    """Each row's command is lost with probability `hold_fraction`, and the last one that arrived is held; neutral at 0.
 
-    Random: its deterministic response is none, its mark is the noise of the command, large where the command moves.
+    Random: its deterministic response is zero; it changes the noise of the command, which is large where the command
+    moves.
 
-    Possible up to 0.6: a link that drops more is a slower link, which no chance decides.
+    Possible up to 0.6: a link that drops more acts as a slower link, not as a random one.
 
     Example:
         >>> import torch

@@ -17,9 +17,9 @@ from avtorch.vehicle.arguments import Number, tensor
 @register
 @dataclass(frozen=True)
 class ConstantResistance(Effect):
-    """`-resistance_mps2` while the car moves, which it does wherever no speed was measured; neutral at 0.
+    """`-resistance_mps2` while the car moves, always where no speed was measured; neutral at 0.
 
-    Possible up to 3.5 m/s²: loose sand, or a motor that brakes as soon as the pedal is let go.
+    Possible up to 3.5 m/s²: loose sand, or a motor that brakes as soon as the pedal is released.
 
     Example:
         >>> import torch

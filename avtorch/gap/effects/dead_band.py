@@ -1,4 +1,4 @@
-"""Dead band: small commands do nothing."""
+"""Dead band: small commands have no effect."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from avtorch.vehicle.arguments import Number, tensor
 class DeadBand(Effect):
     """Soft threshold of `|u|` at `half_width_mps2`; neutral at 0.
 
-    Possible up to 1 m/s², an eighth of what brakes can do.
+    Possible up to 1 m/s², an eighth of full braking.
 
     Example:
         >>> import torch

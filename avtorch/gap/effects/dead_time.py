@@ -1,4 +1,4 @@
-"""Dead time: the command acts late."""
+"""Dead time: the command acts after a delay."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from avtorch.vehicle.arguments import Number, tensor
 class DeadTime(Effect):
     """`u(t - delay_s)`, exact for delays of any fraction of a step; neutral at 0.
 
-    A held command that arrives late switches within a step. So the hook returns two commands and the time for which
-    the older one still acts, and the actuator integrates both parts exactly. Always last among the command's effects.
+    A held command that arrives late switches within a step. The hook therefore returns two commands and the time for
+    which the older one still acts, and the actuator integrates both parts exactly. It is always the last effect of the
+    command.
 
     Possible up to 1.5 s: a radio link of 0.5 s and the air brakes of a long truck, one after the other.
 
@@ -53,7 +54,7 @@ class DeadTime(Effect):
     def advance(self, x: Tensor, row: Row, state: list[Tensor]) -> tuple[tuple[Tensor, Tensor, Tensor], list[Tensor]]:
         delay = tensor(self.delay_s)
         whole, share = self._split(delay, row.dt)
-        reach = int(whole.max()) + 2  # this row's command and those still on their way
+        reach = int(whole.max()) + 2  # this row's command and those still in transit
         kept = [*state, x][-reach:]
         kept = [kept[0]] * (reach - len(kept)) + kept
         if delay.dim() == 0:
@@ -76,13 +77,13 @@ class DeadTime(Effect):
         return early, late, share * dt
 
     def _split(self, delay: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
-        """Whole steps of delay and the remaining share of one."""
+        """Whole steps of delay, and the remaining fraction of a step."""
         steps = delay / dt
-        whole = (steps + 1e-9).floor()  # 0.2 s is 20 steps of 0.01 s, whatever the division says
+        whole = (steps + 1e-9).floor()  # 0.2 s is 20 steps of 0.01 s despite round-off in the division
         return whole.detach().long(), (steps - whole.detach()).clamp_min(0.0)
 
     def _over_jitter(self, x: Tensor, row: Row, delay: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Uneven steps: up to three commands act in one; the last two count by their mean."""
+        """Uneven steps: up to three commands act in one step; the last two are averaged."""
         time, dt = row.time, row.dt
         ends = torch.cat([time[1:], (time[-1] + dt[-1]).reshape(1)])
         first = torch.searchsorted(time, (time - delay).detach().contiguous(), right=True) - 1

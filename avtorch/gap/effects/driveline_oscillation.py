@@ -25,11 +25,11 @@ class DrivelineOscillation(Effect):
 
     `y'' + 2 zeta omega y' + omega² y = omega j`; the car gains `amplitude y + quadrature y' / omega` [m/s²].
 
-    A step of the actuator by 1 m/s² rings with `amplitude` [m/s²]. Where in the driveline the mode sits decides on
-    its phase, so a quadrature part is fitted along; the answer names the length of both. Over a step the mean jerk
-    is held, and the mode is integrated exactly, at any damping (above 1 it creeps back and does not ring).
+    A step of the actuator by 1 m/s² rings with `amplitude` [m/s²]. The phase depends on where the mode sits in the
+    driveline, so a quadrature part is fitted too; the answer states the length of both. Each step holds its mean jerk,
+    and the mode is integrated exactly at any damping (above 1 it decays without ringing).
 
-    Possible are 0.3 to 15 Hz (shuffle of trucks to that of small cars), and a ring of twice the step at most.
+    Possible are 0.3 to 15 Hz (driveline shuffle, from trucks to small cars), and a ring of twice the step at most.
 
     Example:
         >>> import torch
@@ -75,7 +75,7 @@ class DrivelineOscillation(Effect):
 
     def advance(self, x: Tensor, row: Row, state: Any) -> tuple[Tensor, Any]:
         before, y, rate, dt = state
-        if dt is not None:  # from the last row to this one
+        if dt is not None:  # from the previous row to this one
             (m00, m01, m10, m11), (b0, b1) = self._step(dt)
             jerk = (x - before) / dt
             y, rate = m00 * y + m01 * rate + b0 * jerk, m10 * y + m11 * rate + b1 * jerk
@@ -94,10 +94,10 @@ class DrivelineOscillation(Effect):
         return tensor(self.amplitude) * y + tensor(self.quadrature) * rate
 
     def _step(self, dt: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """State `(y, y' / omega)` after `dt`, and what a constant jerk adds."""
+        """State `(y, y' / omega)` after `dt`, and the contribution of a constant jerk."""
         omega, zeta = 2 * math.pi * tensor(self.frequency_hz), tensor(self.mode_damping)
-        # the actuator's formulas, which hold at any damping: their second component is y' / omega²
+        # the actuator's formulas, valid at any damping: their second component is y' / omega²
         m00, m01, m10, m11 = modes_over(1 / omega, 2 * zeta / omega, dt)
         matrix = (m00, m01 / omega, omega * m10, m11)
-        # a constant jerk holds the mode at jerk / omega; the state approaches it
+        # a constant jerk has the equilibrium jerk / omega, which the state approaches
         return matrix, ((1 - matrix[0]) / omega, -matrix[2] / omega)

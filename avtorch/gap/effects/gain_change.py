@@ -17,8 +17,8 @@ from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
-_CHANGES = 12  # moments to begin with, over a drive
-_MOMENTS = 60  # tried one at a time
+_CHANGES = 12  # initial values of the change time over a drive
+_MOMENTS = 60  # change times tried one at a time
 
 
 @register
@@ -26,10 +26,10 @@ _MOMENTS = 60  # tried one at a time
 class GainChange(Effect):
     """`K_L` times `gain_ratio` from `change_s` on, reached over `ramp_s` (near 0: a step); neutral at ratio 1.
 
-    A row takes the mean over its step, so the response is differentiable in the time of the change. The drive's
-    span, `earliest_s … latest_s`, is the prior of that time.
+    A row takes the mean over its step, so the response is differentiable in the change time. The prior of that time is
+    uniform over the drive, `earliest_s … latest_s`.
 
-    Possible are five times either way: the payload of a truck, brakes that fade. The moment may be any.
+    Possible are ratios up to five either way: the payload of a truck, brake fade. The change time is unrestricted.
 
     Example:
         >>> import torch
@@ -79,7 +79,7 @@ class GainChange(Effect):
 
     @classmethod
     def retried_in(cls, first: float, last: float) -> Mapping[str, tuple[float, ...]]:
-        """In a quiet drive only a few moments show a change, so many are tried."""
+        """Change times to try one at a time: many, because in a quiet drive only a few of them are visible."""
         moments = torch.linspace(first, last, _MOMENTS + 2)[1:-1].tolist()
         return {**cls.starts, "change_s": tuple(moments)}
 

@@ -1,4 +1,4 @@
-"""Gear shifts: the drive is interrupted while a gear is changed."""
+"""Gear shifts: the drive torque is interrupted during a gear change."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
-_REARMED = 1.5  # [m/s] below a shift speed the gear counts as changed back, without interruption
+_REARMED = 1.5  # [m/s] below a shift speed at which the gear counts as changed back, without interruption
 _NEVER = -1e9
 _SHIFTS = 6
 
@@ -24,11 +24,11 @@ _SHIFTS = 6
 class GearShift(Effect):
     """Where the speed rises through one of `speeds` [m/s], a positive command loses the share `depth` for `duration_s`.
 
-    Neutral at depth 0. Without `speeds` they are those of a gearbox of even steps: `first_mps`, each next one
-    `gear_ratio` times the last. The crossing is found between rows, and a row loses
-    by the part of its step that lies in the interruption, so the response is differentiable in duration and speeds.
+    Neutral at depth 0. Without `speeds`, they are those of a gearbox with constant ratio: `first_mps`, each next one
+    `gear_ratio` times the previous. The crossing is interpolated between rows, and a row loses drive for the part of
+    its step that lies in the interruption, so the response is differentiable in duration and speeds.
 
-    Possible is an interruption of 0.02 s (two clutches) to 2.5 s (an automated gearbox of a truck).
+    Possible are interruptions of 0.02 s (dual clutch) to 2.5 s (automated gearbox of a truck).
 
     Example:
         >>> import torch
@@ -68,7 +68,7 @@ class GearShift(Effect):
     settings = (Domain("speeds", 0.1, 150.0, "m/s", most=16, rising=True),)
 
     def start(self, x: Tensor, row: Row) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """Of each shift: speed a row ago, whether above, start of the last interruption."""
+        """State of each shift: speed one row ago, whether above, start of the last interruption."""
         v = row.speed
         return [(v, v > s, torch.full_like(v, _NEVER)) for s in self._thresholds()]
 
@@ -89,7 +89,7 @@ class GearShift(Effect):
         before = torch.cat([v[..., :1], v[..., :-1]], -1)
         rows = torch.arange(v.shape[-1])
         for s in self._thresholds():
-            # a hysteresis: the last row that armed or fired decides
+            # hysteresis: the state is that of the last row that armed or fired
             fired = torch.where(v > s, rows, -1).cummax(-1).values
             armed = torch.where(v <= s - _REARMED, rows, -1).cummax(-1).values
             above = fired > armed
@@ -108,7 +108,7 @@ class GearShift(Effect):
         return [tensor(self.first_mps) * tensor(self.gear_ratio) ** i for i in range(_SHIFTS)]
 
     def _crossing(self, before: Tensor, v: Tensor, s: Tensor, row: Row) -> Tensor:
-        """When the interruption starts: one row after the crossing, so that a step knows it when it begins."""
+        """Start of the interruption: one row after the crossing, so that it is known when a step begins."""
         gained = v - before
         share = ((v - s) / torch.where(gained > 0, gained, 1.0)).clamp(0.0, 1.0)
         return row.time + (1 - share) * row.dt

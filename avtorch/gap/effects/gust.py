@@ -20,10 +20,10 @@ from avtorch.vehicle.arguments import Number, tensor
 class Gust(Effect):
     """Ornstein-Uhlenbeck acceleration of standard deviation `sd_mps2` and `time_constant_s`, stationary; neutral at 0.
 
-    Random: its deterministic response is none; the noise model gains this force in both channels.
+    Random: its deterministic response is zero; the noise model gains this force in both channels.
 
-    Possible up to 0.6 m/s², the pull of slopes of 6 % (root mean square) that nobody knows of; a storm's wind of 10 m/s
-    SD does 0.2 m/s² at 30 m/s. Faster than 0.2 s it is vibration, slower than a minute a drift.
+    Possible up to 0.6 m/s², the pull of unmodelled grades of 6 % (root mean square); a storm with a wind SD of 10 m/s
+    causes 0.2 m/s² at 30 m/s. A time constant below 0.2 s is vibration, one above a minute is drift.
 
     Example:
         >>> import torch

@@ -1,4 +1,4 @@
-"""Creep: an idling drive pushes the car at low speed."""
+"""Creep: at low speed an idling engine pushes the car."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FADES_OVER = 0.5  # [m/s]
 class LowSpeedCreep(Effect):
     """`creep_mps2` below about 3 m/s, fading smoothly there; neutral at 0.
 
-    Possible up to 1.5 m/s²: a converter's whole torque at rest.
+    Possible up to 1.5 m/s²: the full stall torque of a converter.
 
     Example:
         >>> import torch

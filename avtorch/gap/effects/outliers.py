@@ -1,4 +1,4 @@
-"""Outliers: now and then the accelerometer is far off."""
+"""Outliers: occasional large errors of the accelerometer."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from avtorch.vehicle.arguments import Number, tensor
 @register
 @dataclass(frozen=True)
 class Outliers(Effect):
-    """A `fraction` of samples is off by a normal error of `scale` times `noise_sd` [m/s²]; neutral at fraction 0.
+    """A `fraction` of samples has a normal error of `scale` times `noise_sd` [m/s²]; neutral at fraction 0.
 
-    Random: its deterministic response is none; the accelerometer's noise gains heavy tails, in units of its own
-    standard deviation. `noise_sd` matters to the simulator only.
+    Random: its deterministic response is zero; the accelerometer's noise gains heavy tails, in units of its own
+    standard deviation. `noise_sd` is used in simulation only.
 
-    Possible up to 0.3 of the samples: more are no outliers but the noise's own shape; and from twice the noise on.
+    Possible up to 0.3 of the samples, beyond which they are the noise's own distribution and not outliers; scale 2 or
+    more.
 
     Example:
         >>> import torch
@@ -59,7 +60,7 @@ class Outliers(Effect):
     def apply(self, x: Tensor, row: Row) -> Tensor:
         if row.normal is None:
             return x
-        # one draw for both: within the hit part of its distribution it is uniform again
+        # one draw serves both: within the tail fraction it is uniform again
         level = torch.special.ndtr(row.normal)
         fraction = tensor(self.fraction)
         hit = level < fraction

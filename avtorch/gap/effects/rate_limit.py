@@ -1,4 +1,4 @@
-"""Rate limit: the realised acceleration changes only so fast."""
+"""Rate limit: the realised acceleration changes at a limited rate."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from avtorch.vehicle.arguments import Number, tensor
 class RateLimit(Effect):
     """`|da/dt|` of the actuator at most `jerk_max_mps3`; neutral at infinity.
 
-    Behind a second-order actuator the set-point `K u` is slewed instead: what limits the one limits the other.
+    Behind a second-order actuator the set-point `K u` is slewed instead, with the same limit.
 
-    Possible are 0.1 m/s³, ten seconds to a gentle push, to 50 m/s³, an emergency brake.
+    Possible are 0.1 m/s³ (ten seconds to a gentle acceleration) to 50 m/s³ (an emergency brake).
 
     Example:
         >>> import torch
@@ -54,7 +54,7 @@ class RateLimit(Effect):
     )
 
     def apply(self, x: Tensor, row: Row) -> tuple[float, float]:
-        return 1.0, 1.0  # the bound is the actuator's own affair, see `actuator.py`
+        return 1.0, 1.0  # the limit is applied in the actuator, see `actuator.py`
 
     def actuator_parameters(self) -> Mapping[str, Tensor]:
         return {"jerk": tensor(self.jerk_max_mps3)}

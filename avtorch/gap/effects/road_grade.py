@@ -1,4 +1,4 @@
-"""Road grade: an unknown, smooth slope along the road."""
+"""Road grade: an unknown, smooth grade along the road."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ from avtorch.vehicle.arguments import Number, tensor
 
 GRAVITY = 9.80665
 """[m/s²]"""
-_SMOOTH_M = 180.0  # correlation length of the slope (Matern 3/2) [m]
+_SMOOTH_M = 180.0  # correlation length of the grade (Matern 3/2) [m]
 
 
 @register
 @dataclass(frozen=True)
 class RoadGrade(Integrated):
-    """`-g sin(slope(position))`; the slope is a Gaussian process over position of size `grade_rms`; neutral at 0.
+    """`-g sin(slope(position))`; the grade is a Gaussian process over position of RMS `grade_rms`; neutral at 0.
 
-    Cubic B-splines every `knot_m` [m] carry it; `profile` (..., knots) holds their coefficients, a priori independent
-    standard normals (the correlation is put in here), linear in the response as far as the sine is: a likelihood may
-    integrate them out by the `columns`. Where `profile` is None the slope is 0, or drawn, where drives are sampled.
+    It is expanded in cubic B-splines, one every `knot_m` [m]; `profile` (..., knots) holds their coefficients, with
+    independent standard normal priors (the correlation is included in the basis). The response is linear in them as far
+    as the sine is, so a likelihood can integrate them out by the `columns`. Where `profile` is None the grade is 0, or
+    drawn where drives are sampled.
 
-    Possible up to 0.2 over a drive: the steepest streets there are reach 0.35.
+    Possible up to 0.2 over a drive: the steepest streets reach 0.35.
 
     Example:
         >>> import torch
@@ -95,12 +96,13 @@ class RoadGrade(Integrated):
         return -GRAVITY * _spline(position, lower.T, self.knot_m, True).movedim(0, -1)
 
     def force(self, position: Tensor, coefficients: Tensor) -> Tensor:
-        """Acceleration (..., time) of a slope of `coefficients` (..., knot), linear in them; `position` (time,) [m]."""
+        """Acceleration (..., time) of a grade with `coefficients` (..., knot), linear in them; `position` (time,)
+        [m]."""
         lower = _lower(self.knots, self.knot_m)
         return -GRAVITY * _spline(position, coefficients @ lower.T, self.knot_m, True)
 
     def magnitude(self, position: Tensor, coefficients: Tensor) -> Tensor:
-        """The slope [-]."""
+        """The grade [-]."""
         return self.force(position, coefficients) / GRAVITY
 
     def along(self, coefficients: Tensor, size: float) -> Self:
@@ -134,7 +136,7 @@ def _spline(position: Tensor, coefficients: Tensor, knot: float, whole: bool) ->
 
 @lru_cache(maxsize=16)
 def _lower(knots: int, knot: float) -> Tensor:
-    """Cholesky factor of the coefficients' prior, scaled so that the slope has standard deviation 1 at a mid-cell."""
+    """Cholesky factor of the coefficients' prior, scaled so that the grade has standard deviation 1 at mid-cell."""
     away = math.sqrt(3) * knot / _SMOOTH_M * (torch.arange(knots)[:, None] - torch.arange(knots)).abs().double()
     covariance = (1 + away) * torch.exp(-away)
     middle = torch.tensor([1.0, 23.0, 23.0, 1.0], dtype=torch.float64) / 48

@@ -1,4 +1,4 @@
-"""Saturation: the car can give only so much."""
+"""Saturation: the car's acceleration is limited."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from avtorch.vehicle.arguments import Number, tensor
 class Saturation(Effect):
     """`K u` clipped to `accel_min_mps2 … accel_max_mps2`; neutral at -inf and inf.
 
-    Possible are 0.1 m/s² (a truck's drive) and -0.3 m/s² (a motor's drag) to 12 m/s², what tyres hold.
+    Possible are 0.1 m/s² (drive of a truck) and -0.3 m/s² (drag of a motor) to 12 m/s², the grip of tyres.
 
     Example:
         >>> import torch
@@ -61,7 +61,7 @@ class Saturation(Effect):
     )
 
     def apply(self, x: Tensor, row: Row) -> Tensor:
-        # clipped before the gain: limits divided by it, so that an inner command passes to the bit
+        # clipped before the gain, with limits divided by it, so that a command within them is unchanged to the last bit
         gain = row.K_L.clamp_min(1e-9)
         high, low = tensor(self.accel_max_mps2) / gain, tensor(self.accel_min_mps2) / gain
         return torch.maximum(torch.minimum(x, high), low)

@@ -1,4 +1,4 @@
-"""Second-order actuator: it can overshoot."""
+"""Second-order actuator: the response can overshoot."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
-_DAMPED = 0.85  # a fit is off by 0.1 or so
+_DAMPED = 0.85  # damping ratio limit: a fit has an error of about 0.1
 
 
 @register
@@ -24,13 +24,13 @@ _DAMPED = 0.85  # a fit is off by 0.1 or so
 class SecondOrderActuator(Effect):
     """`a'' / omega² + 2 zeta a' / omega + a = K u` in place of the one pole.
 
-    Fitted as `tau² a'' + T_L a' + a = K u` with `tau = inverse_frequency_s`: neutral at 0, where the GLVD comes out
-    exactly, and `T_L` keeps its meaning, the slope of the phase. The answer names `natural_frequency_radps = 1 / tau`
-    and `damping_ratio = T_L / (2 tau)`. With `damping_ratio` given, `plant` sets `T_L` to `2 zeta tau`; from then on
-    `T_L` tells the damping, and the effect in the plant has no `damping_ratio` of its own. Where it sets in during a
-    drive, `T_L` is the lag until then and `lag_ratio` times it that from then on.
+    Fitted as `tau² a'' + T_L a' + a = K u` with `tau = inverse_frequency_s`: neutral at 0, where it is exactly GLVD,
+    and `T_L` keeps its meaning, the slope of the phase. The answer reports `natural_frequency_radps = 1 / tau` and
+    `damping_ratio = T_L / (2 tau)`. With `damping_ratio` given, `plant` sets `T_L` to `2 zeta tau`; from then on `T_L`
+    determines the damping, and the effect in the plant has no `damping_ratio` of its own. With an onset during a drive,
+    `T_L` is the lag before it and `lag_ratio` times `T_L` the lag after it.
 
-    Possible are 0.5 to 60 rad/s, a swing of 12 s to one of 0.1 s, damped by 0.03 to 5.
+    Possible are 0.5 to 60 rad/s, periods of 12 s to 0.1 s, with damping ratios of 0.03 to 5.
 
     Example:
         >>> import torch
@@ -66,14 +66,14 @@ class SecondOrderActuator(Effect):
     settings = (Domain("natural_frequency_radps", 1e-3, 1e5, "rad/s"), Domain("damping_ratio", 1e-3, 1e3))
 
     def apply(self, x: Tensor, row: Row) -> tuple[float, Tensor]:
-        return 1.0, tensor(self.lag_ratio)  # the second derivative is the actuator's own affair, see `actuator.py`
+        return 1.0, tensor(self.lag_ratio)  # the second derivative is integrated in the actuator, see `actuator.py`
 
     def actuator_parameters(self) -> Mapping[str, Tensor]:
         return {"tau": tensor(self.inverse_frequency_s)}
 
     @classmethod
     def aliased(cls, values: Mapping[str, float]) -> bool:
-        """Two real poles, as another first-order lag makes them, have a damping of 1 or more."""
+        """Whether the two poles are real, as those of two first-order lags are: a damping ratio of 1 or more."""
         damping = values["T_L"] / max(2 * values["inverse_frequency_s"], 1e-9)
         return damping >= _DAMPED
 
@@ -83,7 +83,7 @@ class SecondOrderActuator(Effect):
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:
-        """From `natural_frequency_radps` and `damping_ratio` (without it the plant keeps its `T_L`)."""
+        """The effect from `natural_frequency_radps` and `damping_ratio` (without it the plant keeps its `T_L`)."""
         given = dict(values)
         if "natural_frequency_radps" in given:
             frequency = given.pop("natural_frequency_radps")

@@ -1,4 +1,4 @@
-"""Sensor bias: the accelerometer is off by a constant."""
+"""Sensor bias: the accelerometer has a constant offset."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sensor lag: the accelerometer is filtered."""
+"""Sensor lag: the accelerometer's reading is low-pass filtered."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class SensorLag(Effect):
 
     Exact for an acceleration that is linear between rows.
 
-    Possible up to 1 s: an accelerometer answers within milliseconds, and no filter on a vehicle bus is slower.
+    Possible up to 1 s: an accelerometer responds within milliseconds, and no filter on a vehicle bus is slower.
 
     Example:
         >>> import torch
@@ -64,7 +64,7 @@ class SensorLag(Effect):
 
     def _weights(self, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         lag = tensor(self.lag_s)
-        ratio = dt / lag.clamp_min(1e-7 * dt)  # at a lag of 0 the filter forgets at once, and has a derivative
+        ratio = dt / lag.clamp_min(1e-7 * dt)  # at a lag of 0 the filter has no memory, and still has a derivative
         keep = torch.exp(-ratio)
         held = lag / dt * -torch.expm1(-ratio)
         return keep, held - keep, 1 - held

@@ -17,7 +17,7 @@ from avtorch.vehicle.arguments import Number, tensor
 class SensorScale(Effect):
     """The measured acceleration times `scale`; neutral at 1.
 
-    Possible are half to twice the truth; beyond that it is another unit.
+    Possible are half to twice the true value; beyond that the unit is wrong.
 
     Example:
         >>> import torch

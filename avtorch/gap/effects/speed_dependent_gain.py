@@ -13,7 +13,7 @@ from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
-_LEAST = 0.0  # the factor's least value, out of a drive's range of speeds
+_LEAST = 0.0  # the factor's lower limit, outside a drive's range of speeds
 
 
 @register
@@ -21,10 +21,10 @@ _LEAST = 0.0  # the factor's least value, out of a drive's range of speeds
 class SpeedDependentGain(Effect):
     """`K_L (1 + gain_slope (v - v_mean) / v_mean)`; neutral at 0. `mean_speed` [m/s] is taken from a drive.
 
-    `pivot` [-]: the speed, as a share of the mean one, at which nothing changes. It bears on K_L alone as long as the
-    effect was always there, and is 1 then.
+    `pivot` [-]: the speed, relative to the mean one, at which the gain is unchanged. It only rescales K_L if the effect
+    has no onset, and is then 1.
 
-    Possible up to 2 either way, where nothing of the gain is left at half or one and a half times the mean speed.
+    Possible up to 2 either way, where the gain vanishes at half or at one and a half times the mean speed.
 
     Example:
         >>> import torch
