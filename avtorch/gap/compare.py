@@ -216,8 +216,7 @@ def _of_draws(x: FloatArray) -> Quantity:
 
 
 def _log_quantity(mean: float, variance: float, sure: float) -> Quantity:
-    """The quantity exp(x) for normal x of this `mean` and `variance`; its central 90 % is `sure` standard
-    deviations."""
+    """exp(x) for a normal x of this `mean` and `variance`; `sure`: half its central 90 % in standard deviations."""
     sd = float(np.sqrt(variance))
     middle = float(np.exp(mean))
     return Quantity(middle, middle * sd, float(np.exp(mean - sure * sd)), float(np.exp(mean + sure * sd)))

@@ -37,8 +37,7 @@ class WithDelay:
 
     @classmethod
     def of(cls, search: Search, none: FittedModel) -> WithDelay:
-        """Fit a dead time on top of `none`, which `search` fitted without effects; it replaces one of the
-        baseline's."""
+        """Fit a dead time on top of `none`, the fit without effects; it replaces one of the baseline's."""
         found = search.with_effects(none, [delay_effect()])
         candidate, record = found.hypothesis, found.hypothesis.record
         keys, own = [c.key for c in candidate.coordinates], _keys()

@@ -23,8 +23,7 @@ _LAGS_S = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
 
 @dataclass(frozen=True, eq=False)
 class BlackBoxRegression:
-    """Regressors (column, channel, counted, 1): response of the channels to unit forces and unit accelerometer
-    faults."""
+    """Regressors (column, channel, counted, 1): the channels' response to unit forces and accelerometer faults."""
 
     record: Record
     columns: FloatArray

@@ -50,8 +50,7 @@ class Location:
 
 
 def localise(shown: RowAttribution, *, onset_s: float | None, lag: float) -> tuple[Location, ...]:
-    """The significant parts, most significant first. `onset_s`: onset from the log's start; `lag` [s] of the
-    actuator."""
+    """The significant parts, most significant first. `onset_s`: from the log's start; `lag` [s] of the actuator."""
     parts: list[Part] = [*_stretches(shown, onset_s, lag), *_signals(shown), *_band(shown)]
     q_values = _q_values([gain - shown.paid for *_, gain in parts])
     parts = [(axis, *_stamps(shown, axis, a, b), share, gain) for axis, a, b, share, gain in parts]

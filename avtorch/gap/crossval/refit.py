@@ -118,8 +118,7 @@ class Refit:
 
     @cached_property
     def effect(self) -> FloatArray:
-        """Effect of its causes over the whole record, (channel, counted, group): rollout with minus rollout without
-        them."""
+        """Rollout with its effects minus rollout without them over the whole record, (channel, counted, group)."""
         hypothesis = self.found.hypothesis
         return self._rolled(hypothesis, self.z) - hypothesis.baseline_rollouts(self.z[None])[0]
 

@@ -96,8 +96,7 @@ class RoadGrade(Integrated):
         return -GRAVITY * _spline(position, lower.T, self.knot_m, True).movedim(0, -1)
 
     def force(self, position: Tensor, coefficients: Tensor) -> Tensor:
-        """Acceleration (..., time) of a grade with `coefficients` (..., knot), linear in them; `position` (time,)
-        [m]."""
+        """Acceleration (..., time) of a grade, linear in its `coefficients` (..., knot); `position` (time,) [m]."""
         lower = _lower(self.knots, self.knot_m)
         return -GRAVITY * _spline(position, coefficients @ lower.T, self.knot_m, True)
 

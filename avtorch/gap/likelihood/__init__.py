@@ -1,1 +1,1 @@
-"""How probable a log is under a candidate: records, noise made white, modes and their evidence."""
+"""Likelihood of a log under a hypothesis: records, whitened residuals, modes and log evidence."""

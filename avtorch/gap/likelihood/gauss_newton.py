@@ -1,7 +1,7 @@
-"""The mode of a hypothesis's parameters: Gauss-Newton from many starts at once, errors made white.
+"""The mode of a hypothesis's parameters: Gauss-Newton on whitened errors, from many starts at once.
 
-Derivatives are forward differences: all columns of all starts are one batch of rollouts, which costs hardly more than
-one. The slope of a road is linear in its coefficients, which are integrated out exactly.
+Derivatives are forward differences: all columns of all starts form one batch of rollouts, which costs hardly more than
+one rollout. The road grade is linear in its coefficients, which are integrated out exactly.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _LONGEST = 1.0
 
 @dataclass(frozen=True, eq=False)
 class GaussNewtonFit:
-    """`z` (coordinate,) at the mode, its posterior covariance, errors (channel, counted, group) left over.
+    """`z` (coordinate,) at the mode, its posterior covariance, and the residuals (channel, counted, group).
 
-    `log_joint`: log likelihood plus log prior at the mode; `log_evidence`: by Laplace, the noise as given.
-    `grade_rms`, `profile`: of a road's slope.
+    `log_joint`: log likelihood plus log prior at the mode; `log_evidence`: by Laplace's approximation, with the noise
+    held. `grade_rms`, `profile`: of the road grade.
     """
 
     z: Float[FloatArray, " coordinate"]
@@ -49,8 +49,8 @@ def modes(
 ) -> tuple[Float[FloatArray, "start coordinate"], Float[FloatArray, " start"]]:
     """Modes (start, coordinate) and their log joint densities (start,), from `starts` (start, coordinate).
 
-    `coarse`: on rollouts of averaged commands, several times as fast, good for a first look. A start has arrived once
-    a step gains less than `enough` nats.
+    `coarse`: rollouts of averaged commands, several times as fast and accurate enough for screening. A start has
+    converged once a step gains less than `enough` nats.
     """
     z = np.array(starts)
     count, size = z.shape
@@ -88,7 +88,7 @@ def _quadratic(
 ) -> tuple[
     Float[FloatArray, "start coordinate"], Float[FloatArray, "start coordinate coordinate"], Float[FloatArray, " start"]
 ]:
-    """Gradient, Gauss-Newton matrix and value of the negative log joint density (less its constant) at `z`."""
+    """Gradient, Gauss-Newton matrix and value of the negative log joint density (up to a constant) at `z`."""
     count, size = z.shape
     moved = np.repeat(z[:, None], size + 1, 1)
     moved[:, 1:] += _STEP * np.eye(size)
@@ -109,7 +109,7 @@ def _quadratic(
 def whitened_jacobian(
     hypothesis: Hypothesis, white: WhiteningFilter, z: Float[FloatArray, " coordinate"], onset: int | None = None
 ) -> Float[FloatArray, "direction row"]:
-    """White directions (direction, row) in which its parameters and its road's slope move a rollout from `z`."""
+    """Whitened derivatives (direction, row) of the rollout at `z` by the parameters and the road grade."""
     moved = np.repeat(z[None], len(z) + 1, 0)
     moved[1:] += _STEP * np.eye(len(z))
     e = white(hypothesis.rollouts(moved, onset)).reshape(len(z) + 1, -1)
@@ -127,7 +127,7 @@ def _integrated(
     cross: FloatArray,
     value: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The quadratic with the slope's coefficients and size integrated out, (start, ...)."""
+    """The quadratic with the road grade's coefficients and size integrated out, (start, ...)."""
     match = base @ slope.image.T
     towards = columns @ slope.image.T
     total, taken = slope.weighed(match)
@@ -140,7 +140,7 @@ _LAST: WeakKeyDictionary[WhiteningFilter, tuple[FloatArray, int | None, GradeMar
 
 
 def grade_marginal(white: WhiteningFilter, hypothesis: Hypothesis, onset: int | None, *, coarse: bool) -> GradeMarginal:
-    """Of the hypothesis's slope under this noise; the last one of each noise is kept."""
+    """The marginal of the hypothesis's road grade under this noise; the last one of each noise model is cached."""
     grade = hypothesis.grade_means if coarse else hypothesis.grade_columns
     assert grade is not None
     kept = _LAST.get(white)
@@ -155,7 +155,7 @@ def grade_marginal(white: WhiteningFilter, hypothesis: Hypothesis, onset: int | 
 def acting(
     white: WhiteningFilter, force: Float[FloatArray, "*column channel counted group"], onset: int | None
 ) -> Float[FloatArray, "*column channel counted group"]:
-    """What a slope does (..., channel, counted, group), if only from `onset` on."""
+    """Response to the road grade (..., channel, counted, group), limited to rows from `onset` on."""
     if onset is None:
         return force
     force = force.copy()
@@ -173,7 +173,7 @@ def residuals(
     *,
     coarse: bool,
 ) -> Float[FloatArray, "channel counted group"]:
-    """Errors (channel, counted, group) at `z` (coordinate,), less what a road's slope explains of them."""
+    """Residuals (channel, counted, group) at `z` (coordinate,), with the fitted road grade subtracted."""
     errors = hypothesis.errors(z[None], onset, coarse=coarse)[0]
     return errors if hypothesis.grade_means is None else errors - _sloped(hypothesis, white, errors, onset)[2]
 
@@ -184,7 +184,7 @@ def _sloped(
     errors: Float[FloatArray, "channel counted group"],
     onset: int | None,
 ) -> tuple[float, Float[FloatArray, " knot"], Float[FloatArray, "channel counted group"]]:
-    """`grade_rms`, coefficients (knot,), and what they do to the errors."""
+    """`grade_rms`, the road grade's coefficients (knot,), and its contribution to the errors."""
     rms, profile = grade_marginal(white, hypothesis, onset, coarse=errors.shape[-1] == 1).told(white(errors).ravel())
     part = hypothesis.grade_response(profile)
     part = part.mean(-1, keepdims=True) if errors.shape[-1] == 1 else part
@@ -194,7 +194,7 @@ def _sloped(
 def finish(
     hypothesis: Hypothesis, white: WhiteningFilter, z: Float[FloatArray, " coordinate"], onset: int | None = None
 ) -> GaussNewtonFit:
-    """Covariance, errors and Laplace evidence at a mode `z` (coordinate,)."""
+    """Covariance, residuals and Laplace evidence at a mode `z` (coordinate,)."""
     size = len(z)
     _, square, value = (x[0] for x in _quadratic(hypothesis, white, z[None], onset))
     errors = hypothesis.errors(z[None], onset)[0]

@@ -1,9 +1,9 @@
-"""A hypothesis cause: a plant with some effects, its coordinates, and what it leaves over of a record.
+"""A hypothesis: a plant with some effects, its fit coordinates, and its residuals on a record.
 
-Coordinates `z` are standard normal a priori. An effect whose size can go to its neutral value may be far fainter than
-what is typical, so the prior of sizes is twice as wide here as the table's range.
+Coordinates `z` are standard normal a priori. An effect whose size can reach its neutral value may be far weaker than
+typical, so the prior of sizes is twice as wide here as the table's range.
 
-With an `onset`, a row number, the effects act from there on, see `avtorch.gap.simulator.rollout_from_onset`.
+With an `onset`, a row number, the effects act from that row on, see `avtorch.gap.simulator.rollout_from_onset`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _WIDER = 2.0
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One coordinate of a fit: the parameter's key in the plant, and how much wider than typical its prior is."""
+    """One coordinate of a fit: the parameter's key in the plant, and the factor by which its prior is widened."""
 
     key: str
     parameter: Parameter
@@ -51,7 +51,7 @@ _ROWS: WeakKeyDictionary[Record, dict[type[Integrated], FloatArray]] = WeakKeyDi
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Effects on top of a baseline, over a record."""
+    """A baseline with effects added, over a record."""
 
     record: Record
     effects: tuple[type[Effect], ...]
@@ -59,7 +59,7 @@ class Hypothesis:
 
     @classmethod
     def named(cls, record: Record, name: str, baseline: GapPlant, more: Sequence[type[Effect]] = ()) -> Hypothesis:
-        """From `none`, an effect's name, or two joined by `+`."""
+        """The hypothesis named `none`, an effect's name, or two joined by `+`."""
         parts = () if name == "none" else tuple(name.split("+"))
         return cls(record, tuple(effect_class(part, more) for part in parts), baseline)
 
@@ -77,7 +77,7 @@ class Hypothesis:
 
     @cached_property
     def coordinates(self) -> tuple[Coordinate, ...]:
-        """`T_L`, `K_L`, then the effects'; vectors (a slope's profile) and baseline effects are left out."""
+        """`T_L`, `K_L`, then the effects' parameters; vectors (a grade's profile) and the baseline's are left out."""
         own = {e.name: e for e in self.effects}
         found = []
         for key, p in self.plant.parameters().items():
@@ -95,24 +95,24 @@ class Hypothesis:
         return len(self.coordinates)
 
     def values(self, z: Float[FloatArray, "column coordinate"]) -> dict[str, torch.Tensor]:
-        """Parameters by key, (column,), for `z` (column, coordinate)."""
+        """Values by key, (column,), for `z` (column, coordinate)."""
         return {c.key: c.value(z[:, i]) for i, c in enumerate(self.coordinates)}
 
     def held(
         self, z: Float[FloatArray, "column coordinate"], onset: int | None
     ) -> Float[FloatArray, "column coordinate"]:
-        """`z` (column, coordinate) with what only an onset can tell put to its prior's centre where there is none."""
+        """`z` (column, coordinate); without an onset, coordinates that need one are set to their prior mean."""
         rests = [c.parameter.of_onset for c in self.coordinates]
         return np.where(rests, 0.0, z) if onset is None and any(rests) else z
 
     def z_of(self, values: Mapping[str, float]) -> Float[FloatArray, " coordinate"]:
-        """Coordinates for values by key; what is missing gets its prior's centre."""
+        """Coordinates for values by key; missing ones are at their prior's centre."""
         return np.array([c.z_of(values[c.key]) if c.key in values else 0.0 for c in self.coordinates])
 
     def rollouts(
         self, z: Float[FloatArray, "column coordinate"], onset: int | None = None, *, coarse: bool = False
     ) -> Float[FloatArray, "column channel counted group"]:
-        """Responses for `z` (column, coordinate): (column, channel, counted, group)."""
+        """Rollouts for `z` (column, coordinate): (column, channel, counted, group)."""
         values = self.values(self.held(z, onset))
         if onset is None:
             return self._rollouts(self.plant, values, coarse)
@@ -125,8 +125,7 @@ class Hypothesis:
     def baseline_rollouts(
         self, z: Float[FloatArray, "column coordinate"], *, coarse: bool = False
     ) -> Float[FloatArray, "some channel counted group"]:
-        """What the baseline alone does with the `T_L` and `K_L` of `z` (column, coordinate); one column if all
-        agree."""
+        """Rollouts of the baseline alone with the `T_L` and `K_L` of `z` (column, coordinate); one if all are equal."""
         lags = z[:, [c.key in ("T_L", "K_L") for c in self.coordinates]]
         z = z[:1] if bool((lags == lags[0]).all()) else z
         values = {k: v for k, v in self.values(z).items() if k in ("T_L", "K_L")}
@@ -149,20 +148,20 @@ class Hypothesis:
     def errors(
         self, z: Float[FloatArray, "column coordinate"], onset: int | None = None, *, coarse: bool = False
     ) -> Float[FloatArray, "column channel counted group"]:
-        """Measured less rolled out, (column, channel, counted, group)."""
+        """Measurement minus rollout, (column, channel, counted, group)."""
         measured = self.record.measured
         return (measured.mean(-1, keepdims=True) if coarse else measured) - self.rollouts(z, onset, coarse=coarse)
 
     @property
     def integrated(self) -> type[Integrated] | None:
-        """The effect among its own whose coefficients are integrated out."""
+        """The hypothesis's effect whose coefficients are integrated out, or None."""
         return next((e for e in self.effects if issubclass(e, Integrated)), None)
 
     @cached_property
     def grade_columns(self) -> Float[FloatArray, "knot channel counted group"] | None:
-        """Rollouts (knot, channel, counted, group) per unit of each coefficient of the slope at `grade_rms` 1.
+        """Response (knot, channel, counted, group) to each coefficient of the road grade at `grade_rms` 1.
 
-        Every segment has coefficients of its own: where one began on the other's road is not known.
+        Every segment has coefficients of its own, because its position on another segment's road is unknown.
         """
         kind = self.integrated
         if kind is None or not self._roads:
@@ -174,7 +173,7 @@ class Hypothesis:
 
     @cached_property
     def grade_means(self) -> Float[FloatArray, "knot channel counted 1"] | None:
-        """The same of each group's mean, (knot, channel, counted, 1): within a group no slope changes."""
+        """The same for each group's mean, (knot, channel, counted, 1): within a group the grade is constant."""
         kind = self.integrated
         if kind is None or not self._roads:
             return None
@@ -192,7 +191,7 @@ class Hypothesis:
         return self._seen_forces(drives, forces, coarse=coarse)
 
     def grade_response(self, coefficients: Float[FloatArray, " knot"]) -> Float[FloatArray, "channel counted group"]:
-        """What a slope of `coefficients` (knot,) does, (channel, counted, group)."""
+        """Response to a road grade of `coefficients` (knot,), (channel, counted, group)."""
         drives = self.record.drives
         forces = [road.force(_position(d), own)[None] for road, d, own in self._each_road(drives, coefficients)]
         return self._seen_forces(drives, forces, coarse=False)[0]
@@ -200,32 +199,32 @@ class Hypothesis:
     def _each_road(
         self, drives: Sequence[Drive], coefficients: FloatArray
     ) -> Iterator[tuple[Integrated, Drive, torch.Tensor]]:
-        """Each drive with its road and that road's part of `coefficients` (..., knot)."""
+        """Each drive with its road and that road's `coefficients` (..., knot)."""
         for drive, road, own in zip(drives, *self._places, strict=True):
             yield road, drive, torch.as_tensor(coefficients[..., own])
 
     @property
     def _places(self) -> tuple[list[Integrated], list[slice]]:
-        """Of each drive the road, and where its coefficients stand among those of all roads."""
+        """The road of each drive, and the slice of its coefficients among those of all roads."""
         ends = np.cumsum([0, *(road.count for road in self._roads)]).tolist()
         own = [slice(*part) for part in pairwise(ends)]
         numbers = self.record.segment
         return [self._roads[n] for n in numbers], [own[n] for n in numbers]
 
     def _seen_forces(self, drives: Sequence[Drive], forces: Sequence[torch.Tensor], *, coarse: bool) -> FloatArray:
-        """Forces (column, time) of each drive as both channels see them, (column, channel, counted, group)."""
+        """Response of both channels to forces (column, time) of each drive, (column, channel, counted, group)."""
         accel, speed = [], []
         for drive, force in zip(drives, forces, strict=True):
             gained = torch.cumsum(0.5 * drive.dt[:-1] * (force[:, 1:] + force[:, :-1]), -1)
             hidden = drive.specific_force and self.integrated is not None and self.integrated.gravity
-            accel.append(torch.zeros_like(force) if hidden else force)  # an accelerometer does not feel gravity
+            accel.append(torch.zeros_like(force) if hidden else force)  # an accelerometer does not measure gravity
             speed.append(torch.cat([torch.zeros_like(force[:, :1]), gained], -1))
         seen = {"accel": accel, "speed": speed}
         return np.stack([self.record.seen(seen[name], coarse=coarse) for name in self.record.channels], 1)
 
     @cached_property
     def _roads(self) -> list[Integrated]:
-        """The integrated effect with as many knots as each segment's road needs; empty where there is none."""
+        """The integrated effect, with the number of knots that each segment's road needs; empty where there is none."""
         if self.integrated is None or self.record.speed is None:
             return []
         grade = next(e for e in self.plant.effects if isinstance(e, self.integrated))
@@ -236,7 +235,7 @@ class Hypothesis:
         return made
 
     def grade_along(self, coefficients: Float[FloatArray, "column knot"]) -> Float[FloatArray, " column"]:
-        """Root mean square of the slope along all drives, (column,), for coefficients (column, knot)."""
+        """Root mean square grade over all drives, (column,), for coefficients (column, knot)."""
         drives = self.record.coarse
         squares = [
             road.magnitude(_position(drive), own).square().mean(-1) * len(drive.time)

@@ -1,4 +1,4 @@
-"""Draws of a rollout's errors from their noise model, by the same exact steps that its filter takes."""
+"""Draws of rollout errors from their noise model, by the exact discretisation that its filter uses."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from avtorch.gap.likelihood.steady_kalman import motion
 def noise_draws(
     noise: NoiseModel, rows: int, dt: float, channels: tuple[str, ...], count: int, rng: np.random.Generator
 ) -> FloatArray:
-    """(draw, channel, row) at rows `dt` [s] apart; the error of the speed begins at 0, its sensor's noise apart."""
+    """(draw, channel, row) at rows `dt` [s] apart; the speed's error starts at 0, except for its sensor noise."""
     move, driven = motion(noise, dt)
-    # what forgets is in its steady state when the drive begins
+    # stationary states start from their stationary distribution
     start = np.zeros_like(move)
     start[1:, 1:] = solve_discrete_lyapunov(move[1:, 1:], driven[1:, 1:])
     root, first = _root(driven), _root(start)

@@ -1,4 +1,4 @@
-"""The noise model fitted to what a rollout leaves over: scoring steps on the innovations' likelihood."""
+"""The noise model fitted to the residuals of a rollout: scoring steps on the innovations' likelihood."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ PRIORS: dict[str, Prior] = {
     "accel_sd": (np.log(0.05), 1.2, 4.0),
     "speed_sd": (np.log(0.02), 1.2, 4.0),
 }
-"""Log-normal priors: mean and sd of the logarithm, and beyond how many sds they end.
+"""Log-normal priors: mean and sd of the logarithm, and the number of sds at which they are truncated.
 
-White jerk noise passes the actuator's lag, so `process_time` is told in units of `T_L`. The nuisance force is small and
-slow by decree: free, it would swallow whatever the car does that no candidate foretells, and every cause with it.
+White jerk noise passes the actuator's lag, so `process_time` is in units of `T_L`. The prior keeps the nuisance force
+small and slow: a free force would absorb whatever no hypothesis predicts, including every cause.
 """
 
 GUST: dict[str, Prior] = {
@@ -36,20 +36,20 @@ GUST: dict[str, Prior] = {
     "force_sd": (np.log(0.1), 1.0, 4.0),
     "force_time": (np.log(2.2), 0.63, 2.5),
 }
-"""Priors where the coloured force is the cause."""
+"""Priors where the coloured force is itself the cause."""
 
-_LAW_END = 4.0  # prior standard deviations of a random effect's parameter
+_LAW_END = 4.0  # limit in prior standard deviations for a random effect's parameter
 _STEP = 1e-3
-_LONGEST = 1.5  # of a step, in prior standard deviations
-_TRIES = 8  # of a step, each shorter; far from the mode squared scores are no information at all
+_LONGEST = 1.5  # longest step, in prior standard deviations
+_TRIES = 8  # tries of a step, each shorter; far from the mode squared scores do not estimate the information
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseFit:
-    """`noise` at its mode; `log_prior` there with Laplace's term: what it adds to a log evidence.
+    """`noise` at its mode; `log_prior` there with Laplace's term: its contribution to a log evidence.
 
     `rows` (counted,): log likelihood of each row; `sds` of the logarithms, by name. `law_z` (coordinate,),
-    `law_covariance`: of a random effect's force that was fitted with it.
+    `law_covariance`: of a random effect's force fitted jointly.
     """
 
     noise: NoiseModel
@@ -73,10 +73,11 @@ def fit_noise(
     law: RandomLaw | None = None,
     law_z: FloatArray | None = None,
 ) -> NoiseFit:
-    """Mode of the noise's parameters given the errors (channel, counted, group) of a rollout; `T_L` [s].
+    """Mode of the noise parameters given the errors (channel, counted, group) of a rollout; `T_L` [s].
 
-    Errors of groups' means come with group 1. Before `onset` the sensor reads plainly, before `gust_onset` the force is
-    calm. `law`: of a random effect whose force is fitted as well, from `law_z` (coordinate,) on.
+    Errors averaged over groups have group size 1. Before `onset` the sensor has neither lag nor scale error, before
+    `gust_onset` the force has its nuisance size. `law`: of a random effect whose force is fitted jointly, from `law_z`
+    (coordinate,) on.
     """
     means = np.array([priors[n][0] for n in NAMES])
     means[NAMES.index("process_time")] += np.log(T_L)
@@ -88,7 +89,7 @@ def fit_noise(
 
     def model(z: FloatArray) -> NoiseModel:
         own = {n: float(x) for n, x in zip(NAMES, np.exp(means + sds * z[:size]), strict=True)}
-        # nothing of a force would leave its state without a use
+        # a force of exactly zero would make its state singular
         more = {} if law is None else {k: max(x, 1e-6) for k, x in law.force(z[size:]).items()}
         return replace(start, **own, **more)
 
@@ -101,7 +102,7 @@ def fit_noise(
     rows = white(z).row_likelihoods(errors)
     value = float(rows.sum()) - 0.5 * float(z @ z)
     if not 0.5 < float((white(z)(errors) ** 2).mean()) < 2.0:
-        # far off: scores mislead, so begin at the best of a coarse grid of sizes
+        # far from the mode scores mislead: start at the best point of a coarse grid of sizes
         for shifts in product((-1.4, 0.0, 1.4), repeat=3):
             other = z.copy()
             for name, shift in zip(("process_sd", "accel_sd", "speed_sd"), shifts, strict=True):
@@ -116,11 +117,11 @@ def fit_noise(
         before = [before_onset(n, **onsets) for n in ahead]
         whites = WhiteningFilter.each(record, ahead, before, coarse=errors.shape[-1] == 1)
         slopes = np.stack([(w.row_likelihoods(errors) - rows) / _STEP for w in whites])
-        # squared scores tell the information where the model fits; far from it they are too large by the square of this
+        # squared scores estimate the information near the mode; far from it they are too large by the square of this
         excess = max(1.0, float((white(z)(errors) ** 2).mean()))
         information = slopes @ slopes.T / excess**2 + np.eye(len(z))
         gradient = slopes.sum(1) - z
-        # what an end holds back does not move
+        # coordinates at a bound with an outward gradient stay fixed
         held = ((z >= ends) & (gradient > 0)) | ((z <= -ends) & (gradient < 0))
         free = np.flatnonzero(~held)
         part = information[np.ix_(free, free)]

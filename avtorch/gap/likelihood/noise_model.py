@@ -1,13 +1,13 @@
-"""The noise of a rollout's errors: its linear-Gaussian model, in six numbers.
+"""The noise of a rollout's errors: a linear-Gaussian model with six parameters.
 
-The error of a rollout is what no deterministic response foretells,
+The error of a rollout is the part of the measurement that no deterministic response predicts,
 
     dw/dt = p + d            error of the speed
     p: white jerk noise through the actuator's lag, an Ornstein-Uhlenbeck process (sd, time constant)
-    d: a slow coloured force, the nuisance of every candidate and the cause where a random force is one, likewise
+    d: a slow coloured force (sd, time constant): a nuisance in every hypothesis, the cause where that is a random force
     accel measured = p + d + white,   speed measured = w + white
 
-A random effect of the user's may add a further force to `p + d`, of the same kind.
+A user's random effect may add a further force of the same kind to `p + d`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 from avtorch.gap.simulator.effect import Effect
 
-_NO_LAG = 2e-3  # [s], of which no log tells
+_NO_LAG = 2e-3  # [s] lags below this are not identifiable from a log
 
 NAMES = ("process_sd", "process_time", "force_sd", "force_time", "accel_sd", "speed_sd")
 
@@ -27,9 +27,9 @@ NAMES = ("process_sd", "process_time", "force_sd", "force_time", "accel_sd", "sp
 @dataclass(frozen=True)
 class NoiseModel:
     """`process_sd`, `force_sd`, `accel_sd` [m/s²], `speed_sd` [m/s] (white, of single rows), times [s]. `more_sd`,
-    `more_time`: of a random effect's force, none at 0.
+    `more_time`: of a random effect's force, absent at 0.
 
-    What the accelerometer makes of the car's random motion: `sensor_scale` [-] times it, late by a first-order
+    The accelerometer measures the car's random motion scaled by `sensor_scale` [-] and lagged by a first-order
     `sensor_lag` [s].
     """
 
@@ -46,7 +46,7 @@ class NoiseModel:
 
     @property
     def forces(self) -> tuple[tuple[float, float], ...]:
-        """Standard deviations [m/s²] and times [s] of the random motion's parts."""
+        """Standard deviations [m/s²] and time constants [s] of the random motion's components."""
         more = ((self.more_sd, self.more_time),) if self.more_sd > 0 else ()
         return ((self.process_sd, self.process_time), (self.force_sd, self.force_time), *more)
 
@@ -54,7 +54,7 @@ class NoiseModel:
         return replace(self, **values)
 
     def seen_through(self, effects: Iterable[type[Effect]], values: Mapping[str, float]) -> NoiseModel:
-        """With the accelerometer that `effects` describe at parameter `values`, by key."""
+        """The noise as measured by the accelerometer that `effects` describe at parameter `values`, by key."""
         lag, scale = 0.0, 1.0
         for e in effects:
             if "lag" in e.reading:
@@ -64,6 +64,6 @@ class NoiseModel:
         return replace(self, sensor_scale=scale, sensor_lag=lag if lag > _NO_LAG else 0.0)
 
     def of_means(self, group: int) -> NoiseModel:
-        """Of the means of `group` rows."""
+        """The noise of means over `group` rows."""
         size = float(np.sqrt(group))
         return replace(self, accel_sd=self.accel_sd / size, speed_sd=self.speed_sd / size)

@@ -1,4 +1,4 @@
-"""The noise before an onset: a sensor that still reads plainly, a force that is still calm."""
+"""The noise before an onset: no sensor lag or scale error yet, and a force of nuisance size."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ CALM = 0.005
 
 
 def before_onset(noise: NoiseModel, *, onset: int | None = None, gust_onset: int | None = None) -> Until:
-    """What `noise` was up to a row, in order: `onset` is that of a sensor's lag and scale, `gust_onset` a gust's."""
+    """`noise` as it was up to each onset, in order: `onset` of a sensor's lag and scale, `gust_onset` of a gust."""
     plain = noise.seen_through((), {})
     shaped = onset if plain != noise else None
     out = []
@@ -26,5 +26,5 @@ def before_onset(noise: NoiseModel, *, onset: int | None = None, gust_onset: int
 def whitening_filter(
     record: Record, noise: NoiseModel, *, onset: int | None = None, gust_onset: int | None = None
 ) -> WhiteningFilter:
-    """Of errors under `noise` as it was before and after the onsets."""
+    """The whitening filter for errors under `noise`, with its changes at the onsets."""
     return WhiteningFilter(record, noise, before_onset(noise, onset=onset, gust_onset=gust_onset))

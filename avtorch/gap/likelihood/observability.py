@@ -1,4 +1,4 @@
-"""Which effects the channels of a log, its acceleration and its speed, can speak of."""
+"""Which effects are observable in the channels of a log, its acceleration and its speed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from avtorch.gap.simulator.effect import Effect
 
 
 def is_observable(effect: type[Effect], channels: Collection[str]) -> bool:
-    """Whether a log with these channels can speak for or against an effect."""
+    """Whether an effect can be tested on a log with these channels."""
     if "accel" not in channels:
         return effect.place != "sensor"
     return "speed" in channels or not (effect.needs_speed or effect.alias == "K_L")

@@ -1,8 +1,8 @@
-"""A random effect as a hypothesis: its parameters as coordinates, and what its `noise` makes of the noise model there.
+"""A random effect as a hypothesis: its parameters as coordinates, and its change of the noise model at their values.
 
-Its evidence is that of the likelihood under the changed noise. Which one depends on what `noise` returns:
+Its evidence comes from the likelihood under the changed noise. The kind of change depends on what `noise` returns:
 
-- a force: one more Ornstein-Uhlenbeck process in the Kalman filter of the errors
+- a force: a further Ornstein-Uhlenbeck process in the Kalman filter of the errors
 - tails: a mixture of two normal distributions for each row of the accelerometer
 - a command's variance: errors of the command that pass the actuator, row by row
 """
@@ -36,8 +36,7 @@ _PARTS: dict[Form, tuple[str, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class RandomLaw:
-    """A random `effect`, prepared for a drive, with its `coordinates` (standard normal a priori) and the `form` of what
-    it does to the noise."""
+    """A random `effect`, prepared for a drive, its `coordinates` (standard normal a priori) and its noise's `form`."""
 
     effect: Effect
     coordinates: tuple[Coordinate, ...] = field(repr=False)
@@ -45,7 +44,7 @@ class RandomLaw:
 
     @classmethod
     def of(cls, kind: type[Effect], record: Record, baseline: GapPlant) -> RandomLaw:
-        """Raises `InputError` where `noise` does not return exactly one of a force, tails, or a command's variance."""
+        """Raises `InputError` unless `noise` returns exactly one of a force, tails, or a command's variance."""
         hypothesis = Hypothesis(record, (kind,), baseline)
         effect = next(e for e in hypothesis.plant.effects if e.name == kind.name)
         own = tuple(c for c in hypothesis.coordinates if c.key.startswith(f"{kind.name}."))
@@ -87,7 +86,7 @@ class RandomLaw:
         return min(fraction, 0.5), self._single("tail_scale", change.tail_scale)
 
     def command_variance(self, z: FloatArray, drives: Sequence[Drive]) -> FloatArray:
-        """[(m/s²)²], of every row of all drives one after another."""
+        """Variance [(m/s²)²] for every row of all drives, concatenated."""
         parts = []
         for drive in drives:
             variance = self._change(z, drive.command).command_variance

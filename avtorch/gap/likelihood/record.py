@@ -1,13 +1,13 @@
-"""What a diagnosis looks at: drives at one rate, their channels, and the stretches that count.
+"""The data of a diagnosis: drives at one rate, their channels, and the stretches that count.
 
-A drive is what a segment of a log holds between two overrides: while a driver is in charge (`engaged` 0) nobody obeys
-the command, so no rollout runs through those rows and each return begins anew, at what is measured there. Of the rows
-in between only the measured speed is used, for how far the car has come along its road.
+A drive is the part of a segment between two overrides: while a driver is in charge (`engaged` 0) the car does not
+follow the command, so no rollout passes through those rows, and after each override a new rollout starts from the
+measurement. Of the override rows only the measured speed is used, to integrate the position along the road.
 
-Rows above some 20 Hz come in groups. A search may begin with `coarse` rollouts, of which only the groups' means are
-compared; what a candidate is worth is told at every row, since a controller feeds the noise of a row back into the
-command of the next, and means alone would take that for a lag. Rows at standstill do not count, but rollouts run on
-through them, as if the actuator went on obeying there and the ground held the car.
+Rows above about 20 Hz are grouped. A search may begin with `coarse` rollouts, which are compared with the groups' means
+only. Scores use every row, because a controller feeds the noise of one row back into the command of the next, and means
+alone would mistake that for a lag. Rows at standstill do not count, but rollouts continue through them, as if the
+actuator still followed the command and the ground held the car.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import AccelKind
 
 RATE_HZ = 20.0
-"""Rows are averaged as long as at least this many a second are left [Hz]."""
+"""Rows are averaged as long as the resulting rate is at least this [Hz]."""
 _SHORTEST_S = 2.0
-_FEW = 20_000  # rows of a log short enough to be rolled out in full wherever means would do
-_GAP_S = 5.0  # zeros between stretches, over which a filter forgets
-_FAR_M = 1000.0  # over which a road's slope is forgotten several times: further along lies another road
+_FEW = 20_000  # rows of a log short enough to be rolled out in full wherever means would suffice
+_GAP_S = 5.0  # zeros between stretches, over which a filter's state decays
+_FAR_M = 1000.0  # several correlation lengths of the road grade: beyond it roads are independent
 
 
 class Cut(NamedTuple):
-    """Where a drive comes from: `log` and `segment` count from 0 over all logs, `rows` are the log's own."""
+    """The origin of a drive: `log` and `segment` count from 0 over all logs, `rows` are the log's own."""
 
     log: int
     segment: int
@@ -47,14 +47,14 @@ class Cut(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """Drives at the log's own rate, and where in one long array of rows averaged to `dt` [s] those stand that count.
+    """Drives at the log's own rate, and the positions of the counted rows in one array of rows averaged to `dt` [s].
 
-    `accel`, `speed` (row, group): measured, over all drives' rows one after another; None: not in the log. `time`
-    (row,) [s], from the start of its log; `stamp` (row,) [s] on that log's own clock, `log` (row,) its number;
-    `command` (row,), mean of a group. `source`, `target`: of every counted row its index in these arrays and in the
-    padded one of `length` rows that is filtered; `stretch` (counted,) numbers the stretches.
-    `group`: rows averaged into one. `coarse` are drives of averaged commands; in a short log the drives themselves.
-    `cuts` tell where each drive comes from; those of one segment have one road, along which `position` runs on.
+    `accel`, `speed` (row, group): measured, all drives' rows concatenated; None: not in the log. `time` (row,) [s] from
+    the start of its log; `stamp` (row,) [s] on that log's own clock, `log` (row,) its number; `command` (row,), mean of
+    a group. `source`, `target`: index of every counted row in these arrays, and in the padded array of `length` rows
+    that is filtered; `stretch` (counted,) numbers the stretches. `group`: rows averaged into one. `coarse` are drives
+    of averaged commands; in a short log they are the drives themselves. `cuts` are the origins of the drives; drives of
+    one segment share a road, and `position` continues along it.
     """
 
     drives: tuple[Drive, ...]
@@ -75,12 +75,12 @@ class Record:
 
     @property
     def rows(self) -> int:
-        """Rows that count."""
+        """Number of counted rows."""
         return len(self.source)
 
     @property
     def accel_kind(self) -> AccelKind:
-        """What `accel` is, as the logs say."""
+        """The kind of `accel`, as the logs state."""
         return "specific-force" if self.drives[0].specific_force else "kinematic"
 
     @property
@@ -89,13 +89,13 @@ class Record:
 
     @property
     def starts(self) -> IntArray:
-        """Where among the counted rows each stretch begins."""
+        """Index of each stretch's first counted row."""
         return np.flatnonzero(np.diff(self.stretch, prepend=-1))
 
     @classmethod
     def of(cls, logs: Log | Iterable[Log], *, rate_hz: float = RATE_HZ, multiple: int = 1) -> Record:
-        """From one or several logs of one car; its drives have a `multiple` of rows, as those of a record
-        with groups of so many have. Raises `InputError` where nothing of use is left.
+        """The record of one or several logs of one car. `multiple`: the number of rows of each drive is a multiple of
+        it, as in a record with groups of that size. Raises `InputError` where nothing usable is left.
         """
         each = [logs] if isinstance(logs, Log) else list(logs)
         if not each:
@@ -208,14 +208,14 @@ class Record:
 
     @cached_property
     def segment(self) -> tuple[int, ...]:
-        """Of each drive its segment's number among `segments`."""
+        """Index of each drive's segment among `segments`."""
         numbers = {n: i for i, n in enumerate(dict.fromkeys(cut.segment for cut in self.cuts))}
         return tuple(numbers[cut.segment] for cut in self.cuts)
 
     def only(self, rows: BoolArray) -> Record:
-        """The same drives of which only these `rows` (counted,) still count, in stretches of 2 s or more.
+        """The same drives, of which only these `rows` (counted,) still count, in stretches of 2 s or more.
 
-        Rollouts go over whole drives as before; what counts no more is neither fitted nor judged.
+        Rollouts cover whole drives as before; rows that no longer count are neither fitted nor scored.
         """
         each = 1 if self.coarse is self.drives else self.group
         sizes = [len(d.time) * each // self.group for d in self.coarse]
@@ -225,7 +225,7 @@ class Record:
         return replace(self, source=source, target=target, stretch=stretch, length=length)
 
     def place(self, row: int, *, coarse: bool = False) -> Place:
-        """Where a counted `row` begins in the drives, or in the `coarse` ones."""
+        """Where the group of a counted `row` begins in the drives, or in the `coarse` ones."""
         drives = self.coarse if coarse else self.drives
         each = 1 if self.coarse is not self.drives and coarse else self.group
         place, number = int(self.source[row]) * each, 0
@@ -235,13 +235,13 @@ class Record:
         return Place(number, place)
 
     def padded(self, values: Float[FloatArray, "*column counted group"]) -> Float[FloatArray, "*column padded"]:
-        """Counted rows' `values` (..., counted, group) at their places in (..., length * group), zeros between."""
+        """Counted rows' `values` (..., counted, group) at their positions in (..., length * group), zeros elsewhere."""
         out = np.zeros((*values.shape[:-2], self.length, values.shape[-1]))
         out[..., self.target, :] = values
         return out.reshape(*values.shape[:-2], -1)
 
     def seen(self, responses: Sequence[Tensor], *, coarse: bool = False) -> Float[FloatArray, "*column counted group"]:
-        """Responses by drive, (..., time) each, at rows that count: (..., counted, group), `coarse` with group 1."""
+        """Responses by drive, (..., time) each, at counted rows: (..., counted, group), `coarse` with group 1."""
         parts = []
         for x in responses:
             if coarse and self.coarse is self.drives:
@@ -256,20 +256,20 @@ class Record:
 
     @cached_property
     def measured(self) -> Float[FloatArray, "channel counted group"]:
-        """What the channels saw, (channel, counted, group)."""
+        """Measurements of the channels, (channel, counted, group)."""
         return np.stack([x[self.source] for x in (self.accel, self.speed) if x is not None])
 
 
 def grouped(rate: float, least: float) -> int:
-    """Rows to be averaged into one, at `rate` [Hz], so that about `least` [Hz] are left.
+    """Number of rows to average into one, at `rate` [Hz], so that about `least` [Hz] are left.
 
-    Clocks are off by a little: the bound lies 2 % below the rates that recorders have, and not on one of them.
+    Clocks deviate slightly, so the bound lies 2 % below the usual rates of recorders, not on one of them.
     """
     return max(1, int(1.02 * rate / least))
 
 
 def rolled(log: Log, group: int) -> Iterator[slice]:
-    """The rows of `log` that become a drive each: its drives of 40 groups or more, whole groups of them."""
+    """The rows of `log` that form a drive each: drives of 40 groups or more, in whole groups."""
     for part in log.drives():
         rows = (part.stop - part.start) // group
         if rows >= 2 * RATE_HZ:
@@ -289,7 +289,7 @@ def _drive(
 
 
 def _position(log: Log, drives: Sequence[Drive], cuts: Sequence[Cut], begun: Cut) -> float:
-    """Where along its segment's road [m] a drive begins, behind those so far: the car moves on under the driver."""
+    """Position on its segment's road [m] at which a drive begins; the car also moves during overrides."""
     if log.speed is None or not cuts or cuts[-1].segment != begun.segment:
         return 0.0
     position = drives[-1].position
@@ -300,13 +300,13 @@ def _position(log: Log, drives: Sequence[Drive], cuts: Sequence[Cut], begun: Cut
 
 
 def _even(time: FloatArray) -> FloatArray:
-    """Stamps that only jitter in their last digits are made even, so that drives are uniform."""
+    """Time stamps, made uniform where they only jitter in their last digits."""
     even = np.linspace(time[0], time[-1], len(time))
     return even if np.abs(even - time).max() < 0.02 * (even[1] - even[0]) else time
 
 
 def _quiet(speed: FloatArray, dt: float) -> FloatArray:
-    """The measured speed without most of its noise, for what depends on speed."""
+    """The measured speed with most of its noise filtered out, for what depends on speed."""
     from scipy.ndimage import gaussian_filter1d
 
     return np.asarray(np.maximum(gaussian_filter1d(speed, 0.15 / dt, mode="nearest"), 0.0))

@@ -1,8 +1,8 @@
-"""A log without sensor noise, read as a good sensor on a quiet road would have read it.
+"""Adds sensor noise and a small road force to a log that has none.
 
-The diagnosis takes every sensor to be noisy and every road to push a little, and what it weighs are misfits in units of
-both. In a log straight from a simulator there is neither: round-off is then told apart from nothing with certainty, and
-named. What is missing is added, the same in every run.
+The diagnosis scales residuals by sensor noise and by a small random force, and assumes both in every log. A log
+straight from a simulator has neither, so round-off would appear significant and be attributed to a cause. The missing
+noise is added, with the same draws in every run.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.io import Log
 
 FINER = {"accel": 1e-3, "speed": 4e-4}
-"""Less scatter from row to row than this [m/s², m/s] is no sensor's; rounding to three decimals leaves 3e-4."""
+"""Row-to-row scatter below this [m/s², m/s] is not sensor noise; rounding to three decimals leaves 3e-4."""
 QUIET = NoiseModel(force_sd=0.005, force_time=3.0, accel_sd=0.02, speed_sd=0.01)
-"""What is added: sensors as good as they come, and the force that the diagnosis expects anyway."""
+"""The added noise: that of very good sensors, and the force that the diagnosis assumes in any case."""
 _SEED = 20
 
 
 def with_sensor_noise(log: Log) -> tuple[Log, str | None]:
-    """`log` with noise in the channels that have none, and a sentence on it; itself and None if all have their own.
+    """`log` with noise added to the channels that have none, and a sentence on it; itself and None if all have noise.
 
-    Noise is told by third differences, which motion hardly has. A log of speed alone is left as it is: recordings of
-    speed are mostly interpolated, and then as fine.
+    Noise is detected by third differences, in which motion is negligible. A log of speed alone is left unchanged:
+    recorded speeds are often interpolated and then as smooth.
     """
     if log.accel is None:
         return log, None
@@ -49,7 +49,7 @@ def with_sensor_noise(log: Log) -> tuple[Log, str | None]:
 
 
 def _force(log: Log, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """An Ornstein-Uhlenbeck force [m/s²] and the speed [m/s] that it gains, (time,), anew in each drive."""
+    """An Ornstein-Uhlenbeck force [m/s²] and the speed [m/s] that it adds, (time,), independent in each drive."""
     force, gained = np.zeros(log.rows), np.zeros(log.rows)
     for part in _drives(log):
         dt = np.diff(log.elapsed[part], append=log.elapsed[part][-1])
@@ -62,15 +62,15 @@ def _force(log: Log, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
 
 
 def _drives(log: Log) -> list[slice]:
-    """Those long enough to tell noise by: `engaged` may come and go with every row."""
+    """Drives long enough to estimate noise: `engaged` may change with every row."""
     return [part for part in log.drives() if part.stop - part.start > 3]
 
 
 def _scatter(log: Log, signal: FloatArray) -> float:
-    """SD of white noise that would bend `signal` from row to row as much as it is bent in a fifth of them or more.
+    """SD of white noise from the 80 % quantile of the third differences of `signal`.
 
-    Half of them would do, but for signals that were interpolated from few rows: those bend at each of the few only.
+    The median would do, but not for signals interpolated from few rows: only at those few do their differences vary.
     """
     together = np.concatenate([np.abs(np.diff(signal[part], n=3)) for part in _drives(log)] or [[]])
-    # four fifths of a normal's absolute values are below this; the norm of (1, -3, 3, -1)
+    # the 80 % quantile of a normal's absolute value is 1.2816; sqrt(20) is the norm of (1, -3, 3, -1)
     return float(np.quantile(together, 0.8)) / 1.2816 / np.sqrt(20.0) if len(together) else np.inf

@@ -1,6 +1,7 @@
-"""The steady Kalman filter of a noise model, as a recursive filter from errors to innovations of unit covariance.
+"""The steady-state Kalman filter of a noise model, as a recursive filter from errors to innovations of unit covariance.
 
-The interval between rows is integrated exactly, and the gain is the one that it settles to within some rows.
+The interval between rows is integrated exactly; the filter uses the steady-state gain, which is reached within some
+rows.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ Filter = tuple[list[list[FloatArray]], FloatArray, float]
 
 
 def designed(noises: Sequence[NoiseModel], dt: float, channels: tuple[str, ...]) -> list[Filter]:
-    """The steady Kalman filter from errors to innovations of unit covariance, for each noise model.
+    """The steady-state Kalman filter from errors to innovations of unit covariance, for each noise model.
 
-    The models have a sensor's lag all of them, or none, and so with a further force.
+    Either all models or none have a sensor lag, and the same holds for a further force.
     """
     pairs = [motion(n, dt) for n in noises]
     move, driven = np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])
@@ -47,7 +48,7 @@ def designed(noises: Sequence[NoiseModel], dt: float, channels: tuple[str, ...])
         m = inner @ m
         bottom[:, k] = -np.trace(m, axis1=-2, axis2=-1) / k
         m = m + bottom[:, k, None, None] * np.eye(size)
-    # innovations: errors less what the filter expects, 1 - see adj gain / det
+    # innovations: errors minus predictions, 1 - see adj gain / det
     tops = np.zeros((len(noises), count, count, size + 1))
     for k, term in enumerate(terms):
         tops[..., k + 1] = -(see @ term @ gain)
@@ -58,16 +59,16 @@ def designed(noises: Sequence[NoiseModel], dt: float, channels: tuple[str, ...])
 
 
 def motion(n: NoiseModel, dt: float) -> tuple[Float[FloatArray, "state state"], Float[FloatArray, "state state"]]:
-    """State (error of the speed, p, d) over `dt`: its transition and the covariance that is added, both exact.
+    """Exact transition of the state (error of the speed, p, d) over `dt`, and the covariance of its process noise.
 
-    Ornstein-Uhlenbeck processes (a third where a random effect adds one) and the integral of their sum. Behind a late
-    sensor its reading is one state more, the last.
+    The state holds Ornstein-Uhlenbeck processes (a third where a random effect adds one) and the integral of their sum.
+    With a sensor lag the sensor's reading is one further state, the last.
     """
     if n.sensor_lag > 0:
         return _late_motion(n, dt)
     size = 1 + len(n.forces)
     move, driven = np.eye(size), np.zeros((size, size))
-    # a hair of speed noise, or the error of the speed is known exactly
+    # a little speed noise, or the error of the speed would be known exactly
     driven[0, 0] = 1e-12 * dt
     for i, (sd, time) in enumerate(n.forces, start=1):
         lost = -np.expm1(-dt / time)
@@ -79,12 +80,12 @@ def motion(n: NoiseModel, dt: float) -> tuple[Float[FloatArray, "state state"], 
 
 
 def _late_motion(n: NoiseModel, dt: float) -> tuple[FloatArray, FloatArray]:
-    """By van Loan's matrix exponential."""
+    """The same with a sensor lag, by van Loan's matrix exponential."""
     size = 2 + len(n.forces)
     drift = np.diag([0.0, *(-1 / time for _, time in n.forces), -1 / n.sensor_lag])
     drift[0, 1:-1], drift[-1, 1:-1] = 1.0, 1 / n.sensor_lag
     spectrum = np.diag([1e-12, *(2 * sd**2 / time for sd, time in n.forces), 0.0])
-    # in halves of a step short enough for the growing half of the matrix, then doubled
+    # the step is halved until the growing half of the matrix stays small, then doubled back
     halves = max(0, int(np.ceil(np.log2(dt / n.sensor_lag))) + 1)
     step = np.asarray(expm(np.block([[-drift, spectrum], [np.zeros((size, size)), drift.T]]) * dt / 2**halves), float)
     move = step[size:, size:].T
@@ -96,8 +97,8 @@ def _late_motion(n: NoiseModel, dt: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _integral(x: float) -> float:
-    """Variance of the integral of a unit process over `x` of its times: 2 x - 3 + 4 exp(-x) - exp(-2 x)."""
-    if x < 0.02:  # the series, where the terms above cancel
+    """Variance of the integral of a unit process over `x` time constants: 2 x - 3 + 4 exp(-x) - exp(-2 x)."""
+    if x < 0.02:  # the series, because the terms above cancel
         return x**3 * (2 / 3 - x / 2 + 7 * x**2 / 30 - x**3 / 12)
     return 2 * x - 3 + 4 * float(np.exp(-x)) - float(np.exp(-2 * x))
 
@@ -108,7 +109,7 @@ def _steady(
     driven: Float[FloatArray, "model state state"],
     white: Float[FloatArray, "model seen seen"],
 ) -> Float[FloatArray, "model state state"]:
-    """Covariances (model, state, state) ahead of a reading, once they have settled: the Riccati equation by doubling.
+    """Steady-state prediction covariances (model, state, state): the Riccati equation solved by doubling.
 
     Structure-preserving doubling (Anderson 1978): each round covers twice as many rows as the last.
     """

@@ -1,8 +1,8 @@
-"""What a rollout leaves over, made white: errors through the steady innovations filter of one noise model.
+"""Whitening filter for rollout residuals: the steady-state innovations filter of one noise model.
 
-Errors (row,) of both channels pass one recursive filter to become white, thousands of columns at once. The speed's
-offset at the start of each stretch is unknown and projected out. Errors of groups' means pass the filter of the groups'
-interval, which is good enough for a first look; every row passes the exact one.
+Errors (row,) of both channels pass one recursive filter, thousands of columns at once. The speed's offset at the start
+of each stretch is unknown and projected out. Errors averaged over groups pass the filter of the groups' interval, which
+is accurate enough for screening; single rows pass the exact filter.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.steady_kalman import Filter, designed
 
 Until = tuple[tuple[int, NoiseModel], ...]
-"""Noise of earlier parts of a record, each up to a counted row, in order."""
+"""Noise models of earlier parts of a record, each up to a counted row, in order."""
 
 
 @dataclass(frozen=True, eq=False)
 class WhiteningFilter:
-    """The map from errors to white ones of unit variance, for one noise model. Linear in the errors.
+    """The linear map from errors to whitened errors of unit variance, for one noise model.
 
-    `until`: what else the noise was in earlier parts of the record, each up to a counted row, in order.
+    `until`: noise models of earlier parts of the record, each up to a counted row, in order.
     """
 
     record: Record
@@ -40,7 +40,7 @@ class WhiteningFilter:
     def each(
         cls, record: Record, noises: Sequence[NoiseModel], until: Sequence[Until] | None = None, *, coarse: bool = False
     ) -> list[Self]:
-        """Of several noise models, their filters designed together: some ten times as fast as one by one."""
+        """One filter for each noise model; designing them together is about ten times as fast as one by one."""
         earlier = [()] * len(noises) if until is None else until
         made = [cls(record, noise, own) for noise, own in zip(noises, earlier, strict=True)]
         parts = zip(*([*(n for _, n in own), noise] for noise, own in zip(noises, earlier, strict=True)), strict=True)
@@ -60,7 +60,7 @@ class WhiteningFilter:
         return {}
 
     def _parts(self, coarse: bool) -> list[tuple[Filter, slice]]:
-        """Filters, and which of the counted rows each of them judges."""
+        """Filters, and the slice of counted rows to which each applies."""
         coarse = coarse and self.record.group > 1
         if coarse not in self._filters:
             noises = [*(n for _, n in self.until), self.noise]
@@ -88,7 +88,7 @@ class WhiteningFilter:
     def turned(
         self, images: Float[FloatArray, "*column channel counted group"]
     ) -> Float[FloatArray, "*column channel counted group"]:
-        """The transpose of the map, of images (..., channel, counted, group): the filter run backward in time."""
+        """Transpose of the map, for images (..., channel, counted, group): the filter run backward in time."""
         record, (count, group) = self.record, images.shape[-3::2]
         images = np.array(images)
         offset = "speed" in record.channels
@@ -103,12 +103,12 @@ class WhiteningFilter:
                 through = [np.asarray(lfilter(tops[o][i], bottom, back[..., o, :], axis=-1)) for o in range(count)]
                 rows = np.sum(through, 0)[..., ::-1].reshape(*back.shape[:-2], -1, group)
                 total[..., i, :, :] += rows[..., record.target, :]
-        if offset:  # each stretch's first speed was taken off all of its rows
+        if offset:  # the first speed of each stretch was subtracted from all of its rows
             total[..., -1, record.starts, 0] -= np.add.reduceat(total[..., -1, :, :].sum(-1), record.starts, -1)
         return total
 
     def response(self, errors: Float[FloatArray, "channel time"]) -> Float[FloatArray, "channel time"]:
-        """White image of errors (channel, time) at consecutive rows that begin with the first, offset and all."""
+        """Whitened image of errors (channel, time) at consecutive rows from the first on, with the offset included."""
         tops, bottom, _ = self._parts(False)[-1][0]
         count = len(errors)
         return np.stack(
@@ -120,7 +120,7 @@ class WhiteningFilter:
         return {}
 
     def _offset(self, coarse: bool) -> tuple[FloatArray, FloatArray]:
-        """White image of a unit offset of the speed from each stretch's start (channel, counted, group), its square."""
+        """Whitened image (channel, counted, group) of a unit speed offset of each stretch, and its squared norm."""
         coarse = coarse and self.record.group > 1
         if coarse not in self._offsets:
             unit = np.zeros((len(self.record.channels), self.record.rows, 1 if coarse else self.record.group))
@@ -139,9 +139,9 @@ class WhiteningFilter:
     def __call__(
         self, errors: Float[FloatArray, "*column channel counted group"]
     ) -> Float[FloatArray, "*column channel counted group"]:
-        """Errors (..., channel, counted, group) made white, of unit variance, the same shape.
+        """Whitened errors of unit variance, in the shape (..., channel, counted, group) of `errors`.
 
-        Errors of groups' means come with group 1.
+        Errors averaged over groups have group size 1.
         """
         if "speed" not in self.record.channels:
             return self._filtered(errors)
@@ -150,7 +150,7 @@ class WhiteningFilter:
         return self._without_offset(self._filtered(errors))
 
     def constants(self, *, coarse: bool) -> Float[FloatArray, " counted"]:
-        """Each row's part (counted,) of what the log likelihood has that does not depend on the errors."""
+        """Each row's term (counted,) of the log likelihood that does not depend on the errors."""
         record = self.record
         each, count = 1 if coarse else record.group, len(record.channels)
         out = np.empty(record.rows)
@@ -161,23 +161,23 @@ class WhiteningFilter:
         return out
 
     def constant_of(self, *, coarse: bool) -> float:
-        """What the log likelihood has that does not depend on the errors."""
+        """The term of the log likelihood that does not depend on the errors."""
         return float(self.constants(coarse=coarse).sum())
 
     def log_likelihood(self, errors: Float[FloatArray, "*column channel counted group"]) -> FloatArray:
-        """Of errors (..., channel, counted, group): (...)."""
+        """Log likelihood (...) of errors (..., channel, counted, group)."""
         e = self(errors)
         return self.constant_of(coarse=errors.shape[-1] == 1) - 0.5 * (e**2).sum((-1, -2, -3))
 
     def row_likelihoods(self, errors: Float[FloatArray, "channel counted group"]) -> Float[FloatArray, " counted"]:
-        """Log likelihood (counted,) of each row of errors (channel, counted, group); sums to the whole."""
+        """Log likelihood (counted,) of each row of errors (channel, counted, group); the rows sum to the total."""
         return self.constants(coarse=errors.shape[-1] == 1) - 0.5 * (self(errors) ** 2).sum((0, 2))
 
 
 def sensed(
     record: Record, noise: NoiseModel, motion: Float[FloatArray, "*column channel counted group"]
 ) -> Float[FloatArray, "*column channel counted group"]:
-    """What the channels show of a motion (..., channel, counted, group), the accelerometer with its scale and lag."""
+    """Measured motion (..., channel, counted, group): the accelerometer's with its scale and lag."""
     if "accel" not in record.channels or (noise.sensor_scale == 1.0 and noise.sensor_lag == 0.0):
         return motion
     motion = motion.copy()

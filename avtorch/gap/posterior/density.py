@@ -1,7 +1,7 @@
-"""The posterior density of a found hypothesis's parameters, exact and with its gradient.
+"""The exact, differentiable posterior density of a hypothesis's parameters.
 
-Rollouts are torch and differentiable; making errors white is one fixed linear map `W` of long columns, so the gradient
-of `-|W e|² / 2` is `Wᵀ W e` sent back through the rollout, with `Wᵀ` the same filter run backward in time.
+Rollouts are differentiable in torch. Whitening is one fixed linear map `W` of long columns, so the gradient of `-|W e|²
+/ 2` is `Wᵀ W e` propagated back through the rollout, with `Wᵀ` the same filter run backward in time.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
 
 _FURTHEST = 10.0
-"""Beyond so many standard deviations of the prior the likelihood stays what it is there: no rollout of infinities."""
+"""The likelihood is constant beyond this number of prior standard deviations, so that rollouts stay finite."""
 _BLOCK = 2**18
-"""Columns times rows of one rollout: few enough to stay in the processor's cache."""
+"""Columns times rows of one rollout: few enough to fit in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class RolloutDensity:
     """Log joint density of errors and coordinates `z`: an `avtorch.inference.Density` of a single window.
 
     A priori `z` is standard normal. The noise model is held, and so is the row `onset` from which the effects act
-    (None: from the start). The coefficients of a road's slope and its size are integrated out.
+    (None: from the start). The coefficients and the size of the road grade are integrated out.
     """
 
     hypothesis: Hypothesis
@@ -50,7 +50,7 @@ class RolloutDensity:
 
     @classmethod
     def of(cls, found: FittedModel) -> RolloutDensity:
-        """With noise and onset as found."""
+        """The density with noise and onset of a fitted model."""
         return cls(found.hypothesis, found.white, np.asarray(found.z, float), found.onset)
 
     # the Density -----------------------------------------------------------------------------------------------------
@@ -64,24 +64,24 @@ class RolloutDensity:
         return LogSpaceNormal(torch.zeros(1, size, dtype=torch.float64), torch.eye(size, dtype=torch.float64)[None])
 
     def select(self, index: Tensor) -> RolloutDensity:
-        """Itself, its only window."""
+        """The density itself, its only window."""
         return self
 
     def initial(self) -> Tensor:
         return torch.as_tensor(self.centre)[None]
 
     def constrain(self, z: Tensor) -> Tensor:
-        """Values of the plant's parameters, each in its unit."""
+        """Values of the plant's parameters, each in its own unit."""
         each = zip(self.hypothesis.coordinates, z.unbind(-1), strict=True)
         return torch.stack([c.parameter.constrain(c.wider * x) for c, x in each], -1)
 
     def unconstrain(self, values: Tensor) -> Tensor:
-        """`z` for values."""
+        """`z` of parameter values."""
         each = zip(self.hypothesis.coordinates, values.unbind(-1), strict=True)
         return torch.stack([c.parameter.unconstrain(x) / c.wider for c, x in each], -1)
 
     def log_prob(self, z: Tensor) -> Tensor:
-        """Of `z` (..., 1, coordinate): (..., 1). Differentiable once."""
+        """Log density (..., 1) of `z` (..., 1, coordinate). Differentiable once."""
         return cast(Tensor, _Exact.apply(z, self))
 
     def score(self, z: Tensor) -> Tensor:
@@ -97,7 +97,7 @@ class RolloutDensity:
                 rolled = self._rolled(place)
                 value, cotangent = self._judged(rolled.detach().numpy(), slope=True)
                 (score,) = torch.autograd.grad(rolled, place, torch.as_tensor(cotangent))
-            place = place.detach()  # NaN where a chain is lost, which its sampler has to see
+            place = place.detach()  # NaN where a chain diverged, so that its sampler can detect it
             values.append(torch.as_tensor(value))
             scores.append(score - place)
         return torch.cat(values).reshape(z.shape[:-1]) + self._prior(z), torch.cat(scores).reshape(z.shape)
@@ -108,20 +108,20 @@ class RolloutDensity:
             values = [torch.as_tensor(self._judged(self._rolled(b).numpy())[0]) for b in self._blocks(z)]
         return torch.cat(values).reshape(z.shape[:-1]) + self._prior(z)
 
-    # what it is made of ----------------------------------------------------------------------------------------------
+    # parts of the density --------------------------------------------------------------------------------------------
     def images(self, z: Tensor) -> FloatArray:
-        """White errors (column, row) for `z` (column, coordinate)."""
+        """Whitened errors (column, row) for `z` (column, coordinate)."""
         with torch.no_grad():
             return np.concatenate([self._image(self._errors(self._rolled(b).numpy())) for b in self._blocks(z)])
 
     @cached_property
     def constant(self) -> float:
-        """Of the log likelihood, what does not depend on the errors."""
+        """The term of the log likelihood that does not depend on the errors."""
         return self.white.constant_of(coarse=False)
 
     @cached_property
     def slope(self) -> GradeMarginal | None:
-        """The slope that is integrated out; None where it is none of the hypothesis's effects."""
+        """The marginal of the road grade; None where the hypothesis has none."""
         columns = self.hypothesis.grade_columns
         if columns is None:
             return None
@@ -140,7 +140,7 @@ class RolloutDensity:
         return plant([], baseline=self.hypothesis.baseline).prepared(*self.hypothesis.record.segments[0])
 
     def _rolled(self, z: Tensor) -> Tensor:
-        """What the channels would have seen, (column, channel, counted, group)."""
+        """Rollouts of the channels, (column, channel, counted, group)."""
         keys = self.names
         near = z.nan_to_num(0.0).clamp(-_FURTHEST, _FURTHEST)
         if self.onset is None:
@@ -164,11 +164,11 @@ class RolloutDensity:
         return self.hypothesis.record.measured - rolled
 
     def _image(self, errors: FloatArray) -> FloatArray:
-        """White errors, every row once: (column, row)."""
+        """Whitened errors, every row once: (column, row)."""
         return self.white(errors).reshape(len(errors), -1)
 
     def _judged(self, rolled: FloatArray, *, slope: bool = False) -> tuple[FloatArray, FloatArray | None]:
-        """Log likelihood (column,) of rollouts and, if asked for its `slope`, the derivative in them."""
+        """Log likelihood (column,) of rollouts and, with `slope`, its derivative by the rollouts."""
         errors = self._errors(rolled)
         flat = self._image(errors)
         value = self.constant - 0.5 * np.einsum("cr,cr->c", flat, flat)
@@ -198,7 +198,7 @@ class _Exact(torch.autograd.Function):
 
 
 def root(covariance: FloatArray) -> Tensor:
-    """A lower triangular root of a covariance, sound also where rounding left it without one."""
+    """A lower triangular root of a covariance, valid also where round-off made it indefinite."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     half = vectors * np.sqrt(np.maximum(values, 1e-14))
     lower = torch.linalg.qr(torch.as_tensor(half.T.copy())).R.mT

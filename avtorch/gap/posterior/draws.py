@@ -1,4 +1,4 @@
-"""Draws of a posterior, however they were made."""
+"""Draws from a posterior, by any method."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from avtorch.arrays import FloatArray
 class Draws:
     """Draws of coordinates `names`: `z` (chain, draw, coordinate) and `values` by key (chain, draw), in their units.
 
-    `method`: "sgld", or "importance" where the posterior has cliffs on which Langevin steps fail, "laplace" where
-    either fails. `effective`: about how many independent draws they are worth. `grade_rms` (chain, draw): of a road's
-    slope, where the candidate has one. `exact_share`: of the gradients, those that were exact. `why` SGLD was given up.
+    `method`: "sgld"; "importance" where the posterior is too steep in places for Langevin steps; "laplace" where both
+    fail. `effective`: effective sample size. `grade_rms` (chain, draw): of the road grade, where the hypothesis has
+    one. `exact_share`: share of exact gradients. `why`: the reason why SGLD was not used.
     """
 
     names: tuple[str, ...]

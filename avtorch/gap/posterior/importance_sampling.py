@@ -1,8 +1,8 @@
-"""Draws of a posterior with cliffs, on which no gradient leads: importance sampling whose proposals adapt.
+"""Adaptive importance sampling, for posteriors too steep for gradient steps.
 
-Rounds of proposals, the first from Laplace's approximation with heavy tails, each next one from kernels about the
-places that weigh most so far; all rounds count together, each place held against the mixture of all proposals
-(Cornuet et al. 2012). A round's weights are tempered as far as they would else rest on a handful of places.
+The first proposals come from Laplace's approximation with heavy tails, each later round from kernels around the points
+with the largest weights so far. All rounds count together, each point weighted relative to the mixture of all proposals
+(Cornuet et al. 2012). A round's weights are tempered as far as a few points would otherwise dominate.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from scipy.special import gammaln, logsumexp
 
 from avtorch.arrays import FloatArray
 
-_DEGREES = 5.0  # of the t distributions proposed from
+_DEGREES = 5.0  # degrees of freedom of the proposals' t distributions
 _KERNELS = 60
-_CARRIED = 20.0  # effective places that shape the next round
+_CARRIED = 20.0  # effective number of points that shape the next round
 
 
 def importance(
@@ -29,10 +29,10 @@ def importance(
     enough: float,
     seed: int,
 ) -> tuple[FloatArray, FloatArray]:
-    """Places (place, coordinate) and their weights (place,), which sum to one.
+    """Points (place, coordinate) and their weights (place,), which sum to one.
 
-    `log_prob`: of (place, coordinate), (place,). `scale`: a triangular root of Laplace's covariance at `centre`.
-    At most so many `rounds` of `size` places, until they are worth `enough` equal draws.
+    `log_prob`: maps (place, coordinate) to (place,). `scale`: a triangular root of Laplace's covariance at `centre`. At
+    most `rounds` rounds of `size` points, until the effective sample size reaches `enough`.
     """
     rng = np.random.default_rng(seed)
     dim = len(centre)
@@ -63,7 +63,7 @@ def importance(
 
 
 def effective(weights: FloatArray) -> float:
-    """How many equal draws the weights are worth."""
+    """Effective sample size of the weights."""
     return float(1 / np.sum(weights**2))
 
 
@@ -79,7 +79,7 @@ def _tempered(ratios: FloatArray) -> FloatArray:
 
 
 def _density(places: FloatArray, centres: FloatArray, root: FloatArray) -> FloatArray:
-    """Log density (place,) of an equal mixture of t distributions about `centres` (kernel, coordinate)."""
+    """Log density (place,) of an equal mixture of t distributions around `centres` (kernel, coordinate)."""
     dim = places.shape[1]
     turned = np.linalg.solve(root, places.T).T[:, None] - np.linalg.solve(root, centres.T).T
     square = (turned**2).sum(-1)

@@ -1,8 +1,8 @@
-"""The posterior of a found candidate: SGLD on the exact density, and the quantities an answer holds.
+"""Posterior draws of a fitted model: SGLD on the exact density, and importance sampling where SGLD fails.
 
-The sampler is the project's own, chains side by side, whitened at the mode. Rollouts of a long drive are dear, so most
-gradients are those of a `Surrogate`, set right at random steps (`Corrected`); how often is read off from how good it
-is, down to the exact gradient at each step.
+The sampler is the project's own, with parallel chains, whitened at the mode. Rollouts of a long drive are expensive, so
+most gradients come from a `Surrogate`, corrected at random steps (`Corrected`). The correction rate follows from the
+surrogate's error, up to the exact gradient at every step.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ __all__ = ["Draws", "drawn", "exact_one_in", "fitted", "moved", "posterior", "re
 
 STEP = 2.0
 """SGLD's step in whitened coordinates; see `SamplerSettings`."""
-_INFLATED = 0.02  # of a variance, by the noise of gradients
-_THROWN = 3.0  # [posterior standard deviations] by one correction
+_INFLATED = 0.02  # relative increase of a variance by gradient noise
+_THROWN = 3.0  # [posterior standard deviations] largest displacement by one correction
 _RAREST = 16.0
-_CLIFF = 9.0  # mean square of what the surrogate's whitened gradient lacks, where no step suits the posterior
-_STEPS = 500.0  # SGLD steps affordable
-_ROWS = 2.5e7  # rows of exact gradients affordable, some ten seconds of one core
-_CHECKED = 160  # of the draws
-_LET_PASS = 0.15  # relative error of a variance
+_CLIFF = 9.0  # mean square error of the surrogate's whitened gradient above which no step size suits the posterior
+_STEPS = 500.0  # largest number of SGLD steps
+_ROWS = 2.5e7  # largest number of rows in exact gradients, about ten seconds on one core
+_CHECKED = 160  # number of draws that are checked
+_LET_PASS = 0.15  # tolerated relative error of a variance
 _ROUNDS = 12
-_ENOUGH = 250.0  # effective draws by importance
-_FEWEST = 30.0  # effective draws, fewer than which are none
+_ENOUGH = 250.0  # effective sample size at which importance sampling stops
+_FEWEST = 30.0  # effective sample size below which the draws are discarded
 
 
 def posterior(found: FittedModel, *, chains: int = 16, draws: int = 50, seed: int = 0) -> Draws:
-    """Draws of the candidate's parameters given its log, noise model and onset held.
+    """Draws of the hypothesis's parameters given its log, with noise model and onset held.
 
     Raises `InputError` for fewer than 1 chain or 4 draws.
     """
@@ -77,10 +77,10 @@ def posterior(found: FittedModel, *, chains: int = 16, draws: int = 50, seed: in
 
 
 def _walked(target: Corrected, chains: int, draws: int, generator: torch.Generator) -> tuple[Tensor | None, str]:
-    """SGLD's draws of `z` (chain, draw, coordinate), or None and why not; no more gradients than are affordable."""
+    """SGLD draws of `z` (chain, draw, coordinate), or None and the reason; the number of gradients is bounded."""
     density, mode = target.exact, target.mode
     pace = float(stiffness(density, Coordinates.of(mode)))
-    exact = chains / target.points  # gradients a step
+    exact = chains / target.points  # exact gradients per step
     rows = sum(len(d.time) for d in density.hypothesis.record.drives)
     steps = min(_STEPS, _ROWS / rows / exact)
     thinning = 2 if draws * 2 + 4 <= steps else 1
@@ -97,7 +97,7 @@ def _walked(target: Corrected, chains: int, draws: int, generator: torch.Generat
         longest=longest,
         attempts=1,
         batch=1 if target.points > 1 else None,
-        compare=False,  # too dear at hundreds of points; Stein's identity below takes its place
+        compare=False,  # too expensive at hundreds of points; Stein's identity below replaces it
     )
     walked = sample(target, settings, generator=generator, mode=mode)
     if not bool(walked.converged[0]):
@@ -110,10 +110,10 @@ def _walked(target: Corrected, chains: int, draws: int, generator: torch.Generat
 
 
 def stein_discrepancy(density: RolloutDensity, mode: Mode, z: Tensor, generator: torch.Generator) -> float:
-    """How far draws `z` (chain, draw, coordinate) are from having the density's gradients; 0 where chance explains it.
+    """Largest violation of Stein's identity by draws `z` (chain, draw, coordinate); 0 where it is not significant.
 
-    Over a posterior the mean of `(w - mean) dU/dw` is 1 for each coordinate. A share of the variance is let pass, and
-    three standard errors.
+    Under the posterior the mean of `(w - mean) dU/dw` is 1 for each coordinate. A share of the variance and three
+    standard errors are tolerated.
     """
     flat = z.flatten(0, 1)
     some = flat[torch.randperm(len(flat), generator=generator)[:_CHECKED]][:, None]
@@ -126,9 +126,9 @@ def stein_discrepancy(density: RolloutDensity, mode: Mode, z: Tensor, generator:
 
 
 def _weighted(density: RolloutDensity, mode: Mode, chains: int, draws: int, seed: int) -> tuple[Tensor, float]:
-    """Draws resampled by importance, and how many they are worth."""
+    """Draws resampled by importance, and their effective sample size."""
     rows = sum(len(d.time) for d in density.hypothesis.record.drives)
-    size = int(min(400, max(80, 2 * _ROWS / rows / _ROUNDS)))  # no gradients, half as dear
+    size = int(min(400, max(80, 2 * _ROWS / rows / _ROUNDS)))  # no gradients, so half the cost
 
     def log_prob(z: FloatArray) -> FloatArray:
         return density.value(torch.as_tensor(z)[:, None])[:, 0].numpy()
@@ -136,7 +136,7 @@ def _weighted(density: RolloutDensity, mode: Mode, chains: int, draws: int, seed
     centre, scale = mode.z[0].numpy(), mode.scale[0].numpy()
     places, weights = importance(log_prob, centre, scale, rounds=_ROUNDS, size=size, enough=_ENOUGH, seed=seed)
     rng = np.random.default_rng(seed)
-    # systematic: each place comes as often as it weighs, but for one
+    # systematic resampling: each point is drawn in proportion to its weight, to within one
     at = (rng.random() + np.arange(chains * draws)) / (chains * draws)
     chosen = np.searchsorted(np.cumsum(weights), at).clip(0, len(weights) - 1)
     z = places[rng.permutation(chosen)]
@@ -144,7 +144,7 @@ def _weighted(density: RolloutDensity, mode: Mode, chains: int, draws: int, seed
 
 
 def _worth(z: Tensor) -> float:
-    """Effective number of draws (chain, draw, coordinate), of the slowest coordinate, by the chains' means."""
+    """Effective sample size of draws (chain, draw, coordinate), for the slowest coordinate, from the chains' means."""
     chains, draws, _ = z.shape
     if chains < 2:
         return float(draws)
@@ -153,7 +153,7 @@ def _worth(z: Tensor) -> float:
 
 
 def fitted(density: RolloutDensity, covariance: FloatArray) -> tuple[Surrogate, Mode]:
-    """A surrogate about the density's mode, and that mode; `covariance`: Laplace's, as far as it is known."""
+    """A surrogate around the density's mode, and that mode; `covariance`: Laplace's, where known."""
     centre, scale = torch.as_tensor(density.centre), root(covariance)
     for turn in range(3):
         surrogate = Surrogate.of(density, centre, scale)
@@ -167,19 +167,19 @@ def fitted(density: RolloutDensity, covariance: FloatArray) -> tuple[Surrogate, 
         step = away[:, 0] / away.abs().max().clamp_min(2.0) * 2.0
         centre = centre + scale @ step
         scale = mode.scale[0] if float(spread.max()) < 4 else scale
-    if not bool(mode.converged[0]):  # far from any quadratic: the fit's own mode and spread
+    if not bool(mode.converged[0]):  # far from any quadratic: keep the mode and spread of the fit
         mode = Mode(centre[None], scale[None], torch.zeros(1, dtype=scale.dtype), torch.tensor([True]))
     exact = density.value(mode.z)
     return surrogate, Mode(mode.z, mode.scale, exact, mode.converged)
 
 
 def exact_one_in(density: RolloutDensity, surrogate: Surrogate, mode: Mode, generator: torch.Generator) -> int:
-    """One gradient in how many has to be exact, so that their noise widens the posterior by no more than told.
+    """The interval n at which gradients must be exact, so that their noise widens the posterior within tolerance.
 
-    A noise of variance s² in whitened gradients widens a variance by `step s² / 4`; correcting one in n leaves
-    `(n - 1)` times the square of what the surrogate lacks, measured at draws from Laplace's approximation, a little
-    widened. 0 where it lacks so much that the posterior has cliffs. Where the surrogate is trusted at the farthest,
-    one correction must not throw a chain far either.
+    Noise of variance s² in whitened gradients widens a variance by `step s² / 4`. Correcting one gradient in n leaves
+    `(n - 1)` times the squared error of the surrogate, measured at slightly widened draws from Laplace's approximation.
+    0 where that error is so large that the posterior is too steep for SGLD. At the limit of the surrogate's range, a
+    single correction must not displace a chain far either.
     """
     size, count = mode.z.shape[-1], 16
     w = torch.randn(count + size, 1, size, dtype=mode.z.dtype, generator=generator)
@@ -197,7 +197,7 @@ def exact_one_in(density: RolloutDensity, surrogate: Surrogate, mode: Mode, gene
 
 
 def _grade(density: RolloutDensity, z: Tensor, seed: int) -> FloatArray | None:
-    """Root mean square of the slope found, (chain, draw), for draws of `z` (chain, draw, coordinate)."""
+    """Root mean square of the road grade, (chain, draw), for draws of `z` (chain, draw, coordinate)."""
     slope = density.slope
     if slope is None:
         return None

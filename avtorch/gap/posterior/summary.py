@@ -1,4 +1,4 @@
-"""What a find says in the answer's own names: parameters with their uncertainty, and the repaired simulator."""
+"""Parameters of a fitted model under the answer's names, with uncertainty, and the repaired simulator."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from avtorch.gap.simulator.plant import GapPlant, plant
 Link = Callable[[Tensor], Tensor]
 T = TypeVar("T")
 
-_LAPLACE = 2000  # draws from Laplace's approximation where none are given
+_LAPLACE = 2000  # draws from Laplace's approximation where no draws are given
 
 
 def reported(found: FittedModel, draws: Draws | None = None) -> dict[str, Quantity]:
-    """Parameters of the find's effects by the table's names, those of a pair as `effect.parameter`.
+    """Parameters of the model's effects by the table's names, those of a pair as `effect.parameter`.
 
     From `draws` of the posterior, or else from Laplace's approximation at the mode. Parameters of random effects are
-    normal in their link, as the fits that found them say.
+    normal on their link's scale, as estimated by their own fits.
     """
     told = {name: Quantity.of_draws(x) for name, x in _deterministic(found, draws).items()}
     normal = {name: Quantity.of_normal(*law) for name, law in _random(found).items()}
@@ -38,7 +38,7 @@ def reported(found: FittedModel, draws: Draws | None = None) -> dict[str, Quanti
 
 
 def moved(found: FittedModel, draws: Draws | None = None) -> dict[str, Quantity]:
-    """The baseline's `T_L` [s] and `K_L` [-] with the find's effects in."""
+    """The baseline's `T_L` [s] and `K_L` [-], fitted together with the model's effects."""
     values = _values(found, draws)
     return {name: Quantity.of_draws(values[name]) for name in ("T_L", "K_L")}
 
@@ -62,10 +62,10 @@ def drawn(found: FittedModel, draws: Draws) -> dict[str, FloatArray]:
 
 
 def repaired(found: FittedModel, baseline: GapPlant | None = None, draws: Draws | None = None) -> GapPlant:
-    """The simulator with the find's effects in, at the posterior mean of each parameter, with the jerk noise found.
+    """The simulator with the model's effects, at the posterior mean of each parameter, with the fitted jerk noise.
 
-    `baseline`: whose effects it keeps; the find's own by default. Effects act from the start of a drive, also those
-    that were found to set in later. A slope is the one found along the road of the first drive.
+    `baseline`: the plant whose effects are kept; the model's own by default. Effects act from the start of a drive,
+    even where the model has an onset. The road grade is the one estimated for the first drive.
     """
     means = {key: float(x.mean()) for key, x in _values(found, draws).items()}
     noise = found.noise.noise
@@ -92,7 +92,7 @@ def repaired(found: FittedModel, baseline: GapPlant | None = None, draws: Draws 
         baseline=found.hypothesis.baseline if baseline is None else baseline,
         T_L=means["T_L"],
         K_L=means["K_L"],
-        # the stationary spread of white jerk noise through a lag
+        # the stationary standard deviation of white jerk noise through a lag
         sigma=float(process_sd * np.sqrt(2 / noise.process_time)),
     )
 
@@ -107,7 +107,7 @@ def _values(found: FittedModel, draws: Draws | None) -> dict[str, FloatArray]:
     noise = rng.standard_normal((_LAPLACE, len(found.z)))
     if found.delays is None:
         z = found.z + noise @ root(found.covariance).numpy().T
-    else:  # each mode by its share
+    else:  # draws from each mode in proportion to its share
         mode = rng.choice(len(found.delays.shares), _LAPLACE, p=found.delays.shares / found.delays.shares.sum())
         roots = np.stack([root(c).numpy() for c in found.delays.covariances])
         z = found.delays.z[mode] + np.einsum("dij,dj->di", roots[mode], noise)
@@ -136,7 +136,7 @@ def _deterministic(found: FittedModel, draws: Draws | None) -> dict[str, FloatAr
 
 
 def _grade_rms(found: FittedModel) -> FloatArray | None:
-    """Draws of the slope's root mean square along the road, at the mode of the other parameters."""
+    """Draws of the road grade's root mean square, at the mode of the other parameters."""
     density = RolloutDensity.of(found)
     slope = density.slope
     if slope is None:
@@ -160,7 +160,7 @@ def _random(found: FittedModel) -> dict[str, tuple[float, float, Link]]:
 
 
 def _searched(found: FittedModel, kind: type[Effect]) -> dict[str, tuple[float, float, Link]]:
-    """Likewise what the own search of an effect found, by the names in its `noise_parameters`."""
+    """The same for the result of an effect's own search, by the names in its `noise_parameters`."""
     form = kind.own_search()
     if form == "force":
         noise, sds = found.noise.noise, found.noise.sds
@@ -183,12 +183,12 @@ def _valued(coordinate: Coordinate, z: Tensor) -> Tensor:
 
 
 def _named(found: FittedModel, by_effect: dict[str, T]) -> dict[str, T]:
-    """Keys as the answer has them: without the effect's name where there is only one."""
+    """The values under the answer's keys: without the effect's name where there is only one effect."""
     pair = len(found.name.split("+")) > 1
     return {key if pair else key.partition(".")[2]: x for key, x in by_effect.items()}
 
 
 def _plain(effect: Effect) -> Effect:
-    """With numbers for tensors of one number, as a text needs them."""
+    """The effect with single-number tensors as numbers, for text output."""
     values = {key: float(x) for key, x in effect.values().items() if x.dim() == 0}
     return effect.replaced(values)

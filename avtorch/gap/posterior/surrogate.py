@@ -1,10 +1,10 @@
-"""A stand-in for the exact density that costs nothing: white errors as quadratics of the coordinates.
+"""A surrogate of the exact density, of negligible cost: whitened errors as quadratics of the coordinates.
 
-Near the mode white errors are all but linear in `z`. Fitted by quadratics from a few dozen rollouts, their sum of
-squares is a polynomial whose coefficients are one small Gram matrix, however long the drive. The sampler walks on the
-exact density all the same: the stand-in is the control variate of its gradient. Each chain's gradient is the
-stand-in's plus, at a random one step in `points`, `points` times what the exact one has more: unbiased wherever a chain
-is, and with hardly any noise where the stand-in is good. Where a chain is far out it is the exact gradient itself.
+Near the mode whitened errors are almost linear in `z`. Quadratics are fitted to a few dozen rollouts; their sum of
+squares is a polynomial whose coefficients form one small Gram matrix, whatever the length of the drive. The sampler
+still targets the exact density, with the surrogate as control variate of its gradient: each chain uses the surrogate's
+gradient and, at one random step in `points`, adds `points` times the difference to the exact one. This is unbiased
+everywhere, and has little noise where the surrogate is accurate. Far from the mode the exact gradient is used.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from torch import Tensor
 from avtorch.gap.posterior.density import RolloutDensity
 from avtorch.inference.map import Mode
 
-_REACH = 1.3  # posterior standard deviations from the centre at which the quadratics are fitted
+_REACH = 1.3  # distance from the centre, in posterior standard deviations, at which the quadratics are fitted
 
 
 @dataclass(frozen=True, eq=False)
 class Surrogate:
-    """`log_prob` as `RolloutDensity` has it, by quadratics about `centre` (coordinate,) in units of `scale`.
+    """`log_prob` as in `RolloutDensity`, from quadratics around `centre` (coordinate,) in units of `scale`.
 
-    `gram` (term, term): of the white errors' terms 1, w, w²/2, w w'. `match` (axis, term): the slope's, where there is
-    one, with its `shrinkage` (size, axis) and `prior` (size,).
+    `gram` (term, term): of the whitened errors' terms 1, w, w²/2, w w'. `match` (axis, term): the road grade's, where
+    there is one, with its `shrinkage` (size, axis) and `prior` (size,).
     """
 
     names: tuple[str, ...]
@@ -43,7 +43,7 @@ class Surrogate:
 
     @classmethod
     def of(cls, density: RolloutDensity, centre: Tensor, scale: Tensor) -> Surrogate:
-        """Fitted to rollouts at `centre`, along the columns of `scale` (a root of a covariance), and between them."""
+        """Fitted to rollouts at `centre`, along and between the columns of `scale` (a covariance's root)."""
         size = len(centre)
         axes = _REACH * torch.eye(size, dtype=centre.dtype)
         pairs = list(combinations(range(size), 2))
@@ -91,9 +91,10 @@ class Surrogate:
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """The exact density, whose minibatch estimates are the surrogate's, set right at random steps.
+    """The exact density, with minibatch estimates from the surrogate that are corrected at random steps.
 
-    At one step in `points` all chains are set right, `points` times as much: one call for many chains is cheap.
+    At one step in `points` all chains are corrected, by `points` times the difference: one call for many chains is
+    cheap.
     """
 
     exact: RolloutDensity
@@ -120,9 +121,9 @@ class Corrected:
         return self.exact.score(z)
 
     def log_prob_minibatch(self, z: Tensor, index: Tensor) -> Tensor:
-        """Of `z` (..., 1, coordinate), the gradient unbiased over uniform `index` in 0 ... points - 1."""
+        """Log density of `z` (..., 1, coordinate), its gradient unbiased over uniform `index` in 0 ... points - 1."""
         flat = z.reshape(-1, z.shape[-1])
-        far = ~self.trusted(flat.detach())  # NaN is far, too
+        far = ~self.trusted(flat.detach())  # NaN counts as far
         share = torch.where(far, 1.0, float((index == 0).sum()) * self.points / len(index))
         chosen = share.nonzero().squeeze(-1)
         value = self.surrogate.log_prob(flat)
@@ -133,11 +134,11 @@ class Corrected:
         return value.index_add(0, chosen, share[chosen] * apart).reshape(z.shape[:-1])
 
     def trusted(self, z: Tensor) -> Tensor:
-        """Whether the surrogate's gradient may stand in at `z` (chain, coordinate)."""
+        """Whether the surrogate's gradient may be used at `z` (chain, coordinate)."""
         w = torch.linalg.solve_triangular(self.mode.scale[0], (z - self.mode.z[0])[..., None], upper=False)[..., 0]
         return w.square().sum(-1) <= trusted_square(z.shape[-1])
 
 
 def trusted_square(size: int) -> float:
-    """Square of the distance from the mode [posterior standard deviations] up to which a surrogate is trusted."""
+    """Squared distance from the mode [posterior standard deviations] up to which a surrogate is used."""
     return size + 4 * (2 * size) ** 0.5

@@ -1,1 +1,1 @@
-"""What a diagnosis returns: facts of the log, size of the gap, verdict, text, traces."""
+"""The result of a diagnosis: facts of the log, size of the gap, verdict, text, traces."""

@@ -1,4 +1,4 @@
-"""What changed between two sets of drives, as an answer says it."""
+"""The result of comparing two sets of drives."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Account = Literal["lag and gain", "not lag and gain", "cannot be told"]
 
 @dataclass(frozen=True)
 class Moved:
-    """One number before and after, and after over before, each with its central 90 %."""
+    """One number before and after, and the ratio of after to before, each with its central 90 %."""
 
     before: Quantity
     after: Quantity
@@ -27,12 +27,12 @@ class Moved:
 
 @dataclass(frozen=True)
 class LaterAnswer:
-    """Whether lag and gain explain a change better than a later answer of the car would.
+    """Whether lag and gain explain a change better than a change of dead time.
 
-    Dead time [s] `before`, `after` and their `difference`, where every drive is fitted with one; below 0 it is noise.
-    `p_lag_gain`: the chance of such a difference of dead times where only lag and gain have changed; `p_dead_time`: of
-    such a difference of lags and gains, dead times free, where only the dead time has. An account with less than
-    `level` is rejected, and lag and gain, which are what `compare` tells, only with less than a quarter of that.
+    Dead time [s] `before`, `after` and their `difference`, where every drive is fitted with one; a value below 0 is
+    noise. `p_lag_gain`: p-value of that difference if only lag and gain have changed; `p_dead_time`: p-value of the
+    difference of lag and gain, fitted with dead time, if only the dead time has changed. An explanation with a p-value
+    below `level` is rejected; lag and gain, which are what `compare` reports, only with less than a quarter of that.
     """
 
     before: Quantity
@@ -45,7 +45,7 @@ class LaterAnswer:
     @property
     def account(self) -> Account:
         """`"lag and gain"` where they explain the change and a dead time does not, `"not lag and gain"` where they do
-        not explain it, `"cannot be told"` where either would."""
+        not explain it, `"cannot be told"` where both explain it."""
         if self.p_lag_gain < 0.25 * self.level:
             return "not lag and gain"
         return "lag and gain" if self.p_dead_time < self.level else "cannot be told"
@@ -62,12 +62,12 @@ class LaterAnswer:
 
 @dataclass(frozen=True)
 class Comparison:
-    """`car`: `T_L` [s] and `K_L` as each set of drives has them; `gap`: rollout errors of the simulator, by metric,
-    over `horizon_s` [s]: 10 s, or on both sides the longest stretch of the side that has none so long.
+    """`car`: `T_L` [s] and `K_L` fitted to each set of drives; `gap`: rollout errors of the simulator, by metric, over
+    `horizon_s` [s]: 10 s, or less where the longest stretch of either set is shorter.
 
-    `changed`: the car's are not the same, at `p_value`, the chance of a difference as large between drives of one car.
-    `simulator`: whether the drives after are closer to the simulator of that side than those before were.
-    `later`: where the car has changed, whether lag and gain explain it; else None.
+    `changed`: the car's parameters differ, with p-value `p_value` for drives of one car. `simulator`: whether the
+    simulator's errors on the drives after are smaller than those on the drives before (each with its own simulator,
+    where two are given). `later`: where the car has changed, whether lag and gain explain it; else None.
     """
 
     before: LogFacts

@@ -1,4 +1,4 @@
-"""The answer of a diagnosis: candidates with their probabilities, the verdict, the gap, and the repaired simulator."""
+"""The answer of a diagnosis: hypotheses with probabilities, the verdict, the gap, and the repaired simulator."""
 
 from __future__ import annotations
 
@@ -63,31 +63,31 @@ DIAGNOSIS_FILES = (
     "manoeuvre.csv",
     "report.html",
 )
-"""Every file that a diagnosis may consist of."""
+"""Every file that a written diagnosis may contain."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis:
-    """What the simulator lacks, by a log; printed, it says so in a few sentences.
+    """What the simulator lacks, according to a log; `str()` states it in a few sentences.
 
-    - `candidates` are listed as `listed` has them, whatever was given
-    - `simulator`: the user's own, `T_L` and `K_L` as fitted without any effect; `plant`: the same with the verdict's
-      effects in, at the posterior mean, None where nothing was named
+    - `candidates`: the hypotheses as `listed` orders them, whatever the order given
+    - `simulator`: the user's own, with `T_L` and `K_L` fitted without any effect; `plant`: the same with the verdict's
+      effects, at the posterior mean, None where nothing was named
     - `assumed`: draws (draw,) of the simulator's `T_L` [s] and `K_L`; `belief`: draws (draw,) of the parameters of
       `plant`, or of `simulator` where there is none, by its own names; `draws`: posterior of the winner's parameters
       (chain, draw) by the table's names
-    - `where`, `shrinkage`: where the gap lies, and how far it shrinks on parts that were held out; empty where there is
-      no gap, None where the drives are too short to be parted or nothing was named
+    - `where`, `shrinkage`: where the gap lies, and how far it shrinks on held-out folds; empty where there is no gap,
+      None where the drives are too short to split or nothing was named
     - `traces`: the drives beside the rollouts of `simulator` and `plant`
-    - `contenders`: the alias set as far as it was fitted, with what it takes to foretell another drive
-    - `next_experiment`, `setting`: objects as in `diagnosis.json`, None where nobody asked
-    - `remaining`: with the default baseline, the candidates for what is left once `dead_time` is in
-    - `onset_s`: when the effect set in, on the own clock of log number `onset_log`; `onset_from_start_s`: from its
-      first row, as a `gain_change` counts in `plant`
-    - `complete` False: the budget ended the search; `scope`: what it tried, None where nobody says. Where that is not
-      all, probabilities are over what was tried, and `unknown` is a cause that was not
+    - `contenders`: predictive models of the alias set, as far as it was fitted
+    - `next_experiment`, `setting`: objects as in `diagnosis.json`, None where they were not requested
+    - `remaining`: with the default baseline, the hypotheses given that `dead_time` is in the simulator
+    - `onset_s`: onset of the effect, on the own clock of log number `onset_log`; `onset_from_start_s`: from its first
+      row, the time scale of `gain_change` in `plant`
+    - `complete` False: the budget ended the search; `scope`: what was tried, None where unknown. Where that is not
+      everything, probabilities cover what was tried, and `unknown` includes the causes that were not
 
-    Raises `InputError` where verdict and candidates do not agree.
+    Raises `InputError` where verdict and hypotheses are inconsistent.
 
     Example:
         >>> from avtorch import Leader, diagnose, simulate
@@ -136,7 +136,7 @@ class Diagnosis:
             raise InputError(f"verdict: found {self.verdict}, needs itself in its alias set, and to abstain on unknown")
 
     def __str__(self) -> str:
-        """The sentences of the terminal, one a line."""
+        """The sentences of the terminal, one per line."""
         told = [
             sentences.headline(self),
             *self.winner.implausible,
@@ -153,18 +153,18 @@ class Diagnosis:
 
     @property
     def winner(self) -> Candidate:
-        """The verdict's candidate."""
+        """The verdict's entry among the hypotheses."""
         return next(c for c in self.candidates if c.name == self.verdict.name)
 
     def probability(self, names: str | Iterable[str]) -> float:
-        """Of a candidate, by name or names; 0 where it is not listed."""
+        """Probability of a hypothesis, by name or names; 0 where it is not listed."""
         name = candidate_name(names)
         return next((c.probability for c in self.candidates if c.name == name), 0.0)
 
     def to_dict(self) -> dict[str, Any]:
-        """The object of `diagnosis.json`; beside the schema's keys `moved`, `onset_s`, `plausible` and `plausibility`
-        of each effect, the last two of the verdict, `onset_from_start_s`, `setting`, `remaining`, `complete`,
-        `not_tried` (`effects` by name; `pairs`, of which "all", "some" or "none" were tried) and `notes`.
+        """The object of `diagnosis.json`. Beyond the schema's keys it has `moved`, `onset_s`, `plausible` and
+        `plausibility` of each effect, the last two of the verdict, `onset_from_start_s`, `setting`, `remaining`,
+        `complete`, `not_tried` (`effects` by name; `pairs`, of which "all", "some" or "none" were tried) and `notes`.
         """
         return {
             "schema": "avtorch.diagnosis/1",
@@ -188,11 +188,11 @@ class Diagnosis:
     def write(self, folder: str | PathLike[str]) -> list[Path]:
         """Publish `diagnosis.json` and, where there is a plant, `plant.toml` at the same moment; returns the files.
 
-        The plant's effects act from the start, also where the log shows them from an onset on; a comment in
-        `plant.toml` then says so (one with an onset of its own has the moment among its parameters).
-        All files of an earlier diagnosis in the folder go at that moment, its page, exports and manoeuvre too: write
-        these after it, or all of them within one `avtorch.io.answer_set(folder, DIAGNOSIS_FILES)`. Raises `InputError`
-        where the folder cannot be written or a number is not finite; the earlier diagnosis then stays.
+        The plant's effects act from the start, even where the log has an onset; a comment in `plant.toml` then states
+        this (an effect with an onset of its own has it among its parameters). All files of an earlier diagnosis in the
+        folder are removed at the same moment, including its page, exports and manoeuvre: write these afterwards, or all
+        of them within one `avtorch.io.answer_set(folder, DIAGNOSIS_FILES)`. Raises `InputError` where the folder cannot
+        be written or a number is not finite; the earlier diagnosis is then kept.
         """
         names = ["diagnosis.json"] if self.plant is None else ["diagnosis.json", "plant.toml"]
         with answer_set(folder, DIAGNOSIS_FILES) as staged:
@@ -203,7 +203,7 @@ class Diagnosis:
         return [Path(folder) / name for name in names]
 
     def _late(self) -> str:
-        """A comment for `plant.toml` where the effects set in within the log."""
+        """A comment for `plant.toml` where the effects have an onset within the log."""
         kinds = [*EFFECTS.values(), *(() if self.plant is None else self.plant.effects)]
         own = {e.name for e in kinds if e.own_onset is not None}
         late = " and ".join(name for name in self.verdict.names if name not in own)
@@ -212,7 +212,7 @@ class Diagnosis:
         return f"# In the log {late} from {sentences.moment(self)} on; in this plant from the start.\n"
 
     def to_arviz(self) -> InferenceData:
-        """The winner's draws as `arviz.InferenceData`, one variable (chain, draw) a parameter, its unit in `attrs`.
+        """The winner's draws as `arviz.InferenceData`, one variable (chain, draw) per parameter, its unit in `attrs`.
 
         Needs `pip install 'avtorch[arviz]'`. Raises `InputError` where there are no draws.
         """

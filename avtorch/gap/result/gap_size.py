@@ -1,4 +1,4 @@
-"""How far the fitted baseline is from the log, in one step and over seconds, and what the best candidate leaves."""
+"""Size of the gap: errors of the fitted baseline in one step and over seconds, and those of the best hypothesis."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 
 @dataclass(frozen=True)
 class GapSize:
-    """How far the baseline is from the log, and how far noise alone would be (`floor`); None where not measured.
+    """Errors of the baseline, and those of the best hypothesis as `floor`; None where not measured.
 
-    Rollouts go over `horizon_s` [s]; accelerations [m/s²], speed [m/s]. `detected`: there is a gap, at `p_value`.
-    `repeats`: the floor as commands that were given twice tell it, None where there are none.
+    Rollouts last `horizon_s` [s]; accelerations [m/s²], speed [m/s]. `detected`: there is a gap, with p-value
+    `p_value`. `repeats`: the noise floor estimated from repeated commands, None where there are none.
     """
 
     detected: bool
@@ -48,11 +48,11 @@ class GapSize:
 
 
 def gap_size(race: SearchResult, best: FittedModel, *, detected: bool, p_value: float | None = None) -> GapSize:
-    """Root mean square errors of `race.none`, the fitted baseline, and as their floors those of `best` if smaller.
+    """Root mean square errors of `race.none`, the fitted baseline, with those of `best` as floors where smaller.
 
-    (An effect may help the speed and cost the acceleration something, and the best of wrong ones may well.)
-    Rollouts begin at what is measured, at every row, and last `HORIZON_S` or as long as the longest stretch: the same
-    measures as those of `shrinkage`, here over all rows that count. None where the log lacks the channel.
+    (An effect may improve the speed at the cost of the acceleration, and a wrong one often does.) Rollouts start from
+    the measurement at every row, and last `HORIZON_S` or as long as the longest stretch: the measures are those of
+    `shrinkage`, here over all counted rows. None where the log lacks the channel.
     """
     none, record = race.none, race.record
     one, lag = [], none.values["T_L"]
@@ -75,10 +75,10 @@ def gap_size(race: SearchResult, best: FittedModel, *, detected: bool, p_value: 
 
 
 def _one_step(record: Record, errors: FloatArray, lag: float) -> float:
-    """Of the acceleration foretold for a row from the one measured a row before.
+    """RMS error of the acceleration predicted for a row from the measurement one row earlier.
 
-    An error of the rollout dies away with the lag, so the error of one step is `e[k+1] - exp(-dt / T_L) e[k]`: of GLVD
-    exactly what its zero-order hold from the measured acceleration leaves.
+    A rollout error decays with the lag, so the one-step error is `e[k+1] - exp(-dt / T_L) e[k]`: for GLVD exactly the
+    error of its zero-order hold from the measured acceleration.
     """
     keep = float(np.exp(-record.dt / record.group / lag))
     steps = [x[1:] - keep * x[:-1] for x in map(np.ravel, _stretches(record, errors))]

@@ -1,4 +1,4 @@
-"""What a diagnosis looked at: rows, rate, signals, and where speeds and commands lie."""
+"""Facts of the diagnosed log: rows, rate, signals, and the ranges of speed and command."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead
 
 @dataclass(frozen=True)
 class LogFacts:
-    """What was looked at: usable or not, all `rows`; `seconds` without gaps; `signals` in any of the logs.
+    """Facts of the logs: all `rows`, usable or not; `seconds` without gaps; `signals` in any of the logs.
 
-    `name`: the logs' own, files without their folders, which are nobody's business where an answer is read. Of rows
-    that count: `speeds` [m/s], all but the slowest and the fastest hundredth, `commands` [m/s²], all; None: not there.
-    `epochs_s`: when each log starts, on its own clock [s].
+    `name`: the logs' own; files without their folders, which a reader of the answer need not know. Over counted rows:
+    `speeds` [m/s] without the slowest and the fastest hundredth, `commands` [m/s²] in full; None: not logged.
+    `epochs_s`: start of each log, on its own clock [s].
     """
 
     rows: int
@@ -36,7 +36,7 @@ class LogFacts:
 
     @classmethod
     def of(cls, logs: Log | Sequence[Log]) -> LogFacts:
-        """Of one log, or of several drives of one car; the rate is then their mean by time."""
+        """The facts of one log, or of several drives of one car; the rate is then their mean by time."""
         all_ = [logs] if isinstance(logs, Log) else list(logs)
         seconds = math.fsum(log.seconds for log in all_)
         return cls(
@@ -59,7 +59,7 @@ class LogFacts:
 
 
 def _driven(logs: Sequence[Log], signal: str, apart: float) -> tuple[float, float] | None:
-    """Where the usable rows of a signal lie, a share `apart` of them at either end left out."""
+    """Range of a signal over its usable rows, without a share `apart` of them at either end."""
     rows = [values[log.usable] for log in logs if (values := getattr(log, signal)) is not None]
     joined = np.concatenate(rows) if rows else np.zeros(0)
     if not len(joined):

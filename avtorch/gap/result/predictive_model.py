@@ -1,4 +1,4 @@
-"""A cause that a log left possible, with all that it takes to foretell another drive of the same car."""
+"""A model of the alias set, with all that is needed to predict another drive of the same car."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _STAND_IN = 3
 
 @dataclass(frozen=True, eq=False)
 class PredictiveModel:
-    """`plant` with the settings it took from the log, `belief`: draws (draw,) of its parameters by its own names.
+    """`plant` with the settings taken from the log; `belief`: draws (draw,) of its parameters by its own names.
 
-    `noise`: of single rows of the log. `grade_rms`: size of an unknown slope, None where it blames none.
-    `specific_force`: what the log's `accel` is.
+    `noise`: of single rows of the log. `grade_rms`: size of an unknown road grade, None where the model has none.
+    `specific_force`: whether the log's `accel` is an accelerometer's reading.
     """
 
     name: str
@@ -34,7 +34,7 @@ class PredictiveModel:
 
     @classmethod
     def of(cls, found: FittedModel) -> PredictiveModel:
-        """From what a search found."""
+        """The predictive model of a fitted one."""
         record = found.hypothesis.record
         grade = found.grade_rms if found.hypothesis.integrated is not None else None
         return cls(
@@ -48,22 +48,22 @@ class PredictiveModel:
 
 
 def predictive_models(race: SearchResult, verdict: Verdict) -> tuple[PredictiveModel, ...]:
-    """The verdict's alias set, as far as its members were fitted, the verdict first; at most five.
+    """Models of the verdict's alias set, as far as its members were fitted, the verdict first; at most five.
 
-    What `unknown` would do nobody knows: where it leaves fewer than two, the named ones with most evidence stand in,
-    as a drive that tells these from one another asks the car for all that they stand for.
+    `unknown` makes no predictions: where it leaves fewer than two models, the named ones with the most evidence are
+    added, because an experiment that distinguishes these tests the car for all that they represent.
     """
     by_name: Mapping[str, FittedModel] = {f.name: f for f in race.found}
     names: Sequence[str] = [n for n in verdict.alias_set if n in by_name]
     if (len(names) < 2 and len(verdict.alias_set) > 1) or verdict.abstained:
         others = [f.name for f in race.found if f.name not in names]
-        # what differs by chance alone foretells the same
+        # models that differ only in a random effect predict the same
         names = _apart([by_name[name] for name in [*names, *others]])[: len(names) + _STAND_IN]
     return tuple(PredictiveModel.of(by_name[name]) for name in names[:_MOST])
 
 
 def _apart(found: Sequence[FittedModel]) -> list[str]:
-    """Names of the finds whose rollouts differ from those of every earlier one."""
+    """Names of the models whose rollouts differ from those of every earlier one."""
     out: dict[frozenset[str], str] = {}
     for f in found:
         out.setdefault(frozenset(e.name for e in f.hypothesis.effects), f.name)

@@ -1,8 +1,8 @@
-"""What noise alone leaves, told without any model: commands that the car was given twice.
+"""Model-free noise floor, from commands that the car was given twice.
 
-Two windows with the same commands, which had been the same for some seconds before, find the actuator in the same
-state. Half the mean square of what the car did differently is then noise, and whatever else the commands do not decide
-(another speed, a slope, an onset between the two): a floor that no fit has touched.
+In two windows with the same commands, preceded by equal commands for some seconds, the actuator starts from the same
+state. Half the mean square difference of the responses is then noise, plus whatever does not depend on the commands
+(another speed, a road grade, an onset between the two): a floor that involves no fit.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from avtorch.gap.likelihood.record import Record
 
 WINDOW_S = 10.0
 SETTLED_S = 3.0
-"""From a window's start, after which the actuator has forgotten what came before [s]."""
-_ALIKE = 0.02  # of the spread of the commands themselves
+"""Time from a window's start after which the actuator has forgotten its earlier state [s]."""
+_ALIKE = 0.02  # tolerance, relative to the spread of the commands
 _LIVELY_MPS2 = 0.2
 
 
 @dataclass(frozen=True)
 class Repeatability:
-    """From so many `pairs` of windows: `seconds` [s] compared, root mean squares `accel` [m/s²] and `speed` [m/s].
+    """Noise floor from `pairs` pairs of windows: `seconds` [s] compared, root mean squares `accel` [m/s²] and `speed`
+    [m/s].
 
-    The speed's is of its change since the window settled. None where the log lacks the channel.
+    The speed's is of its change since the settling time. None where the log lacks the channel.
     """
 
     pairs: int
@@ -47,7 +48,7 @@ class Repeatability:
 
 
 def repeatability(record: Record) -> Repeatability | None:
-    """Of the windows that a record holds twice; None where it holds none."""
+    """The repeatability from windows with repeated commands; None where there are none."""
     rows, settled = round(WINDOW_S / record.dt), round(SETTLED_S / record.dt)
     found = list(_pairs(record.command[record.source], record.stretch, rows))
     if not found:
@@ -66,7 +67,7 @@ def repeatability(record: Record) -> Repeatability | None:
 
 
 def _pairs(command: FloatArray, stretch: NDArray[np.intp], rows: int) -> list[tuple[int, int]]:
-    """Where windows of so many rows begin that have the same commands; no row is in two windows."""
+    """Starts of pairs of windows of `rows` rows with the same commands; no row is in two windows."""
     last = len(command) - rows
     if last < rows:
         return []

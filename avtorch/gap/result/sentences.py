@@ -1,4 +1,4 @@
-"""A diagnosis in words: the sentences that the terminal and the report share. Plain text, a sentence or two each."""
+"""A diagnosis in words: the sentences shared by the terminal and the report, in plain text."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from avtorch.gap.selection.verdict import Candidate, Verdict, meanings
 from avtorch.io.clock import clock_words
 
 SURE = 0.9
-"""What a headline says without a perhaps."""
-_ALIASES = 4  # told by name beside the verdict
-_UNTRIED = 6  # named
+"""Probability from which a headline is unqualified."""
+_ALIASES = 4  # hypotheses named beside the verdict
+_UNTRIED = 6  # names of effects listed as not tried
 _MEASURES = {
     "rollout_rmse_accel": ("acceleration", "m/s²"),
     "rollout_rmse_speed": ("speed", "m/s"),
@@ -25,7 +25,7 @@ _MEASURES = {
 
 
 class Findings(Protocol):
-    """What the sentences rest on; a `Diagnosis` has it."""
+    """The input of the sentences; a `Diagnosis` has it."""
 
     @property
     def log(self) -> LogFacts: ...
@@ -62,7 +62,7 @@ class Findings(Protocol):
 def headline(found: Findings) -> str:
     """The verdict as one sentence; provisional where the budget ended the search.
 
-    Where it is implausible it says so, and the winner's `implausible` says why.
+    It states an implausible fit; the winner's `implausible` gives the reasons.
     """
     return _verdict(found) if found.complete else f"Provisional: {_verdict(found)}"
 
@@ -80,7 +80,7 @@ def _verdict(found: Findings) -> str:
         first = "The" if found.winner.probability >= SURE else "No effect stands out: probably the"
         return f"{first} simulator lacks nothing that this log shows ({p}){but}."
     told = meanings(verdict.name)
-    # what the effect means is not what it is here
+    # an implausible fit is not described by the effect's usual meaning
     told = ", but as fitted that is physically implausible." if odd else f": {told}." if told else "."
     share = found.winner.probability
     who = "The" if share >= SURE else "Probably the" if share >= 0.5 else "Perhaps the"
@@ -88,14 +88,14 @@ def _verdict(found: Findings) -> str:
 
 
 def onset(found: Findings) -> list[str]:
-    """From when on."""
+    """The sentence on the onset."""
     if found.onset_s is not None:
         return [f"Onset: at {moment(found)}."]
     return ["Onset: present from the start."] if found.winner.effects else []
 
 
 def moment(found: Findings) -> str:
-    """The onset from the log's start, beside it on the log's own clock; one figure where they are the same."""
+    """The onset from the log's start, and in brackets on the log's own clock; one figure where both are the same."""
     assert found.onset_s is not None
     assert found.onset_from_start_s is not None
     of = "the log's" if len(found.log.epochs_s) == 1 else f"drive {found.onset_log + 1}'s"
@@ -105,11 +105,11 @@ def moment(found: Findings) -> str:
 
 
 def where(found: Findings) -> list[str]:
-    """Where the gap lies, an onset apart."""
+    """Where the gap lies, apart from an onset."""
     told = []
     for part in found.where:
         if part.axis == "time" and found.onset_s is not None:
-            continue  # the onset says it
+            continue  # stated by the sentence on the onset
         if part.axis == "signal":
             if part.share >= 0.5:
                 told.append("in the car's motion" if part.begin == "actuation" else "in the accelerometer's reading")
@@ -149,7 +149,7 @@ def shrinkage(found: Findings) -> list[str]:
 
 
 def moved(found: Findings) -> list[str]:
-    """What the effect does to the baseline."""
+    """The change of the baseline's fit by the effect."""
     baseline, with_it, told = found.baseline, found.winner.moved, []
     for name in ("T_L", "K_L"):
         if name in with_it and name in baseline:
@@ -159,7 +159,7 @@ def moved(found: Findings) -> list[str]:
 
 
 def aliases(found: Findings) -> str:
-    """Which hypotheses the log cannot distinguish."""
+    """The hypotheses that the log cannot distinguish from the verdict."""
     from_words = {"none": "no effect at all", "unknown": "a cause outside the table"}
     if _cut(found):
         from_words["unknown"] = "a cause that was not tried"
@@ -175,7 +175,7 @@ def aliases(found: Findings) -> str:
 
 
 def untried(scope: Scope) -> list[str]:
-    """Which hypotheses were not tried, and what the probabilities then mean."""
+    """The hypotheses that were not tried, and the resulting meaning of the probabilities."""
     few, rest = scope.not_scored[:_UNTRIED], len(scope.not_scored) - _UNTRIED
     parts = [*few, *([f"{rest} more effects"] if rest > 0 else [])]
     parts += {"all": [], "some": ["some of the pairs"], "none": ["pairs"]}[scope.pairs]
@@ -186,7 +186,7 @@ def untried(scope: Scope) -> list[str]:
 
 
 def _cut(found: Findings) -> bool:
-    """Whether single effects were left untried."""
+    """Whether single effects were not tried."""
     return found.scope is not None and bool(found.scope.not_scored)
 
 
@@ -195,7 +195,7 @@ def _all_tried(found: Findings) -> bool:
 
 
 def _known(found: Findings) -> str:
-    """The effects out of which none is the cause."""
+    """The set of effects that the sentence excludes."""
     if found.scope is None or _all_tried(found):
         return "effects known here"
     if not _cut(found):
@@ -227,12 +227,12 @@ def gap(found: Findings) -> list[str]:
 
 
 def number(p: float) -> str:
-    """A probability of three digits."""
+    """A probability with three decimals."""
     return "<.001" if 0 < p < 0.0005 else ">.999" if 0.9995 <= p < 1 else f"{p:.3f}"
 
 
 def remains(found: Findings) -> list[str]:
-    """What the simulator lacks besides the delay."""
+    """Hypotheses for what the simulator lacks besides the delay."""
     if not found.remaining:
         return []
     best = sorted(found.remaining, key=lambda c: -c.probability)[:3]
@@ -241,7 +241,7 @@ def remains(found: Findings) -> list[str]:
 
 
 def to_set(found: Findings) -> list[str]:
-    """What to set."""
+    """The recommended setting."""
     if found.setting is None:
         return []
     why = found.setting["why"]
@@ -249,7 +249,7 @@ def to_set(found: Findings) -> list[str]:
 
 
 def to_drive(found: Findings) -> list[str]:
-    """Which experiment next."""
+    """The recommended next experiment."""
     told = found.next_experiment
     if told is None:
         return []

@@ -1,4 +1,4 @@
-"""The drives as the search saw them, with what the simulator makes of their commands, before and after the repair."""
+"""The drives as used in the search, with the simulator's rollouts before and after the repair."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from avtorch.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """Rows that count, averaged to some 20 Hz. Accelerations [m/s²], speed [m/s], `time` [s] from their log's start.
+    """Counted rows, averaged to about 20 Hz. Accelerations [m/s²], speed [m/s], `time` [s] from their log's start.
 
-    `command` (row,); `measured`, `before`, `after` (channel, row): what the log shows, and rollouts over whole drives
-    of the fitted simulator without and with the effect (equal where nothing was named). `does` (row,) [nats]: what the
-    effect does to each row. `stretch` (row,) numbers parts without gaps.
+    `command` (row,); `measured`, `before`, `after` (channel, row): measurements, and rollouts over whole drives of the
+    fitted simulator without and with the effect (equal where nothing was named). `does` (row,) [nats]: the effect's
+    contribution in each row. `stretch` (row,) numbers the stretches without gaps.
     """
 
     time: FloatArray
@@ -27,5 +27,5 @@ class Traces:
 
     @property
     def speed(self) -> FloatArray | None:
-        """Measured, (row,); None where it was not."""
+        """Measured speed, (row,); None where it was not measured."""
         return self.measured[self.channels.index("speed")] if "speed" in self.channels else None

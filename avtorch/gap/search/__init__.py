@@ -1,1 +1,1 @@
-"""Which candidates explain a log best: effects, pairs, onsets, and what chance decides."""
+"""The search for the hypotheses that explain a log best: effects, pairs, onsets and random effects."""

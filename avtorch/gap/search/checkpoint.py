@@ -1,7 +1,8 @@
-"""Fits that are done, kept in a file, so that a search that was cut off goes on where it was.
+"""A file of finished fits, from which an interrupted search continues.
 
-The file says what its fits are of: the logs' content and every setting that changes a fit. A fit is taken from it only
-where it began from the same place, to the bit: a search that took another way, as under a budget, makes its own.
+The file states what its fits belong to: the content of the logs and every setting that changes a fit. A fit is reused
+only if it started from exactly the same values, bit for bit; a search that takes another path, for instance under a
+budget, makes its own fits.
 """
 
 from __future__ import annotations
@@ -30,24 +31,24 @@ from avtorch.io import fingerprint, read_sealed, write_sealed
 
 SCHEMA = "avtorch.fits/2"
 MOST = 16 * 2**20
-"""Bytes of a file of fits; a search makes some tens, of a few hundred bytes each."""
+"""Limit on the bytes of a file of fits; a search makes some tens of fits, of a few hundred bytes each."""
 
 REMEDY = "remove it to begin anew (avtorch diagnose --no-resume), or use another folder"
 
 _ENTRY = {"name", "onset", "inputs", "z", "noise", "log_prior"}
-_LARGEST = 64  # coordinates of a fit
+_LARGEST = 64  # most coordinates of a fit
 
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """A fit that has come to rest: the mode `z` (coordinate,), its `noise`, and the noise's `log_prior`."""
+    """A converged fit: the mode `z` (coordinate,), its `noise`, and the noise's `log_prior`."""
 
     z: FloatArray
     noise: NoiseModel
     log_prior: float
 
     def found(self, hypothesis: Hypothesis, onset: int | None) -> FittedModel:
-        """All that follows from it."""
+        """The fitted model that results from this fit."""
         record = hypothesis.record
         white = whitening_filter(record, self.noise, onset=onset)
         fit = finish(hypothesis, white, self.z, onset)
@@ -59,7 +60,7 @@ class Kept:
 
 @dataclass(frozen=True)
 class Start:
-    """Where a fit begins; `inputs` is the fingerprint of all that decides where it ends."""
+    """The start of a fit; `inputs` is the fingerprint of everything that determines its result."""
 
     hypothesis: Hypothesis
     onset: int | None
@@ -77,21 +78,21 @@ _RECORDS: WeakKeyDictionary[Record, str] = WeakKeyDictionary()
 
 
 class Checkpoint:
-    """The fits of one search, `path` None: nothing is kept.
+    """The fits of one search; with `path` None nothing is stored.
 
-    `work`: what they are fits of, from `fitted_work`. Raises `InputError` for a file that is damaged, that is none of
-    its own, or that was begun with other work, saying what differs.
+    `work`: what the fits belong to, from `fitted_work`. Raises `InputError` for a file that is damaged, that is not a
+    file of fits, or that belongs to other work, and states the difference.
     """
 
     def __init__(self, path: str | os.PathLike[str] | None, work: Mapping[str, Any] | None = None) -> None:
         self.path, self.work = None if path is None else Path(path), dict(work or {})
         self._done: dict[str, dict[str, Any]] = {}
-        # a symlink to nowhere is there, too
+        # this includes a dangling symlink
         if self.path is not None and os.path.lexists(self.path):
             self._done = {entry["inputs"]: entry for entry in read_fits(self.path, self.work)}
 
     def next(self, start: Start | None) -> Kept | None:
-        """The fit that begins so, if the file has it."""
+        """The stored fit with this start, or None."""
         entry = None if start is None else self._done.get(start.inputs)
         if start is None or entry is None:
             return None
@@ -103,11 +104,11 @@ class Checkpoint:
     def start(
         self, hypothesis: Hypothesis, z: FloatArray, noise: NoiseModel, onset: int | None, rounds: int
     ) -> Start | None:
-        """Where a fit begins; None where nothing is kept."""
+        """The start of a fit; None where nothing is stored."""
         return None if self.path is None else Start.of(hypothesis, z, noise, onset, rounds)
 
     def keep(self, start: Start | None, fit: Kept) -> None:
-        """One more fit is done."""
+        """Store one more finished fit."""
         if self.path is None or start is None:
             return
         self._done[start.inputs] = {
@@ -140,7 +141,7 @@ def read_fits(path: Path, work: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _faults(entry: Any) -> Iterable[str]:
-    """What is wrong with an entry."""
+    """Faults of an entry, in words."""
     if not isinstance(entry, dict) or set(entry) != _ENTRY:
         yield f"is no object of {', '.join(sorted(_ENTRY))}"
         return

@@ -1,8 +1,8 @@
-"""Random errors of the command whose variance an effect foretells: what they add to the likelihood of a rollout.
+"""Random errors of the command with a variance given by an effect: their gain in the likelihood of a rollout.
 
-An error in one row's command passes the actuator as that command does, so the white errors are white noise and the
-output of a small linear system that the command's errors drive. A Kalman filter of that system gives each row's
-density, given the rows before it. Stretches go side by side in chunks, each begun some rows earlier.
+An error in one row's command passes the actuator as the command does. The whitened errors are therefore white noise
+plus the output of a small linear system driven by the command's errors. A Kalman filter of that system gives each row's
+density given the earlier rows. Stretches are processed in parallel chunks, each started some rows earlier.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from avtorch.gap.search.lost_messages import image_of_row, states_of
 
 
 def rows_gained(white: WhiteningFilter, errors: FloatArray, variance: FloatArray, T_L: float, K_L: float) -> FloatArray:
-    """Log likelihood ratio (counted,) of each row, commands with errors of this `variance` over commands as logged.
+    """Log likelihood ratio (counted,) of each row: commands with errors of this `variance` against commands as logged.
 
     Args: `errors` (channel, counted, 1) of a rollout with `T_L` [s] and `K_L` at the log's own rate; `variance`
     (counted,) [(m/s²)²], independent from row to row.

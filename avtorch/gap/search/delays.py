@@ -1,8 +1,9 @@
-"""Other delays that fit as well: a command that repeats itself shows a delay only up to its period.
+"""All delays that fit equally well under a periodic command.
 
-The likelihood over a delay then has a mode at every multiple of the period, and under a pure sine a delay and a longer
-lag do the same. So where the command repeats itself, all delays within the prior's range are tried, the lag and gain
-fitted to each; evidence and posterior are those of all modes together. A mode within a row of no delay at all is none.
+A periodic command identifies a delay only up to its period: the likelihood has a mode at every multiple of the period,
+and under a pure sine a delay and a longer lag are equivalent. All delays within the prior's range are therefore tried,
+with lag and gain fitted to each; evidence and posterior are those of all modes together. A mode within one row of zero
+delay counts as no delay.
 """
 
 from __future__ import annotations
@@ -19,17 +20,17 @@ from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.fitted_model import ALIKE, Delays, FittedModel
 from avtorch.gap.simulator.drive import Drive
 
-_LONGEST_S = 1.0  # twice the longest that is typical
+_LONGEST_S = 1.0  # twice the longest typical delay
 _TRIED = 40
-_FOLLOWED = 16  # of these, to their modes
+_FOLLOWED = 16  # number of these refined to their modes
 
-_REPEATS = 0.95  # correlation of a command with itself one period later
-_BEGUN_S = 2.0  # of a stretch, in which commands from before the log may still act
-_DIPS = 0.2  # how much less it is in between
+_REPEATS = 0.95  # least correlation of a command with itself one period later
+_BEGUN_S = 2.0  # start of a stretch, in which commands from before the log may still act
+_DIPS = 0.2  # least drop of the correlation between the peaks
 
 
 def repeats_after(drives: Sequence[Drive]) -> float | None:
-    """The period [s] of a command that repeats itself, from the rows of all drives; None where it does not."""
+    """The period [s] of a periodic command, from the rows of all drives; None where it is not periodic."""
     longest = max(len(d.time) for d in drives) // 2
     total, norm = np.zeros(longest), np.zeros(longest)
     for drive in drives:
@@ -38,7 +39,7 @@ def repeats_after(drives: Sequence[Drive]) -> float | None:
         spectrum = np.fft.rfft(u, 2 * len(u))
         total[:count] += np.fft.irfft(np.abs(spectrum) ** 2)[:count]
         square = np.cumsum(u**2)
-        # of the two stretches that are held against each other
+        # energies of the two overlapping stretches
         early, late = square[len(u) - 1 - np.arange(count)], square[-1] - np.concatenate([[0.0], square[: count - 1]])
         norm[:count] += np.sqrt(early * late)
     if not norm[0] > 0:
@@ -47,12 +48,12 @@ def repeats_after(drives: Sequence[Drive]) -> float | None:
     dips = np.minimum.accumulate(r)
     later = np.append(r[1:], -1.0)
     peaks = np.flatnonzero((r > _REPEATS) & (r >= later) & (r > dips + _DIPS))
-    # the first peak may be a shoulder of the true one, a row earlier
+    # the first peak may be a shoulder of the true one, one row earlier
     return None if not len(peaks) else float(peaks[0] * drives[0].dt.median())
 
 
 def all_delays(record: Record, best: Mapping[str, FittedModel]) -> dict[str, FittedModel]:
-    """Finds by name, most evidence first, each with all the delays that a command which repeats leaves possible."""
+    """Fitted models by name, most evidence first, each with all delays that a periodic command leaves possible."""
     period = repeats_after(record.drives)
     if period is None:
         return dict(best)
@@ -66,9 +67,10 @@ def all_delays(record: Record, best: Mapping[str, FittedModel]) -> dict[str, Fit
 
 
 def with_delays(found: FittedModel, without: FittedModel, period: float) -> FittedModel:
-    """`found` with all its delays that fit alike under a command of this `period` [s]; itself where it has no delay.
+    """`found` with all its delays that fit equally well under a command of this `period` [s]; unchanged without a
+    delay.
 
-    `without`: the find of the same effects less the delay.
+    `without`: the fitted model with the same effects except the delay.
     """
     candidate, onset = found.hypothesis, found.onset
     keys = [f"{e.name}.{e.shift}" for e in candidate.effects if e.shift is not None]
@@ -95,7 +97,7 @@ def with_delays(found: FittedModel, without: FittedModel, period: float) -> Fitt
             kept.append(int(k))
     laplace = [finish(candidate, white, z[k], onset) for k in kept]
     first = finish(candidate, white, found.z, onset)
-    # what the first rows say of a delay, they say of a command from before the log
+    # the first rows of a stretch respond to commands from before the log, so they do not discriminate between delays
     begun = [float(white.row_likelihoods(f.errors).sum()) - _settled(white, f.errors) for f in laplace]
     evidence = np.array([f.log_evidence for f in laplace]) - np.array(begun) + max(begun)
     total = float(np.logaddexp.reduce(evidence))
@@ -124,7 +126,7 @@ def with_delays(found: FittedModel, without: FittedModel, period: float) -> Fitt
 
 
 def _settled(white: WhiteningFilter, errors: FloatArray) -> float:
-    """Log likelihood of errors (channel, counted, group), less the rows at the start of each stretch."""
+    """Log likelihood of errors (channel, counted, group), without the rows at the start of each stretch."""
     record = white.record
     since = np.arange(record.rows) - record.starts[record.stretch]
     return float(white.row_likelihoods(errors)[since * record.dt >= _BEGUN_S].sum())

@@ -1,4 +1,4 @@
-"""A hypothesis once it is fitted, all of them after a search, and what a search begins from."""
+"""A fitted hypothesis, the result of a search, and the first guess of the noise."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from avtorch.io import Log
 class ByChance:
     """A user's random effect as fitted: `law` at `z` (coordinate,) with this `covariance`.
 
-    `explained` [nats]: what it explains although the errors still show it; `process_sd` [m/s²]: of the jerk noise
-    beside it, where that was fitted anew.
+    `explained` [nats]: gain from errors that it explains but that remain in the residuals; `process_sd` [m/s²]: of the
+    jerk noise, where it was refitted together with the effect.
     """
 
     law: RandomLaw
@@ -41,10 +41,10 @@ class ByChance:
 
 @dataclass(frozen=True, eq=False)
 class Delays:
-    """Delays that fit alike under a command that repeats itself after `period` [s], in order.
+    """Delays that fit equally well under a command that repeats after `period` [s], in ascending order.
 
     `lengths` (mode,) [s], their `shares` (mode,) of the posterior, `z` (mode, coordinate) and `covariances` at each.
-    `row`: the interval of the log's rows [s]. `gain` [nats]: of log likelihood over the find called `without`, which
+    `row`: the interval of the log's rows [s]. `gain` [nats]: of log likelihood over the model named `without`, which
     has no delay.
     """
 
@@ -59,27 +59,27 @@ class Delays:
 
     @property
     def none(self) -> float:
-        """Share of the posterior within a row of no delay, where a longer one fits alike."""
+        """Posterior share of the modes within one row of zero delay, if longer delays fit equally well."""
         return float(self.shares[self.lengths < self.row].sum()) if len(self.lengths) > 1 else 0.0
 
     @property
     def untold(self) -> bool:
-        """Whether no delay at all does as well, within a row of the log or in the likelihood."""
+        """Whether zero delay fits as well: as one of the modes, or by a likelihood within `ALIKE`."""
         return self.none > 0 or (self.gain < ALIKE and float(self.lengths.max()) > self.row)
 
 
 ALIKE = 4.0
-"""Nats of log likelihood by less of which two delays are not told apart. Not fitted: odds of 55 to 1, which a delay
-beside a lag that bends to it does not reach by chance."""
+"""Nats of log likelihood within which two delays are not distinguished. Chosen, not fitted: likelihood odds of 55 to 1,
+which a delay beside a lag that adapts to it does not reach by noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class FittedModel:
-    """A hypothesis fitted: `name`, `z` and parameter `values` at the mode, `log_evidence` [nats], `errors`.
+    """A fitted hypothesis: `name`, `z` and parameter `values` at the mode, `log_evidence` [nats], `errors`.
 
-    `onset`, `gust_onset`: counted rows from which its effects act and a gust blows, None: from the start. `tails`,
-    `losses`: what random effects among its names found; `searched`: the classes of these and of a gust. `by_chance`:
-    the random effect without a search of its own. `delays`: all that fit alike, under a command that repeats itself.
+    `onset`, `gust_onset`: counted rows from which its effects and its gust act; None: from the start. `tails`,
+    `losses`: results of its random effects; `searched`: the classes of these and of a gust. `by_chance`: the random
+    effect without a search of its own. `delays`: all delays that fit equally well under a periodic command.
     """
 
     name: str
@@ -103,22 +103,22 @@ class FittedModel:
     searched: tuple[type[Effect], ...] = ()
 
     def name_with(self, effect: str) -> str:
-        """With the random effect of this name on top."""
+        """The name with the random effect of this name added."""
         return "+".join(sorted([*([] if self.name == "none" else self.name.split("+")), effect]))
 
     @property
     def blown(self) -> bool:
-        """Whether a random force is among its causes, under whose noise weaker causes do not show."""
+        """Whether a random force is among its causes; its large noise hides weaker causes."""
         return self.gust or (self.by_chance is not None and self.by_chance.law.form == "force")
 
     @property
     def began(self) -> int | None:
-        """Counted row from which anything of it acts; None: from the start."""
+        """Counted row from which any of its causes acts; None: from the start."""
         return self.gust_onset if self.onset is None else self.onset
 
     @property
     def white(self) -> WhiteningFilter:
-        """Of errors under its noise."""
+        """The whitening filter of its noise."""
         return whitening_filter(self.hypothesis.record, self.noise.noise, onset=self.onset, gust_onset=self.gust_onset)
 
     @classmethod
@@ -131,7 +131,7 @@ class FittedModel:
         log_likelihood: float,
         onset: int | None = None,
     ) -> Self:
-        """From a fit under this noise."""
+        """The fitted model from a fit under this noise."""
         return cls(
             name=hypothesis.name,
             hypothesis=hypothesis,
@@ -152,8 +152,8 @@ class FittedModel:
 class Scope:
     """What a search tried: names of single effects `scored` and `not_scored`, and which `pairs`.
 
-    `not_scored`: those that the budget kept out, and those that were not asked for. `pairs`: "all" that promised
-    anything, "some" before the budget ended, or "none".
+    `not_scored`: effects excluded by the budget or by the user. `pairs`: "all" that screening selected, "some" before
+    the budget ended, or "none".
     """
 
     scored: tuple[str, ...] = ()
@@ -168,7 +168,7 @@ class Scope:
         channels: Collection[str],
         pairs: Literal["all", "some", "none"],
     ) -> Self:
-        """Of a search among `effects` that `tried` those names; only what a log with these `channels` could show."""
+        """The scope of a search among `effects`, limited to those observable in `channels`; `tried`: by name."""
         own = {e.name: e for e in effects}
         kinds = own | {n: e for n, e in EFFECTS.items() if n not in own}
         names = [n for n, e in kinds.items() if is_observable(e, channels)]
@@ -176,7 +176,7 @@ class Scope:
 
     @property
     def whole(self) -> bool:
-        """Whether nothing was left out."""
+        """Whether every hypothesis was tried."""
         return not self.not_scored and self.pairs == "all"
 
     def to_dict(self) -> dict[str, Any]:
@@ -185,7 +185,7 @@ class Scope:
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """All hypotheses found, most evidence first, and what they were found on. `complete` False: the budget ended it."""
+    """All fitted hypotheses, most evidence first, and their data. `complete` False: the budget ended the search."""
 
     record: Record
     raw: Record
@@ -204,21 +204,21 @@ class SearchResult:
 
 
 def first_noise(record: Record) -> NoiseModel:
-    """Sensor noise from what rows beside each other differ by, as a first guess."""
+    """A first guess of the noise, with sensor noise from differences of neighbouring rows."""
     same = np.diff(np.repeat(record.stretch, record.group)) == 0
     sds = [1.4826 / np.sqrt(2) * float(np.median(np.abs(np.diff(x.ravel())[same]))) + 1e-4 for x in record.measured]
     return NoiseModel(**{f"{name}_sd": sd for name, sd in zip(record.channels, sds, strict=True)})
 
 
 def with_or_without_onset(forms: Sequence[FittedModel]) -> FittedModel:
-    """One cause in several forms (over the whole drive, from an onset on), equally likely a priori."""
+    """The best form of one cause (whole drive or onset), its evidence averaged over equally likely forms."""
     best = max(forms, key=lambda f: f.log_evidence)
     total = np.logaddexp.reduce([f.log_evidence for f in forms]) - np.log(2.0)
     return replace(best, log_evidence=float(total))
 
 
 def without_outliers(logs: Sequence[Log], raw: Record, glitches: HeavyTails) -> list[Log]:
-    """The logs with glitches of the accelerometer put to the middle of the rows beside them."""
+    """The logs with outliers of the accelerometer replaced by the mean of the neighbouring rows."""
     hit, offset = raw.source[glitches.hit], 0
     read = [None if log.accel is None else log.accel.copy() for log in logs]
     for cut in raw.cuts:

@@ -1,7 +1,7 @@
-"""What fits are of, as the file that keeps them says it: the logs and every setting that changes a fit.
+"""Identity of a set of fits, for the file that stores them: the logs and every setting that changes a fit.
 
-Neither the prior over causes, nor how the winner's posterior is drawn, nor its seed, nor a budget changes a fit: a
-search with others goes on from the same file.
+A fit does not depend on the prior over causes, on the method and seed of the winner's posterior, or on a budget, so a
+search with other values of these continues from the same file.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _SIGNALS = ("time", "accel_cmd", "accel", "speed", "engaged", "grade", "segment"
 def fitted_work(
     logs: Sequence[Log], baseline: GapPlant, effects: Sequence[type[Effect]], *, pairs: bool
 ) -> dict[str, Any]:
-    """By what is in the logs, however their columns or files are called; for JSON."""
+    """The identity, from the content of the logs whatever their columns or files are called; as JSON."""
     return {
         "avtorch": __version__,
         "logs": [
@@ -42,7 +42,7 @@ def fitted_work(
 
 
 def difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
-    """What was otherwise, in words; None if nothing was."""
+    """The differences in words; None if there are none."""
     if set(before) != set(now):
         return "other kinds of settings"
     if before["avtorch"] != now["avtorch"]:
@@ -60,7 +60,7 @@ def difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
 
 
 def _effect(effect: type[Effect]) -> list[Any]:
-    """A class by name, and one from outside avtorch by its source, too: its author may have changed it since."""
+    """A class by name; one from outside avtorch also by its source, which its author may have changed."""
     if effect.__module__.split(".")[0] == "avtorch":
         return [effect]
     own = [cls for cls in effect.__mro__ if cls.__module__.split(".")[0] not in ("avtorch", "builtins")]
@@ -70,7 +70,7 @@ def _effect(effect: type[Effect]) -> list[Any]:
 def _source(cls: type) -> str:
     try:
         return inspect.getsource(cls)
-    except (OSError, TypeError):  # typed into an interpreter
+    except (OSError, TypeError):  # defined in an interpreter
         own = {name: x for name, x in vars(cls).items() if not name.startswith("__")}
         return fingerprint({name: _code(x.__code__) if inspect.isfunction(x) else repr(x) for name, x in own.items()})
 
@@ -81,7 +81,7 @@ def _code(code: CodeType) -> list[Any]:
 
 
 def _in_words(baseline: GapPlant) -> str:
-    """One line."""
+    """The baseline in one line."""
     values = [f"{name}={x:g}" for name in ("T_L", "K_L") if isinstance(x := getattr(baseline, name), (int, float))]
     for effect in baseline.effects:
         given = [(f.name, getattr(effect, f.name)) for f in fields(effect)]
@@ -101,7 +101,7 @@ def _logs(logs: Any) -> str:
 
 
 def _short(x: Any) -> str:
-    """At most one line of it."""
+    """The value in one line, shortened."""
     text = ", ".join(map(str, x)) if isinstance(x, list) else str(x)
     text = "".join(c for c in text if c.isprintable())
     return text if len(text) <= 200 else text[:197] + "..."

@@ -1,4 +1,4 @@
-"""Gusts: a slowly coloured force on top of whatever a candidate's rollout leaves over."""
+"""Gusts: a slowly coloured force added to a hypothesis and fitted to its residuals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from avtorch.gap.simulator.effect import Effect
 
 
 def gust(base: FittedModel, kind: type[Effect]) -> FittedModel:
-    """The coloured force of an effect of this `kind` on top of `base`, over the whole drive and from an onset on."""
+    """`base` with the coloured force of an effect of this `kind`, over the whole drive or from an onset on."""
     record = base.hypothesis.record
     forms = []
     lag = base.values["T_L"]
@@ -39,9 +39,9 @@ def gust(base: FittedModel, kind: type[Effect]) -> FittedModel:
 
 
 def _along(blown: FittedModel) -> FloatArray:
-    """Log likelihood (counted,) if the gust sets in at each row.
+    """Log likelihood (counted,) of an onset of the gust at each row.
 
-    Against the same noise without the gust; the base's own noise has made room for it.
+    The alternative is the same noise without the gust, because the base's own noise has absorbed part of the gust.
     """
     record, noise = blown.hypothesis.record, blown.noise.noise
     calm, strong = (

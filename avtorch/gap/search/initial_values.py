@@ -1,4 +1,4 @@
-"""Where a search begins: a few values of each effect's parameters, for what has more than one hill to climb."""
+"""Starting values of a search: a few values of each effect's parameters, for likelihoods with several modes."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.simulator.integrated import Integrated
 
 _TRADES = tuple(s * k for k in (0.012, 0.025, 0.04, 0.06, 0.085, 0.12) for s in (-1, 1))
-"""Of a delay for lag [s]."""
+"""Trades of a delay for lag [s]."""
 _LEAST_S = 0.01
 _MANY = 100
 
 
 def effect_starts(hypothesis: Hypothesis, name: str) -> list[dict[str, float]]:
-    """Starts of one effect, by key in the plant."""
+    """Starting values of one effect, by key in the plant."""
     kind = next(e for e in hypothesis.effects if e.name == name)
     grid = kind.starts_in(*_span(hypothesis))
-    if not grid:  # an effect of the user's: typical, and fainter
+    if not grid:  # a user's effect: typical, and weaker
         sized = [c for c in hypothesis.coordinates if c.key.startswith(f"{name}.")]
         return [
             {c.key: float(c.value(np.array(at))) for c in sized if c.parameter.neutral is not None}
@@ -33,22 +33,22 @@ def effect_starts(hypothesis: Hypothesis, name: str) -> list[dict[str, float]]:
 
 
 def _span(hypothesis: Hypothesis) -> tuple[float, float]:
-    """First and last moment of the first drive [s]."""
+    """Start and end of the first drive [s]."""
     time = hypothesis.record.drives[0].time
     return float(time[0]), float(time[-1])
 
 
 def one_at_a_time(hypothesis: Hypothesis, z: FloatArray) -> FloatArray:
-    """Places (start, coordinate) that differ from `z` in one parameter of an effect, put to one of its starts.
+    """Starts (start, coordinate) that differ from `z` in one parameter of an effect, set to one of its initial values.
 
-    A limit that is never reached has no slope to follow, and a hill may be climbed from its wrong side.
+    A limit that is never reached has zero derivative, and the nearest mode need not be the best.
     """
     places = []
     kinds, span = {e.name: e for e in hypothesis.effects}, _span(hypothesis)
     for i, c in enumerate(hypothesis.coordinates):
         effect, _, key = c.key.partition(".")
         if effect not in kinds or prod(map(len, kinds[effect].starts_in(*span).values())) > _MANY:
-            continue  # the latter: already tried closely
+            continue  # the latter is already searched closely
         for value in kinds[effect].retried_in(*span).get(key, ()):
             place = z.copy()
             place[i] = c.z_of(value)
@@ -57,9 +57,9 @@ def one_at_a_time(hypothesis: Hypothesis, z: FloatArray) -> FloatArray:
 
 
 def lag_delay_starts(hypothesis: Hypothesis, z: FloatArray) -> FloatArray:
-    """Places (start, coordinate) with more of a delay and less lag than at `z`, or the other way round.
+    """Starts (start, coordinate) with a longer delay and a shorter lag than `z`, or the reverse.
 
-    Along this valley the likelihood is rough: a held command that arrives between two rows makes a kink at every row.
+    Along this valley the likelihood is rough: a held command that arrives between two rows causes a kink at every row.
     """
     own = {key: float(x[0]) for key, x in hypothesis.values(z[None]).items()}
     places = []
@@ -71,7 +71,7 @@ def lag_delay_starts(hypothesis: Hypothesis, z: FloatArray) -> FloatArray:
 
 
 def starts(hypothesis: Hypothesis, base: Mapping[str, float]) -> FloatArray:
-    """(start, coordinate): `base` (T_L, K_L and what is known of some effects) with every effect's own starts."""
+    """(start, coordinate): `base` (T_L, K_L, known effect parameters) combined with each effect's initial values."""
     sets: list[dict[str, float]] = [dict(base)]
     for effect in hypothesis.effects:
         known = any(key.startswith(f"{effect.name}.") for key in base)

@@ -1,15 +1,15 @@
-"""Lost command messages: the car goes on with the last command it got, and the log does not say so.
+"""Lost command messages: the car holds the last command received, and the log does not show which were lost.
 
-Which messages were lost is unknown, so the likelihood of a loss fraction `p` sums over the ways they may have been. A
-message at row `i` is lost with probability `p`; then the command that acts is still the one of the last message that
-arrived, `h`, and all later errors of the rollout get `(h - u[i])` times the white image of one row's unit pulse. A
-path of a bank is one such history: its `h`, and what its losses so far still do to the errors to come. Row by row
-every path is weighed by the white errors of that row alone, then split in two (arrived, lost); of the paths that
-differ least in what they foretell, the lighter is merged into the heavier, by mean.
+The lost messages are unknown, so the likelihood of a loss fraction `p` sums over the possible histories. A message at
+row `i` is lost with probability `p`; the command in force is then still that of the last message received, `h`, and all
+later errors of the rollout receive `(h - u[i])` times the whitened image of a unit pulse in one row. A path of a bank
+is one such history: its `h`, and the effect of its losses so far on later errors. At each row every path is weighted by
+the whitened errors of that row alone, then split in two (received, lost). Of the paths whose predictions differ least,
+the lighter is merged into the heavier, by mean.
 
-So an error is explained once, by those losses that foretell it best, however many rows could each claim it. And
-whatever is merged, the bank foretells each row by a proper density, given the rows before it. Under noise alone the
-likelihood ratio has mean 1 therefore, and evidence above `x` nats comes by chance in at most exp(-x) of all drives.
+Each error is thus explained once, by the losses that predict it best, and not by several rows at the same time. Despite
+the merging, the bank predicts each row by a proper density given the earlier rows. Under noise alone the likelihood
+ratio therefore has mean 1, and evidence above `x` nats occurs in at most exp(-x) of all drives.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _CENTRE, _SD = float(np.log(0.08 / 0.92)), 1.0  # of the prior of the fraction's
 _FIRST = np.array([-3.0, -1.0, 1.0, 3.0])  # fractions tried first, in sds of the prior
 _ROUNDS = 4
 _PATHS = 6
-_ORDER = 4  # of the image's states at most
-_FAINT = 1e-3  # what all jumps within a chunk of rows may tell together [nats] and still be skipped
+_ORDER = 4  # largest number of states of the image
+_FAINT = 1e-3  # [nats] a chunk of rows is skipped if all its command steps together can contribute no more than this
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,20 +44,20 @@ class LostMessages:
 def lost_messages(
     white: WhiteningFilter, errors: FloatArray, command: FloatArray, T_L: float, K_L: float
 ) -> LostMessages:
-    """How much speaks for lost messages, and which fraction of them.
+    """Evidence for lost messages, and the fraction lost.
 
     Args: `errors` (channel, counted, 1) of a rollout with `T_L` [s] and `K_L`, at the log's own rate; `command`
-    (counted,) [m/s²], one message a row. No run of losses reaches from one stretch into the next.
+    (counted,) [m/s²], one message per row. A run of losses does not extend into the next stretch.
     """
     record = white.record
     bank = Bank.of(white, white(errors)[..., 0], command, T_L, K_L)
     if not len(bank.place):
-        return LostMessages(-2.0, 0.0, 1.0, None)  # the command never moves
+        return LostMessages(-2.0, 0.0, 1.0, None)  # the command is constant
 
     def tried(z: FloatArray) -> tuple[FloatArray, list[tuple[int, float]]]:
         rows = bank.ratios(_fraction(z))
         onsets = [onset_of(row, record.dt) for row in rows]
-        # over the whole drive or from any row on, both as likely
+        # onset at the start or at any row, equally likely
         return rows.sum(1) + np.logaddexp(0.0, [more for _, more in onsets]) - np.log(2.0), onsets
 
     z = _FIRST
@@ -82,9 +82,9 @@ def lost_messages(
 def rows_gained(
     white: WhiteningFilter, errors: FloatArray, command: FloatArray, T_L: float, K_L: float, fits: BoolArray
 ) -> FloatArray:
-    """Log likelihood ratio (counted,) of each row, losses over none, at the fraction that the rows in `fits` like best.
+    """Log likelihood ratio (counted,) of each row, losses over none, at the fraction fitted to the rows in `fits`.
 
-    Arguments as of `lost_messages`.
+    Arguments as in `lost_messages`.
     """
     bank = Bank.of(white, white(errors)[..., 0], command, T_L, K_L)
     if not len(bank.place):
@@ -100,7 +100,7 @@ def _fraction(z: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Posterior:
-    """Of a fraction's prior coordinate: mean and sd, and the log evidence [nats]."""
+    """Posterior of the fraction's prior coordinate: mean and sd, and the log evidence [nats]."""
 
     mean: float
     sd: float
@@ -108,8 +108,8 @@ class _Posterior:
 
 
 def _posterior(z: FloatArray, value: FloatArray) -> _Posterior:
-    """From log likelihoods `value` at three `z`, between which it runs as if so many messages were known to be lost
-    and so many to have arrived, or where that does not fit as a parabola."""
+    """Posterior from log likelihoods `value` at three `z`: interpolated as if known numbers of messages had been lost
+    and received, or by a parabola where that does not fit."""
 
     def counted(z: FloatArray) -> FloatArray:
         p = _fraction(z)
@@ -132,9 +132,9 @@ def _posterior(z: FloatArray, value: FloatArray) -> _Posterior:
 class Bank:
     """Paths over chunks of rows, all chunks and all fractions at once.
 
-    `move`, `push`, `see`: what a path's losses do, as x' = move x + push (h - u), to the white errors: see x; in
-    coordinates in which x's square is that of all errors to come. `place` (chunk, step): rows, the first `warm` of
-    them only to get the paths going; `valid` where within the stretch. `error` (channel, counted).
+    `move`, `push`, `see`: state-space model of a path's losses, x' = move x + push (h - u), with whitened errors see x;
+    in coordinates in which the square of x is that of all later errors. `place` (chunk, step): rows, of which the first
+    `warm` only initialise the paths; `valid` where within the stretch. `error` (channel, counted).
     """
 
     move: FloatArray
@@ -168,13 +168,13 @@ class Bank:
         return cls(move, push, see, rows, np.array(valid, bool).reshape(rows.shape), warm, error, command)
 
     def ratios(self, fractions: FloatArray) -> FloatArray:
-        """Log likelihood ratio of each row given those before it, losses over none: (fraction, counted)."""
+        """Log likelihood ratio of each row given the earlier ones, losses over none: (fraction, counted)."""
         count, steps = self.place.shape
         order, total = len(self.push), len(fractions) * count
         p = np.repeat(fractions, count)[:, None]
         u = np.tile(self.command[self.place], (len(fractions), 1))
         e = np.tile(np.where(self.valid, self.error[:, self.place], 0.0), (1, len(fractions), 1))
-        # paths (chunk, path, states and held command); held commands count by what they may yet do
+        # paths (chunk, path, states and held command); held commands are scaled by their possible later effect
         weight = np.zeros((total, _PATHS))
         weight[:, 0] = 1.0
         path = np.zeros((total, _PATHS, order + 1))
@@ -210,7 +210,7 @@ class Bank:
 
 
 def _merged(weight: FloatArray, path: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Half as many paths: those whose merging with a heavier one changes least go to the nearest that is kept."""
+    """Half as many paths: those whose merging changes least are merged into the nearest heavier one that is kept."""
     count = weight.shape[1]
     keep = count // 2
     order = np.argsort(-weight, 1)
@@ -237,22 +237,22 @@ _HEAVIER = np.triu(np.full((2 * _PATHS, 2 * _PATHS), 1e30))
 
 
 def image_of_row(white: WhiteningFilter, T_L: float, K_L: float) -> FloatArray:
-    """White errors (channel, time) of one row whose command is one unit larger than logged."""
+    """Whitened errors (channel, time) caused by a command one unit above the logged one in a single row."""
     dt = white.record.dt
     length = 2 * max(16, round(6 * T_L / dt) + 8)
     decay = np.exp(-dt / T_L)
     accel, speed = np.zeros(length), np.zeros(length)
     accel[1:] = K_L * (1 - decay) * decay ** np.arange(length - 1)
-    # its integral, the command's row exact
+    # its integral, exact for the command's row
     speed[1] = K_L * (dt - T_L * (1 - decay))
     speed[2:] = speed[1] + T_L * K_L * (1 - decay) * (1 - decay ** np.arange(1, length - 1))
     return white.response(np.stack([{"accel": accel, "speed": speed}[name] for name in white.record.channels]))
 
 
 def states_of(image: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A few states whose response to a unit pulse is `image` (channel, time): (move, push, see) of `Bank`.
+    """A small state-space model with unit-pulse response `image` (channel, time): (move, push, see) of `Bank`.
 
-    Singular vectors of the image's Hankel matrix (Kung 1978), in output-normal coordinates.
+    From the singular vectors of the image's Hankel matrix (Kung 1978), in output-normal coordinates.
     """
     channels, length = image.shape
     half = length // 2

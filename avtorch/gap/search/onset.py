@@ -1,4 +1,4 @@
-"""From when on: the row at which a cause sets in, found by running sums of likelihoods with and without it."""
+"""The onset of a cause: the row found by running sums of likelihoods with and without it."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from avtorch.gap.likelihood.grade_marginal import GradeMarginal
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 
-_PLACES = 12  # where a slope is first asked
-_NEAREST_S = 4.0  # an onset this close to the start or the end is none
+_PLACES = 12  # rows in the first round of the search for a road grade's onset
+_NEAREST_S = 4.0  # an onset closer to the start or the end is not distinguished from none
 
 
 def profile(without: FloatArray, with_cause: FloatArray) -> FloatArray:
-    """Log likelihood (row,) if the cause sets in at each row, from those of single rows (row,)."""
+    """Log likelihood (row,) of an onset at each row, from those of single rows (row,) without and with the cause."""
     before = np.concatenate([[0.0], np.cumsum(without)[:-1]])
     after = np.cumsum(with_cause[::-1])[::-1]
     return before + after
 
 
 def allowed(rows: int, dt: float) -> slice:
-    """Rows at which a cause can be said to set in."""
+    """Rows at which an onset is allowed."""
     edge = min(round(_NEAREST_S / dt), rows // 4)
     return slice(edge, rows - edge)
 
 
 def rough_onset(white: WhiteningFilter, hypothesis: Hypothesis, z: FloatArray) -> tuple[int, float]:
-    """Best onset row for parameters `z` of a fit over the whole drive, and what it gains [nats] over none."""
+    """Best onset row for parameters `z` of a fit over the whole drive, and its gain [nats] over no onset."""
     if hypothesis.grade_means is not None:
         return _Road.of(white, hypothesis, z).best(allowed(hypothesis.record.rows, white.record.dt))
     full = hypothesis.errors(z[None], coarse=True)[0]
@@ -65,9 +65,9 @@ def refined_onset(white: WhiteningFilter, hypothesis: Hypothesis, z: FloatArray,
 
 @dataclass(frozen=True, eq=False)
 class _Road:
-    """Log joint densities with a slope integrated out, if it and all other effects set in at some row.
+    """Log joint densities with the road grade integrated out, as functions of the common onset of all effects.
 
-    A slope is flat where it does not act: what an onset spares is the prior of its coefficients.
+    The grade is zero before the onset, which saves the prior cost of its coefficients there.
     """
 
     slope: GradeMarginal
@@ -87,7 +87,7 @@ class _Road:
         return self.along[list(rows)] + self.slope.from_rows(self.full, rows)
 
     def best(self, within: slice) -> tuple[int, float]:
-        """Row, and what it gains over the first row of all."""
+        """Best row, and its gain over an onset at the first row."""
         step = (within.stop - 1 - within.start) / (_PLACES - 1)
         tries = np.linspace(within.start, within.stop - 1, _PLACES).astype(int)
         found: dict[int, float] = {}
@@ -101,12 +101,12 @@ class _Road:
 
 
 def onset_evidence(found: FloatArray, dt: float) -> float:
-    """What not knowing the onset costs [nats]: mean over a uniform prior against the best row."""
+    """Cost of the unknown onset [nats]: mean likelihood under a uniform prior relative to the best row."""
     tried = np.flatnonzero(np.isfinite(found))
     if len(tried) < 2:
         return -float(np.log(len(found)))
     best = found[tried].max()
-    # between rows tried the likelihood is taken to run straight
+    # the likelihood is interpolated linearly between the rows tried
     rows = np.arange(tried[0], tried[-1] + 1)
     inside = np.interp(rows, tried, np.exp(found[tried] - best))
     return float(np.log(max(inside.sum(), 1.0) / len(found)))

@@ -1,7 +1,7 @@
-"""Heavy tails of the accelerometer: glitches, which chance decides and no rollout shows.
+"""Heavy tails of the accelerometer: outliers, a random effect that no rollout predicts.
 
-They leave their mark row by row at the log's own rate, on top of whatever else is amiss, so they are judged by the
-likelihood ratio of single rows, given the errors of a rollout.
+They affect single rows at the log's own rate, on top of any other cause, so they are scored by the likelihood ratio of
+single rows, given the errors of a rollout.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from avtorch.gap.search.onset import allowed
 
 @dataclass(frozen=True, eq=False)
 class HeavyTails:
-    """Heavy tails: `evidence` [nats] over a normal distribution, `fraction`, `scale` with sds of their links.
+    """Heavy tails: `evidence` [nats] over a normal distribution, `fraction`, `scale` with sds on their links' scales.
 
-    `hit` (row,): rows more likely off than not. `ratios` (row,): log likelihood ratio of each row. `z` (coordinate,),
-    `covariance`: of the law's own parameters.
+    `hit` (row,): rows more likely outliers than not. `ratios` (row,): log likelihood ratio of each row. `z`
+    (coordinate,), `covariance`: of the law's own parameters.
     """
 
     evidence: float
@@ -37,7 +37,7 @@ class HeavyTails:
 
     @property
     def plain(self) -> bool:
-        """Whether single rows are plainly glitches, and worth cleaning from the log."""
+        """Whether single rows are clear outliers and should be removed from the log."""
         return self.evidence > _PLAIN and bool(self.hit.any())
 
 
@@ -45,13 +45,13 @@ _PLAIN = 2.0  # nats over a normal distribution
 _TAIL_PRIOR = ((np.log(0.01), 1.5), (np.log(7.0), 0.4))
 
 
-_LEVEL_S = 20.0  # of a drive in which noise has one size: a gust that sets in makes it rougher, which is no glitch
+_LEVEL_S = 20.0  # length over which noise is stationary: an onset of gusts raises its level without any outlier
 
 
 def _level(x: FloatArray, size: int) -> FloatArray:
-    """Running median (row,) of x (row,) over blocks of about `size` rows, straight between their middles.
+    """Running median (row,) of x (row,) over blocks of about `size` rows, interpolated linearly between their centres.
 
-    Each block counts as its roughest neighbour, so that where the level rises no row is held against the lower one.
+    Each block takes the largest value of its neighbourhood, so that at a rise no row is compared with the lower level.
     """
     ends = np.linspace(0, len(x), max(1, round(len(x) / max(size, 1))) + 1).astype(int)
     own = np.pad([float(np.median(x[a:b])) for a, b in pairwise(ends)], 1, mode="edge")
@@ -73,17 +73,17 @@ def heavy_tails(
     law: Callable[[FloatArray], tuple[float, float]] = _outliers,
     size: int = 2,
 ) -> HeavyTails:
-    """Outliers among accelerometer errors (row,), by their distance from the rows beside them.
+    """Outliers among accelerometer errors (row,), by their distance from neighbouring rows.
 
-    A row is held against the median of two before and two after it, which a single glitch does not move. The middle
-    of these distances gives the size of the noise. `fits` (row,): rows by which fraction and scale are found, all if
-    not given. `law`: fraction and scale for `size` coordinates, standard normal a priori.
+    A row is compared with the median of the two rows before and the two after it, which a single outlier does not
+    change. The median of these distances estimates the size of the noise. `fits` (row,): rows used to fit fraction and
+    scale, all by default. `law`: fraction and scale as functions of `size` coordinates, standard normal a priori.
     """
     fits = np.ones(len(errors), bool) if fits is None else fits
     x = np.pad(errors, 2, mode="edge")
     beside = np.median(np.stack([x[:-4], x[1:-3], x[3:-1], x[4:]]), 0)
     away = errors - beside
-    # a jump of the car shows in all rows of its moment, a glitch in one
+    # a jump of the car affects all neighbouring rows, an outlier one
     sd = np.maximum(1.4826 * _level(np.abs(away - np.median(away)), round(_LEVEL_S / dt)), 1e-9)
     spread = np.abs(np.stack([x[:-4], x[1:-3], x[3:-1], x[4:]]) - beside)
     rough = np.sort(spread, 0)[1]  # of four neighbours, those nearest to their median
@@ -91,7 +91,7 @@ def heavy_tails(
 
     def ratios(z: FloatArray) -> FloatArray:
         fraction, scale = law(z)
-        # in units of the distances' own sd, which is some 1.15 of the noise's
+        # in units of the distances' own sd, about 1.15 times the noise's
         wide = 1 + (scale / 1.15) ** 2
         gain = -0.5 * np.log(wide) + 0.5 * away**2 * (1 - 1 / wide)
         return np.log1p(fraction * np.expm1(np.minimum(gain, 500.0)))
@@ -137,7 +137,7 @@ def hessian_of(cost, z: FloatArray, h: float = 0.05) -> FloatArray:  # type: ign
 
 
 def onset_of(ratios: FloatArray, dt: float) -> tuple[int, float]:
-    """Best onset row of per-row ratios, and what it gains net of not knowing it [nats]."""
+    """Best onset row of per-row ratios, and its gain net of the cost of the unknown onset [nats]."""
     after = np.cumsum(ratios[::-1])[::-1]
     within = allowed(len(ratios), dt)
     best = within.start + int(np.argmax(after[within]))

@@ -1,4 +1,4 @@
-"""Two effects at once: which second one would help a first, and where the two of them come to rest together."""
+"""Pairs of effects: screening for the second effect, and the joint fit of both."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.integrated import Integrated
 
 _AT_ONCE = 32
-_MANY = 50  # starts of one effect, more than which are left to the fit of that effect alone
-_MUCH = 6_000_000  # starts times rows, likewise
+_MANY = 50  # with more starts of one effect, only the fit of that effect alone is used
+_MUCH = 6_000_000  # the same limit for starts times rows
 
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """What a second effect is tried on: a `hypothesis` at `z` (coordinate,), its parameter `values`, under `white`."""
+    """The model to which a second effect is added: a `hypothesis` at `z` (coordinate,), parameter `values`, `white`."""
 
     hypothesis: Hypothesis
     z: FloatArray
@@ -36,7 +36,7 @@ class Base:
 
     @cached_property
     def _rested(self) -> tuple[FloatArray, float]:
-        """Where the base comes to rest under this noise, and its log joint density there."""
+        """The base's mode under this noise, and its log joint density there."""
         z, value = modes(self.hypothesis, self.white, self.z[None], onset=self.onset, iterations=4)
         return z[0], float(value[0])
 
@@ -51,27 +51,27 @@ class Base:
 
     @cached_property
     def _errors(self) -> FloatArray:
-        """White errors (row,), less whatever the base's own parameters can do."""
+        """Whitened errors (row,), with the base's own parameter directions projected out."""
         return self._apart(self.white(self.hypothesis.record.measured - self._silent).reshape(1, -1))[0]
 
     @cached_property
     def _own(self) -> tuple[FloatArray, FloatArray]:
-        """White directions (direction, row) in which the base's own parameters move its rollout; their inverse Gram."""
+        """Whitened derivatives (direction, row) of the rollout by the base's parameters, and their inverse Gram."""
         columns = whitened_jacobian(self.hypothesis, self.white, self._rested[0], self.onset)
         columns = columns[np.linalg.norm(columns, axis=1) > 1e-9]
         gram = columns @ columns.T
         return columns, np.asarray(np.linalg.pinv(gram, rcond=1e-10, hermitian=True), np.float64)
 
     def _apart(self, images: FloatArray) -> FloatArray:
-        """White `images` (column, row) less whatever the base's own parameters can do."""
+        """Whitened `images` (column, row), with the base's own parameter directions projected out."""
         columns, inverse = self._own
         return images - (images @ columns.T) @ inverse @ columns
 
     def score(self, hypothesis: Hypothesis, alone: Mapping[str, Mapping[str, float]]) -> tuple[float, FloatArray]:
-        """Nats a `hypothesis` of one effect more could gain, and from which start of its.
+        """Approximate gain [nats] of a `hypothesis` with one more effect, and the start that gives it.
 
-        By one linear step from each start, with whatever the base's own parameters can do taken out. `alone`: where
-        single effects came to rest, by name and parameter; those with a large grid of starts begin there.
+        From one linear step from each start, with the base's own parameter directions projected out. `alone`: modes of
+        single effects, by name and parameter; effects with a large grid of starts begin there.
         """
         (more,) = set(hypothesis.effects) - set(self.hypothesis.effects)
         known = {k: v for k, v in alone.get(more.name, {}).items() if "." in k}
@@ -90,7 +90,7 @@ class Base:
             some = begin[i : i + _AT_ONCE]
             apart = self.white(hypothesis.rollouts(some, self.onset) - self._silent).reshape(len(some), -1)
             apart = self._apart(apart)
-            # a start that overshoots still tells the direction
+            # a start that overshoots still gives the direction
             gains = _gained(apart**2, apart * e, self.onset is None, self.hypothesis.record)
             k = int(gains.argmax())
             if gains[k] > best:
@@ -100,9 +100,9 @@ class Base:
     def partners(
         self, kinds: Sequence[type[Effect]], alone: Mapping[str, Mapping[str, float]], *, most: int, least: float
     ) -> list[tuple[Hypothesis, FloatArray]]:
-        """Hypotheses with one of `kinds` besides, and where to begin: the `most` best, of `least` nats or more."""
+        """The `most` best hypotheses with one more effect of `kinds`, and their starts; `least` gain in nats."""
         record, baseline, own = self.hypothesis.record, self.hypothesis.baseline, self.hypothesis.effects
-        roads = self.hypothesis.integrated is not None  # a hypothesis integrates one effect at most
+        roads = self.hypothesis.integrated is not None  # a hypothesis integrates out one effect at most
         pairs = [
             Hypothesis(record, (*own, kind), baseline)
             for kind in kinds
@@ -113,7 +113,7 @@ class Base:
 
 
 def _gained(squares: FloatArray, crosses: FloatArray, onsets: bool, record: Record) -> FloatArray:
-    """Nats (column,) along a direction of the best size, from rows' parts (column, row).
+    """Gain [nats] (column,) of the best multiple of a direction, from rows' contributions (column, row).
 
     Over the whole drive or, with `onsets`, from any row on.
     """
@@ -137,9 +137,9 @@ def joint_fit(
     *,
     onsets: bool,
 ) -> Screened:
-    """Where a pair comes to rest: from `z`, and with the `first` effect begun anew.
+    """The best fit of a pair: from `z`, and from new starting values of the `first` effect.
 
-    Fitted alone, the first has bent to what the second does, often over a hill.
+    Fitted alone, the first effect has adapted to the second one's response, often in another mode.
     """
     values = {key: float(x[0]) for key, x in hypothesis.values(z[None]).items()}
     anew = effect_starts(hypothesis, first.name)
@@ -160,7 +160,7 @@ def exchanged(
     *,
     tries: int,
 ) -> list[Screened]:
-    """The best pairs that keep one half of `pair` and have another effect in the place of the other."""
+    """The best pairs that keep one effect of `pair` and replace the other."""
     record, baseline = pair.hypothesis.record, pair.hypothesis.baseline
     values = {key: float(x[0]) for key, x in pair.hypothesis.values(pair.z[None]).items()}
     out = []

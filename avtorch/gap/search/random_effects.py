@@ -1,8 +1,8 @@
-"""Random effects as candidates, by what their `noise` says: on top of what a find's rollout leaves over.
+"""Random effects as hypotheses: their `noise` is added to a fitted model and fitted to its residuals.
 
-One of each kind may have a search of its own (`Effect.searched_as`), which also finds from when on it acts. Any other
-is fitted by the likelihood whose noise its `noise` changes, over the whole drive: a force with the lag, the gain and
-the rest of the noise; errors of the command with the jerk noise that they resemble; tails row by row.
+One effect of each kind may have a search of its own (`Effect.searched_as`), which also finds an onset. Any other is
+fitted by the likelihood with its `noise`, over the whole drive: a force together with the lag, the gain and the other
+noise; errors of the command together with the jerk noise, which they resemble; tails row by row.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from avtorch.gap.search.outliers import HeavyTails, hessian_of
 from avtorch.gap.simulator.effect import Effect, SearchedAs
 from avtorch.gap.simulator.plant import GapPlant
 
-_TURNS = 4  # of parameters and noise
+_TURNS = 4  # alternations of parameters and noise
 _ENOUGH = 0.1  # nats
-_SIMPLEX = -0.7  # prior standard deviations, to begin with
+_SIMPLEX = -0.7  # initial step in prior standard deviations
 
 
 def own_searches(effects: Sequence[type[Effect]]) -> dict[SearchedAs, type[Effect]]:
@@ -44,7 +44,7 @@ def own_searches(effects: Sequence[type[Effect]]) -> dict[SearchedAs, type[Effec
 
 
 def users_own(effects: Sequence[type[Effect]], raw: Record, baseline: GapPlant) -> dict[Form, list[RandomLaw]]:
-    """Random effects without a search of their own, by what they do to the noise."""
+    """Random effects without a search of their own, by their change of the noise."""
     laws: dict[Form, list[RandomLaw]] = {"force": [], "tails": [], "command": []}
     searched = own_searches(effects).values()
     for kind in effects:
@@ -55,10 +55,10 @@ def users_own(effects: Sequence[type[Effect]], raw: Record, baseline: GapPlant) 
 
 
 def forced(base: FittedModel, law: RandomLaw) -> FittedModel:
-    """A random force on top of `base`, fitted with the lag, the gain, the base's effects and all of the noise."""
+    """`base` with a random force, fitted jointly with the lag, the gain, the base's effects and all of the noise."""
     candidate, record = base.hypothesis, base.hypothesis.record
     best: FittedModel | None = None
-    for begin in (0.0, -1.0):  # typical, and fainter
+    for begin in (0.0, -1.0):  # typical, and weaker
         z, noise, errors = base.z, base.noise.noise, base.errors
         law_z: FloatArray = np.full(law.size, begin)
         value = -np.inf
@@ -97,7 +97,7 @@ def forced(base: FittedModel, law: RandomLaw) -> FittedModel:
 
 
 def tailed(base: FittedModel, law: RandomLaw, tails: HeavyTails) -> FittedModel:
-    """Tails on top of `base`."""
+    """`base` with tails added."""
     assert tails.z is not None
     assert tails.covariance is not None
     by_chance = ByChance(law, tails.z, tails.covariance)
@@ -108,9 +108,9 @@ def tailed(base: FittedModel, law: RandomLaw, tails: HeavyTails) -> FittedModel:
 def glitched(
     found: Sequence[FittedModel], glitches: Sequence[tuple[RandomLaw | type[Effect], HeavyTails]], *, pairs: bool
 ) -> list[FittedModel]:
-    """Tails alone and, where pairs are tried, on top of every single effect.
+    """Tails alone and, where pairs are tried, added to every single effect.
 
-    Each with the law of the effect that has them, or its class where it has a search of its own.
+    Each comes with the law of its effect, or with its class where the effect has a search of its own.
     """
     out = []
     for f in found:
@@ -127,7 +127,7 @@ def glitched(
 
 
 def commanded(base: FittedModel, law: RandomLaw, raw: Record) -> FittedModel:
-    """Errors of the command on top of `base`, fitted with the size of the jerk noise, which passes the same lag."""
+    """`base` with errors of the command, fitted jointly with the size of the jerk noise, which passes the same lag."""
     errors, plain = full_rate_errors(raw, base), full_rate_filter(raw, base)
     T_L, K_L = base.values["T_L"], base.values["K_L"]
     _, spread, _ = PRIORS["process_sd"]
@@ -148,13 +148,13 @@ def commanded(base: FittedModel, law: RandomLaw, raw: Record) -> FittedModel:
         gained = float(rows_gained(white(x[0]), errors, variance, T_L, K_L).sum())
         return without(x) - gained + 0.5 * float(x[1:] @ x[1:])
 
-    # towards less jerk noise, for which these errors were taken
+    # start with less jerk noise, as it has absorbed part of these errors
     begin = np.concatenate([[-0.3], np.zeros(law.size)])
     simplex = begin + np.concatenate([np.zeros((1, len(begin))), _SIMPLEX * np.eye(len(begin))])
     options = {"xatol": 0.02, "fatol": 0.05, "maxfev": 100 * (1 + law.size), "initial_simplex": simplex}
     best = minimize(cost, begin, method="Nelder-Mead", options=options)
     hessian = hessian_of(cost, best.x)
-    # the jerk noise pays for its size in the base already
+    # the prior of the jerk noise's size is already included in the base
     curvature = max(float(hessian_of(without, np.zeros(1))[0, 0]), 1.0)
     evidence = -float(best.fun) - 0.5 * float(np.linalg.slogdet(hessian)[1]) + 0.5 * float(np.log(curvature))
     covariance = np.asarray(np.linalg.inv(hessian)[1:, 1:], np.float64)
@@ -164,7 +164,7 @@ def commanded(base: FittedModel, law: RandomLaw, raw: Record) -> FittedModel:
 
 
 def variance_of(law: RandomLaw, z: FloatArray, base: FittedModel, raw: Record) -> FloatArray:
-    """Of the command's errors as they reach the actuator, (counted,) [(m/s²)²]: behind a delay of the base's, late."""
+    """Variance of the command's errors at the actuator, (counted,) [(m/s²)²], delayed where the base has a delay."""
     late = 0.0
     for e in base.hypothesis.effects:
         if e.shift is not None and law.effect.order <= e.order:

@@ -1,5 +1,5 @@
-"""A first look at a hypothesis: from all its starts, under noise that is not its own, over the whole drive and from an
-onset on. Rollouts of averaged commands are good enough for it, and several times as fast."""
+"""Screening of a hypothesis: fits from all its starts, under the noise of another model, over the whole drive and from
+an onset on. Rollouts of averaged commands are accurate enough for it, and several times as fast."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from avtorch.gap.search.initial_values import one_at_a_time
 from avtorch.gap.search.onset import allowed, profile, rough_onset
 
 ENOUGH = 0.3
-"""Nats a step gains at least, or the look is over."""
+"""Least gain of a step [nats]; a smaller one ends the screening fit."""
 _AT_ONCE = 32
-_TURNS = 2  # through the parameters one at a time
-_WORTH = 4.0  # nats an onset must gain to be looked at
-_FAINT = 0.3  # the same where the effect shows over the whole drive: fitted to all of it, it is diluted
+_TURNS = 2  # passes through the parameters one at a time
+_WORTH = 4.0  # least gain [nats] of an onset for a fit from it
+_FAINT = 0.3  # the same where the effect gains over the whole drive, over which a late effect is diluted
 
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """Where a `hypothesis` came to: `z` (coordinate,), its log joint density `value`, from row `onset` on."""
+    """Screening fit of a `hypothesis`: `z` (coordinate,), its log joint density `value`, from row `onset` on."""
 
     hypothesis: Hypothesis = field(repr=False)
     z: FloatArray = field(repr=False)
@@ -42,9 +42,9 @@ def screen(
     keep: int = 2,
     iterations: int = 6,
 ) -> list[Screened]:
-    """The best over the whole drive and, where it promises more, the best that sets in later.
+    """The best fit over the whole drive and, where it may gain more, the best fit with a later onset.
 
-    `starts` (start, coordinate); of these the `keep` best are followed. `floor`: the value without any effect.
+    `starts` (start, coordinate); the `keep` best are refined. `floor`: the value without any effect.
     """
     whole, late, when = _tried(hypothesis, white, starts, onsets)
     first = starts[np.argsort(-whole)[:keep]]
@@ -70,8 +70,8 @@ def screen(
 
 
 def refine(look: Screened, white: WhiteningFilter) -> Screened:
-    """The same at every row. Means are good enough to find a place, not to tell what it is worth: a controller that
-    answers to noise within a group of rows makes a lag look shorter, and a partner worth hundreds of nats."""
+    """The fit refined at single rows. Group means are accurate enough for a start, not for a score: a controller that
+    responds to noise within a group of rows makes a lag appear shorter, and a second effect gain hundreds of nats."""
     if white.record.group == 1:
         return look
     z, value = modes(look.hypothesis, white, look.z[None], onset=look.onset, iterations=3, enough=ENOUGH)
@@ -79,7 +79,7 @@ def refine(look: Screened, white: WhiteningFilter) -> Screened:
 
 
 def _from(hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int) -> Screened:
-    """Parameters and onset in turn."""
+    """Fit parameters and onset alternately."""
     value = -np.inf
     for _ in range(2):
         z, value = _best(hypothesis, white, z[None], onset, 5)
@@ -93,7 +93,7 @@ def _from(hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: 
 def _best(
     hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int | None, iterations: int
 ) -> tuple[FloatArray, float]:
-    """The best mode from starts `z` (start, coordinate), also of those beside it."""
+    """The best mode from starts `z` (start, coordinate), also from starts that differ in one parameter."""
     found, values = modes(hypothesis, white, z, onset=onset, iterations=iterations, coarse=True, enough=ENOUGH)
     best, value = found[values.argmax()], float(values.max())
     for _ in range(_TURNS):
@@ -112,7 +112,7 @@ def _best(
 
 
 def converge(hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onset: int | None) -> Screened:
-    """Where a hypothesis comes to rest from `z` (coordinate,), its onset held."""
+    """The mode of a hypothesis reached from `z` (coordinate,), with its onset held."""
     best, value = _best(hypothesis, white, z[None], onset, 6)
     return Screened(hypothesis, best, value, onset)
 
@@ -120,7 +120,7 @@ def converge(hypothesis: Hypothesis, white: WhiteningFilter, z: FloatArray, onse
 def _tried(
     hypothesis: Hypothesis, white: WhiteningFilter, starts: FloatArray, onsets: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Log joint densities (start,) over the whole drive, with the best onset, and which row that is."""
+    """Log joint densities (start,) over the whole drive, those with the best onset, and the row of that onset."""
     record = hypothesis.record
     within = allowed(record.rows, record.dt)
     measured = record.measured.mean(-1, keepdims=True)

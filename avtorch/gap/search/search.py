@@ -1,8 +1,8 @@
 """The search for the cause: all single effects, then pairs where a second effect still gains.
 
 Every hypothesis is first fitted under the noise of the bare baseline, over the whole drive and from an onset on. The
-best are fitted anew, each with noise of its own, and joined with whatever else gains most on top of them. Causes that
-chance decides (gusts, outliers, lost messages) are judged on the errors that these leave over.
+best are refitted, each with its own noise, and combined with further effects. Random effects (gusts, outliers, lost
+messages) are fitted to the residuals of these models.
 """
 
 from __future__ import annotations
@@ -53,15 +53,15 @@ Progress = Callable[[str, int, int], None]
 
 Kinds = Sequence[type[Effect]]
 
-_TURNS = 10  # of parameters and noise, at most
-_SINGLES = 6  # fitted with noise of their own
-_LEAST = 3.0  # nats at first sight, for less of which no noise of its own would help
-_BASES = 3  # joined with a second effect
-_SECONDS = 4  # tried on each
-_PAIRS = 4  # fitted with noise of their own
-_SWAPS = 2  # times that either half of the best pair is exchanged for another effect
-_SECOND = 8.0  # nats a pair must be ahead of the best single effect for that
-_CLOSE = 12.0  # nats by which a pair may be behind at first sight
+_TURNS = 10  # alternations of parameters and noise, at most
+_SINGLES = 6  # single effects fitted with noise of their own
+_LEAST = 3.0  # least gain in screening [nats] for a fit with noise of its own
+_BASES = 3  # models combined with a second effect
+_SECONDS = 4  # second effects tried on each
+_PAIRS = 4  # pairs fitted with noise of their own
+_SWAPS = 2  # rounds in which either half of the best pair is replaced by another effect
+_SECOND = 8.0  # nats by which a pair must exceed the best single effect for that
+_CLOSE = 12.0  # nats by which a pair may be behind in screening
 
 
 class Search:
@@ -83,7 +83,7 @@ class Search:
         self.until = None if budget_s is None else time.monotonic() + budget_s
         self.progress = progress or (lambda what, done, of: None)
         self.complete = True
-        self._seen: set[str] = set()  # effects rolled out, also those whose evidence is not kept
+        self._seen: set[str] = set()  # effects rolled out, including those whose evidence is not kept
         self._paired = False
         self._own = own_searches(self.effects)
         self._laws: dict[Form, list[RandomLaw]] = {"force": [], "tails": [], "command": []}
@@ -91,7 +91,7 @@ class Search:
         work = None if checkpoint is None else fitted_work(self.logs, baseline, self.effects, pairs=pairs)
         self.checkpoint = Checkpoint(checkpoint, work)
 
-    # the whole ---------------------------------------------------------------------------------------------------
+    # the whole search ----------------------------------------------------------------------------------------------
     def run(self) -> SearchResult:
         glitches, logs = None, self.logs
         record = Record.of(logs)
@@ -131,7 +131,7 @@ class Search:
         return SearchResult(record, raw, tuple(logs), tuple(best.values()), self.complete, scope)
 
     def _blowing(self, on: FittedModel) -> list[FittedModel]:
-        """Every random force on top of a find."""
+        """A fitted model with every random force added in turn."""
         own = [gust(on, self._own["force"])] if "force" in self._own else []
         return [*own, *(forced(on, law) for law in self._laws["force"])]
 
@@ -150,7 +150,7 @@ class Search:
         return self._settled(hypothesis, found[values.argmax()], noise, rounds=6)
 
     def with_effects(self, none: FittedModel, kinds: Kinds) -> FittedModel:
-        """`none` with effects of these kinds on top from the drives' start, with noise of its own."""
+        """`none` with effects of these kinds, acting from the drives' start, with noise of its own."""
         hypothesis = Hypothesis(none.hypothesis.record, tuple(kinds), self.baseline)
         white = WhiteningFilter(hypothesis.record, none.noise.noise)
         places, values = modes(hypothesis, white, starts(hypothesis, none.values), iterations=6, coarse=True)
@@ -159,13 +159,13 @@ class Search:
     def _settled(
         self, hypothesis: Hypothesis, z: FloatArray, noise: NoiseModel, *, onset: int | None = None, rounds: int = 2
     ) -> FittedModel:
-        """Parameters and noise in turn until both rest."""
+        """Fit parameters and noise alternately until both converge."""
         record = hypothesis.record
         start = self.checkpoint.start(hypothesis, z, noise, onset, rounds)
         known = self.checkpoint.next(start)
         if known is not None:
             return known.found(hypothesis, onset)
-        # on averaged commands first, which is several times as fast and ends close by
+        # first on averaged commands, which is several times as fast and ends nearby
         for coarse in (True, False) if record.group > 1 else (False,):
             value, best = -np.inf, (z, noise)
             usual = 2 if record.group > 1 and not coarse else rounds + 1
@@ -173,7 +173,7 @@ class Search:
                 noise = noise.seen_through(hypothesis.effects, self._values(hypothesis, z))
                 white = whitening_filter(record, noise, onset=onset)
                 enough = ENOUGH if coarse else 0.05
-                if turn < 2:  # once under the noise one came with, and once under its own
+                if turn < 2:  # once under the initial noise, and once under the fitted one
                     z = self._traded(hypothesis, z, white, onset, coarse)
                 z = modes(hypothesis, white, z[None], onset=onset, iterations=4, coarse=coarse, enough=enough)[0][0]
                 errors = residuals(hypothesis, white, z, onset, coarse=coarse)
@@ -194,7 +194,7 @@ class Search:
     def _traded(
         hypothesis: Hypothesis, z: FloatArray, white: WhiteningFilter, onset: int | None, coarse: bool
     ) -> FloatArray:
-        """`z`, or the best place from which a dead time and the lag are told apart better."""
+        """`z`, or the best mode reached by trading dead time for lag."""
         places = np.concatenate([z[None], lag_delay_starts(hypothesis, z)])
         if len(places) == 1:
             return z
@@ -236,7 +236,7 @@ class Search:
             if self._late():
                 break
             fitted.add(name)
-            # a gust's noise is too quiet for causes that explain less
+            # a gust's model leaves too little noise for models that explain less
             noise = max((f for f in found if not f.blown), key=lambda f: f.log_evidence).noise.noise
             found.append(self._refined([look for look in seen if look.hypothesis.name == name], noise))
         found += self._left_behind([look for look in seen if look.hypothesis.name not in fitted], white, none)
@@ -246,7 +246,7 @@ class Search:
         return found
 
     def _left_behind(self, rest: Sequence[Screened], white: WhiteningFilter, none: FittedModel) -> list[FittedModel]:
-        """The others keep the evidence of their screening."""
+        """The other hypotheses, with the evidence of their screening fits."""
         flat = finish(none.hypothesis, white, none.z).log_evidence
         found = []
         for look in rest:
@@ -257,7 +257,7 @@ class Search:
         return found
 
     def _refined(self, forms: Sequence[Screened], noise: NoiseModel) -> FittedModel:
-        """One cause over the whole drive and from an onset on; both weigh the same a priori."""
+        """One cause over the whole drive and from an onset on, equally likely a priori."""
         return with_or_without_onset([self._from_onset(f.hypothesis, f.z, noise, f.onset) for f in forms])
 
     def _from_onset(self, hypothesis: Hypothesis, z: FloatArray, noise: NoiseModel, onset: int | None) -> FittedModel:
@@ -287,7 +287,7 @@ class Search:
         bases = [f for f in single if not f.blown and f.log_evidence - none.log_evidence > 0.2 * top][:_BASES]
         made = {f.name: f for base in bases[:2] for f in self._blowing(base)}
         for base in bases[:2]:
-            # what drifts slowly is a gust or a road, and the noise that was fitted without either hides the road
+            # slow drift may be a gust or a road grade; noise fitted without either of them hides the grade
             gusty = made.get(base.name_with(self._own["force"].name)) if "force" in self._own else None
             if gusty is None or gusty.log_evidence <= base.log_evidence + _SECOND or base.hypothesis.integrated:
                 continue
@@ -295,7 +295,7 @@ class Search:
                 hypothesis = Hypothesis(record, (*base.hypothesis.effects, road), self.baseline)
                 look = Screened(hypothesis, hypothesis.z_of(base.values), 0.0, base.onset)
                 self._settle_pairs([look], 1, gusty.noise.noise.replaced(force_sd=CALM), made)
-        # a gust's noise is too quiet for causes that explain less
+        # a gust's model leaves too little noise for models that explain less
         noise = (bases[0] if bases else none).noise.noise
         if single[0].blown:
             self._under(single[0], kinds, none, made)
@@ -314,7 +314,7 @@ class Search:
         for _ in range(_SWAPS):
             if done is None or done.log_evidence < single[0].log_evidence + _SECOND or self._late():
                 break
-            # a better partner for either half, now that the noise is what the best pair leaves over
+            # try to replace either half, now under the noise fitted with the best pair
             white = done.white
             _, value = modes(done.hypothesis, white, done.z[None], onset=done.onset, iterations=1)
             here = Screened(done.hypothesis, done.z, float(value[0]), done.onset)
@@ -327,7 +327,7 @@ class Search:
         return list(made.values())
 
     def _under(self, blown: FittedModel, kinds: Kinds, none: FittedModel, made: dict[str, FittedModel]) -> None:
-        """Causes that show only once a random force's noise is in, each with that force, added to `made`."""
+        """Add to `made` effects that are visible only under a random force's noise, each combined with that force."""
         on = Base(none.hypothesis, none.z, none.values, none.onset, blown.white)
         for hypothesis, z in on.partners(kinds, {}, most=_BASES, least=_LEAST):
             if self._late():
@@ -347,20 +347,20 @@ class Search:
         alone: Mapping[str, Mapping[str, float]],
         most: int,
     ) -> list[Screened]:
-        """The `most` effects that promise most on top of `base`, each fitted with it."""
+        """The `most` second effects with the largest gains on top of `base`, each fitted with it."""
         on = Base(base.hypothesis, base.z, base.values, base.onset, white)
         found = [
             joint_fit(hypothesis, base.hypothesis.effects[0], z, base.onset, white, onsets=True)
             for hypothesis, z in on.partners(kinds, alone, most=most, least=4.0)
             if not self._late()
         ]
-        # on averaged commands a controller's noise passes for a partner
+        # on averaged commands the noise that a controller feeds back resembles a second effect
         return [near for near in (refine(look, white) for look in found) if near.value > on.flat + _LEAST]
 
     def _settle_pairs(
         self, pairs: list[Screened], most: int, noise: NoiseModel, made: dict[str, FittedModel]
     ) -> FittedModel | None:
-        """The best `most` of them with noise of their own, added to `made`; the best of these."""
+        """The best `most` pairs with noise of their own, added to `made`; returns the best of these."""
         best: FittedModel | None = None
         for look in sorted(pairs, key=lambda k: -k.value)[:most]:
             if self._late():
@@ -373,9 +373,9 @@ class Search:
                 noise = pair.noise.noise
         return best
 
-    # chance --------------------------------------------------------------------------------------------------------
+    # random effects ------------------------------------------------------------------------------------------------
     def _tails(self, raw: Record, of: FittedModel) -> HeavyTails:
-        """The best of all tails; `_glitches` are those of each effect."""
+        """The best of all tails; `_glitches` holds those of each effect."""
         errors = full_rate_errors(raw, of)[0, :, 0]
         self._glitches = [(self._own["tails"], heavy_tails(errors, raw.dt))] if "tails" in self._own else []
         for law in self._laws["tails"]:
@@ -383,13 +383,13 @@ class Search:
         return max((found for _, found in self._glitches), key=lambda found: found.evidence)
 
     def _alone_and_best(self, found: list[FittedModel], none: FittedModel) -> list[FittedModel]:
-        """What errors of the command are tried on: they pass for a delay, so always on the bare baseline, too."""
+        """Models to which errors of the command are added: as these resemble a delay, always the bare baseline, too."""
         alone = [f for f in found if f.name != "none" and "+" not in f.name and f.hypothesis.effects]
         best = max(alone, key=lambda f: f.log_evidence, default=none)
         return [none, best] if self._paired and best.log_evidence >= none.log_evidence + _LEAST else [none]
 
     def _held(self, raw: Record, found: list[FittedModel], none: FittedModel) -> list[FittedModel]:
-        """Lost messages alone and, where pairs are tried, on top of the best single effect."""
+        """Lost messages alone and, where pairs are tried, added to the best single effect."""
         out, kind = [], self._own["losses"]
         for f in self._alone_and_best(found, none):
             errors = full_rate_errors(raw, f)

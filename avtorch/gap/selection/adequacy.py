@@ -1,15 +1,15 @@
-"""What even the best candidate leaves over: the absolute check behind `unknown`.
+"""Adequacy of the most probable hypothesis: the goodness-of-fit test behind `unknown`.
 
-A candidate may win by thousands of nats and still be wrong, when the cause is not in the table. So its white errors
-are asked whether anything flexible still finds structure in them. Every question is a Bayes factor against white noise
-whose regressors were known before the row they foretell: commands, the rollout and the measured speed of earlier rows
-only. A controller that feeds noise back into later commands cannot feign such structure, since under the null the
-expectation of a Bayes factor with regressors known beforehand is 1, loop or no loop, and the chance that its logarithm
-exceeds `x` is below exp(-x) (Ville; Vovk and Wang 2021 on e-values). A Bayes factor pays for its own coefficients, so
-no blocks are held out. How large the coefficients are is not known; a few sizes are averaged over. The mean of Bayes
-factors is one again, which is how questions are put together here.
+A hypothesis may win by thousands of nats and still be wrong, when the cause is not in the table. Its whitened residuals
+are therefore tested for any structure that a flexible model can find. Every test is a Bayes factor against white noise,
+with regressors that were known before the row they predict: only commands, the rollout and the measured speed of
+earlier rows. A controller that feeds noise back into later commands cannot create such structure: under the null the
+expectation of a Bayes factor with predetermined regressors is 1, in open or closed loop, and the probability that its
+logarithm exceeds `x` is below exp(-x) (Ville; Vovk and Wang 2021 on e-values). A Bayes factor penalises its own
+coefficients, so no blocks are held out. The size of the coefficients is unknown, and a few values are averaged over.
+The mean of Bayes factors has expectation 1 again, and this is how tests are combined here.
 
-Noise fitted to the same rows takes a little of what is left, never adds to it.
+Fitting the noise to the same rows removes a little of the structure and never adds to it.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.selection.calibration import CALIBRATION
 
 SCALES = CALIBRATION.remainder
-"""Chosen before `unknown` was fitted, whose weights hold for these only. Numbers below are numerics: they keep a
-division from 0, a block from a single row, and one far row or line from drowning the others."""
+"""Chosen before the weights of `unknown` were fitted, which are valid for these values only. The numbers below are
+numerical safeguards against division by 0, blocks of a single row, and dominance of one extreme row or line."""
 
 _DELAYS = SCALES.response_delays
 
 
 @dataclass(frozen=True)
 class Adequacy:
-    """Log Bayes factors [nats] of what is left over, 0 and below where nothing is.
+    """Log Bayes factors [nats] of structure in the residuals, 0 and below where there is none.
 
     - `flexible`: forces and sensor faults that are smooth functions of acceleration, command, speed and time, their
       products, hysteresis, or any smooth response to past jerk
-    - `drift`: delay, lag, gain, force or the sensors' gain and offset that differ from block to block
-    - `line`: a force or reading that swings at one steady frequency
-    - `memory`: an autoregression of the white errors
-    - `bursts`: a variance that goes with driving or changes with time
-    - `tails`: single rows far off, by the fourth moment (an approximate gain, not a Bayes factor)
+    - `drift`: delay, lag, gain, force, or the sensors' gain and offset, differing from block to block
+    - `line`: a force or reading that oscillates at one constant frequency
+    - `memory`: an autoregression of the whitened residuals
+    - `bursts`: a variance that depends on the driving or changes with time
+    - `tails`: outlying single rows, by the fourth moment (an approximate gain, not a Bayes factor)
     """
 
     flexible: float
@@ -57,7 +57,7 @@ class Adequacy:
 
     @property
     def total(self) -> float:
-        """All but `tails` in one log Bayes factor."""
+        """All but `tails`, combined in one log Bayes factor."""
         return _mean((self.flexible, self.drift, self.line, self.memory, self.bursts))
 
 
@@ -68,10 +68,10 @@ def adequacy(
     *,
     explained: float = 0.0,
 ) -> Adequacy:
-    """Of errors (channel, counted, group) of a candidate whose rollout is (channel, counted, group).
+    """Adequacy from errors (channel, counted, group) of a hypothesis whose rollout is (channel, counted, group).
 
-    `explained` [nats]: what the candidate's random causes explain although `errors` still show it (lost messages:
-    `found.losses.evidence`); it is taken off whatever is above 0.
+    `explained` [nats]: what the hypothesis's random effects explain although it remains in `errors` (lost messages:
+    `found.losses.evidence`); it is subtracted from every value above 0.
     """
     look = _Look(white, errors, rollout)
     return Adequacy(
@@ -83,7 +83,7 @@ def adequacy(
 
 
 class _Look:
-    """The white errors and the regressors that all questions share."""
+    """The whitened residuals and the regressors shared by all tests."""
 
     def __init__(self, white: WhiteningFilter, errors: FloatArray, rollout: FloatArray) -> None:
         record = white.record
@@ -92,7 +92,7 @@ class _Look:
         self.e = _summed(self.each)
         self.rows = self.e.shape[1]
         told = rollout.mean(-1)
-        # one row late: within a group of rows, commands already answer to the first rows' noise
+        # one row late: within a group of rows, commands already respond to the noise of the first rows
         self.a = _late(told[0] if "accel" in self.channels else np.gradient(told[-1]) / self.dt, 1)
         self.u = _late(record.command[record.source], 1)
         self.jerk = np.diff(self.a, prepend=self.a[0]) / self.dt
@@ -102,11 +102,11 @@ class _Look:
         self.t = np.linspace(0.0, 1.0, self.rows)
 
     def _force(self, x: FloatArray) -> FloatArray:
-        """White image (column, channel * counted) of accelerations (column, counted) of the car itself."""
+        """Whitened image (column, channel * counted) of accelerations (column, counted) of the car itself."""
         return self._image(x, True, self.channels)
 
     def _reading(self, x: FloatArray, channel: str) -> FloatArray:
-        """Likewise of what only one channel shows."""
+        """The same for a change in the reading of one channel only."""
         return self._image(x, False, (channel,))
 
     def _image(self, x: FloatArray, moves: bool, seen: Sequence[str]) -> FloatArray:
@@ -171,7 +171,7 @@ class _Look:
 
     def line(self) -> float:
         record = self.white.record
-        # rows at their own times, zeros between; padded so that no frequency falls between two
+        # rows at their own times, zeros between; padded for a fine grid of frequencies
         place = record.source - record.source[0]
         count, dt = len(self.e), self.dt / self.group
         grid = np.zeros((count, int(place[-1]) + 1, self.group))
@@ -197,7 +197,7 @@ class _Look:
         for answer in answers:
             weight = np.maximum((np.abs(answer) ** 2).sum(0), 1e-15)
             power = np.abs((answer.conj() * seen).sum(0)) ** 2 / weight / (self.rows * self.group)
-            # against the level of the spectrum around, or a broad hump would pass for lines
+            # relative to the local level of the spectrum, so that a broad hump does not count as lines
             power /= np.maximum(gaussian_filter1d(np.minimum(power, 6.0), 60), 1.0)
             told += [_mean(power * s / (1 + s) - np.log1p(s)) for s in SCALES.line_sizes]
         return _mean(told)
@@ -235,12 +235,12 @@ class _Look:
 
 
 def _summed(e: FloatArray) -> FloatArray:
-    """White rows (..., counted, group) summed over groups to white ones (..., counted)."""
+    """Whitened rows (..., counted, group) summed over groups and scaled to unit variance, (..., counted)."""
     return e.sum(-1) / np.sqrt(e.shape[-1])
 
 
 def _mean(nats: Sequence[float] | FloatArray) -> float:
-    """Log of the mean of Bayes factors given by their logarithms."""
+    """Log of the mean of Bayes factors, given by their logarithms."""
     return float(np.logaddexp.reduce(np.asarray(nats, float)) - np.log(len(nats)))
 
 
@@ -257,7 +257,7 @@ def _evidence(columns: FloatArray, e: FloatArray) -> float:
 
 
 def _scattered(square: FloatArray, match: FloatArray, variance: float) -> float:
-    """Log Bayes factor of one column with a coefficient of its own in every block, independent, of this variance."""
+    """Log Bayes factor of one column with independent coefficients of this variance in every block."""
     return float(0.5 * (match**2 * variance / (1 + variance * square) - np.log1p(variance * square)).sum())
 
 
@@ -267,7 +267,7 @@ def _late(x: FloatArray, rows: int) -> FloatArray:
 
 
 def _decaying(keep: float) -> FloatArray:
-    """Root of the stable-spline prior of impulse responses: smooth, and `keep` times smaller with every delay.
+    """Root of the stable-spline prior of impulse responses: smooth, and decaying by the factor `keep` per delay.
 
     Pillonetto and De Nicolao (2010), first-order kernel.
     """

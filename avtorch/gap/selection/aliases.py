@@ -1,9 +1,9 @@
-"""What one channel alone cannot tell apart, so that it comes back as a set and not as a guess.
+"""Effects that a log with one channel cannot distinguish, reported as an alias set.
 
-With the acceleration only, an offset of the sensor and a constant force on the car are the same thing, a filter in the
-sensor is a second pole of the actuator, and the sensor's scale is another `K_L`. What depends on the speed cannot be
-judged at all; a force among it would pass for an offset or a gust. With the speed only, the sensor leaves no mark.
-With both channels nothing here applies.
+With the acceleration only, a sensor offset is equivalent to a constant force on the car, a sensor filter to a second
+pole of the actuator, and the sensor's scale to another `K_L`. Effects that depend on the speed cannot be tested; a
+force among them would appear as an offset or a gust. With the speed only, sensor effects are not observable. With both
+channels there are no exact aliases.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ Kinds = Iterable[type[Effect]]
 
 
 def exact_aliases(name: str, channels: Collection[str], values: Values | None = None, among: Kinds = ()) -> set[str]:
-    """Candidates that respond to every command as `name` does, as far as the `channels` show; `name` among them.
+    """Hypotheses with the same response as `name` to every command in these `channels`, including `name` itself.
 
-    `values`: parameters fitted, by the plant's keys; a resistance can only be an offset below 0, and a sensor's lag
-    only an actuator that does not overshoot. Without them every alias counts. `among`: effects beside those registered.
+    `values`: fitted parameters, by the plant's keys; a resistance is equivalent only to an offset below 0, and a
+    sensor's lag only to an actuator that does not overshoot. Without them every alias counts. `among`: effects beside
+    those registered.
     """
     known = _known(among)
     parts = name.split("+")
@@ -47,7 +48,7 @@ def _known(among: Kinds) -> dict[str, type[Effect]]:
 def _instead(
     one: str, others: Sequence[str], values: Values | None, known: Mapping[str, type[Effect]]
 ) -> Iterable[str]:
-    """Effects that may stand for `one` beside the `others`."""
+    """Effects equivalent to `one` in combination with the `others`."""
     kind = known.get(one)
     if kind is None or kind.alias is None:
         return ()
@@ -59,7 +60,7 @@ def _instead(
         linear = all(p in known and (known[p].commutes or known[p].place == "command") for p in others)
         own = _own(one, values)
         return [e.name for e in same] if linear and (own is None or kind.aliased(own)) else ()
-    return ()  # another K_L is no candidate: it cannot be observed at all
+    return ()  # another K_L is no hypothesis: it is not observable at all
 
 
 def _own(name: str, values: Values | None) -> Values | None:
@@ -78,9 +79,9 @@ def lookalikes(
     specific_force: bool = False,
     among: Kinds = (),
 ) -> set[str]:
-    """Candidates that were not judged, for want of speed, and whose force may be what `name` takes for a slow one.
+    """Hypotheses not tested for want of speed, whose force may be the true cause behind a slow force in `name`.
 
-    One such force in place of all slow parts of `name` (an offset, a gust), where its direction allows it.
+    One such force replaces all slow effects of `name` (an offset, a gust), where its sign allows it.
     """
     parts, known = name.split("+"), _known(among)
     slow = [known[p] for p in parts if p in known and known[p].slow_force]
@@ -98,7 +99,7 @@ def lookalikes(
 
 
 def note(channels: Collection[str], effects: Iterable[type[Effect]]) -> str | None:
-    """One sentence on what the log cannot judge of `effects`; None where that is nothing."""
+    """One sentence on the `effects` that the log cannot test; None where there are none."""
     hidden = sorted((e for e in effects if not is_observable(e, channels)), key=lambda e: e.name)
     if not hidden:
         return None
@@ -121,9 +122,10 @@ def note(channels: Collection[str], effects: Iterable[type[Effect]]) -> str | No
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What a search's candidates can be told apart by: the `channels`, and the `values` fitted of each by name.
+    """Data that determine which hypotheses of a search can be distinguished: the `channels`, and fitted `values` by
+    name.
 
-    `among`: the effects that were candidates; `prior`: the user's weights by name. Both bound what is added.
+    `among`: the effects that were tested; `prior`: the user's weights by name. Both limit which aliases are added.
     """
 
     channels: tuple[str, ...]
@@ -137,14 +139,14 @@ class Identifiability:
     def of(
         cls, race: SearchResult, among: Iterable[type[Effect]], prior: Mapping[str, float] | None = None
     ) -> Identifiability:
-        """From a search."""
+        """The identifiability of a search's hypotheses."""
         values = {f.name: f.values for f in race.found}
         specific = race.record.accel_kind == "specific-force"
         return cls(race.record.channels, values, tuple(among), dict(prior or {}), specific, race.complete)
 
     def shared(self, chances: Mapping[str, float]) -> dict[str, float]:
-        """Probabilities by name in which exact aliases share what they have together, by the prior's weights (equal
-        ones unless given). An alias the search did not try gets its share too.
+        """Probabilities by name, with the total of exact aliases divided among them by the prior's weights (equal by
+        default). An alias that the search did not try gets its share, too.
         """
         out = dict(chances)
         done: set[str] = set()
@@ -159,7 +161,7 @@ class Identifiability:
         return out
 
     def mirrored(self, candidates: Sequence[Candidate], chances: Mapping[str, float]) -> list[Candidate]:
-        """Candidates for names in `chances` that only `shared` put there, with the evidence of their alias."""
+        """Hypotheses for names in `chances` that only `shared` added, with the evidence of their alias."""
         known = {c.name for c in candidates}
         out = []
         for name in sorted(set(chances) - known):
@@ -169,10 +171,9 @@ class Identifiability:
         return out
 
     def alias_set(self, candidates: Sequence[Candidate]) -> tuple[str, ...]:
-        """The candidates `near` the most probable one, and whatever cannot be told from that one.
+        """The hypotheses `near` the most probable one, and those that cannot be distinguished from it.
 
-        Exact aliases, and forces that were not judged (`lookalikes`), have their place there whatever their
-        probability.
+        Exact aliases, and forces that could not be tested (`lookalikes`), are included whatever their probability.
         """
         names = near(ALIAS_RATIO)(candidates)
         first = max(candidates, key=lambda c: c.probability).name
@@ -180,16 +181,16 @@ class Identifiability:
         like = lookalikes(first, self.channels, self.values.get(first), **more)
         more = [*sorted(self._group(first)), *sorted(n for n in like if self._allowed(n))]
         if not self.complete:
-            more.append("unknown")  # any candidate that the budget left untried
+            more.append("unknown")  # it includes any hypothesis that the budget excluded
         return tuple(dict.fromkeys([*names, *more]))
 
     @property
     def note(self) -> str | None:
-        """What the log cannot judge, in a sentence."""
+        """The sentence on effects that the log cannot test."""
         return note(self.channels, self.among)
 
     def _group(self, name: str) -> set[str]:
-        """Exact aliases, each of which also reaches the other's fit; `name` among them."""
+        """Exact aliases, where each is also an alias of the other at its fitted values; including `name`."""
         group = exact_aliases(name, self.channels, self.values.get(name), self.among)
         return {name} | {
             n

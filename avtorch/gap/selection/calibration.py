@@ -1,8 +1,8 @@
 """The constants behind probabilities and alias sets, read from `calibration.json` beside this module.
 
 ``python -m benchmarks.fit_calibration`` writes that file. It gives each constant a unit, a meaning, and `by`: "fitted"
-to simulated cases, or "chosen" beforehand. Its `provenance` names the cases and the figures that they gave, its
-`fingerprint` holds log evidences that a test computes again: constants fitted to another likelihood are not kept.
+to simulated cases, or "chosen" beforehand. Its `provenance` names the cases and the results on them. Its `fingerprint`
+holds log evidences that a test recomputes, so constants fitted to another likelihood are rejected.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Scales = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Odds:
-    """From log evidence to odds. Meanings and units of all of these fields are in `calibration.json`."""
+    """Constants that turn log evidence into odds; `calibration.json` has meanings and units of all these fields."""
 
     effect: float
     second: float
@@ -43,7 +43,7 @@ class Odds:
 
 @dataclass(frozen=True)
 class UnknownWeights:
-    """Of the logistic regression for `unknown`, in the order of `odds.signs`."""
+    """Weights of the logistic regression for `unknown`, in the order of `odds.signs`."""
 
     constant: float
     most: float
@@ -54,7 +54,7 @@ class UnknownWeights:
 
 @dataclass(frozen=True)
 class AliasLimits:
-    """From where on two candidates count as the same answer."""
+    """Thresholds from which on two hypotheses count as the same answer."""
 
     ratio: float
     unknown_ratio: float
@@ -62,7 +62,7 @@ class AliasLimits:
 
 @dataclass(frozen=True)
 class RemainderScales:
-    """Sizes, times and numbers of functions with which `remainder` looks for structure."""
+    """Sizes, times and numbers of basis functions used by `remainder` to test residuals for structure."""
 
     sizes: Scales
     response_delays: int
@@ -89,7 +89,7 @@ class RemainderScales:
 
 @dataclass(frozen=True)
 class Calibration:
-    """All constants, by what they serve."""
+    """All constants, by purpose."""
 
     odds: Odds
     unknown: UnknownWeights
@@ -98,12 +98,12 @@ class Calibration:
 
     @classmethod
     def read(cls, path: Path = PATH) -> Calibration:
-        """Raises `InputError` for a file that is missing, of another schema, or not these constants to the last."""
+        """Raises `InputError` for a file that is missing, has another schema, or lacks or adds a constant."""
         return cls.of(document(path)["constants"], str(path))
 
     @classmethod
     def of(cls, constants: Mapping[str, Any], where: str = "calibration") -> Calibration:
-        """From the file's `constants`: groups of entries with `value`, `unit`, `by` and `meaning`."""
+        """The constants from the file's `constants`: groups of entries with `value`, `unit`, `by` and `meaning`."""
         _same_keys(constants, {f.name for f in fields(cls)}, f"{where}: constants")
         return cls(
             odds=_group(Odds, constants["odds"], f"{where}: odds"),
@@ -114,7 +114,7 @@ class Calibration:
 
 
 def document(path: Path = PATH) -> dict[str, Any]:
-    """The whole file, its parts present. Raises `InputError` where it cannot be read or is no such file."""
+    """The whole file, with its sections checked. Raises `InputError` where it cannot be read or is not such a file."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as fault:
@@ -164,4 +164,4 @@ def _same_keys(found: Any, needed: set[str], where: str) -> None:
 
 
 CALIBRATION = Calibration.read()
-"""As shipped."""
+"""The constants shipped with avtorch."""

@@ -1,4 +1,4 @@
-"""What remains once the delay is in: bare GLVD as the baseline makes nearly every car's answer the delay."""
+"""Probabilities given a dead time: relative to bare GLVD, a delay is the verdict for nearly every car."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from avtorch.gap.simulator.plant import GapPlant
 def given_dead_time(
     candidates: Sequence[Candidate], verdict: Verdict, baseline: GapPlant | None = None
 ) -> tuple[Candidate, ...] | None:
-    """The candidates for what else there is, given that the delay is one of the causes; the most probable first.
+    """Hypotheses for the other causes, given that the delay is one of the causes; the most probable first.
 
-    `none` is the delay alone, an effect's name its pair with the delay. Probabilities are those of `candidates` with
-    the delay in them, so a second cause pays the price that it paid there; `unknown` keeps its own. They sum to 1.
-    `log_evidence` is relative to the delay alone, `parameters` are the second effect's, `moved` is with both in.
+    `none` is the delay alone, an effect's name its pair with the delay. Probabilities are proportional to those of the
+    `candidates` with the delay, including the penalty of a second cause; `unknown` keeps its own. They sum to 1.
+    `log_evidence` is relative to the delay alone, `parameters` are the second effect's, `moved` is with both effects.
 
-    None where the baseline is more than the bare GLVD, the verdict does not contain the delay, or no pair was tried.
+    None where the baseline is more than bare GLVD, the verdict does not contain the delay, or no pair was tried.
     """
     delay = delay_effect().name
     late = [c for c in candidates if delay in c.effects]

@@ -1,14 +1,14 @@
-"""From evidence to probabilities that mean what they say, and the probability that the cause is not in the table.
+"""Calibrated probabilities from log evidence, including the probability that the cause is not in the table.
 
-Log evidence grows with every row and every small misfit of the equations, so its differences are far too sure. Three
-things are put right, all of them growing with the square root of the nats at stake, as a misfit's share does:
+Log evidence grows with every row and with every small model error, so its differences are overconfident. Three
+corrections are made, all of them growing with the square root of the gain in nats, as the effect of a model error does:
 
-- any effect pays a price, and the second of a pair another, larger one
+- any effect pays a penalty, and the second of a pair another, larger one
 - differences are compressed to a logarithm: `g` nats behind become odds of `(1 + g / unit) ** -power`
-- what the most probable candidate leaves over (`Adequacy`) tells the probability of `unknown`
+- the structure in the residuals of the most probable hypothesis (`Adequacy`) determines the probability of `unknown`
 
-The constants come from `calibration.json` (`calibration.Calibration`), which says what each one means and which
-simulated cases it was fitted to; docs/calibration.md says how to fit them anew.
+The constants come from `calibration.json` (`calibration.Calibration`), which states their meaning and the simulated
+cases to which they were fitted; docs/calibration.md explains how to refit them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from avtorch.gap.simulator.effect import EFFECTS
 
 
 class Weighed(Protocol):
-    """What of a candidate counts here, be it just fitted or kept from an earlier search."""
+    """The properties of a hypothesis used here, whether just fitted or kept from an earlier search."""
 
     @property
     def name(self) -> str: ...
@@ -41,7 +41,7 @@ _Kind = TypeVar("_Kind", bound=Weighed)
 
 @dataclass(frozen=True)
 class ComplexityPenalty:
-    """What an effect must gain [nats]: `fixed`, and `share` times the root of what its partner gains alone."""
+    """Penalty of an effect [nats]: `fixed`, plus `share` times the root of what its partner gains alone."""
 
     fixed: float
     share: float = 0.0
@@ -61,11 +61,11 @@ def model_probabilities(
     *,
     calibration: Calibration = CALIBRATION,
 ) -> dict[str, float]:
-    """Probability by candidate's name, `unknown` among them; sums to 1.
+    """Probability by hypothesis, including `unknown`; sums to 1.
 
-    `left`: what the most probable named candidate (`favourite`) leaves over. `prior`: weights by name (an effect,
-    `none`, `unknown`, or `pair` for all pairs) that multiply the default's. Raises `InputError` for weights that are
-    negative or not finite.
+    `left`: structure in the residuals of the most probable named hypothesis (`favourite`). `prior`: weights by name (an
+    effect, `none`, `unknown`, or `pair` for all pairs) that multiply the default's. Raises `InputError` for weights
+    that are negative or not finite.
     """
     weigh = dict(prior or {})
     for name, weight in weigh.items():
@@ -91,7 +91,7 @@ def model_probabilities(
 
 
 def favourite(found: Sequence[_Kind], odds: Odds = CALIBRATION.odds) -> _Kind:
-    """The most probable of the named candidates; of those that differ by round-off the plainest."""
+    """The most probable of the named hypotheses; of those equal within round-off, the simplest."""
     worth = _worth(found, odds)
     best = max(worth.values())
     tied = [f for f in found if worth[f.name] >= best - _ROUND_OFF]
@@ -99,7 +99,7 @@ def favourite(found: Sequence[_Kind], odds: Odds = CALIBRATION.odds) -> _Kind:
 
 
 def complexity_penalties(found: Sequence[Weighed], odds: Odds = CALIBRATION.odds) -> dict[str, float]:
-    """What each candidate has to gain over none before it counts for anything [nats]."""
+    """Penalty of each hypothesis [nats]: the gain over none that it must exceed."""
     second = ComplexityPenalty(odds.second, odds.second_share)
     second_by_chance = ComplexityPenalty(odds.second_by_chance, odds.second_by_chance_share)
     paid, gained = {"none": 0.0}, gains(found)
@@ -113,7 +113,7 @@ def complexity_penalties(found: Sequence[Weighed], odds: Odds = CALIBRATION.odds
 
 
 def by_chance(f: Weighed) -> bool:
-    """Whether an effect that chance decides is among its causes."""
+    """Whether one of its causes is a random effect."""
     return f.by_chance is not None or any(part in EFFECTS and EFFECTS[part].random for part in f.name.split("+"))
 
 
@@ -124,7 +124,7 @@ def gains(found: Sequence[Weighed]) -> dict[str, float]:
 
 
 def partner(pair: str, gained: Mapping[str, float]) -> float:
-    """What the stronger half of a pair gains alone [nats]; 0 for a half that was not fitted alone."""
+    """Gain of the stronger effect of a pair alone [nats]; 0 for an effect that was not fitted alone."""
     return max(gained.get(part, 0.0) for part in pair.split("+"))
 
 
@@ -133,13 +133,13 @@ def _none(found: Sequence[Weighed]) -> Weighed:
 
 
 def _worth(found: Sequence[Weighed], odds: Odds) -> dict[str, float]:
-    """Log evidence over none less what each candidate pays [nats]."""
+    """Log evidence over none less the penalty of each hypothesis [nats]."""
     paid = complexity_penalties(found, odds)
     return {name: gained - paid[name] for name, gained in gains(found).items()}
 
 
 def relative(found: Sequence[Weighed], odds: Odds = CALIBRATION.odds) -> dict[str, float]:
-    """Probability of each named candidate in units of the most probable one's, before the user's prior."""
+    """Probability of each named hypothesis relative to the most probable one, before the user's prior."""
     worth = _worth(found, odds)
     best = max(worth.values())
     unit = odds.unit + odds.unit_share * float(np.sqrt(max(best, 0.0)))
@@ -147,10 +147,11 @@ def relative(found: Sequence[Weighed], odds: Odds = CALIBRATION.odds) -> dict[st
 
 
 def signs(top: Weighed, none: Weighed, left: Adequacy) -> tuple[float, ...]:
-    """What the log odds of `unknown` are a weighted sum of, in the order of `UnknownWeights`.
+    """Regressors of the log odds of `unknown`, in the order of `UnknownWeights`.
 
-    1, the strongest structure left, all of it against what the favourite `top` gains, that gain, whether it is none.
-    The divisors only bring logarithms of nats to the order of 1, at which one prior serves all weights.
+    1, the strongest structure in the residuals, all structure relative to the gain of the favourite `top`, that gain,
+    and whether `top` is none. The divisors only scale logarithms of nats to the order of 1, so that one prior serves
+    all weights.
     """
     gain = float(np.log1p(max(top.log_evidence - none.log_evidence, 0.0)))
     most = max(left.flexible, left.drift, left.line, left.memory, left.bursts)

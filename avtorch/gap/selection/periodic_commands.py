@@ -1,4 +1,4 @@
-"""What a command that repeats itself leaves open: a delay is known only up to the period, and may be none."""
+"""Ambiguity under a periodic command: a delay is identified only up to the period, and may be zero."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from collections.abc import Iterable, Mapping, Sequence
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.selection.verdict import Verdict
 
-_NAMED = 4  # delays
+_NAMED = 4  # delays named in a sentence
 
 
 def untold(found: Iterable[FittedModel]) -> dict[str, FittedModel]:
-    """Finds, by name, whose delay may as well be none."""
+    """Fitted models, by name, whose delay may be zero."""
     return {f.name: f for f in found if f.delays is not None and f.delays.untold}
 
 
 def shared(chances: Mapping[str, float], untold: Mapping[str, FittedModel]) -> dict[str, float]:
-    """Probabilities in which the share of a delay within a row of none is that of the find without a delay."""
+    """Probabilities after the share of near-zero delays is moved to the same model without a delay."""
     out = dict(chances)
     for name, f in untold.items():
         assert f.delays is not None
         if not out.get(f.delays.without):
-            continue  # ruled out by the prior
+            continue  # excluded by the prior
         part = chances[name] * f.delays.none
         out[name] -= part
         out[f.delays.without] += part
@@ -29,7 +29,7 @@ def shared(chances: Mapping[str, float], untold: Mapping[str, FittedModel]) -> d
 
 
 def joined(aliases: Sequence[str], untold: Mapping[str, FittedModel]) -> list[str]:
-    """An alias set, the verdict first, with the delay that the verdict may hide, or the cause without one."""
+    """The alias set, verdict first, with the model that differs from the verdict only by an undetermined delay."""
     more = []
     for name, f in untold.items():
         assert f.delays is not None
@@ -40,7 +40,7 @@ def joined(aliases: Sequence[str], untold: Mapping[str, FittedModel]) -> list[st
 
 
 def why(chances: Mapping[str, float], untold: Mapping[str, FittedModel]) -> str | None:
-    """The verdict's sentence, where it is one of two that differ by a delay only; None elsewhere."""
+    """The verdict's sentence, where an alias differs from it only by a delay; None elsewhere."""
     first = max(chances, key=lambda name: chances[name])
     for name, f in untold.items():
         assert f.delays is not None
@@ -51,7 +51,7 @@ def why(chances: Mapping[str, float], untold: Mapping[str, FittedModel]) -> str 
 
 
 def notes(found: Iterable[FittedModel], verdict: Verdict) -> list[str]:
-    """What the verdict, or its alias, does not know of its delay, and what would tell."""
+    """The note on an undetermined delay in the alias set, and the experiment that would determine it."""
     for f in found:
         if f.delays is None or f.name not in verdict.alias_set:
             continue

@@ -1,7 +1,7 @@
-"""Is an answer physically possible? What a fit makes of a parameter, against what such a parameter can be at all.
+"""Physical plausibility of an answer: fitted parameters compared with their physically possible ranges.
 
-A cause that wins far outside its range is a finding in itself: the name is right about the shape of the gap and wrong
-about what makes it. Said is that once the whole central 90 % lies outside, so that a wide posterior is no accusation.
+A cause that wins far outside its range is informative: the name is right about the shape of the gap and wrong about its
+origin. It is reported only where the whole central 90 % lies outside, so that a wide posterior is not reported.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def implausible(
 
 
 def outside(parameter: Parameter, q: Quantity) -> bool:
-    """Whether the central 90 % has nothing in common with what is possible."""
+    """Whether the central 90 % lies entirely outside the possible range."""
     low, high = parameter.physical
     return q.q95 < low or q.q05 > high
 

@@ -1,4 +1,4 @@
-"""Candidate causes, their probabilities, and the verdict drawn from them."""
+"""Hypotheses, their probabilities, and the verdict based on them."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from avtorch.gap.simulator.effect import EFFECTS
 
 ALWAYS = ("none", "unknown")
 LEAST_LISTED = 1e-4
-"""Candidates less probable than this are left out of an answer; `none` and `unknown` never are."""
+"""Hypotheses less probable than this are left out of an answer; `none` and `unknown` never are."""
 
 
 def candidate_name(names: str | Iterable[str]) -> str:
-    """The one way to write a candidate: its effects in alphabetical order, joined by `+`."""
+    """The canonical name of a hypothesis: its effects in alphabetical order, joined by `+`."""
     return "+".join(sorted(names.split("+") if isinstance(names, str) else names))
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A cause: `"none"`, `"unknown"`, an effect, or two (`"a+b"`, in alphabetical order).
+    """A hypothesis: `"none"`, `"unknown"`, an effect, or two (`"a+b"`, in alphabetical order).
 
-    `log_evidence` [nats] relative to `none`, free of the prior over causes; None for `unknown`. `parameters` by the
-    table's names, those of a pair as `effect.parameter`; `moved`: the baseline's `T_L` [s] and `K_L` [-] with this
-    candidate in. `onset_s` on the log's own clock; None where the effect was there from the start. `implausible`:
-    a sentence for each parameter outside what is physically possible (`plausible.implausible`).
+    `log_evidence` [nats] relative to `none`, without the prior over causes; None for `unknown`. `parameters` by the
+    table's names, those of a pair as `effect.parameter`; `moved`: the baseline's `T_L` [s] and `K_L` [-] under this
+    hypothesis. `onset_s` on the log's own clock; None where the effect acts from the start. `implausible`: a sentence
+    for each parameter outside its physically possible range (`plausible.implausible`).
     """
 
     name: str
@@ -48,7 +48,7 @@ class Candidate:
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """The effects in it: none, one or two."""
+        """Its effects: none, one or two."""
         return () if self.name in ALWAYS else tuple(self.name.split("+"))
 
     def to_dict(self) -> dict[str, Any]:
@@ -65,20 +65,20 @@ class Candidate:
 
 
 def plausibility(implausible: Sequence[str]) -> dict[str, Any]:
-    """The keys `plausible` and, where it is not, `plausibility`: why not."""
+    """The keys `plausible` and, where it is False, `plausibility` with the reasons."""
     return {"plausible": not implausible, "plausibility": " ".join(implausible) or None}
 
 
 def listed(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
-    """As an answer lists them: the improbable left out, renormalised to a sum of 1, the most probable first.
+    """Hypotheses as listed in an answer: improbable ones left out, renormalised to a sum of 1, most probable first.
 
-    Raises `InputError` where `none` or `unknown` is missing, a name comes twice, or no probability is above 0.
+    Raises `InputError` where `none` or `unknown` is missing, a name occurs twice, or no probability is above 0.
     """
     given = list(candidates)
     names = [c.name for c in given]
     if len(set(names)) < len(names) or not set(ALWAYS) <= set(names):
         raise InputError(f"candidates: found {', '.join(names)}, needs none and unknown and each name once")
-    # the improbable are told by their share, so that weights need not be normalised
+    # improbable by their share, so that weights need not be normalised
     total = math.fsum(c.probability for c in given)
     if not total > 0:
         raise InputError("candidates: found no probability above 0, needs one")
@@ -92,10 +92,10 @@ def listed(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is named, and what it cannot be told apart from.
+    """The named causes, and the hypotheses that cannot be distinguished from them.
 
-    `names`: `("none",)`, `("unknown",)`, or one or two effects, the most probable. `alias_set`: the candidates that
-    cannot be told apart on this log, the verdict among them. `abstained`: it is `unknown`. `why`: one sentence.
+    `names`: `("none",)`, `("unknown",)`, or one or two effects, the most probable. `alias_set`: the hypotheses that
+    this log cannot distinguish, including the verdict. `abstained`: it is `unknown`. `why`: one sentence.
     """
 
     names: tuple[str, ...]
@@ -105,7 +105,7 @@ class Verdict:
 
     @property
     def name(self) -> str:
-        """The verdict as a candidate's name."""
+        """The verdict as a hypothesis's name."""
         return candidate_name(self.names)
 
     def to_dict(self) -> dict[str, Any]:
@@ -118,15 +118,15 @@ class Verdict:
 
 
 ALIAS_RATIO = CALIBRATION.alias_sets.ratio
-"""Candidates at least this probable, in units of the most probable one, are not told apart from it."""
+"""Hypotheses at least this probable, relative to the most probable one, are not distinguished from it."""
 UNKNOWN_RATIO = CALIBRATION.alias_sets.unknown_ratio
-"""The same for `unknown`. It foretells nothing, so no log ever rules it out: below this it is a doubt, no rival."""
+"""The same for `unknown`, which makes no predictions and so is never ruled out by a log: below this it is no rival."""
 
 
 def near(ratio: float, unknown: float = UNKNOWN_RATIO) -> Callable[[Sequence[Candidate]], tuple[str, ...]]:
-    """An alias set by probability: all candidates at least `ratio` as probable as the first, that one in front.
+    """A function that returns the alias set: all hypotheses at least `ratio` as probable as the first, which leads.
 
-    For `unknown` it takes the ratio `unknown`.
+    For `unknown` the ratio is `unknown`.
     """
 
     def aliases(candidates: Sequence[Candidate]) -> tuple[str, ...]:
@@ -144,10 +144,10 @@ def verdict_of(
     why: str | None = None,
     known: str = "known effect",
 ) -> Verdict:
-    """The most probable candidate.
+    """The most probable hypothesis as a verdict.
 
-    `aliases` says which names cannot be told apart (the verdict's is put in front; default `near(ALIAS_RATIO)`);
-    `why` defaults to a sentence on evidence and runner-up, in which `known` is what was tried.
+    `aliases` returns the names that cannot be distinguished (the verdict's is put first; default `near(ALIAS_RATIO)`);
+    `why` defaults to a sentence on evidence and runner-up, in which `known` describes what was tried.
     """
     ranked = listed(candidates)
     first = ranked[0]
@@ -169,11 +169,11 @@ def _why(ranked: Sequence[Candidate], known: str) -> str:
 
 
 def plain(quantities: Mapping[str, Quantity]) -> dict[str, dict[str, float]]:
-    """For a JSON answer."""
+    """Quantities as plain numbers, for JSON."""
     return {name: quantity.to_dict() for name, quantity in quantities.items()}
 
 
 def meanings(name: str) -> str:
-    """What the effects of a candidate do, in words; empty for an effect that is not registered."""
+    """The meaning of a hypothesis's effects, in words; empty for an effect that is not registered."""
     known = [EFFECTS[n].meaning for n in candidate_name(name).split("+") if n in EFFECTS]
     return ", and ".join(known)

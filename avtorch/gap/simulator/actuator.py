@@ -1,12 +1,12 @@
-"""The actuator between command and body: what it does over a step in which its target and lag are held.
+"""The actuator between command and body: its response over a step in which its target and lag are held.
 
     first order     T a' + a = g                        (Eq. 1; g = K u)
     rate-limited    a' = (g - a) / T within ± jerk
     second order    tau² a'' + T a' + a = g             (first order at tau = 0)
 
 A step has one part, or two where a late command switches within it. Each part is integrated exactly, for the
-acceleration, its integral and its double integral. The same formulas serve one step (...) and whole drives
-(..., time): first and second order by scans, the rate limit row by row.
+acceleration, its integral and its double integral. The same formulas serve one step (...) and whole drives (..., time):
+first and second order by scans, the rate limit row by row.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from avtorch.gap.simulator.rate_limited import by_rows, limited_row, slewed_row
 from avtorch.gap.simulator.recursion import scan, scan_pair
 from avtorch.vehicle.glvd import motion_coefficients
 
-_NO_LIMIT = 1e9  # [m/s³], stands for infinity where infinity times a part of length 0 would be undefined
+_NO_LIMIT = 1e9  # [m/s³] replaces infinity, as infinity times a part of length 0 would be undefined
 
 
 @dataclass(frozen=True)
@@ -53,13 +53,13 @@ class Actuator:
     jerk: Tensor | None = None
 
     def settled(self, accel: Tensor) -> ActuatorState:
-        """At rest at `accel`."""
+        """The state at rest at `accel`."""
         if self.tau is None:
             return ActuatorState(accel)
         return ActuatorState(accel, torch.zeros_like(accel), accel)
 
     def step(self, state: ActuatorState, parts: list[Substep]) -> tuple[ActuatorState, Tensor, Tensor]:
-        """State after a step, what it adds to the speed [m/s], and to the position besides `speed dt` [m]."""
+        """State after a step, change of the speed [m/s], and change of the position besides `speed dt` [m]."""
         gained = moved = torch.zeros_like(state.accel)
         for part in parts:
             state, speed, place = self._part(state, part)
@@ -68,9 +68,9 @@ class Actuator:
         return state, gained, moved
 
     def over(self, accel0: Tensor, parts: list[Substep]) -> tuple[Tensor, Tensor]:
-        """Accelerations (..., time) from `accel0` (...), and what each step adds to the speed (..., time - 1).
+        """Accelerations (..., time) from `accel0` (...), and the change of the speed in each step (..., time - 1).
 
-        `parts` hold the targets of all rows (the last one's is not needed); settled before the first row.
+        `parts` hold the targets of all rows (the last one's is not needed); in steady state before the first row.
         """
         steps = parts[0].target.shape[-1] - 1
         parts = [part.rows(slice(0, steps)) for part in parts]
@@ -87,7 +87,7 @@ class Actuator:
                 slope = slope * own
             return before, slope
 
-        # row by row without derivatives, which a round of Newton's method then gives
+        # row by row without derivatives; one Newton iteration then supplies them
         a = _joined(accel0, solve(step, accel0, by_rows(limited_row, accel0, parts, jerk)))
         at, gained = a[..., :-1], torch.zeros_like(a[..., 1:])
         for part in parts:
@@ -169,11 +169,11 @@ def _first_over(accel0: Tensor, parts: list[Substep]) -> tuple[Tensor, Tensor]:
 
 
 def _limited(a: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Rate-limited part from `a`: acceleration after it, its slope in `a`, what speed and position gain."""
+    """Rate-limited part from `a`: acceleration after it, its derivative by `a`, changes of speed and position."""
     g, T, h = part.target, part.lag, part.length
     J = jerk.clamp_max(_NO_LIMIT)
     d = g - a
-    at_limit = torch.minimum((d.abs() / J - T).clamp_min(0.0), h)  # so long at the limit, then exponential
+    at_limit = torch.minimum((d.abs() / J - T).clamp_min(0.0), h)  # time at the limit, then exponential
     cut = torch.sign(d) * J * at_limit
     rest, left = h - at_limit, d - cut
     alpha, m1, m2 = motion_coefficients(T, rest)
@@ -184,12 +184,12 @@ def _limited(a: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor, Te
 
 
 def _slewed(r: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Target after a part, slewed from `r` at no more than `jerk`; its slope in `r`; its mean over the part."""
+    """Target after a part, slewed from `r` at no more than `jerk`; its derivative by `r`; its mean over the part."""
     h, J = part.length, jerk.clamp_max(_NO_LIMIT)
     d = part.target - r
     moving = torch.minimum(d.abs() / J, h)
     after = r + torch.maximum(torch.minimum(d, J * h), -J * h)
-    # over the part it misses the target by a trapezium that shrinks while it moves, and by what is left after
+    # the mean deficit from the target is a shrinking trapezium during the slew, plus the constant rest after it
     missed = moving * 0.5 * (d + part.target - after) + (h - moving) * (part.target - after)
     mean = part.target - torch.where(h > 0, missed / torch.where(h > 0, h, 1.0), 0.0)
     return after, (d.abs() > J * h).to(r.dtype), mean
@@ -213,10 +213,11 @@ def _slewed_over(accel0: Tensor, parts: list[Substep], jerk: Tensor) -> list[Sub
 
 
 def modes_over(tau: Tensor, T: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Matrix over `h` on `(a - g, tau² a')`; regular at tau = 0 and at critical damping, as are its derivatives."""
+    """Transition matrix over `h` of `(a - g, tau² a')`; with its derivatives regular at tau = 0 and critical
+    damping."""
     square = tau * tau
     bend = T * T - 4 * square
-    # (difference of the poles times h / 2)², where small taken by its series
+    # (difference of the poles times h / 2)², by its series where small
     small = bend.abs() * h * h < 4e-4 * square * square
     real, complex_ = (bend > 0) & ~small, (bend <= 0) & ~small
     root = torch.sqrt(torch.where(small, 1.0, bend.abs()))

@@ -1,4 +1,4 @@
-"""What a field of an effect may hold where it comes from text: a finite number in its range, or a list of them."""
+"""Valid values of an effect's field given as text: a finite number in its range, or a list of them."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from typing import Any
 from avtorch.errors import InputError, printable
 from avtorch.gap.simulator.parameter import Parameter
 
-# typical ranges are experience: no car is a thousand times as far out, and no fit of one a million times nearer to zero
+# typical ranges come from experience: no car exceeds them a thousandfold, nor does a fit fall a million times below
 _FAR, _NEAR = 1e3, 1e6
 
 
 @dataclass(frozen=True)
 class Domain:
-    """Field `name`: numbers from `low` to `high`, and `neutral`, at which the effect does nothing, wherever it lies.
+    """Valid values of field `name`: numbers from `low` to `high`, and `neutral`, at which the effect is zero, in any
+    case.
 
     `whole`: whole numbers only. `most` above 0: a list of `least` to `most` numbers, `rising` or not.
 
@@ -40,10 +41,10 @@ class Domain:
 
     @classmethod
     def of(cls, parameter: Parameter) -> Domain:
-        """Up to a thousand times as far as the typical range of `parameter`, or a million times nearer to zero."""
+        """The domain from a millionth of the typical range of `parameter` to a thousand times that range."""
         low, high, kind = parameter.low, parameter.high, parameter.constraint
         unit = "" if parameter.unit == "-" else parameter.unit
-        if kind == "interval":  # its ends are a drive's, which is not known yet
+        if kind == "interval":  # its ends depend on a drive, which is not known yet
             return cls(parameter.name, -1e12, 1e12, unit)
         ends = {
             "positive": (low / _NEAR, high * _FAR),
@@ -55,7 +56,7 @@ class Domain:
         return cls(parameter.name, *ends, unit, parameter.neutral, signed)
 
     def value(self, where: str, given: Any) -> Any:
-        """`given` as a float, an int or a tuple. Raises `InputError` that begins with `where`."""
+        """`given` as a float, an int or a tuple. Raises an `InputError` that begins with `where`."""
         if not self.most:
             return self._number(where, given)
         if not isinstance(given, list) or not self.least <= len(given) <= self.most:
@@ -84,7 +85,7 @@ class Domain:
 
 
 def _found(given: Any) -> str:
-    """A value as a message shows it: TOML's own word for true, and the kind of what is no single value."""
+    """A value as shown in a message: TOML's own words for booleans, the type for anything that is no single value."""
     if isinstance(given, bool):
         return str(given).lower()
     if isinstance(given, list | dict):

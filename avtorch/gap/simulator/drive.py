@@ -1,4 +1,4 @@
-"""A drive as the plants take it, and what a plant answers."""
+"""A drive as the input of a plant, and the plant's response."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Drive:
     """Stretches without gaps: `time` (time,) [s], `command` (..., time) [m/s²] and, where measured, `speed` [m/s].
 
     A row's command acts from its time until the next row's. `accel0` (...) [m/s²] is the car's acceleration at the
-    first row; None: the actuator has settled at the first command. Before the first row the first command acted.
-    `dt` (time,) are the steps (the last one repeats), `position` (..., time) [m] the speed integrated by trapezoids
-    from `position0` (...) [m] on; `uniform` says whether all steps are the same. `specific_force`: what is measured as
-    acceleration, `accel0` too, is an accelerometer's reading, which feels every force but gravity: a slope's pull is in
-    the speed alone.
+    first row; None: the actuator is in steady state at the first command, which also acted before the first row. `dt`
+    (time,) are the steps (the last one repeats), `position` (..., time) [m] the speed integrated by trapezoids from
+    `position0` (...) [m] on; `uniform`: all steps are equal. `specific_force`: measured accelerations, including
+    `accel0`, are an accelerometer's readings, which include every force but gravity: a road grade acts on the speed
+    alone.
 
     Raises `InputError` for shapes that do not fit, time that does not rise, or values that are not finite.
 
@@ -79,13 +79,13 @@ class Drive:
 
     @classmethod
     def from_log(cls, log: Log, segment: int = 0, *, settled: bool = False) -> Drive:
-        """One segment of a log, its time from the log's start.
+        """One segment of a log, with time from the log's start.
 
-        It begins at the measured acceleration, if there is one, unless `settled`.
+        It starts from the measured acceleration, if there is one, unless `settled`.
 
-        Rows with `engaged` 0 are in it: their commands act in the response, though the car did not obey them.
+        Rows with `engaged` 0 are included: their commands act in the response, although the car did not follow them.
 
-        Raises `InputError` for a segment that is not there or a log without `accel_cmd`.
+        Raises `InputError` for a missing segment or a log without `accel_cmd`.
         """
         if log.accel_cmd is None:
             raise InputError("accel_cmd: not in the log, needed for the response of a plant")
@@ -107,10 +107,10 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Response:
-    """What a plant does over a drive, (..., time): `accel` of the car and `accel_measured` [m/s²], `speed` [m/s].
+    """Response of a plant over a drive, (..., time): `accel` of the car and `accel_measured` [m/s²], `speed` [m/s].
 
-    `speed` is the car's acceleration integrated from the first measured speed (0 where there is none). Nothing stops
-    at standstill: such rows are masked.
+    `speed` is the car's acceleration integrated from the first measured speed (0 where there is none). The response
+    does not stop at standstill; such rows are masked.
 
     Example:
         >>> import torch

@@ -10,12 +10,12 @@ command → actuator → body → sensor, and its one hook means there:
 | body     | acceleration of the actuator [m/s²]  | additional acceleration of the car [m/s²]                 |
 | sensor   | acceleration of the car [m/s²]       | acceleration shown [m/s²]                                 |
 
-Without memory the hook is `apply(x, row)`, and one definition serves a single step of a simulation and a whole drive
-at once: only the shapes differ. With memory (`memory = True`) it is `start` and `advance`, one row at a time, and
-`over`, a whole drive; `over` may be left out, then rows are looped over: right, but slow.
+Without memory the hook is `apply(x, row)`, and one definition serves both a single step of a simulation and a whole
+drive: only the shapes differ. With memory (`memory = True`) it is `start` and `advance`, one row at a time, and `over`,
+a whole drive. Without `over` the rows are looped over, which is correct but slow.
 
-An effect also brings what the rest of the package has to know of it, so that no file outside `effects/` names one. The
-defaults are right for an ordinary effect:
+An effect also declares what the rest of the package needs to know of it, so that no file outside `effects/` names one.
+The defaults suit an ordinary effect:
 
 | asked by             | declared by                                            | default                           |
 |----------------------|--------------------------------------------------------|-----------------------------------|
@@ -52,7 +52,7 @@ from avtorch.vehicle.broadcasting import broadcast
 
 Place = Literal["command", "actuator", "body", "sensor"]
 Alias = Literal["offset", "pole", "K_L"]
-"""What an effect adds to the measured acceleration: a constant, one more real pole, or a factor."""
+"""The effect's equivalent in the measured acceleration: a constant, one more real pole, or a factor."""
 SearchedAs = Literal["force", "tails", "losses"]
 PLACES: tuple[Place, ...] = ("command", "actuator", "body", "sensor")
 """Places in the chain, in its order.
@@ -67,25 +67,26 @@ V = TypeVar("V")
 
 
 def fixed(**values: V) -> Mapping[str, V]:
-    """`values` by name, for a class attribute that nobody can change by mistake."""
+    """`values` by name, read-only, for a class attribute that cannot be changed by mistake."""
     return MappingProxyType(values)
 
 
-_LARGEST = 1e12  # of a number in a text whose domain nobody said
-_NAME = 60  # characters of a name that may be an effect's, mistyped
+_LARGEST = 1e12  # limit for a number in a text without a declared domain
+_NAME = 60  # most characters of a name that may be a mistyped effect
 
 
 @dataclass(frozen=True)
 class NoiseChange:
-    """What a random effect does to the noise model, its deterministic response being none.
+    """The change that a random effect makes to the noise model; its deterministic response is zero.
 
-    `force_sd` [m/s²] and `force_time` [s]: a coloured (Ornstein-Uhlenbeck) acceleration of the body, in both
-    channels. `tail_fraction` of the accelerometer's samples has `tail_scale` times its standard deviation more.
-    `command_variance` (..., time) [(m/s²)²]: mean square of what the command acting in a row differs from the one
+    `force_sd` [m/s²] and `force_time` [s]: a coloured (Ornstein-Uhlenbeck) acceleration of the body, in both channels.
+    `tail_fraction` of the accelerometer's samples has additional noise of `tail_scale` times its standard deviation.
+    `command_variance` (..., time) [(m/s²)²]: mean square difference between the command acting in a row and the one
     logged there, independent from row to row.
 
-    By this a diagnosis finds the effect: its parameters are fitted with those of the candidate and of the noise, by
-    the likelihood under the changed noise. A candidate says one of the three: a force, tails, or a command's variance.
+    The diagnosis uses it to find the effect: its parameters are fitted together with those of the hypothesis and of the
+    noise, by the likelihood under the changed noise. An effect to be tested returns one of the three: a force, tails,
+    or a command's variance.
 
     Example:
         >>> import torch
@@ -104,32 +105,32 @@ class NoiseChange:
 
 @dataclass(frozen=True)
 class Effect:
-    """Base of all effects; see the module for the hooks. `order` sorts effects at the same place.
+    """Base of all effects; the module docstring lists the hooks. `order` sorts effects at the same place.
 
-    `gravity`: a force of the body that an accelerometer does not feel (see `Drive.specific_force`). `derived`: what
+    `gravity`: a body force that an accelerometer does not measure (see `Drive.specific_force`). `derived`: what
     `report` names in place of coordinates that are not reported, with typical and possible ranges. `shift`: the
-    parameter [s], if there is one, by which it makes commands late and does nothing else. `settings`: what fields that
-    are no parameters may hold in a text; a field without a domain takes any single finite number.
+    parameter [s], if there is one, by which it delays commands and does nothing else. `settings`: valid values in a
+    text for fields that are not parameters; a field without a domain takes any single finite number.
 
-    Search. `starts`: first values of some parameters, all combinations of which are tried, then each one at a time.
-    `own_onset`: the parameter [s] that is the moment at which it sets in; no other onset is tried. `of_the_drive`: its
-    parameters belong to a drive and not to the car, so it is no placebo in a cross-validation.
+    Search. `starts`: initial values of some parameters, tried in all combinations and then one at a time. `own_onset`:
+    the parameter [s] that is its onset; no other onset is tried. `of_the_drive`: its parameters belong to a drive and
+    not to the car, so it is no placebo in a cross-validation.
 
-    Randomness. `searched_as`: the search of its own that a random effect has, which also finds an onset; a derived
-    class does not inherit it. `noise_parameters`: its parameter by the name that this search has for it
-    (`force_sd` and `force_time`, `tail_fraction` and `tail_scale`, or `loss`).
+    Randomness. `searched_as`: the dedicated search of a random effect, which also finds an onset; a derived class does
+    not inherit it. `noise_parameters`: its parameters by their names in this search (`force_sd` and `force_time`,
+    `tail_fraction` and `tail_scale`, or `loss`).
 
-    Sensor. `reading`: its parameter for `"lag"` [s] or `"scale"` [-], where the accelerometer treats the car's random
-    motion likewise.
+    Sensor. `reading`: its parameter for `"lag"` [s] or `"scale"` [-], where it also applies to the car's random motion.
 
-    Aliases, where the log has no speed. `alias`: effects with the same word respond alike, as far as `aliased` and
-    `force_sign` allow; one with `"K_L"` cannot be observed there. `force_sign`: the only sign its force can have, 0:
-    either. `slow_force`: its force does not follow the command, so one that depends on speed may pass for it.
-    `commutes`: it passes two poles in a row alike, wherever it stands among them.
+    Aliases, where the log has no speed. `alias`: effects with the same value respond alike, as far as `aliased` and
+    `force_sign` allow; one with `"K_L"` is not observable there. `force_sign`: the only possible sign of its force, 0:
+    either. `slow_force`: its force does not follow the command, so a speed-dependent force may be mistaken for it.
+    `commutes`: its position among two poles in series makes no difference.
 
-    Elsewhere. `linear` False: the response to a step is no multiple of it. `one_sided`: it differs between driving
-    and braking. `role`: `"delay"` for the effect that stands for a bare delay wherever one is needed. `half_said`: of
-    an effect that other tools have half a word for, what they cannot say. `pictured`: speed [m/s] at which it shows.
+    Elsewhere. `linear` False: the step response is not proportional to the step. `one_sided`: it differs between
+    driving and braking. `role`: `"delay"` for the effect that serves as a bare delay wherever one is needed.
+    `half_said`: what an export to other tools cannot express about this effect. `pictured`: speed [m/s] at which it is
+    visible.
 
     Example:
         >>> from dataclasses import dataclass
@@ -177,11 +178,11 @@ class Effect:
 
     # the hook ------------------------------------------------------------------------------------------------------
     def apply(self, x: Tensor, row: Row) -> Any:
-        """The effect without memory."""
+        """Output of an effect without memory."""
         raise NotImplementedError(f"{type(self).__name__} has neither apply nor advance")
 
     def start(self, x: Tensor, row: Row) -> Any:
-        """State before the first row, settled at input `x` (...)."""
+        """State before the first row, in steady state at input `x` (...)."""
         return None
 
     def advance(self, x: Tensor, row: Row, state: Any) -> tuple[Any, Any]:
@@ -204,14 +205,14 @@ class Effect:
 
     # around it -----------------------------------------------------------------------------------------------------
     def noise(self, u: Tensor) -> NoiseChange | None:
-        """What it adds to the noise model under commands `u` (..., time): a random effect's evidence is found by it.
+        """Change of the noise model under commands `u` (..., time), by which a random effect's evidence is computed.
 
         None for a deterministic effect.
         """
         return None
 
     def in_noise(self, accel_sd: float) -> Self:
-        """This effect with what it takes from the accelerometer's white noise `accel_sd` [m/s²] of a log."""
+        """This effect with its settings taken from a log's white accelerometer noise `accel_sd` [m/s²]."""
         return self
 
     def actuator_parameters(self) -> Mapping[str, Tensor]:
@@ -219,68 +220,68 @@ class Effect:
         return {}
 
     def accel_limit(self) -> float | None:
-        """Largest acceleration either way [m/s²] that it lets the car reach; None: no limit."""
+        """Largest acceleration of either sign [m/s²] that the car can reach with it; None: no limit."""
         return None
 
     def settled(self) -> Mapping[str, float]:
-        """Values at which whatever it changes in the course of a drive has changed long before."""
+        """Parameter values at which any change during a drive is long past."""
         return {}
 
     @classmethod
     def starts_in(cls, first: float, last: float) -> Mapping[str, tuple[float, ...]]:
-        """First values for a drive from `first` to `last` [s]."""
+        """Initial values for a drive from `first` to `last` [s]."""
         return cls.starts
 
     @classmethod
     def retried_in(cls, first: float, last: float) -> Mapping[str, tuple[float, ...]]:
-        """Values that one parameter at a time is put to, once the others have found their place."""
+        """Values tried for one parameter at a time, after the others have converged."""
         return cls.starts
 
     @classmethod
     def aliased(cls, values: Mapping[str, float]) -> bool:
-        """Whether it responds as its `alias` says at these `values` of its parameters and of `T_L` [s]."""
+        """Whether it responds as its `alias` states, at these `values` of its parameters and of `T_L` [s]."""
         return True
 
     @classmethod
     def constant_accel(cls, values: Mapping[str, float] | None) -> float | None:
-        """The constant [m/s²] that it adds to the acceleration shown, at `values` of its parameters (None: unknown).
+        """The constant [m/s²] that it adds to the measured acceleration, at `values` of its parameters (None: unknown).
 
-        Where they are unknown, any number of the only sign it can have. None where nothing is known of it.
+        Where they are unknown, any number of the only possible sign. None where it is not known to be constant.
         """
         return None
 
     @classmethod
     def own_search(cls) -> SearchedAs | None:
-        """`searched_as`, where this very class says so: what derives from it has another name, and is a user's own."""
+        """`searched_as`, only if this very class declares it: a derived class is a user's own effect."""
         return vars(cls).get("searched_as")
 
     def coordinates(self) -> tuple[Parameter, ...]:
-        """The parameters of a fit; as `parameters`, unless settings of this very effect enter them."""
+        """The parameters of a fit: `parameters`, unless settings of this instance affect them."""
         return self.parameters
 
     def prepared(self, time: Tensor, speed: Tensor | None, position: Tensor | None) -> Self:
-        """This effect with the settings it takes from a drive (mean speed, span), each (time,)."""
+        """This effect with the settings taken from a drive (mean speed, span), each (time,)."""
         return self
 
     def drawn(self, generator: torch.Generator | None) -> Self:
-        """This effect with whatever is drawn once a drive, drawn."""
+        """This effect with anything that is random once per drive drawn."""
         return self
 
     def lag_apart(self) -> tuple[Self, Tensor | None]:
-        """This effect without what it says about the plant's `T_L` [s], and that `T_L`; None where it says nothing."""
+        """This effect without its own value of the plant's `T_L` [s], and that `T_L`; None where it has none."""
         return self, None
 
     def report(self, T_L: Tensor) -> dict[str, Tensor]:
-        """The parameters as the answer names them, given the plant's lag."""
+        """The parameters under the answer's names, given the plant's lag."""
         return {p.name: tensor(getattr(self, p.name)) for p in self.coordinates() if p.reported}
 
     def values(self) -> dict[str, Tensor]:
-        """The fit's coordinates by name; one not given (None) is left out."""
+        """The fit's coordinates by name, without those that are None."""
         named = {p.name: getattr(self, p.name) for p in self.coordinates()}
         return {name: tensor(value) for name, value in named.items() if value is not None}
 
     def replaced(self, values: Mapping[str, Any]) -> Self:
-        """With other values. Raises `InputError` for a name that is no field of the effect."""
+        """The effect with other values. Raises `InputError` for a name that is no field of the effect."""
         known = {f.name for f in fields(self)}
         for name in values:
             if name not in known:
@@ -289,18 +290,18 @@ class Effect:
 
     @classmethod
     def neutral(cls) -> Self:
-        """The effect that does nothing: the plant is then GLVD to machine precision."""
+        """The effect at its neutral values: the plant is then GLVD to machine precision."""
         return cls(**{p.name: p.neutral for p in cls.parameters if p.neutral is not None})
 
     @classmethod
     def domains(cls) -> dict[str, Domain]:
-        """What each field may hold in a text, and each other name that `of` takes."""
+        """Valid values, in a text, of each field and of each other name that `of` takes."""
         anything = {f.name: Domain(f.name, -_LARGEST, _LARGEST) for f in fields(cls)}
         return anything | {p.name: Domain.of(p) for p in cls.parameters} | {s.name: s for s in cls.settings}
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:
-        """From parameters as the answer names them. Raises `InputError` for other names."""
+        """The effect from parameters under the answer's names. Raises `InputError` for other names."""
         known = {f.name for f in fields(cls)}
         for name in values:
             if name not in known:
@@ -325,7 +326,7 @@ E = TypeVar("E", bound=type[Effect])
 
 
 def register(cls: E) -> E:
-    """Make an effect known by its name (in strings, TOML files and searches). Raises `InputError` if it is taken.
+    """Register an effect by its name (for strings, TOML files and searches). Raises `InputError` if the name is taken.
 
     Example:
         >>> from avtorch import InputError
@@ -363,11 +364,11 @@ def effect_class(name: str, more: Iterable[type[Effect]] = ()) -> type[Effect]:
 
 
 def delay_effect() -> type[Effect]:
-    """The effect that stands for a bare delay: the first one registered with that role."""
+    """The effect that serves as a bare delay: the first one registered with that role."""
     return next(cls for cls in EFFECTS.values() if cls.role == "delay")
 
 
 def delay_key() -> str:
-    """That delay [s] among a plant's parameters."""
+    """The key of that delay [s] among a plant's parameters."""
     kind = delay_effect()
     return f"{kind.name}.{kind.shift}"

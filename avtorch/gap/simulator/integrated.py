@@ -1,6 +1,6 @@
 """A force that is linear in many coefficients, standard normal a priori, which a likelihood integrates out.
 
-Its one parameter in the answer, `size`, scales all of them. A candidate has at most one such effect.
+Its one parameter in the answer, `size`, scales all of them. A hypothesis has at most one such effect.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from avtorch.gap.simulator.effect import Effect
 
 @dataclass(frozen=True)
 class Integrated(Effect):
-    """An effect of the body over position, with so many `knots` coefficients. `size`: the parameter that scales them.
+    """An effect of the body over position, with `knots` coefficients. `size`: the parameter that scales them.
 
-    `prepared` says how many knots a road needs. None of its parameters is a coordinate of a fit: the size is
+    `prepared` sets the number of knots that a road needs. None of its parameters is a coordinate of a fit: the size is
     integrated over a grid, the coefficients in closed form.
     """
 
@@ -37,9 +37,9 @@ class Integrated(Effect):
         raise NotImplementedError(f"{type(self).__name__} has no force")
 
     def magnitude(self, position: Tensor, coefficients: Tensor) -> Tensor:
-        """That whose root mean square is the size, (..., time), likewise."""
+        """The quantity whose root mean square is the size, (..., time), with the same arguments."""
         raise NotImplementedError(f"{type(self).__name__} has no magnitude")
 
     def along(self, coefficients: Tensor, size: float) -> Self:
-        """The effect of `coefficients` (knot,) at size 1, as one of this `size`."""
+        """The effect with this `size`, and `coefficients` (knot,) at size 1."""
         raise NotImplementedError(f"{type(self).__name__} has no along")

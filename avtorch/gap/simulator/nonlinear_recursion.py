@@ -1,8 +1,8 @@
 """Nonlinear recursions over time, all rows at once: x[k] = f_k(x[k-1]).
 
-Newton's method on the whole drive: linearise every row at the guess, solve the linear recursion by a scan, repeat
-(Lim et al. 2024, "Parallelizing non-linear sequential models over the sequence length"). After n rounds the first n
-rows are right whatever f is, and where f is piecewise smooth with slopes in 0 … 1 a handful of rounds does for all.
+Newton's method on the whole drive: linearise every row at the guess, solve the linear recursion by a scan, repeat (Lim
+et al. 2024, "Parallelizing non-linear sequential models over the sequence length"). After n rounds the first n rows are
+exact for any f; where f is piecewise smooth with slopes in 0 … 1, a few rounds suffice for all.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ def solve(
 ) -> Tensor:
     """`x` (..., time) with `x[-1] = start` (...), from a `guess` (..., time), to `tolerance` times its size.
 
-    Rows that are not settled after so many rounds are stepped one by one: slow, and right (`settle` False:
-    they are left as they are, for a guess). First derivatives flow to
-    `start` and to whatever `step` depends on; there are no second ones.
+    Rows that have not converged after the last round are stepped one by one, which is slow but exact (`settle` False:
+    they are left as they are, for a guess). First derivatives flow to `start` and to whatever `step` depends on; there
+    are no second ones.
     """
     whole = slice(0, guess.shape[-1])
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The chain's order, and how the effects before the actuator make up what it is asked."""
+"""The chain's order, and the actuator's input from the effects upstream of it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from avtorch.gap.simulator.effect import PLACES, Effect, Place
 from avtorch.gap.simulator.row import Row
 
 Hook = Callable[[Effect, Tensor], Any]
-"""How an effect with memory is run: `hook(effect, x) -> output`, for one row or a whole drive."""
+"""Runs an effect with memory: `hook(effect, x) -> output`, for one row or a whole drive."""
 
 
 def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
@@ -21,7 +21,7 @@ def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
 
 
 def at_place(effects: Iterable[Effect], place: Place) -> list[Effect]:
-    """The effects that sit there, in order."""
+    """The effects at that place, in order."""
     return [e for e in effects if e.place == place]
 
 
@@ -49,7 +49,7 @@ def substeps(effects: Iterable[Effect], u: Tensor, row: Row, hook: Hook) -> list
 
 
 def actuator_of(effects: Iterable[Effect]) -> Actuator:
-    """What moves to the target: first order, unless effects say otherwise."""
+    """The actuator: first order, unless effects change it."""
     given: dict[str, Tensor] = {}
     for e in effects:
         given |= e.actuator_parameters()

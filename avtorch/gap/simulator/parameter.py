@@ -1,7 +1,7 @@
-"""A parameter of an effect: its unit, what is typical, its prior, and the real line it is fitted on.
+"""A parameter of an effect: its unit, its typical range, its prior, and its unconstrained coordinate for fits.
 
-Every prior is a standard normal `z` seen through a link, `value = link(location + spread z)`, so that the prior of
-`z` needs no Jacobian and every coordinate of a fit has scale one. The typical range holds the prior's central 80 %.
+Every prior is a standard normal `z` passed through a link, `value = link(location + spread z)`, so the prior of `z`
+needs no Jacobian and every coordinate of a fit has scale one. The typical range holds the prior's central 80 %.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Constraint = Literal["real", "positive", "negative", "unit", "interval"]
 
 _CENTRAL_80 = 1.2815515655446004  # normal quantile of 0.9
 _LOG_2PI = math.log(2 * math.pi)
-_AS_FAR = 3.0  # times the typical range, where an effect does not say what is possible
+_AS_FAR = 3.0  # multiple of the typical range, where an effect does not state what is possible
 
 # torch.special has no types
 _normal_distribution = cast(Callable[[Tensor], Tensor], torch.special.ndtr)  # pyright: ignore[reportUnknownMemberType]
@@ -33,11 +33,11 @@ class Parameter:
 
     `constraint` is the link: `"real"` the value itself, `"positive"` its log, `"negative"` the log of its opposite,
     `"unit"` (0 to 1) its logit, `"interval"` uniform from `low` to `high`, by the normal distribution function.
-    `reported` False: a coordinate that the table of effects does not name, fitted and kept out of the answer.
-    `size`: 1, or the length of a vector-valued coordinate, then on its last dimension. `of_onset`: one that can only be
-    identified where an effect sets in during a drive, and rests at its prior's centre elsewhere.
-    `possible`: what physics allows at all; an answer that lies wholly outside says so, with the reason `beyond` ("wind
-    and road do not do this"). Default: three times the typical range, on the link's scale.
+    `reported` False: a coordinate that is fitted but not part of the answer. `size`: 1, or the length of a
+    vector-valued coordinate, then on its last dimension. `of_onset`: identifiable only where an effect has an onset
+    during a drive, and held at its prior's centre elsewhere. `possible`: the physically possible range; an answer
+    entirely outside it is reported as implausible, with the reason `beyond` ("wind and road do not do this"). Default:
+    three times the typical range, on the link's scale.
 
     Raises `InputError` for a range that is empty or outside the constraint.
 
@@ -87,7 +87,7 @@ class Parameter:
 
     @property
     def physical(self) -> tuple[float, float]:
-        """Least and greatest value that physics allows: `possible`, or what stands in for it."""
+        """The physically possible least and greatest value: `possible`, or its default."""
         if self.possible is not None:
             return self.possible
         if self.constraint == "interval":

@@ -1,6 +1,6 @@
-"""A simulator out of effects: GLVD, and what the car does besides.
+"""A simulator composed of effects: GLVD, and deviations of the car from it.
 
-`plant([DeadTime(0.2), AerodynamicDrag()])` composes them in the chain's order. The result answers whole drives
+`plant([DeadTime(0.2), AerodynamicDrag()])` composes them in the chain's order. The result responds to whole drives
 (`response`, batched over parameters, differentiable) and drives in `avtorch.simulate` step by step (`step`).
 """
 
@@ -54,11 +54,12 @@ Example:
 class GapPlant:
     """A plant with `effects`, `T_L` [s], `K_L` [-], jerk noise `sigma` [m/s³]; made by `plant`.
 
-    For the loop it is a `Plant`: the acceleration it returns is the *measured* one, so logs and controllers see the
-    sensor's faults, while the car moves by the true one. It remembers the drive (commands under way, position, time
-    since its first step) for as long as it is handed back the acceleration it gave, as a loop does; any other
-    acceleration starts a drive anew, settled there. `reset()` does so by force. A copy goes on by itself. Parameters
-    are floats or tensors (scenario,); `seed` is of the random effects. Raises `InputError` for an effect given twice.
+    In the closed loop it is a `Plant`: the acceleration it returns is the *measured* one, so logs and controllers
+    receive the sensor's faults, while the car moves by the true one. It keeps the state of the drive (commands in
+    transit, position, time since its first step) for as long as it is given the acceleration that it returned, as a
+    loop does; any other acceleration starts a new drive in steady state at that value. `reset()` forces a new drive. A
+    copy continues independently. Parameters are floats or tensors (scenario,); `seed` is of the random effects. Raises
+    `InputError` for an effect given twice.
 
     Example:
         >>> from avtorch.gap import GapPlant
@@ -82,7 +83,7 @@ class GapPlant:
         return f"plant({list(self.effects)}, T_L={self.T_L}, K_L={self.K_L})"
 
     def __deepcopy__(self, memo: dict[int, Any]) -> GapPlant:
-        return copy.copy(self)  # nothing in it is ever written to
+        return copy.copy(self)  # instances are never modified
 
     # parameters ----------------------------------------------------------------------------------------------------
     def parameters(self) -> dict[str, Parameter]:
@@ -91,7 +92,7 @@ class GapPlant:
         return own | {f"{e.name}.{p.name}": p for e in self.effects for p in e.coordinates()}
 
     def values(self) -> dict[str, Tensor]:
-        """Their present values; those that are not set (a slope's profile) are left out."""
+        """Their current values; those that are not set (a grade's profile) are left out."""
         own = {"T_L": tensor(self.T_L), "K_L": tensor(self.K_L)}
         return own | {f"{e.name}.{key}": value for e in self.effects for key, value in e.values().items()}
 
@@ -121,11 +122,11 @@ class GapPlant:
         return GapPlant(effects, T_L=self.T_L, K_L=self.K_L, sigma=self.sigma, seed=self.seed)
 
     def report(self) -> dict[str, dict[str, Tensor]]:
-        """Parameters by effect, as an answer names them."""
+        """Parameters by effect, under the answer's names."""
         return {e.name: e.report(tensor(self.T_L)) for e in self.effects}
 
     def noise(self, command: Tensor) -> dict[str, NoiseChange]:
-        """What the random effects do to the noise model under commands (..., time)."""
+        """Change of the noise model by each random effect under commands (..., time)."""
         changes = {e.name: e.noise(command) for e in self.effects}
         return {name: change for name, change in changes.items() if change is not None}
 
@@ -141,9 +142,9 @@ class GapPlant:
         """The noise-free response to `drive`; with a `generator`, one in which the random effects are drawn.
 
         `parameters` by the names of `parameters()`, in their own units, each (...), which broadcast with the drive's
-        leading dimensions (a vector-valued one has its size on a further, last dimension). What is missing keeps the
-        plant's own value. Differentiable in all of them. Speed-dependent effects look at the drive's measured speed.
-        `actuator0` (...) [m/s²]: where the actuator stands at the first row, in place of what the drive says of it.
+        leading dimensions (a vector-valued one has its size on a further, last dimension). Missing ones keep the
+        plant's own value. Differentiable in all of them. Speed-dependent effects use the drive's measured speed.
+        `actuator0` (...) [m/s²]: the actuator's state at the first row, instead of the one given by the drive.
         """
         this = self if parameters is None else self.with_values(parameters)
         return rollout(this.effects, tensor(this.T_L), tensor(this.K_L), drive, generator, actuator0=actuator0)
@@ -159,7 +160,7 @@ class GapPlant:
         return motion
 
     def reset(self) -> None:
-        """Forget the drive: the next step starts one anew."""
+        """Discard the state of the drive: the next step starts a new one."""
         self._past = None
 
     # as text -------------------------------------------------------------------------------------------------------
@@ -169,7 +170,8 @@ class GapPlant:
 
     @classmethod
     def from_toml(cls, text: str, *, effects: Iterable[type[Effect]] = ()) -> GapPlant:
-        """From TOML: `T_L`, `K_L`, `sigma`, and a table of parameters for each effect; or from `"dead_time=0.2"`.
+        """The plant from TOML: `T_L`, `K_L`, `sigma`, and a table of parameters for each effect; or from
+        `"dead_time=0.2"`.
 
         `effects`: classes besides the registered ones. Raises `InputError` for unknown names and wrong values.
         """
@@ -185,12 +187,12 @@ def plant(
     baseline: GapPlant | str | PathLike[str] | None = None,
     seed: int = 0,
 ) -> GapPlant:
-    """A plant with `effects` (a class stands for its typical values) on top of a `baseline`.
+    """A plant with `effects` (a class has its typical values) on top of a `baseline`.
 
-    `baseline`: the user's own simulator, as a plant, as a string such as `"dead_time=0.2"` (`"glvd"`: none), or a
-    TOML file (a string that ends in `.toml` or names a file is one); an effect given here takes the place of the
-    baseline's of that name. `T_L` [s], `K_L` [-] and the jerk noise `sigma` [m/s³] default to the baseline's, or 0.3,
-    1 and 0.1. Raises `InputError` for bad values or a file that is not there.
+    `baseline`: the user's own simulator, as a plant, as a string such as `"dead_time=0.2"` (`"glvd"`: none), or a TOML
+    file (a string that ends in `.toml` or names a file); an effect given here replaces the baseline's of that name.
+    `T_L` [s], `K_L` [-] and the jerk noise `sigma` [m/s³] default to the baseline's, or 0.3, 1 and 0.1. Raises
+    `InputError` for bad values or a missing file.
 
     Example:
         >>> from avtorch import Leader, simulate
@@ -229,7 +231,7 @@ def plant(
 
 
 def _joined(parts: Sequence[Tensor | None]) -> Tensor | None:
-    """The first of each part's (..., time), one after another, (time,)."""
+    """The parts' first batch elements of (..., time), concatenated, (time,)."""
     flat = [x.reshape(-1, x.shape[-1])[0] for x in parts if x is not None]
     return torch.cat(flat) if flat else None
 

@@ -26,24 +26,25 @@ _BASELINE = (
     Domain("sigma", 0.0, 1e3, "m/s³"),
 )
 _DOMAINS = {domain.name: domain for domain in _BASELINE}
-"""What the values of the baseline may be."""
+"""Valid values of the baseline's parameters."""
 
-_LONGEST = 10_000  # characters of a plant in words
+_LONGEST = 10_000  # most characters of a plant as a short string
 
 
 @dataclass(frozen=True)
 class Described:
-    """A plant in words: the values of the `baseline` that were given, and the effects."""
+    """A plant read from text: the given values of the `baseline`, and the effects."""
 
     baseline: dict[str, float]
     effects: list[Effect]
 
 
 def described(text: str, more: Iterable[type[Effect]] = ()) -> Described:
-    """From TOML or a short string; `"glvd"` or nothing is the bare GLVD. Raises `InputError` for what is wrong in it.
+    """A plant from TOML or a short string; `"glvd"` or nothing is bare GLVD. Raises `InputError` for errors in the
+    text.
 
-    In a short string an effect's name stands for its first parameter, `effect.parameter` for any, and an effect
-    without a value takes its typical ones.
+    In a short string an effect's name sets its first parameter, `effect.parameter` any, and an effect without a value
+    has its typical ones.
     """
     if "\n" in text or "[" in text:
         return _of(parse_toml(text, "plant"), more)
@@ -77,7 +78,7 @@ def described(text: str, more: Iterable[type[Effect]] = ()) -> Described:
 
 
 def names_a_file(text: str) -> bool:
-    """Whether a string is a file's name, there or missing, and not a plant in words."""
+    """Whether a string is a file's name, existing or missing, and not a plant as text."""
     if "\n" in text or text.strip().lower() in ("", "glvd"):
         return False
     try:
@@ -87,7 +88,7 @@ def names_a_file(text: str) -> bool:
 
 
 def read_file(path: str | PathLike[str], more: Iterable[type[Effect]] = ()) -> Described:
-    """From a TOML file of up to 1 MB. Raises `InputError` where it cannot be read."""
+    """A plant from a TOML file of up to 1 MB. Raises `InputError` where it cannot be read."""
     if not os.path.lexists(path):
         raise InputError(f"plant: {place(path)}: no such file; needs a TOML file, or effects such as dead_time=0.2")
     try:
@@ -97,10 +98,10 @@ def read_file(path: str | PathLike[str], more: Iterable[type[Effect]] = ()) -> D
 
 
 def to_toml(effects: Iterable[Effect], baseline: Mapping[str, Any]) -> str:
-    """TOML that `described` reads back to the same numbers."""
+    """TOML from which `described` reads the same numbers."""
     lines = [f"{name} = {_number(name, value)}" for name, value in baseline.items()]
     for given in effects:
-        effect, _ = given.lag_apart()  # T_L stands there already
+        effect, _ = given.lag_apart()  # T_L is already written there
         lines += ["", f"[{effect.name}]"]
         for f in fields(effect):
             value = getattr(effect, f.name)
@@ -134,7 +135,7 @@ def _of(tables: Mapping[str, Any], more: Iterable[type[Effect]]) -> Described:
         cls = effect_class(name, more)
         table = value if isinstance(value, Mapping) else {_first(cls): value}
         domains = cls.domains()
-        # a name that is not known goes on as it is: the effect refuses it and says what it knows
+        # an unknown name is passed on: the effect rejects it and lists the known ones
         given = {key: domains[key].value(f"{name}.{key}", x) if key in domains else x for key, x in table.items()}
         if "profile" in given:
             given["profile"] = tensor(given["profile"])
@@ -143,5 +144,5 @@ def _of(tables: Mapping[str, Any], more: Iterable[type[Effect]]) -> Described:
 
 
 def _first(cls: type[Effect]) -> str:
-    """The first parameter as the answer names it."""
+    """The first parameter under the answer's name."""
     return next(iter(cls().report(tensor(0.3))))

@@ -1,8 +1,9 @@
-"""Rate-limited recursions row by row, in NumPy, many stretches of the drive at once.
+"""Rate-limited recursions row by row, in NumPy, with many stretches of the drive in parallel.
 
-Each stretch first starts at its target, then where the one before it ended, until that no longer changes: a lag forgets
-its start, so a few passes do for all. Where a limit binds for long nothing is forgotten and there are more of them, at
-worst as many as stretches. The batch is the inner dimension, so a hundred columns cost hardly more than one.
+Each stretch first starts at its target, then at the end of the previous one, until that no longer changes: a lag
+forgets its initial state, so a few passes suffice. Where a limit binds for long the initial state is not forgotten and
+more passes are needed, at worst as many as stretches. The batch is the inner dimension, so a hundred columns cost
+hardly more than one.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _SAME = 1e-13  # [m/s²]
 
 
 class Held(Protocol):
-    """A part of each step: what is aimed at, the lag and the length, (...) or (..., time)."""
+    """A part of each step: its target, lag and length, (...) or (..., time)."""
 
     @property
     def target(self) -> Tensor: ...
@@ -69,7 +70,7 @@ def by_rows(step: RowStep, start: Tensor, parts: Sequence[Held], jerk: Tensor) -
                 state = step(state, target(k), lag(k), length(k), bound)
             known = np.abs(state - out[k]).max() <= _SAME
             out[k] = state
-            if known:  # and so is what follows
+            if known:  # and so are the rows that follow
                 break
         ends = np.concatenate([first[None], out[-1, :-1]])
         if np.abs(ends - begin).max() <= _SAME:
@@ -84,7 +85,7 @@ def _tensors(part: Held) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _by_time(x: Tensor, shape: tuple[int, ...], count: int, size: int) -> Any:
-    """`at(k)`: values (stretch, batch) at row `k` of each; what does not change over time is laid out once."""
+    """`at(k)`: values (stretch, batch) at row `k` of each; what is constant over time is stored once."""
     if x.dim() == 0 or x.shape[-1] == 1:
         once = x.expand(*shape[:-1], 1).reshape(-1).numpy() if x.dim() else np.asarray(float(x))
         return lambda k: once

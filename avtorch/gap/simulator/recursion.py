@@ -2,13 +2,14 @@
 
     x[k] = alpha[k] x[k-1] + beta[k],    x[-1] = start
 
-as a blocked scan: rows are cut into about sqrt(N) blocks that are stepped side by side, each from zero; then the
-blocks' ends are joined, and what each block inherits is added. 2 sqrt(N) small tensor operations instead of N, no
-truncation and products only, so nothing overflows where alpha is zero. The derivative of a linear recursion is a
-linear recursion (backward in time for the gradient, forward for a tangent), hence derivatives of any order.
+as a blocked scan: rows are cut into about sqrt(N) blocks that are stepped in parallel, each from zero; then the blocks'
+ends are chained, and each block adds its inherited state. This takes 2 sqrt(N) small tensor operations instead of N,
+without truncation and with products only, so nothing overflows where alpha is zero. The derivative of a linear
+recursion is a linear recursion (backward in time for the gradient, forward for a tangent), hence derivatives of any
+order.
 
-`scan` takes a scalar state, `scan_pair` a state of two components with 2 x 2 matrices. In `torch.inference_mode`,
-where nobody will ask for a derivative, constant recursions pass SciPy's filter, a dozen times as fast.
+`scan` takes a scalar state, `scan_pair` a state of two components with 2 x 2 matrices. In `torch.inference_mode`, where
+no derivatives are needed, constant recursions use SciPy's filter, a dozen times as fast.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ def scan_pair(
 
 
 def _filtered(bottom: _Components, tops: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """The sum of inputs (..., time), each through `top / (1 + bottom[0] / z + ...)`, every column its own filter."""
+    """Sum of inputs (..., time), each through `top / (1 + bottom[0] / z + ...)`, every column with its own filter."""
     shape = tops[0][1].shape
     below = torch.stack([torch.ones_like(bottom[0]), *bottom], -1).reshape(-1, len(bottom) + 1).numpy()
     total = torch.zeros(shape, dtype=torch.float64).reshape(-1, shape[-1])
@@ -85,7 +86,7 @@ def _filtered(bottom: _Components, tops: list[tuple[Tensor, Tensor]]) -> Tensor:
 
 
 def _aligned(n: int, alpha: _Components, beta: _Components, start: _Components) -> list[Any]:
-    """One batch shape for all, one length of time for each kind."""
+    """All inputs with one batch shape, and one length of time for each kind."""
     start = [s.unsqueeze(-1) for s in start]
     shape = np.broadcast_shapes(*(x.shape[:-1] for x in (*alpha, *beta, *start)))
     steps = max(x.shape[-1] for x in (*alpha, *beta))
@@ -176,7 +177,7 @@ def _blocked(n: int, alpha: _Components, beta: _Components, start: _Components) 
         power = _product(n, step, power)
         own.append(state)
         reach.append(power)
-    # what each block inherits: the ends of the ones before, itself a scan over blocks
+    # state inherited by each block: the ends of the earlier ones, by a scan over blocks
     ends = [x.expand_as(state[0]) for x in state]
     whole = [p if constant else p.expand_as(state[0]) for p in power]
     joined = _blocked(n, whole, ends, start)
@@ -191,7 +192,7 @@ def _blocked(n: int, alpha: _Components, beta: _Components, start: _Components) 
 
 
 def _cut(x: Tensor, blocks: int, length: int) -> tuple[Tensor, ...]:
-    """(..., time) as `length` contiguous tensors (..., block): the rows at one place within their blocks."""
+    """(..., time) as `length` contiguous tensors (..., block): the rows at one position within their blocks."""
     short = blocks * length - x.shape[-1]
     if short:
         x = torch.cat([x, x.new_zeros(()).expand(*x.shape[:-1], short)], -1)

@@ -1,4 +1,4 @@
-"""A plant's response to whole drives, all rows and all candidates at once."""
+"""A plant's response to whole drives, all rows and all parameter columns at once."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from avtorch.gap.simulator.order import actuator_of, at_place, substeps
 from avtorch.gap.simulator.row import Row, row_at
 
 STANDS_MPS = 0.1
-"""Below this measured speed the car stands and its acceleration is nought [m/s]."""
+"""Measured speed below which the car stands and its acceleration is zero [m/s]."""
 
 
 def rollout(
@@ -49,7 +49,7 @@ def rollout(
         accel0 = actuator0
     elif drive.accel0 is not None:
         accel0 = start = torch.as_tensor(drive.accel0).expand(shape[:-1])
-        # the actuator gives what the car does beyond the other forces
+        # the actuator's share is the car's acceleration less the other forces
         for e in at_place(single, "body"):
             if e.gravity and drive.specific_force:
                 continue
@@ -69,7 +69,7 @@ def rollout(
             measured = measured - force if e.gravity else measured
     sensors = at_place(whole, "sensor")
     if sensors and drive.speed is not None:
-        # a late sensor shows the standstill for a while after it
+        # the reading of a lagging sensor reaches zero some time after the car stops
         measured = torch.where(drive.speed < STANDS_MPS, 0.0, measured)
     for e in sensors:
         measured = e.over(measured, rows[e.name])
@@ -79,7 +79,7 @@ def rollout(
 
 
 def _shape(effects: list[Effect], row: Row, drive: Drive) -> torch.Size:
-    """(..., time): everything broadcast."""
+    """The common shape (..., time) of all inputs."""
     shapes = [drive.command.shape, row.T_L.shape, row.K_L.shape]
     shapes += [x.shape for x in (drive.speed,) if x is not None]
     shapes += [(*x.shape, 1) for x in (drive.accel0,) if isinstance(x, Tensor)]

@@ -1,4 +1,4 @@
-"""Effects that set in during a drive: until then the baseline, from then on the whole plant, begun where the car is."""
+"""Rollouts with an onset: the baseline before it, the whole plant from then on, started in the car's state."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ def rollout_from_onset(
 ) -> list[Response]:
     """Responses to all drives of `without` before `place` and of `plant` from there on, both with these parameters.
 
-    What the plant keeps in mind (a command on its way, a filter's state) begins at rest there, the actuator where
-    `without` has brought it. A baseline with effects of its own would lose what it keeps in mind: there the car goes on
-    as if it had always been the plant, but for its speed.
+    The plant's memory (a command in transit, a filter's state) starts in steady state there, the actuator in the state
+    that `without` has reached. A baseline with effects of its own would lose their memory: in that case the car
+    continues as if it had always been the plant, except for its speed.
     """
     base = {key: value for key, value in values.items() if key in ("T_L", "K_L")}
     drive, row = drives[place.drive], place.row

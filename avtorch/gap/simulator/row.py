@@ -1,4 +1,4 @@
-"""What an effect may look at besides its input: the signals of one row, or of whole drives at once."""
+"""The input of an effect besides its signal: the signals of one row, or of whole drives at once."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from avtorch.errors import InputError
 
 @dataclass(frozen=True)
 class Row:
-    """What an effect may look at besides its input: one row (...) while simulating, whole drives (..., time) else.
+    """The input of an effect besides its signal: one row (...) in simulation, whole drives (..., time) otherwise.
 
     `time` [s] and step `dt` [s] to the next row; `position` [m] since the drive's start; the baseline's `T_L` [s],
     `K_L` [-]; `normal`, standard normal draws for an effect that samples, None where the response is deterministic.
@@ -37,14 +37,14 @@ class Row:
 
     @property
     def speed(self) -> Tensor:
-        """[m/s], not below 0; measured, where the drive is a log. Raises `InputError` where it was not."""
+        """[m/s], not below 0; the measured speed, if the drive is a log. Raises `InputError` if it was not measured."""
         if self.measured_speed is None:
             raise InputError("speed: not in the drive, needed by an effect that depends on it")
         return self.measured_speed.clamp_min(0.0)
 
     @property
     def position(self) -> Tensor:
-        """[m], the measured speed integrated. Raises `InputError` where it was not measured."""
+        """[m], the integrated measured speed. Raises `InputError` where it was not measured."""
         if self.travelled is None:
             raise InputError("speed: not in the drive, needed by an effect that depends on position")
         return self.travelled

@@ -1,7 +1,7 @@
-"""A plant step by step: what it carries between steps, and one step of it.
+"""A plant step by step: its state between steps, and one step of it.
 
-The forces of the body are integrated by trapezoids, as over whole drives; those that depend on the speed at the
-step's end are found by fixed-point rounds, each of which gains some three digits.
+The forces of the body are integrated by trapezoids, as over whole drives; those that depend on the speed at the end of
+the step are found by fixed-point iterations, each of which gains some three digits.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _ROUNDS = 5
 
 @dataclass(frozen=True)
 class Past:
-    """What a drive carries from step to step; never written to, so copies share it."""
+    """The state of a drive from step to step; never modified, so copies share it."""
 
     effects: tuple[Effect, ...]
     T_L: Tensor
@@ -34,8 +34,8 @@ class Past:
     noise: dict[str, Noise]
     row: int
     time: float
-    dt: float  # of the step that led here
-    seen: Tensor  # the acceleration handed to the loop
+    dt: float  # the step that led to this state
+    seen: Tensor  # the acceleration returned to the loop
     speed: Tensor
     position: Tensor
     actuator: ActuatorState
@@ -44,10 +44,10 @@ class Past:
 
 
 def goes_on(past: Past, a: Tensor) -> bool:
-    """Whether `a` is what the last step gave, hence the same drive.
+    """Whether `a` is the acceleration that the last step returned, hence the same drive.
 
-    The same memory (also where a loop's copy expanded it), or equal values. A car at rest without any acceleration
-    looks like any other, so there the values alone do not tell.
+    This holds for the same memory (also where a loop's copy expanded it), or for equal values. Equal values do not
+    identify a car at rest without acceleration.
     """
     if a.data_ptr() == past.seen.data_ptr():
         return True
@@ -59,7 +59,7 @@ def goes_on(past: Past, a: Tensor) -> bool:
 def begin(
     effects: tuple[Effect, ...], a: Tensor, v: Tensor, u: Tensor, dt: float, T_L: Tensor, K_L: Tensor, seed: int
 ) -> Past:
-    """A drive that starts at the car's acceleration `a` and speed `v`, its commands settled at `u`."""
+    """A drive that starts at the car's acceleration `a` and speed `v`, its commands in steady state at `u`."""
     effects = tuple(
         e.drawn(torch.Generator().manual_seed(_stream(e.name, seed)) if e.place == "body" else None) for e in effects
     )
@@ -70,7 +70,7 @@ def begin(
     past = Past(effects, T_L, K_L, noise, 0, 0.0, dt, a, v, zero, ActuatorState(a), zero, {})
     row = _row(past, 0.0, v, zero, dt)
     memory: dict[str, Any] = {}
-    for e in effects:  # each settled at what the one before gives
+    for e in effects:  # each in steady state at the previous one's output
         if e.place in ("command", "actuator"):
             at = _draw(past, e, row, past.row)
             memory[e.name] = e.start(u, at)
@@ -81,7 +81,7 @@ def begin(
     for e in bodies:
         at = _draw(past, e, row, past.row)
         force = force + e.advance(a, at, e.start(a, at))[0]
-    own = a - force  # the actuator gives what the car does beyond the other forces
+    own = a - force  # the actuator's share is the car's acceleration less the other forces
     for e in bodies:
         at = _draw(past, e, row, past.row)
         memory[e.name] = e.advance(own, at, e.start(own, at))[1]
@@ -93,8 +93,8 @@ def begin(
 
 
 def move(past: Past, v: Tensor, u: Tensor, dt: float, eps: Tensor) -> tuple[Motion, Past]:
-    """One step, command `u` and jerk noise `eps` held: `(measured acceleration, speed, displacement)`, and the past."""
-    # by trapezoids of the speeds, as a log's is
+    """One step, `u` and jerk noise `eps` held: `(measured acceleration, speed, displacement)` and the new state."""
+    # by trapezoids of the speeds, as for a log
     position = past.position if past.row == 0 else past.position + 0.5 * past.dt * (past.speed + v)
     row = _row(past, past.time, v, position, dt)
     number, time = past.row + 1, past.time + dt
