@@ -85,7 +85,7 @@ def read(truth: Mapping[str, Any], answer: Mapping[str, Any] | None) -> Answered
     if abs(sum(probabilities.values()) - 1) > 1e-6 or min(probabilities.values(), default=-1) < 0:
         raise InputError(f"{of}: probabilities sum to {sum(probabilities.values()):.8g}, need 1 and none below 0")
     if not {"none", "unknown"} <= probabilities.keys():
-        raise InputError(f"{of}: found {', '.join(probabilities)}, needs none and unknown among the candidates")
+        raise InputError(f"{of}: found {', '.join(probabilities)}, needs none and unknown among the hypotheses")
     verdict = joined(answer["verdict"]["names"])
     named_right = verdict == truth["verdict"]
     return Answered(

@@ -36,7 +36,7 @@ class Case:
     Example:
         >>> from avtorch.blindtest import draw_case
         >>> case = draw_case(0, seed=1, mix={"single": 1.0}, effects=["sensor_bias"], tiers=["easy"], seconds=20.0)
-        >>> case.truth_name, case.tier, "sensor_bias" in str(case.log())  # the log does not tell
+        >>> case.truth_name, case.tier, "sensor_bias" in str(case.log())  # not in the log
         ('sensor_bias', 'easy', False)
     """
 

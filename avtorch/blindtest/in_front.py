@@ -104,7 +104,7 @@ def put_in_front(
         if not (np.isfinite(value) and value > 0):
             raise InputError(f"{name}: found {value}, needs a finite number above 0")
     if log.accel_cmd is None:
-        raise InputError(f"{log.name}: has no accel_cmd, in front of which an effect could be put")
+        raise InputError(f"{log.name}: has no accel_cmd, which is needed to add an effect")
     bench = _Bench(log, log.accel_cmd, float(T_L), float(K_L), float(size), np.random.default_rng(seed))
     return IN_FRONT[effect](bench)
 

@@ -42,7 +42,7 @@ class AerodynamicDrag(Effect):
     starts = fixed(drag_per_m=(5e-5, 4e-4))
     parameters = (
         Parameter(
-            "drag_per_m", "1/m", 0.0, 2e-4, 6e-4, possible=(0.0, 3e-3), beyond="air does not hold a car like that"
+            "drag_per_m", "1/m", 0.0, 2e-4, 6e-4, possible=(0.0, 3e-3), beyond="no car has that much air resistance"
         ),
         Parameter("wind_mps", "m/s", None, -4.0, 4.0, "real", reported=False),
     )

@@ -41,10 +41,10 @@ class BrakeThrottleAsymmetry(Effect):
     starts = fixed(brake_gain_ratio=(0.6, 0.95, 1.2), brake_lag_ratio=(1.0, 2.5))
     parameters = (
         Parameter(
-            "brake_gain_ratio", "-", 1.0, 0.5, 0.9, possible=(0.2, 5.0), beyond="brake and drive do not differ so"
+            "brake_gain_ratio", "-", 1.0, 0.5, 0.9, possible=(0.2, 5.0), beyond="brakes and engine differ by less"
         ),
         Parameter(
-            "brake_lag_ratio", "-", 1.0, 1.3, 3.0, possible=(0.1, 10.0), beyond="brake and drive do not differ so"
+            "brake_lag_ratio", "-", 1.0, 1.3, 3.0, possible=(0.1, 10.0), beyond="brakes and engine differ by less"
         ),
     )
 

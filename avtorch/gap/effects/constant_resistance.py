@@ -49,7 +49,7 @@ class ConstantResistance(Effect):
             0.05,
             0.3,
             possible=(0.0, 3.5),
-            beyond="nothing holds a moving car like that",
+            beyond="no moving car has that much resistance",
         ),
     )
 

@@ -46,7 +46,7 @@ class DeadTime(Effect):
     equation = "u(t - tau)"
     role = "delay"
     starts = fixed(delay_s=(0.03, 0.07, 0.13, 0.22, 0.35, 0.55))
-    parameters = (Parameter("delay_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.5), beyond="no command takes that long"),)
+    parameters = (Parameter("delay_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.5), beyond="no command is that late"),)
 
     def start(self, x: Tensor, row: Row) -> list[Tensor]:
         return [x]

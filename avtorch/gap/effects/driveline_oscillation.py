@@ -57,9 +57,9 @@ class DrivelineOscillation(Effect):
         quadrature=(0.05,),
     )
     parameters = (
-        Parameter("frequency_hz", "Hz", None, 1.0, 5.0, possible=(0.3, 15.0), beyond="no driveline rings there"),
+        Parameter("frequency_hz", "Hz", None, 1.0, 5.0, possible=(0.3, 15.0), beyond="no driveline has such a mode"),
         Parameter(
-            "amplitude", "-", 0.0, -0.5, 0.5, "real", possible=(-2.0, 2.0), beyond="no driveline rings so loudly"
+            "amplitude", "-", 0.0, -0.5, 0.5, "real", possible=(-2.0, 2.0), beyond="no driveline rings that strongly"
         ),
         Parameter("quadrature", "-", 0.0, -0.5, 0.5, "real", reported=False),
         Parameter("mode_damping", "-", None, 0.03, 0.2, reported=False),

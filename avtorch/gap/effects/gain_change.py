@@ -56,7 +56,7 @@ class GainChange(Effect):
     commutes = True
     starts = fixed(ramp_s=(0.3, 3.0, 30.0))
     parameters = (
-        Parameter("gain_ratio", "-", 1.0, 0.65, 1.4, possible=(0.2, 5.0), beyond="payload and fading brakes do less"),
+        Parameter("gain_ratio", "-", 1.0, 0.65, 1.4, possible=(0.2, 5.0), beyond="payload and brake fade do less"),
         Parameter("change_s", "s", None, 0.0, 60.0, "interval", possible=(-math.inf, math.inf)),
         Parameter("ramp_s", "s", None, 0.5, 60.0, reported=False),
     )

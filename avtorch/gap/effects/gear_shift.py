@@ -61,7 +61,7 @@ class GearShift(Effect):
     )
     parameters = (
         Parameter("depth", "-", 0.0, 0.3, 0.95, "unit"),
-        Parameter("duration_s", "s", None, 0.1, 0.6, possible=(0.02, 2.5), beyond="no gearbox shifts like that"),
+        Parameter("duration_s", "s", None, 0.1, 0.6, possible=(0.02, 2.5), beyond="no gear shift has that duration"),
         Parameter("first_mps", "m/s", None, 3.0, 7.0, reported=False),
         Parameter("gear_ratio", "-", None, 1.3, 1.8, reported=False),
     )

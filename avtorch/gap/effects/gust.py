@@ -50,7 +50,7 @@ class Gust(Effect):
     parameters = (
         Parameter("sd_mps2", "m/s²", 0.0, 0.1, 0.4, possible=(0.0, 0.6), beyond="wind and road do not do this"),
         Parameter(
-            "time_constant_s", "s", None, 1.0, 5.0, possible=(0.2, 60.0), beyond="wind and road change otherwise"
+            "time_constant_s", "s", None, 1.0, 5.0, possible=(0.2, 60.0), beyond="gusts have other time constants"
         ),
     )
 

@@ -44,7 +44,7 @@ class LowSpeedCreep(Effect):
     pictured = 1.0
     starts = fixed(creep_mps2=(0.05, 0.3))
     parameters = (
-        Parameter("creep_mps2", "m/s²", 0.0, 0.1, 0.5, possible=(0.0, 1.5), beyond="no car creeps like that"),
+        Parameter("creep_mps2", "m/s²", 0.0, 0.1, 0.5, possible=(0.0, 1.5), beyond="no car creeps that strongly"),
     )
 
     def apply(self, x: Tensor, row: Row) -> Tensor:

@@ -51,7 +51,7 @@ class Outliers(Effect):
     noise_parameters = fixed(tail_fraction="fraction", tail_scale="scale")
     parameters = (
         Parameter(
-            "fraction", "-", 0.0, 0.005, 0.05, "unit", possible=(0.0, 0.3), beyond="so many are no single samples"
+            "fraction", "-", 0.0, 0.005, 0.05, "unit", possible=(0.0, 0.3), beyond="outliers are not that frequent"
         ),
         Parameter("scale", "sigma", None, 5.0, 10.0, possible=(2.0, 1000.0), beyond="outliers are not of that size"),
     )

@@ -49,7 +49,7 @@ class RateLimit(Effect):
             0.5,
             4.0,
             possible=(0.1, 50.0),
-            beyond="no actuator is bound like that",
+            beyond="no actuator has that rate limit",
         ),
     )
 

@@ -46,7 +46,7 @@ class Saturation(Effect):
     )
     parameters = (
         Parameter(
-            "accel_max_mps2", "m/s²", float("inf"), 0.8, 2.0, possible=(0.1, 12.0), beyond="no drive is cut there"
+            "accel_max_mps2", "m/s²", float("inf"), 0.8, 2.0, possible=(0.1, 12.0), beyond="no engine saturates there"
         ),
         Parameter(
             "accel_min_mps2",
@@ -56,7 +56,7 @@ class Saturation(Effect):
             -1.5,
             "negative",
             possible=(-12.0, -0.3),
-            beyond="no brakes are cut there",
+            beyond="no brakes saturate there",
         ),
     )
 

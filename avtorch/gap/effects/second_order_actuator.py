@@ -59,9 +59,9 @@ class SecondOrderActuator(Effect):
     )
     derived = (
         Parameter(
-            "natural_frequency_radps", "rad/s", None, 3.0, 12.0, possible=(0.5, 60.0), beyond="no actuator swings there"
+            "natural_frequency_radps", "rad/s", None, 3.0, 12.0, possible=(0.5, 60.0), beyond="impossible for actuators"
         ),
-        Parameter("damping_ratio", "-", None, 0.2, 0.9, possible=(0.03, 5.0), beyond="no actuator is damped like that"),
+        Parameter("damping_ratio", "-", None, 0.2, 0.9, possible=(0.03, 5.0), beyond="no actuator has that damping"),
     )
     settings = (Domain("natural_frequency_radps", 1e-3, 1e5, "rad/s"), Domain("damping_ratio", 1e-3, 1e3))
 

@@ -49,7 +49,7 @@ class SensorBias(Effect):
             0.25,
             "real",
             possible=(-1.0, 1.0),
-            beyond="no accelerometer is off like that",
+            beyond="no accelerometer has that offset",
         ),
     )
 

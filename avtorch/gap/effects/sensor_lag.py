@@ -44,7 +44,7 @@ class SensorLag(Effect):
     alias = "pole"
     reading = fixed(lag="lag_s")
     starts = fixed(lag_s=(0.03, 0.1, 0.2, 0.4))
-    parameters = (Parameter("lag_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.0), beyond="no accelerometer is that late"),)
+    parameters = (Parameter("lag_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.0), beyond="no accelerometer is so slow"),)
 
     def start(self, x: Tensor, row: Row) -> Any:
         return x, x, None

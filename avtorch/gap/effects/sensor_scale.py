@@ -39,7 +39,7 @@ class SensorScale(Effect):
     reading = fixed(scale="scale")
     starts = fixed(scale=(0.95, 1.05))
     parameters = (
-        Parameter("scale", "-", 1.0, 0.83, 1.2, possible=(0.5, 2.0), beyond="no accelerometer is off like that"),
+        Parameter("scale", "-", 1.0, 0.83, 1.2, possible=(0.5, 2.0), beyond="no accelerometer has that scale error"),
     )
 
     def apply(self, x: Tensor, row: Row) -> Tensor:

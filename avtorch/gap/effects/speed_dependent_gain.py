@@ -48,7 +48,7 @@ class SpeedDependentGain(Effect):
     starts = fixed(gain_slope=(-0.15, 0.15))
     parameters = (
         Parameter(
-            "gain_slope", "-", 0.0, -0.4, 0.4, "real", possible=(-2.0, 2.0), beyond="no gain depends on speed so"
+            "gain_slope", "-", 0.0, -0.4, 0.4, "real", possible=(-2.0, 2.0), beyond="no gain depends that much on speed"
         ),
         Parameter("pivot", "-", None, 0.6, 1 / 0.6, reported=False, of_onset=True),
     )

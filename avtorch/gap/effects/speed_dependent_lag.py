@@ -48,7 +48,7 @@ class SpeedDependentLag(Effect):
     equation = "T_L (1 + slope (v - v_mean) / v_mean)"
     starts = fixed(lag_slope=(-0.4, 0.4))
     parameters = (
-        Parameter("lag_slope", "-", 0.0, -0.7, 0.7, "real", possible=(-2.0, 2.0), beyond="no lag depends on speed so"),
+        Parameter("lag_slope", "-", 0.0, -0.7, 0.7, "real", possible=(-2.0, 2.0), beyond="no lag varies that much"),
         Parameter("pivot", "-", None, 0.6, 1 / 0.6, reported=False, of_onset=True),
     )
     settings = (Domain("mean_speed", 0.1, 150.0, "m/s"),)

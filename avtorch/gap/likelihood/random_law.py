@@ -56,7 +56,7 @@ class RandomLaw:
         if form is None:
             found = " and ".join(parts) or "nothing"
             need = "force_sd and force_time, or tail_fraction and tail_scale, or command_variance"
-            raise InputError(f"{kind.name}.noise: found {found}, needs {need} from a random effect that is a candidate")
+            raise InputError(f"{kind.name}.noise: found {found}, needs {need} from a random effect under test")
         return cls(effect, own, form)
 
     @property

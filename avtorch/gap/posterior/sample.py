@@ -105,7 +105,7 @@ def _walked(target: Corrected, chains: int, draws: int, generator: torch.Generat
     z = density.unconstrain(walked.draws[:, :, 0])
     off = stein_discrepancy(density, mode, z, generator)
     if off > 0:
-        return None, f"by Stein's identity its draws are {off:.2g} off in a variance, on a posterior with kinks"
+        return None, f"by Stein's identity a variance of its draws is off by {off:.2g}, on a posterior with kinks"
     return z, ""
 
 

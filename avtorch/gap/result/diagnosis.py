@@ -218,7 +218,7 @@ class Diagnosis:
         """
         if not self.draws:
             raise InputError(
-                f"draws: the diagnosis has none of {self.verdict.name}; a posterior is kept of effects only"
+                f"draws: the diagnosis has none for {self.verdict.name}; only effects have posterior draws"
             )
         with warnings.catch_warnings():
             # ArviZ 0.23 announces its successor on import

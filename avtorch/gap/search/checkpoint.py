@@ -98,7 +98,7 @@ class Checkpoint:
             return None
         own = (start.hypothesis.name, start.onset, start.hypothesis.size)
         if (entry["name"], entry["onset"], len(entry["z"])) != own:
-            raise InputError(f"{self.path}: the fit of {entry['name']} is not of the place it names; {REMEDY}")
+            raise InputError(f"{self.path}: the fit of {entry['name']} does not match its recorded start; {REMEDY}")
         return Kept(np.array(entry["z"]), NoiseModel(**entry["noise"]), float(entry["log_prior"]))
 
     def start(

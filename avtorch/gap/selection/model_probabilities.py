@@ -85,7 +85,7 @@ def model_probabilities(
     unknown = odds / (1 + odds)
     if not total > 0:
         if not unknown > 0:
-            raise InputError("prior: leaves no candidate any weight, needs one above 0")
+            raise InputError("prior: found weight 0 for every hypothesis, needs one above 0")
         return {name: 0.0 for name in shares} | {"unknown": 1.0}
     return {name: (1 - unknown) * share / total for name, share in shares.items()} | {"unknown": unknown}
 

@@ -91,7 +91,7 @@ class Drive:
             raise InputError("accel_cmd: not in the log, needed for the response of a plant")
         rows = log.segment == segment
         if rows.sum() < 2:
-            raise InputError(f"segment: found {segment} with fewer than two rows, needs one of the log's")
+            raise InputError(f"segment: found {segment}, needs a segment of the log with two rows or more")
         speed = None if log.speed is None else torch.as_tensor(log.speed[rows])
         accel0 = None if log.accel is None or settled else float(log.accel[rows][0])
         time, command = torch.as_tensor(log.elapsed[rows]), torch.as_tensor(log.accel_cmd[rows])

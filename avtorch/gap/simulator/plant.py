@@ -36,7 +36,7 @@ BASELINE = (
         beyond="no actuator is that quick or that slow",
     ),
     Parameter(  # log-normal, median 1, log sd 0.3
-        "K_L", "-", None, 0.681, 1.469, possible=(0.3, 3.5), beyond="no actuator makes that of a command in m/s²"
+        "K_L", "-", None, 0.681, 1.469, possible=(0.3, 3.5), beyond="no actuator has that gain"
     ),
 )
 """Parameters of the baseline, with their priors.

@@ -186,7 +186,7 @@ def test_a_mode_of_another_candidate_is_refused(log: Log, kept: Path) -> None:
     for change in ({"z": [0.1]}, {"name": "gust"}, {"onset": 7}):
         fits = [{**fit, **change} for fit in found.content["fits"]]
         write_sealed(kept, {"fits": fits}, schema=SCHEMA, of=found.of)
-        with pytest.raises(InputError, match=r"fits\.json: the fit of \w+ is not of the place it names"):
+        with pytest.raises(InputError, match=r"fits\.json: the fit of \w+ does not match its recorded start"):
             avtorch.diagnose(log, checkpoint=kept, **ONLY)
 
 

@@ -64,7 +64,7 @@ def test_a_lag_of_5_ms_is_remarked() -> None:
 
 def test_a_gain_of_a_sixteenth_is_remarked() -> None:
     found = avtorch.diagnose(log_of(plant(T_L=0.3, K_L=0.06)), effects=[], pairs=False)
-    said_everywhere(found, "no actuator makes that of a command")
+    said_everywhere(found, "no actuator has that gain")
 
 
 @pytest.mark.slow
@@ -94,7 +94,7 @@ def test_what_an_effect_reports_has_a_range_that_holds_its_typical_values(kind: 
 def test_one_interval_that_reaches_in_is_no_accusation() -> None:
     (late,) = implausible({"lag_s": Quantity(2.4, 0.1, 2.2, 2.6)}, {}, [SensorLag])
     assert late.startswith(
-        "sensor_lag.lag_s is 2.4 s, typical 0.05 to 0.5: no accelerometer is that late; the effect stands"
+        "sensor_lag.lag_s is 2.4 s, typical 0.05 to 0.5: no accelerometer is so slow; the effect stands"
     )
     assert implausible({"lag_s": Quantity(2.4, 1.0, 0.9, 4.2)}, {}, [SensorLag]) == ()
     # of a pair each by its own name
