@@ -17,7 +17,7 @@ from avtorch.vehicle.arguments import Number, tensor
 class AerodynamicDrag(Effect):
     """`-drag_per_m (v + wind_mps)²`: drag against the relative wind; neutral at 0. The head wind is fitted with it.
 
-    Possible up to 3e-3 1/m, a cyclist's; a car has 2 to 6e-4 (half of rho c_d A / m).
+    Possible up to 3e-3 1/m, the value of a cyclist; a car has 2 to 6e-4 (half of rho c_d A / m).
 
     Example:
         >>> import torch

@@ -41,7 +41,7 @@ class CommandHold(Effect):
     place = "command"
     memory = True
     random = True
-    meaning = "messages are lost and the last command acts on"
+    meaning = "messages are lost and the last command is held"
     equation = "u of the last row that arrived"
     searched_as = "losses"
     noise_parameters = fixed(loss="hold_fraction")

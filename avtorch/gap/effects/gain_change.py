@@ -49,7 +49,7 @@ class GainChange(Effect):
 
     name = "gain_change"
     place = "actuator"
-    meaning = "from some moment on the car realises another share of the command"
+    meaning = "the gain changes at some time during the drive"
     equation = "K_L (1 + (ratio - 1) clip((t - t_change) / ramp, 0, 1))"
     own_onset = "change_s"
     of_the_drive = True

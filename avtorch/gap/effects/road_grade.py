@@ -55,7 +55,7 @@ class RoadGrade(Integrated):
     place = "body"
     needs_speed = True
     gravity = True
-    meaning = "slopes that the log does not record"
+    meaning = "a road grade that the log does not record"
     equation = "-g sin(slope(x)), slope a smooth random function of position"
     of_the_drive = True
     size = "grade_rms"

@@ -67,7 +67,7 @@ class Surrogate:
         return self.centre[None]
 
     def log_prob(self, z: Tensor) -> Tensor:
-        """Of `z` (..., 1, coordinate): (..., 1)."""
+        """Log density (..., 1) of `z` (..., 1, coordinate)."""
         terms = self._terms(z)
         value = self.constant - 0.5 * (terms * (terms @ self.gram)).sum(-1) - 0.5 * z.square().sum(-1)
         if self.match is None:

@@ -17,19 +17,19 @@ a whole drive. Without `over` the rows are looped over, which is correct but slo
 An effect also declares what the rest of the package needs to know of it, so that no file outside `effects/` names one.
 The defaults suit an ordinary effect:
 
-| asked by             | declared by                                            | default                           |
-|----------------------|--------------------------------------------------------|-----------------------------------|
-| search: first values | `starts`; of a drive `starts_in`, `retried_in`         | sizes typical, and one sd fainter |
-| search: onset        | `own_onset`; after it `settled`                        | any row is tried                  |
-| search: randomness   | `noise`; `searched_as`, `noise_parameters`, `in_noise` | fitted by its `noise`             |
-| likelihood           | `reading`; `integrated.Integrated`                     | the accelerometer is true         |
-| actuator             | `actuator_parameters`                                  | first order, no rate limit        |
-| aliases: which       | `alias`, `aliased`, `constant_accel`, `force_sign`     | no other responds as it does      |
-| aliases: beside what | `slow_force`, `commutes`                               | its force follows the command     |
-| cross-validation     | `of_the_drive`                                         | parameters are the car's          |
-| linearisation        | `linear`, `one_sided`                                  | a multiple of the command         |
-| delay                | `shift`, `role`                                        | none                              |
-| exports, pictures    | `accel_limit`, `half_said`, `pictured`                 | no word for it; drawn at 12 m/s   |
+| used by                 | declared by                                            | default                         |
+|-------------------------|--------------------------------------------------------|---------------------------------|
+| search: initial values  | `starts`; of a drive `starts_in`, `retried_in`         | typical sizes, and one sd lower |
+| search: onset           | `own_onset`; after it `settled`                        | any row is tried                |
+| search: randomness      | `noise`; `searched_as`, `noise_parameters`, `in_noise` | fitted by its `noise`           |
+| likelihood              | `reading`; `integrated.Integrated`                     | the accelerometer has no error  |
+| actuator                | `actuator_parameters`                                  | first order, no rate limit      |
+| aliases: which          | `alias`, `aliased`, `constant_accel`, `force_sign`     | no equivalent effect            |
+| aliases: in combination | `slow_force`, `commutes`                               | its force follows the command   |
+| cross-validation        | `of_the_drive`                                         | parameters are the car's        |
+| linearisation           | `linear`, `one_sided`                                  | proportional to the command     |
+| delay                   | `shift`, `role`                                        | none                            |
+| exports, plots          | `accel_limit`, `half_said`, `pictured`                 | not exported; plotted at 12 m/s |
 """
 
 from __future__ import annotations

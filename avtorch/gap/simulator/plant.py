@@ -41,8 +41,9 @@ BASELINE = (
 )
 """Parameters of the baseline, with their priors.
 
-Possible are lags from an electric motor's torque control with its driveline (some 20 ms) to a laden truck's engine and
-air brakes (seconds), and gains as far from 1 as a truck's mass changes between empty and laden (some three times).
+Possible are lags from an electric motor's torque control with its driveline (about 20 ms) to the engine and air brakes
+of a laden truck (seconds), and gains as far from 1 as a truck's mass changes between empty and laden (about a factor of
+three).
 
 Example:
     >>> from avtorch.gap import BASELINE
