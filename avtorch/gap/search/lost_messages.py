@@ -210,7 +210,7 @@ class Bank:
 
 
 def _merged(weight: FloatArray, path: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Half as many paths: those whose merging changes least are merged into the nearest heavier one that is kept."""
+    """Half as many paths: those whose merging changes least are merged into the nearest one kept."""
     count = weight.shape[1]
     keep = count // 2
     order = np.argsort(-weight, 1)

@@ -71,7 +71,7 @@ def adequacy(
     """Adequacy from errors (channel, counted, group) of a hypothesis whose rollout is (channel, counted, group).
 
     `explained` [nats]: what the hypothesis's random effects explain although it remains in `errors` (lost messages:
-    `found.losses.evidence`); it is subtracted from every value above 0.
+    `found.losses.evidence`); it is subtracted from positive values, down to 0.
     """
     look = _Look(white, errors, rollout)
     return Adequacy(
