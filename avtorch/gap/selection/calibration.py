@@ -43,7 +43,7 @@ class Odds:
 
 @dataclass(frozen=True)
 class UnknownWeights:
-    """Weights of the logistic regression for `unknown`, in the order of `odds.signs`."""
+    """Weights of the logistic regression for `unknown`, in the order of `model_probabilities.signs`."""
 
     constant: float
     most: float
@@ -62,7 +62,7 @@ class AliasLimits:
 
 @dataclass(frozen=True)
 class RemainderScales:
-    """Sizes, times and numbers of basis functions used by `remainder` to test residuals for structure."""
+    """Sizes, times and numbers of basis functions used by `adequacy` to test residuals for structure."""
 
     sizes: Scales
     response_delays: int

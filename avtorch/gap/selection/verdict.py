@@ -29,7 +29,7 @@ class Candidate:
     `log_evidence` [nats] relative to `none`, without the prior over causes; None for `unknown`. `parameters` by the
     table's names, those of a pair as `effect.parameter`; `moved`: the baseline's `T_L` [s] and `K_L` [-] under this
     hypothesis. `onset_s` on the log's own clock; None where the effect acts from the start. `implausible`: a sentence
-    for each parameter outside its physically possible range (`plausible.implausible`).
+    for each parameter outside its physically possible range (`plausibility.implausible`).
     """
 
     name: str
