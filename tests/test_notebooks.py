@@ -1,6 +1,7 @@
-"""Notebooks run from top to bottom, with recordings and without, show their pictures, and say what is so.
+"""Notebooks run from top to bottom, with recordings and without, show their pictures, and make true statements.
 
-What a notebook's text says of its figures is kept true here: the claims look at what the cells computed.
+What a notebook's text says of its figures is kept true here: the claims are checked against the values that the cells
+computed.
 """
 
 from __future__ import annotations

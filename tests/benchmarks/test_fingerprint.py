@@ -1,4 +1,4 @@
-"""Constants are those of this likelihood: the numbers stored when they were fitted come out again."""
+"""Constants belong to this likelihood: it reproduces the numbers stored when they were fitted."""
 
 from __future__ import annotations
 

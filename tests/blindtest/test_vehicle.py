@@ -1,4 +1,4 @@
-"""The reference vehicle: GLVD exactly when nothing is on, and every cause does what its equation says."""
+"""The reference vehicle: GLVD exactly without a cause, and every cause follows its equation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Algorithm 2, branch by branch, and the paper's own settings judged both ways."""
+"""Algorithm 2, branch by branch, and the paper's own settings tested both ways."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""A controller of unknown structure under the monitor: its slopes tell the setting, the belief needs neither."""
+"""A controller of unknown structure under the monitor: its slopes give the setting; the belief needs neither."""
 
 import torch
 

@@ -1,4 +1,5 @@
-"""Feed-forward as Strategy 4: judged with its delay, priced, chosen where it is the least that suffices, in force."""
+"""Feed-forward as Strategy 4: evaluated with its delay, costed, chosen where it is the least sufficient, put in
+force."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The setting: verdicts through the effective actuation, strategies told apart, bad values refused."""
+"""The setting: verdicts through the effective actuation, strategies distinguished, bad values refused."""
 
 import pytest
 import torch

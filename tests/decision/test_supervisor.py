@@ -1,4 +1,4 @@
-"""The supervisor end to end: what it is told, what it says, what it puts in force, and when."""
+"""The supervisor end to end: its input, its alerts, the settings it puts in force, and when."""
 
 import dataclasses
 
@@ -68,7 +68,7 @@ def obedient(answer, **rules):
 
 
 def test_events_between_windows_happen_when_they_are_due():
-    """Rows equal to the bit those of the same drive with nobody watching; windows stay on their grid."""
+    """Rows equal bit for bit those of the same drive without monitoring; windows stay on their grid."""
     events = [(7.31, becomes(0.8, 0.7)), (3.07, becomes(0.5, 0.9)), (20.0, becomes(9.0, 0.1))]
     run = Supervisor(make_loop()).run(11.0, events=events)
     schedule = [(3.07, {"plant": GLVDPlant(0.5, 0.9, 0.1)}), (7.31, {"plant": GLVDPlant(0.8, 0.7, 0.1)})]
@@ -163,7 +163,7 @@ def test_what_is_decided_is_put_in_force(setting, delay):
     assert torch.allclose(r.demanded[0], demand, rtol=0, atol=1e-11)
     sent = setting.lower_level().command(r.accel[0], r.demanded[0])
     assert torch.equal(r.accel_cmd[0], torch.where(new, sent, r.demanded[0].clamp(-6.0, 4.0)))
-    # judged by what is in force: the longer gap only from the first window that ends after the driver has set it
+    # evaluated with the setting in force: the longer gap only from the first window after the driver has set it
     for w in run.windows:
         expected = Setting().as_dict() if w.window.start_s < 9.99 else setting.as_dict()
         if w.window.end_s <= 10.0 + waits + 1e-6:
@@ -198,7 +198,7 @@ def test_a_chosen_setting_that_still_works_stays():
     later = [a for a in run.alerts[0] if a.time_s > 14.01]
     assert [a.detector for a in later] == ["accepted_change"]
     assert float(supervisor.watch.monitor.accepted[0][0]) == pytest.approx(1.2, abs=0.1)
-    # not for want of an idea: asked, the strategist would have changed the lower level again
+    # the strategist, if called, would have changed the lower level again
     (args, how, _) = strategist.asked[0]
     last = run.windows[-1].window.belief.draws
     fresh = Strategist().decide(
@@ -229,7 +229,7 @@ def test_the_strategist_replays_the_last_seconds():
     lengths = []
     for (_, _, history), _, _ in strategist.asked:
         rows = history.lead_speed.shape[1]
-        # the leader is one and the same for all, so its stretch tells the time
+        # all scenarios have the same leader, so its stretch identifies the time
         ends = [w.window.end_s for w in run.windows]
         at = [e for e in ends if rows <= round(e / 0.01)]
         matches = [
@@ -295,7 +295,7 @@ def test_a_scenario_sees_the_same_noise_in_any_company():
 
 @pytest.mark.slow
 def test_an_action_leaves_the_other_scenarios_alone():
-    """Scenario 0 is on its way to a longer gap when scenario 1 is changed: it goes on as if nothing were."""
+    """Scenario 0 is on its way to a longer gap when scenario 1 is changed: it continues undisturbed."""
 
     def drive(n):
         longer = Setting(time_gap=2.5, scenarios=n)

@@ -1,4 +1,4 @@
-"""Manoeuvres keep to their limits, come back to the speed they began at, and say what they are."""
+"""Manoeuvres stay within their limits, return to the speed they began at, and describe themselves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a manoeuvre is expected to tell, and which one is chosen."""
+"""The expected information of a manoeuvre, and which one is chosen."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_limits_hold_for_the_speed_that_the_car_will_drive(fresh_seed: int) -> N
     assert m.metres <= 700
     assert m.speed.min() >= 3
     np.testing.assert_allclose(speed, m.speed, atol=0.3)
-    # resistance is met by a push: the speed comes back all the same
+    # a push compensates the resistance: the speed still returns
     assert m.speed[-1] == pytest.approx(m.speed[0], abs=0.5)
 
 
@@ -188,7 +188,7 @@ def test_a_slow_car_is_offered_what_it_can_drive(fresh_seed: int) -> None:
 
 @pytest.mark.slow
 def test_drag_on_a_fast_road_leaves_manoeuvres_that_come_back(fresh_seed: int) -> None:
-    """What drag takes depends on the speed that is left once it is made up for."""
+    """The effect of drag depends on the speed that remains after compensation."""
     rng = np.random.default_rng(fresh_seed)
     rivals = [contender([AerodynamicDrag(2.7e-4)], rng=rng), contender([ConstantResistance(0.2)], rng=rng)]
     limits = Limits(23, 29.6, -1.3, 1.3)

@@ -29,7 +29,7 @@ def test_a_slower_car_is_told_and_by_how_much(rotating_seed: int) -> None:
     told = avtorch.compare(_drive(rng, T_L=0.4, K_L=0.9), _drive(rng, T_L=0.56, K_L=0.9))
     assert told.changed
     lag = told.car["T_L"].ratio
-    # told from ten blocks a side
+    # estimated from ten blocks a side
     assert abs(np.log(lag.mean) - np.log(1.4)) < BAR * max(lag.sd / lag.mean, 0.02)
     assert told.simulator == "farther"
     assert "has changed" in told.why

@@ -1,4 +1,5 @@
-"""A search that did not try everything, cut by its budget or without pairs: the answer says so and claims no more."""
+"""A search that did not try everything, cut by its budget or without pairs: the answer reports this and claims no
+more."""
 
 from __future__ import annotations
 
@@ -59,7 +60,7 @@ def test_a_budget_leaves_nothing_told_apart_from_what_it_left_untried(
     assert not {c.name for c in found.candidates} & set(found.scope.not_scored)
     answer = json.loads(json.dumps(found.to_dict()))
     assert answer["not_tried"] == {"effects": list(found.scope.not_scored), "pairs": "none"}
-    # the untried are behind `unknown`, and every text says what was not tried
+    # `unknown` stands for the untried, and every text lists what was not tried
     assert "unknown" in found.verdict.alias_set
     for text in (str(found), "\n".join([*diagnosis_headline(found), *diagnosis_notes(found)])):
         assert "old apart from every" not in text

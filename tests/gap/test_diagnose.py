@@ -1,4 +1,4 @@
-"""The whole diagnosis on drives of the reference vehicle: what is plain is named, what is not there is not."""
+"""The whole diagnosis on drives of the reference vehicle: clear effects are named, absent ones are not."""
 
 import json
 from pathlib import Path

@@ -175,7 +175,7 @@ def test_a_log_simulated_without_noise_is_told_to_the_finest_sensor() -> None:
     found = sample(density, quiet, generator=torch.Generator().manual_seed(0))
     away = (found.mean[0, :2] - f64(T, K)).abs() / found.sd[0, :2]
     assert bool((away < 5.0).all())
-    # a hundred rows, each read to 1e-4 m/s² while the command is of order one, cannot tell a ratio better than this
+    # a hundred rows, each read to 1e-4 m/s² while the command is of order one, determine a ratio no better than this
     assert bool((found.sd[0, :2] > 0.1 * FINEST / math.sqrt(rows)).all())
     assert bool((found.sd[0, :2] < 0.01).all())
 

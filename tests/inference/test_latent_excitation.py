@@ -1,4 +1,4 @@
-"""The excitation rule of the latent form: silent commands refused, steps taken, measured values never looked at."""
+"""The excitation rule of the latent form: silent commands rejected, steps accepted, measured values never used."""
 
 from __future__ import annotations
 

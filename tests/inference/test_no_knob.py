@@ -1,7 +1,7 @@
-"""No step-size knob: windows in strange units and noise, default settings, judged by quadrature.
+"""No step size to tune: windows in unusual units and noise, default settings, compared with quadrature.
 
 The prior's scales stay those of SI units, so a window in other units is merely a stranger car behind stranger noise:
-its posterior may be odd, and must be right. One that does not settle must say so, and why.
+its posterior may be unusual, and must be right. One that does not converge must report it, with the reason.
 """
 
 from __future__ import annotations

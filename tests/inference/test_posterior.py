@@ -1,4 +1,4 @@
-"""What is read off draws, and the nested R-hat that judges them."""
+"""Summaries of draws, and the nested R-hat that tests them."""
 
 from __future__ import annotations
 

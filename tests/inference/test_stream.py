@@ -237,7 +237,7 @@ def test_a_driver_masks_his_rows_and_the_settling_after_them(drive, tmp_path_fac
     stream, windows = new(), []
     for k, (first, last) in enumerate(pairwise([0, *sorted(cuts), 1000])):
         part = slice(first, last)
-        # who says nothing of a driver while none is in charge need not: the settling goes on
+        # `engaged` may be omitted while no driver is in charge: the settling continues
         on = None if bool(engaged[:, part].all()) else engaged[:, part]
         windows += stream.feed(time[part], {n: c[:, part] for n, c in garbled.items()}, engaged=on)
         if k == save_at:

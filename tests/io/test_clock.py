@@ -26,7 +26,7 @@ UNIX_S = 1_700_000_000.123
 def test_microseconds_survive_any_epoch(steps: list[int], first: int) -> None:
     """A recorder's stamps in whole microseconds, read as the nearest float64 [s]: their differences come back exactly.
 
-    From 4.3e9 s on, the year 2106, a float64 tells no microseconds any more.
+    From 4.3e9 s on, the year 2106, a float64 no longer resolves microseconds.
     """
     ticks = np.cumsum([0, *steps])
     stamps = np.array([(first + int(tick)) / 1_000_000 for tick in ticks])

@@ -1,4 +1,5 @@
-"""One process at a time in a folder: the second is told of the first, and a killed one keeps nobody out."""
+"""One process at a time in a folder: the second gets a message that names the first, and a killed one blocks no
+other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that are no logs, or would rather be something else: one printable line each, at once and in little memory."""
+"""Files that are not logs, some of them hostile: one printable line each, at once and in little memory."""
 
 from __future__ import annotations
 

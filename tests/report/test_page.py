@@ -1,4 +1,4 @@
-"""The report: whole, self-contained, and deaf to what a log would like to say to the browser."""
+"""The report: complete, self-contained, and safe against markup in a log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A black box finds what is there, and makes up little where nothing is."""
+"""A black box finds structure that exists, and little where there is none."""
 
 import numpy as np
 import pytest

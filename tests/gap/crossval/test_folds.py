@@ -1,4 +1,4 @@
-"""Every row judges once, far from what fits."""
+"""Every row is scored once, far from the rows fitted."""
 
 import numpy as np
 import pytest

@@ -147,7 +147,7 @@ def test_evidence_prefers_the_cause_that_is_there(rotating_seed: int) -> None:
             evidence.append(
                 finish(hypothesis, white, modes(hypothesis, white, start, iterations=12)[0][0]).log_evidence
             )
-        # of the bias alone: its prior is some 0.4 m/s² wide, what the drive tells some 0.005
+        # of the bias alone: its prior is some 0.4 m/s² wide, its posterior some 0.005
         assert sign * (evidence[0] - evidence[1]) > (15 if sign > 0 else -8)
 
 
@@ -161,7 +161,7 @@ def test_an_onset_counts_what_comes_after_it(fresh_seed: int) -> None:
     fit = finish(hypothesis, white, early[0], onset)
     assert fit.log_joint == pytest.approx(float(_log_joint(hypothesis, white, early, onset)[0]), abs=1e-6)
     whole = finish(hypothesis, white, modes(hypothesis, white, start, iterations=12)[0][0])
-    # half of the drive tells less
+    # half of the drive is less informative
     assert fit.covariance[2, 2] > 1.4 * whole.covariance[2, 2]
 
 

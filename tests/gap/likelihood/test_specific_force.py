@@ -1,7 +1,7 @@
-"""An accelerometer feels every force but gravity: on hills it and the speed tell two tales, and that is what slopes do.
+"""An accelerometer measures every force but gravity: on hills it differs from the speed, which identifies slopes.
 
-The reference vehicle gives the log. Its actuator does not look at the speed, so under the same commands and the same
-noise what an accelerometer reads on hills is what it shows on the flat.
+The reference vehicle gives the log. Its actuator does not depend on the speed, so under the same commands and noise an
+accelerometer reads the same on hills as on the flat.
 """
 
 from __future__ import annotations

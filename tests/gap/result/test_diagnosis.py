@@ -187,7 +187,7 @@ def test_verdict_is_the_most_probable_with_its_aliases() -> None:
         "next is sensor_lag with probability 0.3."
     )
     assert verdict_of(given, aliases=near(0.6)).alias_set == ("dead_time",)
-    # what foretells nothing is a rival only where it is about as probable
+    # a hypothesis without prediction is a rival only where it is about as probable
     assert verdict_of(given, aliases=near(0.6, unknown=0.05)).alias_set == ("dead_time", "unknown")
     doubted = candidates(dead_time=0.6, none=0.05, unknown=0.35)
     assert verdict_of(doubted).alias_set == ("dead_time", "unknown", "none")
@@ -347,7 +347,7 @@ def test_several_logs_are_counted_together() -> None:
 
     facts = LogFacts.of([log(101, 0.1), log(201, 0.05, accel=True)])
     assert (facts.rows, facts.segments, facts.name) == (302, 2, "101, 201")
-    # where a log lay is not told
+    # the log's folder is not in the answer
     named = [replace(log(101, 0.1), name=name) for name in ("somebody/at home/a.csv", "b.csv", "arrays")]
     assert LogFacts.of(named).name == "a.csv, b.csv, arrays"
     assert facts.seconds == pytest.approx(20.0)

@@ -1,4 +1,4 @@
-"""A user's random effect, one for each thing that it can say of the noise: named where it acts, and only there."""
+"""A user's random effect, one for each kind of change of the noise: named where it acts, and only there."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Crosstalk(Effect):
 
 @dataclass(frozen=True)
 class ValveJitter(Effect):
-    """Errors of the command in proportion to it; it says that it looks at speed."""
+    """Errors of the command in proportion to it; declared to need the speed."""
 
     share: Any = 0.4
 

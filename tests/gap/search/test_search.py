@@ -119,7 +119,7 @@ def test_what_is_far_behind_at_first_sight_is_not_fitted_anew(tmp_path: Path, ro
     assert set(fitted) == {"none", "sensor_bias"}
     evidence = _evidence(race)
     assert evidence["sensor_bias"] > 100
-    # judged under the noise of the bare car
+    # scored under the noise of the bare car
     behind = [f for f in race.found if f.name in ("dead_time", "saturation")]
     assert len(behind) == 2
     assert all(f.noise is race.none.noise for f in behind)
@@ -154,7 +154,7 @@ def test_lost_messages_on_top_of_a_single_effect(rotating_seed: int) -> None:
     names = {f.name: f for f in race.found}
     assert race.best.name == "command_hold+sensor_bias"
     assert race.best.losses is not None
-    # told too low: the lag and the noise fitted without losses have taken a part of what losses do
+    # estimated too low: lag and noise fitted without losses absorb a part of their effect
     assert 0.1 < race.best.losses.fraction < 0.6
     evidence = _evidence(race)
     assert evidence[race.best.name] == pytest.approx(evidence["sensor_bias"] + race.best.losses.evidence)

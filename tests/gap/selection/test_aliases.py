@@ -1,4 +1,4 @@
-"""What one channel cannot tell apart: exact in the response, shared in probability, and a set in the verdict."""
+"""Aliases under one channel: exact in the response, equal in probability, and a set in the verdict."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def test_adding_an_effect_is_one_line() -> None:
     glvd = avtorch.simulate(leader(), plant=GLVDPlant())
     torch.testing.assert_close(plain.accel, glvd.accel, rtol=0, atol=1e-12)
     assert float((late.accel - glvd.accel).abs().max()) > 0.05
-    assert late.log().jerk is None  # this plant does not tell its jerk
+    assert late.log().jerk is None  # this plant does not report its jerk
 
 
 def test_the_chain_has_one_order() -> None:

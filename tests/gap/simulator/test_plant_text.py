@@ -1,4 +1,4 @@
-"""Plants in text that somebody else wrote: each value is in its domain, or one line says which is not."""
+"""Plants in text from others: each value is in its domain, or one line names the one that is not."""
 
 from __future__ import annotations
 
