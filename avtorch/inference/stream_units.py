@@ -207,8 +207,8 @@ class StreamUnits:
         start, end = float(self.rows["time"][0]), float(self.rows["time"][-1])
         which = f" of vehicle {vehicle}" if self.vehicles > 1 else ""
         return InputError(
-            f"stream: columns {one!r} and {other!r}{which}, {start:.10g} to {end:.10g} s: {told}; nothing learnt in "
-            f"this time is kept"
+            f"stream: columns {one!r} and {other!r}{which}, {start:.10g} to {end:.10g} s: {told}; no estimate "
+            f"from this time is kept"
         )
 
     def state_dict(self) -> dict[str, Any]:

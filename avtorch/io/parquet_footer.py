@@ -29,9 +29,9 @@ def uncompressed_sizes(raw: bytes) -> list[list[int]]:
     try:
         sizes = [[chunk[_META_DATA][_UNCOMPRESSED] for chunk in group[_COLUMNS]] for group in groups]
     except (LookupError, TypeError):  # damaged: a list for a struct, or a number for a list
-        raise ValueError("a row group does not say how large its columns are") from None
+        raise ValueError("a row group does not declare the size of its columns") from None
     if not all(type(size) is int for group in sizes for size in group):
-        raise ValueError("a row group does not say how large its columns are")
+        raise ValueError("a row group does not declare the size of its columns")
     return sizes
 
 

@@ -163,7 +163,7 @@ def _says_missing(missing: tuple[str, ...]) -> list[str]:
     said = {
         "accel_cmd": "no accel_cmd: every result on the actuator is conditional on an assumed controller",
         "accel": "no accel: speed is the only channel, so the log cannot distinguish sensor faults from real forces",
-        "speed": "no speed: accel is the only channel, short stops go unnoticed, and sensor faults look like forces",
+        "speed": "no speed: accel is the only channel, short stops go unnoticed, and sensor faults resemble forces",
     }
     return [said[name] for name in missing]
 

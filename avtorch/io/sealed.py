@@ -153,7 +153,7 @@ def regular_bytes(path: Path, most: int, *, remedy: str = REMEDY) -> bytes:
             # read() allocates the size requested: request the reported size and one byte more, to detect growth
             content = stream.read(facts.st_size + 1) if facts.st_size <= most else None
             if content is not None and len(content) > facts.st_size:
-                raise InputError(f"{path}: grows while it is read, or says nothing of its size; {remedy}")
+                raise InputError(f"{path}: grows while it is read, or does not report its size; {remedy}")
     except (OSError, ValueError) as fault:
         if isinstance(fault, InputError):
             raise

@@ -81,7 +81,7 @@ def check_time(time: NDArray, same_drive: NDArray, where: Callable[[int], str]) 
     if beyond.any():
         row = int(np.argmax(beyond))
         raise InputError(
-            f"{where(row)}: found {time[row]:.4g} s, a stamp so far from zero that float64 does not tell rows apart; "
+            f"{where(row)}: found {time[row]:.4g} s, a stamp so far from zero that float64 cannot resolve the rows; "
             "needs stamps within 1e9 s of the first"
         )
     bad = (np.diff(time) <= 0) & same_drive
@@ -96,7 +96,7 @@ def check_rate(step: float, where: str) -> None:
     ns."""
     if not step > 0:
         raise InputError(
-            f"{where}: found stamps so far from zero, or from each other, that float64 does not tell rows apart; needs "
+            f"{where}: found stamps so far from zero, or from each other, that float64 cannot resolve rows; needs "
             "stamps within 1e9 s of the first"
         )
     rate = 1 / step

@@ -136,7 +136,7 @@ def _check(n: int, seed: int, names: Sequence[str], workers: int, signals: Seque
     if workers < 1:
         raise InputError(f"workers: found {workers}, needs 1 or more")
     if not names:
-        raise InputError("answerers: found none, needs one to judge")
+        raise InputError("answerers: found none, needs at least one")
     for name in names:
         if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
             raise InputError(f"answerers: found the name {name!r}, needs letters, digits, _ and -")

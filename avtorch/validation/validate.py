@@ -189,7 +189,7 @@ def validate(
         source = windows_of_log(source, window=window, count=windows)
     settings = source.sampler if settings is None else settings
     if settings.chains == 1 and settings.draws < 8:
-        raise InputError(f"draws: found {settings.draws} of a single chain, needs 8 or more to judge it")
+        raise InputError(f"draws: found {settings.draws} of a single chain, needs 8 or more")
     latent = source.form == "latent"
     nuts = (LATENT_NUTS if latent else NutsSettings()) if nuts is None else nuts
     if nuts_windows is None:

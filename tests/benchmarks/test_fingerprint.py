@@ -36,7 +36,7 @@ def test_every_part_is_stored() -> None:
     assert document()["fingerprint"].keys() == PARTS.keys()
 
 
-def test_a_difference_is_told() -> None:
+def test_a_difference_is_reported() -> None:
     stored = {"none": 1000.0, "dead_time": 1100.0}
     assert differences("late", stored, {"none": 1000.04, "dead_time": 1100.0}) == []
     assert differences("late", stored, {"none": 1000.06, "dead_time": 1100.0}) == [

@@ -31,7 +31,7 @@ def test_every_command_that_writes_holds_its_folder() -> None:
         assert "out" in inspect.signature(command).parameters
 
 
-def test_a_second_process_is_told_of_the_first(tmp_path: Path) -> None:
+def test_a_second_process_gets_the_name_of_the_first(tmp_path: Path) -> None:
     out = tmp_path / "out"
     line = [sys.executable, "-m", "avtorch.cli", "stability", "--quiet", "--out", str(out)]
     with sole_use(out, work="avtorch diagnose"):

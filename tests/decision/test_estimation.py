@@ -168,7 +168,7 @@ def test_segments_that_follow_at_once_are_still_two_drives(healthy):
     assert ends[:4] == pytest.approx([2.0, 4.0, 5.0, 7.0])
 
 
-def test_progress_is_told_in_rows(healthy):
+def test_progress_is_reported_in_rows(healthy):
     log, seen = joined(healthy, drive(seed=2, seconds=8.0)), []
     estimate(log, progress=lambda done, of: seen.append((done, of)), settings=QUICK)
     assert [of for _, of in seen] == [log.rows] * len(seen)

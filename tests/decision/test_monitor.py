@@ -44,7 +44,7 @@ def test_accepted_change(T, K, sd, alarmed):
     assert bool(report.any[0]) is alarmed
 
 
-def test_accepting_moves_the_accepted_value_only_where_told():
+def test_accepting_moves_the_accepted_value_only_where_given():
     monitor = Monitor(2, detectors=["accepted_change"])
     changed = cloud([1.5, 1.5], [0.5, 0.5])
     assert monitor.update(*changed, yes(2), Setting()).any.tolist() == [True, True]

@@ -108,7 +108,7 @@ def test_alerts_are_those_of_the_windows_and_begin_with_the_change():
     assert {a.detector for a in run.alerts[2]} >= {"accepted_change"}
 
 
-def test_the_estimator_sees_the_command_after_clipping():
+def test_the_estimator_gets_the_command_after_clipping():
     """A narrow actuator and a lower level that inverts: what was demanded is far from what was sent."""
     lower = LowerLevel(1.0, 0.8, accel_min=-1.5, accel_max=1.2)
     loop = make_loop(lower_level=lower, plant=GLVDPlant(1.0, 0.8, 0.1))
@@ -171,7 +171,7 @@ def test_what_is_decided_is_put_in_force(setting, delay):
         assert w.setting.as_dict() == expected
 
 
-def test_an_action_is_told_with_its_truth():
+def test_an_action_is_reported_with_its_true_peak_gain():
     supervisor = Supervisor(make_loop(limits=WIDE), strategist=Strategist())
     run = supervisor.run(12.0, events=[(8.0, becomes(1.5, 0.5))])
     (action,) = run.actions[0]
@@ -278,7 +278,7 @@ def test_a_loop_under_way_is_watched_on_its_own_grid():
     assert [a.time_s for a in run.actions[0]] == pytest.approx([9.33])
 
 
-def test_a_scenario_sees_the_same_noise_in_any_company():
+def test_a_scenario_gets_the_same_noise_in_any_batch():
     change = (6.0, becomes(1.5, 0.5))
     batch = Supervisor(make_loop(3, seeds=[3, 8, 11])).run(12.0, events=[change])
     alone = Supervisor(make_loop(1, seeds=[8])).run(12.0, events=[change])
@@ -333,7 +333,7 @@ def test_the_seed_decides():
     assert not torch.equal(one.windows[3].window.belief.draws, other.windows[3].window.belief.draws)
 
 
-def test_a_crashed_car_is_believed_nothing_of():
+def test_rows_of_a_crashed_car_are_not_used():
     loop = make_loop(2, spacing0=torch.tensor([0.5, 10.0]), speed0=torch.tensor([8.0, 0.0]), seeds=1)
     supervisor = Supervisor(loop, strategist=Strategist())
     run = supervisor.run(14.0, events=[(6.0, becomes(torch.tensor([1.5, 1.5]), torch.tensor([0.5, 0.5])))])
@@ -381,7 +381,7 @@ def test_a_controller_of_unknown_structure_takes_a_given_setting():
     assert float(run.windows[-1].report.mean[0][0]) == pytest.approx(1.5, abs=0.3)
 
 
-def test_an_mpc_is_judged_by_its_equivalent_gains_and_given_a_new_time_gap():
+def test_an_mpc_is_evaluated_by_its_equivalent_gains_and_given_a_new_time_gap():
     loop = make_loop(controller=MPC(), leader=LEADER)
     supervisor = Supervisor(loop, strategist=mpc_strategist())
     assert supervisor.setting.gains[0].tolist() == list(mpc_gains(1.0))
@@ -465,7 +465,7 @@ def test_an_order_overtaken_before_the_driver_complies():
 
 
 @pytest.mark.slow
-def test_a_plant_that_tells_no_jerk_is_believed_by_the_latent_form():
+def test_a_plant_without_jerk_is_estimated_by_the_latent_form():
     truth = GLVDPlant(0.3, 1.0, 0.1)
 
     def silent():
@@ -481,7 +481,7 @@ def test_a_plant_that_tells_no_jerk_is_believed_by_the_latent_form():
     assert any(bool(w.window.belief.excited) for w in run.windows)
 
 
-def test_progress_is_told_window_by_window():
+def test_progress_is_reported_window_by_window():
     seen = []
     Supervisor(make_loop()).run(5.0, progress=seen.append)
     assert seen == pytest.approx([2.0, 4.0, 5.0])

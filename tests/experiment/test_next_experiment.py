@@ -84,7 +84,7 @@ def test_margin_is_half_the_square_of_the_distance(rotating_seed: int) -> None:
     assert told.margin == pytest.approx(distance**2 / 2, abs=BAR * 1.26 * distance / np.sqrt(32))
 
 
-def test_the_same_cause_twice_is_never_told_apart(fresh_seed: int) -> None:
+def test_the_same_cause_twice_is_never_distinguished(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     one = contender([DeadBand(0.1)], rng=rng)
     m = library()[:1]
@@ -106,7 +106,7 @@ def test_a_resistance_and_a_bias_differ_in_the_speed_alone(rotating_seed: int) -
 
 @pytest.mark.statistical
 @pytest.mark.slow
-def test_of_what_surely_tells_the_gentlest_is_driven(rotating_seed: int) -> None:
+def test_of_the_sure_manoeuvres_the_gentlest_is_chosen(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     found = left([contender([], rng=rng), contender([DeadBand(0.1)], rng=rng)], [0.6, 0.3])
     told = next_experiment(found)
@@ -137,7 +137,7 @@ def test_limits_hold_for_the_speed_that_the_car_will_drive(fresh_seed: int) -> N
     assert m.speed[-1] == pytest.approx(m.speed[0], abs=0.5)
 
 
-def test_an_unknown_road_widens_what_is_foretold(fresh_seed: int) -> None:
+def test_an_unknown_road_widens_the_prediction(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     hilly = contender([RoadGrade(0.02)], rng=rng)
     m = library()[:1]

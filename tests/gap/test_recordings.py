@@ -70,7 +70,7 @@ def fitted(race: SearchResult, base: FittedModel, more: type[Effect]) -> tuple[H
 
 @pytest.mark.parametrize("lap", LAPS)
 @pytest.mark.parametrize("on", ["none", "road_grade"])
-def test_what_the_laps_tell_of_lag_delay_and_order(races: dict[int, SearchResult], lap: int, on: str) -> None:
+def test_lag_delay_and_order_from_the_laps(races: dict[int, SearchResult], lap: int, on: str) -> None:
     race = races[lap]
     base = next(f for f in race.found if f.name == on)
     hypothesis, fit, _ = fitted(race, base, DeadTime)

@@ -160,7 +160,7 @@ def test_where_digits_are_lost_the_answer_is_nan_and_no_error() -> None:
 
 
 @pytest.mark.slow
-def test_a_log_simulated_without_noise_is_told_to_the_finest_sensor() -> None:
+def test_a_log_without_noise_is_resolved_to_the_finest_sensor() -> None:
     """Its likelihood grows without end as the noise parameters fall, unless sensors have a finest step."""
     dt, rows = 0.05, 101
     u = f64(*([1.0] * 30 + [-1.0] * 41 + [0.5] * 30))

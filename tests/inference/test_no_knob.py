@@ -76,7 +76,7 @@ def test_strange_units_and_noise(rotating_seed: int) -> None:
         assert (ratio.abs() < BIAS + BAR * ((tail - 1) / (4 * ess)).sqrt())[short].all()
 
 
-def test_a_window_without_motion_settles_on_the_prior_or_says_why(rotating_seed: int) -> None:
+def test_a_window_without_motion_settles_on_the_prior_or_gives_a_reason(rotating_seed: int) -> None:
     """Nothing moves, in any units: the noise is learnt, lag and gain are those of the prior."""
     g = torch.Generator().manual_seed(rotating_seed)
     still = torch.zeros(3, ROWS, dtype=F64)

@@ -248,7 +248,7 @@ def test_a_driver_masks_his_rows_and_the_settling_after_them(drive, tmp_path_fac
     assert_same(expected, windows + stream.feed(time[:0], {n: c[:, :0] for n, c in columns.items()}, until=10.0))
 
 
-def test_a_driver_is_told_by_vehicle_and_row(drive):
+def test_a_driver_is_given_by_vehicle_and_row(drive):
     time, columns = block(drive, slice(0, 10))
     with pytest.raises(InputError, match=r"engaged: of shape \(2, 9\), needs \(2, 10\)"):
         new().feed(time, columns, engaged=torch.ones(2, 9, dtype=torch.bool))

@@ -156,7 +156,7 @@ CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=list(CHANGES))
-def test_a_checksum_made_anew_helps_nothing(saved: BeliefStream, change: Callable) -> None:
+def test_a_recomputed_checksum_does_not_help(saved: BeliefStream, change: Callable) -> None:
     """Each is wrong in itself, even with a right checksum."""
     state = copy.deepcopy(saved.state_dict())
     del state["sha256"]

@@ -142,7 +142,7 @@ def test_a_sign_flip_is_not_believed(fresh_seed):
     """Before it was: T_L 2.94 s and K_L 0.06. The stream is left as it was, and goes on with the right sign."""
     time, given = drive(fresh_seed, seconds=20.0)
     found, fresh = stream(), stream()
-    with pytest.raises(InputError, match=r"wrong sign.* nothing learnt in this time is kept"):
+    with pytest.raises(InputError, match=r"wrong sign.* no estimate from this time is kept"):
         found.feed(time, changed(given, accel_cmd=-1.0))
     assert found.inference.belief.mean.equal(fresh.inference.belief.mean)
     windows, expected = found.feed(time, given), fresh.feed(time, given)

@@ -40,7 +40,7 @@ def test_rows_settle_for_two_seconds_after_every_return(engaged: list[bool], clo
 
 
 @given(st.lists(st.booleans(), min_size=2, max_size=60), st.integers(1, 59))
-def test_a_stream_cut_anywhere_tells_the_same_as_a_log(engaged: list[bool], cut: int) -> None:
+def test_a_stream_cut_anywhere_gives_the_same_answer_as_a_log(engaged: list[bool], cut: int) -> None:
     on, time = np.array(engaged), np.arange(len(engaged)) / RATE_HZ
     whole, last = settled(time, on)
     first, before = settled(time[:cut], on[:cut])

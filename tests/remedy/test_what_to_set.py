@@ -75,7 +75,7 @@ def test_a_late_sensor_and_notes_of_what_bends() -> None:
     assert "backlash" in play.notes[0]
 
 
-def test_wrong_arguments_are_told() -> None:
+def test_wrong_arguments_are_refused() -> None:
     with pytest.raises(InputError, match="required"):
         what_to_set(plant(), _belief(1, 0.3, 1.0), required=1.5)
     with pytest.raises(InputError, match="speeds"):

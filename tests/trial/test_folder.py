@@ -218,7 +218,7 @@ def test_an_earlier_avtorchs_folder_and_no_files_are_refused(root: Path) -> None
             again(root)
 
 
-def test_two_processes_in_one_folder_are_told_apart(root: Path) -> None:
+def test_two_processes_in_one_folder_are_distinguished(root: Path) -> None:
     """A thread stands for the other process: to the lock they are alike."""
     import threading
 

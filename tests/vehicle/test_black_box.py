@@ -63,7 +63,7 @@ def test_what_is_measured_is_the_transfer_function(k_f: float, delay: float) -> 
 
 
 @pytest.mark.slow
-def test_a_black_box_is_judged_by_its_slopes_for_small_motions_only() -> None:
+def test_a_black_box_gets_its_slopes_verdict_for_small_motions_only() -> None:
     law = linearise(network, 25.0)
     omega = torch.tensor([0.8], dtype=torch.float64)
     said = float(stability.gain(omega, 1.2, 0.6, law.time_gap, law.gains, dead_time=0.005)[0])

@@ -26,7 +26,7 @@ def _raced(effect: str, among: list, seed: int, **more):  # type: ignore[no-unty
 @pytest.mark.parametrize(
     "effect", ["sensor_bias", *(pytest.param(e, marks=pytest.mark.slow) for e in ("aerodynamic_drag", "dead_band"))]
 )
-def test_what_is_closed_is_what_one_who_knows_would_say(effect: str, rotating_seed: int) -> None:
+def test_closed_agrees_with_the_oracle(effect: str, rotating_seed: int) -> None:
     from avtorch.gap import AerodynamicDrag, DeadBand, SensorBias
 
     case, race = _raced(effect, [SensorBias, AerodynamicDrag, DeadBand], rotating_seed, tiers=["easy"])

@@ -206,7 +206,7 @@ def test_integrating_a_slope_out_is_the_dense_gaussian(onset: int | None, fresh_
 
 
 @pytest.mark.parametrize("onset", [None, 80])
-def test_the_slope_told_is_the_posterior_mean(onset: int | None, fresh_seed: int) -> None:
+def test_the_reported_slope_is_the_posterior_mean(onset: int | None, fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     hypothesis, white = _case(_hills(rng), "road_grade", rng, speed0=30.0, seconds=14.0)
     z = hypothesis.z_of({"T_L": 0.3, "K_L": 1.0})
@@ -233,7 +233,7 @@ def test_the_slope_told_is_the_posterior_mean(onset: int | None, fresh_seed: int
 
 
 @pytest.mark.statistical
-def test_the_slope_told_is_the_roads(rotating_seed: int) -> None:
+def test_the_reported_slope_is_the_roads(rotating_seed: int) -> None:
     """A plant given the profile found does what the log shows, all but the noise."""
     rng = np.random.default_rng(rotating_seed)
     car = _hills(rng)

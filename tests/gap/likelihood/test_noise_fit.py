@@ -84,7 +84,7 @@ def test_the_mode_is_found_from_afar(rotating_seed: int) -> None:
 
 
 @pytest.mark.statistical
-def test_what_is_seen_well_is_told_well(rotating_seed: int) -> None:
+def test_well_observed_noise_is_estimated_well(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     record = record_of(120.0, noise=None)
     truth = NoiseModel(process_sd=0.08, process_time=0.4, force_sd=0.005, accel_sd=0.06, speed_sd=0.03)

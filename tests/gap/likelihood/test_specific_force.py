@@ -43,7 +43,7 @@ def hills() -> Log:
 
 
 @pytest.mark.slow
-def test_hills_are_named_where_the_log_says_what_its_accelerometer_reads(hills: Log) -> None:
+def test_hills_are_named_where_the_log_declares_specific_force(hills: Log) -> None:
     told = avtorch.diagnose(hills, accel_kind="specific-force", pairs=False)
     assert told.verdict.names == ("road_grade",)
     # taken for dv/dt, the same reading contradicts the speed, and no slope explains that

@@ -287,7 +287,7 @@ def test_errors_behind_a_sensor_become_white(
         )
 
 
-def test_the_speed_alone_knows_nothing_of_the_accelerometer(fresh_seed: int) -> None:
+def test_the_speed_alone_does_not_depend_on_the_accelerometer(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     noise = SENSORS["late and scaled"]
     record = record_of(12.0, channels=("speed",))

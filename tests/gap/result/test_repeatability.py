@@ -37,7 +37,7 @@ def steps(seconds: float, rng: np.random.Generator) -> np.ndarray:
 
 
 @pytest.mark.statistical
-def test_a_manoeuvre_driven_twice_tells_the_noise(rotating_seed: int) -> None:
+def test_a_manoeuvre_driven_twice_gives_the_noise(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     manoeuvre = steps(40, rng)
     told = repeatability(Record.of(log_of(np.concatenate([steps(20, rng), manoeuvre, steps(14, rng), manoeuvre]), rng)))
@@ -53,7 +53,7 @@ def test_a_manoeuvre_driven_twice_tells_the_noise(rotating_seed: int) -> None:
 
 
 @pytest.mark.statistical
-def test_what_is_driven_once_tells_nothing(rotating_seed: int) -> None:
+def test_a_manoeuvre_driven_once_gives_no_noise(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     assert repeatability(Record.of(log_of(steps(120, rng), rng))) is None
     # a command that stands still is no manoeuvre

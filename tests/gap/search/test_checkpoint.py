@@ -175,7 +175,7 @@ FAULTS: dict[str, Callable[[dict[str, Any]], Any]] = {
 
 
 @pytest.mark.parametrize("change", FAULTS.values(), ids=list(FAULTS))
-def test_entries_are_checked_whatever_the_checksum_says(log: Log, kept: Path, change: Callable) -> None:
+def test_entries_are_checked_even_with_a_right_checksum(log: Log, kept: Path, change: Callable) -> None:
     found = read_sealed(kept, schema=SCHEMA)
     change(found.content)
     write_sealed(kept, found.content, schema=SCHEMA, of=found.of)

@@ -191,7 +191,7 @@ def test_no_message_is_held_from_one_stretch_to_the_next() -> None:
     assert found.evidence < 0
 
 
-def test_a_command_that_never_moves_tells_nothing() -> None:
+def test_a_constant_command_is_uninformative() -> None:
     found = _found(np.full(800, 0.3), 0.2, np.random.default_rng(0), 20)
     assert found.evidence < 0
     assert found.fraction == 0.0

@@ -89,7 +89,7 @@ def test_the_true_second_effect_is_ranked_first(name: str, rotating_seed: int) -
 
 
 @pytest.mark.statistical
-def test_a_gain_is_told_before_it_is_fitted(rotating_seed: int) -> None:
+def test_a_gain_is_predicted_before_it_is_fitted(rotating_seed: int) -> None:
     """One linear step predicts the fit of a faint second effect."""
     record, white = _drive(plant([SensorBias(0.1), ConstantResistance(0.1)]), np.random.default_rng(rotating_seed))
     base, z, values = _alone(record, white, SensorBias)

@@ -185,7 +185,7 @@ def test_one_derived_from_a_built_in_is_a_users_own(rotating_seed: int) -> None:
         (NoiseChange(command_variance=torch.tensor(-1.0)), "command_variance below 0"),
     ],
 )
-def test_a_noise_that_says_nothing_of_use_is_refused_in_a_line(change: NoiseChange | None, said: str) -> None:
+def test_a_noise_without_a_usable_change_is_refused_in_a_line(change: NoiseChange | None, said: str) -> None:
     class Mute(Outliers):
         name = "mute"
 

@@ -80,7 +80,7 @@ def test_an_onset_late_in_the_drive_is_found_though_the_whole_fit_is_diluted(nam
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", ["dead_time", "rate_limit"])
-def test_starts_show_an_onset_of_which_the_whole_fit_tells_nothing(
+def test_starts_show_an_onset_that_the_whole_fit_misses(
     name: str, rotating_seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where the fit to the whole drive ends at zero effect, no row contains information about an onset."""
@@ -193,7 +193,7 @@ def test_limits_on_both_sides_are_found_from_the_starts(limits: tuple[float, flo
     assert found.value > top - 2
 
 
-def test_whole_and_late_are_judged_by_the_same_likelihood(fresh_seed: int) -> None:
+def test_whole_and_late_are_scored_by_the_same_likelihood(fresh_seed: int) -> None:
     """The value of a screening is the joint density of its rollout, spliced where it has an onset."""
     rng = np.random.default_rng(fresh_seed)
     record = _drive("constant_resistance", {"resistance_mps2": 0.25}, 36.0, int(rng.integers(2**31)))

@@ -107,7 +107,7 @@ def test_a_pair_is_found(rotating_seed: int) -> None:
 
 
 @pytest.mark.statistical
-def test_what_is_far_behind_at_first_sight_is_not_fitted_anew(tmp_path: Path, rotating_seed: int) -> None:
+def test_hypotheses_far_behind_in_screening_are_not_refitted(tmp_path: Path, rotating_seed: int) -> None:
     """The plain cause and what comes near it get noise of their own; what does nothing keeps its first figure."""
     path = tmp_path / "fits.json"
     log = _log({"sensor_bias": {"bias_mps2": 0.25}}, rotating_seed)
@@ -179,7 +179,7 @@ def test_lost_messages_alone(rotating_seed: int) -> None:
 
 
 @pytest.mark.statistical
-def test_lost_messages_alone_are_judged_where_they_look_like_a_delay(rotating_seed: int) -> None:
+def test_lost_messages_alone_are_tested_where_they_resemble_a_delay(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     log = _log({"command_hold": {"hold_fraction": 0.4}}, int(rng.integers(2**31)), command=_steps(rng))
     race = _search(log, [DeadTime, CommandHold])
@@ -197,7 +197,7 @@ def test_an_effect_that_the_log_cannot_show_is_not_tried(fresh_seed: int) -> Non
     assert {f.name for f in race.found} == {"none", "aerodynamic_drag"}
 
 
-def test_out_of_time_it_says_so(fresh_seed: int) -> None:
+def test_a_search_out_of_time_reports_it(fresh_seed: int) -> None:
     race = _search(_log({}, fresh_seed, seconds=30.0), [SensorBias, DeadTime], budget_s=0.0)
     assert not race.complete
     assert [f.name for f in race.found] == ["none"]

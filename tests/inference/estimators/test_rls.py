@@ -94,7 +94,7 @@ def test_with_forgetting_the_customary_covariance_is_twice_too_wide(rotating_see
 
 
 @pytest.mark.statistical
-def test_draws_and_quantiles_tell_the_same(make_windows, rotating_seed):
+def test_draws_and_quantiles_agree(make_windows, rotating_seed):
     belief = taken(1.0, make_windows(rotating_seed, [0.3], T=0.6, K=0.8), seed=rotating_seed)
     for i in range(3):
         below = (belief.draws[:, 0, i] < belief.q05[0, i]).double().mean().item()
