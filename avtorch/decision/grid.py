@@ -78,8 +78,7 @@ class Intrusiveness:
     margin: float = 4.0
 
     def __call__(self, setting: Setting, default: Setting, stale: Tensor) -> Tensor:
-        """Cost of settings relative to defaults that broadcast with them; `stale`: a model known to be wrong is
-        kept."""
+        """Cost of settings relative to broadcasting defaults; `stale`: a model known to be wrong is kept."""
         lower = setting.lower_differs(default)
         effort = (setting.amplification() / default.amplification()).log2().clamp_min(0.0)
         longer = (setting.time_gap / default.time_gap - 1.0).clamp_min(0.0)

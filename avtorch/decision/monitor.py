@@ -193,7 +193,7 @@ class Monitor:
 
     @torch.no_grad()
     def update(self, T_L: Tensor, K_L: Tensor, excited: Tensor, setting: Setting) -> MonitorReport:
-        """Update with one window: posterior draws T_L [s], K_L [-] (scenario, draw), excited (scenario,), setting in
+        """Update with a window: posterior draws T_L [s], K_L [-] (scenario, draw), excited (scenario,), setting in
         force.
 
         Raises `InputError` for shapes that do not fit.
@@ -297,8 +297,7 @@ class Monitor:
         return Gaussian.of_draws(T_L, K_L, inflation=self.inflation, unevenness=self.unevenness)
 
     def _accepted_change(self, T_L: Tensor, K_L: Tensor, mean: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """(alarm, probability of being outside) (scenario,), for whichever of T_L and K_L is outside with more
-        probability."""
+        """(alarm, probability of being outside) (scenario,), of T_L or K_L, whichever is outside more probably."""
         sure = torch.zeros_like(mean[0])
         for draws, centre, accepted, width in zip((T_L, K_L), mean, self.accepted, self.change, strict=True):
             outside = ((draws - accepted.unsqueeze(-1)).abs() > width).to(draws.dtype).mean(dim=-1)

@@ -277,8 +277,7 @@ class _Search:
         return pick, torch.isfinite(best)
 
     def _best_of_the_rest(self, lost: Tensor) -> Tensor:
-        """Where none is sufficient: the best P(string stable) among settings that clip little more than the one in
-        force.
+        """Where none is sufficient: the best P(string stable) of settings that clip little more than the one in force.
 
         The setting in force is the first candidate. All that reach the required P have been replayed already.
         """

@@ -27,8 +27,7 @@ from avtorch.inference.planes import from_planes, lower_times, to_planes
 MEAN_TOLERANCE, SD_TOLERANCE, TAIL_TOLERANCE = 0.1, 0.05, 0.003
 """Tolerances: error of a mean in SDs, of an SD as a ratio, of the share of draws beyond TAIL as a probability."""
 TAIL = 3.0
-"""SDs of the draws, on either side, where the tail begins: a heavy tail is visible there long before it affects the
-SD."""
+"""SDs of the draws, on either side, where the tail begins: a heavy tail shows there long before it affects the SD."""
 RESOLUTION = 0.05
 """A claim needs the density's moments to be known this well: standard error of a mean in SDs, of an SD as a ratio."""
 ERRORS = 3.0
@@ -78,8 +77,7 @@ class Exactness:
         return fine.all(-1) & (self.pareto_k < RELIABLE)
 
     def beyond(self, errors: float = 1.0) -> Tensor:
-        """Where mean, SD or tail of the draws is off by more than tolerance and chance, ``(3, window, parameter)``
-        bool.
+        """Where mean, SD or tail of the draws exceeds tolerance and chance, ``(3, window, parameter)`` bool.
 
         ``errors``: standard errors of the density's side that are allowed in addition.
         """

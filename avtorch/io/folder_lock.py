@@ -111,8 +111,7 @@ def _sign(path: Path, work: str) -> None:
 
 
 def _holder(path: Path) -> str:
-    """The process that holds the lock, for a message; the file is writable by anyone, so the text is short and
-    sanitised."""
+    """The process that holds the lock, for a message: short and sanitised, as anyone can write the file."""
     try:
         told = json.loads(regular_bytes(path, 4096).decode("utf-8"))
         words = {key: "".join(c for c in str(told[key])[:80] if c.isprintable()) for key in ("pid", "host", "work")}

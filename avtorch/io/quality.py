@@ -1,5 +1,4 @@
-"""Check a log before estimation: what it contains, which rows are masked, what is doubtful. It reports and corrects
-nothing."""
+"""Check a log before estimation: what it contains, which rows are masked, what is doubtful. It never corrects a log."""
 
 from __future__ import annotations
 

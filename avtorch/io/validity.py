@@ -92,8 +92,7 @@ def check_time(time: NDArray, same_drive: NDArray, where: Callable[[int], str]) 
 
 
 def check_rate(step: float, where: str) -> None:
-    """Raise InputError for a median ``step`` [s] outside 10 to 200 Hz, naming the unit where it is probably ms, us or
-    ns."""
+    """Raise InputError for a median ``step`` [s] outside 10 to 200 Hz, naming a probable unit (ms, us, ns)."""
     if not step > 0:
         raise InputError(
             f"{where}: found stamps so far from zero, or from each other, that float64 cannot resolve rows; needs "

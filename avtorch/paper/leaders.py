@@ -20,7 +20,8 @@ _STEADY = ("openacc_astazero/ASta_040719_platoon7.csv", 5, 300.0)
 
 @dataclass(frozen=True)
 class Ahead:
-    """A leader, its `name` in rows, `which` it is in full, and `note`: the leader that it replaces (empty: none)."""
+    """A leader, its `name` in rows, `which` it is in full, and `note`: why it is used in place of a recording (or
+    "")."""
 
     leader: Leader
     name: str

@@ -380,7 +380,7 @@ def test_a_dead_time_out_of_range_is_refused(healthy, seconds):
 @pytest.mark.statistical
 @pytest.mark.parametrize("form", ["jerk", "latent"])
 def test_a_driver_who_acts_against_the_command_teaches_nothing(form, rotating_seed):
-    """The state after an override decays first: lag and gain are the car's, as precise as the remaining rows allow."""
+    """The state after an override decays first: lag and gain are the car's, as precise as the remaining rows permit."""
     rng = np.random.default_rng(rotating_seed)
     truth = {"T_L": 0.5, "K_L": 0.9}
     overrides = [(4.0, 6.0), (10.0, 12.0), (16.0, 18.0)]
