@@ -1,4 +1,4 @@
-"""Answers for machines: what a command found, as plain objects ready for JSON."""
+"""Answers for machines: the results of a command, as plain objects ready for JSON."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 def window_entry(watched: WatchedWindow, scenario: int = 0) -> dict[str, Any]:
     """One window of `estimates.json` and `run.json`, for one scenario.
 
-    `excited` is the fixed rule's word; `used` is false as well where an excited window's chains did not settle, and the
-    belief was carried over. The jerk form has `sigma` [m/s³], the latent form `noise` with its own parameters.
+    `excited` is the result of the fixed rule; `used` is also false where an excited window's chains did not settle, and
+    the belief was carried over. The jerk form has `sigma` [m/s³], the latent form `noise` with its own parameters.
     """
     window, belief = watched.window, watched.window.belief
     excited, settled = bool(belief.excited[scenario]), bool(belief.converged[scenario])
@@ -55,7 +55,7 @@ def alert_entries(watched: Sequence[WatchedWindow], scenario: int = 0) -> list[d
 
 
 def estimates_answer(estimates: Estimates) -> dict[str, Any]:
-    """`estimates.json`: the windows of a log, and beside them what the quality check saw and what was assumed.
+    """`estimates.json`: the windows of a log, the results of the quality check, and the assumptions.
 
     Times are on the log's own clock; `epoch_s` is its first row's.
     """
@@ -125,7 +125,7 @@ def _seconds(time: float) -> float:
 
 
 def _performance(rows: Block, time_gap: float, scenario: int) -> dict[str, Any]:
-    """The measures of a drive, and whether it ended in a collision, after which none of them means much."""
+    """The measures of a drive, and whether it ended in a collision, after which they mean little."""
     return {
         **performance(rows, time_gap=time_gap).row(scenario),
         "collided": bool(rows.collided[scenario]),
@@ -133,7 +133,7 @@ def _performance(rows: Block, time_gap: float, scenario: int) -> dict[str, Any]:
 
 
 def finite(value: float | None) -> float | None:
-    """Infinity (the peak gain of an unstable loop, say) has no other word in JSON than null."""
+    """JSON has no infinity (the peak gain of an unstable loop, say), so it becomes null."""
     return value if value is not None and math.isfinite(value) else None
 
 
@@ -142,7 +142,7 @@ def stability_answer(
 ) -> dict[str, Any]:
     """`stability.json`: Eqs. 2 and 3 at one point, the exact verdicts and the peak gain (null where unstable).
 
-    The conditions know no dead time; the verdicts, the peak and the margin do.
+    The conditions ignore dead time; the verdicts, the peak and the margin include it.
     """
     setting = (T_L, K_L, time_gap, gains)
     peak = float(stability.peak_gain(*setting, dead_time=dead_time))

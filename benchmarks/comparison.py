@@ -1,4 +1,4 @@
-"""Does `avtorch.compare` leave a car alone that has not changed, and find a lag that is a fifth longer?
+"""Does `avtorch.compare` report no change for an unchanged car, and detect a lag that is a fifth longer?
 
 ``python -m benchmarks.comparison [--n 40] [--seed 1] [--seconds 300] [--baseline PLANT] [--json FILE]``
 
@@ -25,7 +25,7 @@ LONGER = 1.2
 
 
 def slower(case: Case, *, seed: int) -> Log:
-    """The same drive anew by the same car with a longer lag, and noise of its own."""
+    """The same drive again by the same car with a longer lag and independent noise."""
     drive = case.drive
     car = replace(case.car, T_L=LONGER * case.car.T_L)
     run = simulate(car, drive.pilot(), seconds=drive.seconds, rate_hz=drive.rate_hz, seed=seed)
@@ -35,7 +35,7 @@ def slower(case: Case, *, seed: int) -> Log:
 
 
 def tried(index: int, *, seed: int, seconds: float, baseline: str | None) -> dict[str, Any]:
-    """One car: what is said of its own second half, and of the slower car's."""
+    """One car: the comparisons with its own second half and with that of the slower car."""
     manoeuvre = list(MANOEUVRES)[index % len(MANOEUVRES)]
     case = draw_case(index, seed, mix=NONE, seconds=2 * seconds, manoeuvre=manoeuvre)
     log = case.log()
@@ -49,7 +49,7 @@ def tried(index: int, *, seed: int, seconds: float, baseline: str | None) -> dic
 
 
 def share(hits: Sequence[bool]) -> str:
-    """As `hits of so many, share (interval)`."""
+    """Text of the form `hits of total, share (interval)`."""
     between = wilson(sum(hits), len(hits))
     if between is None:
         return "none"
@@ -64,7 +64,7 @@ def inside(rows: Sequence[Any]) -> list[bool]:
 
 
 def main() -> None:
-    """Run, print as it goes, and sum up."""
+    """Run, print progress, and summarise."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("--n", type=int, default=40)
     arguments.add_argument("--seed", type=int, default=1)

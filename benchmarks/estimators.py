@@ -1,15 +1,16 @@
-"""SGLD beside least squares, Kalman filters and the posterior mode on the very same streams.
+"""SGLD compared with least squares, Kalman filters and the posterior mode on identical streams.
 
 ``python -m benchmarks.estimators [--only jerk|latent] [--seeds 100] [--latent-seeds 6] [--first-seed 0]
 [--noise 0.1 0.3] [--accel-noise 0.1] [--window 2]``
 
 Closed loops behind US06 (embedded), 80 s; at 26 s the vehicle changes from (0.3 s, 1) to (1.5 s, 0.5). No estimator
-acts on the loop, so all see identical logs. `jerk`: jerk is measured. `latent`: acceleration only, with sensor noise.
+acts on the loop, so all get identical logs. `jerk`: jerk is measured. `latent`: acceleration only, with sensor noise.
 
 Errors and coverage of the 90 % interval are over used windows (excited and converged): before the change, after it,
 and late, from 50 s on; the error of a coverage is over seeds. Delay is from the change to the end of the first window
 whose belief lies within the accepted change (0.2 s, 0.15) of the truth, whether it was used or carried over. Cost is
-the processor's time over SGLD's, each window given to all in turn, for all vehicles in one batch and for one alone.
+the processor time relative to SGLD's, each window given to all in turn, for all vehicles in one batch and for one
+alone.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ PHASES = ("before", "after", "late")
 
 @dataclass
 class Arm:
-    """An estimator with its options, what it said of every window, and the processor's seconds it took."""
+    """An estimator with its options, its belief after every window, and the processor seconds it took."""
 
     label: str
     stream: BeliefStream
@@ -54,7 +55,7 @@ def drive(seeds: int, *, first_seed: int = 0, noise: float = 0.1) -> Block:
 
 
 def jerk_arms() -> dict[str, dict[str, object]]:
-    """Default settings first, then other values of the one number that says how fast the past is forgotten."""
+    """Default settings first, then other values of the one number that sets the rate of forgetting."""
     arms: dict[str, dict[str, object]] = {name: {"estimator": name} for name in ("sgld", "map", "rls", "ekf", "ukf")}
     for lam in (0.01, 1.0):
         arms[f"map, lambda {lam:g}"] = {"estimator": "map", "lam": lam}
@@ -67,7 +68,7 @@ def jerk_arms() -> dict[str, dict[str, object]]:
 
 
 def latent_arms(noise: float, accel_noise: float) -> dict[str, dict[str, object]]:
-    """Filters with the default noise levels, and told the simulator's own: noise held over a step, no unknown force."""
+    """Filters with the default noise levels, and with the simulator's own: noise held over a step, no unknown force."""
     told = {"process_noise": noise * math.sqrt(DT), "accel_noise": accel_noise, "coloured_sd": 0.01}
     arms: dict[str, dict[str, object]] = {name: {"estimator": name} for name in ("sgld", "map", "ekf", "ukf")}
     return arms | {f"{name}, given the noise": {"estimator": name, "noise": told} for name in ("ekf", "ukf")}
@@ -98,7 +99,7 @@ def run(
             until = float(time_s[part][-1]) + DT
             windows = arm.stream.feed(time_s[part], block, usable=usable[:, part], until=until)
             arm.seconds += time.process_time() - begun
-            # the draws of all windows would fill the memory
+            # the draws of all windows would not fit in memory
             arm.windows += [replace(w, belief=replace(w.belief, draws=w.belief.draws[:0])) for w in windows]
     return made
 
@@ -107,7 +108,7 @@ def phases(window: Window) -> list[str]:
     if window.end_s <= CHANGE_S + 1e-6:
         return ["before"]
     if window.start_s < CHANGE_S - 1e-6:
-        return []  # two vehicles in one window have no one truth
+        return []  # a window with two vehicles has no single truth
     return ["after", "late"] if window.start_s >= LATE_S - 1e-6 else ["after"]
 
 

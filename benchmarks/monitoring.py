@@ -1,4 +1,4 @@
-"""How well the paper's change is seen and met: many seeds of the closed loop in one batch.
+"""How well the paper's change is detected and handled: many seeds of the closed loop in one batch.
 
 ``python -m benchmarks.monitoring [--seeds 200] [--noise 0.1] [--strategy none|auto] [--leader FILE --start S]``
 
@@ -36,7 +36,7 @@ def drive(
     duration: float = 80.0,
     strategy: str = "none",
 ) -> SupervisedRun:
-    """`seeds` closed loops side by side, each with its own jerk noise; the vehicle changes at `change_at` [s]."""
+    """`seeds` closed loops in one batch, each with its own jerk noise; the vehicle changes at `change_at` [s]."""
     plant = GLVDPlant(*HEALTHY, sigma=noise)
     loop = ClosedLoop(leader, plant=plant, scenarios=seeds, seeds=range(first_seed, first_seed + seeds))
     strategist = None if strategy == "none" else Strategist(Grid(allowed=ALLOWED[strategy]))
@@ -60,7 +60,7 @@ def score(
         w, belief = watched.window, watched.window.belief
         after = w.start_s >= change_at - 1e-6
         if not after and w.end_s > change_at + 1e-6:
-            continue  # two vehicles in one window have no one truth
+            continue  # a window with two vehicles has no single truth
         truth = torch.tensor(vehicle if after else HEALTHY, dtype=torch.float64)
         used = belief.excited & belief.converged
         covered = (belief.q05[:, :2] <= truth) & (truth <= belief.q95[:, :2])

@@ -1,13 +1,13 @@
-"""Does the proposed manoeuvre tell apart what a drive left confused? Tried on the reference vehicle of the blind test.
+"""Does the proposed manoeuvre separate the causes that a drive does not? Tested on the blind test's reference vehicle.
 
 ``python -m benchmarks.next_experiment [--n 60] [--seed 1] [--seconds 60] [--json FILE]``
 
 Draws sealed cases that followed a vehicle, diagnoses each, and where more than one named cause (or none at all) is
-left, drives the proposed manoeuvre with the same car and the same cause: an open loop, with noise and road of its own.
-Then both drives are diagnosed together. Separated is a case in which only the truth is left, right one whose verdict is
-the truth; shares come with their 90 % intervals (Wilson). Cases where only `unknown` stood beside the verdict are
-counted apart, and so are those whose truth was among what was left: no manoeuvre parts a truth from causes that it is
-not held against.
+left, drives the proposed manoeuvre with the same car and the same cause: an open loop, with new noise and road.
+Then both drives are diagnosed together. A case is separated if only the truth is left, and right if its verdict is the
+truth; shares come with their 90 % intervals (Wilson). Cases where only `unknown` remained beside the verdict are
+counted separately. So are those whose truth was among the remaining causes: a manoeuvre is not designed to separate a
+truth that was excluded before.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _LATER_S = 60.0  # after the log's end the manoeuvre begins
 
 
 def driven(case: Case, experiment: Experiment, *, seed: int) -> Log:
-    """The manoeuvre with the case's own car and cause, as the car would log it."""
+    """Simulate the manoeuvre with the case's own car and cause, as the car would log it."""
     m = experiment.manoeuvre
     rate = case.drive.rate_hz
     times = np.arange(0.0, m.time[-1], 1 / rate)
@@ -52,7 +52,7 @@ def driven(case: Case, experiment: Experiment, *, seed: int) -> Log:
 
 
 def tried(case: Case, limits: Limits, *, seed: int) -> dict[str, Any]:
-    """One case: what was left before, and after."""
+    """One case: the remaining causes before and after."""
     log = case.log()
     before = diagnose(log)
     named = [n for n in before.verdict.alias_set if n != "unknown"]

@@ -1,11 +1,11 @@
-"""The loop over windows against one inference on all of them, and how it follows a vehicle that changes.
+"""The loop over windows against one inference on all of them, and its response to a vehicle that changes.
 
 ``python -m benchmarks.pooled [--only constant|carried|change] [--vehicles 200] [--windows 10] [--seed 20240602]``
 
 Truths come from the first prior, windows have 200 points. `constant`: means, SDs and coverage of the last belief beside
-the posterior given all windows (quadrature, one sigma). `carried`: what of `posterior` mode's difference is the normal
-approximation and what the sampler's noise. `change`: a step to a fresh draw from the prior before window 6, and a drift
-of 3 % a window in T_L and K_L.
+the posterior given all windows (quadrature, one sigma). `carried`: the parts of `posterior` mode's difference due to
+the normal approximation and to the sampler's noise. `change`: a step to a fresh draw from the prior before window 6,
+and a drift of 3 % a window in T_L and K_L.
 """
 
 from __future__ import annotations

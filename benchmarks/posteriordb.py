@@ -1,4 +1,4 @@
-"""Three posteriors of posteriordb, written in torch and sampled with SGLD, against the reference draws of others.
+"""Three posteriors of posteriordb, written in torch and sampled with SGLD, against posteriordb's reference draws.
 
     python -m benchmarks.posteriordb DATA [--chains 2048]
 

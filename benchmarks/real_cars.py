@@ -3,9 +3,9 @@
 ``AVTORCH_DATA=DIR python -m benchmarks.real_cars [--cause] [--slope] [--json FILE]``
 
 Reads the OpenACC platoons in ``openacc_astazero`` and ``openacc_zalazone`` and prints a line a car. ``--cause`` also
-diagnoses the half of each drive that judges. ``--slope`` prints how much of the surveyed slope (AstaZero) each follower
-shows in its speed, the slope's coefficient in the identified loop, 1 for a car that does nothing against it; and how
-near a slope that is fitted without the survey comes to it. ``--only TEXT``: files with that in their path.
+diagnoses the test half of each drive. ``--slope`` prints how strongly the surveyed slope (AstaZero) acts on each
+follower's speed, as the slope's coefficient in the identified loop: 1 for a car that does not compensate it. It also
+compares a slope fitted without the survey with the surveyed one. ``--only TEXT``: files with that in their path.
 """
 
 from __future__ import annotations
@@ -74,9 +74,9 @@ def row_of(found: FollowerDiagnosis, log: Log) -> dict[str, Any]:
 
 
 def slope_coefficient(found: FollowerDiagnosis, log: Log, grade: np.ndarray) -> tuple[float, float]:
-    """How much of the surveyed ``grade`` (row,) [-] acts on the car that is not met by its controller: mean and sd.
+    """Share of the surveyed ``grade`` (row,) [-] that the car's controller does not compensate: mean and sd.
 
-    By regression of the loop's white errors on the white image of the slope's pull, law and plant held.
+    By regression of the loop's whitened errors on the whitened response to the slope, with law and plant fixed.
     """
     pull = -GRAVITY * grade
     record, one = found.identified.hypothesis.record, found.identified
@@ -90,7 +90,7 @@ def slope_coefficient(found: FollowerDiagnosis, log: Log, grade: np.ndarray) -> 
 
 
 def slope_recovered(found: FollowerDiagnosis, grade: np.ndarray) -> dict[str, float]:
-    """A slope fitted together with law, lag and delay, held against the surveyed ``grade`` (row,) [-].
+    """A slope fitted together with law, lag and delay, compared with the surveyed ``grade`` (row,) [-].
 
     ``correlation``; ``rmse`` [-] about both means; ``zero``: the same of no slope at all.
     """

@@ -1,10 +1,10 @@
-"""How long the belief takes to follow: seconds per 2 s window, for one vehicle and for many side by side.
+"""Cost of updating the belief: seconds per 2 s window, for one vehicle and for many in one batch.
 
     python -m benchmarks.real_time [--repeats 5]
 
 One thread. A window has 200 rows at 100 Hz and is sampled with the default settings. The aim is an update
-in less than 5 % of the window's length, and a cost that grows more slowly than the number of vehicles. The share is
-that of the processor's time, which a busy machine does not stretch; the clock's time stands beside it.
+in less than 5 % of the window's length, and a cost that grows more slowly than the number of vehicles. The share is of
+processor time, which does not grow on a busy machine; wall time is printed beside it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ AIM = 0.05
 
 
 def drive(vehicles: int, windows: int, seed: int = 0) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Rows of ``vehicles`` of unlike lags and gains behind commands of two sines, jerk noise 0.1 m/s^3."""
+    """Rows of ``vehicles`` of different lags and gains behind commands of two sines, jerk noise 0.1 m/s^3."""
     g = torch.Generator().manual_seed(seed)
     time_s = torch.arange(round(windows * WINDOW_S * RATE_HZ), dtype=torch.float64) / RATE_HZ
     draw = torch.rand(5, vehicles, 1, generator=g, dtype=torch.float64)

@@ -2,9 +2,9 @@
 # # The vehicle and its stability
 #
 # An automated vehicle does not follow its command at once, nor in full: a lag `T_L` and a gain `K_L` lie between the
-# command and the acceleration. You will see what the two do to one car, why a whole line of such cars may turn a tap on
-# the brake into a jam, how to predict whether it will, and how sure you can be when `T_L` and `K_L` are estimated, not
-# known.
+# command and the acceleration. This notebook shows the effect of both on one car, why a whole line of such cars may
+# turn a tap on the brake into a jam, how to predict whether it will, and how certain the prediction is when `T_L` and
+# `K_L` are estimated, not known.
 #
 # Pictures appear below their cells; run as a script, the notebook saves them and prints where.
 
@@ -45,7 +45,7 @@ plots.show(figure, OUT / "one_car.png")
 
 # %% [markdown]
 # The healthy car reaches the command within a second. The worn one takes several, and then realises only half of it.
-# Both go on after the command has ended, for as long as they were late.
+# Both continue after the command has ended, for as long as they were late.
 #
 # ## A line of cars
 #
@@ -146,7 +146,7 @@ wrongly = int((eq3.string & eq3.local & ~plane.string).sum())
 print("passed by Eq. 3 without being string stable:", wrongly)
 
 # %% [markdown]
-# All that is hatched lies within the blue, as it must; the rest of the blue is what the sufficient condition misses.
+# The hatched area lies within the blue, as it must; the rest of the blue is what the sufficient condition misses.
 #
 # ## Which gains, which time gap
 #
@@ -174,8 +174,7 @@ plots.show(figure, OUT / "gains.png")
 #
 # ## A delay is not a lag
 #
-# Real actuators also have dead time: for a moment nothing happens at all. It is tempting to add it to the lag and
-# forget about it.
+# Real actuators also have dead time: for a moment nothing happens at all. It is tempting to simply add it to the lag.
 
 # %%
 dead = torch.linspace(0.0, 0.6, 121, dtype=torch.float64)

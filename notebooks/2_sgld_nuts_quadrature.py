@@ -47,7 +47,7 @@ plots.show(figure, OUT / "window.png")
 
 # %% [markdown]
 # On the right is what the likelihood explains: `jerk = (K_L u - a) / T_L` plus noise of `sigma` (the paper's Eq. 4).
-# Two columns that look much alike, `a` and `u`, have to separate `T_L` from `K_L`. So their posterior is strongly
+# Two similar columns, `a` and `u`, have to separate `T_L` from `K_L`. So their posterior is strongly
 # correlated, and a sampler needs a preconditioner.
 #
 # ## SGLD by hand

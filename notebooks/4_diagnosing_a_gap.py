@@ -4,7 +4,7 @@
 # A simulator and a car disagree. Which effect does the simulator lack? You will draw a drive of a reference vehicle
 # that shares no code with the diagnosis, with one hidden effect. You will diagnose it from its log alone, see where
 # the gap lies, how far it shrinks and which manoeuvre would separate the remaining hypotheses, drive that manoeuvre,
-# and only then look at the truth. At the end the repaired simulator drives.
+# and only then reveal the truth. At the end the repaired simulator drives.
 
 # %%
 from pathlib import Path

@@ -5,12 +5,11 @@
 # are informative all the same: you will see how the car follows, whether a line of such cars damps a disturbance or
 # amplifies it, and which of these results is conditional on what. Then comes a car whose commands *are* known, a test
 # vehicle on three laps, and a diagnosis that names no effect.
-#
-# The recordings belong to others and are not part of the project, but they are public: OpenACC by the European
+# The recordings belong to third parties and are not part of the project, but they are public: OpenACC by the European
 # Commission's Joint Research Centre (its data catalogue has it, GitHub's `yinglonghe/C2ART-OPT` the platoons on
 # AstaZero) and the laps of GitHub's `MPC-Berkeley/genesis_path_follower`. Put their files into folders
 # `openacc_astazero` and `genesis`, the laps as CSV with the columns `time`, `accel_cmd` and `speed`, and let
-# `AVTORCH_DATA` name the folder of both. Without them every cell runs and says what it lacks.
+# `AVTORCH_DATA` name the folder of both. Without them every cell runs and names the missing files.
 
 # %%
 import os
@@ -35,7 +34,7 @@ LAPS = [f"genesis/lap{k}.csv" for k in (1, 2, 3)]
 
 
 def there(*names: str) -> bool:
-    """Whether the recordings are at hand; says what is missing."""
+    """Whether the recordings are available; prints what is missing."""
     missing = [name for name in names if DATA is None or not (DATA / name).exists()]
     if missing:
         print("not shown, for lack of", ", ".join(missing), "in the folder that AVTORCH_DATA names")
@@ -113,8 +112,8 @@ if there(*LAPS):
     print(", ".join(f"{name} {q.mean:.2f} ({q.q05:.2f} to {q.q95:.2f})" for name, q in told.winner.parameters.items()))
 
 # %% [markdown]
-# The measured speed fluctuates at 8 to 20 Hz as under no effect of the table, so the honest verdict is `unknown`.
-# Without that choice, the verdict is brakes that are stronger than the engine.
+# The measured speed fluctuates at 8 to 20 Hz as under no effect of the table, so the right verdict is `unknown`. With
+# that excluded, the verdict is brakes that are stronger than the engine.
 
 # %%
 if there(*LAPS) and told.shrinkage is not None:

@@ -191,7 +191,7 @@ for key in ("accel_rms_ratio", "jerk_rms_mps3", "min_spacing_m"):
 # %% [markdown]
 # The belief follows lag and gain as it does under the paper's controller: it uses the commands and the response, not
 # the controller. Without action the worn car runs into its leader at the stop (the least spacing is below zero; the
-# orange line means nothing afterwards). With a lower level that knows the car, it stops clear of its leader.
+# orange line means nothing afterwards). With a lower level that has the right model, it stops clear of its leader.
 #
 # ## Try this
 #

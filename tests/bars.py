@@ -1,8 +1,9 @@
-"""How far a statistical test may find a number from the truth: bars that follow from the number of comparisons.
+"""Bars of statistical tests: the allowed distance of a number from the truth, from the number of comparisons.
 
-In one of a hundred runs of the whole suite a correct program is to miss a bar. The comparisons share that evenly: each
-may fail by chance in one of a million, and its bar lies 4.9 standard errors off, which comments round to 5 sigma. What
-misses one is drawn once more; three such tests in one run, which fail it, are a chance of one in several million.
+In one of a hundred runs of the whole suite a correct program may miss a bar. The comparisons share that evenly: each
+may fail by chance in one of a million, and its bar lies 4.9 standard errors off, which comments round to 5 sigma. A
+test that misses its bar is drawn once more; three such tests in one run, which fail it, have a probability of one in
+several million.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ import math
 from scipy import stats
 
 ALARM = 0.01
-"""Of runs of the whole suite, how many miss a bar by chance."""
+"""Share of runs of the whole suite in which a bar is missed by chance."""
 TESTS = 230
-"""Test functions marked `statistical`; `tests/test_statistical.py` holds it to their number within a factor of two."""
+"""Test functions marked `statistical`; `tests/test_statistical.py` checks it against their number within a factor of
+two."""
 PER_TEST = 40
 """Comparisons of one: its cases, times windows, parameters, moments or lags. A factor of two moves the bar by 0.14."""
 LEVEL = ALARM / (TESTS * PER_TEST)
@@ -35,9 +37,9 @@ def student(degrees: float, level: float = LEVEL) -> float:
 
 
 def log_odds(count: int = 1) -> float:
-    """What the largest of `count` log likelihood ratios against the truth [nats] stays below.
+    """Upper bound on the largest of `count` log likelihood ratios against the truth [nats].
 
     A ratio's mean is 1 under the truth, so that it exceeds x nats with a probability of exp(-x) at most. It is most of
-    what its test asks, and has the level of a whole test.
+    its test, and has the level of a whole test.
     """
     return math.log(count / (PER_TEST * LEVEL))

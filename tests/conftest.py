@@ -16,7 +16,8 @@ pytest_plugins = ("tests.redraws", "pytester")
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """Folder of real recordings, named by AVTORCH_DATA; the tests that need it are skipped only where that is unset."""
+    """Folder of real recordings, named by AVTORCH_DATA; the tests that need it are skipped only where the variable is
+    unset."""
     folder = os.environ.get("AVTORCH_DATA")
     if folder is None:
         pytest.skip("AVTORCH_DATA is not set")

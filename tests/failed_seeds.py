@@ -51,7 +51,7 @@ def recorded(root: Path) -> Seeds:
 
 
 def add(root: Path, failed: Seeds) -> Path:
-    """Adds to the file, in one step, so that a run that is interrupted leaves the old file or the new one."""
+    """Add to the file in one step, so that an interrupted run leaves the old file or the new one."""
     path = written_to(root)
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f"{path.name}.{os.getpid()}")

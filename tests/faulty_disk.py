@@ -1,7 +1,7 @@
-"""A file system that fails at the n-th call below one folder, or lets a test look at that folder just before it.
+"""A file system that fails at the n-th call below one folder, or lets a test inspect that folder just before it.
 
 Counted are the calls of `os` that make, rename, remove or open files, what streams opened for writing do (write, flush,
-close), and if wanted the calls that list files or look at them.
+close), and optionally the calls that list or stat files.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def interrupts(at: int) -> Call:
 
 
 def visible(folder: Path, *, besides: frozenset[str] = frozenset()) -> dict[str, str]:
-    """What a reader of a folder sees: the content of each file by its name, links followed, none of them dangling."""
+    """The content of a folder for a reader: each file's content by name, links followed, none of them dangling."""
     if not folder.is_dir():
         return {}
     return {
@@ -57,12 +57,12 @@ def visible(folder: Path, *, besides: frozenset[str] = frozenset()) -> dict[str,
 
 
 def tree(folder: Path) -> tuple[tuple[str, str], ...]:
-    """All that lies in a folder, with what is hidden: equal where only the sets are called otherwise."""
+    """The whole content of a folder, hidden files included; equal for folders that differ only in the names of sets."""
     found = []
     for path in sorted(folder.rglob("*")) if folder.is_dir() else ():
         if path.is_symlink():
             what = f"link to {os.readlink(path)}"
-        elif path.is_dir() or path.suffix == ".lock":  # which says when it was made
+        elif path.is_dir() or path.suffix == ".lock":  # it contains the time it was made
             what = path.suffix or "folder"
         else:
             what = hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,4 +1,4 @@
-"""Every public name, where it is made, and what its documentation says: read from the source, without an import."""
+"""Every public name, its module, and its documentation: read from the source, without an import."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def _names(node: ast.stmt) -> list[str]:
 
 
 def _text(node: ast.stmt | None) -> str:
-    """What a string below a constant says of it."""
+    """The documentation string below a constant."""
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
         return node.value.value
     return ""

@@ -1,7 +1,7 @@
 """How a test that draws is run: recorded seeds first, then a new one, and a failed bar once more with more samples.
 
 A pytest plugin, loaded by `tests/conftest.py`. It replaces pytest-rerunfailures, which cannot run a recorded seed
-before a new one, also runs again what failed in a fixture or while an AssertionError was handled, and does not tell an
+before a new one, also repeats failures in a fixture or while an AssertionError was handled, and does not distinguish an
 assertion of the test from one inside the package. With xdist the workers draw; their reports carry the seeds to the
 controller, which counts and writes.
 """
@@ -70,7 +70,7 @@ def draws_factor(request: pytest.FixtureRequest) -> int:
 
     A bar of k standard errors that is computed from the number of samples becomes half as wide. A correct program
     misses it as rarely as the first. A bias that stands at z standard errors in the first draw stands at 2 z in the
-    second: one of the bar's own size, which a first draw sees half the time, fails the second.
+    second: one of the bar's own size, which a first draw detects half the time, fails the second.
     """
     return request.node.stash[DRAW].factor
 

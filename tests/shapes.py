@@ -1,10 +1,10 @@
 """Shapes checked under test: calls of annotated functions are held to `Float[Tensor, "window time"]` and its like.
 
 `install` puts a finder before Python's own. What it loads from `PACKAGES` is the module as it stands, with every
-function that names a shape wrapped: jaxtyping compares the dimensions of one call with each other, beartype looks into
-unions and tuples. Other annotations are not looked at, because the tests of refusals pass what is wrong on purpose; and
-the function runs first, because what it refuses itself it refuses in its own words. A combination of shapes that has
-passed once is not compared again: a loop of ten thousand equal steps costs ten thousand look-ups in a set.
+function that names a shape wrapped: jaxtyping compares the dimensions of one call with each other, beartype resolves
+unions and tuples. Other annotations are not checked, because the tests of refusals pass wrong values on purpose; and
+the function runs first, so that its own error messages take precedence. A combination of shapes that has passed once is
+not compared again: a loop of ten thousand equal steps costs ten thousand look-ups in a set.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --- stability
 
 
-def test_stability_says_what_the_specification_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_stability_matches_the_specification(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["stability", "--T", "1.5", "--K", "0.5", "--out", str(tmp_path / "s")]) == 0
     told = capsys.readouterr().out
     assert "2.2445" in told
@@ -110,7 +110,7 @@ def test_quiet_is_quiet_and_a_seed_repeats(drive: Path, tmp_path: Path, capsys: 
     assert windows[0] == windows[1]
 
 
-def test_windows_that_did_not_settle_are_told_apart() -> None:
+def test_windows_that_did_not_settle_are_reported_separately() -> None:
     def window(*, excited: bool, used: bool) -> dict:
         stat = {"mean": 0.3, "sd": 0.01, "q05": 0.28, "q95": 0.32}
         return {"excited": excited, "used": used, "T_L": stat, "K_L": stat, "alerts": []}
@@ -137,7 +137,7 @@ def test_windows_that_did_not_settle_are_told_apart() -> None:
 
 
 @pytest.mark.slow
-def test_run_sees_the_change_and_acts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_detects_the_change_and_acts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["run", "--duration", "36", "--seed", "3", "--out", str(tmp_path)]
     assert main(arguments) == 0
     assert "the vehicle changes" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""What is known of an effect stands in its own file: no other file of the package names one, by string or by import."""
+"""All knowledge of an effect is in its own file: no other file of the package names one, by string or by import."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every public name is documented with an example, and the examples run and show what they say they show."""
+"""Every public name is documented with an example, and the examples run and print the output shown."""
 
 from __future__ import annotations
 

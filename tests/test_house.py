@@ -1,4 +1,4 @@
-"""The house in order: the files a newcomer meets, and rules that a reader would otherwise have to check."""
+"""Rules of the repository: the files that a newcomer reads first, and rules that a reviewer would otherwise check."""
 
 from __future__ import annotations
 

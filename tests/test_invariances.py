@@ -137,7 +137,7 @@ def answers(drive: Log) -> dict[str, Numbers]:
     return {name: function(drive) for name, function in FUNCTIONS.items()}
 
 
-# what an answer says on the log's own clock, and with it moves
+# the parts of an answer on the log's own clock, which move with it
 ON_THE_CLOCK = ("start_s", "end_s", "time_s", "onset_s", "epoch_s")
 _EPOCH_NOTE = re.compile("times are shown from the log's start")
 
@@ -193,7 +193,7 @@ def test_where_a_followers_clock_begins_changes_nothing(behind: Log) -> None:
 
 
 def test_two_drives_need_not_share_a_clock() -> None:
-    """Neither in a comparison nor in a diagnosis, which sees nothing but drives; every row keeps its own stamp."""
+    """Neither in a comparison nor in a diagnosis, which uses only the drives; every row keeps its own stamp."""
     one, two = _drive(60.0, seed=5), _drive(60.0, seed=6)
     later = [replace(log, time=log.time + offset) for log, offset in zip((one, two), OFFSETS, strict=False)]
     told = avtorch.compare(*later).to_dict()
@@ -352,7 +352,7 @@ def test_the_units_of_signals_change_nothing(name: str, drive: Log, answers: dic
 
 
 def test_the_order_of_columns_changes_nothing(tmp_path: Path, drive: Log) -> None:
-    """To the bit: every function sees the same log."""
+    """To the bit: every function gets the same log."""
     names = tuple(_columns(drive))
     given = _written(drive, tmp_path, names)
     turned = _written(drive, tmp_path, names[::-1])
@@ -467,7 +467,7 @@ def test_the_sign_of_everything_changes_no_fit_of_the_acceleration(drive: Log) -
 # 7. the same drive twice
 
 
-def test_a_drive_given_twice_tells_the_same_twice_as_surely(drive: Log) -> None:
+def test_a_drive_given_twice_halves_the_variance(drive: Log) -> None:
     """Estimates stay within what the prior moves them by, and twice the rows halve that; spreads shrink by sqrt 2 to
     the tenth that the noise model, fitted anew, and the prior's own share allow."""
     one, two = _fits([drive], DeadTime, AerodynamicDrag), _fits([drive, drive], DeadTime, AerodynamicDrag)

@@ -1,6 +1,7 @@
-"""Notebooks run from top to bottom, with recordings and without, show their pictures, and say what is so.
+"""Notebooks run from top to bottom, with recordings and without, show their pictures, and make true statements.
 
-What a notebook's text says of its figures is kept true here: the claims look at what the cells computed.
+What a notebook's text says of its figures is kept true here: the claims are checked against the values that the cells
+computed.
 """
 
 from __future__ import annotations
@@ -174,7 +175,7 @@ def test_real_cars_with_recordings(data_dir: Path, run: Callable, monkeypatch: p
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
-def test_tells_a_story(path: Path) -> None:
+def test_has_title_cells_and_exercises(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert text.startswith("# %% [markdown]\n# # ")
     cells = re.split(r"^# %%.*\n", text, flags=re.M)[1:]

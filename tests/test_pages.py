@@ -54,7 +54,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize("page", ALL, ids=lambda page: page.name)
 def test_tests_that_are_named_exist(page: Path) -> None:
-    """A promise is worth the test that holds avtorch to it."""
+    """Every promise names a test that enforces it."""
     named = re.findall(r"\b(tests/[\w/]+\.py)(?:::(\w+))?", page.read_text(encoding="utf-8"))
     assert named or page.name != "trust.md"
     for path, name in named:

@@ -98,7 +98,7 @@ def test_a_broad_first_prior_does_not_squeeze_the_rest() -> None:
     assert ax.get_ylim()[1] < 3.0
 
 
-def test_map_tells_the_three_verdicts_apart() -> None:
+def test_map_distinguishes_the_three_verdicts() -> None:
     local = np.array([[False, True, True]] * 2)
     string = np.array([[False, False, True]] * 2)
     ax = plots.verdict_map(axes(), [0.0, 1.0, 2.0], [0.0, 1.0], local, string)
@@ -115,7 +115,7 @@ def test_map_of_one_verdict_only() -> None:
     plots.verdict_map(axes(), [0.0, 1.0, 2.0], [0.0, 1.0], nowhere, nowhere, np.full((2, 3), np.inf))
 
 
-def test_setting_region_judges_the_effective_vehicle() -> None:
+def test_setting_region_is_that_of_the_effective_vehicle() -> None:
     # with the lower level's model right at (1.5, 0.5) that vehicle behaves as the target and is string stable
     right = {**SETTING, "T_hat": 1.5, "K_hat": 0.5}
     for setting, expected in ((SETTING, 1), (right, 2)):

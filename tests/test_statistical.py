@@ -66,7 +66,7 @@ def test_bars_are_of_as_many_tests_as_there_are(tests: dict[str, tuple[bool, boo
     assert bars.TESTS / 2 < sum(marked for _, marked in tests.values()) < 2 * bars.TESTS
 
 
-def test_the_reader_sees_marks_and_fixtures() -> None:
+def test_the_reader_finds_marks_and_fixtures() -> None:
     source = """
 @pytest.fixture
 def pair(rotating_seed): ...

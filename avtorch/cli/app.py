@@ -34,7 +34,7 @@ for _command in (run, estimate, diagnose, compare, stability, validate, blindtes
 
 
 def _missing(fault: MissingArgumentError) -> str:
-    """What is missing, and an example; the parser only says that something is."""
+    """Name the missing argument and give an example; the parser only reports that one is missing."""
     command = " ".join(fault.command_chain or ())
     argument = fault.argument
     if argument is None or argument.tokens:
@@ -51,7 +51,7 @@ def main(tokens: Sequence[str] | None = None) -> int:
     try:
         app(tokens, exit_on_error=False, print_error=False)
     except (InputError, CycloptsError) as fault:
-        # one line, whatever the parser's own message looks like and recites
+        # one line, however many the parser's own message has
         said = _missing(fault) if isinstance(fault, MissingArgumentError) else str(fault)
         most = None if isinstance(fault, InputError) else 400
         print("avtorch: " + printable(" ".join(said.split()), most), file=sys.stderr)

@@ -81,7 +81,7 @@ def two_axes(text: str) -> tuple[str, str]:
 def free_folder(out: Path, *, without: str | None = None) -> None:
     """Refuse a place that cannot become a folder before any work is done; nothing is made yet.
 
-    `without`: an answer that may not be there already, since its pictures have names that this one's have too.
+    `without`: an answer that must not be in the folder already, because its pictures have the same names as this one's.
     """
     if without is not None and (out / without).exists():
         raise InputError(f"--out: {out} holds {without}, and pictures of the same names; needs another folder")

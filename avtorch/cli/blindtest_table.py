@@ -8,7 +8,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-# what is shown, its path in the answer, how it is written, and what it must reach
+# label, path in the answer, number format, and the aim
 _MEASURES = (
     ("top-1, easy", "top1.easy", "%", "≥ 97 %"),
     ("top-1, medium", "top1.medium", "%", "≥ 95 %"),
@@ -32,7 +32,7 @@ _MEASURES = (
 
 
 def blindtest_table(answer: Mapping[str, Any]) -> Table:
-    """A row a measure; `answer` as of `avtorch.trial.run_trial`. Measures that no case bears on are left out."""
+    """One row per measure; `answer` as of `avtorch.trial.run_trial`. Measures without a case are left out."""
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("")
     for name in (answer["answerer"], "90 %", "aim", *answer["baselines"]):
@@ -48,7 +48,7 @@ def blindtest_table(answer: Mapping[str, Any]) -> Table:
 
 
 def blindtest_notes(answer: Mapping[str, Any]) -> list[str]:
-    """How many cases there were, who gave no answer, and which answers were damaged."""
+    """The number of cases, which methods gave no answer, and which answers were damaged."""
     counts = answer["counts"]
     singles = sum(counts["top1"].values())
     notes = [

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 TRACK = Group("Next experiment", sort_key=20)
 FOLLOWER = Group("Car following", sort_key=21)
 CAUSES = ("none", "unknown", "pair")
-"""What a prior may weigh beside the effects; `pair`: all pairs together."""
+"""Hypotheses besides the effects that a prior may weigh; `pair`: all pairs together."""
 
 
 def diagnose(
@@ -220,7 +220,7 @@ _FILES = {
 
 
 def _limits(drives: Sequence[Log], given: Mapping[str, float | None]) -> Limits:
-    """From the log where not given; what is given is refused before the search where it allows nothing at all."""
+    """Limits not given are taken from the log. Limits that allow no manoeuvre are refused before the search starts."""
     from avtorch.experiment import Limits, library
     from avtorch.gap.result.diagnosis import LogFacts
 
@@ -281,7 +281,7 @@ def _usable(path: Path, drive: Log, accel_kind: str) -> None:
 
 
 def _judged(names: Sequence[str], path: Path, drive: Log) -> None:
-    """Whoever asks for an effect by name is told where a log cannot show it."""
+    """Report a requested effect that the log's channels cannot show."""
     from avtorch.gap import EFFECTS
 
     for name in names:

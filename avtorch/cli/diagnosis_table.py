@@ -1,4 +1,4 @@
-"""A diagnosis that reads in ten seconds: one sentence, one table, a few lines below it."""
+"""A diagnosis to read in ten seconds: one sentence, one table, a few lines below it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 
 def diagnosis_headline(found: Diagnosis) -> list[str]:
-    """The verdict as one sentence, what is implausible of it, and below it the diagnosis' own reason."""
+    """The verdict in one sentence, its implausible parameters, and the diagnosis' reason below."""
     from avtorch.gap.result.sentences import headline
 
     odd = found.winner.implausible
@@ -32,7 +32,7 @@ def diagnosis_headline(found: Diagnosis) -> list[str]:
 
 
 def diagnosis_table(found: Diagnosis) -> Table:
-    """A row a candidate: probability, log evidence, parameters."""
+    """One row per candidate: probability, log evidence, parameters."""
     from avtorch.gap.result.sentences import number
 
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
@@ -59,7 +59,7 @@ def diagnosis_table(found: Diagnosis) -> Table:
 
 
 def diagnosis_notes(found: Diagnosis) -> list[str]:
-    """What else there is to say, as lines with markup: alias set, onset, size of the gap, what remains, budget."""
+    """Further lines with markup: alias set, onset, size of the gap, what remains, budget."""
     from avtorch.gap.result import sentences
 
     told = [
@@ -92,7 +92,7 @@ def bar(share: float) -> str:
 
 
 def _shown(candidates: Iterable[Candidate]) -> tuple[list[Candidate], list[Candidate]]:
-    """The first rows that are not faint, the verdict's, `none` and `unknown` always among them; and those left out."""
+    """Rows to print, and rows left out. The rows of the verdict, `none` and `unknown` are always printed."""
     ranked = list(candidates)
     always = [c for c in ranked if c.name in ("none", "unknown")]
     best = [c for c in ranked if c not in always and (c is ranked[0] or c.probability >= _FAINT)]

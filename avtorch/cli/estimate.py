@@ -119,11 +119,11 @@ def estimate(
 
 
 UNEXPLAINED = 1.5
-"""Spread of windows over their SDs (`Estimates.spread_ratio`) above which one lag and one gain are not the log's."""
+"""`Estimates.spread_ratio` above which a single lag and gain do not describe the log."""
 
 
 def estimates_note(answer: Mapping[str, Any]) -> str:
-    """One sentence on a list of windows."""
+    """Summarise a list of windows in one sentence."""
     windows = answer["windows"]
     excited, used = ([w for w in windows if w[key]] for key in ("excited", "used"))
     if not excited:

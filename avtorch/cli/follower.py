@@ -35,7 +35,7 @@ def follow(
     seed: int,
     step: Callable[[str, int, int], None],
 ) -> None:
-    """Diagnose the follower, write the answer and the page, and print what a person wants to know.
+    """Diagnose the follower, write the answer and the page, and print a summary.
 
     `source`: keywords of `read_following`.
     """

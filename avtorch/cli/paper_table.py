@@ -1,4 +1,4 @@
-"""The tables of `avtorch paper`: a row an experiment or a row a claim, and in words what was not reproduced."""
+"""The tables of `avtorch paper`: one row per experiment or per claim, and a text on what was not reproduced."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _COLOURS = {"same": "green", "better": "bold green", "not reproduced": "yellow"}
 
 
 def counts_table(answer: Mapping[str, Any]) -> Table:
-    """How many claims of each experiment came out how."""
+    """Counts of the claims of each experiment by verdict."""
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("")
     for verdict in ("rows", *_COLOURS):
@@ -27,7 +27,7 @@ def counts_table(answer: Mapping[str, Any]) -> Table:
 
 
 def rows_table(answer: Mapping[str, Any]) -> Table:
-    """A row a claim: what was asked and where, the paper's word, ours with its 90 % interval, the verdict."""
+    """One row per claim: quantity and place, the paper's value, ours with its 90 % interval, the verdict."""
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("", ratio=5)
     table.add_column("paper", ratio=3)

@@ -7,9 +7,9 @@ from pathlib import Path
 from avtorch.errors import InputError
 
 FITS = "fits.json"
-"""Finished fits, kept by the diagnosis, which also holds them against the logs and settings they are of."""
+"""Finished fits. The diagnosis keeps them and compares their fingerprint with that of its logs and settings."""
 
-_EARLIER = "fits_of.json"  # beside them until 0.1.0: what they are of
+_EARLIER = "fits_of.json"  # written beside the fits until 0.1.0: the fingerprint of their logs and settings
 
 
 def begin_anew(out: Path) -> None:

@@ -153,7 +153,7 @@ def _unwatched(
     change: Callable[[ClosedLoop], None],
     step: Callable[[float, float], None],
 ) -> Block:
-    """The same drive with nobody watching, in blocks so that the bar moves."""
+    """The same drive without a monitor, in blocks so that the progress bar moves."""
     from avtorch.vehicle import Block
 
     end, turn, blocks = round(seconds / loop.dt), round(change_at / loop.dt), []

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def read_simulator(option: str, text: str) -> GapPlant | None:
-    """None for the bare GLVD, whose answer says as well what remains once a delay is in.
+    """None for the bare GLVD, for which the answer also reports the gap that remains once a delay is modelled.
 
     Raises `InputError` that names the `option`, for a file that is not there and for values out of range.
     """

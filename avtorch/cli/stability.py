@@ -53,7 +53,7 @@ def stability(
     talk = Talk(json=json, quiet=quiet)
     answer = stability_answer(T, K, tau, k, dead_time=dead_time)
     point = {"k_s": k[0], "k_v": k[1], "k_a": k[2], "tau": tau, "T": T, "K": K}
-    # the sweep that a dead time needs is dear: fewer points then
+    # a dead time needs a frequency sweep, which is slow: use fewer points
     points = 401 if dead_time == 0 else 101
     x, y = ((name, torch.linspace(*_around(name, point[name]), points, dtype=torch.float64)) for name in axes)
     held = {"T_L": T, "K_L": K, "time_gap": tau, "gains": k, "dead_time": dead_time}
@@ -79,7 +79,7 @@ def stability(
 
 
 def _around(name: str, value: float) -> tuple[float, float]:
-    """A stretch of an axis that shows the setting and where it could go."""
+    """Limits of an axis that contain the setting and the settings that could replace it."""
     usual = {
         "T": (0.02, 2.0),
         "K": (0.2, 1.3),

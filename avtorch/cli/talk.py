@@ -1,4 +1,4 @@
-"""Everything a person sees of a command: notes, progress, tables, where the files are."""
+"""Everything a command prints: notes, progress, tables, where the files are."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from avtorch.cli.terminal import SafeConsole
 
 
 class Talk:
-    """Everything a person sees. With `json` the tables give way to the answer; with `quiet` to nothing."""
+    """Prints tables and progress. With `json` it prints the answer in place of the tables; with `quiet` nothing."""
 
     def __init__(self, *, json: bool, quiet: bool) -> None:
         self.json, self.silent = json and not quiet, quiet or json
@@ -88,7 +88,7 @@ class Talk:
             self.out.print(told, style="yellow", markup=False)
 
     def story(self, answer: Mapping[str, Any]) -> None:
-        """What happened in a run, in order, and what the action was worth."""
+        """The events of a run in order, and how much the action helped."""
         change = answer["change"]
         lines = [(change["time_s"], "", f"the vehicle changes to T_L {change['T_L']:g} s, K_L {change['K_L']:g}")]
         lines += [(a["time_s"], "yellow", f"alert, {a['detector']}: {a['why']}") for a in answer["alerts"]]
@@ -178,7 +178,8 @@ def write_answer(
     *,
     also: Sequence[str] = (),
 ) -> None:
-    """Publish the answer and its pictures as one set; `also`: what an earlier answer of the kind may have written."""
+    """Publish the answer and its pictures as one set; `also`: files that an earlier answer of this kind may have
+    left."""
     from avtorch.io import answer_set, write_json
     from avtorch.plots import save
 

@@ -1,4 +1,4 @@
-"""A terminal that no text from a file can steer."""
+"""A terminal that text from a file cannot control."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from avtorch.errors import printable
 
 
 class SafeConsole(Console):
-    """A console whose own styles and movements reach the terminal, and from all text only what can be seen.
+    """A console that sends its own styles and cursor movements to the terminal, but only visible characters of any
+    text.
 
     Names of files and columns may hold terminal sequences or turn the direction of writing: they are shown escaped.
     """

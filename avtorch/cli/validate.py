@@ -1,4 +1,4 @@
-"""`avtorch validate`: SGLD held against exact quadrature and NUTS, on a log or on synthetic windows."""
+"""`avtorch validate`: compare SGLD with exact quadrature and NUTS, on a log or on synthetic windows."""
 
 from __future__ import annotations
 

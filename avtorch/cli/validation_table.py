@@ -1,4 +1,4 @@
-"""The table of a validation that reads in ten seconds."""
+"""The table of a validation, to read in ten seconds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rich.table import Table
 
 
 def validation_table(answer: Mapping[str, Any]) -> Table:
-    """A row a parameter: how far SGLD lies from the reference over the windows; last the aims."""
+    """One row per parameter: distance of SGLD from the reference over the windows; the last row has the aims."""
     from avtorch.inference.arviz_export import UNITS
 
     units = {name: unit.replace("^2", "²").replace("^3", "³").replace("sqrt(s)", "√s") for name, unit in UNITS.items()}
@@ -35,7 +35,7 @@ def validation_table(answer: Mapping[str, Any]) -> Table:
 
 
 def validation_notes(answer: Mapping[str, Any]) -> list[str]:
-    """What the columns are, how many windows stand behind them, and what a window cost."""
+    """A caption: the columns, the number of windows they are over, and the time per window."""
     summary = answer["summary"]
     seconds = summary["seconds_per_window"]
     run = [f"{name} {seconds[name]:.2g} s" for name in seconds if name not in summary["not_run"]]

@@ -1,4 +1,4 @@
-"""What is done: detectors, Algorithm 2, the strategist, and the supervisor that closes the loop online.
+"""Decisions: detectors, Algorithm 2, the strategist, and the supervisor that closes the loop online.
 
 Example:
     >>> from avtorch import GLVDPlant, Leader, Setting, estimate, simulate

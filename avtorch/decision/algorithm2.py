@@ -8,9 +8,9 @@
                         1. time gap:  τ_new > τ
                         2. gains:     |k_s'| > |k_s|, |k_v'| > |k_v|, |k_a'| > |k_a|
 
-The print leaves the new values open; `PAPER_TIME_GAP` and `PAPER_GAINS` are those of its experiment, which calm the car
-without making it string stable when the lower level passes the demand through. The print checks the
-estimates themselves, with the time gap and gains in force, not what the updated lower level would make of them.
+The paper leaves the new values open; `PAPER_TIME_GAP` and `PAPER_GAINS` are those of its experiment, which calm the car
+without making it string stable when the lower level passes the demand through. The paper checks the estimates
+themselves, with the time gap and gains in force, not what the updated lower level would make of them.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ Choice = Literal["time_gap", "gains"]
 class Algorithm2:
     """The branch taken, bool (scenario,) each, and the setting it leads to.
 
-    `outside`: the estimate left the accepted boundary; `stable`: what the check said (checked or not, so that it can be
-    shown); `lower_level_updated`, `time_gap_increased`, `gains_increased`: what was done.
+    `outside`: the estimate left the accepted boundary; `stable`: the result of the stability check (computed in every
+    branch, so that it can be plotted); `lower_level_updated`, `time_gap_increased`, `gains_increased`: what was done.
 
     Example:
         >>> import torch
@@ -75,8 +75,8 @@ def algorithm2(
 
     The boundary is `accepted` ± `change`, both (T_L, K_L); by default around the model in the lower level, which is
     what was accepted last. `check="print"` is Eq. 2 with the sufficient Eq. 3 at the estimate; `"exact"` the exact
-    string condition. Raises `InputError` where the new time gap is not longer or a new gain not larger in size than
-    the one in force, as the print demands, in a scenario that takes that branch.
+    string condition. Raises `InputError` where a scenario takes a branch whose new time gap is not longer, or whose new
+    gain is not larger in size, than the one in force, as the paper requires.
 
     Example:
         >>> import torch

@@ -6,7 +6,7 @@ In control the innovations are independent standard normal. One two-sided chart 
 - **EWMA** when :math:`|e_t| > L \sqrt{w/(2-w)}`, with :math:`e_t = (1-w) e_{t-1} + w z_t` and :math:`e_0 = 0`;
 - **CUSUM** when :math:`\max(c^+_t, c^-_t) > L`, with :math:`c^\pm_t = \max(0, c^\pm_{t-1} \pm z_t - r)`, likewise.
 
-No limit is typed in. The ARL of Shewhart is exact; those of EWMA and CUSUM solve the renewal (Fredholm) equation of
+All limits are computed. The ARL of Shewhart is exact; those of EWMA and CUSUM solve the renewal (Fredholm) equation of
 the chart's Markov chain, the continuous limit of Brook & Evans (1972), on Gauss-Legendre nodes; the limit for a
 wanted ARL is then found by bracketing. A chart starts again from zero after its alarm, so alarms in control come an
 ARL apart.
@@ -118,7 +118,7 @@ class Chart:
     def step(self, innovation: Tensor, seen: Tensor) -> Tensor:
         """Feed standardised innovations (scenario, component); returns alarms (scenario,).
 
-        Where `seen` (scenario,) is false the chart stands still: no window came, none is counted.
+        Where `seen` (scenario,) is false the chart does not advance, and no window is counted.
         """
         z = innovation.to(torch.float64)
         if self.kind == "shewhart":
@@ -136,7 +136,7 @@ class Chart:
         return alarm
 
     def restart(self, where: Tensor) -> None:
-        """Back to zero for the scenarios in `where` (scenario,) bool."""
+        """Reset the scenarios in `where` (scenario,) bool to zero."""
         self._arms = torch.where(where[:, None, None], torch.zeros_like(self._arms), self._arms)
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-r"""How far a window's posterior lies from a baseline posterior, and whether that is more than chance.
+r"""Distance of a window's posterior from a baseline posterior, and a test of whether it exceeds chance.
 
 Both are taken as Gaussians in :math:`(\log T_L, \log K_L)`, the scale on which the posteriors are close to normal:
 
@@ -9,8 +9,8 @@ Both are taken as Gaussians in :math:`(\log T_L, \log K_L)`, the scale on which 
 
 Each is increasing in one quadratic form :math:`\delta^\top A \delta` of the distance of the means. If nothing has
 changed, :math:`\delta \sim N(0, P + Q)`, as the baseline is uncertain too; the form is then a sum of weighted
-chi-squares, whose upper tail in two dimensions is one smooth periodic integral. The threshold on the divergence is
-that tail's quantile, so that the rate of false alarms is what was asked for, whatever the two covariances are.
+chi-squares, whose upper tail in two dimensions is one smooth periodic integral. The threshold on the divergence is that
+tail's quantile, so the rate of false alarms is the one requested for any two covariances.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class Gaussian(NamedTuple):
         """Moments of (log T_L, log K_L) over the last dimension, T_L [s] and K_L [-] of shape (..., draw).
 
         `inflation` multiplies the standard deviations: the measured ratio of window-to-window spread to posterior SD,
-        for logs on which the posterior is known to be too narrow. `unevenness` is what a sound vehicle's T_L and K_L
-        scatter from window to window anyway, SDs as shares of the value; its square is added to the variances.
+        for logs on which the posterior is known to be too narrow. `unevenness` is the scatter of a sound vehicle's T_L
+        and K_L from window to window, SDs as shares of the value; its square is added to the variances.
         """
         if T_L.shape[-1] < 3:
             raise InputError(f"T_L: found {T_L.shape[-1]} draws, need at least 3 for a covariance")
@@ -59,7 +59,7 @@ class Gaussian(NamedTuple):
         return Gaussian(mean, cov * inflation**2 + floor)
 
     def combine(self, other: Gaussian) -> Gaussian:
-        """The belief that two independent looks at the same parameters give together (product of the densities)."""
+        """Combine two independent posteriors of the same parameters (product of the densities)."""
         total = torch.linalg.inv(self.cov + other.cov)
         mean = self.mean + (self.cov @ total @ (other.mean - self.mean).unsqueeze(-1)).squeeze(-1)
         cov = self.cov @ total @ other.cov
@@ -103,7 +103,7 @@ def divergence(kind: DivergenceKind, p: Gaussian, q: Gaussian) -> Tensor:
 
 
 def divergence_p_value(kind: DivergenceKind, p: Gaussian, q: Gaussian) -> Tensor:
-    """Chance of a divergence at least this large if nothing has changed, shape (...); two dimensions.
+    """Probability of a divergence at least this large if nothing has changed, shape (...); two dimensions.
 
     Alarming below a p-value of `rate` is a threshold on the divergence itself, set so that a share `rate` of in-control
     windows alarms.

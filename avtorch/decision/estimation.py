@@ -27,15 +27,15 @@ Array = NDArray[Any]
 FormName = Literal["auto", "jerk", "latent"]
 
 LEAST_ROWS = 10
-"""Rows a window must span: three parameters and their noise from fewer are a guess."""
+"""Rows a window must span: fewer do not determine three parameters and their noise."""
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """What `estimate` found.
+    """The result of `estimate`.
 
     `windows` in the order of the log; `seconds_per_window` of computing; `form` "jerk" or "latent"; `quality` of the
-    log, looked at first; `setting` under which P(string stable) was asked: a log does not tell its controller;
+    log, checked first; `setting` for which P(string stable) was computed, since a log does not contain its controller;
     `estimator` by name; `accepted` (T_L [s], K_L [-]) of a sound car, with which `accepted_change` compares;
     `dead_time` [s] that commands were given.
 
@@ -58,16 +58,16 @@ class Estimates:
 
     @property
     def excited_share(self) -> float:
-        """Share of the windows that were excited, and so used."""
+        """Share of the windows that were excited and therefore used."""
         excited = [bool(w.window.belief.excited[0]) for w in self.windows]
         return sum(excited) / len(excited)
 
     def spread_ratio(self, name: str) -> float | None:
         """Spread of a parameter from window to window over its posterior SD, None below three used windows.
 
-        About 1 where the vehicle stays as it is and the posterior is honest; above 1.5 the posterior is too narrow for
-        what the log shows, or the vehicle changed. Each window's distance from the mean counts in its own SD, and the
-        mean weighs windows by precision (the Birge ratio), so windows that know little do not pass for spread.
+        About 1 where the vehicle does not change and the posterior has the right width; above 1.5 the posterior is too
+        narrow for this log, or the vehicle changed. Each window's distance from the mean is divided by its own SD, and
+        the mean weighs windows by precision (the Birge ratio), so uninformative windows do not count as spread.
         """
         beliefs = [w.window.belief for w in self.windows]
         stats = [b.stat(name) for b in beliefs if bool(b.excited[0] & b.converged[0])]
@@ -101,9 +101,9 @@ def estimate(
     squares (measured jerk only), "ekf" and "ukf" are joint Kalman filters. Further keywords are the estimator's own
     (`mode`, `lam`, `settings`, ...; see `avtorch.inference.estimators.make_estimator`).
 
-    `dead_time` [s] of the vehicle, where it is known (`avtorch.diagnose` tells it): commands act so much later, and
-    the first rows of a drive, whose commands are not in the log or were not obeyed, are masked. The default monitor
-    judges with it.
+    `dead_time` [s] of the vehicle, where it is known (`avtorch.diagnose` estimates it): commands act that much later,
+    and the first rows of a drive, whose commands are not in the log or were not obeyed, are masked. The default monitor
+    computes its verdicts with it.
 
     Raises `InputError` for a log without accel_cmd or without any row that counts, a form whose columns it lacks, a
     window longer than the log, or an estimator that is not known or cannot take the form.
@@ -156,7 +156,7 @@ def estimate(
         time = time + ahead
         last = float(time[-1])
         seen: list[WatchedWindow] = []
-        # block by block, so that progress can be shown and an interruption heard
+        # block by block, so that progress can be reported and an interruption handled
         for first in range(0, len(time), 1000):
             block = slice(first, first + 1000)
             rows = {name: signal[part][block] for name, signal in signals.items()}
@@ -197,7 +197,7 @@ def _delayed(log: Log, dead_time: float) -> tuple[Array, Array]:
 def _on_the_logs_clock(watched: WatchedWindow, ahead: float) -> WatchedWindow:
     if ahead == 0.0:
         return watched
-    # rounded: a nanosecond is less than any clock tells, and more than there and back costs
+    # rounded to a nanosecond: finer than any clock resolves, coarser than the round-off of both conversions
     start, end = (round(t - ahead, 9) for t in (watched.window.start_s, watched.window.end_s))
     return replace(watched, window=replace(watched.window, start_s=start, end_s=end))
 

@@ -7,11 +7,12 @@ Grid, relative to the driver's default and to the setting in force:
   effort T_hat K_d / (K_hat T_d).
 - time gap: the one in force, the default, and the driver's settings that are longer than the default.
 - gains: those in force, the default's, and a stated list of triples, calibrated beforehand.
-- feed-forward: the gain in force, the default's, and where the vehicle hears its leader a stated list of gains.
+- feed-forward: the gain in force, the default's, and, where the vehicle receives its leader's acceleration, a stated
+  list of gains.
 
-Intrusiveness is a number without unit; one is what updating the lower level costs. What nobody in the car notices
-costs least; what the driver sees on the dashboard or the engineer has to re-approve costs more; both together cost
-more than the sum:
+Intrusiveness is a number without unit; updating the lower level costs one. A change that nobody in the car notices
+costs least; one that the driver sees on the dashboard or that the engineer has to re-approve costs more; both together
+cost more than the sum:
 
     lower level differs from the default    1    + 0.5 for each doubling of the command effort above 1
     lower level kept though known wrong     3    (the paper: update at a minimum)
@@ -22,9 +23,9 @@ more than the sum:
     anything differs from what is in force  1    (do not intervene for a trifle)
 
 so that 1 -> 1.6 s costs 3.3, 1 -> 2.5 s costs 6, doubling k_v costs 3, and k_f 0 -> 0.5 costs 2: nobody in the car
-notices and no road is lost, but the car then leans on a radio link. The lower level alone comes first (about 2 to
-3.7), then with it one step of the gap or a mild change of gains, then the longest gap or a strong change of gains, then
-gap and gains. All weights are parameters.
+notices and no road capacity is lost, but the car then depends on a radio link. The lower level alone is cheapest (about
+2 to 3.7). Next come the lower level with one step of the gap or a mild change of gains, then the longest gap or a
+strong change of gains, then both gap and gains. All weights are parameters.
 """
 
 from __future__ import annotations
@@ -46,13 +47,13 @@ GAINS_GRID: tuple[tuple[float, float, float], ...] = (
     *product((1.5,), (1.5, 2.0, 3.0, 4.0, 6.0), (-0.8, -1.8, -3.0, -5.0)),
     PAPER_GAINS,
 )
-"""Gains (k_s, k_v, k_a) on offer: k_v makes the car responsive, which a weak actuator needs; a stronger k_a holds
-back a slow one. k_s stays, as it is neutral (paper, table on gains). The paper's own triple is among them."""
+"""Gains (k_s, k_v, k_a) on offer: a larger k_v makes the car responsive, which a weak actuator needs; a stronger k_a
+damps a slow one. k_s is kept, as it is neutral (paper, table on gains). The paper's own triple is among them."""
 
 
 @dataclass(frozen=True)
 class Intrusiveness:
-    """Weights of the cost in this module's text; `margin` is the strategist's price of a setting that barely passes.
+    """Weights of the cost in the module docstring; `margin` is the strategist's price of a setting that barely passes.
 
     Example:
         >>> import torch
@@ -77,14 +78,14 @@ class Intrusiveness:
     margin: float = 4.0
 
     def __call__(self, setting: Setting, default: Setting, stale: Tensor) -> Tensor:
-        """Cost of settings against defaults that broadcast with them; `stale`: a model known to be wrong is kept."""
+        """Cost of settings relative to broadcasting defaults; `stale`: a model known to be wrong is kept."""
         lower = setting.lower_differs(default)
         effort = (setting.amplification() / default.amplification()).log2().clamp_min(0.0)
         longer = (setting.time_gap / default.time_gap - 1.0).clamp_min(0.0)
         k, k0 = setting.gains, default.gains
         k = torch.cat([k[..., :2], 1.0 - k[..., 2:]], dim=-1)
         k0 = torch.cat([k0[..., :2], 1.0 - k0[..., 2:]], dim=-1)
-        # A gain of zero or below has no ratio; the smallest stands in, so that it counts as a large change.
+        # A gain of zero or below has no ratio; the smallest float replaces it, so that it counts as a large change.
         fed = (setting.feedforward - default.feedforward).abs()
         octaves = (k.clamp_min(1e-3) / k0.clamp_min(1e-3)).log2().abs().sum(dim=-1)
         return (
@@ -114,10 +115,10 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Grid:
-    """A finite set of settings (see the module's text).
+    """A finite set of settings (see the module docstring).
 
     time_gaps [s]; gains: triples; targets: positions of T_d between the default's target lag (0) and the estimated lag
-    (1); feedforward: gains k_f on the leader's acceleration, none where nothing is heard of it; allowed: strategies out
+    (1); feedforward: gains k_f on the leader's acceleration, none where it is not received; allowed: strategies out
     of {1, 2, 3, 4} that may be used. gains_of_gap: for a controller whose gains follow from
     its time gap (an MPC's equivalent gains): (time gap [s]) -> triple; Strategies 3 and 4 are then not on offer. Raises
     `InputError` for an empty or impossible grid.
@@ -171,7 +172,7 @@ class Grid:
         T_hat = torch.cat([current.T_hat[:, None], T_L[:, None].expand(-1, len(targets))], dim=1)
         K_hat = torch.cat([current.K_hat[:, None], K_L[:, None].expand(-1, len(targets))], dim=1)
         K_d = torch.cat([current.K_d[:, None], column.K_d.expand(-1, len(targets))], dim=1)
-        # An estimate at or below the default's target leaves one update, not several that are the same.
+        # An estimate at or below the default's target leaves one update, not several equal ones.
         fresh = torch.cat([torch.ones(scenarios, 1, dtype=torch.bool), (targets == 0.0) | (reach > 1e-9)], dim=1)
 
         gaps = torch.cat([current.time_gap[:, None], column.time_gap, _listed(self.time_gaps, scenarios)], dim=1)

@@ -1,17 +1,18 @@
-"""The monitor: looks at every window's posterior and says which detectors are alarmed, for many scenarios at once.
+"""The monitor: evaluates all detectors on every window's posterior, for many scenarios at once.
 
 Detectors, each reported by its own name:
 
 - `stability` (default): under the belief and the setting in force the loop is probably not string stable. It takes
   precedence over all others (paper, Strategy 1).
-- `accepted_change` (default): the paper's rule, estimate outside accepted value ± (0.2 s, 0.15), made honest: the
-  posterior mean must be outside *and* the posterior must be sure of it. The accepted value moves by `accept`.
+- `accepted_change` (default): the paper's rule, estimate outside accepted value ± (0.2 s, 0.15), with one more
+  condition: the posterior mean must be outside *and* so must nearly all of the posterior. The accepted value moves by
+  `accept`.
 - `kl`, `hellinger`, `w2`: divergence from a baseline posterior beyond chance at a stated false-alarm rate.
 - `shewhart`, `ewma`, `cusum`: control charts on the standardised innovations, with a stated in-control run length.
 
 The baseline pools all excited windows since the last acceptance in which no detector of change was alarmed (a
-stability alarm may be the fault of the setting). An unexcited window never alarms and moves nothing: it says nothing
-about the vehicle.
+stability alarm may be the fault of the setting). An unexcited window carries no information about the vehicle: it
+raises no alarm and updates no statistic.
 """
 
 from __future__ import annotations
@@ -53,9 +54,9 @@ Example:
 
 @dataclass(frozen=True)
 class MonitorReport:
-    """What one window's update saw; every tensor (scenario,).
+    """The result of one window's update; every tensor (scenario,).
 
-    `alerts` by detector's name, in order of precedence, bool; `statistics` by name: what each detector compared;
+    `alerts` by detector's name, in order of precedence, bool; `statistics` by name: the value each detector compared;
     `p_string_stable`, `p_local_stable` under the belief with the setting in force; `mean` (T_L [s], K_L [-]).
 
     Example:
@@ -92,7 +93,7 @@ class MonitorReport:
         return [name for name, on in self.alerts.items() if bool(on[scenario])]
 
     def why(self, name: str, scenario: int = 0) -> str:
-        """One sentence a person reads about one detector in one scenario."""
+        """One sentence on one detector in one scenario."""
         T, K = (float(m[scenario]) for m in self.mean)
         T0, K0 = (float(a[scenario]) for a in self.accepted)
         seen = f"T_L {T:.2f} s, K_L {K:.2f}"
@@ -112,17 +113,17 @@ class MonitorReport:
 
 
 class Monitor:
-    """Watches `scenarios` beliefs; see the module's text for the detectors.
+    """Monitors `scenarios` beliefs; see the module docstring for the detectors.
 
     accepted: (T_L [s], K_L [-]) accepted at the start, numbers or (scenario,); change: accepted change of the two.
     certainty: posterior probability of being outside that an `accepted_change` alarm takes. stability_level: an alarm
     where P(string stable) or P(locally stable) is below it; a little below the 0.95 a new setting must reach, so that
-    a sufficient setting is not put in question again by the next window's scatter. false_alarm_rate: of each divergence
+    scatter in the next window does not raise an alarm on a sufficient setting. false_alarm_rate: of each divergence
     detector, per excited window. arl: in-control average run length of each chart [excited windows]. inflation: ratio
-    of window-to-window spread to posterior SD, 1 for an honest posterior. unevenness: SDs, as shares of T_L and K_L, by
-    which a sound vehicle differs from window to window anyway: divergences and charts without it alarm on any car that
-    is not GLVD to a per cent (0.1 and 0.03 kept them quiet, docs/detectors.md). dead_time [s]: of the vehicle, number
-    or (scenario,). link_delay [s]: of the leader's acceleration where it is fed forward. Raises `InputError` for
+    of window-to-window spread to posterior SD, 1 for a posterior of the right width. unevenness: SDs, as shares of T_L
+    and K_L, by which a sound vehicle differs from window to window: divergences and charts without it alarm on any car
+    that is not GLVD to a per cent (0.1 and 0.03 kept them quiet, docs/detectors.md). dead_time [s]: of the vehicle,
+    number or (scenario,). link_delay [s]: of the leader's acceleration where it is fed forward. Raises `InputError` for
     unknown detectors and numbers out of range.
 
     Example:
@@ -192,7 +193,8 @@ class Monitor:
 
     @torch.no_grad()
     def update(self, T_L: Tensor, K_L: Tensor, excited: Tensor, setting: Setting) -> MonitorReport:
-        """Look at one window: posterior draws T_L [s], K_L [-] (scenario, draw), excited (scenario,), setting in force.
+        """Update with a window: posterior draws T_L [s], K_L [-] (scenario, draw), excited (scenario,), setting in
+        force.
 
         Raises `InputError` for shapes that do not fit.
         """
@@ -211,7 +213,7 @@ class Monitor:
         alerts: dict[str, Tensor] = {}
         statistics: dict[str, Tensor] = {}
         comparable = excited & self._has_baseline
-        # Scenarios without a baseline are compared with themselves: no number of theirs is used.
+        # Scenarios without a baseline are compared with themselves; their results are not used.
         baseline = _choose(self._has_baseline, self._baseline, window)
         for name in self.detectors:
             if name == "stability":
@@ -242,7 +244,8 @@ class Monitor:
         return report
 
     def accept(self, where: Tensor, T_L: Tensor | None = None, K_L: Tensor | None = None) -> None:
-        """The change was accepted or acted on in the scenarios `where` (scenario,) bool: it is the new normal.
+        """Make the present state the new baseline in the scenarios `where` (scenario,) bool, after it was accepted or
+        acted on.
 
         The accepted values become T_L [s], K_L [-] (scenario,), by default the means of the last excited window; the
         baseline becomes that window's posterior and the charts start afresh.
@@ -259,13 +262,13 @@ class Monitor:
             chart.restart(where)
 
     def set_baseline(self, T_L: Tensor, K_L: Tensor) -> None:
-        """A baseline posterior from elsewhere (an earlier drive, knowledge): draws (scenario, draw) or (draw,)."""
+        """Set a baseline posterior from another source (an earlier drive): draws (scenario, draw) or (draw,)."""
         given = self._gaussian(T_L.to(torch.float64), K_L.to(torch.float64))
         self._baseline = Gaussian(given.mean.expand(self.scenarios, 2), given.cov.expand(self.scenarios, 2, 2))
         self._has_baseline = torch.ones(self.scenarios, dtype=torch.bool)
 
     def state_dict(self) -> dict[str, Any]:
-        """All that later updates depend on, as tensors and dicts of tensors."""
+        """The whole state that later updates depend on, as tensors and dicts of tensors."""
         return {
             "accepted": [a.clone() for a in self.accepted],
             "mean": [m.clone() for m in self._mean],
@@ -276,10 +279,10 @@ class Monitor:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume to the bit.
+        """Restore a state bit for bit.
 
-        Raises `InputError`, and stays as it was, where the state is of other charts or scenarios, or has other shapes
-        or types than a monitor saves, or numbers that are not finite.
+        Raises `InputError`, and leaves the monitor unchanged, where the state is of other charts or scenarios, has
+        other shapes or types than a monitor saves, or holds numbers that are not finite.
         """
         shaped_as(self.state_dict(), state, "state: monitor")
         self.accepted = (state["accepted"][0].clone(), state["accepted"][1].clone())
@@ -294,7 +297,7 @@ class Monitor:
         return Gaussian.of_draws(T_L, K_L, inflation=self.inflation, unevenness=self.unevenness)
 
     def _accepted_change(self, T_L: Tensor, K_L: Tensor, mean: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """(alarm, probability of being outside) (scenario,): for T_L or K_L, whichever of those outside is surer."""
+        """(alarm, probability of being outside) (scenario,), of T_L or K_L, whichever is outside more probably."""
         sure = torch.zeros_like(mean[0])
         for draws, centre, accepted, width in zip((T_L, K_L), mean, self.accepted, self.change, strict=True):
             outside = ((draws - accepted.unsqueeze(-1)).abs() > width).to(draws.dtype).mean(dim=-1)

@@ -1,4 +1,4 @@
-"""Why a setting was chosen, as a person would say it."""
+"""Why a setting was chosen, in one plain sentence."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def sentences(
     asked: Tensor,
     seconds: float,
 ) -> list[str]:
-    """One sentence a scenario on the choice of a `Decision`; tensors are (scenario,).
+    """One sentence per scenario on the choice of a `Decision`; tensors are (scenario,).
 
-    `p_deaf`: P(string stable) if the leader's acceleration is no longer heard. `asked`: the driver is asked for the
-    gap. `seconds` [s] of the past that `predicted` has replayed.
+    `p_deaf`: P(string stable) if the leader's acceleration is no longer received. `asked`: the driver is asked to set
+    the gap. `seconds` [s] of the past over which `predicted` was replayed.
     """
     out = []
     for i, used in enumerate(strategies):

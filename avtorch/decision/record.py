@@ -1,4 +1,4 @@
-"""What a supervised run leaves behind: rows, windows, alerts and actions."""
+"""The record of a supervised run: rows, windows, alerts and actions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from avtorch.vehicle.block import Block
 
 @dataclass(frozen=True)
 class Alert:
-    """`detector` was alarmed at `time_s`, the end of a window; `why` in one sentence.
+    """`detector` raised an alarm at `time_s`, the end of a window; `why` in one sentence.
 
     Example:
         >>> from avtorch.decision import Alert
@@ -29,8 +29,8 @@ class Alert:
 class Action:
     """A new setting, in force from `time_s` on, for one scenario.
 
-    `strategies` lead to `setting` (of shape ``(1,)``) from the default; `sufficient` tells whether it meets the
-    strategist's conditions. `peak_gain_true`: the exact peak gain at the true vehicle, None where there is no truth.
+    `strategies` lead to `setting` (of shape ``(1,)``) from the default; `sufficient`: whether it meets the strategist's
+    conditions. `peak_gain_true`: the exact peak gain at the true vehicle, None where the truth is unknown.
     `driver_delay_s`: where a driver was asked for the time gap, how long until it begins to move; else 0.
 
     Example:
@@ -53,7 +53,7 @@ class Action:
 
 @dataclass(frozen=True)
 class SupervisedRun:
-    """What a supervised run leaves: `rows` (scenario, time), `windows`, and per scenario its `alerts` and `actions`.
+    """A supervised run: `rows` (scenario, time), `windows`, and per scenario its `alerts` and `actions`.
 
     Example:
         >>> from avtorch import BeliefStream, ClosedLoop, Leader, Supervisor

@@ -1,8 +1,8 @@
-"""What a setting would have done over the last windows: the closed loop replayed behind the leader that was seen.
+"""What a setting would have done over the last windows: the closed loop replayed behind the logged leader.
 
 The replay starts from the state logged at the beginning of the stretch, follows the leader's logged speed and
 acceleration with the posterior mean as the vehicle, and moves the time gap from the one in force at the loop's own
-rate. It is how the strategist predicts clipping and cost before it touches the car.
+rate. From it the strategist predicts clipping and cost before it acts on the car.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from avtorch.vehicle.performance import performance
 from avtorch.vehicle.plant import GLVDPlant
 from avtorch.vehicle.time_gap import RAMP_RATE
 
-_ROWS = 4096  # closed loops run side by side: more would only cost memory
+_ROWS = 4096  # closed loops simulated in one batch: larger batches only cost memory
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class History:
 
     @staticmethod
     def of_blocks(blocks: Sequence[Block], *, seconds: float = 20.0) -> History:
-        """The last `seconds` of consecutive blocks of a run, (scenario, time), shortened to what there is."""
+        """The last `seconds` of consecutive blocks of a run, (scenario, time), or all rows where there are fewer."""
         whole = Block.concatenate(list(blocks))
         dt = float(whole.time[1] - whole.time[0])
         part = whole[max(0, whole.time.shape[0] - round(seconds / dt) - 1) :]
@@ -77,7 +77,7 @@ class History:
         return History(stride * self.dt, v, a, self.spacing, self.speed)
 
     def leader(self) -> Leader:
-        """The leader seen, (scenario, time), position from 0."""
+        """The logged leader, (scenario, time), position from 0."""
         v = self.lead_speed
         moved = 0.5 * self.dt * (v[:, 1:] + v[:, :-1])
         position = torch.cat([torch.zeros_like(v[:, :1]), moved.cumsum(dim=1)], dim=1)
@@ -103,7 +103,7 @@ class Prediction:
     amplification: Tensor
 
     def map(self, change: object) -> Prediction:
-        """A function of a tensor applied to every field."""
+        """Apply a function of a tensor to every field."""
         return Prediction(**{name: change(value) for name, value in vars(self).items()})  # type: ignore[operator]
 
     def as_dict(self, scenario: int = 0) -> dict[str, float]:
@@ -130,9 +130,9 @@ def replay(
     """Run `setting` (scenario, candidate) through `history` with the vehicle T_L [s], K_L [-] (scenario,).
 
     The time gap leaves `time_gap_now` (scenario,) after `delay` [s] at `ramp_rate` [s/s]; the leader's acceleration is
-    heard `link_delay` [s] late. Limits [m/s²] are numbers or
-    (scenario,). The step is the logged one or a multiple of it, at most `dt` [s] and a sixth of the lag: a command held
-    for longer would shake a fast car with a strong k_a, which the real loop does not.
+    received `link_delay` [s] late. Limits [m/s²] are numbers or (scenario,). The step is the logged one or a multiple
+    of it, at most `dt` [s] and a sixth of the lag: holding a command for longer would make a fast car with a strong k_a
+    oscillate, unlike the real loop.
 
     Example:
         >>> import torch
@@ -146,7 +146,7 @@ def replay(
     """
     strides = (torch.clamp_max(T_L / 6.0, dt) / history.dt + 1e-9).long().clamp(1, history.lead_speed.shape[1] - 1)
     out: Prediction | None = None
-    # By its own lag, not by its company's: a scenario is predicted alike in any batch.
+    # The step follows from the scenario's own lag, so its prediction does not depend on the rest of the batch.
     for stride in strides.unique().tolist():
         rows = torch.nonzero(strides == stride)[:, 0]
         seen = _replay_at(
@@ -209,7 +209,7 @@ def _pick(limit: Number, rows: Tensor) -> Number:
 
 
 def _predict(run: Block, setting: Setting, standstill: float) -> Prediction:
-    """Of one run (candidate, scenario, time) under `setting` (candidate, scenario)."""
+    """The prediction from one run (candidate, scenario, time) under `setting` (candidate, scenario)."""
     shape = setting.shape
 
     def flat(x: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
-"""The whole setting of a car-following controller, for many scenarios at once, and how it is changed.
+"""The complete setting of a car-following controller, for many scenarios at once, and how it changes.
 
 Strategy 1 changes the model in the lower level, Strategy 2 the time gap, Strategy 3 the gains of the upper level
-(paper, Section 4), and Strategy 4 the feed-forward gain of a vehicle that hears its leader (an option that the paper
-names). Formulas live in `avtorch.vehicle`; this file only carries the numbers to them.
+(paper, Section 4), and Strategy 4 the feed-forward gain of a vehicle that receives its leader's acceleration (an option
+that the paper names). The formulas are in `avtorch.vehicle`; this file only passes the numbers to them.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Setting:
     `T_hat` [s], `K_hat` [-]: model in the lower level; `T_d` [s], `K_d` [-]: the actuation it imitates; `time_gap` [s];
     `gains` (k_s [1/s²], k_v [1/s], k_a [-]); `feedforward` k_f [-] on the leader's acceleration, 0 without a link.
     Plain numbers are broadcast. Raises `InputError` for values that are not positive (gains, feedforward: not finite)
-    or shapes that do not go together.
+    or shapes that do not broadcast.
 
     Example:
         >>> import torch
@@ -127,11 +127,11 @@ class Setting:
         return self.lower_level().amplification()
 
     def controller(self, *, standstill: Number = 5.0) -> LinearController:
-        """The upper level of this setting with its time gap already reached."""
+        """The upper level of this setting, with the time gap at its final value."""
         return LinearController(self.gains, self.time_gap, standstill, self.feedforward)
 
     def retarget(self, controller: Any, *, at: float, rate: float = RAMP_RATE) -> Any:
-        """`controller` moved to this setting from time `at` [s] on; all at once, but the time gap at `rate` [s/s]."""
+        """`controller` moved to this setting from time `at` [s]: gains at once, the time gap at `rate` [s/s]."""
         if isinstance(controller, LinearController):
             return controller.retargeted(
                 at=at, time_gap=self.time_gap, gains=self.gains, feedforward=self.feedforward, rate=rate
@@ -139,7 +139,7 @@ class Setting:
         return controller.retargeted(at=at, time_gap=float(self.time_gap.reshape(-1)[0]), rate=rate)
 
     def effective(self, T_L: Tensor, K_L: Tensor) -> tuple[Tensor, Tensor]:
-        """(T_e, K_e) the unclipped loop behaves as with draws of the plant (scenario, draw)."""
+        """Effective (T_e, K_e) of the unclipped loop for draws of the plant (scenario, draw)."""
         return self._over_draws().lower_level().effective(T_L, K_L)
 
     def p_string_stable(self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0, link_delay: Number = 0.0) -> Tensor:
@@ -160,12 +160,13 @@ class Setting:
         )
 
     def p_locally_stable(self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0) -> Tensor:
-        """As `p_string_stable`, of disturbances dying out at all."""
+        """P(locally stable), arguments as in `p_string_stable`."""
         T_e, K_e = self.effective(T_L, K_L)
         return stability.p_locally_stable(T_e, K_e, self.time_gap, self.gains, dead_time=_per_draw(dead_time))
 
     def peak_gain(self, T_L: Number, K_L: Number, *, dead_time: Number = 0.0, link_delay: Number = 0.0) -> Tensor:
-        """Peak gain (scenario,) at one plant a scenario, through (T_e, K_e): the judge of a choice, at the truth."""
+        """Peak gain (scenario,) at one plant per scenario, through (T_e, K_e): the score of a choice at the true
+        plant."""
         T_e, K_e = self.lower_level().effective(T_L, K_L)
         return stability.peak_gain(
             T_e,
@@ -178,7 +179,8 @@ class Setting:
         )
 
     def lower_differs(self, other: Setting) -> Tensor:
-        """Whether the lower levels send different commands; shapes broadcast. A renamed model is no difference."""
+        """Whether the lower levels send different commands; shapes broadcast. Models that send equal commands do not
+        differ."""
         here, there = self.lower_level(), other.lower_level()
         one, none = torch.ones((), dtype=torch.float64), torch.zeros((), dtype=torch.float64)
         return _differs(here.raw_command(one, none), there.raw_command(one, none)) | _differs(
@@ -221,8 +223,8 @@ class Setting:
 class DesignBounds:
     """A box of actuation (scenario,) for a robust controller: `T_L` [s] and `K_L` [-] as (lower, upper) pairs.
 
-    The paper's further option (Section 4): instead of the handbook's [0.1, 0.4] s and [0.7, 1] the box is what the
-    posterior holds likely; `recheck` judges the design over it.
+    The paper's further option (Section 4): instead of the handbook's [0.1, 0.4] s and [0.7, 1] the box holds most of
+    the posterior; `recheck` evaluates the design over it.
 
     Example:
         >>> import torch
@@ -241,8 +243,8 @@ class DesignBounds:
     def of_belief(T_L: Tensor, K_L: Tensor, *, coverage: float = 0.95) -> DesignBounds:
         """The box that holds at least `coverage` of the draws (scenario, draw).
 
-        Each side leaves out (1 - coverage)/2 in all, a quarter of the excess at each end, so the box keeps its promise
-        whatever the correlation of the two. Raises `InputError` for a coverage outside (0, 1).
+        Each parameter's interval leaves out (1 - coverage)/2, a quarter of 1 - coverage at each end, so the box has at
+        least this coverage for any correlation of the two. Raises `InputError` for a coverage outside (0, 1).
         """
         if not 0.0 < coverage < 1.0:
             raise InputError(f"coverage: found {coverage}, need a number between 0 and 1")

@@ -5,18 +5,18 @@ A setting is *sufficient* when
 1. P(string stable) under the posterior draws reaches `required` (0.95), by the exact condition at the effective
    actuation (T_e, K_e) that setting gives every draw;
 2. at most 5 % of the commands it would have sent over the last windows are clipped at the vehicle's limits, and it
-   would not have collided, both in a replay of the closed loop (`replay.py`). The inversion formula knows no limits:
-   without this, inverting a slow actuator would always win, on paper.
+   would not have collided, both in a replay of the closed loop (`replay.py`). The inversion formula ignores limits:
+   without this condition, inverting a slow actuator would always win on paper.
 
-Among the sufficient ones the least `total` is taken: the intrusiveness of `grid.py` plus `margin` times the
-probability of being string unstable when the spread of the belief is doubled, as the first posterior after a change
-is still pulled to the past by its prior. Sufficient settings are searched in order of intrusiveness, and the search
-ends when nothing left could be better; where it ends without one, every setting that reaches `required` has been
-replayed. The one with the best P(string stable) is then taken, out of those that clip at most five points more than
-the setting in force would have and would have collided no harder (a leader who asks for more than the car has clips
-every setting). Where P says little, mostly as it is 0 for all, the peak gain of the belief's mean decides: a swing that
-grows 1.3 times a car is better than one that grows fivefold. Among equals intrusiveness is weighed against clipping.
-`sufficient` says that it is not.
+Among the sufficient settings the strategist takes the one of least `total`: the intrusiveness of `grid.py` plus
+`margin` times the probability of string instability when the spread of the belief is doubled. The doubling accounts for
+the prior, which pulls the first posterior after a change towards the past. Settings are searched in order of
+intrusiveness, and the search ends when no remaining one could be better. Where no setting is sufficient, every setting
+that reaches `required` has been replayed; the strategist then takes the best P(string stable) among those that clip at
+most five percentage points more than the setting in force would have, and would have collided no harder (a leader who
+demands more than the car can do clips every setting). Where P does not discriminate, mostly because it is 0 for all,
+the peak gain at the belief's mean decides: a swing that grows 1.3 times per car is better than one that grows fivefold.
+Among equals intrusiveness is weighed against clipping. The decision's `sufficient` is then false.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from avtorch.decision.settings import Number, Setting
 from avtorch.errors import InputError
 from avtorch.vehicle.time_gap import RAMP_RATE
 
-# Candidates judged, and replayed, at a time: few scenarios leave room for more at nearly the same price.
+# Candidates evaluated, and replayed, at a time: with few scenarios a larger batch costs hardly more.
 _JUDGED = 48
 _REPLAYED = 512
 _PAIRS = 1024
-_GAIN_PRICE = 0.05  # where none will do, a peak gain that is e times as large weighs as much as this P(string stable)
+_GAIN_PRICE = 0.05  # where none is sufficient, a peak gain e times as large weighs as much as this P(string stable)
 _HIGHEST_GAIN = 1e3  # a loop that is not even locally stable has no peak; it is worse than any that has
-_CLIPPING_PRICE = 10.0  # where none will do, ten points of clipped commands weigh as much as a lower-level update
+_CLIPPING_PRICE = 10.0  # where none is sufficient, ten points of clipped commands weigh as much as a lower-level update
 _SCREEN = 12
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What to do in each scenario; every tensor (scenario,).
+    """The decision for each scenario; every tensor (scenario,).
 
     `setting`: the choice. `sufficient`: whether it meets both conditions; `p_string_stable` under the belief, and
     `p_robust` with the spread doubled. `intrusiveness` as in `grid.py`. `predicted`: clipping and costs in the replay.
@@ -95,7 +95,7 @@ class Decision:
 
 @dataclass(frozen=True)
 class Strategist:
-    """Chooses settings; see the module's text.
+    """Chooses settings; see the module docstring.
 
     grid: what is on offer. required: P(string stable) to reach. most_clipped: share of commands. draws: of the
     posterior, used in the search (the figures reported use all that are given). dead_time [s]: of the vehicle.
@@ -156,7 +156,7 @@ class Strategist:
 
         `current` is in force, `default` the driver's and engineer's choice; `time_gap_now` [s] where the gap is still
         on its way (default: there). `model_wrong` (scenario,) bool, default all: a change of the vehicle was detected,
-        so keeping the lower level's model has its price. Limits [m/s²] are numbers or (scenario,). Raises `InputError`
+        so keeping the lower level's model is penalised. Limits [m/s²] are numbers or (scenario,). Raises `InputError`
         for shapes that do not fit.
         """
         scenarios = T_L.shape[0]
@@ -255,7 +255,7 @@ class _Search:
         chunk = max(_JUDGED, _REPLAYED // cost.shape[0])
         for first in range(0, cost.shape[1], chunk):
             column = order[:, first : first + chunk]
-            # The margin only adds: what is dearer already without it cannot win.
+            # The margin only adds cost: a setting that costs more even without it cannot win.
             open_ = torch.nonzero(cost.gather(1, column[:, :1])[:, 0] < best)[:, 0]
             if len(open_) == 0:
                 break
@@ -266,7 +266,7 @@ class _Search:
                 worth &= self.total[open_] < best[open_, None]
                 if not bool(worth.any()):
                     break
-                # Few at first, as the least intrusive mostly is sufficient; ever more where it is not.
+                # Small chunks first, as the least intrusive setting usually is sufficient; larger ones where it is not.
                 self._replay(open_, worth, self.total[open_], tries)
                 tries *= 4
                 good = torch.where(self._sufficient(), self.total, torch.inf)
@@ -277,7 +277,7 @@ class _Search:
         return pick, torch.isfinite(best)
 
     def _best_of_the_rest(self, lost: Tensor) -> Tensor:
-        """Where none will do: the best P(string stable) of what clips little more than the setting in force would.
+        """Where none is sufficient: the best P(string stable) of settings that clip little more than the one in force.
 
         The setting in force is the first candidate. All that reach the required P have been replayed already.
         """
@@ -365,7 +365,7 @@ class _Search:
             self.predictions = seen.map(lambda x: torch.full(self.p.shape, torch.nan, dtype=torch.float64))
         for name, value in vars(seen).items():
             getattr(self.predictions, name)[rows[:, None], columns] = value
-        # Columns that only fill up the batch are not told of, so that a scenario is judged alike in any company.
+        # Columns that only pad the batch are dropped, so that a scenario's result does not depend on the batch.
         self.replayed[rows[:, None], columns] |= worth.gather(1, columns)
 
     def _sufficient(self) -> Tensor:

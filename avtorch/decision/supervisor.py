@@ -28,7 +28,7 @@ from avtorch.vehicle.time_gap import RAMP_RATE
 _NEVER = 2**62  # steps
 
 HISTORY_S = 20.0
-"""What the strategist replays [s]: ten windows, long enough to hold a manoeuvre of the leader."""
+"""Length that the strategist replays [s]: ten windows, long enough for one manoeuvre of the leader."""
 
 Strategy = Literal["auto", "1", "2", "3"]
 
@@ -38,15 +38,15 @@ ALLOWED: dict[str, frozenset[int]] = {
     "2": frozenset({1, 2}),
     "3": frozenset({1, 3}),
 }
-"""What each `strategy` may use: the paper adopts Strategy 1 at a minimum, 2 and 3 in addition to it (Section 4)."""
+"""Strategies that each `strategy` may use: the paper always adopts Strategy 1, and 2 and 3 in addition (Section 4)."""
 
 
 class Supervisor:
-    """Runs a closed `loop` window by window, watches it, and changes its setting where the monitor is alarmed.
+    """Runs a closed `loop` window by window, monitors it, and changes its setting after an alarm.
 
-    The stability verdict asks the setting in force: the gains are those of a `LinearController`, or the equivalent
-    gains of a controller that tells them (an MPC). Another controller of unknown structure is watched with `setting`
-    given; its actuation is estimated all the same, and only the lower level may be changed.
+    The stability verdict is for the setting in force, with the gains of a `LinearController` or the equivalent gains
+    that a controller reports (an MPC). For a controller of unknown structure, pass `setting`; its actuation is
+    estimated as well, and only the lower level may be changed.
 
     Where the strategist asks the driver for a longer time gap, lower level and gains change at once, the gap begins to
     move after the driver's delay, and until then the verdicts are on the setting without it.
@@ -59,7 +59,7 @@ class Supervisor:
         setting: in force at the start, by default read off the loop's controller and lower level.
         seed: of the sampler's noise.
 
-    Raises `InputError` for a platoon, for parts that do not go together, and for a strategist that may change what the
+    Raises `InputError` for a platoon, for parts that do not fit together, and for a strategist that may change what the
     controller cannot.
 
     Example:
@@ -89,7 +89,7 @@ class Supervisor:
             raise InputError(f"window: found {window:g} s, needs a multiple of the step {loop.dt:g} s")
         n = loop.scenarios
         if stream is None:
-            # a plant that tells no jerk leaves the latent form; nothing is differenced
+            # without a jerk from the plant only the latent form applies; no signal is differenced
             form = JerkForm() if hasattr(loop.plant, "jerk") else LatentForm(accel=True, speed=True)
             stream = BeliefStream(window=window, vehicles=n, form=form, seed=seed)
         if stream.vehicles != n or abs(stream.window - window) > 1e-9:
@@ -107,7 +107,7 @@ class Supervisor:
         self.watch = Watch(stream, monitor)
         self.default = self.setting
         self.strategist = strategist
-        # what was decided; the setting in force lags behind it while a driver is asked, until the step `_due`
+        # the decided setting; while a driver is asked, the setting in force lags behind it until the step `_due`
         self._ordered = self.setting
         self._due = torch.full((n,), _NEVER)
         # the model in the lower level is known to be wrong from a detected change until it is updated
@@ -124,7 +124,7 @@ class Supervisor:
         events: Sequence[tuple[float, Callable[[ClosedLoop], None]]] = (),
         progress: Callable[[float], None] | None = None,
     ) -> SupervisedRun:
-        """Advance by `duration` [s]. `events` are `(time [s], change)`: at that time `change(loop)` alters the world.
+        """Advance by `duration` [s]. `events` are `(time [s], change)`: `change(loop)` is called at that time.
 
         `progress(seconds done)` is called after each window. Raises `InputError` for less than one step.
         """
@@ -154,7 +154,7 @@ class Supervisor:
             for watched in self._feed(block):
                 windows.append(watched)
                 self._note(watched, alerts)
-                # what ends with the run is answered when it goes on
+                # an alarm at the run's last step is acted on when the run continues
                 self._unanswered.append(watched)
             if progress is not None:
                 progress(loop.time)
@@ -173,7 +173,7 @@ class Supervisor:
                 alerts[i].append(Alert(watched.window.end_s, name, report.why(name, i)))
 
     def _remember(self, block: Block) -> None:
-        """Keep what the strategist replays, and no more."""
+        """Keep only the rows that the strategist replays."""
         self._recent.append(block)
         enough = round(HISTORY_S / self.loop.dt) + 1
         while sum(len(b.time) for b in self._recent[1:]) >= enough:
@@ -183,7 +183,7 @@ class Supervisor:
         if self.strategist is None:
             return
         report, loop = watched.report, self.loop
-        # a setting that was chosen and still does its work stays: the paper warns of changing the controller often
+        # a chosen setting that is still sufficient stays: the paper warns against changing the controller often
         content = self._acted & (self._verdict(watched) >= self.strategist.required)
         self.watch.monitor.accept(report.any & content)
         self._model_wrong |= report.actuation_changed & ~content
@@ -229,14 +229,16 @@ class Supervisor:
                     waits * loop.dt,
                 )
             )
-        # what was acted on, or found good as it is, is the new normal; where nothing is sufficient the alarm goes on
+        # a state that was acted on, or found sufficient, is the new baseline; where none is sufficient the alarm
+        # continues
         settled = torch.zeros_like(where).index_put((asked,), decision.sufficient)
         self.watch.monitor.accept(where | settled)
         self._model_wrong &= ~where
         self._acted |= where
 
     def _verdict(self, watched: WatchedWindow) -> Tensor:
-        """P(stable) (scenario,) of what was decided: in force, or soon, when the driver has set the time gap."""
+        """P(stable) (scenario,) of the decided setting, which may be in force only once the driver has set the time
+        gap."""
         report = watched.report
         p = torch.minimum(report.p_string_stable, report.p_local_stable)
         waiting = self._due < _NEVER
@@ -255,7 +257,7 @@ class Supervisor:
         assert self.strategist is not None
         loop, delay = self.loop, round(self.strategist.driver_delay / self.loop.dt)
         longer = setting.time_gap > self.setting.time_gap + 1e-9
-        # asked already for this very gap: the driver needs no telling twice
+        # the driver has already been asked for this time gap
         asked = (self._due < _NEVER) & ((setting.time_gap - self._ordered.time_gap).abs() <= 1e-9)
         afresh = torch.full_like(self._due, loop.steps_done + delay)
         wait = longer & (delay > 0)
@@ -286,7 +288,7 @@ class Supervisor:
 def read_setting(loop: ClosedLoop) -> Setting:
     """The setting a loop runs with, (scenario,).
 
-    Raises `InputError` for a controller that tells neither gains nor a time gap.
+    Raises `InputError` for a controller that reports neither gains nor a time gap.
     """
     controller, lower = loop.controller, loop.lower_level
     gains: Any = getattr(controller, "gains", None)
@@ -321,7 +323,8 @@ def _for_scenarios(setting: Setting, n: int) -> Setting:
 
 
 def _check_reach(strategist: Strategist, loop: ClosedLoop) -> None:
-    """Refuse a strategist that may choose what the controller cannot do: the choice would be reported, not made."""
+    """Refuse a strategist that may choose what the controller cannot do: the choice would be reported but not
+    applied."""
     controller, grid = loop.controller, strategist.grid
     if 4 in grid.allowed and grid.feedforward and abs(strategist.link_delay - loop.link_delay) > 1e-9:
         raise InputError(

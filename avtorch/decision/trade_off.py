@@ -1,7 +1,7 @@
-"""What a longer time gap costs the road, and what it buys: throughput against string stability.
+"""What a longer time gap costs in throughput, and what it gains in string stability.
 
 At equilibrium a lane carries `3600 v / (tau v + standstill + length)` vehicles an hour (paper, Section 4.5, leaves the
-price of a longer gap open). The belief says how probable string stability is at each gap, and how large the peak gain.
+price of a longer gap open). The belief gives the probability of string stability at each gap, and the peak gain.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def gap_trade_off(
 ) -> GapTradeOff:
     """Throughput, P(string stable) and peak gain over `time_gaps` (gap,) [s] under draws T_L [s], K_L [-] (draw,).
 
-    `setting` (one scenario, its own time gap unused) tells lower level, gains and feed-forward; `speed` [m/s] is that
+    `setting` (one scenario, its own time gap unused) gives lower level, gains and feed-forward; `speed` [m/s] is that
     of the traffic. Raises `InputError` for draws or gaps that are not one-dimensional, or a setting of several
     scenarios.
 

@@ -1,4 +1,4 @@
-"""Belief and monitor on one stream of samples: what `estimate` and the supervisor both look through."""
+"""Belief and monitor on one stream of samples, used by both `estimate` and the supervisor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from avtorch.inference.stream import BeliefStream, Window
 
 @dataclass(frozen=True)
 class WatchedWindow:
-    """A window's belief and what the monitor said of it under the `setting` in force.
+    """A window's belief and the monitor's report on it under the `setting` in force.
 
     Example:
         >>> from avtorch import GLVDPlant, Leader, estimate, simulate
@@ -34,7 +34,7 @@ class WatchedWindow:
 class Watch:
     """A `stream` of beliefs about many vehicles with a `monitor` behind it, one scenario a vehicle.
 
-    Raises `InputError` where the two count differently.
+    Raises `InputError` where their numbers of vehicles and scenarios differ.
 
     Example:
         >>> from avtorch import BeliefStream, GLVDPlant, Leader, Setting, simulate
@@ -63,7 +63,8 @@ class Watch:
         engaged: Tensor | None = None,
         until: float | None = None,
     ) -> list[WatchedWindow]:
-        """Rows in, watched windows out; arguments as `BeliefStream.feed`, `setting` is in force over these rows."""
+        """Take in rows, return watched windows; arguments as `BeliefStream.feed`, `setting` is in force over these
+        rows."""
         windows = self.stream.feed(time, columns, usable=usable, engaged=engaged, until=until)
         return [self._watch(w, setting) for w in windows]
 
@@ -78,11 +79,11 @@ class Watch:
         return WatchedWindow(window, self.monitor.update(T_L, K_L, used, setting), setting)
 
     def state_dict(self) -> dict[str, Any]:
-        """Belief, open window and monitor: a resumed watch goes on equal to the bit."""
+        """Belief, open window and monitor: a resumed watch continues bit for bit."""
         return {"stream": self.stream.state_dict(), "monitor": self.monitor.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from `state_dict`; raises `InputError` where it is another watch's, and then stays as it was."""
+        """Continue from `state_dict`; raises `InputError`, and changes nothing, where the state is another watch's."""
         if not isinstance(state, dict) or set(state) != {"stream", "monitor"}:
             raise InputError("state: is not a watch's; needs stream and monitor")
         before = self.stream.state_dict()

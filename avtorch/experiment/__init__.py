@@ -1,4 +1,4 @@
-"""Which experiment next: the manoeuvre that separates what a log left confused."""
+"""Which experiment next: the manoeuvre that separates causes that a log does not distinguish."""
 
 from avtorch.experiment.information import Information, information
 from avtorch.experiment.limits import Limits

@@ -1,7 +1,7 @@
-"""What each cause that is left foretells of a manoeuvre: a normal law of the measured rows.
+"""The prediction of each remaining cause for a manoeuvre: a normal distribution of the measured rows.
 
-Its mean is the rollout at the middle of what is known of the parameters, its spread that of rollouts at draws of them
-(and of a slope that nobody knows), in the noise that the log had.
+Its mean is the rollout at the posterior mean of the parameters, its spread that of rollouts at posterior draws (and at
+draws of the unknown slope); its noise is that of the log.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ _SLOWEST_MPS = 0.5
 
 
 def responses(contender: PredictiveModel, manoeuvres: Sequence[Manoeuvre], draws: slice) -> Response:
-    """Rollouts (manoeuvre, draw, time) of manoeuvres of one length, at `draws` of what is believed."""
+    """Rollouts (manoeuvre, draw, time) of manoeuvres of one length, at `draws` of the belief."""
     command = torch.as_tensor(np.stack([m.command for m in manoeuvres]))[:, None]
     speed = torch.as_tensor(np.stack([np.maximum(m.speed, _SLOWEST_MPS) for m in manoeuvres]))[:, None]
     time = torch.as_tensor(manoeuvres[0].time)
     belief = {k: torch.as_tensor(x[draws]) for k, x in contender.belief.items()}
     effects = contender.plant.effects
-    for effect in effects:  # what changed in the log has changed
+    for effect in effects:  # an effect with an onset in the log acts from the start
         for name, value in effect.settled().items():
             key = f"{effect.name}.{name}"
             if key in belief or name == effect.own_onset:
@@ -43,14 +43,14 @@ def responses(contender: PredictiveModel, manoeuvres: Sequence[Manoeuvre], draws
 
 @dataclass(frozen=True, eq=False)
 class PredictiveLaw:
-    """Of one manoeuvre by one contender: `mean` (channel, row), `spread` (direction, channel, row), and its noise."""
+    """One contender's prediction of one manoeuvre: `mean` (channel, row), `spread` (direction, channel, row), noise."""
 
     white: WhiteningFilter = field(repr=False)
     mean: FloatArray = field(repr=False)
     spread: FloatArray = field(repr=False)
 
     def log_density(self, measured: FloatArray) -> FloatArray:
-        """Of rows (draw, channel, row): (draw,) [nats]."""
+        """Log density of rows (draw, channel, row): (draw,) [nats]."""
         e = self._white(measured - self.mean)
         u = self._white(self.spread)
         constant = self.white.constant_of(coarse=False)
@@ -61,7 +61,7 @@ class PredictiveLaw:
         return constant - 0.5 * ((e**2).sum(-1) - (match * taken).sum(-1) + size)
 
     def _white(self, errors: FloatArray) -> FloatArray:
-        """(column, white row) of errors (column, channel, row)."""
+        """Whitened errors (column, white row) from errors (column, channel, row)."""
         if not len(errors):
             return np.zeros((0, 1))
         kept = errors[..., self.white.record.source, None]
@@ -70,8 +70,8 @@ class PredictiveLaw:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """One contender on all manoeuvres: `rollouts` (manoeuvre, draw, channel, row), half of which make the laws and
-    half the examples."""
+    """One contender on all manoeuvres: `rollouts` (manoeuvre, draw, channel, row); one half gives the distributions,
+    the other half the examples."""
 
     contender: PredictiveModel
     channels: tuple[str, ...]
@@ -88,7 +88,7 @@ class Prediction:
         group: int,
         draws: int,
     ) -> Prediction:
-        """With so many `draws`; rows of the manoeuvres are means of `group` rows of a log."""
+        """Simulate with this many `draws`; rows of the manoeuvres are means of `group` rows of a log."""
         seen = responses(contender, manoeuvres, slice(0, draws))
         # parts that do not depend on the draw come without that dimension
         shape = (len(manoeuvres), draws, len(manoeuvres[0].time))
@@ -97,7 +97,7 @@ class Prediction:
         return cls(contender, channels, manoeuvres, stacked, group)
 
     def law(self, number: int) -> PredictiveLaw:
-        """Of manoeuvre `number`."""
+        """The prediction for manoeuvre `number`."""
         some = self.rollouts[number, ::2]
         mean = some.mean(0)
         spread = (some - mean) / np.sqrt(max(len(some) - 1, 1))
@@ -108,7 +108,7 @@ class Prediction:
         return PredictiveLaw(white, mean, spread if road is None else np.concatenate([spread, road]))
 
     def examples(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """What would be measured, (draw, channel, row)."""
+        """Simulated measurements, (draw, channel, row)."""
         some = self.rollouts[number, 1::2]
         count, _, rows = some.shape
         time = self.manoeuvres[number].time
@@ -118,7 +118,7 @@ class Prediction:
         return seen if road is None else seen + np.einsum("dk,kwr->dwr", rng.standard_normal((count, len(road))), road)
 
     def _road(self, number: int) -> FloatArray | None:
-        """Directions (knot, channel, row) in which an unknown slope moves what is measured."""
+        """Directions (knot, channel, row) in which an unknown slope moves the measurements."""
         size = self.contender.grade_rms
         if not size:
             return None
@@ -136,7 +136,7 @@ class Prediction:
 
 
 def _record(m: Manoeuvre, channels: tuple[str, ...]) -> Record:
-    """Rows of a manoeuvre as a diagnosis would look at them."""
+    """Rows of a manoeuvre at the sampling that a diagnosis uses."""
     speed = np.maximum(m.speed, _SLOWEST_MPS)
     given = {"accel": np.gradient(speed, m.time), "speed": speed}
     log = Log.from_arrays(time=m.time, accel_cmd=m.command, **{name: given[name] for name in channels})

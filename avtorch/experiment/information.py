@@ -1,4 +1,4 @@
-"""How well a manoeuvre would tell causes apart."""
+"""How well a manoeuvre would distinguish causes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from avtorch.experiment.foretold import Prediction
 
 @dataclass(frozen=True)
 class Information:
-    """`nats`: mutual information between the cause and what will be measured, at most the entropy of the cause.
+    """`nats`: mutual information between the cause and the measurements to come, at most the entropy of the cause.
 
     `told`: expected probability of the true cause afterwards. `margin`: median log odds [nats] of the true cause
     against the likest other one, for the worst pair.
@@ -31,9 +31,9 @@ class Information:
 
 
 def information(foretold: Sequence[Prediction], number: int, prior: Sequence[float], *, seed: int = 0) -> Information:
-    """Of manoeuvre `number`, with causes a priori as probable as `prior` says, by examples of what would be measured.
+    """The information of manoeuvre `number`, from simulated measurements; `prior` has the causes' probabilities.
 
-    Each example is scored by the law of each cause.
+    Each simulated measurement is scored under the distribution of each cause.
 
     Example:
         >>> from avtorch import Leader, diagnose, simulate

@@ -11,14 +11,14 @@ from avtorch.gap.result.diagnosis import LogFacts
 LEAST_SPAN_MPS = 1.5
 _LEAST_MPS2 = 0.3
 _BEYOND = 0.05
-"""Share of what was driven by which limits from a log reach beyond it, at either end."""
+"""Limits taken from a log extend beyond what was driven by this share, at either end."""
 
 
 @dataclass(frozen=True)
 class Limits:
     """Speeds [m/s], commands [m/s²], length of the road [m] and duration [s] that a manoeuvre keeps to.
 
-    `source`: where they come from, in words. Raises `InputError` where nothing could be driven.
+    `source`: where they come from, in words. Raises `InputError` where no manoeuvre could be driven.
 
     Example:
         >>> from avtorch.experiment import Limits, library
@@ -58,10 +58,11 @@ class Limits:
 
     @classmethod
     def of_log(cls, log: LogFacts, **given: float | None) -> Limits:
-        """What the car did in a log, a twentieth more at either end; `given` limits (not None) go before.
+        """The range that the car drove in a log, extended by a twentieth at either end; `given` limits (not None)
+        override it.
 
-        At least 1.5 m/s and 0.3 m/s² either way, less of which no manoeuvre needs. Without a speed in the log those of
-        a usual car are assumed. Raises `InputError` where nothing could be driven.
+        At least 1.5 m/s and 0.3 m/s² either way, the least that any manoeuvre needs. Without a speed in the log the
+        limits are those of a usual car. Raises `InputError` where no manoeuvre could be driven.
         """
         chosen = {name: value for name, value in given.items() if value is not None}
         found: dict[str, float] = {}

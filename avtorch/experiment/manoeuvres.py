@@ -1,8 +1,8 @@
 """Manoeuvres for a test track or a driver in the loop: commands over time, within limits.
 
-Each begins and ends with some seconds without a command, and comes back to the speed it began at. What shows where:
-steps show delay, lag and order, both pedals to the limit saturation and asymmetry, small reversals a dead band or
-play, ramps a limited jerk, holds whatever depends on speed, a sweep of frequencies the modes.
+Each begins and ends with some seconds without a command, and returns to the speed it began at. Steps show delay, lag
+and order; both pedals to the limit show saturation and asymmetry; small reversals show a dead band or play; ramps show
+a limited jerk; holds show whatever depends on speed; a sweep of frequencies shows the modes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _BEFORE_S, _AFTER_S = 3.0, 2.0
 _SPEEDS = (0.2, 0.5, 0.8)  # of the span between slowest and fastest
 _SHORTEST_HOLD_S = 1.5
 _GAIN_MPS = 4.0  # by one push of a pedal
-# where speeds span little [m/s]: commands [m/s²] and what a push gains [m/s], as shares of that span, that leave room
+# for a narrow range of speeds [m/s]: commands [m/s²] and speed gained by a push [m/s] that fit, as shares of the range
 _PARTS_PER_S = 1 / 6
 _SWEPT_PER_S = 0.06  # of a sweep that begins at 0.05 Hz
 _PUSH = 0.2
@@ -56,7 +56,7 @@ class Manoeuvre:
         return float(np.sqrt(np.mean(self.command**2)))
 
     def within(self, limits: Limits) -> bool:
-        """Whether all of it keeps to the limits."""
+        """Whether it stays within the limits throughout."""
         slow, fast = float(self.speed.min()), float(self.speed.max())
         low, high = float(self.command.min()), float(self.command.max())
         return (
@@ -73,14 +73,14 @@ class Manoeuvre:
         return replace(self, speed=speed)
 
     def trimmed(self, gain: float, start: float | None = None) -> Manoeuvre:
-        """With what changes the speed by `gain` [m/s] spread over its commands, the more the gentler they are.
+        """The same with an extra change of speed of `gain` [m/s] spread over its commands, most over the gentlest.
 
         The speed expected is then that of a perfect car from `start` [m/s] on.
         """
         dt = float(self.time[1] - self.time[0])
         active = (self.time >= _BEFORE_S - 1e-9) & (self.time <= self.time[-1] - _AFTER_S + 1e-9)
         limit = np.where(self.command < 0, self.command.min(), self.command.max())
-        # none where a pedal is at its most, and no jumps where there were none
+        # none at full pedal, and no new jumps
         gentle = np.where(active, 1.0 - (self.command / np.where(limit == 0, 1.0, limit)) ** 2, 0.0)
         command = self.command + gain / (gentle.sum() * dt) * gentle
         begin = float(self.speed[0]) if start is None else start
@@ -154,12 +154,12 @@ def _made(name: str, time: FloatArray, start: float, pattern: Pattern, lasts: fl
 
 
 def _steps(t: FloatArray, size: float, hold: float) -> FloatArray:
-    """+, 0, -, 0, -, 0, +, 0: every level meets rest, both signs begin."""
+    """+, 0, -, 0, -, 0, +, 0: every level alternates with rest, and each sign comes first once."""
     return size * np.array([1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0, 0.0])[(t / hold + 1e-9).astype(int) % 8]
 
 
 def _pedals(t: FloatArray, push: float, brake: float, gain: float) -> FloatArray:
-    """The whole of one pedal after the whole of the other, then half of each, as long as gives back the speed."""
+    """One pedal in full after the other, then half of each, for as long as restores the speed."""
     on, off = gain / push, gain / brake
     ends = np.cumsum([on, off, 1.0, 2 * off, 2 * on, 1.0])
     levels = np.array([push, -brake, 0.0, -0.5 * brake, 0.5 * push, 0.0])
@@ -194,5 +194,5 @@ def _slow_and_go(t: FloatArray, size: float, gain: float) -> FloatArray:
 
 
 def _stage(t: FloatArray, ends: FloatArray) -> IntArray:
-    """Number of the stage at each moment, over and over."""
+    """Number of the stage at each moment, repeating."""
     return np.searchsorted(ends, t % ends[-1] + 1e-9, side="right").clip(0, len(ends) - 1)

@@ -1,4 +1,4 @@
-"""The manoeuvre that best separates what a log left confused: the gentlest of those that surely do."""
+"""The manoeuvre that best separates causes that a log does not distinguish: the gentlest of those that surely do."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from avtorch.io import atomic
 
 _RATE_HZ = 20.0
 _DRAWS = 32
-_TURNS = 3  # of trimming what a manoeuvre changes the speed by
+_TURNS = 3  # iterations that trim a manoeuvre's net change of speed
 _SURE = 12.0
 """Log odds [nats] of the worst pair that are enough: more than a real car's differing from every model can cost."""
-_FAINT = 0.1  # of what there is to learn
+_FAINT = 0.1  # share of the entropy
 
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """Drive `manoeuvre` next: it `separates` those causes.
 
-    `information`: what is to be expected of it; `entropy` [nats]: how much is unknown of the cause. `every`: the same
-    of all manoeuvres within the `limits`. `untold`: what no manoeuvre tells apart with these signals.
-    `why`: a sentence.
+    `information`: its expected information; `entropy` [nats]: of the cause before it. `every`: the same for all
+    manoeuvres within the `limits`. `untold`: causes that no manoeuvre distinguishes with these signals. `why`: a
+    sentence.
 
     Example:
         >>> from avtorch.experiment import Experiment, Information, library
@@ -71,7 +71,7 @@ class Experiment:
 
 
 def next_experiment(found: Diagnosis, limits: Limits | None = None, *, seed: int = 0) -> Experiment | None:
-    """The manoeuvre out of the library that tells the diagnosis' `contenders` apart; None where nothing is confused.
+    """The library manoeuvre that distinguishes the diagnosis' `contenders`; None where there is nothing to distinguish.
 
     Start it at its first expected speed, on a level road if there is one. `limits` default to what the car did in the
     log (`Limits.of_log`). Raises `InputError` where the limits allow no manoeuvre at all.
@@ -118,7 +118,7 @@ def next_experiment(found: Diagnosis, limits: Limits | None = None, *, seed: int
 def write_table(experiment: Experiment | None, folder: str | PathLike[str]) -> list[Path]:
     """Write `manoeuvre.csv`, the command table: `time` [s], `accel_cmd` [m/s²], `speed_expected` [m/s].
 
-    A command holds until the next row's time. An earlier table in the folder goes where there is no experiment.
+    A command holds until the next row's time. Where there is no experiment, an earlier table in the folder is removed.
     Raises `InputError` where the folder cannot be written.
 
     Example:
@@ -142,7 +142,8 @@ def write_table(experiment: Experiment | None, folder: str | PathLike[str]) -> l
 
 
 def _expected(first: PredictiveModel, manoeuvres: tuple[Manoeuvre, ...], limits: Limits) -> list[Manoeuvre]:
-    """With the speeds that the likeliest cause foretells, trimmed so that they come back; those within the limits."""
+    """Manoeuvres with the speeds that the likeliest cause predicts, trimmed to return to the start; those within
+    limits."""
     offers = list(manoeuvres)
     K_L = float(np.mean(first.belief["K_L"]))
     for turn in range(_TURNS + 1):
@@ -151,7 +152,7 @@ def _expected(first: PredictiveModel, manoeuvres: tuple[Manoeuvre, ...], limits:
         speeds = responses(first, offers, slice(None)).speed.mean(1).numpy()
         speeds = [m.speed[0] + v - v[0] for m, v in zip(offers, speeds, strict=True)]
         if turn < _TURNS:
-            # what depends on speed is asked of the speed that will be driven once the change is made up for
+            # speed-dependent effects are evaluated at the speed driven once the change is compensated
             level = [v - (v[-1] - v[0]) * np.linspace(0.0, 1.0, len(v)) for v in speeds]
             offers = [m.trimmed(-float(v[-1] - v[0]) / K_L) for m, v in zip(offers, speeds, strict=True)]
             speeds = level
@@ -160,7 +161,7 @@ def _expected(first: PredictiveModel, manoeuvres: tuple[Manoeuvre, ...], limits:
 
 
 def _chosen(offers: list[Manoeuvre], judged: list[Information]) -> int:
-    """The gentlest that surely tells every pair apart, or else the one that tells most."""
+    """The gentlest manoeuvre that surely distinguishes every pair, or else the most informative one."""
     sure = [i for i, j in enumerate(judged) if j.margin >= _SURE]
     if sure:
         return min(sure, key=lambda i: (round(offers[i].effort, 1), offers[i].metres))

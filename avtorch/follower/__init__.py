@@ -1,4 +1,4 @@
-"""Cars that follow: what can be said of loop, gap and cause without knowing what was demanded."""
+"""Cars that follow: diagnosis of loop, gap and cause where the demanded acceleration was not logged."""
 
 from avtorch.follower.closed_loop import LoopErrors, loop_errors
 from avtorch.follower.diagnose_follower import FollowerDiagnosis, diagnose_follower

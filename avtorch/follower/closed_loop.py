@@ -1,4 +1,4 @@
-"""The whole loop driven by the recorded leader alone: law, delay, lag, speed and spacing."""
+"""The closed loop simulated from the recorded leader alone: law, delay, lag, speed and spacing."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class LoopErrors(NamedTuple):
 
 
 def loop_errors(law: Law, values: Mapping[str, float], seen: Seen, dt: float, *, seconds: float = 60.0) -> LoopErrors:
-    """Of stretches of `seconds` of one drive, side by side; rows `dt` [s] apart.
+    """Simulate stretches of `seconds` of one drive, in one batch; rows `dt` [s] apart.
 
     `values`: the law's as `law.*`, `T_L` [s], the delay [s] by `delay_key()`; `K_L` is 1.
 
@@ -55,7 +55,7 @@ def loop_errors(law: Law, values: Mapping[str, float], seen: Seen, dt: float, *,
     whole, part = int(delay), delay - int(delay)
     starts = np.arange(0, len(s) - length, length)
     rows = starts + np.arange(length + 1)[:, None]
-    # commands before a stretch are those of what was measured
+    # commands before a stretch follow from the measured motion
     demanded = law.command(own, seen).numpy()
     sent = [demanded[np.maximum(starts - k, 0)] for k in range(whole + 2, 0, -1)]
     keep = float(np.exp(-dt / values["T_L"]))
@@ -82,7 +82,7 @@ def loop_errors(law: Law, values: Mapping[str, float], seen: Seen, dt: float, *,
 
 
 def keeps_speed(seen: Sequence[Seen], dt: float, *, seconds: float = 60.0) -> float:
-    """Root mean square error [m/s] over the same stretches of a car that goes on as fast as it was."""
+    """Root mean square error [m/s] over the same stretches of a car that keeps its initial speed."""
     off = []
     for speed in (one.speed.numpy() for one in seen):
         length = min(round(seconds / dt), len(speed) - 1)
@@ -92,5 +92,5 @@ def keeps_speed(seen: Sequence[Seen], dt: float, *, seconds: float = 60.0) -> fl
 
 
 def _spread(x: FloatArray) -> float:
-    """About each stretch's own mean, (row, stretch)."""
+    """Spread about each stretch's own mean, (row, stretch)."""
     return float(np.sqrt(np.mean((x - x.mean(0)) ** 2))) + 1e-12

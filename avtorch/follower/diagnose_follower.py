@@ -1,7 +1,7 @@
 """The diagnosis of a car that follows another, where nobody logged what its controller demanded.
 
-A law is assumed, identified on one half of the drive and judged on the other. With the commands that the law would have
-given, the half that judges is then diagnosed like any other log: all that is said of causes is conditional on the law.
+A law is assumed, identified on one half of the drive and tested on the other. The test half, with the commands that the
+law would have given, is then diagnosed like any other log: every claim about causes is conditional on the law.
 """
 
 from __future__ import annotations
@@ -28,19 +28,20 @@ from avtorch.gap.simulator.effect import delay_effect, delay_key
 from avtorch.io import Log
 
 _LEAST_S = 40.0
-_LOWEST, _HIGHEST = -8.0, 5.0  # of a command [m/s²]; what a law asks beyond, no car is sent
+_LOWEST, _HIGHEST = -8.0, 5.0  # bounds of a command [m/s²]; no car is sent more
 
 
 @dataclass(frozen=True, eq=False)
 class FollowerDiagnosis:
-    """Of one follower under one `law`.
+    """The diagnosis of one follower under one `law`.
 
     - `parameters` of law, lag `T_L` and `delay_s` by name; `lag_with_delay_s`, and at the median speed `headway_s`
-    - `loops` by law, `without_delay` (the law chosen, on the bare GLVD) among them: errors of the closed loop over
-      60 s, driven by the leader alone, each half by what the other fitted; `keeps_speed` [m/s]: that of a car that does
+    - `loops` by law, `without_delay` (the law chosen, on the bare GLVD) among them: errors of the closed loop over 60
+      s, driven by the leader alone, each half with the parameters fitted to the other; `keeps_speed` [m/s]: the error
+      of a car that keeps its speed
     - `stability` about slow, usual and quick speeds of the drive
-    - `diagnosis`: gap and cause on that half, conditional on the law; None where it was not asked for
-    - `conditional`: which claims are conditional on what, one sentence each
+    - `diagnosis`: gap and cause on the test half, conditional on the law; None where it was not requested
+    - `conditional`: the condition that each claim rests on, one sentence each
 
     Example:
         >>> from avtorch import Leader, LinearController, simulate
@@ -69,7 +70,7 @@ class FollowerDiagnosis:
         return self.stability[len(self.stability) // 2]
 
     def to_dict(self) -> dict[str, Any]:
-        """The object of `diagnosis.json` with a further key `follower`; only that, where no cause was sought."""
+        """The object of `diagnosis.json` with a further key `follower`; only that key where no cause was sought."""
         told = {
             "law": self.law.name,
             "parameters": {name: q.to_dict() for name, q in self.parameters.items()},
@@ -100,7 +101,7 @@ def diagnose_follower(
 ) -> FollowerDiagnosis:
     """Time gap, gains, lag with delay, string stability, gap and cause of a car-following `log`.
 
-    `law`: `constant_time_gap` or `intelligent_driver`; default: the one that foretells better what did not fit it.
+    `law`: `constant_time_gap` or `intelligent_driver`; default: the one that predicts held-out data better.
     `cause` False: stop at the loop. `effects`, `progress`: as `avtorch.diagnose` has them.
 
     Raises `InputError` for a log without speed, spacing or the leader's speed, with less than 40 s of following, or for
@@ -156,7 +157,7 @@ def _halves(record: Record) -> tuple[Record, Record]:
 
 
 def _crossed(candidate: Followed, halves: tuple[Record, Record]) -> tuple[LoopErrors, Identified]:
-    """The closed loop's errors on each half by what the other fitted; and the fit to the first."""
+    """The closed loop's errors on each half with parameters fitted to the other, and the fit to the first."""
     first, second = (identified(candidate, half) for half in halves)
     each = [
         loop_errors(candidate.law, found.values, _longest(candidate, half), _step(half))
@@ -170,7 +171,7 @@ def _step(record: Record) -> float:
 
 
 def _longest(candidate: Followed, half: Record) -> Seen:
-    """What was seen in the longest stretch of a half."""
+    """The measurements of the longest stretch of a half."""
     offsets = np.cumsum([0, *(len(s.speed) for s in candidate.seen)])
     number = np.bincount(half.stretch).argmax()
     rows = half.source[half.stretch == number] * half.group
@@ -187,7 +188,7 @@ def _cause(
     seed: int,
     progress: Callable[[str, int, int], None] | None,
 ) -> Diagnosis:
-    """The half that judges, with the law's commands, from lag and delay as the other half has them."""
+    """The diagnosis of the test half, with the law's commands, starting from the lag and delay of the other half."""
     law = tensors({k.removeprefix("law."): v for k, v in first.values.items() if k.startswith("law.")})
     sent = first.candidate.law.command(law, seen_in(log)).numpy()
     begin = first.candidate.on(half).row(0)

@@ -1,8 +1,8 @@
 """A car that follows: its controller's law in front of the plant, fitted to its speed together with lag and delay.
 
-The law is fed with what was measured, so that a rollout goes over the plant alone; what the car does otherwise feeds
-back through its own sensors, and the noise filter makes of it what is new in each row. `K_L` is held at 1: it cannot be
-told from the law's gains.
+The law's inputs are the measured signals, so that a rollout covers the plant alone. Unmodelled motion of the car feeds
+back through its own sensors; the noise filter reduces it to each row's innovation. `K_L` is held at 1: it cannot be
+distinguished from the law's gains.
 """
 
 from __future__ import annotations
@@ -54,24 +54,24 @@ class Followed(Hypothesis):
         return self._seen(cast(list, [_Speed(x) for x in out]), len(z), coarse)
 
     def row(self, counted: int) -> int:
-        """Which row of the log a `counted` row of the record begins at."""
+        """The row of the log at which each `counted` row of the record begins."""
         place = self.record.place(counted)
         return self.begins[place.drive] + place.row
 
     def on(self, record: Record) -> Followed:
-        """The same over another record of the same drives."""
+        """The same response over another record of the same drives."""
         return replace(self, record=record)
 
 
 @dataclass(frozen=True)
 class _Speed:
-    """A response of which only the speed is looked at."""
+    """A response with speed as its only channel."""
 
     speed: torch.Tensor
 
 
 def followed(log: Log, law: Law, *, dead_time: bool = True) -> Followed:
-    """Of a car-following log; `dead_time` False: the plant is the bare GLVD.
+    """Make the response for a car-following log; `dead_time` False: the plant is the bare GLVD.
 
     Only its speed is a channel, as the acceleration of public recordings is that speed's derivative. Raises
     `InputError` for a log without speed, spacing and the leader's speed.
@@ -88,7 +88,7 @@ def followed(log: Log, law: Law, *, dead_time: bool = True) -> Followed:
 
 
 def seen_in(log: Log) -> Seen:
-    """What the car saw, over all rows of the log."""
+    """The law's inputs over all rows of the log."""
     assert log.spacing is not None
     assert log.speed is not None
     assert log.lead_speed is not None

@@ -1,7 +1,8 @@
-"""Law, lag and delay found from a car-following record, with intervals that parts of the drive agree to.
+"""Law, lag and delay estimated from a car-following record, with intervals that cover the spread between its parts.
 
-The noise is an Ornstein-Uhlenbeck force beside jerk noise (the prior of a gust): a real controller does much that no
-law foretells. Such a likelihood is too sure of itself, so the spread between fits to parts of the drive widens it.
+The noise is an Ornstein-Uhlenbeck force and jerk noise (with the prior of a gust), because a real controller does much
+that no law predicts. The likelihood alone gives intervals that are too narrow, so the spread between fits to parts of
+the drive widens them.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _DELAYS_S = (0.3, 1.2)
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """`z` (coordinate,) at the mode, its `covariance`, `noise`; `log_evidence` [nats] of what was fitted.
+    """`z` (coordinate,) at the mode, its `covariance`, `noise`; `log_evidence` [nats] of the fit.
 
     Example:
         >>> from avtorch import Leader, LinearController, simulate
@@ -65,12 +66,12 @@ class Identified:
         return {k: x.numpy() for k, x in self.candidate.values(z).items()}
 
     def errors(self, record: Record) -> FloatArray:
-        """Measured less rolled out (channel, counted, group) at the rows of `record`."""
+        """Residuals, measured minus simulated, (channel, counted, group) at the rows of `record`."""
         return self.candidate.on(record).errors(self.z[None])[0]
 
 
 def identified(candidate: Followed, record: Record | None = None, *, start: Identified | None = None) -> Identified:
-    """Fitted to `record` (default: all rows), parameters and noise in turn, from a short and a long delay."""
+    """Fit to `record` (default: all rows), parameters and noise in turn, from a short and a long delay."""
     record = candidate.record if record is None else record
     own = candidate.on(record)
     noise, value = _START if start is None else start.noise, -np.inf
@@ -92,7 +93,7 @@ def identified(candidate: Followed, record: Record | None = None, *, start: Iden
 
 
 def widened(found: Identified, record: Record) -> FloatArray:
-    """Its covariance, each coordinate wider by what fits to parts of `record` differ by beyond it."""
+    """The fit's covariance, each coordinate widened by the excess spread of fits to parts of `record`."""
     count = int(min(_PARTS, record.rows * record.dt // _PART_S))
     if count < 2:
         return found.covariance
@@ -105,7 +106,7 @@ def widened(found: Identified, record: Record) -> FloatArray:
             parts.append(identified(found.candidate, part, start=found).z)
     if len(parts) < 2:
         return found.covariance
-    # each part is pulled by the same prior: what they differ by is a lower bound of what they know
+    # the same prior pulls each part: their spread is a lower bound on the uncertainty
     between = np.var(parts, axis=0, ddof=1) / len(parts)
     wider = np.sqrt(np.maximum(between / np.diag(found.covariance), 1.0))
     return found.covariance * np.outer(wider, wider)

@@ -1,6 +1,6 @@
-"""Controllers that a follower is taken to have: what they demand, of what they see, with parameters to be found.
+"""Assumed controllers of a follower: demanded acceleration as a function of their inputs, with parameters to identify.
 
-Nobody outside knows a production car's controller. Each law here is a hypothesis, judged on data that did not fit it.
+The controller of a production car is not public. Each law here is a hypothesis, tested on held-out data.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Values = Mapping[str, Tensor]
 
 
 class Seen(NamedTuple):
-    """What the follower sees, (time,): `spacing` [m], its own `speed` and `lead_speed` [m/s].
+    """The law's inputs, (time,): `spacing` [m], own `speed` and `lead_speed` [m/s].
 
     Example:
         >>> import torch
@@ -37,7 +37,7 @@ class Seen(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """How a demand moves with what is seen, for small motions: per metre, and per m/s of own and of lead speed.
+    """Slopes of the demand for small motions: per metre of spacing, and per m/s of own and of lead speed.
 
     Example:
         >>> from avtorch.follower import ConstantTimeGap
@@ -71,11 +71,11 @@ class Law(Protocol):
         ...
 
     def spacing(self, values: Values, speed: float) -> Tensor:
-        """In equilibrium at `speed` [m/s], `values` (...): (...) [m]."""
+        """Equilibrium spacing (...) [m] at `speed` [m/s], `values` (...)."""
         ...
 
     def slopes(self, values: Values, speed: float) -> Slopes:
-        """In equilibrium at `speed` [m/s], `values` (...)."""
+        """Slopes in equilibrium at `speed` [m/s], `values` (...)."""
         ...
 
 

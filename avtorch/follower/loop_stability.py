@@ -33,9 +33,10 @@ class LoopStability:
 
 
 def loop_stability(law: Law, draws: Mapping[str, FloatArray], speeds: Sequence[float]) -> list[LoopStability]:
-    """For small motions about `speeds` [m/s], of draws (draw,) by key.
+    """Stability for small motions about `speeds` [m/s], of draws (draw,) by key.
 
-    What holds of the loop holds whatever of it is controller or car: of gains and `K_L` only the product counts.
+    The result does not depend on how the loop is divided into controller and car: only the product of gains and `K_L`
+    counts.
 
     Example:
         >>> import numpy as np

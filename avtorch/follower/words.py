@@ -1,4 +1,4 @@
-"""A follower's diagnosis in words: what is said of the loop, a sentence or two each."""
+"""A follower's diagnosis in words: one or two sentences on each property of the loop."""
 
 from __future__ import annotations
 

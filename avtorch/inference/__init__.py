@@ -1,4 +1,4 @@
-"""What we believe: densities and priors, SGLD, Algorithm 1, and the sequential loop.
+"""Estimation: densities and priors, SGLD, Algorithm 1, and the sequential loop.
 
 Example:
     >>> from avtorch import GLVDPlant, Leader, simulate

@@ -1,4 +1,4 @@
-"""What is believed of every vehicle after a window, whichever estimator says so."""
+"""The belief about every vehicle after a window, for any estimator."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Z90 = 1.6448536269514722
 
 
 class Summary(NamedTuple):
-    """Of some vehicles: ``draws`` ``(draw, vehicle, parameter)``, the rest ``(vehicle, parameter)``."""
+    """Summary of some vehicles: ``draws`` ``(draw, vehicle, parameter)``, the rest ``(vehicle, parameter)``."""
 
     mean: Float[Tensor, "vehicle parameter"]
     sd: Float[Tensor, "vehicle parameter"]
@@ -35,14 +35,14 @@ class Summary(NamedTuple):
         kept: int,
         generator: torch.Generator,
     ) -> Summary:
-        """Of parameters whose logarithms are normal: moments and quantiles in closed form, and ``kept`` draws.
+        """Summary of parameters with normal logarithms: moments and quantiles in closed form, and ``kept`` draws.
 
         Args:
             mean_z: ``(vehicle, parameter)``. cov_z: ``(vehicle, parameter, parameter)``, positive semidefinite.
         """
         sd_z = cov_z.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
         mean = (mean_z + 0.5 * sd_z.square()).exp()
-        values, basis = torch.linalg.eigh(cov_z)  # a parameter that is known has no spread, and no Cholesky factor
+        values, basis = torch.linalg.eigh(cov_z)  # a known parameter has no spread, and no Cholesky factor
         noise = torch.randn(kept, *mean_z.shape, generator=generator, dtype=mean_z.dtype)
         draws = mean_z + torch.einsum("vij,kvj->kvi", basis * values.clamp_min(0.0).sqrt().unsqueeze(-2), noise)
         low, high = (mean_z - Z90 * sd_z).exp(), (mean_z + Z90 * sd_z).exp()
@@ -51,7 +51,7 @@ class Summary(NamedTuple):
 
 @dataclass(frozen=True)
 class Belief:
-    """What is believed of every vehicle after a window.
+    """The belief about every vehicle after a window.
 
     Attributes:
         names: parameter names, ``T_L`` [s] and ``K_L`` [-] first, then the noise parameters.
@@ -59,7 +59,7 @@ class Belief:
         draws: ``(draw, vehicle, parameter)``.
         excited: ``(vehicle,)`` bool; where false the window was not used and the rest is carried over unchanged.
         converged: ``(vehicle,)`` bool; false where the window was excited but its chains did not settle: carried over,
-            too. In the latent form it says only that the chains agree (see `Posterior`).
+            too. In the latent form true means only that the chains agree (see `Posterior`).
 
     Example:
         >>> from avtorch.inference import SequentialInference
@@ -97,7 +97,7 @@ class Belief:
         return Belief(self.names, draws=draws, excited=excited, converged=converged, **table)
 
     def unused(self, excited: Tensor) -> Belief:
-        """After a window that none was learnt from: all carried over."""
+        """After a window that no vehicle used: all carried over."""
         return replace(self, excited=excited, converged=torch.ones_like(excited))
 
     def state_dict(self) -> dict[str, Any]:
@@ -106,10 +106,10 @@ class Belief:
         return {"names": list(self.names), **{key: getattr(self, key) for key in keys}}
 
     def taken_from(self, state: dict[str, Any]) -> Belief:
-        """The inverse of :meth:`state_dict`, for the same parameters, vehicles and draws; what else is there is left.
+        """The inverse of :meth:`state_dict`, for the same parameters, vehicles and draws; other entries are ignored.
 
         Raises:
-            InputError: for other shapes or types, or numbers that no belief has.
+            InputError: for other shapes or types, or numbers that are impossible for a belief.
         """
         own = self.state_dict()
         shaped_as(own, {key: state[key] for key in own if key in state}, "state")
@@ -124,7 +124,7 @@ class Belief:
 
     @classmethod
     def of_prior(cls, names: tuple[str, ...], prior: Prior, kept: int, vehicles: int, g: torch.Generator) -> Belief:
-        """Before any window: ``kept`` draws of the prior, from the generator ``g``."""
+        """The belief before any window: ``kept`` draws of the prior, from the generator ``g``."""
         draws = prior.sample(kept, vehicles, generator=g).exp()
         ordered = draws.sort(0).values
         quantiles = (sorted_quantile(ordered, 0.05), sorted_quantile(ordered, 0.95))

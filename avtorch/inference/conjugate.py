@@ -1,8 +1,8 @@
-"""The fastest exact route where jerk is measured: a conjugate posterior, reweighted to the prior that was meant.
+"""The fastest exact method where jerk is measured: a conjugate posterior, reweighted to the intended prior.
 
 Eq. 4 is a linear regression of jerk on ``(-a, u)`` with coefficients ``(1/T_L, K_L/T_L)``, whose conjugate posterior is
 normal-inverse-gamma: independent draws in closed form. Importance weights bring them from the conjugate prior to any
-other. No Markov chain, no step size; it exists for this likelihood only.
+other. It needs no Markov chain and no step size, and exists for this likelihood only.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from avtorch.errors import InputError
 from avtorch.inference.jerk import JerkDensity
 from avtorch.inference.posterior import Posterior
 
-#: Variance of the conjugate prior over that of the prior meant: the proposal must have the wider tails.
+#: Variance of the conjugate prior over that of the intended prior: the proposal must have the wider tails.
 WIDENING = 4.0
 #: Draws of the prior that its moments in ``(1/T_L, K_L/T_L)`` are taken from.
 MOMENT_DRAWS = 2048
@@ -62,8 +62,8 @@ def sample_conjugate(
     """Sample every window's posterior by conjugate regression and importance resampling.
 
     The conjugate prior is ``N(m, sigma^2 V)`` on ``(1/T_L, K_L/T_L)`` with the moments of the density's own prior,
-    widened, and flat in ``log sigma``. Weights are the density over the proposal, so any prior is met exactly; a window
-    where least squares points to a negative lag merely loses the proposals outside the quadrant.
+    widened, and flat in ``log sigma``. Weights are the density over the proposal, so any prior is represented exactly;
+    a window where least squares gives a negative lag only loses the proposals outside the quadrant.
 
     Args:
         density: the jerk posterior with any prior.

@@ -1,7 +1,7 @@
 """Control variates at the mode: minibatch gradients that are exact where the posterior is (Baker et al. 2019, SGLD-CV).
 
-A minibatch tells the gradient at ``z`` poorly but its *difference* from the gradient at the mode well, and the gradient
-at the mode is known. What is left of the minibatch noise grows with the distance from the mode, not with the window.
+A minibatch estimates the gradient at ``z`` poorly but its *difference* from the gradient at the mode well, and the
+gradient at the mode is known. The remaining minibatch noise grows with the distance from the mode, not with the window.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class ControlVariates:
     mode are taken once, at the cost of one pass over the window; a step then costs its minibatch.
 
     Args:
-        density: what to estimate.
+        density: the density to estimate.
         mode: where the linear term is taken; any point near the posterior's bulk will do.
 
     Raises:
@@ -90,7 +90,7 @@ class ControlVariates:
         return constrained(self.density, z)
 
     def select(self, index: Tensor) -> ControlVariates:
-        """The windows named by ``index``; the gradients at their modes are kept, not taken again."""
+        """The windows named by ``index``; the gradients at their modes are reused."""
         if not isinstance(self.density, SelectableDensity):
             raise InputError(f"density: the windows of {type(self.density).__name__} cannot be taken apart")
         chosen = object.__new__(ControlVariates)

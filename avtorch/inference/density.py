@@ -1,4 +1,4 @@
-"""What a target density must offer: one log density serves SGLD, NUTS and quadrature alike."""
+"""The interface of a target density: one log density serves SGLD, NUTS and quadrature."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from avtorch.arrays import Float, Int
 class Density(Protocol):
     """A posterior, one per window, in an unconstrained space ``z``: for positive parameters ``z = log(parameter)``.
 
-    The potential of a Langevin sampler is ``U(z) = -log_prob(z)``, on the scale of the *whole* window: no mean over the
-    points is taken anywhere.
+    The potential of a Langevin sampler is ``U(z) = -log_prob(z)``, on the scale of the *whole* window, never a mean
+    over its points.
 
     Example:
         >>> import torch
@@ -42,7 +42,7 @@ class Density(Protocol):
     def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
         """Log posterior density of ``z`` with shape ``(..., window, parameter)``; returns ``(..., window)``.
 
-        The prior and the Jacobian of ``z`` are counted; constants of the likelihood are kept.
+        The prior and the Jacobian of ``z`` are included; constants of the likelihood are kept.
         """
         ...
 
@@ -136,5 +136,5 @@ class ConstrainedDensity(Density, Protocol):
 
 
 def constrained(density: Density, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
-    """Parameters of ``density`` in their own units: ``exp(z)`` unless it says otherwise."""
+    """Parameters of ``density`` in their own units: ``exp(z)`` unless it defines another transform."""
     return density.constrain(z) if isinstance(density, ConstrainedDensity) else z.exp()

@@ -1,4 +1,4 @@
-"""What a window of rows says: its density, once a prior is given, and whether it can teach anything."""
+"""The evidence of a window of rows: its density for a given prior, and whether it is excited."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Evidence:
 
 
 class Form(Protocol):
-    """A form of the log density: which columns it reads, which parameters it has, what a window of rows is to it.
+    """A form of the log density: its columns, its parameters, and its evidence from a window of rows.
 
     Example:
         >>> from avtorch.inference import Form, JerkForm, SpeedLagForm
@@ -64,7 +64,7 @@ class Form(Protocol):
 
     @property
     def sampler(self) -> SamplerSettings:
-        """How its posteriors are walked unless the user says otherwise."""
+        """Default settings of the sampler for its posteriors."""
         ...
 
     def evidence(self, rows: Rows, full: float) -> Evidence:

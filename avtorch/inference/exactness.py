@@ -1,11 +1,12 @@
 r"""Do the draws of a walk follow the density? Chains that agree with each other need not agree with the posterior.
 
 A constant step has a law of its own, and chains that all begin at the mode may not have reached the posterior's tails.
-The log density is exact and cheap, so it is asked: points are drawn from a proposal around the draws, a mixture of
-normals with the draws' mean and covariance and 1 to 15 times their SDs, and weighed by ``density / proposal``. If the
-ratios are reliable (Pareto-k, :mod:`avtorch.inference.pareto`), their weighted moments are the posterior's, with a
-Monte Carlo error that is known, and those of the draws are held against them. If they are not, the draws do not cover
-the density, or its shape is too far from a normal to be judged this way: then nothing is claimed.
+The log density is exact and cheap, so it serves as the test: points are drawn from a proposal around the draws, a
+mixture of normals with the draws' mean and covariance and 1 to 15 times their SDs, and weighed by ``density /
+proposal``. If the ratios are reliable (Pareto-k, :mod:`avtorch.inference.pareto`), their weighted moments are the
+posterior's, with a Monte Carlo error that is known, and those of the draws are compared with them. If the ratios are
+not reliable, the draws do not cover the density, or its shape is too far from normal for this test: then nothing is
+claimed.
 """
 
 from __future__ import annotations
@@ -24,21 +25,21 @@ from avtorch.inference.pareto import RELIABLE, pareto_k
 from avtorch.inference.planes import from_planes, lower_times, to_planes
 
 MEAN_TOLERANCE, SD_TOLERANCE, TAIL_TOLERANCE = 0.1, 0.05, 0.003
-"""How far a mean may be off in SDs, an SD as a ratio, and the share of draws beyond TAIL as a probability."""
+"""Tolerances: error of a mean in SDs, of an SD as a ratio, of the share of draws beyond TAIL as a probability."""
 TAIL = 3.0
-"""SDs of the draws, on either side, where the tail begins: a heavy one shows there long before it moves the SD."""
+"""SDs of the draws, on either side, where the tail begins: a heavy tail shows there long before it affects the SD."""
 RESOLUTION = 0.05
 """A claim needs the density's moments to be known this well: standard error of a mean in SDs, of an SD as a ratio."""
 ERRORS = 3.0
-"""Monte Carlo standard errors of the draws that are let pass where they are more than the tolerance."""
+"""Monte Carlo standard errors of the draws that are allowed where they exceed the tolerance."""
 HEAVY = 1.0
-"""An SD's error counts up to so many of its mean's: 0.7 under a normal, 1 at a kurtosis of 5. Where it is more, a few
-far draws carry the SD, and those that are still missing make it too small rather than uncertain."""
+"""Upper bound on an SD's error in errors of its mean: 0.7 under a normal, 1 at a kurtosis of 5. Beyond it a few far
+draws determine the SD, and missing ones make it too small rather than uncertain."""
 CERTAIN = 0.4
-"""Pareto-k up to which few points are enough; between this and RELIABLE a rare point may still matter."""
-#: SDs of the proposal's parts in the draws' SDs, and their shares; the wide ones look for what the draws miss.
+"""Pareto-k up to which a small sample of points is enough; between this and RELIABLE a rare point may still matter."""
+#: SDs of the proposal's components in the draws' SDs, and their shares; the wide ones find mass that the draws miss.
 SCALES, SHARES = (1.0, 1.5, 3.0, 6.0, 15.0), (0.45, 0.27, 0.14, 0.09, 0.05)
-#: Points of a second look where the first leaves a doubt, as a multiple.
+#: Factor by which a second test increases the points where the first is inconclusive.
 AGAIN = 8
 #: Points times windows at once.
 BLOCK = 2**18
@@ -76,9 +77,9 @@ class Exactness:
         return fine.all(-1) & (self.pareto_k < RELIABLE)
 
     def beyond(self, errors: float = 1.0) -> Tensor:
-        """Where mean, SD or tail of the draws is off by more than tolerance or chance, ``(3, window, parameter)`` bool.
+        """Where mean, SD or tail of the draws exceeds tolerance and chance, ``(3, window, parameter)`` bool.
 
-        ``errors``: standard errors of the density's side that are let pass on top.
+        ``errors``: standard errors of the density's side that are allowed in addition.
         """
         off = torch.stack([self.mean_shift.abs(), (self.sd_ratio - 1).abs(), self.tail_excess.abs()])
         own_sd = torch.minimum(self.draws_sd_error, HEAVY * self.draws_mean_error)
@@ -92,11 +93,11 @@ class Exactness:
         return self.known() & (self.pareto_k < CERTAIN) | self.hopeless()
 
     def hopeless(self) -> Tensor:
-        """Where not even a mean of the ratios exists: the density is nothing like the draws, ``(window,)`` bool."""
+        """Where the ratios do not even have a mean: the density is far from the draws, ``(window,)`` bool."""
         return self.pareto_k > 1.0
 
     def clear(self) -> Tensor:
-        """Where a first look leaves no doubt that the draws follow the density, ``(window,)`` bool."""
+        """Where the first test already shows that the draws follow the density, ``(window,)`` bool."""
         return self.known(2 * RESOLUTION) & (self.pareto_k < CERTAIN) & ~self.beyond().any(0).any(-1)
 
     def holds(self) -> Tensor:
@@ -140,22 +141,22 @@ class Exactness:
 
     @classmethod
     def unknown(cls, windows: int, parameters: int) -> Exactness:
-        """Nothing is known of any window: NaN throughout."""
+        """NaN throughout: nothing is known of any window."""
         each = torch.full((windows, parameters), torch.nan, dtype=torch.float64)
         a, b, c, d, e, f, g, h, i = (each.clone() for _ in range(9))
         return cls(each[:, 0].clone(), a, b, c, d, e, f, g, h, i, each[:, 0].clone())
 
 
 def compare(density: Density, z: Tensor) -> Exactness:
-    """Hold draws ``z`` ``(chain, draw, window, parameter)`` against their density.
+    """Compare draws ``z`` ``(chain, draw, window, parameter)`` with their density.
 
-    A first look takes few points beside what the draws cost; the windows of which it leaves a doubt get about AGAIN
-    times as many, and those that it cannot tell by then as many times more. What holds is searched for other modes.
+    The first test takes few points compared with the draws; windows where it is inconclusive get about AGAIN times as
+    many, and those still undecided get AGAIN times more. Windows that pass are searched for other modes.
     """
     total = z.shape[0] * z.shape[1]
     points = min(1024, max(256, total // 8))
     closer = min(AGAIN * points, max(4 * points, total))
-    # a walk of few draws has a density that is dear
+    # few draws mean that the density is expensive
     looks = (closer, AGAIN * closer) if total >= 4096 else (closer,)
     everyone = torch.arange(z.shape[2])
 
@@ -167,7 +168,7 @@ def compare(density: Density, z: Tensor) -> Exactness:
     moments = Moments.of(z)
     found = weighed(density, moments, points)
     for count in looks:
-        # more points do not help where the ratios' tail is heavy beyond doubt
+        # more points do not help where the ratios' tail is clearly heavy
         index = chosen(~(found.clear() if count == closer else found.clear() | found.sure()))
         if len(index):
             found = found.put(index, weighed(_picked(density, index), moments.select(index), count))
@@ -190,7 +191,7 @@ def exactness(density: Density, z: Tensor, points: int) -> Exactness:
 
 
 class Moments(NamedTuple):
-    """Of draws: ``lower`` ``(window, parameter, parameter)``, the rest ``(window, parameter)``.
+    """Moments of draws: ``lower`` ``(window, parameter, parameter)``, the rest ``(window, parameter)``.
 
     Attributes:
         mean: in the units of ``z``.
@@ -208,7 +209,7 @@ class Moments(NamedTuple):
 
     @classmethod
     def of(cls, z: Tensor) -> Moments:
-        """Of draws ``(chain, draw, window, parameter)``."""
+        """Compute them from draws ``(chain, draw, window, parameter)``."""
         chains, draws = z.shape[:2]
         pieces = max(1, min(draws // 2, -(-16 // chains)))
         planes = to_planes(z.transpose(0, 1))  # (parameter, window, draw, chain), contiguous as the walk leaves it
@@ -234,7 +235,7 @@ class Moments(NamedTuple):
 
 
 def weighed(density: Density, moments: Moments, points: int) -> Exactness:
-    """Draws of these moments against their density: one call of its ``log_prob``, or a few where windows are many."""
+    """Compare draws of these moments with their density: one call of its ``log_prob``, or a few for many windows."""
     mean, lower, share, mean_error, sd_error = moments
     base, log_proposal = proposal(points, mean.shape[-1])
     found = []
@@ -243,7 +244,7 @@ def weighed(density: Density, moments: Moments, points: int) -> Exactness:
         found.append(_weighed(_picked(density, part), mean[part], lower[part], base, log_proposal))
     k, m, variance, tail, m_error, v_error, tail_error = (torch.cat(x) for x in zip(*found, strict=True))
     spread = variance.sqrt()
-    # chance of the tail's share from as many independent draws as the mean is worth
+    # binomial error of the tail's share, for the mean's effective number of independent draws
     of_tail = (torch.maximum(share, tail) * mean_error.square()).sqrt()
     errors = (m_error / spread, 0.5 * v_error / variance, tail_error)
     return Exactness(
@@ -272,9 +273,9 @@ def _weighed(density: Density, mean: Tensor, lower: Tensor, base: Tensor, log_pr
 
 
 def log_density(density: Density, z: Tensor) -> Tensor:
-    """``log_prob`` of ``z`` ``(point, window, parameter)``, minus infinity where the density refuses to be asked.
+    """``log_prob`` of ``z`` ``(point, window, parameter)``, minus infinity where the density raises.
 
-    Far out a user's function may leave the numbers that torch's distributions take, and they raise.
+    Far out, a user's function may pass numbers that torch's distributions refuse by raising.
     """
     try:
         value = density.log_prob(z)
@@ -290,7 +291,7 @@ def log_density(density: Density, z: Tensor) -> Tensor:
 def proposal(points: int, d: int) -> tuple[Tensor, Tensor]:
     """Points ``(point, d)`` of a scale mixture of standard normals, mirrored, and their log density ``(point,)``.
 
-    The same for every window and every run: neither the walk's random numbers nor the number of windows matter.
+    They are the same for every window and every run, independent of the sampler's random numbers.
     """
     half = points // 2
     edges = (torch.arange(half, dtype=torch.float64) + 0.5) / half

@@ -1,4 +1,4 @@
-"""Which windows can teach anything: a fixed rule on ``a``, ``u`` and the noise level, never on the posterior."""
+"""Which windows are excited: a fixed rule on ``a``, ``u`` and the noise level, never on the posterior."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ class ExcitationRule:
 
     Least squares of jerk on ``(-a, u)`` predicts the standard deviations of ``1/T_L`` and ``K_L/T_L`` from the products
     of ``a`` and ``u`` and the noise level; at the reference they become those of ``T_L`` and ``K_L``. A window whose
-    prediction is wider leaves the belief to its prior, and would only water it down. The rule does not know the
-    vehicle: one much quicker than the reference (a lag of 0.05 s, say) would be resolved by some windows left out.
+    prediction is wider hardly changes the prior and would only dilute the belief. The rule does not depend on the
+    vehicle: for one much quicker than the reference (a lag of 0.05 s, say) it excludes some windows that would resolve
+    it.
 
     Attributes:
         T_ref, K_ref: reference lag [s] and gain [-], slow enough that a degraded vehicle is resolved, too.

@@ -20,7 +20,7 @@ _LOG_SCALED = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, -1.0], [-1.0, 1.0, -1.
 
 RESOLUTION = 1e-4
 """Finest noise that the sums resolve, as a share of the RMS jerk: the log density of a window, about ``n`` jerks
-squared over noise squared, then keeps eight digits, enough for Newton's method to see the mode."""
+squared over noise squared, then keeps eight digits, enough for Newton's method to find the mode."""
 
 
 def jerk_log_likelihood(
@@ -101,7 +101,7 @@ class JerkStatistics:
     def with_least_noise(self, share: float = RESOLUTION) -> JerkStatistics:
         """The same sums with white noise of ``share`` of the RMS jerk mixed in, where the residual holds less.
 
-        A simulated log without noise leaves a residual of round-off, and sigma no place to stop.
+        For a simulated log without noise the residual is round-off, and sigma would have no lower bound.
         """
         lacking = (share**2 * self.jj - self.n * self.least_squares()[2].square()).clamp_min(0.0)
         return replace(self, jj=self.jj + lacking)

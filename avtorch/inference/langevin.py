@@ -1,4 +1,5 @@
-"""What every Langevin optimizer shares: a generator that resumes to the bit, checked groups, closures that leave U."""
+"""What every Langevin optimizer shares: a generator that resumes bit for bit, checked groups, closures that return
+U."""
 
 from __future__ import annotations
 

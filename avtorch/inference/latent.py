@@ -14,19 +14,20 @@ from avtorch.inference.latent_steady import EvenRows, steady_log_likelihood
 from avtorch.inference.latent_window import LatentWindow
 from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior
 
-#: Rows count as even while their times lie this close to an even grid: a quarter of a step, and 2.5 ms. That moves a
-#: speed by 2.5 mm/s per m/s², below the noise of a wheel speed; beyond it the row-by-row filter takes over, which is
-#: exact for any times and slower by the number of rows.
+#: Rows count as even while their times are this close to an even grid: a quarter of a step, and 2.5 ms. The error in
+#: speed is 2.5 mm/s per m/s², below the noise of a wheel speed. Other rows use the row-by-row filter, which is exact
+#: for any times and slower by the number of rows.
 EVEN_STEPS, EVEN_S = 0.25, 0.0025
-#: What the sensors' noise parameters are added to, in squares [m/s, m/s²]: no sensor in a car reads finer than this. A
-#: log that was simulated without noise would otherwise be told ever better, until the filter's digits are gone.
+#: Floor added in squares to the sensors' noise parameters [m/s, m/s²]: no sensor in a car resolves less. Without it the
+#: noise fitted to a noise-free simulated log would shrink until the filter loses all digits.
 FINEST = 1e-4
 #: Medians and log SDs of the noise parameters, for a test car and a production car alike.
 #: process_noise [m/s²/√s], the actuator's own roughness: at a lag of 0.3 s the median makes 0.06 m/s², and 95 %
 #: lie within a factor 7. road_noise [m/s/√s]: body vibration; the median makes 1 mm/s from row to row at 100 Hz.
 #: speed_noise [m/s]: from a good inertial unit to a coarse wheel speed. accel_noise [m/s²]: likewise.
 #: coloured_sd [m/s²] and coloured_time [s]: forces that GLVD lacks, such as slope (1 % is 0.1 m/s²), gusts (0.1 to
-#: 0.4 m/s² for 1 to 5 s), curves and gear changes; free to reach them, or T_L and K_L would be believed too narrowly.
+#: 0.4 m/s² for 1 to 5 s), curves and gear changes; the prior must allow these values, or the posterior of T_L and K_L
+#: would be too narrow.
 NOISE_PRIOR: dict[str, tuple[float, float]] = {
     "process_noise": (0.15, 1.0),
     "road_noise": (0.01, 1.0),
@@ -68,7 +69,7 @@ def even_rows(runs: LatentWindow) -> EvenRows | None:
     index = torch.arange(runs.time.shape[1], dtype=torch.float64)
     last = runs.time.gather(1, (count - 1)[:, None])[:, 0]
     dt = (last - runs.time[:, 0]) / (count - 1).clamp(min=1)
-    # A run of a single row has no step; any will do.
+    # A run of a single row has no step; any value will do.
     dt = torch.where(count > 1, dt, dt[count > 1].median() if bool((count > 1).any()) else 0.01)
     off = (runs.time - runs.time[:, :1] - dt[:, None] * index).abs() * runs.mask
     if bool((off > (EVEN_STEPS * dt[:, None]).clamp(max=EVEN_S)).any()):

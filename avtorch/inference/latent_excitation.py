@@ -1,4 +1,4 @@
-"""Which windows of the latent form can teach anything about the actuator: a fixed rule, blind to the posterior."""
+"""Which windows of the latent form are excited: a fixed rule, independent of the posterior."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from avtorch.inference.latent_window import LatentWindow
 REFERENCE = (0.3, 1.0)
 #: Noise level at which it is predicted: the medians of the noise priors.
 REFERENCE_NOISE = {name: median for name, (median, _) in NOISE_PRIOR.items()}
-#: What is known beforehand of log T_L and log K_L: the first prior's SDs.
+#: SDs of log T_L and log K_L under the first prior.
 KNOWN = (0.7, 0.3)
-#: A window is excited from one bit on: where it promises to halve the area of the belief about (T_L, K_L).
+#: A window is excited from one bit on: where it is expected to halve the area of the belief about (T_L, K_L).
 LEAST_BITS = 1.0
 
 
@@ -29,13 +29,13 @@ def latent_excitation(
     reference: tuple[float, float] = REFERENCE,
     least_bits: float = LEAST_BITS,
 ) -> tuple[Bool[Tensor, " window"], Float[Tensor, " window"]]:
-    """Which windows are excited, ``(window,)`` bool, and the information they promise, ``(window,)`` [bit].
+    """Which windows are excited, ``(window,)`` bool, and their expected information, ``(window,)`` [bit].
 
     The figure is the expected information about ``(log T_L, log K_L)`` that the *command* brings, at a fixed reference
     vehicle and noise level: with ``F`` the Fisher information of the predicted signal and ``C = diag(KNOWN²)``,
     ``log2 det(I + C F) / 2``. It depends on times, commands and mask, on which signals are measured and on ``noise``
     (names and units of ``NOISE_PRIOR``; the default is ``REFERENCE_NOISE``), not on measured values or a posterior.
-    Each run's start and a constant force on it are taken as unknown, so a constant command says nothing.
+    Each run's start and a constant force on it are taken as unknown, so a constant command carries no information.
     """
     runs, owner = data.runs()
     names = latent_names(accel=data.accel is not None, speed=data.speed is not None)
@@ -45,7 +45,7 @@ def latent_excitation(
     by_lag, by_gain = _sensitivities(runs, *reference)
 
     def energy(accel: Tensor, speed: Tensor) -> Tensor:
-        """``sᵀ Σ⁻¹ s`` of a signal: twice what the likelihood loses to it when nothing is commanded."""
+        """``sᵀ Σ⁻¹ s`` of a signal: twice the loss of log likelihood that it causes without a command."""
         signal = LatentWindow(
             runs.time,
             torch.zeros_like(runs.u),
@@ -55,7 +55,7 @@ def latent_excitation(
         )
         return -2.0 * run_log_likelihood(p, signal, even_rows(signal))
 
-    # A force of unknown constant size, such as a slope: it leaves the gain to what the command changes.
+    # A force of unknown constant size, such as a slope: only changes of the command then determine the gain.
     since = runs.time - runs.time[:, :1]
     signals = (by_lag, by_gain, (torch.ones_like(since), since))
     zero = torch.zeros_like(since)

@@ -1,6 +1,6 @@
 """Exact log likelihood of the latent form by a Kalman filter, row by row: any sampling, gaps, masked rows.
 
-The slow and general route; `latent_steady` is the fast one for even sampling, and equals it.
+The slow and general method; `latent_steady` is the fast one for even sampling, with the same result.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def latent_log_likelihood(
         for data, variance, row in channels:
             innovation = data[k] - mean @ row
             if not everywhere:
-                # A masked row may hold anything, also NaN, and must not reach a gradient either.
+                # A masked row may hold any number or NaN, and must not affect a gradient either.
                 innovation = torch.where(on, innovation, 0.0)
             pointing = covariance @ row
             spread = pointing @ row + variance

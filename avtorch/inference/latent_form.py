@@ -1,4 +1,4 @@
-"""The latent form as the stream sees it: only acceleration and/or speed are measured, and neither is differenced."""
+"""The latent form for a stream: only acceleration and/or speed are measured, and neither is differenced."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from avtorch.inference.latent_window import LatentWindow
 from avtorch.inference.priors import Prior
 from avtorch.inference.sampler import SamplerSettings
 
-#: A step costs a filter run over the rows for every chain here, so there are fewer chains, each walking for longer.
-#: Some of its parameters are known by little more than their prior, in shapes so far from a normal that points around
-#: the draws do not settle their moments; convergence is that of the chains alone.
+#: Each step runs a filter over the rows for every chain, so there are fewer and longer chains. Some parameters are
+#: determined by little more than their prior, and their posteriors are so far from normal that importance sampling
+#: around the draws does not determine their moments; convergence is tested on the chains alone.
 SAMPLER = SamplerSettings(chains=64, draws=20, burn_in=12, thinning=1, step=1.5, longest=3.0, compare=False)
 
 
@@ -25,8 +25,8 @@ class LatentForm:
     Args:
         accel, speed: which of the two is measured.
         noise: noise level at which excitation is predicted, by name (see :func:`latent_excitation`).
-        share: the least share of a window's rows that must be usable; the start of a run is unknown here, so that a
-            short remainder of a drive says less than its rows promise.
+        share: the least share of a window's rows that must be usable; the state at the start of a run is unknown, so
+            that a short end of a drive is less informative than its rows suggest.
     """
 
     sampler = SAMPLER

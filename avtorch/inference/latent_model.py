@@ -1,8 +1,7 @@
 r"""The latent-acceleration model and its exact discretisation (latent form).
 
-State ``(v, a, c, e)``: the speed that the actuator alone would give, the actuator's acceleration, and what the
-simulator does not know: ``c``, by how much the car is faster than that, and its derivative ``e``, an external
-acceleration.
+State ``(v, a, c, e)``: the speed that the actuator alone would give, the actuator's acceleration, and two unmodelled
+quantities: ``c``, the car's excess speed over ``v``, and its derivative ``e``, an external acceleration.
 
 .. math::
     \dot v = a + g\, w_3, \qquad \dot a = -a/T_L + (K_L/T_L)\, u + q\, w_1, \qquad
@@ -10,14 +9,14 @@ acceleration.
 
 with ``w`` unit white noise. Measured are the speed ``v + c`` and/or the acceleration ``a + e``, each with independent
 noise per row. ``c`` is a Matérn process of smoothness 3/2 with length scale ``coloured_time`` (``lambda = sqrt(3) /
-coloured_time``); it carries the coloured residual, and ``coloured_sd`` is the stationary SD of ``e``. That the speed
-error stays bounded is what recorded laps show: an external acceleration with power down to zero frequency, such as an
-Ornstein-Uhlenbeck force, would let the speed drift by metres per second within a minute, which it does not; it is
-less likely by tens of nats, and it throws away the slow part of the response, where ``K_L`` is seen best.
+coloured_time``); it carries the coloured residual, and ``coloured_sd`` is the stationary SD of ``e``. On recorded laps
+the speed error stays bounded. With an external acceleration that has power down to zero frequency, such as an
+Ornstein-Uhlenbeck force, it would drift by metres per second within a minute. That model is less likely by tens of
+nats, and it discards the slow part of the response, which determines ``K_L`` best.
 
-``g`` is road noise: vibration of the body that the wheels see, faster than the rows. Without it the mode ``T_L → 0``
-with a huge ``q`` imitates it, on a recorded lap by hundreds of nats, and drags the lag to nothing. ``a`` and ``c`` are
-independent, so every entry has a closed form and no matrix exponential is needed.
+``g`` is road noise: vibration in the wheel speeds, faster than the rows. Without it a mode at ``T_L → 0`` with a huge
+``q`` imitates it, on a recorded lap with hundreds of nats, and the estimate of the lag goes to zero. ``a`` and ``c``
+are independent, so every entry has a closed form and no matrix exponential is needed.
 """
 
 from __future__ import annotations
@@ -30,9 +29,10 @@ from torch import Tensor
 
 from avtorch.arrays import Float
 
-#: Prior standard deviation of the first speed about the first measured one [m/s]: as good as diffuse.
+#: Prior standard deviation of the first speed about the first measured one [m/s]: practically diffuse.
 SPEED_SD0 = 10.0
-#: Prior standard deviation of the first actuator acceleration about zero [m/s²]: wider than what cars do in ACC use.
+#: Prior standard deviation of the first actuator acceleration about zero [m/s²]: wider than the accelerations of cars
+#: with ACC.
 ACCEL_SD0 = 3.0
 
 # Below this x the closed form of _integral_squared cancels; the series is exact there to round-off.
@@ -40,7 +40,7 @@ _SERIES_BELOW = 0.5
 _SERIES = tuple((-1) ** (k + 1) * (2.0 ** (k - 1) - 2.0) / math.factorial(k) for k in range(3, 21))
 
 
-# What the sensors see of the state.
+# Measurement rows of the sensors.
 SPEED_ROW = (1.0, 0.0, 1.0, 0.0)
 ACCEL_ROW = (0.0, 1.0, 0.0, 1.0)
 

@@ -1,6 +1,6 @@
 r"""The latent log likelihood on even rows, without a loop over time: exact, and milliseconds for 64 chains.
 
-On even rows the Kalman filter is time-invariant but for its start. Two facts turn that into matrix products:
+On even rows the Kalman filter is time-invariant except for its start. Two facts reduce it to matrix products:
 
 - Started from the *stationary* covariance ``P`` the gain is constant from the first row, and the innovations are a
   linear filter of the data: inside blocks of rows by their impulse response, across blocks by a scan.
@@ -9,7 +9,7 @@ On even rows the Kalman filter is time-invariant but for its start. Two facts tu
 
   .. math:: \log p = \log p_P + \tfrac12 j^T (I + D J)^{-1} D j - \tfrac12 \log\det(I + D J)
 
-  which stays true where ``D`` is not positive. So nothing is truncated; there is no transient to wait for.
+  which also holds where ``D`` is not positive. So nothing is truncated, and no transient has to decay.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ BLOCK = 32
 class EvenRows:
     """Even runs of rows, laid out once for `steady_log_likelihood`.
 
-    ``lagged`` ``(run, BLOCK·channel, block·BLOCK)``: what each row sees of its own block, newest first; channels are
-    the measured ones, then the command. ``used`` ``(run, block·BLOCK)``; ``count`` rows in use; ``dt`` [s] ``(run,)``.
+    ``lagged`` ``(run, BLOCK·channel, block·BLOCK)``: the part of its own block that each row uses, newest first;
+    channels are the measured ones, then the command. ``used`` ``(run, block·BLOCK)``; ``count`` rows in use; ``dt`` [s]
+    ``(run,)``.
     """
 
     lagged: Tensor
@@ -65,7 +66,7 @@ def _solved(A: Tensor, B: Tensor) -> Tensor:
 
 
 def _riccati_limit(phi: Tensor, H: Tensor, Q: Tensor, R: Tensor) -> Tensor:
-    """The limit by structured doubling: the k-th step covers ``2^k`` rows, so a dozen reach any memory."""
+    """The limit by structured doubling: the k-th step covers ``2^k`` rows, so a dozen cover any memory."""
     A, X = phi.mT, Q
     G = H.mT @ (H / R.diagonal(dim1=-2, dim2=-1)[..., None])
     n = Q.shape[-1]
@@ -74,8 +75,8 @@ def _riccati_limit(phi: Tensor, H: Tensor, Q: Tensor, R: Tensor) -> Tensor:
         WA, WG = _solved(eye + G @ X, torch.cat((A, G), -1)).split(n, -1)
         added = A.mT @ X @ WA
         X = X + added
-        # Convergence is quadratic: what comes after this is below round-off.
-        if not bool((added.abs().amax((-2, -1)) > 1e-9 * X.abs().amax((-2, -1))).any()):  # NaN settles nothing
+        # Convergence is quadratic: further steps are below round-off.
+        if not bool((added.abs().amax((-2, -1)) > 1e-9 * X.abs().amax((-2, -1))).any()):  # NaN never converges
             break
         G = G + A @ WG @ A.mT
         A = A @ WA
@@ -173,7 +174,7 @@ def steady_log_likelihood(
         noises.append(accel_noise.reshape(-1, runs) ** 2)
     H, R = phi.new_tensor(sensors), torch.diag_embed(torch.stack(noises, -1))
     if not data.has_speed:
-        # Nothing sees the speed then, and it has no stationary law: leave it out.
+        # The speed is then unobservable and has no stationary law: leave it out.
         phi, B, Q, P0, H = phi[..., 1:, 1:], B[..., 1:], Q[..., 1:, 1:], P0[..., 1:, 1:], H[..., 1:]
     n, m = phi.shape[-1], H.shape[0]
 
@@ -184,7 +185,7 @@ def steady_log_likelihood(
     white = torch.linalg.inv(root)
     K = P @ H.mT @ white.mT @ white
     M = phi - phi @ K @ H
-    drive = torch.cat((phi @ K, B[..., None]), -1)  # what a row's measurements and command add to the next mean
+    drive = torch.cat((phi @ K, B[..., None]), -1)  # contribution of a row's measurements and command to the next mean
     powers = _powers(M, BLOCK)
     seen = ((white @ H)[..., None, :, :] @ powers).transpose(-3, -2).flatten(2, 3)  # (chain, run, m·BLOCK, n)
     pushed = powers @ drive[..., None, :, :]  # (chain, run, BLOCK, n, m + 1)

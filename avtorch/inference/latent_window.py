@@ -95,7 +95,7 @@ class LatentWindow:
     def runs(self) -> tuple[LatentWindow, Int[Tensor, " run"]]:
         """Stretches without a gap or an unused row, one a row, and the window ``(run,)`` each comes from.
 
-        Behind a gap, a standstill or a driver's override the acceleration is anybody's, so each run starts afresh.
+        After a gap, a standstill or a driver's override the acceleration is unknown, so each run starts afresh.
         """
         pieces: list[LatentWindow] = []
         owner: list[int] = []

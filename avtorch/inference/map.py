@@ -75,8 +75,8 @@ def find_mode(
 
     Args:
         start: shape ``(window, parameter)``; by default ``density.initial()``.
-        tolerance: end when half the Newton decrement, the potential still to be won, is below this in every window.
-            1e-8 leaves the mode within 1.5e-4 posterior SDs.
+        tolerance: end when half the Newton decrement, the possible further decrease of the potential, is below this in
+            every window. 1e-8 leaves the mode within 1.5e-4 posterior SDs.
 
     Example:
         >>> from avtorch.inference import find_mode
@@ -152,7 +152,7 @@ def _from_graph(density: Density, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     (gradient,) = torch.autograd.grad(potential.sum(), z, create_graph=True)
     rows = []
     for i in range(z.shape[-1]):
-        # a density that is linear in a parameter has no second derivative to ask for
+        # a density that is linear in a parameter has no second derivative
         row = torch.autograd.grad(gradient[:, i].sum(), z, retain_graph=True)[0] if gradient.requires_grad else None
         rows.append(torch.zeros_like(z) if row is None else row)
     return potential.detach(), gradient.detach(), torch.stack(rows, -2)

@@ -1,4 +1,4 @@
-"""The same posterior as a Pyro model, and full-batch NUTS over it: the reference that others wrote.
+"""The same posterior as a Pyro model, and full-batch NUTS over it: an independent reference.
 
 Needs the extra ``nuts`` (Pyro), so import it by its path. Priors are ``pyro.sample`` statements; the jerk likelihood is
 one, too, where the rows are given, and otherwise a factor. In ``z = log(parameter)``, with Pyro's own Jacobian, the
@@ -71,7 +71,7 @@ class _Site:
         return (value if self.log_space else value.log()).reshape(len(self.columns))
 
     def unconstrained(self, z: Tensor) -> Tensor:
-        """What Pyro walks in: ``z`` in either case, as the positive constraint is met by ``exp``."""
+        """Pyro's unconstrained coordinates: ``z`` in either case, as Pyro maps positive parameters by ``exp``."""
         return z[list(self.columns)].reshape(self.law.batch_shape + self.law.event_shape)
 
 
@@ -136,12 +136,12 @@ class PyroModel:
         return {site.name: site.unconstrained(z) for site in self.sites}
 
     def walked(self, found: dict[str, Tensor]) -> Tensor:
-        """What Pyro's MCMC returns, as ``z`` ``(draw, parameter)``."""
+        """The result of Pyro's MCMC as ``z`` ``(draw, parameter)``."""
         parts = [found[s.name] if s.log_space else found[s.name].log() for s in self.sites]
         return torch.cat([part.reshape(len(part), -1) for part in parts], -1)
 
     def log_prob(self, z: Tensor) -> Tensor:
-        """Pyro's own log density of ``z`` ``(parameter,)``, Jacobian counted: minus the potential that NUTS sees."""
+        """Pyro's own log density of ``z`` ``(parameter,)``, Jacobian included: minus the potential of NUTS."""
         _, potential, _, _ = initialize_model(self, initial_params=self.unconstrained(z))
         return -potential(self.unconstrained(z))
 
@@ -162,7 +162,7 @@ def nuts(
     """Full-batch NUTS with a dense mass matrix over one window of a density, by Pyro.
 
     Chains start from the Laplace approximation at the mode and run one after another. PyTorch's global random state is
-    left as it was.
+    unchanged.
 
     Args:
         density, window, samples: see :class:`PyroModel`.

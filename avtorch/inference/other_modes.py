@@ -1,4 +1,4 @@
-"""Is there a mode that the chains never saw? Starts far around the draws climb the density; where do they end?"""
+"""Is there a mode that the chains never reached? Searches that start far from the draws ascend the density."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from avtorch.inference.map import find_mode
 from avtorch.inference.planes import lower_times, lower_transposed_times
 from avtorch.inference.whitening import score_of
 
-#: How far out the starts lie, in SDs of the draws, evenly spaced; half of them, the others mirror them.
+#: Distances of the starts in SDs of the draws, evenly spaced; these are half of them, the others are mirror images.
 RADII = (4.0, 16.0)
 STARTS, STEPS = 16, 3
 #: Longest step of the climb, in the same SDs.
 STRIDE = 10.0
-#: Nats below the draws' centre, and SDs away from it, where an end is worth a search for a mode.
+#: Nats below the draws' centre, and SDs away from it, at which an end point is searched for a mode.
 DEPTH, FAR = 7.0, 5.0
 #: Share of the posterior's mass (by Laplace) from which a mode must not be missed.
 MASS = 0.005
@@ -39,7 +39,7 @@ def missed_mass(density: Density, mean: Tensor, lower: Tensor) -> Tensor:
         with torch.no_grad():
             end = lower_times(lower, w) + mean
             height = density.log_prob(torch.cat([mean[None], end]))
-    except ValueError:  # a user's function that cannot be asked so far out: no start ends there
+    except ValueError:  # a user's function that raises this far out: no search ends there
         return mean.new_zeros(len(mean))
     high = (w.square().sum(-1) > FAR**2) & (height[1:] > height[:1] - DEPTH)
     missed = mean.new_zeros(len(mean))
@@ -53,7 +53,7 @@ def missed_mass(density: Density, mean: Tensor, lower: Tensor) -> Tensor:
     volume = (other.scale.diagonal(dim1=-2, dim2=-1).abs().log() - lower[index].diagonal(dim1=-2, dim2=-1).log()).sum(
         -1
     )
-    # a skewed posterior's own mode lies near its draws; the height at their centre stands for it
+    # a skewed posterior's own mode lies near its draws; the density at their centre replaces it
     ratio = (other.log_prob - height[0, index] + volume).exp()
     there = other.converged & (away.norm(dim=-1) > FAR) & (ratio > MASS)
     return missed.index_put((index,), torch.where(there, ratio, 0.0))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 RELIABLE = 0.7
-"""Above this shape a mean weighted by the ratios is not to be trusted, however many there are (Vehtari et al. 2024)."""
+"""Above this shape a mean weighted by the ratios is unreliable for any number of them (Vehtari et al. 2024)."""
 
 
 def pareto_k(log_ratio: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Draws of a posterior and what is read off them."""
+"""Draws of a posterior and their summaries."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class Posterior:
     Attributes:
         names: parameter names, in the order of the last dimension.
         draws: shape ``(chain, draw, window, parameter)``, in the parameters' own units.
-        converged: ``(window,)`` bool; false where the draws are not shown to follow the density: not to be used. Where
-            nobody compared (``exactness`` is None, as in the latent form) it says only that the chains agree.
+        converged: ``(window,)`` bool; false where the draws were not found to follow the density: do not use them.
+            Without a comparison (``exactness`` is None, as in the latent form) true means only that the chains agree.
         why: a reason for every window that did not converge, ``""`` for the others; empty where none was recorded.
-        exactness: moments of the draws against those of the exact density, or None where nobody compared them.
+        exactness: moments of the draws against those of the exact density, or None where they were not compared.
 
     Example:
         >>> import torch
@@ -103,9 +103,9 @@ def sorted_quantile(ordered: Float[Tensor, "draw *rest"], q: float) -> Float[Ten
 def nested_rhat(draws: Float[Tensor, "chain draw *rest"], groups: int = 8) -> Float[Tensor, "*rest"]:
     """Split nested R-hat (Margossian et al. 2024) over ``(chain, draw, ...)``; returns the remaining shape.
 
-    Many short chains are joined into ``groups`` superchains, cut into halves: chains of a few autocorrelation times
-    each would look apart to the plain R-hat even at stationarity. A common drift shows between the halves, a chain that
-    went elsewhere shows between the groups.
+    Many short chains are joined into ``groups`` superchains, cut into halves: the plain R-hat of chains of a few
+    autocorrelation times each is large even at stationarity. A common drift shows up between the halves, a chain in
+    another place between the groups.
 
     Example:
         >>> import torch
@@ -138,10 +138,11 @@ def normal_scores(draws: Float[Tensor, "chain draw *rest"]) -> Float[Tensor, "ch
 
 
 def effective(values: Float[Tensor, "chain draw *rest"]) -> Float[Tensor, "*rest"]:
-    """How many independent values ``(chain, draw, ...)`` would know the mean as well; returns the remaining shape.
+    """Number of independent values that give the mean of ``(chain, draw, ...)`` as precisely; returns the remaining
+    shape.
 
-    By the means of independent chains, each cut into pieces where there are fewer than sixteen: short chains say little
-    about their own autocorrelation. NaN where all values are alike, as nothing can be known then.
+    By the means of independent chains, each cut into pieces where there are fewer than sixteen: short chains do not
+    determine their own autocorrelation. NaN where all values are equal.
     """
     chains, draws = values.shape[:2]
     pieces = max(1, min(draws // 2, -(-16 // chains)))

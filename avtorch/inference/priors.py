@@ -1,4 +1,4 @@
-"""Priors, stated on the positive parameters and evaluated in ``z = log(parameter)`` with the Jacobian counted.
+"""Priors, stated on the positive parameters and evaluated in ``z = log(parameter)`` with the Jacobian included.
 
 Defaults: ``T_L ~ LogNormal(log 0.3, 0.7)``, ``K_L ~ LogNormal(log 1, 0.3)``,
 ``sigma ~ HalfNormal(1 m/s^3)``.
@@ -112,7 +112,7 @@ class HalfNormalPrior:
 class QuadrantNormal:
     """Normal of ``variance`` around ``mean``, cut to the positive quadrant: the paper's ``N([K, T], lambda I)``.
 
-    The print (Sec. 3.2.3) does not say what happens to the mass below zero; it is cut off and the rest renormalised.
+    The paper (Sec. 3.2.3) does not define the mass below zero; here it is cut off and the rest renormalised.
 
     Args:
         mean: shape ``(window, parameter)``, in the parameters' own units.

@@ -2,7 +2,7 @@
 
 The trapezoid rule on a smooth density that has died out at both ends converges faster than any power of the spacing
 (Trefethen and Weideman 2014), so a grid of one node per third of an SD is exact to round-off on a normal. The grid lies
-in coordinates whitened at the mode, then at the moments found, and reaches as far as there is mass.
+in coordinates whitened at the mode, then at the moments found, and extends over all of the mass.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from avtorch.errors import InputError
 from avtorch.inference.density import Density
 from avtorch.inference.map import Mode, find_mode
 
-#: Half width of the grid in SDs to begin with, how much a side grows that still shows mass, and how often.
+#: Initial half width of the grid in SDs, the growth of a side that still has mass, and how often it may grow.
 REACH, GROWTH, ROUNDS = 7.0, 1.3, 12
 #: A side reaches too short if the marginal on its face is above the first share of its peak, and too far beyond the
 #: nodes that are above the second.
@@ -171,7 +171,7 @@ def _moments(
 
 @dataclass(frozen=True)
 class _Sums:
-    """What one pass over a grid of weights ``w = exp(log_prob - reference)`` gave.
+    """The result of one pass over a grid of weights ``w = exp(log_prob - reference)``.
 
     total ``(window,)``; mean and cov of the whitened coordinates; marginals ``(window, axis, node)``; coarse: marginal
     of the first axis on every second node of all axes, ``(window, node // 2 + 1)``.
@@ -189,7 +189,7 @@ class _Sums:
         return ends / self.marginals.amax(-1, keepdim=True)
 
     def short(self) -> Bool[Tensor, "window d 2"]:
-        """Where a side still shows mass, ``(window, axis, 2)`` bool."""
+        """Where a side still has mass, ``(window, axis, 2)`` bool."""
         return self.edge() > FACE
 
     def settled(self) -> bool:
@@ -241,11 +241,11 @@ class _Place:
         return (self.lower.diagonal(dim1=-2, dim2=-1) * spacing).prod(-1)
 
     def grown(self, sums: _Sums) -> _Place:
-        """With longer reach on the sides that showed mass."""
+        """With longer reach on the sides that still have mass."""
         return replace(self, reach=torch.where(sums.short(), GROWTH * self.reach, self.reach))
 
     def trimmed(self, sums: _Sums) -> _Place:
-        """With each side ending one node beyond the last that shows anything: the steep side of a skewed posterior."""
+        """With each side ending one node beyond the last with mass: this trims the steep side of a skewed posterior."""
         nodes = sums.marginals.shape[-1]
         empty = sums.marginals <= NOTHING * sums.marginals.amax(-1, keepdim=True)
         idle = torch.stack([empty.int().cumprod(-1).sum(-1), empty.flip(-1).int().cumprod(-1).sum(-1)], -1)
@@ -255,7 +255,7 @@ class _Place:
     def moved(self, sums: _Sums) -> _Place:
         """To the moments found, with the sides trimmed and grown to the mass found."""
         lower = self.lower
-        # a window whose grid caught a single node has no covariance; it stays, and its error will tell
+        # a window with mass on a single node has no covariance; it stays, and its error will be large
         sound = torch.linalg.eigvalsh(sums.cov.nan_to_num())[:, 0] > 1e-6
         center = self.center + torch.einsum("wij,wj->wi", lower, sums.mean)
         cov = lower @ sums.cov @ lower.mT
@@ -284,7 +284,7 @@ def _integrate(density: Density, place: _Place, nodes: int, reference: Float[Ten
         z = place.center + torch.einsum("wij,snwj->snwi", lower, points)
         with torch.no_grad():
             log_prob = density.log_prob(z[..., back])
-        # far out a density may overflow to "inf - inf": nothing is there
+        # far out a density may overflow to "inf - inf": there is no mass
         w = (log_prob - reference).exp().nan_to_num(nan=0.0)
         weights.append(w.sum(1))
         coarse.append(w[:, even].sum(1))

@@ -21,9 +21,10 @@ from avtorch.inference.posterior import Posterior, nested_rhat
 from avtorch.inference.sgld import SGLD, Noise
 from avtorch.inference.whitening import Coordinates, Whitening, stiffness
 
-#: Chains times windows walked at once: enough to drown the cost of a call, few enough to stay in the processor's cache.
+#: Chains times windows sampled at once: enough to make the cost of a call negligible, few enough for the processor's
+#: cache.
 BLOCK = 2**15
-#: Chains times windows below which a step costs what its calls cost, however few they are.
+#: Chains times windows below which the calls alone determine the cost of a step.
 FEW = 2**11
 
 #: A window stiffer than this is whitened afresh by a pilot walk.
@@ -40,10 +41,10 @@ MakeOptimizer = Callable[[list[Tensor], float, torch.Generator | None], Optimize
 
 @dataclass(frozen=True)
 class SamplerSettings:
-    """How Algorithm 1 walks. The space is whitened by the Laplace covariance at the mode, so one step fits every car.
+    """Settings of Algorithm 1. The space is whitened by the Laplace covariance at the mode, so one step fits every car.
 
     A window whose posterior is skewed gets a shorter step and in proportion more of them (:func:`stiffness`), so that
-    every window ends with about the same number of effective draws: there is no knob to turn for a new car.
+    every window gets about the same number of effective draws: a new car needs no tuning.
 
     Attributes:
         chains: chains per window.
@@ -55,14 +56,14 @@ class SamplerSettings:
         batch: points per minibatch, or ``None`` for the whole window.
         spread: chains start this many posterior SDs around the mode; 0 starts them at the mode.
         schedule: makes a learning-rate scheduler from the optimizer, or ``None`` for a constant step.
-        longest: how many times as many steps a skewed window gets at most; a low value saves time where a step is dear,
-            and leaves the most skewed windows short of mixing.
+        longest: maximum factor of steps for a skewed window; a low value saves time where a step is expensive, but then
+            the most skewed windows do not mix.
         attempts: how often a window whose chains diverge, disagree or miss the density is run again with half the step.
         whitening: ``"full"``, or for comparison ``"diagonal"`` or ``"none"`` (see :class:`Coordinates`).
         optimizer: makes another optimizer than SGLD from ``(parameters, step, generator)``.
-        compare: hold the draws against the exact density (:mod:`avtorch.inference.exactness`), whatever made them: a
-            minibatch, a schedule, another optimizer. Without, ``converged`` says no more than that chains agree with
-            each other; for a density too dear to evaluate at some hundred points.
+        compare: compare the draws with the exact density (:mod:`avtorch.inference.exactness`), also with a minibatch, a
+            schedule or another optimizer. Set it to false only for a density too expensive to evaluate at some hundred
+            points; ``converged`` then means only that the chains agree with each other.
 
     Raises:
         InputError: naming the setting that is out of range.
@@ -106,9 +107,10 @@ class SamplerSettings:
             raise InputError(f"whitening: {self.whitening!r} is none of 'full', 'diagonal', 'none'")
 
     def slower(self, times: float) -> SamplerSettings:
-        """The same walk in ``times`` as many steps, for a step that is ``times`` shorter.
+        """The same settings with ``times`` as many steps, for a step that is ``times`` shorter.
 
-        What is steep on one side is flat on the other, where chains arrive later still: the burn-in grows once more.
+        A posterior that is steep on one side is flat on the other, which chains reach even later: the burn-in grows
+        further.
         """
         times = min(times, self.longest)
         burn_in = math.ceil(times * min(times, 5.0) * self.burn_in)
@@ -127,8 +129,8 @@ def sample(
 
     A window whose chains leave the finite numbers or the posterior, end with a nested R-hat above ``rhat_max``, or do
     not follow the exact density in mean, SD and tails (:mod:`avtorch.inference.exactness`), is sampled again, with half
-    the step and, up to ``longest``, twice the steps; one that never settles, or of which this cannot be shown, comes
-    back with ``converged`` false and the reason in ``why``.
+    the step and, up to ``longest``, twice the steps; one that never settles, or for which the comparison is
+    inconclusive, is returned with ``converged`` false and the reason in ``why``.
 
     Args:
         density: the target.
@@ -163,7 +165,7 @@ def sample(
             fresh = torch.isin(index, open_)
             new = index[fresh]
             strayed[new] = _strayed(part, where, coordinates, w)[fresh]
-            apart[new] = ~(nested_rhat(w).amax(-1) <= limit)[fresh]  # NaN is trouble, too
+            apart[new] = ~(nested_rhat(w).amax(-1) <= limit)[fresh]  # NaN counts as not converged
             stuck[new] = (pace[new] > STUCK) | _too_wide(where, settings, pace[index], times)[fresh]
             z = coordinates.z(w)
             values = constrained(density, z)
@@ -173,7 +175,7 @@ def sample(
         pace = 2 * pace
         again = strayed | apart
         if settings.compare:
-            # a second walk may reach what the first did not; where it changed nothing, half its step will not either
+            # a second run may reach what the first did not; where it changed nothing, half the step will not either
             again |= ~found.holds() if attempt == 0 else ~(found.holds() | found.hopeless())
         open_ = again.nonzero().squeeze(-1)
         if not len(open_):
@@ -226,7 +228,7 @@ def _too_wide(
     """Where the burn-in is too short for the widest direction of a space left unwhitened, ``(window,)`` bool.
 
     Along a direction of SD ``s`` a step forgets ``h/(2 s^2)`` of what was; chains that begin at the mode reach 99 % of
-    an SD after two such times. They agree with each other all the way, which R-hat takes for success.
+    an SD after two such times. They agree with each other all the while, so R-hat does not detect it.
     """
     if settings.whitening == "full":
         return torch.zeros_like(pace, dtype=torch.bool)
@@ -235,12 +237,12 @@ def _too_wide(
 
 
 def _longer(pace: Float[Tensor, "*window"]) -> Float[Tensor, "*window"]:
-    """How many times as many steps a window of this pace gets: the nearest of 1, sqrt 2, 2, ... 64."""
+    """Factor of steps for a window of this pace: the nearest of 1, sqrt 2, 2, ... 64."""
     return 2.0 ** (0.5 * (2 * pace.log2()).round().clamp(0, 12))
 
 
 def _batches(density: Density, index: Tensor, pace: Tensor, chains: int) -> list[Tensor]:
-    """Windows to walk together: as many steps each, and not too many windows at once."""
+    """Windows to sample together: with equal numbers of steps, and not too many windows at once."""
     if not isinstance(density, SelectableDensity):
         return [torch.arange(density.windows)]
     size = max(1, BLOCK // chains)
@@ -250,7 +252,7 @@ def _batches(density: Density, index: Tensor, pace: Tensor, chains: int) -> list
         few = torch.cat([few, index[times == each]])
         # a handful of windows costs less in the next batch, at its slower pace, than in one of their own
         if len(few) * chains >= FEW or each == times.max():
-            # in their own order: all windows of a density are walked without being picked out
+            # in their own order: a batch of all windows needs no indexing
             batches += few.sort().values.split(size)
             few = index[:0]
     return batches
@@ -267,8 +269,8 @@ def _strayed(
 ) -> Bool[Tensor, " window"]:
     """Where some chain's furthest draw lies ``depth`` nats and one a parameter off the mode, ``(window,)`` bool.
 
-    R-hat alone overlooks the few chains that diverge: they blow up the variance within as much as that between. A draw
-    of a normal lies ``chi^2/2`` nats deep: among ten thousand in three dimensions none beyond 20.
+    R-hat alone does not detect a few diverging chains: they increase the variance within as much as that between. A
+    draw of a normal lies ``chi^2/2`` nats deep: among ten thousand in three dimensions none beyond 20.
     """
     distance = w.square().sum(-1).nan_to_num_(nan=torch.inf)
     furthest = distance.transpose(0, 1).flatten(0, 1).argmax(0)  # in the order of memory
@@ -321,7 +323,7 @@ def _walk(
             return -_log_prob(density, coordinates.z(w), settings.batch, generator).sum()
         w.grad = gradient()
         if k < settings.burn_in:
-            # far out the slope may be anything, and a step along it would throw the chain further still
+            # far out the slope may be arbitrary, and a step along it would move the chain even further
             w.grad.nan_to_num_(nan=0.0).clamp_(-TAMED, TAMED)
         return None
 
@@ -347,7 +349,7 @@ def _log_prob(density: Density, z: Tensor, batch: int | None, generator: torch.G
 def _gradient(
     density: Density, coordinates: Coordinates, w: Tensor, batch: int | None, generator: torch.Generator | None
 ) -> Callable[[], Tensor]:
-    """``dU/dw`` at the present ``w``; a density that knows its own score saves the graph."""
+    """``dU/dw`` at the present ``w``; for a density with its own score no graph is built."""
     state = w.detach()
     if batch is None and isinstance(density, ScoredDensity):
         scored = density

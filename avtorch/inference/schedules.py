@@ -11,8 +11,8 @@ from avtorch.errors import InputError
 def harmonic(optimizer: Optimizer) -> LambdaLR:
     """The paper's ``eta_k = eta_1 / k`` (Algorithm 1), ``k = 1, 2, ...``; ``eta_1`` is the optimizer's ``lr``.
 
-    The sum of its steps grows only like ``log k``: the chain freezes long before it has walked through the posterior.
-    It is here for comparison.
+    The sum of its steps grows only like ``log k``: the chain freezes long before it has explored the posterior. It is
+    provided for comparison.
     """
     return LambdaLR(optimizer, lambda k: 1.0 / (k + 1))
 

@@ -2,7 +2,7 @@
 
 One derivative below the GLVD the measured one is the acceleration, which every car has; no jerk is needed. Speed or
 location are taken as exact beside it, as the acceleration is in Eq. 4. Both lags are linear in two coefficients of two
-columns, so that the sums of :class:`~avtorch.inference.jerk.JerkStatistics` hold all that a window says.
+columns, so that the sums of :class:`~avtorch.inference.jerk.JerkStatistics` are sufficient statistics of a window.
 """
 
 from __future__ import annotations

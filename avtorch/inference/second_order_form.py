@@ -1,4 +1,4 @@
-"""Second-order lags as the stream sees them: the same loop over windows, with a speed or a position command.
+"""Second-order lags for a stream: the same loop over windows, with a speed or a position command.
 
 The belief is about ``(T_V, K_V)`` or ``(T_P, zeta)``. The monitor's verdicts are about the GLVD's ``(T_L, K_L)`` and
 do not apply to it.
@@ -85,7 +85,7 @@ class PositionLagForm:
 
 
 def _predicted_log_sd(s: JerkStatistics) -> tuple[Tensor, Tensor]:
-    """SDs of ``log T_P`` and ``log zeta`` that least squares promises at ``T_P`` 1 s and ``zeta`` 1, ``(window,)``.
+    """SDs of ``log T_P`` and ``log zeta`` that least squares predicts at ``T_P`` 1 s and ``zeta`` 1, ``(window,)``.
 
     There the coefficients ``(2 zeta/T, 1/T²)`` are ``(2, 1)``; ``log T = -log(c_2)/2`` and ``log zeta = log(c_1/2) +
     log T``.

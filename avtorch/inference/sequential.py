@@ -37,8 +37,9 @@ class SequentialInference:
     - ``"posterior"``: the last posterior, as a normal with full covariance in the log parameters, noise included;
     - ``"forgetting"``: the same with the covariance divided by ``forgetting``, so that old windows fade.
 
-    ``"posterior"`` holds the vehicle for constant, and ``"forgetting"`` for slowly drifting: after a sudden change both
-    stay where they were for many windows and raise the noise instead. ``"lambda"`` follows within a window or two.
+    ``"posterior"`` assumes a constant vehicle, and ``"forgetting"`` a slowly drifting one: after a sudden change the
+    estimates of both stay unchanged for many windows while the noise estimate rises. ``"lambda"`` follows within a
+    window or two.
 
     Before a vehicle's first excited window its prior is ``first_prior``. Memory does not grow with the windows.
 
@@ -129,7 +130,8 @@ class SequentialInference:
         return self.belief
 
     def take(self, rows: Rows, evidence: Evidence) -> Belief:
-        """:meth:`update` as every estimator of a stream has it; the evidence holds all that is needed of the rows."""
+        """:meth:`update` with the interface of an estimator of a stream; the evidence contains all that is needed of
+        the rows."""
         return self.update(evidence.density, evidence.excited)
 
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
@@ -142,7 +144,7 @@ class SequentialInference:
         return summary, *posterior.log_moments(), posterior.converged
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything a resumed loop needs to go on equal to the bit; plain tensors and names."""
+        """Everything a resumed loop needs to continue bit for bit; plain tensors and names."""
         own = {
             "started": self._started,
             "mean_z": self._mean_z,
@@ -152,11 +154,11 @@ class SequentialInference:
         return {"mode": self.mode, **self.belief.state_dict(), **own}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state_dict`.
+        """Continue from :meth:`state_dict`.
 
         Raises:
             InputError: if it was saved by a loop of another mode or other parameters, or has other shapes, types or
-                numbers than a loop saves; it then stays as it was.
+                numbers than a loop saves; nothing is then changed.
         """
         saved = about(state, "mode")
         own = about(self.state_dict(), "mode")

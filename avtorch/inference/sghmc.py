@@ -14,7 +14,7 @@ from avtorch.inference.langevin import LangevinOptimizer
 
 
 class SGHMC(LangevinOptimizer):
-    r"""Samples from :math:`\exp(-U)` by gradient steps with a momentum that friction damps and noise feeds.
+    r"""Samples from :math:`\exp(-U)` by gradient steps with a momentum that friction damps and noise drives.
 
     With :math:`\varepsilon = \sqrt h` and :math:`c = e^{-\gamma\varepsilon}` one step is
 
@@ -42,7 +42,8 @@ class SGHMC(LangevinOptimizer):
         temperature: scales the noise's variance; 1 samples the density, 0 descends to its mode.
         maximize: the closure returns a log density instead of a potential.
         foreach: use the fused multi-tensor arithmetic; the draws and the result's law are the same.
-        generator: source of the noise. Its state is part of ``state_dict``, which makes a resumed run equal to the bit.
+        generator: source of the noise. Its state is part of ``state_dict``, which makes a resumed run equal bit for
+            bit.
 
     Raises:
         InputError: naming the argument that is out of range.
@@ -102,7 +103,7 @@ class SGHMC(LangevinOptimizer):
 
     def _update(self, group: dict[str, Any], params: list[Tensor]) -> None:
         eps, sign = math.sqrt(group["lr"]), (-1.0 if group["maximize"] else 1.0)
-        # nothing moves in no time, whatever the friction
+        # a step of zero length moves nothing, for any friction
         kept = math.exp(-group["friction"] * eps) if eps > 0 else 1.0
         amplitude = math.sqrt((1 - kept**2) * group["temperature"])
         velocities = [self._velocity(p, group["temperature"]) for p in params]

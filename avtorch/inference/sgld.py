@@ -26,10 +26,10 @@ class SGLD(LangevinOptimizer):
 
     ``U`` is the potential: the negative log density **on the scale of the whole window**. A closure that works on a
     minibatch returns ``-log p(theta) - (N/n) sum_batch log p(D_i | theta)``; a mean over points would shrink the drift
-    but not the noise. (The print of the paper, its Eq. for SGLD, misplaces ``N/n``, loses the sign and applies the step
-    twice; this is the law of Welling and Teh.) With ``temperature=0`` no noise is drawn and the step is that of SGD
-    with ``lr = h/2``. On a Gaussian of precision ``p`` with gradient-noise variance ``s2`` the stationary variance is
-    ``(1 + h s2/4) / (p (1 - h p/4))``.
+    but not the noise. (The paper's equation for SGLD misplaces ``N/n``, loses the sign and applies the step twice; this
+    is the law of Welling and Teh.) With ``temperature=0`` no noise is drawn and the step is that of SGD with ``lr =
+    h/2``. On a Gaussian of precision ``p`` with gradient-noise variance ``s2`` the stationary variance is ``(1 + h
+    s2/4) / (p (1 - h p/4))``.
 
     Chains and windows are leading dimensions of the parameters: one step moves all of them, and ``U`` may then be a
     tensor with one entry per chain and window (their sum is differentiated).
@@ -51,7 +51,8 @@ class SGLD(LangevinOptimizer):
             ``Gamma`` then costs one derivative per remaining entry. Used by the preconditioner only.
         maximize: the closure returns a log density instead of a potential.
         foreach: use the fused multi-tensor arithmetic; the draws and the result's law are the same.
-        generator: source of the noise. Its state is part of ``state_dict``, which makes a resumed run equal to the bit.
+        generator: source of the noise. Its state is part of ``state_dict``, which makes a resumed run equal bit for
+            bit.
 
     Raises:
         InputError: naming the argument that is out of range.
@@ -213,7 +214,7 @@ class SGLD(LangevinOptimizer):
         state["mean_square"] = mean_square
         root = mean_square.sqrt()
         scale = 1 / (group["eps"] + root)
-        # |gradient| sqrt(1 - alpha) <= root, so the quotient is bounded and needs no floor but against 0/0
+        # |gradient| sqrt(1 - alpha) <= root, so the quotient is bounded and needs a floor only against 0/0
         quotient = gradient / root.clamp_min(torch.finfo(root.dtype).tiny)
         gamma = -scale.square() * (1 - alpha) * quotient * curvature
         return scale, gamma

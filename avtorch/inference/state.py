@@ -1,4 +1,4 @@
-"""Saved states held against the streams that take them: believed as a whole, or not at all."""
+"""Saved states checked against the streams that load them: accepted as a whole, or not at all."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from avtorch.errors import InputError
 
 
 def shaped_as(own: Any, given: Any, place: str) -> None:
-    """Hold `given` against `own`: the same keys, types, dtypes and shapes, and finite numbers throughout.
+    """Check `given` against `own`: the same keys, types, dtypes and shapes, and finite numbers throughout.
 
     Raises:
         InputError: that names the `place` within the state.
@@ -35,7 +35,7 @@ def shaped_as(own: Any, given: Any, place: str) -> None:
 
 
 def tensor_as(given: Any, dtype: torch.dtype, shape: tuple[int, ...], place: str, *, finite: bool = True) -> None:
-    """Hold a tensor's dtype and shape against these; its numbers must be `finite`, unless that is False.
+    """Check a tensor's dtype and shape against these; its numbers must be finite unless `finite` is False.
 
     Raises:
         InputError: that names the `place` within the state.
@@ -49,8 +49,8 @@ def tensor_as(given: Any, dtype: torch.dtype, shape: tuple[int, ...], place: str
 
 
 def about(state: Any, *more: str) -> tuple[Any, ...]:
-    """What a state is of: the values of `more`, the parameters' names, the number of vehicles; None for what is not
-    there."""
+    """The identity of a state: the values of `more`, the parameters' names, the number of vehicles; None where
+    missing."""
     given = state if isinstance(state, dict) else {}
     names, mean = given.get("names"), given.get("mean")
     plain = tuple(str(name)[:40] for name in names) if isinstance(names, (list, tuple)) else None

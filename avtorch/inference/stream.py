@@ -21,12 +21,12 @@ from avtorch.inference.stream_units import StreamUnits
 from avtorch.io.clock import ROUNDING_S, decimals
 from avtorch.io.engagement import settled
 
-_LONGEST_S = 1e6  # rows this far from the first are still told apart as finely as it is
+_LONGEST_S = 1e6  # up to this distance from the first row, times keep its resolution
 
 
 @dataclass(frozen=True)
 class Window:
-    """One window of every vehicle, and what is believed after it.
+    """One window of every vehicle, and the belief after it.
 
     Attributes:
         start_s, end_s: its bounds on the clock of the rows [s]; a row belongs to it if ``start_s <= time < end_s``.
@@ -50,16 +50,16 @@ class Window:
 
 
 class BeliefStream:
-    """Takes samples one by one or in blocks, at one clock for all vehicles; closes a window every ``window`` seconds.
+    """Takes samples one by one or in blocks, on one clock for all vehicles; closes a window every ``window`` seconds.
 
-    How the samples are cut into blocks changes nothing. Only the rows of the open window are kept.
+    The result does not depend on how the samples are divided into blocks. Only the rows of the open window are kept.
 
     Args:
         window: length [s].
         form: which density; :class:`JerkForm` by default.
         gap: a step between rows longer than this [s] ends the window early; the next starts with the next row.
         check_units: refuse rows whose columns contradict each other in unit or sign
-            (:mod:`avtorch.inference.stream_units`); false where they are known to be right.
+            (:mod:`avtorch.inference.stream_units`); false where units and signs are known to be right.
         estimator: a name of :data:`~avtorch.inference.estimators.ESTIMATORS`.
         **inference: the estimator's options, for ``"sgld"`` those of
             :class:`~avtorch.inference.sequential.SequentialInference` (``mode``, ``lam``, ``settings``, ``seed`` ...).
@@ -125,8 +125,8 @@ class BeliefStream:
 
         Raises:
             InputError: for time that does not increase, a column that is missing or of another shape, a usable row that
-                is not finite, or ``engaged`` other than 0 and 1. Nothing of the block is then taken in. Also where the
-                last 10 to 40 s prove that a column has another unit or sign: then the belief is moreover what it was
+                is not finite, or ``engaged`` other than 0 and 1. The block is then rejected as a whole. Also where the
+                last 10 to 40 s prove that a column has another unit or sign: the belief then also returns to its value
                 before them.
         """
         time = torch.atleast_1d(torch.as_tensor(time, dtype=torch.float64))
@@ -149,7 +149,7 @@ class BeliefStream:
             return self._take(block, steps, until)
 
     def _take(self, block: dict[str, Tensor], steps: Tensor, until: float | None) -> list[Window]:
-        """Rows that are in order, split where ``steps`` between them are gaps."""
+        """Process ordered rows, split where ``steps`` between them are gaps."""
         time = block["time"]
         windows: list[Window] = []
         pieces = [*((steps > self.gap).nonzero().squeeze(-1) + (len(time) - len(steps))).tolist(), len(time)]
@@ -167,7 +167,7 @@ class BeliefStream:
 
     @contextmanager
     def _whole_or_nothing(self) -> Iterator[None]:
-        """Rows that prove a unit wrong leave the stream as it was before them, and the belief before their stretch."""
+        """Where rows prove a unit wrong, restore the stream before them and the belief before their stretch."""
         before = self._rows, self._origin, self._index, self._last, self._driven, self._epoch
         try:
             yield
@@ -195,7 +195,7 @@ class BeliefStream:
     def _since_driven(
         self, time: Tensor, usable: Tensor | None, engaged: Tensor | None
     ) -> tuple[Tensor | None, list[float | None]]:
-        """What of ``usable`` is left, and when a driver was last in charge of each vehicle."""
+        """The rows of ``usable`` that remain, and when a driver was last in charge of each vehicle."""
         if engaged is None and not any(x is not None for x in self._driven):
             return usable, self._driven
         if time.ndim != 1:
@@ -233,7 +233,7 @@ class BeliefStream:
                     f"{name}: of shape {tuple(value.shape)}, needs {shape} (vehicle, time) or ({shape[1]},)"
                 )
             block[name] = torch.atleast_2d(value).expand(shape)
-            # a masked row may hold anything
+            # a masked row may hold any number
             bad = block["usable"] & ~block[name].isfinite()
             if bool(bad.any()):
                 raise InputError(
@@ -276,7 +276,7 @@ class BeliefStream:
         steps = rows["time"].diff()
         full = self.window / float(steps.median()) if len(steps) else torch.inf
         if early:
-            # what lies behind the last row's own step belongs to no window
+            # time beyond the last row's own step belongs to no window
             end = min(end, float(rows["time"][-1]) + (self.window / full))
         if self._units is not None:
             self._units.take(rows, self.inference.state_dict())
@@ -288,7 +288,7 @@ class BeliefStream:
 
     @staticmethod
     def _since(time: Tensor, epoch: float | None) -> Tensor:
-        """Seconds from `epoch`, the same for a row whatever block it comes in: near 1.7e9 a float64 is 2.4e-7 s off."""
+        """Seconds from `epoch`, independent of the division into blocks: near 1.7e9 a float64 is 2.4e-7 s off."""
         if epoch is None:
             return time
         return torch.from_numpy(np.round(time.numpy() - epoch, decimals(abs(epoch) + _LONGEST_S)))
@@ -299,7 +299,7 @@ class BeliefStream:
         return {"time": torch.empty(0, dtype=torch.float64), "usable": usable, **rows}
 
     def state_dict(self) -> dict[str, Any]:
-        """The open window's rows and the belief: all that a resumed stream needs to go on equal to the bit.
+        """The open window's rows and the belief: all that a resumed stream needs to continue bit for bit.
 
         Under ``sha256`` it carries its own checksum.
         """
@@ -311,7 +311,7 @@ class BeliefStream:
         return with_checksum({"rows": dict(self._rows), **clock, **own, "inference": self.inference.state_dict()})
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state_dict`. Where it is refused, the stream stays as it was.
+        """Continue from :meth:`state_dict`. Where it is refused, the stream is unchanged.
 
         Raises:
             InputError: if it was saved by a stream of another window length, form, estimator or number of vehicles, or
@@ -331,7 +331,7 @@ class BeliefStream:
             stretch.load_state_dict(state["units"])
         present = self.inference.state_dict()
         try:
-            if stretch.before is not None:  # only to see that it could be gone back to
+            if stretch.before is not None:  # only to check that it could be restored
                 self.inference.load_state_dict(stretch.before)
             self.inference.load_state_dict(state["inference"])
         except InputError:
@@ -345,7 +345,7 @@ class BeliefStream:
         self._epoch = state["epoch"]
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write :meth:`state_dict` to a file, with a checksum, so that it is whole or as it was before.
+        """Write :meth:`state_dict` to a file, with a checksum, so that the file is complete or unchanged.
 
         Raises:
             InputError: where the place cannot be written, or is a symlink, a folder or a device.
@@ -356,7 +356,7 @@ class BeliefStream:
         """Read what :meth:`save` wrote; only tensors and plain values are read, no code is run.
 
         Raises:
-            InputError: that names the file, for anything else; the stream then stays as it was.
+            InputError: that names the file, for anything else; the stream is then unchanged.
         """
         state = read_state(path)
         try:
@@ -366,5 +366,5 @@ class BeliefStream:
 
 
 def _moment(time: float, epoch: float | None) -> str:
-    """A row's time [s] for people: from the first row on, unless the clock itself counts from there."""
+    """A row's time [s] for messages: from the first row on, unless the clock itself counts from there."""
     return f"{time:g} s" if not epoch else f"{time:g} s from the first row ({epoch + time:.15g} s)"

@@ -20,13 +20,13 @@ from avtorch.io.clock import ROUNDING_S
 
 SCHEMA = "avtorch.belief_stream/1"
 MOST = 2**30
-"""A state has no more bytes than this."""
+"""Maximum size of a state [bytes]."""
 
 _REMEDY = "needs a state as it was saved; begin with a new stream, or load another"
 
 
 def with_checksum(state: Mapping[str, Any]) -> dict[str, Any]:
-    """The state with the fingerprint of all that is in it, under `sha256`."""
+    """The state with the fingerprint of its content, under `sha256`."""
     return {**state, "sha256": fingerprint(state)}
 
 
@@ -49,7 +49,7 @@ def without_checksum(state: Any) -> dict[str, Any]:
 
 
 def check_clock(state: Mapping[str, Any], *, columns: Mapping[str, Tensor], vehicles: int) -> None:
-    """Hold the open window's rows and the clock against each other and against the stream's own empty `columns`.
+    """Check the open window's rows and the clock against each other and against the stream's own empty `columns`.
 
     Raises:
         InputError: for shapes, types, numbers that are not finite, or times that do not increase within the window.
@@ -66,7 +66,7 @@ def check_clock(state: Mapping[str, Any], *, columns: Mapping[str, Tensor], vehi
     tensor_as(rows["usable"], torch.bool, (vehicles, count), "state: rows.usable")
     for name in set(columns) - {"time", "usable"}:
         tensor_as(rows[name], torch.float64, (vehicles, count), f"state: rows.{name}", finite=False)
-        # a masked row may hold anything
+        # a masked row may hold any number
         if not bool((rows[name].isfinite() | ~rows["usable"]).all()):
             raise InputError(f"state: rows.{name}: not finite in a row that is not masked")
     origin, index, last = state["origin"], state["index"], state["last"]
@@ -90,14 +90,14 @@ def check_clock(state: Mapping[str, Any], *, columns: Mapping[str, Tensor], vehi
     start, end = origin + index * window, origin + (index + 1) * window
     if last is None or last >= end or (count and last != float(time[-1])):
         raise InputError("state: last: is not the time of the last row")
-    # as the stream itself, which lets round-off push no row over a window's end
+    # as in the stream itself, where round-off must not push a row over a window's end
     inside = (time >= start - 2 * ROUNDING_S) & (time < end)
     if not bool(inside.all()) or not bool((time.diff() > 0).all()):
         raise InputError(f"state: rows.time: does not increase from {start:g} to {end:g} s")
 
 
 def write_state(path: str | PathLike[str], state: Mapping[str, Any]) -> None:
-    """Write a state so that the file holds all of it, or what it held before.
+    """Write a state so that the file is complete or unchanged.
 
     Raises:
         InputError: where the place cannot be written, or is a symlink, a folder or a device.
@@ -112,7 +112,7 @@ def read_state(path: str | PathLike[str]) -> dict[str, Any]:
     """Read what :func:`write_state` wrote; only tensors and plain values are read, no code is run.
 
     Raises:
-        InputError: for anything else than a file as it was written.
+        InputError: for any file that is not exactly as written.
     """
     content = read_sealed_bytes(Path(path), schema=SCHEMA, most=MOST, remedy=_REMEDY).content
     try:
@@ -121,7 +121,7 @@ def read_state(path: str | PathLike[str]) -> dict[str, Any]:
             if any(x.compress_type != zipfile.ZIP_STORED or x.file_size > len(content) for x in archive.infolist()):
                 raise ValueError("compressed")
         return torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
-    # of torch.load no documented list of errors exists
+    # torch.load has no documented list of errors
     except Exception as fault:
         told = (str(fault).splitlines() or [type(fault).__name__])[0][:100]
         raise Damaged(f"{path}: holds no tensors and plain values ({told}); {_REMEDY}") from None

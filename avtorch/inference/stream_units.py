@@ -1,9 +1,9 @@
 """Are the columns of a stream in their units and signs? Stretches of windows are checked as :mod:`avtorch.io.validity`
 checks a log: the change of a level over a span against the integral of its rate over the same span.
 
-A stretch begins with a window and ends when it has been found right, or after LONGEST seconds that say nothing. Where
-it is found wrong, none of its windows is believed. Where samples are cut into blocks does not matter: rows are looked
-at window by window.
+A stretch begins with a window and ends when it has been found right, or after LONGEST seconds without a result. Where
+it is found wrong, all of its windows are rejected. The division of samples into blocks does not matter: rows are
+checked window by window.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from avtorch.io.units import GRAVITY
 from avtorch.io.validity import ACCEL_FACTORS, SPEED_FACTORS, WITNESS
 
 RATES = (("position", "speed"), ("speed", "accel"), ("accel", "jerk"))
-"""A level and its rate, of the columns that forms read."""
+"""Pairs of a level and its rate, among the columns of the forms."""
 COMMAND = (0.02, 3.5)
-"""Gains that are believed; a log's limit is lower, but ten seconds of a real race car came out at 3.2."""
+"""Range of plausible gains; the limit for a log is lower, but ten seconds of a real race car gave 3.2."""
 LOOKS_S = (9.5, 19.0, 38.0)
-"""Seconds of a stretch after which it is looked at; it is not kept for longer than the last."""
+"""Seconds of a stretch after which it is checked; it is not kept beyond the last."""
 DELAYS_S = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 """Delays [s] of the response to a command that are tried."""
 STEP_S = 0.05
 """Rows kept of a stretch are this far apart [s] or farther; integrals over them are made from all rows."""
 SURE = 0.95
-"""Correlation from which a scale is believed; a log, which is asked once and not every ten seconds, takes less."""
+"""Correlation from which a scale is accepted; a log, which is checked once and not every ten seconds, needs less."""
 BREAK_S = 2.0
-"""Time without rows [s] behind which a stretch begins anew."""
+"""Time without rows [s] after which a new stretch begins."""
 SWAPPED = 8.0
 """Standard errors by which both coefficients of the jerk must be negative, and nine tenths of it explained."""
 _HINTS = {
@@ -49,7 +49,8 @@ _HINTS = {
 
 
 class Pair(NamedTuple):
-    """A level, or the integral of ``level`` if ``integrated``, that should change as the integral of ``rate`` does."""
+    """A level, or the integral of ``level`` if ``integrated``, whose changes should equal those of the integral of
+    ``rate``."""
 
     level: str
     rate: str
@@ -83,7 +84,7 @@ class StreamUnits:
         self.before: dict[str, Any] | None = None
 
     def take(self, rows: Rows, belief: dict[str, Any]) -> None:
-        """Take in a window of rows, which ``belief`` has not seen yet.
+        """Take in a window of rows that ``belief`` does not include yet.
 
         Raises:
             InputError: that names columns and vehicle, where the stretch proves a unit or sign wrong.
@@ -115,7 +116,7 @@ class StreamUnits:
             statistics = JerkStatistics.from_samples(rows["accel"], rows["accel_cmd"], rows["jerk"], usable)
             sums = torch.stack([getattr(statistics, name) for name in ("n", "jj", "aj", "uj", "aa", "au", "uu")])
             self.sums = sums if self.sums is None else self.sums + sums
-        # a masked row may hold anything, also NaN
+        # a masked row may hold any number or NaN
         clean = {name: torch.where(usable, rows[name], 0.0) for name in self.columns}
         last = {name: value[..., -1:] for name, value in self.rows.items()}
         if last:
@@ -132,7 +133,7 @@ class StreamUnits:
             begin = last[name] if last else torch.zeros(len(usable), 1, dtype=torch.float64)
             new[name] = torch.cat([begin, begin + part.cumsum(-1)], -1)
         every = max(1, int(STEP_S / float(usual) + 1e-6)) if bool(usual > 0) else 1
-        # the last row always: the next window goes on from it
+        # always keep the last row: the next window continues from it
         kept = torch.tensor(sorted({*range(1 if last else 0, len(time), every), len(time) - 1}))
         self.rows = {
             name: torch.cat([self.rows[name], value[..., kept]], -1) if last else value[..., kept]
@@ -140,7 +141,7 @@ class StreamUnits:
         }
 
     def _judge(self, pair: Pair) -> bool:
-        """Whether the stretch is sure about ``pair`` for every vehicle; raises InputError where one has it wrong."""
+        """Whether the stretch decides ``pair`` for every vehicle; raises InputError where one of them is wrong."""
         found = [self._compare(pair, span) for span in SPANS_S]
         slope, correlation = (torch.cat(x) for x in zip(*found, strict=True))  # (span x delay, vehicle)
         # a periodic drive correlates as strongly, with the other sign, half a period off: the agreeing sign goes first
@@ -188,7 +189,8 @@ class StreamUnits:
         return slope.mT, correlation.mT
 
     def _judge_swap(self) -> None:
-        """Least squares of the jerk on ``(-accel, accel_cmd)``: a lag and gain that are both negative are swapped."""
+        """Least squares of the jerk on ``(-accel, accel_cmd)``: where lag and gain are both negative, the columns are
+        swapped."""
         if self.sums is None:
             return
         statistics = JerkStatistics(*self.sums)
@@ -205,8 +207,8 @@ class StreamUnits:
         start, end = float(self.rows["time"][0]), float(self.rows["time"][-1])
         which = f" of vehicle {vehicle}" if self.vehicles > 1 else ""
         return InputError(
-            f"stream: columns {one!r} and {other!r}{which}, {start:.10g} to {end:.10g} s: {told}; nothing learnt in "
-            f"this time is kept"
+            f"stream: columns {one!r} and {other!r}{which}, {start:.10g} to {end:.10g} s: {told}; no estimate "
+            f"from this time is kept"
         )
 
     def state_dict(self) -> dict[str, Any]:

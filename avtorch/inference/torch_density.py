@@ -1,4 +1,4 @@
-"""Any log density written in torch as a target: for posteriors that have nothing to do with vehicles."""
+"""Any log density written in torch as a target, also for posteriors unrelated to vehicles."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ LogDensity = Callable[[dict[str, Tensor]], Tensor]
 class TorchDensity:
     """A posterior over scalar parameters, each with its constraint, given as a function of them.
 
-    The parameters are walked in an unconstrained space by PyTorch's own bijections (``log`` for positive ones), whose
-    Jacobian is counted here and must not be in ``log_density``.
+    The parameters are sampled in an unconstrained space by PyTorch's own bijections (``log`` for positive ones). Their
+    Jacobian is included here and must not be in ``log_density``.
 
     Args:
         log_density: from a dict of named tensors ``(...)`` to the log density ``(...)``, up to a constant; it must be
@@ -76,7 +76,7 @@ class TorchDensity:
         return torch.stack([t(x) for t, x in zip(self._maps, z.unbind(-1), strict=True)], -1)
 
     def log_prob(self, z: Tensor) -> Tensor:
-        """Log density of ``z`` ``(..., 1, parameter)``, Jacobian counted; returns ``(..., 1)``, NaN where ``z`` is."""
+        """Log density of ``z`` ``(..., 1, parameter)``, Jacobian included; returns ``(..., 1)``, NaN where ``z`` is."""
         # torch's distributions raise at the first NaN: one chain that diverges must not end the others
         lost = z.isnan().any(-1)
         free = torch.where(lost[..., None], torch.zeros((), dtype=z.dtype), z).unbind(-1)

@@ -59,7 +59,7 @@ class Coordinates:
 
 
 def stiffness(density: Density, coordinates: Coordinates, *, radius: float = 3.0) -> Float[Tensor, " window"]:
-    """How much steeper than its Laplace approximation the potential gets ``radius`` SDs out: ``(window,)``, at least 1.
+    """Slope of the potential over that of its Laplace approximation ``radius`` SDs out: ``(window,)``, at least 1.
 
     A skewed posterior (a weak window) has a steep side on which the step that suits the mode overshoots; dividing the
     window's step by this keeps ``step x curvature`` what it is at the mode of a Gaussian.

@@ -1,4 +1,4 @@
-"""Files of one answer that appear together: a reader sees the whole earlier answer or the whole new one.
+"""Files of one answer that appear together: a reader gets the whole earlier answer or the whole new one.
 
 A rename is atomic for one file, not for six. So the names in a folder are links, and one rename moves them all, as
 Kubernetes' atomic writer does for mounted configuration:
@@ -8,8 +8,9 @@ Kubernetes' atomic writer does for mounted configuration:
     OUT/.avtorch/answer  ->  set-k3v9      replaced by one rename
     OUT/.avtorch/set-k3v9/                 the files
 
-Whatever ends the process, SIGKILL too, the link points to one whole set. What was half written lies in `.avtorch` until
-the next answer removes it. A name that the set does not have dangles for a moment: to a reader that is no file.
+However the process ends, SIGKILL included, the link points to one whole set. Half-written files stay in `.avtorch`
+until the next answer removes them. The link of a file that the set lacks dangles for a moment: to a reader there is no
+such file.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ from avtorch.io.set_lock import lock_if_free, locked
 HIDDEN, CURRENT, SET = ".avtorch", "answer", "set-"
 
 _staged: set[Path] = set()
-"""Folders that `answer_set` has handed out: what writes an answer into one of them adds to that set."""
+"""Folders that `answer_set` has yielded: an answer written into one of them is added to its set."""
 
 published: list[Path] = []
-"""Where this process has published answers, in order: what can be said of an interruption that comes later."""
+"""Folders in which this process has published answers, in order, for the message of a later interruption."""
 
 _NO_LINKS = {errno.EPERM, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP}
 _NO_LINKS_WINDOWS = {1, 50, 1314}  # invalid function, not supported, a privilege is not held
@@ -43,15 +44,15 @@ _NO_LINKS_WINDOWS = {1, 50, 1314}  # invalid function, not supported, a privileg
 def answer_set(folder: str | os.PathLike[str], names: Sequence[str]) -> Iterator[Path]:
     """Yield an empty folder for the files of an answer; they replace the earlier ones in `folder` all at once.
 
-    `names`: every file that this answer may consist of, the one that says what it is first. Earlier files of these
-    names that are not written anew go in the same moment; all others stay. If the block or the publication fails, the
+    `names`: every file that this answer may consist of, the identifying one first. Earlier files of these names that
+    are not written again are removed at the same moment; all others stay. If the block or the publication fails, the
     earlier answer stays whole. Regular files of these names, such as an earlier version wrote, are taken over: their
-    content does not change before the new answer is there.
+    content does not change before the new answer is complete.
 
     A writer that is called within the block with the yielded folder adds to the same set.
 
-    Where the file system has no symbolic links the files are moved one by one, the first of `names` last, and the
-    earlier one of that name is removed before: while it is missing, what lies in `folder` is not whole.
+    Where the file system has no symbolic links the files are moved one by one, the first of `names` last, and its
+    earlier version is removed before: while it is missing, the answer in `folder` is incomplete.
 
     Raises InputError where `folder` cannot be written, ValueError for a file that `names` does not have.
 
@@ -71,7 +72,7 @@ def answer_set(folder: str | os.PathLike[str], names: Sequence[str]) -> Iterator
     try:
         staged = _stage(place)
         _staged.add(staged)
-        with lock_if_free(staged):  # so that no other process takes it for a leftover
+        with lock_if_free(staged):  # so that no other process removes it as a leftover
             yield staged
             _publish(place, staged, names)
             published.append(place)
@@ -80,7 +81,7 @@ def answer_set(folder: str | os.PathLike[str], names: Sequence[str]) -> Iterator
         if isinstance(fault, OSError):
             raise InputError(_failed(place, fault, there=there)) from None
         if isinstance(fault, InputError):
-            # the folder that the user named, not the one that is gone
+            # name the user's folder in the message, not the temporary one
             raise InputError(str(fault).replace(str(staged), str(place))) from None
         if isinstance(fault, KeyboardInterrupt) and there:
             raise KeyboardInterrupt(f"the new answer is in {place}") from None
@@ -114,7 +115,7 @@ def _publish(place: Path, staged: Path, names: Sequence[str]) -> None:
         _sync(staged / name)
     hidden = place / HIDDEN
     with locked(hidden):
-        try:  # the link that will be renamed; made first, since it says whether there are links at all
+        try:  # the link that will be renamed; made first, to find out whether the file system has links
             ahead = _link(hidden, staged.name, staged.name)
         except (NotImplementedError, OSError) as fault:
             if not _means_no_links(fault):
@@ -140,7 +141,8 @@ def _publish(place: Path, staged: Path, names: Sequence[str]) -> None:
 
 
 def _take_over(place: Path, names: Sequence[str]) -> None:
-    """Put regular files of these names into the present set, and links in their places: a reader sees no change."""
+    """Move regular files of these names into the current set and put links in their places; readers notice no
+    change."""
     loose = [name for name in names if _mode(place / name) and not _is_ours(place, name)]
     if not loose:
         return
@@ -150,13 +152,13 @@ def _take_over(place: Path, names: Sequence[str]) -> None:
         os.replace(_link(hidden, present.name, present.name), hidden / CURRENT)
     for name in loose:
         kept = hidden / CURRENT / name
-        kept.unlink(missing_ok=True)  # hidden by the file, so nobody sees it go
+        kept.unlink(missing_ok=True)  # the file hides it, so no reader notices the removal
         _copy(place / name, kept)
         os.replace(_link(hidden, _target(name), f"{SET}{name}"), place / name)
 
 
 def _carry(place: Path, staged: Path, names: Sequence[str]) -> None:
-    """Take what other answers have in the present set along."""
+    """Carry over the files of other answers in the current set."""
     present = _current(place)
     if present is None:
         return
@@ -166,14 +168,15 @@ def _carry(place: Path, staged: Path, names: Sequence[str]) -> None:
 
 
 def _reveal(place: Path, name: str) -> None:
-    """Put the link there; it dangles until the set that has the file is the present one."""
+    """Make the link; it dangles until the set that has the file becomes the current one."""
     # someone removed the link: an earlier file must not come back for a moment
     (place / HIDDEN / CURRENT / name).unlink(missing_ok=True)
     os.symlink(_target(name), place / name)
 
 
 def _move(place: Path, staged: Path, files: Sequence[str], names: Sequence[str]) -> None:
-    """One by one, for want of links: the first of `names` goes before all others and comes after them."""
+    """Without links, move the files one by one: the first of `names` is removed before all others and written after
+    them."""
     first, *rest = names
     try:
         if rest:
@@ -191,7 +194,8 @@ def _move(place: Path, staged: Path, files: Sequence[str], names: Sequence[str])
 
 
 def _discard(place: Path, staged: Path | None) -> bool:
-    """Remove a set that was not published; True if it was. What cannot be removed, the next answer removes."""
+    """Remove a set that was not published; True if it was published. The next answer removes what cannot be removed
+    now."""
     with suppress(OSError):
         if staged is not None and _current(place) == staged.name:
             return True
@@ -204,7 +208,7 @@ def _discard(place: Path, staged: Path | None) -> bool:
 
 
 def _clear(place: Path, *, own: Path | None = None) -> None:
-    """Remove links to nothing, sets that nobody uses, and what an ended process left of its own.
+    """Remove dangling links, unused sets, and the temporary files of processes that have ended.
 
     `own`: the caller's, which holds its lock.
     """
@@ -239,7 +243,7 @@ def _is_ours(place: Path, name: str) -> bool:
 
 
 def _current(place: Path) -> str | None:
-    """Name of the set that the folder shows; None where there is none."""
+    """Name of the folder's current set; None where there is none."""
     path = place / HIDDEN / CURRENT
     name = os.readlink(path) if stat.S_ISLNK(_mode(path)) else ""
     return name if re.fullmatch(rf"{SET}\w+", name) and (place / HIDDEN / name).is_dir() else None
@@ -284,7 +288,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Have the disk keep a file or a folder, as far as the file system can."""
+    """Flush a file or a folder to disk, as far as the file system can."""
     folder = path.is_dir()
     if folder and os.name == "nt":
         return

@@ -18,9 +18,9 @@ _NOT_PLAIN = re.compile(r"[^ -~\n]")
 def write_json(path: str | os.PathLike[str], obj: Any) -> None:
     """Write ``obj`` as indented UTF-8 JSON, atomically.
 
-    Takes dicts with string keys, lists, tuples, strings, numbers, booleans and None, and whatever has ``tolist`` (NumPy
-    arrays and scalars, tensors). Control characters and others that cannot be seen are escaped. Raises InputError,
-    naming the key, for NaN, infinity or a foreign type; nothing is written then, and an earlier file stays.
+    Accepts dicts with string keys, lists, tuples, strings, numbers, booleans and None, and objects with ``tolist``
+    (NumPy arrays and scalars, tensors). Control characters and other invisible ones are escaped. Raises
+    InputError, naming the key, for NaN, infinity or a foreign type; nothing is written then, and an earlier file stays.
 
     Example:
         >>> import json
@@ -37,9 +37,9 @@ def write_json(path: str | os.PathLike[str], obj: Any) -> None:
 
 
 def json_text(obj: Any, *, indent: int | None = 1, ascii_only: bool = False) -> str:
-    """``obj`` as strict JSON; takes and refuses what :func:`write_json` does."""
+    """``obj`` as strict JSON; accepts and refuses the same objects as :func:`write_json`."""
     text = json.dumps(_plain(obj, "$"), indent=indent, ensure_ascii=ascii_only, allow_nan=False)
-    # what no screen shows can only be in a string, where JSON has an escape for it
+    # invisible characters occur only in strings, where JSON can escape them
     return _NOT_PLAIN.sub(lambda found: _seen(found[0]), text)
 
 

@@ -1,4 +1,4 @@
-"""From a table and a mapping to the signals of a log: found, converted, checked, merged onto one clock."""
+"""From a table and a mapping to the signals of a log: find, convert, check, and merge onto one clock."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def assemble(table: Table, mapping: SignalMap, *, folder: Path, following: bool)
 
     ``folder`` is where other files named in the mapping lie. Rows where a signal with its own stamps had not arrived,
     or is older than three of its own steps (0.1 s at least), are left out, which makes a gap; ``engaged`` and
-    ``segment`` are states that only tell changes and are held without end. Raises InputError for all that is certainly
-    wrong.
+    ``segment`` are states whose messages mark changes only, so they are held indefinitely. Raises InputError for
+    everything that is certainly wrong.
     """
     source = table.source
     _require(table, mapping, following)
@@ -65,7 +65,7 @@ def assemble(table: Table, mapping: SignalMap, *, folder: Path, following: bool)
     drive = signals.get("segment", np.zeros(len(time)))
     clock = mapping.column.get("time", "time")
     check_time(time, np.diff(drive) == 0, _place(table, "time", clock))
-    # gaps are not known yet: drives by the log's own column, whose numbers may be of any size
+    # gaps are not known yet: drives follow from the log's own column, whose numbers may be of any size
     elapsed = since_start(time, np.concatenate([[0], np.cumsum(np.diff(drive) != 0)]))
     time_step = median_step(elapsed, np.diff(drive) == 0)
     check_rate(time_step, f"{source}: column {clock!r}")
@@ -77,7 +77,8 @@ def assemble(table: Table, mapping: SignalMap, *, folder: Path, following: bool)
         origin = float(time[0])
         ticks, sent = (since(x, origin, largest=largest) for x in (time, stamps))
         signals[signal], age = held(ticks, sent, values)
-        # a value that is long overdue is no longer what the car does: those rows make a gap. States only tell changes.
+        # a value that is long overdue no longer describes the car: its rows form a gap. States are sent only on a
+        # change.
         limit = gap_limit(float(np.median(np.diff(sent)))) if len(sent) > 1 else np.inf
         limit = np.inf if signal in ("engaged", "segment") else limit + time_step / 2
         stale = (age > limit) | np.isinf(age)
@@ -147,7 +148,7 @@ def _signal(table: Table, signal: str, column: str, mapping: SignalMap) -> Float
 
 
 def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tuple[FloatArray, FloatArray]:
-    """Arrivals of a signal with a time column of its own in the log's table; rows empty in it brought nothing."""
+    """Arrivals of a signal with a time column of its own in the log's table; empty rows are no arrivals."""
     clock = mapping.stamp[signal]
     values = table.numbers(column, empty_is_nan=True)
     stamps = table.numbers(clock, empty_is_nan=True)
@@ -167,7 +168,7 @@ def _from_elsewhere(signal: str, mapping: SignalMap, folder: Path) -> tuple[Floa
     there = mapping.elsewhere[signal]
     column = there.column or mapping.column.get(signal, signal)
     table = read_table(_within(folder, there.file, signal), wanted=lambda names: {column, there.time})
-    for name in (column, there.time):  # what else is in a file that only the mapping names is not for messages
+    for name in (column, there.time):  # messages must not quote other content of a file that only the mapping names
         if name not in table.names:
             raise InputError(f"{table.source}: column {quoted(name)} ({signal}) is missing")
     values, stamps = table.numbers(column), table.numbers(there.time)
@@ -177,7 +178,7 @@ def _from_elsewhere(signal: str, mapping: SignalMap, folder: Path) -> tuple[Floa
 
 
 def _within(folder: Path, file: str, signal: str) -> Path:
-    """The place of a file that a mapping names. A mapping may come from anybody: it reaches into no other folder."""
+    """The place of a file that a mapping names. A mapping is not trusted: it may not point outside the log's folder."""
     try:
         there = (folder / file).resolve()
         inside = there.is_relative_to(folder.resolve()) and not Path(file).is_absolute()

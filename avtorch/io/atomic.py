@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all: written beside their place under a passing name, then renamed."""
+"""Files that appear whole or not at all: written under a temporary name in the same folder, then renamed."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from avtorch.errors import InputError
 
 @contextmanager
 def atomic(path: str | os.PathLike[str], *, binary: bool = False) -> Iterator[IO]:
-    """Open ``path`` for writing so that a reader sees the old file or the new one, never a part of it.
+    """Open ``path`` for writing so that a reader gets the old file or the new one, never a part of it.
 
-    Missing folders are made. If the block raises, the passing file is removed and ``path`` keeps what it had.
+    Missing folders are made. If the block raises, the temporary file is removed and ``path`` is unchanged.
     Raises InputError where the place cannot be written.
 
     Example:
@@ -53,10 +53,10 @@ def atomic(path: str | os.PathLike[str], *, binary: bool = False) -> Iterator[IO
             os.fsync(stream.fileno())
         mask = os.umask(0)
         os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)  # mkstemp makes it private; an answer is as readable as any other file
+        os.chmod(name, 0o666 & ~mask)  # mkstemp makes it private; an answer gets the permissions of any other file
         os.replace(name, target)
     except BaseException as fault:
-        with suppress(OSError):  # what failed first is what is to be said
+        with suppress(OSError):  # report the first failure
             os.unlink(name)
         if isinstance(fault, OSError):
             raise InputError(f"{target}: cannot be written ({fault.strerror or fault})") from None

@@ -1,4 +1,4 @@
-"""Time from the log's start: what every computation uses, so that where a clock begins to count changes no answer.
+"""Time from the log's start, used by every computation, so that the origin of the clock does not change any answer.
 
 A float64 near 1.7e9, the seconds since 1970, comes in steps of 2.4e-7 s: differences of such stamps are off by as much,
 and a clock of exactly 100 Hz shows steps of 0.0099999 and 0.0100002 s. Stamps this coarse still hold the decimals that
@@ -21,15 +21,15 @@ from avtorch.arrays import FloatArray, IntArray
 UNIX_S = (946_684_800.0, 4_102_444_800.0)
 """Stamps in here may count seconds since 1970: the years 2000 to 2099."""
 ROUNDING_S = 1e-5
-"""More than rounding does to a difference of stamps [s], and less than any step between rows."""
+"""Larger than the rounding error of a difference of stamps [s], and smaller than any step between rows."""
 _FINEST = 12
 _ANOTHER_CLOCK_S = 1e6  # between two segments, some twelve days: the clock was set, not the car parked
 _SET_ANEW_S = 1.0
-_EVEN = 1e-9  # of a step: nobody sees it
+_EVEN = 1e-9  # of a step: negligible
 
 
 def decimals(largest: float) -> int:
-    """Decimals [of a second] that the difference of two stamps of up to `largest` [s] still tells.
+    """Decimals [of a second] that the difference of two stamps of up to `largest` [s] still resolves.
 
     Each stamp is rounded by half a step of float64, so the difference is off by up to a whole one: the nearest decimal
     is the recorder's own where half a unit of it is more than that.
@@ -40,8 +40,8 @@ def decimals(largest: float) -> int:
 def since(stamps: FloatArray, origin: float, *, largest: float | None = None) -> FloatArray:
     """`stamps` (row,) [s] as seconds from `origin`, free of the rounding of stamps of that size.
 
-    `largest`: size of the stamps where more are to be rounded alike. Stamps closer than the decimals tell are left
-    as the difference has them.
+    `largest`: size of the largest stamp where several arrays are to be rounded alike. Stamps closer together than these
+    decimals resolve are not rounded.
     """
     away = stamps - origin
     if not len(stamps):
@@ -53,9 +53,10 @@ def since(stamps: FloatArray, origin: float, *, largest: float | None = None) ->
 
 def since_start(stamps: FloatArray, segment: IntArray) -> FloatArray:
     """Seconds (row,) from the first row of a log; `segment` (row,) numbers its drives, within each of which rows that
-    are even as far as the stamps tell become even.
+    are even up to the stamps' resolution become even.
 
-    A segment that starts more than `_ANOTHER_CLOCK_S` away has another clock: it goes on a second after the one before.
+    A segment that starts more than `_ANOTHER_CLOCK_S` away has another clock: it is placed a second after the one
+    before.
     """
     out = np.empty(len(stamps))
     cuts = [0, *(np.flatnonzero(np.diff(segment)) + 1).tolist(), len(stamps)]
@@ -73,7 +74,8 @@ def since_start(stamps: FloatArray, segment: IntArray) -> FloatArray:
 
 
 def _even(time: FloatArray, finest: float) -> FloatArray:
-    """`time` (row,) on an even grid, some of whose rows may be lost, where it is off that only by its own rounding."""
+    """`time` (row,) on an even grid, with lost rows allowed, where it deviates from the grid only by its own
+    rounding."""
     steps = np.diff(time)
     usual = float(np.median(steps)) if len(steps) else 0.0
     # rows further apart than float64 counts steps lie on no grid
@@ -87,7 +89,7 @@ def _even(time: FloatArray, finest: float) -> FloatArray:
 
 
 def clock_words(stamp: float) -> str:
-    """A stamp [s] for people: the number, and the date that it is if it counts from 1970."""
+    """A stamp [s] for messages: the number, and its date if it counts from 1970."""
     number = f"{round(stamp, decimals(stamp)):.15g} s"
     if not UNIX_S[0] <= stamp < UNIX_S[1]:
         return number

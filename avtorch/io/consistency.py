@@ -1,4 +1,5 @@
-"""Do two signals of a log tell the same motion? The scale between a signal's change and the integral of its rate."""
+"""Do two signals of a log describe the same motion? The scale between a signal's change and the integral of its
+rate."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-SPANS_S = (1.0, 4.0)  # the short one sees brisk drives, the long one averages more sensor noise
+SPANS_S = (1.0, 4.0)  # the short one suits brisk drives, the long one averages more sensor noise
 MIN_SPANS = 8
 
 
@@ -28,7 +29,7 @@ def scale_between(
 
     ``parts`` are the stretches that may be used; of ``delays`` [s] of the response and of SPANS_S, the pair of best
     correlation counts. None where there are fewer than MIN_SPANS separate spans or one of the two signals does not
-    move: then nothing can be said.
+    move: the scale is then unknown.
     """
     totals = []
     for part in parts:

@@ -1,8 +1,7 @@
-"""Returns to the automation after a driver was in charge: from where on its rows say something of the car.
+"""Returns to the automation after a driver was in charge: the first rows that are informative about the car again.
 
-While `engaged` is 0 nobody obeys the command. Where the actuator and the sensors' filters stand at the return is not
-known, and whether commands that were on their way still arrive is not known either, so rows count once both are
-forgotten.
+While `engaged` is 0 the car does not obey the command. At the return, the states of the actuator and of the sensors'
+filters are unknown, and so is whether delayed commands still arrive. Rows count once both have decayed.
 """
 
 from __future__ import annotations

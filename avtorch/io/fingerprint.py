@@ -15,7 +15,7 @@ def fingerprint(*parts: Any) -> str:
     """64 hex digits over `parts`: arrays and tensors by dtype, shape and bytes, dataclasses by class and fields.
 
     Takes None, booleans, numbers, strings, bytes, classes, slices, arrays, and mappings, sequences and dataclasses of
-    these. Raises TypeError for anything else: a value left out would make two different things look alike.
+    these. Raises TypeError for anything else: omitting a value would give two different objects the same fingerprint.
 
     Example:
         >>> import numpy as np

@@ -27,12 +27,12 @@ _NO_LOCKS = {ENOSYS, ENOLCK, EOPNOTSUPP, EINVAL}
 def sole_use(folder: str | os.PathLike[str], *, work: str) -> Iterator[bool]:
     """Keep other processes out of `folder` while the block runs; yields whether the file system has locks.
 
-    `work` is what they are told that goes on here. The folder is made where it is missing, and removed again where
-    nothing was put into it. A block within another of the same folder and thread is let in. The lock is the kernel's
-    (`filelock`): it is gone with its process, however that ended.
+    `work` describes the running task in the message to those processes. A missing folder is made, and removed again if
+    it stays empty. A nested block of the same folder and thread is admitted. The lock is the kernel's (`filelock`): it
+    ends with its process, however that ends.
 
-    Raises `InputError` that names the other process (pid, host, command, since when), or says why the folder cannot be
-    written.
+    Raises `InputError` that names the other process (pid, host, command, since when), or gives the reason why the
+    folder cannot be written.
 
     Example:
         >>> from avtorch.io import sole_use
@@ -51,7 +51,7 @@ def sole_use(folder: str | os.PathLike[str], *, work: str) -> Iterator[bool]:
     finally:
         if lock is not None:
             if lock.lock_counter == 1:
-                # unlocked only afterwards: who waits on the removed file is told so by filelock, and begins anew
+                # unlock only afterwards: filelock lets a process that waits on the removed file start again
                 with suppress(OSError):
                     (place / LOCK).unlink()
             lock.release()
@@ -79,7 +79,7 @@ def _acquired(place: Path) -> Any:
     """The lock, held; None where the file system has none."""
     from filelock import FileLock, SoftFileLock, Timeout
 
-    # one object for a folder, so that a block within a block is let in
+    # one object per folder, so that a nested block is admitted
     lock = FileLock(place.resolve() / LOCK, timeout=_WAIT_S, is_singleton=True)
     try:
         with warnings.catch_warnings():
@@ -93,7 +93,7 @@ def _acquired(place: Path) -> Any:
         if isinstance(fault, NotImplementedError) or fault.errno in _NO_LOCKS:
             return None
         raise InputError(f"{place}: cannot be written ({fault.strerror or fault})") from None
-    if isinstance(lock, SoftFileLock):  # a file that means a lock by being there would outlive a killed process
+    if isinstance(lock, SoftFileLock):  # a lock by mere existence of a file would outlive a killed process
         lock.release()
         return None
     return lock
@@ -106,12 +106,12 @@ def _sign(path: Path, work: str) -> None:
         "work": work,
         "since": f"{datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC",
     }
-    with suppress(OSError):  # only a message would lack it
+    with suppress(OSError):  # only the message needs it
         path.write_text(json.dumps(told), encoding="utf-8")
 
 
 def _holder(path: Path) -> str:
-    """The process that holds the lock, in words; from a file that anyone can write, hence in few and plain ones."""
+    """The process that holds the lock, for a message: short and sanitised, as anyone can write the file."""
     try:
         told = json.loads(regular_bytes(path, 4096).decode("utf-8"))
         words = {key: "".join(c for c in str(told[key])[:80] if c.isprintable()) for key in ("pid", "host", "work")}

@@ -17,8 +17,8 @@ from avtorch.io.recorded_columns import recorded
 from avtorch.io.tables import Table, read_table
 
 _LONG_STEP_S = 0.25
-_DRIFT_M, _DRIFT_MPS = 5.0, 0.15  # by which gap and speeds may differ over a stretch
-_JUMP_M = 2.0  # of the gap from row to row, beyond what both speeds make of it: another leader
+_DRIFT_M, _DRIFT_MPS = 5.0, 0.15  # allowed difference of spacing and integrated speeds over a stretch
+_JUMP_M = 2.0  # a larger jump of the gap from row to row, beyond what both speeds imply, means another leader
 
 
 def read_following(
@@ -34,9 +34,9 @@ def read_following(
     NGSIM (``event``, default: the longest), or any log with ``speed``, ``spacing`` and ``lead_speed``.
 
     Recordings are cut to the longest stretch in which all three are known and the leader stays the same; ``remarks``
-    says so. ``map``, ``unit``, ``stamp``: of a log, as ``Log.read`` has them; a recording's form tells its own. Raises
-    InputError for a vehicle or event that is not there or follows nobody, for a gap that is not the speeds', for an
-    option without a meaning, and as ``Log.read`` does.
+    records the cut. ``map``, ``unit``, ``stamp``: of a log, as for ``Log.read``; a recording's form fixes its own.
+    Raises InputError for a vehicle or event that is not there or follows nobody, for a spacing that contradicts the
+    speeds, for an option that does not apply, and as ``Log.read`` does.
 
     Example:
         >>> import numpy as np

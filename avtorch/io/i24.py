@@ -14,8 +14,8 @@ NO_LEADER_M = 252.0
 def read(table: Table) -> RawLeader:
     """The instrumented car itself, as a leader for others.
 
-    Its ``Acceleration`` is handed on as recorded; where it differs in scale from the derivative of the speed, the note
-    says by how much.
+    Its ``Acceleration`` is passed on as recorded; where its scale differs from the derivative of the speed, the note
+    gives the ratio.
     """
     columns = {"time": "Time", "speed": "Velocity"}
     time, speed = table.numbers("Time"), table.numbers("Velocity", empty_is_nan=True) / 3.6

@@ -47,11 +47,11 @@ class Log:
     ``time`` [s], on the recorder's own clock (``elapsed``: from the log's start); ``accel_cmd`` [m/s^2], the command
     sent, held until the next row (None only in a car-following log);
     ``accel`` [m/s^2] and ``speed`` [m/s], at least one of them; ``jerk`` [m/s^3]; ``engaged`` (bool, all true where the
-    log does not tell); ``spacing`` [m, bumper to bumper]; ``lead_speed`` [m/s]; ``lead_accel`` [m/s^2]; ``grade`` [-];
-    ``segment`` (int from 0; rises at each gap and each new value of the log's own column, where time may start anew).
-    ``name`` of the source; ``ignored``: its further columns; ``remarks``: what merging left out. ``accel_kind`` is not
-    in a file: ``accel`` is dv/dt, as on a vehicle bus, or what an accelerometer fixed to the car reads along it, dv/dt
-    plus gravity's share on a slope; ``dataclasses.replace`` sets it.
+    log has no such column); ``spacing`` [m, bumper to bumper]; ``lead_speed`` [m/s]; ``lead_accel`` [m/s^2]; ``grade``
+    [-]; ``segment`` (int from 0; rises at each gap and each new value of the log's own column, where time may start
+    anew). ``name`` of the source; ``ignored``: its further columns; ``remarks``: what merging left out. ``accel_kind``
+    is not in a file: ``accel`` is dv/dt, as on a vehicle bus, or what an accelerometer fixed to the car reads along it,
+    dv/dt plus gravity's share on a slope; ``dataclasses.replace`` sets it.
 
     Example:
         >>> import numpy as np
@@ -92,9 +92,9 @@ class Log:
 
         ``map`` names the columns (``{"accel": "CAN.ACC_X"}`` or ``["accel=CAN.ACC_X"]``), ``unit`` their units
         (``speed=km/h``), ``stamp`` the signals' own time columns (``speed=GPS_TIME``); the TOML file beside the log may
-        say the same, and more (`avtorch.io.mapping.read_mapping`). A stamped signal is held, not interpolated; naming
-        the log's own time column as its stamp says that it is written only in the rows where it arrived. ``following``
-        lets a car-following log (``spacing`` and ``lead_speed``) come without ``accel_cmd``.
+        give the same, and more (`avtorch.io.mapping.read_mapping`). A stamped signal is held, not interpolated; naming
+        the log's own time column as its stamp declares that it is written only in the rows where it arrived.
+        ``following`` lets a car-following log (``spacing`` and ``lead_speed``) come without ``accel_cmd``.
 
         Raises InputError, one line that names file, row (of data, from 1) and line (of the file) and column.
         """
@@ -147,11 +147,11 @@ class Log:
         return log
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the log as Parquet (``.parquet``, ``.pq``) or CSV; to the bit the same when read again."""
+        """Write the log as Parquet (``.parquet``, ``.pq``) or CSV; reading it gives the same log bit for bit."""
         columns: dict[str, NDArray] = {}
         for name in SIGNALS:
             values = getattr(self, name)
-            # what reading gives anyway is left out
+            # values that reading restores by default are left out
             if values is None or (name == "engaged" and values.all()) or (name == "segment" and not values.any()):
                 continue
             columns[name] = values.astype(np.int64) if name == "engaged" else values
@@ -196,7 +196,8 @@ class Log:
 
     @cached_property
     def moving(self) -> BoolArray:
-        """Rows not at standstill, ``(time,)``; without speed as the answer to the brake tells (``standing``)."""
+        """Rows not at standstill, ``(time,)``; without speed, detected from the response to the brake
+        (``standing``)."""
         if self.speed is not None:
             return self.speed >= STANDSTILL_MPS
         moving = np.ones(self.rows, bool)
@@ -210,24 +211,26 @@ class Log:
 
     @property
     def usable(self) -> BoolArray:
-        """Rows that belief may use, ``(time,)``: engaged, settled since the driver let go, and not at standstill."""
+        """Rows that estimation may use, ``(time,)``: engaged, settled since the driver let go, and not at
+        standstill."""
         return self.engaged & self.settled & self.moving
 
     @cached_property
     def settled(self) -> BoolArray:
-        """Rows ``(time,)`` that do not follow so closely on a return to ``engaged`` that the car's state is unknown."""
+        """Rows ``(time,)`` late enough after a return to ``engaged`` for the car's state to be known."""
         out = np.ones(self.rows, bool)
         if self.engaged.all():
             return out
         for part in self.segments():
-            # a drive that begins where the last one was left to the driver begins with a return
+            # a drive after one that ended under the driver begins with a return
             driven = part.start > 0 and not self.engaged[part.start - 1]
             since = self.elapsed[part.start] if driven else -np.inf
             out[part] = settled(self.elapsed[part], self.engaged[part], since)[0]
         return out
 
     def segments(self) -> list[slice]:
-        """What was recorded in one piece, as slices of rows; between two lies a gap or a new value of ``segment``."""
+        """Segments recorded without a break, as slices of rows; between two lies a gap or a new value of
+        ``segment``."""
         cuts = np.flatnonzero(np.diff(self.segment)) + 1
         edges = [0, *cuts.tolist(), self.rows]
         return [slice(a, b) for a, b in pairwise(edges)]

@@ -1,4 +1,4 @@
-"""Other names, units and clocks: what ``--map``, ``--unit`` and the TOML file beside the log say."""
+"""Other names, units and clocks, from ``--map``, ``--unit`` and the TOML file beside the log."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _beside(log: Path) -> Path | None:
     try:
         beside = log.with_suffix(".toml")
         return beside if beside != log and os.path.lexists(beside) else None
-    except (OSError, ValueError):  # the log has no name that a file beside it could share
+    except (OSError, ValueError):  # no file beside the log can have its name
         return None
 
 

@@ -25,10 +25,10 @@ def read_event(table: Table, event: int) -> RawLeader:
 def join_events(table: Table, *, duration: float | None = None, first: int | None = None) -> RawLeader:
     """A leader of at least ``duration`` [s] (default 80) out of events joined at equal speed.
 
-    Rule. Start with the longest event, or ``first``. At its end, look at the first 5 s of every event not yet used
+    Rule. Start with the longest event, or ``first``. At its end, search the first 5 s of every event not yet used
     (each leaves at least 10 s to drive) for samples whose lead speed is within 0.2 m/s of the last one; take the sample
     whose acceleration over the next 0.5 s is nearest to that of the last 0.5 s, ties to the lower event number, and go
-    on from the sample after it, speeds as recorded. ``events`` and ``note`` of the answer say what was joined. Raises
+    on from the sample after it, speeds as recorded. ``events`` and ``note`` of the result list what was joined. Raises
     InputError where no event fits before ``duration`` is reached.
     """
     wanted = DURATION_S if duration is None else float(duration)
@@ -80,7 +80,7 @@ def _slope(time: NDArray, speed: NDArray, start: float, end: float) -> float:
 
 
 def _parsed(table: Table) -> Table:
-    """The three columns that count, read once for all events."""
+    """The three columns needed, read once for all events."""
     names = ("event", "time", "lead_speed")
     return Table(table.source, names, tuple(table.numbers(name) for name in names), table.lines)
 

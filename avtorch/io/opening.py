@@ -25,10 +25,10 @@ def place(path: str | os.PathLike[str]) -> str:
 
 
 def read_regular(path: str | os.PathLike[str], *, most: int, need: str, links: bool = True) -> bytes:
-    """The content of a regular file of up to `most` bytes; `need` says in messages what should lie there.
+    """The content of a regular file of up to `most` bytes; `need` names the expected file in messages.
 
-    The checks look at the opened file, so it cannot be exchanged in between, and opening never waits: a pipe without a
-    writer, a device or a directory is refused at once. `links` False refuses a symbolic link too. Raises InputError.
+    The checks apply to the opened file, so it cannot be exchanged in between, and opening never blocks: a pipe without
+    a writer, a device or a directory is refused at once. `links` False refuses a symbolic link too. Raises InputError.
     """
     shown = place(path)
     # O_NONBLOCK: a pipe would wait for its writer; both flags are missing on Windows, where neither is needed
@@ -46,7 +46,7 @@ def read_regular(path: str | os.PathLike[str], *, most: int, need: str, links: b
         if not stat.S_ISREG(info.st_mode):
             kind = _KINDS.get(stat.S_IFMT(info.st_mode), "no regular file")
             raise InputError(f"{shown}: is {kind}; {need} is needed")
-        # some files of the system say that they hold nothing: what is read counts, not what is said
+        # some system files report size 0: rely on what is read
         raw = b"" if info.st_size > most else _read(handle, most + 1)
     except OSError as fault:
         raise InputError(f"{shown}: cannot be read ({fault.strerror or type(fault).__name__})") from None
@@ -59,7 +59,7 @@ def read_regular(path: str | os.PathLike[str], *, most: int, need: str, links: b
 
 
 def _read(handle: int, most: int) -> bytes:
-    """Up to `most` bytes, in pieces: asked for at once, they would be allocated at once."""
+    """Up to `most` bytes, in pieces, so that memory is allocated only for what is there."""
     pieces, left = [], most
     while left > 0 and (piece := os.read(handle, min(left, 2**20))):
         pieces.append(piece)

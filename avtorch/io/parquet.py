@@ -15,7 +15,7 @@ from avtorch.io.parquet_footer import uncompressed_sizes
 from avtorch.io.size import MOST_CELLS, MOST_COLUMNS
 
 _BATCH = 65536  # rows decoded at once
-_CELL_BYTES, _PAGE_BYTES = 64, 2**22  # what a cell may take uncompressed, and a column besides
+_CELL_BYTES, _PAGE_BYTES = 64, 2**22  # bytes per uncompressed cell, and per column besides
 _TEXT = 100  # bytes of the longest text that can be a number
 
 Cells = Sequence[Any] | NDArray
@@ -54,7 +54,7 @@ def _read(
     schema = metadata.schema.to_arrow_schema()
     names = tuple(schema.names)
     chosen, count = set(names if wanted is None else wanted(names)), Counter(names)
-    # a name that occurs twice is refused by whoever asks for it
+    # the caller refuses a name that occurs twice
     kept = [i for i, name in enumerate(names) if name in chosen and count[name] == 1]
     _refuse_size(raw, metadata, source, [names[i] for i in kept])
     texts = []

@@ -1,4 +1,4 @@
-"""What a Parquet file says of its columns' sizes, read from its footer in Python.
+"""The column sizes that a Parquet file declares, read from its footer in Python.
 
 pyarrow's own `RowGroupMetaData.column` lets C++ exceptions through, which end the process: a damaged file must not get
 that far. The footer is a Thrift struct in the compact protocol (https://github.com/apache/thrift/blob/master/doc/specs/
@@ -28,10 +28,10 @@ def uncompressed_sizes(raw: bytes) -> list[list[int]]:
     groups = _Footer(raw[begin:-8]).struct().get(_ROW_GROUPS, [])
     try:
         sizes = [[chunk[_META_DATA][_UNCOMPRESSED] for chunk in group[_COLUMNS]] for group in groups]
-    except (LookupError, TypeError):  # a list may stand where a struct should, and a number where a list should
-        raise ValueError("a row group does not say how large its columns are") from None
+    except (LookupError, TypeError):  # damaged: a list for a struct, or a number for a list
+        raise ValueError("a row group does not declare the size of its columns") from None
     if not all(type(size) is int for group in sizes for size in group):
-        raise ValueError("a row group does not say how large its columns are")
+        raise ValueError("a row group does not declare the size of its columns")
     return sizes
 
 
@@ -53,7 +53,7 @@ class _Footer:
 
     def _value(self, kind: int, depth: int) -> Any:
         match kind:
-            case 1 | 2:  # a field's truth is its kind
+            case 1 | 2:  # a boolean field's value is its type code
                 return kind == 1
             case 3:
                 return self._byte()
@@ -66,9 +66,9 @@ class _Footer:
             case 9 | 10:
                 head = self._byte()
                 count = head >> 4 if head >> 4 < 15 else self._unsigned()
-                self._left(count)  # each takes a byte at least
+                self._left(count)  # each element takes at least one byte
                 inner = head & 15
-                # in a list a truth is a byte of its own
+                # in a list a boolean takes a byte of its own
                 return [self._byte() if inner in (1, 2) else self._value(inner, depth + 1) for _ in range(count)]
             case 12:
                 return self.struct(depth + 1)

@@ -1,4 +1,4 @@
-"""The look at a log before anything is believed: what it holds, masks and leaves in doubt. It notes, never guesses."""
+"""Check a log before estimation: what it contains, which rows are masked, what is doubtful. It never corrects a log."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ class Gap:
 
 @dataclass(frozen=True)
 class Quality:
-    """What a log is worth.
+    """The quality of a log.
 
     ``epoch_s``: time of the first row [s], from which ``notes`` count; ``jitter``: 95 % point of the deviation of a
     step from the median one, as its share [-]; ``late_rows``: steps over 1.5 median ones that are no gap;
     ``masked_rows``: rows not usable, of which ``driver_rows`` not engaged, ``settling_rows`` within 2 s of one of
-    ``returns`` to engaged and ``standstill_rows`` below 0.3 m/s or, without speed, taken for it; ``notes``: all of it
-    in sentences.
+    ``returns`` to engaged and ``standstill_rows`` below 0.3 m/s or, without speed, classified as standing; ``notes``:
+    all of it in sentences.
 
     Example:
         >>> import numpy as np
@@ -83,7 +83,7 @@ class Quality:
 
 
 def check(log: Log) -> Quality:
-    """Look a log over. Takes any valid `Log` and raises nothing.
+    """Check the quality of a log. Accepts any valid `Log` and raises nothing.
 
     Example:
         >>> import numpy as np
@@ -98,7 +98,7 @@ def check(log: Log) -> Quality:
     steps = np.diff(log.elapsed)[same]
     jitter = float(np.quantile(np.abs(steps - step), 0.95) / step) if len(steps) else 0.0
     late = int((steps > 1.5 * step).sum())
-    apart = np.round(np.diff(log.time), 6)  # where the clock was set anew, as it says
+    apart = np.round(np.diff(log.time), 6)  # one label where the clock was reset
     gaps = tuple(
         Gap(int(row) + 1, float(log.time[row]), float(apart[row]))
         for row in np.flatnonzero(~same)
@@ -162,19 +162,19 @@ def _says_missing(missing: tuple[str, ...]) -> list[str]:
     said = {
         "accel_cmd": "no accel_cmd: every result on the actuator is conditional on an assumed controller",
         "accel": "no accel: speed is the only channel, so the log cannot distinguish sensor faults from real forces",
-        "speed": "no speed: accel is the only channel, short stops go unnoticed, and sensor faults look like forces",
+        "speed": "no speed: accel is the only channel, short stops go unnoticed, and sensor faults resemble forces",
     }
     return [said[name] for name in missing]
 
 
 def _repeats(present: dict[str, NDArray], log: Log) -> list[str]:
-    """Signals that come more slowly than the rows and are held between."""
+    """Signals sampled more slowly than the rows and held in between."""
     notes = []
     for name in ("accel_cmd", "accel", "speed"):
         if name not in present:
             continue
         changes = np.flatnonzero(np.diff(present[name]) != 0)
-        # a signal at rest repeats too; a slow one repeats by the same count each time
+        # a constant signal repeats too; a slowly sampled one repeats equally often each time
         if len(changes) >= 20:
             runs = np.diff(changes)
             usual = int(np.median(runs))
@@ -224,7 +224,7 @@ def _disagreements(log: Log) -> list[str]:
     if log.speed is None or log.accel is None:
         return []
     found = scale_between(log.elapsed, stretches(log.usable, log.segment), log.speed, log.accel)
-    # 0.5 m/s in a second is well above what noise and grade do
+    # 0.5 m/s in a second is well above noise and grade
     if found is None or found.change < 0.5 or found.correlation >= 0.5:
         return []
     r = f"{found.correlation:.2f}"

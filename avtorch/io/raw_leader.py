@@ -1,4 +1,4 @@
-"""What every form of leader file becomes, and the checks they share."""
+"""The common type of all forms of leader files, and their shared checks."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class RawLeader:
     """The motion of a recorded vehicle, unsmoothed, at the rate of its file; everything ``(time,)`` and SI.
 
     ``time`` [s] is the file's own, strictly rising; ``speed`` [m/s] >= 0; ``accel`` [m/s^2] and ``spacing`` [m, to the
-    vehicle ahead, bumper to bumper; NaN where not recorded] are None where the file has none. ``events``: what was
-    joined, in order. ``note``: what was chosen, cut or mended, in words; empty where nothing was.
+    vehicle ahead, bumper to bumper; NaN where not recorded] are None where the file has none. ``events``: the joined
+    events, in order. ``note``: what was selected, cut or repaired, in words; empty where nothing was.
 
     Example:
         >>> import numpy as np

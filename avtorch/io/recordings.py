@@ -1,4 +1,4 @@
-"""Recorded leaders: any of the known forms, told apart by their header."""
+"""Recorded leaders in any of the known forms, recognised by their header."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def read_leader(
 
     ``vehicle`` is the file's own number (OpenACC; default: the lowest). ``event`` is the NGSIM event; without it events
     are joined at equal speed until they last ``duration`` [s] (default 80). ``unit`` (``speed=km/h``) is for the plain
-    form. A recording is cut to its longest stretch without empty speeds or steps over 1.5 s; ``note`` says so.
+    form. A recording is cut to its longest stretch without empty speeds or steps over 1.5 s; ``note`` records the cut.
     Raises InputError for a file of no known form, a vehicle or event that is not in it, and bad values.
 
     Example:

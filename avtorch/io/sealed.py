@@ -1,4 +1,4 @@
-"""State files that are believed only if they are whole: a checksum, a schema, and what the content belongs to.
+"""State files that are accepted only if intact: a checksum, a schema, and the identity of what the content belongs to.
 
 A sealed file is JSON. Its first line holds the schema and the SHA-256 of everything else, so that the checksum is
 compared before anything is parsed:
@@ -8,8 +8,8 @@ compared before anything is parsed:
      "content": {…}
     }
 
-With bytes as content, they follow after the second line. The checksum finds damage and careless edits; it is no
-signature, and whoever reads a file still checks the shape of its content.
+With bytes as content, they follow after the second line. The checksum detects damage and careless edits; it is not a
+signature, and the reader of a file must still check the shape of its content.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from avtorch.io.answers import json_text
 from avtorch.io.atomic import atomic
 
 MOST = 64 * 2**20
-"""A state file has no more bytes than this, unless its reader says otherwise."""
+"""Maximum size of a state file [bytes], unless its reader sets another."""
 
 REMEDY = "remove it, or use another folder"
 
@@ -37,7 +37,7 @@ _FIRST = re.compile(rb'\{"schema": "([a-z0-9_./-]{1,80})", "sha256": "([0-9a-f]{
 
 
 class Damaged(InputError):
-    """A regular file whose content cannot be believed; what can be computed again may be.
+    """Raised for a regular file whose content is damaged; the caller may compute it again.
 
     Example:
         >>> from pathlib import Path
@@ -70,7 +70,7 @@ class Sealed(NamedTuple):
 
 
 def write_sealed(path: Path, content: Any, *, schema: str, of: Mapping[str, Any]) -> None:
-    """Write `content` (see `json_text` for what it may hold, or bytes) so that `path` is whole or as it was.
+    """Write `content` (bytes, or what `json_text` accepts) so that `path` is complete or unchanged.
 
     `of`: what it belongs to. Raises `InputError` where `path` cannot be written, or is a symlink, a folder, a device.
 
@@ -86,7 +86,7 @@ def write_sealed(path: Path, content: Any, *, schema: str, of: Mapping[str, Any]
         line = json_text({"of": of, "bytes": len(content)}, indent=None, ascii_only=True)
         rest = line[1:].encode() + b"\n" + content
     else:
-        # a file's name may hold what UTF-8 cannot say
+        # a file's name may contain bytes that are not UTF-8
         rest = json_text({"of": of, "content": content}, ascii_only=True)[1:].lstrip().encode() + b"\n"
     first = f'{{"schema": "{schema}", "sha256": "{_checksum(schema.encode(), rest)}",\n'
     with atomic(path, binary=True) as stream:
@@ -96,7 +96,7 @@ def write_sealed(path: Path, content: Any, *, schema: str, of: Mapping[str, Any]
 def read_sealed(path: Path, *, schema: str, most: int = MOST, remedy: str = REMEDY) -> Sealed:
     """Read what `write_sealed` wrote from JSON content.
 
-    `most`: bytes, above which the file is not read. `remedy`: what a user can do, the end of every message. Raises
+    `most`: bytes, above which the file is not read. `remedy`: advice to the user, the end of every message. Raises
     `InputError` for what is no regular file, `Damaged` for anything but a file of this `schema` as it was written.
 
     Example:
@@ -136,13 +136,13 @@ def regular_bytes(path: Path, most: int, *, remedy: str = REMEDY) -> bytes:
     """All bytes of a regular file, at most `most` of them.
 
     Raises `InputError` for a symlink, a folder, a FIFO, a device, a file that is missing, not readable or too large;
-    none of these is waited for or read.
+    it neither blocks on these nor reads them.
     """
     try:
         kind = os.lstat(path).st_mode
         if not stat.S_ISREG(kind):
             raise InputError(f"{path}: is {_kind(kind)}, needs a regular file; {remedy}")
-        # the file may have been exchanged since: the one that is open counts
+        # the file may have been exchanged since: check the open one
         flags = os.O_RDONLY | sum(
             getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY")
         )
@@ -150,10 +150,10 @@ def regular_bytes(path: Path, most: int, *, remedy: str = REMEDY) -> bytes:
             facts = os.fstat(stream.fileno())
             if not stat.S_ISREG(facts.st_mode):
                 raise InputError(f"{path}: is {_kind(facts.st_mode)}, needs a regular file; {remedy}")
-            # a read sets aside all that it is asked for: no more than the file says it has, and a byte to notice more
+            # read() allocates the size requested: request the reported size and one byte more, to detect growth
             content = stream.read(facts.st_size + 1) if facts.st_size <= most else None
             if content is not None and len(content) > facts.st_size:
-                raise InputError(f"{path}: grows while it is read, or says nothing of its size; {remedy}")
+                raise InputError(f"{path}: grows while it is read, or does not report its size; {remedy}")
     except (OSError, ValueError) as fault:
         if isinstance(fault, InputError):
             raise
@@ -210,7 +210,7 @@ def _free_or_regular(path: Path) -> None:
     try:
         kind = os.lstat(path).st_mode
     except (OSError, ValueError):
-        return  # nothing there; whatever else is wrong, the writer says
+        return  # no file yet; the writer reports any other fault
     if not stat.S_ISREG(kind):
         raise InputError(f"{path}: is {_kind(kind)}, needs a regular file or a free name")
 

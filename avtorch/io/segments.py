@@ -1,4 +1,4 @@
-"""Where a drive breaks off: gaps, and runs of rows that belong together."""
+"""Where a drive is interrupted: gaps, and the unbroken runs of rows between them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def median_step(time: FloatArray, same_drive: BoolArray) -> float:
 
 
 def gap_limit(step: float) -> float:
-    """The longest time between two rows [s] that is no gap, at a median ``step`` [s].
+    """The longest time between two rows [s] that is not a gap, at a median ``step`` [s].
 
     A little more than the bound: two rows lost at 30 Hz make 0.1 s, give or take the rounding of the stamps.
     """

@@ -23,7 +23,7 @@ _PATIENCE_S = 10.0
 def lock_if_free(folder: Path) -> Iterator[bool]:
     """Try to hold the lock of `folder` within the block; yields whether it is held.
 
-    False too where the system has no such locks: what cannot be known to be free counts as used.
+    False too where the system has no such locks: a folder not known to be free counts as used.
     """
     with _opened(folder) as handle:
         yield _acquire(handle) is True

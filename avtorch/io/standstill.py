@@ -1,9 +1,9 @@
-"""Where a car stands, told by a log that has no speed.
+"""Where a car stands, estimated from a log without speed.
 
-A stop shows itself in two ways: a brake command, held for longer than any car takes to answer, to which nothing
-happens; and a deceleration that ends at once while the brake stays on, faster than any actuator lets go. From there the
-acceleration is integrated both ways, its reading at rest taken as zero, up to the speed at which GLVD holds again. What
-slows down on the way did not stand. A stop that asks for hardly any braking is not seen.
+A stop is detected in two ways: a brake command without a response, held for longer than any car takes to respond; and a
+deceleration that ends at once while the brake stays on, faster than any actuator releases. From the stop the
+acceleration is integrated in both directions, with the reading at rest taken as zero, up to the speed at which GLVD
+holds again. A car that decelerates on the way was not standing. A stop with hardly any braking is not detected.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from avtorch.arrays import BoolArray, FloatArray
 
-_BRAKED_MPS2 = -0.5  # more than a dead band hides or a hill of 5 % takes
-_RESTS = 0.15  # of the demand at most is felt
-_SLOWEST_S = 2.0  # dead time and lag of a car slower than any
-_FELT_S = 0.3  # over which a reading is averaged
+_BRAKED_MPS2 = -0.5  # stronger than any dead band or a hill of 5 %
+_RESTS = 0.15  # largest share of the demand that is still measured
+_SLOWEST_S = 2.0  # upper bound on any car's dead time and lag
+_FELT_S = 0.3  # averaging time of a reading
 _REST_S = 0.5
-_SLOWED_MPS2 = -0.25  # a deceleration, and no noise
+_SLOWED_MPS2 = -0.25  # a deceleration larger than noise
 _STILL_BRAKED_MPS2 = -0.3
-# Where a deceleration ends by itself the brake was not eased for longer than a car takes to answer.
+# A deceleration that ends by a stop: the brake was not eased for longer than a car takes to respond.
 _SINCE_S = 1.8
 _EASED_MPS2 = 0.2
 
@@ -45,11 +45,11 @@ def standing(accel_cmd: FloatArray, accel: FloatArray, dt: float, below: float) 
 
 
 def _braked_at_rest(accel_cmd: FloatArray, accel: FloatArray, dt: float) -> BoolArray:
-    """Braked for longer than the slowest car takes to answer, and at rest."""
+    """Rows braked for longer than the slowest car takes to respond, and without deceleration."""
     brakes = accel_cmd < _BRAKED_MPS2
     rows = np.arange(len(brakes))
     braked = rows - np.maximum.accumulate(np.where(brakes, -1, rows))
-    # the weakest demand that the car may still be answering to
+    # the weakest demand to which the car may still be responding
     asked = _latest_max(np.where(brakes, accel_cmd, -np.inf), _count(_SLOWEST_S, dt))
     rests = (braked > _SLOWEST_S / dt) & (np.abs(_felt(accel, dt)) < -_RESTS * asked)
     return minimum_filter1d(rests, _count(_REST_S, dt), mode="nearest").astype(bool)
@@ -65,9 +65,9 @@ def _halted(accel_cmd: FloatArray, accel: FloatArray, dt: float) -> BoolArray:
     at = np.arange(n, rows - n - 1)
     slowed, rests = (sums[at] - sums[at - n]) / n, (sums[at + 1 + n] - sums[at + 1]) / n
     short = max(n // 3, 1)
-    late = (sums[at] - sums[at - short]) / short  # no sooner than in the last third
+    late = (sums[at] - sums[at - short]) / short  # the deceleration lasts into the final third
     early = (sums[at + 1 + short] - sums[at + 1]) / short
-    since = _count(0.5 * _SINCE_S, dt)  # a rise is sought from up to as long before as it is looked back
+    since = _count(0.5 * _SINCE_S, dt)  # half of the time each for the search of the minimum and of the rise after it
     eased = _latest_max(accel_cmd - _latest_min(accel_cmd, since), since) > _EASED_MPS2
     ends = (slowed < _SLOWED_MPS2) & (late < 0.7 * slowed) & (early > 0.4 * slowed) & (np.abs(rests) < -0.25 * slowed)
     found = np.zeros(rows, bool)

@@ -24,17 +24,17 @@ from avtorch.io.size import MOST_BYTES, MOST_CELLS, MOST_COLUMNS
 from avtorch.numeral import numeral
 
 _MOST_CHARACTERS = 1_000_000  # of one row
-_LINES_AHEAD = 100  # in which a header that other lines precede is looked for
+_LINES_AHEAD = 100  # lines searched for a header that other lines precede
 
 Wanted = Callable[[tuple[str, ...]], Collection[str]]
-"""From the names of a file's columns to those that are to be read."""
+"""Selects the columns to read from the names of a file's columns."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Named columns of one file, cells not yet read as numbers; None for a column that nobody wanted.
+    """Named columns of one file, cells not yet parsed as numbers; None for a column that was not requested.
 
-    Rows are told to people as ``row 3 (line 4)``: the third row of data, and the line an editor shows. A Parquet file
+    Messages name rows as ``row 3 (line 4)``: the third row of data, and the line an editor shows. A Parquet file
     and arrays have no lines.
     """
 
@@ -97,7 +97,7 @@ class Table:
 
 
 def _number(cell: Any) -> float:
-    """A cell that is no text: a whole number may be too large, and bytes are text that nobody decoded."""
+    """A cell that is not text: an integer may be too large, and bytes are text not yet decoded."""
     if isinstance(cell, (bytes, bytearray)):
         raise TypeError
     try:
@@ -120,7 +120,7 @@ def read_table(path: str | os.PathLike[str], *, header: str | None = None, wante
 
     ``header`` names the first cell of the header line where other lines come before it. Unnamed columns get the name
     ``(unnamed 1)`` by position. Lines end at ``\\n``, ``\\r\\n`` or ``\\r`` and nowhere else. Numbers are decimal, with
-    ASCII digits and a point. Raises InputError for what is no such file: missing, no regular file, empty, binary,
+    ASCII digits and a point. Raises InputError for any other file: missing, not a regular file, empty, binary,
     another separator, no header, a row with too few or too many cells, and beyond 512 MiB, 10,000 columns, 1,000,000
     characters in a row, or 20 million cells in the wanted columns.
     """
@@ -170,7 +170,7 @@ def _line(before: bytes) -> int:
 
 
 class _Lines:
-    """Lines with their ends, cut nowhere else than at those; counts the characters of a row that is not complete."""
+    """Lines with their ends, split only at those; counts the characters of an incomplete row."""
 
     def __init__(self, source: str, text: str) -> None:
         self.source, self.open = source, 0

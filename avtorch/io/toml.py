@@ -1,4 +1,4 @@
-"""TOML from outside, in bounded time: one line with the line's number for what is wrong, and nothing of its content."""
+"""Untrusted TOML in bounded time: an error is one line with the line's number, and quotes none of its content."""
 
 from __future__ import annotations
 

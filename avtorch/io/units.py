@@ -1,4 +1,4 @@
-"""Units a recorder may use, each with its way to SI."""
+"""Units a recorder may use, each with its conversion to SI."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ACCEL = {
 _JERK = {"m/s3": 1.0, "mps3": 1.0, "g/s": GRAVITY, "cm/s3": 0.01, "mm/s3": 0.001, "ft/s3": _FOOT}
 _TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 _GRADE = {"-": 1.0, "1": 1.0, "%": 0.01, "percent": 0.01, "permille": 0.001}
-# an angle is no factor: the grade is its tangent
+# an angle is not converted by a factor: the grade is its tangent
 _ANGLE: dict[str, Callable[[NDArray], NDArray]] = {"rad": np.tan, "deg": lambda x: np.tan(np.radians(x))}
 
 _UNITS: dict[str, dict[str, float]] = {

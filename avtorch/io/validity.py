@@ -1,4 +1,4 @@
-"""What is certainly wrong with the values of a log: these raise. What is only doubtful is for ``quality`` to note."""
+"""Values of a log that are certainly wrong raise here. ``quality`` notes those that are only doubtful."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from avtorch.io.units import GRAVITY
 RATE_HZ = (10.0, 200.0)
 _RATE_SLACK = 0.05  # clocks are off by a little, and 10 Hz is the rate of most recordings
 
-# signal: lowest, highest, unit, what a value outside says
+# signal: lowest, highest, unit, explanation of a value outside
 _LIMITS: dict[str, tuple[float, float, str, str]] = {
     "speed": (-2.0, 150.0, "m/s", "speed is forward speed"),
     "lead_speed": (-2.0, 150.0, "m/s", "speed is forward speed"),
@@ -48,7 +48,7 @@ _PLAUSIBLE = {
 
 
 def check_range(signal: str, values: NDArray, where: Callable[[int], str]) -> None:
-    """Raise InputError at the first value that no car gives; ``where`` tells the place of a row, counted from 0."""
+    """Raise InputError at the first value that no car produces; ``where`` names the place of a row, counted from 0."""
     if signal == "engaged":
         _at_first(~np.isin(values, (0.0, 1.0)), values, where, "0 (driver) or 1 (engaged) is needed")
     elif signal == "segment":
@@ -71,7 +71,7 @@ def _at_first(bad: NDArray, values: NDArray, where: Callable[[int], str], need: 
         raise InputError(f"{where(row)}: is {values[row]:.10g}; {need}")
 
 
-_BEYOND_CLOCKS = 1e24  # nanoseconds since 1970 read as seconds are 2e18, and `check_rate` says so
+_BEYOND_CLOCKS = 1e24  # nanoseconds since 1970 taken as seconds are 2e18, which `check_rate` reports
 
 
 def check_time(time: NDArray, same_drive: NDArray, where: Callable[[int], str]) -> None:
@@ -81,7 +81,7 @@ def check_time(time: NDArray, same_drive: NDArray, where: Callable[[int], str]) 
     if beyond.any():
         row = int(np.argmax(beyond))
         raise InputError(
-            f"{where(row)}: found {time[row]:.4g} s, a stamp so far from zero that float64 does not tell rows apart; "
+            f"{where(row)}: found {time[row]:.4g} s, a stamp so far from zero that float64 cannot resolve the rows; "
             "needs stamps within 1e9 s of the first"
         )
     bad = (np.diff(time) <= 0) & same_drive
@@ -92,10 +92,10 @@ def check_time(time: NDArray, same_drive: NDArray, where: Callable[[int], str]) 
 
 
 def check_rate(step: float, where: str) -> None:
-    """Raise InputError for a median ``step`` [s] outside 10 to 200 Hz, saying so where it looks like ms, us or ns."""
+    """Raise InputError for a median ``step`` [s] outside 10 to 200 Hz, naming a probable unit (ms, us, ns)."""
     if not step > 0:
         raise InputError(
-            f"{where}: found stamps so far from zero, or from each other, that float64 does not tell rows apart; needs "
+            f"{where}: found stamps so far from zero, or from each other, that float64 cannot resolve rows; needs "
             "stamps within 1e9 s of the first"
         )
     rate = 1 / step
@@ -128,8 +128,9 @@ def command_scale(
 ) -> Scale | None:
     """How the motion follows the command ``u``: from speed where it is known, else from the integrated acceleration.
 
-    Of a command that comes back with the other sign after half a period, a late answer and a turned one look alike: an
-    answer against the command counts only where none with it, by up to 2.5 s of delay and lag, is as clear.
+    For a command that returns with the other sign after half a period, a late response cannot be distinguished from an
+    inverted one: an inverted response counts only where no response of the right sign, with up to 2.5 s of delay and
+    lag, correlates as strongly.
     """
     if speed is None:
         assert accel is not None

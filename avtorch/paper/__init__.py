@@ -1,4 +1,4 @@
-"""The paper's figures and tables, one module each, run anew and held against what it says."""
+"""The paper's figures and tables, one module each: rerun and compared with its claims."""
 
 from avtorch.paper.estimation import Estimation, estimation
 from avtorch.paper.gains import Gains, gains

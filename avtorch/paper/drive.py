@@ -1,4 +1,5 @@
-"""The paper's drive: a vehicle that changes at 26 s and is set anew at 28 s, for settings and seeds side by side."""
+"""The paper's drive: a vehicle that changes at 26 s and gets a new setting at 28 s, for many settings and seeds in one
+batch."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ HEALTHY, CHANGED = (0.3, 1.0), (1.5, 0.5)
 """(T_L [s], K_L [-]) before and after the change (paper, Table 1 and Section 4)."""
 
 ESTIMATED = (1.33, 0.64)
-"""What the paper estimates after it, and puts into its lower level (Section 4, Strategy 1)."""
+"""The paper's estimates after the change, which it puts into its lower level (Section 4, Strategy 1)."""
 
 CHANGE_S, ACT_S = 26.0, 28.0
 
@@ -24,7 +25,7 @@ NOISE = 0.1
 """Jerk noise [m/s³]; the paper gives none (SPEC section 1)."""
 
 Progress = Callable[[float], None]
-"""Told the share of an experiment that is done, 0 to 1."""
+"""Called with the share of an experiment that is done, 0 to 1."""
 
 
 def noise_seeds(seed: int, count: int) -> list[int]:
@@ -33,7 +34,7 @@ def noise_seeds(seed: int, count: int) -> list[int]:
 
 
 def change(loop: ClosedLoop) -> None:
-    """What happens to the vehicle at 26 s."""
+    """The change of the vehicle at 26 s."""
     loop.plant = GLVDPlant(*CHANGED, sigma=NOISE)
 
 
@@ -48,8 +49,8 @@ def drive(
     noise: float = NOISE,
     progress: Progress | None = None,
 ) -> Block:
-    """Every one of `settings` (setting,) put in force at 28 s, under the same `seeds` noises; the vehicle of Table 1
-    before.
+    """Simulate each of `settings` (setting,), in force from 28 s, under the same `seeds` noises; before, the vehicle of
+    Table 1.
 
     The time gap moves there at the loop's own rate, gains and lower level at once. Returns rows (setting, seed, time),
     with `vehicles` (setting, seed, vehicle, time).
@@ -98,7 +99,7 @@ def rms(x: Tensor) -> Tensor:
 
 
 def _advance(loop: ClosedLoop, until: float, duration: float, progress: Progress | None) -> Block:
-    """To `until` [s], in pieces so that progress can be told."""
+    """Advance to `until` [s], in pieces so that progress can be reported."""
     end, blocks = round(until / loop.dt), []
     while loop.steps_done < end:
         blocks.append(loop.advance(min(1000, end - loop.steps_done)))

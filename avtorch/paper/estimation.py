@@ -1,8 +1,8 @@
 """Estimation over a sweep of T_L and a sweep of K_L (paper, Section 3.3, Fig. "sgldexperiments").
 
-Vehicles of every setting and noise, side by side, follow a recorded leader; each is believed on its own, window by
-window. Two claims are held against it: the truth lies inside the interval, and "the error in estimation increases when
-T_L increases, and similarly when K_L decreases".
+Vehicles of every setting and noise follow a recorded leader in one batch; the belief about each is estimated
+separately, window by window. Two claims are tested: the truth lies inside the interval, and "the error in estimation
+increases when T_L increases, and similarly when K_L decreases".
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ GAINS = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4)
 """K_L [-], with T_L = 0.3 s."""
 
 COVERAGE = (0.85, 0.95)
-"""Where the coverage of a 90 % interval should lie."""
+"""Bounds in which the coverage of a 90 % interval should lie."""
 
 KNOWN = 0.5
 """Least share of excited windows for a setting to be called known."""
@@ -34,7 +34,7 @@ KNOWN = 0.5
 class Sweep:
     """Behind one leader: `truth` (setting, 2), lags first, then gains; estimates (setting, seed, 2) after the last
     window, and of the seven windows (window, setting, seed): `used`, and whether the interval held the truth, `inside`
-    (window, setting, seed, 2). `asked`: RMS of the command over the seven [m/s²], (setting, seed).
+    (window, setting, seed, 2). `asked`: RMS of the command over the seven windows [m/s²], (setting, seed).
     """
 
     ahead: Ahead
@@ -81,7 +81,7 @@ class Estimation:
         return out
 
 
-# what grows, along which sweep, relative to the truth or not
+# quantity that grows, its sweep, whether relative to the truth
 _GROWTHS = (("T_L", "T_L", False), ("K_L", "K_L", False), ("K_L", "K_L", True), ("T_L", "K_L", False))
 
 
@@ -126,7 +126,7 @@ def estimation(leaders: Leaders, *, seeds: int, seed: int, progress: Progress = 
 
 
 def _coverage(sweeps: list[Sweep], seed: int) -> ClaimRow:
-    """Over used windows and both parameters; whole runs are resampled, for what belongs to one run goes together."""
+    """Over used windows and both parameters; whole runs are resampled, as the windows of one run are dependent."""
     held = torch.cat([(s.inside & s.used[..., None]).double().sum((0, 3)).flatten() for s in sweeps])
     asked = torch.cat([2 * s.used.double().sum(0).flatten() for s in sweeps])
     at = resampled(len(held), seed)
@@ -181,7 +181,7 @@ def _excitation(sweep: Sweep) -> ClaimRow:
 
 
 def _growth(sweep: Sweep, what: str, along: str, relative: bool, seed: int) -> ClaimRow:
-    """The exponent with which the median error goes along the sweep, a straight line through the logarithms."""
+    """The exponent of the median error along the sweep, from a straight line through the logarithms."""
     part = slice(0, len(LAGS)) if along == "T_L" else slice(len(LAGS), None)
     column = ("T_L", "K_L").index(what)
     x = sweep.truth[part, ("T_L", "K_L").index(along)]

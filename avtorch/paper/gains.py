@@ -1,4 +1,4 @@
-"""What each gain does (paper, Table 2 and Section 4, Strategy 3), shown by experiment.
+"""The effect of each gain (paper, Table 2 and Section 4, Strategy 3), by experiment.
 
 Each gain in turn is made 1.5, 2 and 3 times as large, the others kept, behind the main leader, with the healthy vehicle
 under the same noises. The table's words and how they are measured:
@@ -7,7 +7,7 @@ under the same noises. The table's words and how they are measured:
   which the speed lags behind the leader's stays within 5 %;
 - k_v "match the leader's speed", "responsive": RMS of the speed difference falls, and so does that lag;
 - k_a "minimize acceleration", "resists acceleration change": RMS of the acceleration falls, and the lag grows; (text)
-  "less responsive to noise": what the jerk noise adds to the acceleration falls;
+  "less responsive to noise": the acceleration caused by the jerk noise falls;
 - (text) "an increase in |k_s| or |k_v| will prompt the controller to dampen disturbances and regain stability", k_v
   more than k_s: the exact peak gain of the changed vehicle falls.
 """
@@ -34,7 +34,7 @@ _LONGEST_LAG_S = 6.0
 
 Goes = Literal["below 1", "above 1", "0.95 to 1.05"]
 
-# gain, what is measured, where its ratio must lie, the paper's words
+# gain, measure, bounds of its ratio, the paper's words
 _CLAIMS: tuple[tuple[str, str, Goes, str], ...] = (
     ("k_s", "spacing error", "below 1", "maintains the target spacing"),
     ("k_s", "speed lag", "0.95 to 1.05", "pushes towards neutral behaviour"),
@@ -173,7 +173,7 @@ def gains(leaders: Leaders, *, seeds: int, seed: int, progress: Progress = lambd
 
 
 def _lag(run: Block) -> Tensor:
-    """By how much [s] the leader's speed, held back, fits the follower's best (least squares), (scenario,)."""
+    """The delay [s] at which the leader's speed fits the follower's best (least squares), (scenario,)."""
     dt = float(run.time[1] - run.time[0])
     steps = range(0, round(_LONGEST_LAG_S / dt) + 1, 5)
     longest = steps[-1]

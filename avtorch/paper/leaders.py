@@ -1,4 +1,4 @@
-"""Which vehicles drive ahead: recordings where there are some, the embedded US06 where there are none."""
+"""The leaders: recordings where available, otherwise the embedded US06."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ _STEADY = ("openacc_astazero/ASta_040719_platoon7.csv", 5, 300.0)
 
 @dataclass(frozen=True)
 class Ahead:
-    """A leader, its `name` in rows, `which` it is in full, and `note`, what it stands in for (empty: itself)."""
+    """A leader, its `name` in rows, `which` it is in full, and `note`: why it is used in place of a recording (or
+    "")."""
 
     leader: Leader
     name: str
@@ -28,7 +29,7 @@ class Ahead:
     note: str = ""
 
     def said(self, why: str) -> str:
-        """A sentence with the note behind it."""
+        """A sentence with the note appended."""
         return f"{why[:-1]}; {self.note}." if self.note else why
 
 
@@ -51,8 +52,8 @@ class Leaders:
     def read(cls, data: str | os.PathLike[str] | None = None) -> Leaders:
         """Out of a folder of recordings, in the sub-folders `ngsim`, `openacc_zalazone` and `openacc_astazero`.
 
-        NGSIM: the longest event, and where it is shorter than the sweep, events joined at equal speed; `which` says
-        it. OpenACC: car 2 of ZalaZONE `handling_part40` from 4 s on, and car 5 of AstaZero platoon 7 from 300 s on.
+        NGSIM: the longest event, and where it is shorter than the sweep, events joined at equal speed; `which` names
+        them. OpenACC: car 2 of ZalaZONE `handling_part40` from 4 s on, and car 5 of AstaZero platoon 7 from 300 s on.
         Every acceleration is Gaussian-smoothed (`Leader.from_speed`). None: US06 for all of them.
 
         Raises `InputError` where the folder or one of the files is missing or cannot be read.
@@ -78,7 +79,7 @@ class Leaders:
 
     @property
     def main(self) -> Ahead:
-        """Leads the strategies, the gains and the platoon."""
+        """The leader of the strategies, the gains and the platoon."""
         return self.drives[0]
 
 

@@ -1,7 +1,8 @@
-"""The monitoring experiment (paper, Section 4, Fig. "monitoring"): a vehicle changes at 26 s, windows of 2 s watch it.
+"""The monitoring experiment (paper, Section 4, Fig. "monitoring"): a vehicle changes at 26 s, monitored in windows of
+2 s.
 
-The paper tells one run: 0.24 s and 0.98 before the change (true: 0.3 s and 1), 1.33 s and 0.64 after it (true: 1.5 s
-and 0.5), the alert 2 s after it. Here `seeds` runs are watched and nothing is done. *Before* is the last used window
+The paper reports one run: 0.24 s and 0.98 before the change (true: 0.3 s and 1), 1.33 s and 0.64 after it (true: 1.5 s
+and 0.5), the alert 2 s after it. Here `seeds` runs are monitored without any action. *Before* is the last used window
 before the change, *first after* the first used one after it, *after* the mean error over all used windows after it.
 """
 
@@ -71,7 +72,7 @@ class Watched:
         level: Tensor,
         seed: int,
     ) -> ClaimRow:
-        """`seen` (window, seed), `index` (seed,) of the window asked about, None for the mean over those seen."""
+        """`seen` (window, seed); `index` (seed,) of one window, None for the mean over those seen."""
         some = seen.any(0)
         paper, truth = (
             (PAPER_BEFORE[column], HEALTHY[column]) if "before" in when else (PAPER_AFTER[column], CHANGED[column])
@@ -142,7 +143,7 @@ class Watched:
 
 @dataclass(frozen=True)
 class Monitoring:
-    """What was watched, one a leader; `seed` of the intervals.
+    """The monitored runs, one per leader; `seed` of the intervals.
 
     Example:
         >>> from avtorch.paper import Leaders, Monitoring, monitoring

@@ -1,9 +1,9 @@
 """Ten vehicles behind one leader, all changed at 26 s, with and without action at 28 s.
 
-The paper watches one follower and argues for the traffic behind it; what the action is worth there shows in a platoon.
+The paper monitors one follower and argues for the traffic behind it; a platoon shows how much the action helps there.
 Every vehicle gets the same setting: none, one of the paper's, or what the strategist chose for a single follower of the
-same leader, free to use all strategies. A collision is recorded and not acted out: what a platoon does after one is no
-longer physical, and a row says so.
+same leader, free to use all strategies. A collision is recorded but not simulated: a platoon's motion after one is no
+longer physical, and a row reports it.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ from avtorch.vehicle.block import Block
 
 VEHICLES = 10
 PASSED_S = 80.0
-"""When what ten opening gaps stir up has passed through all ten [s]: it takes a time gap, up to 2.5 s, a vehicle."""
+"""When the disturbance of ten opening gaps has passed all ten vehicles [s]: it takes up to 2.5 s, a time gap, per
+vehicle."""
 
 MOST_SEEDS = 5
-"""Noises at most: they hardly move a platoon, and each holds 12 MB of rows a setting."""
+"""Maximum number of noises: they hardly move a platoon, and each takes 12 MB of rows per setting."""
 
 _WHOLE_S = 46.0  # long enough for the strategist's first choices
 
@@ -85,7 +86,7 @@ class Platoon:
         )
 
     def _attenuates(self, i: int, name: str) -> ClaimRow:
-        """Does what the leader does die out toward the tail?"""
+        """Does the leader's motion die out toward the tail?"""
         speed = self.against_leader("speed", PASSED_S)[i]
         ratio = speed[:, -1] / speed[:, 0]
         interval = median_interval(ratio, self.seed)
@@ -144,7 +145,7 @@ def platoon(leaders: Leaders, *, seeds: int, seed: int, progress: Progress = lam
 
 
 def our_setting(ahead: Ahead, seed: int, progress: Progress) -> Setting:
-    """What the strategist has a single follower drive with soon after the change, (1,)."""
+    """The setting that the strategist gives a single follower soon after the change, (1,)."""
     found = supervise(ahead, "auto", seeds=1, seed=seed, duration=_WHOLE_S, progress=progress)
     actions = found.actions[0]
     return actions[-1].setting if actions else Setting(scenarios=1)

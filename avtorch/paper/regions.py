@@ -1,8 +1,8 @@
 """Stability regions in the plane and the box of the gains (paper, Figs. "timpact" and "taoimpact", Section 2.1).
 
-The print shows regions "as a function of control gain settings" without naming its axes, so the size of a region is
-taken here over all three gains: the share of the box k_s in (0, 3], k_v in [0, 6], k_a in [-6, 0] that is stable, local
-and string together. Four ways to draw one region:
+The paper shows regions "as a function of control gain settings" without naming its axes, so the size of a region is
+computed here over all three gains: the share of the box k_s in (0, 3], k_v in [0, 6], k_a in [-6, 0] that is stable,
+local and string together. A region is drawn in four ways:
 
 - `print`: Eqs. 2 and 3 over the bounds, as printed;
 - `rigorous`: every vehicle within the bounds meets them (`avtorch.vehicle.stability.conditions`);
@@ -60,7 +60,7 @@ CASES = (
 )
 
 _WIDER = Panel("$K_L$ in [0.4, 1]", (0.0, 0.1), 1.0, 0.1, WIDE_GAIN_BOUNDS)
-"""Against the first case: what the paper says of K_L in words."""
+"""Compared with the first case: the paper's claim about K_L."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ class Regions:
     """`k_v`, `k_a`: axes of the pictures' plane, at k_s = 1.5. `local`, `string`: masks by case and form, (k_a, k_v).
 
     `shares`: by case and form the share of the box of gains that is stable, (1,), for the posterior (seed,). `passed`,
-    `betrayed`: by case, how many gains of the box the print passes, and how many of them leave a vehicle of the bounds
-    string unstable. `wider`: shares by form with wider bounds of K_L.
+    `betrayed`: by case, how many gains of the box the printed conditions pass, and how many of those leave a vehicle of
+    the bounds string unstable. `wider`: shares by form with wider bounds of K_L.
 
     Example:
         >>> from avtorch.paper import Leaders, Regions, regions
@@ -154,7 +154,7 @@ class Regions:
 
 
 def regions(leaders: Leaders, *, seeds: int, seed: int, progress: Progress = lambda _: None) -> Regions:
-    """The four panels of the paper, four ways each; posteriors of `seeds` noises behind the sweep's first leader.
+    """The four panels of the paper, each in four ways; posteriors of `seeds` noises behind the sweep's first leader.
 
     Example:
         >>> from avtorch.paper import Leaders, regions

@@ -1,4 +1,4 @@
-"""All of the paper, or a part of it, from one call: what was found, by name, and the rows."""
+"""All of the paper, or a part of it, in one call: results by name, and the rows."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Example:
 
 
 class Experiment(Protocol):
-    """What an experiment leaves: its rows, and whatever its picture needs."""
+    """The result of an experiment: its rows, and the data for its picture."""
 
     @property
     def rows(self) -> list[ClaimRow]: ...
@@ -41,7 +41,7 @@ EXPERIMENTS: Mapping[str, Callable[..., Experiment]] = {
     "gains": gains,
     "platoon": platoon,
 }
-"""In the order of the paper: `(leaders, seeds=, seed=, progress=)` to what was found.
+"""Experiments in the order of the paper: `(leaders, seeds=, seed=, progress=)` to a result.
 
 Example:
     >>> from avtorch.paper import EXPERIMENTS
@@ -91,10 +91,11 @@ def reproduce(
     seed: int = 0,
     progress: Callable[[float, float], None] | None = None,
 ) -> Reproduction:
-    """Run the experiments `names` (default: all), each with `seeds` noises; equal to the bit by `seed`.
+    """Run the experiments `names` (default: all), each with `seeds` noises; results are equal bit for bit for equal
+    `seed`.
 
     `leaders`: default the embedded US06. `progress(done, of)`. Raises `InputError` for an unknown name, or fewer than
-    two seeds: an interval needs them.
+    two seeds, which an interval needs.
 
     Example:
         >>> from avtorch.paper import reproduce

@@ -1,14 +1,14 @@
-"""A row of the reproduction: what the paper says, what came out here, and a verdict by a rule that is stated once.
+"""A row of the reproduction: the paper's claim, our result, and a verdict by a rule that is stated once.
 
-Rules, in the order in which a figure meets them; an interval is the 90 % one:
+Rules, in order; an interval is the 90 % one:
 
 - `error`: the paper's one error against the median over runs. *better*: the interval of the median lies below it;
   *same*: the interval holds it; else *not reproduced*.
-- `sign`: the paper says a quantity lies above (or below) a value. *same*: so does the whole interval.
-- `share`: the paper says something happens. *same*: it does in at least 95 % of runs (or of whatever is counted).
-- `within`: the paper's word holds where the figure lies between two bounds. *same*: it does.
+- `sign`: the paper claims that a quantity lies above (or below) a value. *same*: so does the whole interval.
+- `share`: the paper claims that something happens. *same*: it does in at least 95 % of runs (or of the units counted).
+- `within`: the paper's claim holds where the figure lies between two bounds. *same*: it does.
 
-*better* is also said of a setting that does what the print's own, of the same strategy, fails to do (`strategies`).
+*better* also holds for a setting that achieves what the printed setting of the same strategy does not (`strategies`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from torch import Tensor
 Verdict = Literal["same", "better", "not reproduced"]
 
 MOST = 0.95
-"""A thing that the paper says happens must happen in this share of runs."""
+"""An event that the paper claims must happen in this share of runs."""
 
 _RESAMPLED = 1000
 
@@ -54,25 +54,25 @@ class ClaimRow:
 
 
 def error(paper: float, interval: tuple[float, float]) -> Verdict:
-    """See the module's text."""
+    """The rule `error`."""
     if interval[1] < paper:
         return "better"
     return "same" if interval[0] <= paper else "not reproduced"
 
 
 def sign(found: float | tuple[float, float], *, above: float | None = None, below: float | None = None) -> Verdict:
-    """See the module's text; `found` is an interval, or a number where nothing is random."""
+    """The rule `sign`; `found` is an interval, or a number where nothing is random."""
     low, high = found if isinstance(found, tuple) else (found, found)
     return "same" if (above is None or low > above) and (below is None or high < below) else "not reproduced"
 
 
 def share(value: float, least: float = MOST) -> Verdict:
-    """See the module's text."""
+    """The rule `share`."""
     return "same" if value >= least - 1e-9 else "not reproduced"
 
 
 def within(value: float, low: float, high: float) -> Verdict:
-    """See the module's text."""
+    """The rule `within`."""
     return "same" if low <= value <= high else "not reproduced"
 
 
@@ -82,7 +82,7 @@ def middle(values: Tensor, dim: int = -1) -> Tensor:
 
 
 def spread(values: Tensor) -> tuple[float, float]:
-    """Where the middle 90 % of the runs lie, `values` (run,)."""
+    """The central 90 % of the runs, `values` (run,)."""
     low, high = torch.quantile(values.double(), torch.tensor([0.05, 0.95], dtype=torch.float64)).tolist()
     return low, high
 
@@ -90,7 +90,7 @@ def spread(values: Tensor) -> tuple[float, float]:
 def resampled(runs: int, seed: int, times: int = _RESAMPLED) -> Tensor:
     """Runs drawn with replacement, (times, run): the bootstrap behind every interval of a median or share.
 
-    Whole runs are drawn, for what happens within one shares its noise.
+    Whole runs are drawn, because everything within a run shares its noise.
     """
     return torch.randint(runs, (times, runs), generator=torch.Generator().manual_seed(seed))
 

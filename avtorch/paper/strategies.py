@@ -2,9 +2,9 @@
 
 The paper changes the vehicle at 26 s and the setting at 28 s: the lower level to its estimates (Strategy 1), with it
 the time gap to 2 s (2) or the gains to [3, 3, -1.8] (3), and shows accelerations and speeds that "regain stability".
-What it means to update the lower level it does not say; here the lower level inverts its model (SPEC section 1), and
-Strategies 2 and 3 are shown without that update as well. The strategist (`avtorch.decision`) acts on its own belief,
-restricted to Strategy 1, 1 and 2, 1 and 3, and with all three.
+The paper does not define the update of the lower level; here the lower level inverts its model (SPEC section 1), and
+Strategies 2 and 3 are also shown without that update. The strategist (`avtorch.decision`) acts on its own belief,
+restricted to Strategy 1, to 1 and 2, and to 1 and 3, and with all three.
 
 *Calmer* is measured against the same drive without action, under the same noise, from the action on, and once more from
 45 s on, when even a time gap of 2.5 s has been reached: opening a gap is a disturbance of its own. *String stable* is
@@ -46,10 +46,10 @@ from avtorch.vehicle import ClosedLoop, GLVDPlant
 from avtorch.vehicle.block import Block
 
 SETTLED_S = 45.0
-"""When every time gap on offer has been reached [s]: 28 s and 1.5 s at 0.1 s/s, and two seconds more."""
+"""Time at which every offered time gap has been reached [s]: 28 s, 15 s for 1.5 s at 0.1 s/s, and two seconds more."""
 
 UNITY = 1.001
-"""A peak gain up to this is string stable; what is above one is rounding."""
+"""A peak gain up to this is string stable; the excess over one is rounding."""
 
 AS_BUILT = "no action"
 
@@ -81,7 +81,7 @@ class Driven:
     sufficient: Tensor | None = None
     """Whether the strategist called its last choice sufficient, (seed,); None for printed settings."""
     actions: int = 1
-    """Most actions in a run."""
+    """Maximum number of actions in a run."""
 
 
 @dataclass(frozen=True)

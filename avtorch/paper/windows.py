@@ -18,7 +18,7 @@ FOR_PRIOR, MORE = 3, 7
 def ten_windows(
     leader: Leader, T_L: Tensor, K_L: Tensor, *, seed: int, progress: Progress
 ) -> tuple[list[Window], list[Tensor]]:
-    """Vehicles T_L [s], K_L [-] (run,) behind `leader`, each with noise of its own and believed on its own.
+    """Vehicles T_L [s], K_L [-] (run,) behind `leader`, each with its own noise and its own belief.
 
     The nominal controller drives, its demand passed through. Returns the ten windows and, of each, the RMS of the
     command (run,) [m/s²].

@@ -1,4 +1,4 @@
-"""The picture of a calibration: are the truths where posteriors said that they would be?"""
+"""The picture of a calibration: do posteriors cover the truths as often as stated?"""
 
 from __future__ import annotations
 

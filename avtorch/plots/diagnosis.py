@@ -1,4 +1,4 @@
-"""Drawings of a diagnosis: the gap on the road, where it lies, which cause, how far it shrinks, what the loop does."""
+"""Drawings of a diagnosis: the gap over time, where it lies, its cause, how far it shrinks, the loop's stability."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from avtorch.io.clock import time_label
 from avtorch.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILLION, styled
 from avtorch.vehicle.stability import Chain, chain_gain
 
-_SECONDS = 25.0  # of a drive that a picture holds
+_SECONDS = 25.0  # seconds of a drive in a picture
 _NAMES = {"accel": "acceleration [m/s²]", "speed": "speed [m/s]"}
 
 
@@ -30,7 +30,7 @@ def gap_on_the_road(ax: Axes, found: Diagnosis, *, seconds: float = _SECONDS) ->
         raise InputError("traces: the diagnosis has none to draw")
     errors = [(traces.measured - x).std(-1) for x in (traces.before, traces.after)]
     shows = errors[0] / np.maximum(errors[1], 1e-12)
-    # an acceleration shows what happens when it happens
+    # unlike the speed, the acceleration shows an event at its own time
     k = 0 if shows[0] > 1.1 else int(np.argmax(shows))
     inside = _liveliest(traces.time, traces.stretch, np.abs(traces.before[k] - traces.after[k]), seconds)
     time = traces.time[inside]
@@ -69,7 +69,8 @@ def _liveliest(time: FloatArray, stretch: IntArray, size: FloatArray, seconds: f
 
 
 def where_it_lies(ax: Axes, found: Diagnosis, axis: Axis) -> Axes:
-    """Along `axis` (time, speed or command): the share of rows, and the share of what the effect does; named parts.
+    """Along `axis` (time, speed or command): the share of rows, the share of the effect's response, and the named
+    parts.
 
     Raises `InputError` where there are no traces or the log has no such signal.
     """
@@ -98,7 +99,7 @@ def where_it_lies(ax: Axes, found: Diagnosis, axis: Axis) -> Axes:
 
 
 def probabilities(ax: Axes, found: Diagnosis, *, most: int = 7) -> Axes:
-    """A bar a candidate, the most probable first; the alias set in blue, the rest in grey."""
+    """One bar per candidate, the most probable first; the alias set in blue, the rest in grey."""
     some = list(found.candidates[:most])[::-1]
     colours = [BLUE if c.name in found.verdict.alias_set else "#BBBBBB" for c in some]
     ax.barh(range(len(some)), [c.probability for c in some], color=colours, height=0.7)
@@ -166,7 +167,7 @@ def loop_gain(ax: Axes, chains: Mapping[str, tuple[Chain, dict]], *, colours: Ma
 
 @styled
 def road_figure(found: Diagnosis) -> Figure:
-    """The one picture that shows the gap."""
+    """The picture of the gap over time."""
     figure = Figure(figsize=(8.6, 3.3), layout="constrained")
     gap_on_the_road(figure.add_subplot(), found)
     return figure
@@ -174,7 +175,7 @@ def road_figure(found: Diagnosis) -> Figure:
 
 @styled
 def where_figure(found: Diagnosis) -> Figure:
-    """Where it lies, along every axis that the log has."""
+    """Where the gap lies, along every axis that the log has."""
     axes: list[Axis] = ["time", "command"]
     if found.traces is not None and found.traces.speed is not None:
         axes.insert(1, "speed")

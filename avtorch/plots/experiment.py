@@ -10,7 +10,7 @@ from avtorch.plots.style import BLUE, GREY, ORANGE, styled
 
 
 def commands(ax: Axes, m: Manoeuvre) -> Axes:
-    """What to command over time, as it is held."""
+    """The command over time, held between rows."""
     ax.axhline(0.0, color=GREY, lw=0.6)
     ax.step(m.time, m.command, where="post", color=BLUE)
     ax.set(ylabel="command [m/s²]")

@@ -54,7 +54,7 @@ def belief_figure(
 ) -> Figure:
     """Posterior bands of T_L and K_L over time; with a `log`, the quality of its rows below them.
 
-    Times are drawn from the log's start, which the answer's `epoch_s` or the `log` tells.
+    Times are drawn from the log's start, given by the answer's `epoch_s` or the `log`.
 
     Example:
         >>> from avtorch import Leader, estimate, simulate
@@ -83,7 +83,7 @@ def belief_figure(
 
 @styled
 def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = None, target: float = 0.95) -> Figure:
-    """P(string stable) over time, with alerts and actions; each action says what it set.
+    """P(string stable) over time, with alerts and actions; each action is labelled with the setting it chose.
 
     Example:
         >>> from avtorch import Leader, estimate, simulate
@@ -200,7 +200,7 @@ def stability_figure(
     """A stability region with one setting in it, beside that setting's gain over frequency.
 
     `omega` [rad/s] and `gain` [-] are (frequency,), `peak` the two at the peak. `stable`: the setting is
-    locally stable; where it is not the gain is only formal, and the picture says so.
+    locally stable; where it is not, the gain is only formal, and the picture is labelled so.
 
     Example:
         >>> import torch
@@ -226,13 +226,13 @@ def stability_figure(
 
 
 def _from_start(answer: Mapping[str, Any] | None, epoch_s: float) -> dict[str, Any]:
-    """An answer whose windows, alerts and actions are counted from the log's start."""
+    """An answer with the times of windows, alerts and actions from the log's start."""
     lists = ("windows", "alerts", "actions")
     return {k: from_start(v, epoch_s) if k in lists and v else v for k, v in (answer or {}).items()}
 
 
 def _events_of(ax: Axes, answer: Mapping[str, Any]) -> Axes:
-    """Mark an answer's events; of a detector's alarm that goes on over many windows only the first and those acted
+    """Mark an answer's events. Of an alarm that continues over many windows, mark only the first and those acted
     upon."""
     windows = answer.get("windows") or []
     went_on = {(b["end_s"], name) for a, b in pairwise(windows) for name in set(a["alerts"]) & set(b["alerts"])}

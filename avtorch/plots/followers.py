@@ -30,9 +30,9 @@ def parameter_of_each(ax: Axes, cars: Sequence[FollowerDiagnosis], name: str) ->
 
 
 def peak_gain_of_each(ax: Axes, cars: Sequence[FollowerDiagnosis], *, most: float = 4.0) -> Axes:
-    """Peak gain at the median speed, a row a car; above 1 what the leader does grows from car to car.
+    """Peak gain at the median speed, a row a car; above 1 the leader's motion grows from car to car.
 
-    Rows of cars whose loop may not be stable at all are left empty; what is beyond `most` is cut off.
+    Rows of cars whose loop may be unstable are left empty; gains above `most` are cut off.
     """
     rows = np.arange(len(cars))[::-1]
     for row, car in zip(rows, cars, strict=True):

@@ -1,4 +1,4 @@
-"""Drawings of what a longer time gap buys and costs."""
+"""Drawings of the benefits and costs of a longer time gap."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _COLOURS = (VERMILLION, BLUE, GREEN, ORANGE, BLACK)
 
 
 def gap_probability(ax: Axes, curves: Mapping[str, GapTradeOff], *, required: float = 0.95) -> Axes:
-    """P(string stable) over the time gap, a line a curve, by name; grey where a setting must get to.
+    """P(string stable) over the time gap, one line per curve, by name; the required level in grey.
 
     Example:
         >>> import torch

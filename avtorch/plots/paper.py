@@ -1,4 +1,4 @@
-"""Drawings of the paper's experiments run anew. Each takes an axes and returns it."""
+"""Drawings of the paper's experiments, rerun. Each takes an axes and returns it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def tracked(ax: Axes, truth: ArrayLike, mean: ArrayLike, low: ArrayLike, high: A
 
 
 def error_growth(ax: Axes, x: ArrayLike, errors: Mapping[str, ArrayLike], *, along: str, of: str) -> Axes:
-    """Absolute errors (setting, run) over what was swept, log against log: median, and the middle 90 % of the runs."""
+    """Absolute errors (setting, run) over the swept parameter, log-log: median, and the central 90 % of the runs."""
     x = np.asarray(x, dtype=float)
     for (name, values), (colour, marker) in zip(errors.items(), _LINES, strict=False):
         v = np.maximum(np.asarray(values, dtype=float), 1e-9)
@@ -79,7 +79,7 @@ def setting_gains(ax: Axes, omega: ArrayLike, curves: Mapping[str, ArrayLike]) -
 
 
 def gain_effects(ax: Axes, factors: Sequence[float], measured: Mapping[str, ArrayLike], *, gain: str) -> Axes:
-    """What a gain does: measures (factor,) relative to those with the default gain."""
+    """Effect of a gain: measures (factor,) relative to those with the default gain."""
     for (name, values), (colour, marker) in zip(measured.items(), _LINES, strict=False):
         v = np.asarray(values, dtype=float)
         ax.plot(np.asarray(factors), v / v[0], color=colour, marker=marker, markersize=4, label=name)
@@ -91,7 +91,7 @@ def gain_effects(ax: Axes, factors: Sequence[float], measured: Mapping[str, Arra
 def platoon_speeds(ax: Axes, time: ArrayLike, leader: ArrayLike, speeds: ArrayLike, *, hit_s: float | None) -> Axes:
     """Speeds of a platoon (vehicle, time), pale at the head and dark at the tail, behind the leader's (time,).
 
-    `hit_s`: of the first collision [s]; what follows it is shaded.
+    `hit_s`: time of the first collision [s]; the time after it is shaded.
     """
     time, speeds = np.asarray(time), np.asarray(speeds)
     shades = mpl.colormaps["viridis_r"](np.linspace(0.1, 0.95, len(speeds)))

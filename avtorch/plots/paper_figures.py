@@ -108,7 +108,7 @@ def regions_figure(found: Regions) -> Figure:
 
 @styled
 def estimation_figure(found: Estimation) -> Figure:
-    """Estimates over both sweeps behind every leader, and how the error goes along them."""
+    """Estimates over both sweeps behind every leader, and the error along them."""
     count = len(found.sweeps)
     figure = Figure(figsize=(11, 3.4 * count + 3.6), layout="constrained")
     grid = figure.add_gridspec(count + 1, 6)
@@ -175,7 +175,7 @@ def strategy_figure(found: Strategies, quantity: str) -> Figure:
 
 @styled
 def strategy_verdict_figure(found: Strategies) -> Figure:
-    """What the print lacks: |G(jω)| at the true vehicle under every setting (ours: the first run's last)."""
+    """Not in the paper: |G(jω)| at the true vehicle under every setting (ours: the first run's last)."""
     figure = Figure(figsize=(11, 4.4), layout="constrained")
     axes = figure.subplots(1, len(_PANELS), sharey=True)
     omega = torch.logspace(-2, 1.3, 300, dtype=torch.float64)
@@ -211,7 +211,7 @@ def gains_figure(found: Gains) -> Figure:
 
 @styled
 def platoon_figure(found: Platoon) -> Figure:
-    """Speeds of the first run's platoons, and how RMS speed and acceleration go from vehicle to vehicle."""
+    """Speeds of the first run's platoons, and RMS speed and acceleration from vehicle to vehicle."""
     shown = [i for i, name in enumerate(found.names) if not name.endswith("with the lower level")]
     figure = Figure(figsize=(11, 2.2 * len(shown) + 3.8), layout="constrained")
     grid = figure.add_gridspec(len(shown) + 1, 2, height_ratios=[1.0] * len(shown) + [1.5])

@@ -50,7 +50,7 @@ def verdict_map(
             ax.contour(x, y, mask.astype(float), levels=[0.5], colors=BLACK, linewidths=1.1, linestyles=style)
     if peak is not None:
         gain = np.asarray(peak, dtype=float)
-        # inf beyond the stable part would end the contours a cell early
+        # inf outside the stable part would end the contours one cell early
         gain = np.where(np.isfinite(gain), gain, np.nan)
         levels = (
             [level for level in (1.1, 1.25, 1.5, 2.0, 3.0) if np.nanmin(gain) < level < np.nanmax(gain)]
@@ -98,7 +98,7 @@ def setting_region(
     truth: tuple[float, float] | None = None,
     points: int = 401,
 ) -> Axes:
-    """Which vehicles `(T_L, K_L)` a setting, as an answer holds it, keeps string stable.
+    """The vehicles `(T_L, K_L)` that a setting, in the form of an answer, keeps string stable.
 
     The lower level's inversion is taken into account: the verdict on a vehicle is that on its effective lag and gain.
     `clouds`: draws `(T_L, K_L)` of the belief, by the name of the moment; the last one is drawn strongest.

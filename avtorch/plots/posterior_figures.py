@@ -1,4 +1,4 @@
-"""The pictures of a validation: SGLD held against quadrature and NUTS, window by window and all together."""
+"""The pictures of a validation: SGLD compared with quadrature and NUTS, window by window and all together."""
 
 from __future__ import annotations
 
@@ -234,7 +234,7 @@ def _grouped(chains: Tensor, groups: int) -> dict[str, np.ndarray]:
 
 
 def _ess(value: Tensor) -> float:
-    """An effective sample size to count with: chains that stand still have none."""
+    """An effective sample size as a number: chains that stand still have none."""
     return max(4.0, float(value)) if bool(value.isfinite()) else 4.0
 
 

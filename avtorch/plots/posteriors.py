@@ -1,7 +1,7 @@
-"""Drawings of posteriors beside their references. Each takes an axes and returns it.
+"""Drawings of posteriors and their references. Each takes an axes and returns it.
 
-One look a method everywhere: grey and filled is exact (quadrature), blue is avtorch's SGLD, vermillion and dashed NUTS,
-black the truth.
+Each method has one style everywhere: grey and filled is exact (quadrature), blue is avtorch's SGLD, vermillion and
+dashed NUTS, black the truth.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def marginals(
         found = np.asarray(draws, dtype=float).ravel()
         finite = found[np.isfinite(found)]
         if len(finite):
-            # Scott's rule with the exact SD, so that the bins do not hide a width that is wrong
+            # Scott's rule with the exact SD, so that the bins do not hide a wrong width
             edges = _edges(finite, 3.5 * (sd if sd > 0 else finite.std()) * len(finite) ** (-1 / 3))
             height = np.histogram(finite, edges)[0] / (len(found) * np.diff(edges))
             ax.stairs(height, edges, label=label, zorder=3 if label == "SGLD" else 3.1, **look)
@@ -135,7 +135,7 @@ def joint_cloud(
     where the two agree.
 
     Args:
-        posterior: what is judged, drawn as points.
+        posterior: the posterior under test, drawn as points.
         references: draws for the contours and which of their windows, by method: ``"exact"``, ``"NUTS"``.
         shown: points drawn at most, evenly taken.
 
@@ -192,7 +192,7 @@ def agreement_scatter(
     settled: ArrayLike | None = None,
     reach: float | None = None,
 ) -> Axes:
-    """How far each window's posterior is from the exact one, over how wide that is, with the limits asked for.
+    """Distance of each window's posterior from the exact one over the latter's width, with the required limits.
 
     The share of windows inside the limits is written as the title; windows beyond the axis are triangles on its edge.
 
@@ -222,7 +222,7 @@ def agreement_scatter(
     within = (y >= limits[0]) & (y <= limits[1])
     beyond = ~(np.abs(y - middle) <= reach)
     sound = np.ones(len(y), bool) if settled is None else np.asarray(settled, bool)
-    # a value that is no number is drawn at the top
+    # NaN is drawn at the top
     edge = np.where(y < middle, middle - 0.95 * reach, middle + 0.95 * reach)
     at = np.where(beyond, edge, y)
     kinds = [
@@ -282,7 +282,7 @@ def _pair(posterior: Posterior, names: tuple[str, str], window: int) -> np.ndarr
 def _regions(draws: np.ndarray) -> tuple[gaussian_kde, tuple[float, float]]:
     """A smooth density of draws ``(draw, 2)``, and its heights around 50 and 90 % of them."""
     kernel = gaussian_kde(draws.T)
-    # left out one by one: a draw under its own kernel looks too likely
+    # leave one out: under its own kernel a draw's density would be too high
     own = 1 / (2 * np.pi * np.sqrt(np.linalg.det(kernel.covariance)))
     others = (len(draws) * kernel(draws.T) - own) / (len(draws) - 1)
     fifty, ninety = np.quantile(others, [0.5, 0.1])

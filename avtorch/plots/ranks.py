@@ -1,7 +1,7 @@
 """Drawings of ranks: is one set of draws spread over another as it should be? Each takes an axes and returns it.
 
 The bands hold all of their bars, or the whole curve, at once with the probability written: a picture is off if anything
-in it leaves the band. Correlated draws count as many as they are worth, by their effective sample size.
+in it leaves the band. Correlated draws count by their effective sample size.
 """
 
 from __future__ import annotations

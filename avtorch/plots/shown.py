@@ -1,4 +1,4 @@
-"""Which windows of a validation are shown one by one, and what is known of them."""
+"""The windows of a validation that are drawn one by one, and their data."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EXACT = 4000
 
 @dataclass(frozen=True)
 class ShownWindow:
-    """A window shown one by one: its number, its place among those NUTS was run on, what it stands for."""
+    """A window drawn individually: its number, its place among those NUTS was run on, what it represents."""
 
     number: int
     nuts: int | None
@@ -25,7 +25,7 @@ class ShownWindow:
 
 
 class ChosenWindows:
-    """The windows shown one by one: with the widest, a middling and the narrowest posterior of the lag.
+    """The windows drawn individually: with the widest, a median and the narrowest posterior of the lag.
 
     They are of those NUTS was run on, if there are any, and settled, if any did.
     """
@@ -50,7 +50,7 @@ class ChosenWindows:
 
     @cached_property
     def exact(self) -> Posterior | None:
-        """Independent draws of the joint posterior of the windows shown, in their order."""
+        """Independent draws of the joint posterior of the selected windows, in their order."""
         index = torch.tensor([w.number for w in self.windows])
         return self.validation.quadrature_draws(index, chains=1, draws=EXACT)
 

@@ -1,4 +1,4 @@
-"""What each effect does to one and the same command: its signature, with and without it."""
+"""The signature of each effect: the response to one standard command, with and without it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def standard_command() -> tuple[Tensor, Tensor]:
 def standard_response(effect: Effect | None, *, seed: int = _SEED) -> Response:
     """Response of GLVD (0.3 s, 1), with `effect` if one is given, to the standard command; random ones are drawn.
 
-    The speed that an effect looks at is that of the very response, found by repeating.
+    An effect that depends on speed gets the speed of this response, found by iteration.
     """
     time, command = standard_command()
     first = (Effect if effect is None else effect).pictured
@@ -84,7 +84,7 @@ def effect_signature(ax: Axes, effect: Effect, *, seed: int = _SEED) -> Axes:
 
 
 def _typical(kind: type[Effect]) -> Effect:
-    """At its typical strength; one with an onset of its own within the picture."""
+    """The effect at its typical strength; one with its own onset starts within the picture."""
     effect = kind()
     return effect if kind.own_onset is None else effect.replaced({kind.own_onset: _ONSET_S})
 

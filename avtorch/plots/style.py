@@ -1,7 +1,7 @@
-"""The look of every picture, and how one is saved or shown.
+"""The style of every picture, and how one is saved or displayed.
 
-One palette (Okabe and Ito's, safe for colour-blind readers) and one meaning a colour: blue is what avtorch believes or
-did, vermillion what happens without it, black is the truth, green an action, orange an alert.
+One palette (Okabe and Ito's, safe for colour-blind readers) and one meaning a colour: blue is avtorch's belief or
+action, vermillion is the run without it, black is the truth, green an action, orange an alert.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ STYLE: Any = {
     "ytick.labelcolor": BLACK,
     "hatch.linewidth": 0.6,
 }
-"""The look of all pictures, as matplotlib's rcParams.
+"""The style of all pictures, as matplotlib's rcParams.
 
 Example:
     >>> import matplotlib
@@ -97,7 +97,7 @@ def short(name: str) -> str:
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Let a figure be made in the house's style without touching the caller's."""
+    """Make a figure in this style without changing the caller's."""
 
     @wraps(draw)
     def inner(*args: P.args, **kwargs: P.kwargs) -> Figure:
@@ -123,7 +123,7 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
 
 
 def show(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Show a figure where one looks: below the cell in a notebook; elsewhere it is saved at `path`, which is printed.
+    """Display a figure below the cell in a notebook; elsewhere save it at `path` and print the path.
 
     Raises `InputError` where the file cannot be written.
 
@@ -134,7 +134,7 @@ def show(figure: Figure, path: str | os.PathLike[str]) -> None:
         picture: empty.png
     """
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    # the shell of a terminal has no kernel, and no pictures
+    # the shell of a terminal has no kernel and shows no pictures
     if shell is None or not hasattr(shell, "kernel"):
         print(f"picture: {save(figure, path)}")
         return

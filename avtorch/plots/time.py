@@ -20,7 +20,7 @@ _TRACES = {
 }
 
 Windows = Sequence[Mapping[str, Any]]
-"""Windows as an answer holds them: `start_s`, `end_s`, `excited`, `used`, `T_L`, `K_L`, `p_string_stable`, ..."""
+"""Windows in the form of an answer: `start_s`, `end_s`, `excited`, `used`, `T_L`, `K_L`, `p_string_stable`, ..."""
 
 Steps = Sequence[tuple[float, float]]
 """A quantity that jumps: `(from this time on [s], value)`."""
@@ -59,7 +59,7 @@ def belief_band(
 ) -> Axes:
     """The belief about one parameter: 90 % interval and mean of each window, paler where the window was not used.
 
-    `truth`: what it really was. `bounds`: the design bounds that the controller was built for.
+    `truth`: the true value. `bounds`: the design bounds that the controller was built for.
 
     Example:
         >>> from matplotlib.figure import Figure
@@ -142,7 +142,7 @@ def events(
         >>> len(ax.lines)
         2
     """
-    # an action follows its alert at once: the broad pale line leaves the thin one on top of it to be seen
+    # an action follows its alert at once: its line is broad and pale so that the thin alert on top stays visible
     for i, time in enumerate(sorted({a["time_s"] for a in alerts})):
         ax.axvline(time, color=ORANGE, alpha=0.45, linewidth=5, zorder=1.7, label="alert" if label and i == 0 else None)
     for i, action in enumerate(actions):

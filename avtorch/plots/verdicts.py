@@ -1,4 +1,4 @@
-"""Drawings of verdicts: what was the cause, and what was said of it."""
+"""Drawings of verdicts: true causes against the answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""What to do about a gap once its cause is known: which setting the car needs, its plant in other tools' terms."""
+"""What to do about a gap once its cause is known: the setting that the car needs, and its plant in other tools'
+terms."""
 
 from avtorch.remedy.exports import Exported, to_autoware, to_openpilot, write_exports
 from avtorch.remedy.linearised import linearised

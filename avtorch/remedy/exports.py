@@ -1,4 +1,4 @@
-"""The repaired plant in the terms of other tools, as far as these have a word for it.
+"""The repaired plant in the parameters of other tools, as far as these can express it.
 
 - Autoware's planning simulator (`simple_planning_simulator`, model `DELAY_STEER_ACC_GEARED_WO_FALL_GUARD` and its
   kin): `acc_time_delay` [s], `acc_time_constant` [s], `vel_rate_lim` [m/s²], `acc_scaling_factor` of the debug model
@@ -18,7 +18,8 @@ from avtorch.io import answer_set, atomic
 
 @dataclass(frozen=True)
 class Exported:
-    """`values` by the tool's own names; `lost`: what the plant has and the tool cannot say, one sentence each.
+    """`values` by the tool's own names; `lost`: properties of the plant that the tool cannot express, one sentence
+    each.
 
     Example:
         >>> from avtorch.gap import plant
@@ -33,7 +34,7 @@ class Exported:
     lost: tuple[str, ...]
 
     def to_text(self) -> str:
-        """YAML lines, with what is lost as comments."""
+        """YAML lines, with the lost properties as comments."""
         lines = [f"# {self.tool}", *(f"# not expressed: {text}" for text in self.lost)]
         return "\n".join([*lines, *(f"{name}: {value:.6g}" for name, value in self.values.items())]) + "\n"
 
@@ -98,7 +99,7 @@ def write_exports(plant: GapPlant | None, folder: str | PathLike[str]) -> list[P
 
 
 def _delay(plant: GapPlant) -> float:
-    """By which all effects together make commands late [s]."""
+    """Total delay [s] that all effects add to the command."""
     return sum((float(getattr(e, e.shift)) for e in plant.effects if e.shift is not None), 0.0)
 
 

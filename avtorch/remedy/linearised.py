@@ -1,8 +1,8 @@
 """A plant for small motions about a speed: its response to a step, as a function of frequency.
 
-The plant itself is asked, so any effect will do, also one of the user's. A step of the command shows `P` and what the
-sensor makes of it; a little more and a little less speed show how much the acceleration falls with it. What is not
-linear (a dead band, play, a limit) answers as it does to a step of that size.
+The responses come from simulating the plant, so any effect works, including a user's own. A step of the command gives
+`P` and the sensor's reading of it; runs at slightly higher and lower speed give the drop of acceleration with speed. A
+nonlinearity (a dead band, play, a limit) is represented by its response to a step of that size.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def linearised(
         >>> verdict.string_stable.tolist(), verdict.peak_gain.round(decimals=2).tolist()
         ([False], [1.75])
     """
-    # a road is a place, no property of the car
+    # the road is not a property of the car
     own = [e for e in plant.effects if not e.random and not isinstance(e, Integrated)]
     car = GapPlant(own, T_L=plant.T_L, K_L=plant.K_L, sigma=0.0)
     given = {k: v for k, v in (belief or {}).items() if k in car.parameters()}
@@ -56,7 +56,7 @@ def linearised(
 
     rests, moves = answer(torch.zeros_like(command), speed), answer(command, speed)
     omega = frequencies(most=100.0)
-    # from sample to sample the response runs straight: a rate that is constant, whose transform is exact
+    # linear between samples: the rate is piecewise constant, and its transform exact
     middle = _DT * (torch.arange(len(time) - begin, dtype=torch.float64) + 0.5) - _DT
     half = 0.5 * omega * _DT
     turn = torch.exp(-1j * middle[:, None] * omega) * (torch.sin(half) / half)

@@ -1,9 +1,9 @@
-"""Is the car string stable as it really is, and which setting makes it so with the least intrusion?
+"""Is the repaired plant string stable, and which setting makes it so with the least intrusion?
 
-The repaired plant is judged whole, with its dead time, second pole or late sensor in the loop, at slow, usual and quick
-speeds and for driving and braking; a draw of its parameters counts as stable where all of these are. Settings and what
-they cost are the strategist's (`avtorch.decision.grid`), with calmer gains besides; a setting that would have more than
-one in twenty of the log's commands clipped is none.
+The complete repaired plant, with its dead time, second pole or late sensor, is evaluated in the loop at slow, usual and
+quick speeds and for driving and braking; a draw of its parameters counts as stable where it is stable in all of these.
+Settings and their costs are the strategist's (`avtorch.decision.grid`), with calmer gains added. A setting that would
+have clipped more than one in twenty of the log's commands is excluded.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from avtorch.remedy.linearised import linearised
 from avtorch.vehicle.stability import Chain, chain_verdict
 
 SOFTER: tuple[tuple[float, float, float], ...] = tuple(product((0.1, 0.2, 0.4, 0.8), (0.4, 0.7, 1.0), (-0.8, -0.2)))
-"""Gains on offer besides the strategist's: a loop with dead time in it needs calmer ones, and a longer gap."""
+"""Gains on offer besides the strategist's: a loop with dead time needs calmer gains and a longer gap."""
 SPEEDS_MPS = (5.0, 15.0, 30.0)
 STEP_MPS2 = 0.5
-_BLOCK = 32  # settings judged at a time
+_BLOCK = 32  # settings evaluated at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ def what_to_set(
     now = Setting(scenarios=1) if in_force is None else in_force
     chains = _chains(plant, draws, speeds)
     T, K = (draws[name].mean().reshape(1) for name in ("T_L", "K_L"))
-    # a model no further off than the paper accepts is none that is known to be wrong
+    # a model within the paper's accepted change is not known to be wrong
     stale = ((T - now.T_hat).abs() > ACCEPTED_CHANGE[0]) | ((K - now.K_hat).abs() > ACCEPTED_CHANGE[1])
     offers = (Grid(gains=(*GAINS_GRID, *SOFTER)) if grid is None else grid).candidates(
         T, K, current=now, default=now, model_wrong=stale
@@ -206,7 +206,7 @@ def setting_for(
 
 
 def _chains(plant: GapPlant, draws: Mapping[str, Tensor], speeds: Sequence[float]) -> list[Chain]:
-    """At every speed; driving and braking apart where the plant answers them otherwise."""
+    """Chains at every speed; driving and braking separately where the plant responds differently to them."""
     bends = any(e.one_sided for e in plant.effects)
     at = speeds if any(e.needs_speed for e in plant.effects) else speeds[:1]
     steps = (STEP_MPS2, -STEP_MPS2) if bends else (STEP_MPS2,)
@@ -242,14 +242,14 @@ def _told(peak: Tensor) -> tuple[float, float, float]:
 
 
 def _lower(settings: Setting) -> tuple[Tensor, Tensor]:
-    """What the lower level sends for a unit of sensed acceleration, and of demanded."""
+    """The lower level's command per unit of sensed and of demanded acceleration."""
     zero, one = torch.zeros_like(settings.T_hat), torch.ones_like(settings.T_hat)
     lower = settings.lower_level(accel_min=-1e9, accel_max=1e9)
     return lower.raw_command(one, zero), lower.raw_command(zero, one)
 
 
 def _clipped(settings: Setting, commands: FloatArray, low: float, high: float) -> list[float]:
-    """Share of the log's commands that each setting would have clipped, as much larger as its inversion makes them."""
+    """Share of the log's commands that each setting would have clipped, scaled by its inversion."""
     if not len(commands):
         return [0.0] * len(settings.T_hat)
     sizes = settings.amplification().numpy()[:, None] * commands

@@ -1,4 +1,5 @@
-"""A self-contained page: words, tables and pictures of a diagnosis. Nothing is fetched, all from the log is escaped."""
+"""A self-contained page: text, tables and pictures of a diagnosis. It loads nothing, and all text from the log is
+escaped."""
 
 from __future__ import annotations
 
@@ -50,8 +51,8 @@ def report_html(
 ) -> str:
     """The page as text.
 
-    `quality`: what was noted of the data when it was read, a line each. `experiment`: what to drive next, for a picture
-    of it. `sections`: what else there is to say after the verdict, lines by title.
+    `quality`: notes from reading the data, one line each. `experiment`: what to drive next, for its picture.
+    `sections`: further lines after the verdict, by title.
 
     Example:
         >>> from avtorch import Leader, diagnose, simulate
@@ -136,7 +137,7 @@ def _pictures(found: Diagnosis, experiment: Experiment | None) -> dict[str, Mark
 
 
 def _svg(name: str, figure: Figure) -> Markup:
-    """Inline: text as text, no date, the same for the same figure, its ids its own on the page."""
+    """An inline SVG: text as text, no date, equal for equal figures, with ids that are unique on the page."""
     stream = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "avtorch"}):
         figure.savefig(stream, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))

@@ -1,4 +1,4 @@
-"""Those who can be asked, by name."""
+"""Methods that can answer, by name."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ RIVALS: dict[str, Answerer] = {
     "black_box": black_box,
     "random_guess": random_guess,
 }
-"""The competitors.
+"""The rival methods.
 
 Example:
     >>> from avtorch.trial import RIVALS
@@ -42,7 +42,7 @@ Example:
 
 
 def rivals(names: str | Sequence[str] = "all") -> dict[str, Answerer]:
-    """Competitors by name: `"all"` that are installed, `"none"`, or those named; the random guess is always among them.
+    """Rivals by name: `"all"` that are installed, `"none"`, or those named; the random guess is always included.
 
     Raises `InputError` for an unknown name, and for one that is named and not installed.
 

@@ -1,8 +1,8 @@
 """The folder of a trial: its settings, the truths apart from the answers, and one small file per answer.
 
 `trial.json`, `truth/case_00012.json`, `answers/NAME/case_00012.json`, and if they are kept `logs/case_00012.csv`. Every
-file appears whole or not at all, so whatever is there after an interruption counts. Each JSON file is sealed and says
-which trial, case and answerer it is of: one that was damaged, or moved to another's place, is not believed.
+file appears whole or not at all, so every file that an interruption leaves is valid. Each JSON file is sealed and names
+its trial, case and answerer: a file that was damaged, or moved to another's place, is rejected.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ _ANSWER_AGAIN = "remove it to have the case answered again, or use another folde
 
 
 class TrialFolder:
-    """Paths and files of a trial kept in `root`; `settle` comes first, as the files belong to its settings."""
+    """Paths and files of a trial kept in `root`; call `settle` first, as the files belong to its settings."""
 
     def __init__(self, root: Path, settings: Mapping[str, Any] | None = None) -> None:
         self.root = root
         self._trial = None if settings is None else fingerprint(settings)
 
     def settle(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Remember the settings, or hold them against those that are there; returns them as JSON has them.
+        """Store the settings, or compare them with the stored ones; returns them as read from JSON.
 
         Raises `InputError` where the folder is of another trial, naming what differs, or cannot be read.
         """
@@ -68,10 +68,10 @@ class TrialFolder:
         return self.root / "answers" / answerer / f"{case_name(index)}.json"
 
     def missing(self, index: int, answerers: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Those who have not answered the case, and a sentence on each answer that was, but is damaged.
+        """The methods without an answer to the case, and a sentence on each damaged answer.
 
-        All of them are missing where the truth is not there. Raises `InputError` for a truth that is damaged: it
-        may have been changed after the answers were seen.
+        All are missing where there is no truth. Raises `InputError` for a damaged truth: it may have been changed after
+        the answers were known.
         """
         if not os.path.lexists(self.truth_path(index)):
             return tuple(answerers), ()
@@ -84,23 +84,24 @@ class TrialFolder:
             try:
                 self._answer(name, index, truth)
             except Damaged as fault:
-                # unlike a truth, it can be had again
+                # unlike a truth, an answer can be computed again
                 missing.append(name)
                 damaged.append(f"{str(fault).partition(';')[0]}; the case was answered again.")
         return tuple(missing), tuple(damaged)
 
     def truth(self, index: int) -> dict[str, Any]:
-        """Raises `InputError` for one that is missing, damaged, or of another case or trial."""
+        """Read a truth. Raises `InputError` for one that is missing, damaged, or of another case or trial."""
         return self._truth(index)["truth"]
 
     def answer(self, answerer: str, index: int) -> dict[str, Any]:
-        """What `keep_answer` kept. Raises `InputError` for one that is missing, damaged, or of another."""
+        """Read what `keep_answer` wrote. Raises `InputError` for a file that is missing, damaged, or of another
+        case."""
         return self._answer(answerer, index, self.truth(index))
 
     def keep_truth(self, case: Case, *, log: bytes | None = None) -> None:
         """Write the truth, and the checksum of the `log` that is kept beside it.
 
-        Raises `InputError` where the same case was another one when it was answered before.
+        Raises `InputError` where this case differed when it was answered before.
         """
         path, told = self.truth_path(case.index), case.truth()
         if os.path.lexists(path) and self.truth(case.index) != json.loads(json.dumps(told)):
@@ -114,14 +115,14 @@ class TrialFolder:
     def keep_answer(
         self, answerer: str, index: int, answer: Mapping[str, Any] | None, *, error: str | None, **spent: float
     ) -> None:
-        """Write an answer, None with the `error` that came in its place, and what it `spent`."""
+        """Write an answer, or None with the `error` raised in its place, and the time it `spent`."""
         kept = {"answer": answer, "error": error, **spent}
         path = self.answer_path(answerer, index)
         write_sealed(path, kept, schema=ANSWER, of=self._of(index, answerer))
 
     def kept_log(self, index: int, signals: Sequence[str]) -> Log | None:
-        """The log that was kept, with the channels in `signals`; None where none was, it is not the one that was
-        kept, or its truth is missing."""
+        """The stored log, with the channels in `signals`; None where no log was stored, it was changed since, or its
+        truth is missing."""
         path = self.log_path(index)
         if not path.exists() or not os.path.lexists(self.truth_path(index)):
             return None
@@ -129,7 +130,7 @@ class TrialFolder:
             return None
         log = Log.read(path)
         accel, speed = (getattr(log, name) if name in signals else None for name in ("accel", "speed"))
-        # as `Case.log` makes it, to the bit
+        # bit for bit as `Case.log` makes it
         return Log.from_arrays(
             name=case_name(index), time=log.time, accel_cmd=log.accel_cmd, accel=accel, speed=speed
         )  # fmt: skip
@@ -166,7 +167,7 @@ def case_name(index: int) -> str:
 
 
 def _fault(kept: Any, truth: Mapping[str, Any]) -> str | None:
-    """What is wrong with the content of an answer's file."""
+    """The fault in the content of an answer's file, or None."""
     if not isinstance(kept, dict) or set(kept) != {"answer", "error", "seconds", "cpu_seconds"}:
         return "holds no answer"
     for key in ("seconds", "cpu_seconds"):

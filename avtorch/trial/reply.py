@@ -1,4 +1,4 @@
-"""An answer of `avtorch.diagnosis/1` from as little as a rival knows."""
+"""An answer of `avtorch.diagnosis/1` from the few numbers that a rival computes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def reply(
     onset_s: float | None = None,
     p_value: float | None = None,
 ) -> dict[str, Any]:
-    """The most probable candidate is the verdict, those that reach 95 % together with it the alias set.
+    """The most probable candidate is the verdict; the fewest that reach 95 % together with it are the alias set.
 
     Args: `probabilities` of candidates, at any scale; `none` and `unknown` are added with 0. `baseline`, `parameters`:
     (mean, sd) of normal laws. `log_evidence` relative to `none`. Candidates below 1e-4 are left out.

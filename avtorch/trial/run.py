@@ -1,4 +1,4 @@
-"""A trial: sealed cases, those who answer them, and the score. What was answered stays, a rerun does the rest."""
+"""A trial: sealed cases, the methods that answer them, and the score. A rerun answers only what is missing."""
 
 from __future__ import annotations
 
@@ -41,12 +41,13 @@ def run_trial(
 ) -> dict[str, Any]:
     """Let `answerers` answer cases 0 to `n - 1` of the set `seed`; write and return `out/blindtest.json`.
 
-    An earlier one stays until the new one is there, and its picture goes with it.
+    An earlier one stays until the new one is complete; its picture is then removed.
 
-    The first answerer is judged, the others stand under `baselines` with the same keys. Answers and truths are kept in
-    `out` as they come (`avtorch.trial.folder`); a rerun, also with more cases or another answerer, answers only what is
-    missing. Who raises, or answers outside the schema, has not answered: the message is kept, and the case counts as
-    wrong. Delete an answerer's folder in `out/answers` to hear it again, as one must once its code has changed.
+    The scores are those of the first answerer; the others are under `baselines` with the same keys. Answers and truths
+    are written to `out` as they are made (`avtorch.trial.folder`); a rerun, also with more cases or another answerer,
+    answers only what is missing. An answerer that raises, or answers outside the schema, has not answered: the message
+    is kept, and the case counts as wrong. After a change of an answerer's code, delete its folder in `out/answers` to
+    run it again.
 
     Args:
         answerers: by name (letters, digits, `_`, `-`): `Log` to a dict of `avtorch.diagnosis/1`.
@@ -55,11 +56,10 @@ def run_trial(
         mix, outside, draw_options: as `avtorch.blindtest.draw_cases`.
         signals: the channels in the logs, in which a cause must show.
         keep_logs: keep `out/logs/NAME.csv`, so that a rerun need not draw the cases again.
-        progress: is told (cases done, of).
+        progress: called with (cases done, of).
         publish: False returns the answer and leaves `out/blindtest.json`, whatever it is, to the caller.
 
-    An answer that is damaged is asked for again, and `notes` of what is returned names it; a truth that is damaged is
-    refused.
+    A damaged answer is computed again, and `notes` of the result names it; a damaged truth is refused.
 
     Raises `InputError` for a folder with another trial's settings or in use by another process, for files of it that
     are damaged or another case's, and for arguments out of range.
@@ -136,7 +136,7 @@ def _check(n: int, seed: int, names: Sequence[str], workers: int, signals: Seque
     if workers < 1:
         raise InputError(f"workers: found {workers}, needs 1 or more")
     if not names:
-        raise InputError("answerers: found none, needs one to judge")
+        raise InputError("answerers: found none, needs at least one")
     for name in names:
         if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
             raise InputError(f"answerers: found the name {name!r}, needs letters, digits, _ and -")
@@ -145,7 +145,7 @@ def _check(n: int, seed: int, names: Sequence[str], workers: int, signals: Seque
 
 
 def _worked(tasks: Sequence[Task], workers: int) -> Iterator[int]:
-    """Cases as they are done."""
+    """Yield cases as they are finished."""
     if workers == 1 or len(tasks) < 2:
         yield from map(work, tasks)
         return
@@ -167,7 +167,7 @@ def _worked(tasks: Sequence[Task], workers: int) -> Iterator[int]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Children begun within use one thread each; it must be told before their libraries are loaded."""
+    """Child processes started within use one thread each; this must be set before their libraries are loaded."""
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(dict.fromkeys(names, "1"))

@@ -1,4 +1,4 @@
-"""From kept answers to `blindtest.json`: the judged one's measures, and the same measures of its rivals."""
+"""From stored answers to `blindtest.json`: the scores of the method under test and of its rivals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from avtorch.trial.folder import TrialFolder
 
 
 def tally(folder: TrialFolder, n: int, names: Sequence[str], settings: Mapping[str, Any]) -> dict[str, Any]:
-    """`avtorch.blindtest/1` of cases 0 to `n - 1`, all of them answered; the first of `names` is the judged one."""
+    """`avtorch.blindtest/1` of cases 0 to `n - 1`, all of them answered; the first of `names` is the method under
+    test."""
     truths = [folder.truth(i) for i in range(n)]
     measures = {name: _measures(folder, name, truths) for name in names}
     judged = measures.pop(names[0])

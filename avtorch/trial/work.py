@@ -1,4 +1,4 @@
-"""One case of a trial: drawn, shown to those who have not answered it yet, and their answers kept."""
+"""One case of a trial: draw it, let the methods without an answer answer it, and store their answers."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Task:
 
 
 def work(task: Task) -> int:
-    """Answer a case and keep what was said; returns its index."""
+    """Answer a case and store the answers; returns its index."""
     folder = TrialFolder(task.root, task.settings)
     log = folder.kept_log(task.index, task.signals)
     if log is None:
@@ -69,7 +69,7 @@ def work(task: Task) -> int:
 
 
 def _answer(folder: TrialFolder, name: str, task: Task, log: Log, truth: Mapping[str, Any]) -> None:
-    """One answer, with what it cost; a failure is an answer too, and its message is kept."""
+    """One answer and its time; a failure counts as an answer, and its message is kept."""
     answer: dict[str, Any] | None = None
     fault = ""
     wall, cpu = time.perf_counter(), time.process_time()
@@ -84,12 +84,12 @@ def _answer(folder: TrialFolder, name: str, task: Task, log: Log, truth: Mapping
             json_text(answer)
         except (InputError, KeyError, TypeError, ValueError) as error:
             answer, fault = None, f"the answer is not of avtorch.diagnosis/1: {type(error).__name__}: {error}"
-    # a disk that is full is no fault of the answer's
+    # a full disk is not the answerer's fault
     folder.keep_answer(name, task.index, answer, error=fault if answer is None else None, **spent)
 
 
 def begin_worker() -> None:
-    """Settings of a worker process: one thread each, and no life without the process that started it."""
+    """Set up a worker process: one thread, and it ends with the process that started it."""
     import torch
 
     torch.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""How we know: draws held against references, with the error that chance makes.
+"""Validation: draws compared with references, with their Monte Carlo error.
 
 Example:
     >>> from avtorch.inference import integrate, sample

@@ -1,8 +1,8 @@
-"""How far draws lie from a reference, window by window, and how far chance alone would have put them.
+"""Distance of draws from a reference, window by window, and the distance that chance alone would cause.
 
-Every measure is per window and parameter, in the parameter's own units or in SDs of the reference. Beside each stands
-what Monte Carlo error alone accounts for, so that a difference can be told from noise. Effective sample sizes and R-hat
-are ArviZ's (extra ``validate``).
+Every measure is per window and parameter, in the parameter's own units or in SDs of the reference. Each comes with the
+value expected from Monte Carlo error alone, so that a difference can be distinguished from noise. Effective sample
+sizes and R-hat are ArviZ's (extra ``validate``).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Agreement:
         sd_ratio: SD over the reference's.
         sd_error: its Monte Carlo standard error.
         w1: Wasserstein-1 distance of the marginals, in SDs of the reference.
-        w1_expected: what independent exact draws of the same effective number would give in the mean.
+        w1_expected: the expectation of `w1` for independent exact draws of the same effective number.
         z_mean, z_sd: differences of mean and of SD over their Monte Carlo standard errors.
         rhat: rank-normalised split R-hat, over superchains (see `avtorch.validation.diagnostics`).
         ess_bulk, ess_tail: effective sample sizes for the bulk and for the 5 % and 95 % quantiles.
@@ -78,7 +78,7 @@ class Agreement:
         return (mean & sd).all(-1)
 
     def chance_within(self, *, slack: float = 0.0) -> Tensor:
-        """Chance that exact draws of the same effective number meet the tolerance, ``(window,)``.
+        """Probability that exact draws of the same effective number meet the tolerance, ``(window,)``.
 
         Normal errors, taken as independent between mean and SD and between parameters, which errs on the low side.
         """

@@ -1,14 +1,14 @@
-"""Simulation-based calibration of one window and of the whole loop: do posteriors hold the truth as often as they say?
+"""Simulation-based calibration of one window and of the whole loop: do intervals cover the truth as often as stated?
 
 Draw a truth from the prior, simulate a window from it, sample its posterior: the truth is then one more draw from that
 posterior, so its rank among them is uniform (Talts et al. 2018). This holds for any function of truth and data, and the
-log likelihood of the data finds faults that no parameter's own rank sees (Modrak et al. 2023). It also holds given data
-seen before, if the truth is drawn from the posterior at that point (posterior SBC, Sailynoja et al. 2025): that is how
-a loop is checked whose prior claims that the vehicle changes. Whatever is chosen by looking at data alone (windows that
-are excited, chains that settled) leaves ranks uniform.
+log likelihood of the data reveals faults that the ranks of single parameters do not (Modrak et al. 2023). It also holds
+given earlier data, if the truth is drawn from the posterior at that point (posterior SBC, Sailynoja et al. 2025): this
+tests a loop whose prior assumes that the vehicle changes. Ranks stay uniform under any selection that depends on data
+alone (excited windows, settled chains).
 
-The package ``simuk`` does SBC for PyMC, Bambi and NumPyro models, one fit after another in a Python loop. Ours are not
-models of these, and all replications are windows of one tensor; so the ranks are made here, in a few lines.
+The package ``simuk`` does SBC for PyMC, Bambi and NumPyro models, one fit after another in a Python loop. Our densities
+are not such models, and all replications are windows of one tensor; so the ranks are computed here, in a few lines.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ VARIED = (0.1, 2.0)
 """Amplitudes [m/s^2] from weak to strong excitation."""
 
 QUADRATURE_BATCH = 20
-"""Windows integrated at once: more would not fit the cache."""
+"""Windows integrated at once: more would exceed the cache."""
 
 
 Sampler = Callable[[JerkDensity, torch.Generator], tuple[Tensor, Tensor]]
@@ -70,7 +70,7 @@ def sbc(
         prior: of ``z = log(T_L, K_L, sigma)``; the library's first prior by default.
         sampler: what is tested; SGLD with default settings by default.
         draws: draws that a rank counts, spread over chains and time to be nearly independent.
-        inflate: stretch the draws about their mean in ``z`` by this factor: a fault that the tests must see.
+        inflate: stretch the draws about their mean in ``z`` by this factor, a fault that the tests must detect.
         batch: windows sampled at once.
 
     Raises:
@@ -97,10 +97,11 @@ def sbc_quadrature(
     seed: int = 0,
     batch: int = 500,
 ) -> Calibration:
-    """The same by quadrature, for the parameters only: what an exact posterior scores on the windows of :func:`sbc`.
+    """The same by quadrature, for the parameters only: the calibration of an exact posterior on the windows of
+    :func:`sbc`.
 
-    The windows are the same if seed, ``batch`` and all that shapes them are; ``dropped`` stays 0: ``nodes`` that are
-    too few for a window show in the figures, they do not vanish from them. Ranks are ``below`` in ``draws + 1`` steps.
+    The windows are the same if seed, ``batch`` and all that shapes them are; ``dropped`` stays 0: windows for which
+    ``nodes`` are too few are included in the figures. Ranks are ``below`` in ``draws + 1`` steps.
 
     Raises:
         InputError: as :func:`sbc`.
@@ -150,11 +151,11 @@ def sbc_loop(
     """Calibration of the sequential loop after each of its windows; replications are its vehicles.
 
     With ``truth="constant"`` a vehicle is drawn once from the first prior and stays. Ranks are then uniform after every
-    window if the loop passes on all it knows: what ``posterior`` mode claims, up to its normal approximation. With
-    ``truth="claimed"`` each window's vehicle is drawn from the prior that the loop holds for it at that moment, as if
-    vehicles did change the way that ``lambda`` and ``forgetting`` suppose (posterior SBC); ranks are then uniform if
-    every update is right given the prior carried to it. A constant truth in these modes is not what they claim, and its
-    ranks are not uniform: the loop is too wide.
+    window if the loop passes on all information, as ``posterior`` mode claims up to its normal approximation. With
+    ``truth="claimed"`` each window's vehicle is drawn from the loop's current prior for it, as if vehicles changed the
+    way that ``lambda`` and ``forgetting`` assume (posterior SBC); ranks are then uniform if every update is right given
+    its prior. A constant truth contradicts the assumption of these modes, and its ranks are not uniform: the loop's
+    posteriors are too wide.
 
     Args:
         truth: by default ``"constant"`` in ``posterior`` mode, else ``"claimed"``.

@@ -1,11 +1,12 @@
 """R-hat and effective sample sizes of draws, by ArviZ, and the Monte Carlo errors that follow from them.
 
 Many short chains are joined into a few superchains first. ArviZ's autocorrelations are those of single chains, and over
-a chain of twenty draws they are biased: at an autocorrelation of 0.3 it calls 256 chains of 20 draws 3 660 effective
-draws where there are 2 850, and its R-hat 1.04 where the chains are stationary and independent. Over eight superchains
-it says 2 875 and 1.001: at lag ``t`` a share ``t/n`` of the pairs straddles two independent chains of ``n`` draws, and
-that is the very factor by which ``t`` counts in the variance of their mean. Chains that sit still in different places
-are still seen: a superchain of them is a sequence of plateaus, with an autocorrelation as long as a chain.
+a chain of twenty draws they are biased: at an autocorrelation of 0.3 it counts 3 660 effective draws in 256 chains of
+20 draws where there are 2 850, and gives an R-hat of 1.04 where the chains are stationary and independent. Over eight
+superchains the figures are 2 875 and 1.001: at lag ``t`` a share ``t/n`` of the pairs straddles two independent chains
+of ``n`` draws, and that is the very factor by which ``t`` counts in the variance of their mean. Chains that stand still
+in different places are still detected: their superchain is a sequence of plateaus, with an autocorrelation as long as a
+chain.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ SUPERCHAINS = 8
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """Moments of draws and what is known about their errors; shapes ``(window, parameter)``, in the parameters' units.
+    """Moments of draws and their errors; shapes ``(window, parameter)``, in the parameters' units.
 
     ``mean_error`` and ``sd_error`` are Monte Carlo standard errors; ``ess_mean`` is the effective number of draws
     behind the mean, ``ess_bulk`` and ``ess_tail`` are rank-normalised and of the 5 % and 95 % quantiles.
@@ -44,7 +45,7 @@ class Diagnostics:
 
 
 def arviz() -> ModuleType:
-    """ArviZ, or an `InputError` that says how to get it."""
+    """ArviZ, or an `InputError` with the command that installs it."""
     with warnings.catch_warnings():
         # ArviZ 0.23 announces its successor on import
         warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major refactor", FutureWarning)
@@ -72,7 +73,7 @@ def diagnose(posterior: Posterior) -> Diagnostics:
     """Moments, R-hat and effective sample sizes of every window.
 
     Raises:
-        InputError: if ArviZ is missing, or for fewer than four draws a (super)chain, which it cannot judge.
+        InputError: if ArviZ is missing, or for fewer than four draws per (super)chain, the least that it can evaluate.
     """
     az = arviz()
     import xarray

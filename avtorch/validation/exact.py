@@ -25,8 +25,8 @@ def exact_draws(
 ) -> Posterior:
     """Draws ``(chain, draw, window, parameter)`` of the density that a quadrature integrated.
 
-    Cells of a coarse grid are drawn by their weight and points in them uniformly; importance resampling then brings
-    them from the staircase to the density itself. No Markov chain: the chains are only a layout.
+    Cells of a coarse grid are drawn by their weight and points in them uniformly; importance resampling then corrects
+    them to the density itself. There is no Markov chain: the chains are only a layout.
 
     Args:
         density, quadrature: of the same windows; the quadrature's moments place the grid.
@@ -69,7 +69,7 @@ def _draw(density: Density, center: Tensor, lower: Tensor, count: int, generator
             return z, density.log_prob(z).nan_to_num(nan=-torch.inf)
 
     _, height = log_prob(cells[:, None].expand(-1, windows, -1))
-    # the proposals evenly over the cells, as nothing is lost by it; the draws from them independently
+    # proposals systematically over the cells, which loses nothing; draws from them independently
     proposals = PROPOSALS * count
     offset = torch.rand(windows, 1, generator=generator, dtype=center.dtype)
     even = (torch.arange(proposals, dtype=center.dtype) + offset) / proposals

@@ -1,4 +1,4 @@
-"""NUTS over the windows chosen for it, by Pyro: the reference that others wrote."""
+"""NUTS over selected windows, by Pyro: an independent reference."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ class NutsSettings:
                 raise InputError(f"{name}: found {getattr(self, name)}, needs {least} or more")
 
 
-#: NUTS where a step costs milliseconds, and where it runs a filter over the rows (minutes a window, even so).
+#: NUTS where a step costs milliseconds, and where it runs a filter over the rows (minutes per window even with fewer
+#: draws).
 NUTS_WINDOWS, LATENT_NUTS_WINDOWS = 3, 1
 LATENT_NUTS = NutsSettings(chains=1, draws=300, warmup=200)
 

@@ -1,9 +1,9 @@
-"""The loop over windows against one inference on all of them: what is lost by passing on a prior instead of the data.
+"""The loop over windows against one inference on all of them: the loss from passing on a prior instead of the data.
 
 A vehicle that stays as it is gives windows whose sums add up, so the posterior given all of them is one window's, with
 one sigma throughout (:func:`pool`), or with a sigma of its own for each window (:class:`FreeNoise`, as ``lambda`` mode
-supposes). Both are integrated by quadrature. A vehicle that changes has no such truth; there the error and the coverage
-count (:func:`follow`).
+supposes). Both are integrated by quadrature. For a vehicle that changes there is no such reference; there the error and
+the coverage are reported (:func:`follow`).
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class FreeNoise:
 
     @property
     def windows(self) -> int:
-        """Vehicles: each has one posterior."""
+        """Number of vehicles: each has one posterior."""
         return len(self.total.n)
 
     def select(self, index: Tensor) -> FreeNoise:
@@ -80,7 +80,7 @@ class FreeNoise:
         log_prob = self.actuation.log_prob(z)
         for s in self.sums:
             squares = s.jj + 2 * b * s.aj - 2 * g * s.uj + b.square() * s.aa - 2 * b * g * s.au + g.square() * s.uu
-            # round-off may leave less than nothing of a residual
+            # round-off may make a residual negative
             squares = squares.clamp_min(1e-12 * s.jj)
             width = (2 * s.n).rsqrt()
             log_sigma = 0.5 * (squares / s.n).log().unsqueeze(-1) + width.unsqueeze(-1) * self._nodes

@@ -1,4 +1,4 @@
-"""Ranks of truths among posterior draws, and what is read off them: are they uniform, do intervals hold the truth."""
+"""Ranks of truths among posterior draws: are they uniform, and do intervals cover the truth?"""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from torch import Tensor
 from avtorch.validation.uniformity import bonferroni, chi2_p_value, dispersion_p_value, ecdf_band, ecdf_p_value
 
 LEVELS = (0.5, 0.9, 0.95)
-"""Interval levels whose coverage is asked."""
+"""Interval levels whose coverage is computed."""
 
 
 class SampledDensity(Protocol):
-    """What ranks need of a posterior; :class:`JerkDensity` is one."""
+    """The interface of a posterior for ranks; :class:`JerkDensity` has it."""
 
     @property
     def names(self) -> tuple[str, ...]: ...

@@ -1,4 +1,4 @@
-"""Quadrature over many windows: block by block, and on a finer grid where the usual one does not do."""
+"""Quadrature over many windows: block by block, and on a finer grid where the usual one is too coarse."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from avtorch.inference.quadrature import Quadrature, integrate
 from avtorch.validation.windows import Windows
 
 #: Nodes an axis, and for the windows where these are too few. A weak window's posterior is a funnel: the shorter the
-#: lag, the closer the gain follows from it, and a grid for the wide end is coarse at the narrow one.
+#: lag, the narrower the range of the gain, and a grid for the wide end is coarse at the narrow one.
 NODES = (49, 97, 129)
 
 
 def reference(windows: Windows) -> Quadrature:
-    """Quadrature of all windows; where fewer sufficed, the marginals are interpolated to the last number of nodes."""
+    """Quadrature of all windows; where fewer nodes sufficed, the marginals are interpolated to the last number of
+    nodes."""
     # one by one: the grids of a batch are moved until the worst of its windows is covered, 117 649 nodes at a time
     return join([_one(windows.select(index)) for index in torch.arange(len(windows)).split(1)])
 

@@ -1,9 +1,9 @@
-"""Windows drawn from the very model that the jerk likelihood states, for checks that need both to agree.
+"""Windows drawn from the exact model of the jerk likelihood, for checks that need both to agree.
 
-``jerk_i ~ Normal((K_L u_i - a_i)/T_L, sigma^2)``, and ``a`` moves by the *measured* jerk, ``a + dt jerk``: then
-``a`` tells no more of the vehicle than the jerk has told already, and the likelihood of the jerk is the likelihood of
-all that was seen. An acceleration rolled out without the noise would give the vehicle away, and a posterior that does
-not use it would not be calibrated in any exact sense.
+``jerk_i ~ Normal((K_L u_i - a_i)/T_L, sigma^2)``, and ``a`` moves by the *measured* jerk, ``a + dt jerk``: then ``a``
+carries no information about the vehicle beyond that of the jerk, and the likelihood of the jerk is that of all data. An
+acceleration simulated without the noise would carry more information, and a posterior that does not use it would not be
+exactly calibrated.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-r"""Kernel Stein discrepancy: how far draws lie from a density, by its score alone.
+r"""Kernel Stein discrepancy: the distance of draws from a density, from its score alone.
 
     KSD^2 = 1/n^2 sum_ij k_p(x_i, x_j),
     k_p(x, y) = s(x).s(y) k + s(x).grad_y k + s(y).grad_x k + tr grad_x grad_y k,     s = grad log p,
@@ -72,8 +72,8 @@ def stein_discrepancy(
         points: at most so many draws are used, evenly spaced along the chains (and over the chains, where there are
             more chains than points).
         scale: ``c`` of the kernel, in the whitened coordinates.
-        flip: chance that the bootstrap's sign changes from one draw used to the next of its chain; 0.5 takes them as
-            independent, less allows for their autocorrelation.
+        flip: probability that the bootstrap's sign changes from one draw used to the next of its chain; 0.5 takes them
+            as independent, less allows for their autocorrelation.
 
     Raises:
         InputError: for draws of another shape than the density's, fewer than two points, or ``flip`` not in (0, 0.5].

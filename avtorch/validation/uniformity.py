@@ -3,7 +3,7 @@
 Ranks ``0..draws`` of ``replications`` truths; under the hypothesis each is uniform on the ``draws + 1`` values and they
 are independent. The ECDF band is that of Sailynoja, Burkner and Vehtari (2022): pointwise binomial intervals, widened
 until all of them hold at once with the probability asked for. That probability is found exactly, by the recursion over
-counts for a Poisson process in a corridor (Moscovich and Nadler 2017), so p-values far below 1 % have their meaning.
+counts for a Poisson process in a corridor (Moscovich and Nadler 2017), so p-values far below 1 % are accurate.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
 
 LEAST = 1e-15
-"""Pointwise probabilities below this are this: the corridor's own is known to some 1e-12 only."""
+"""Floor of pointwise probabilities: the corridor's own is accurate to only some 1e-12."""
 
 
 def _counts(ranks: Tensor, draws: int) -> IntArray:
@@ -86,7 +86,7 @@ def ecdf_band(replications: int, draws: int, *, level: float = 0.95) -> tuple[Te
 
 
 def bonferroni(p_values: Tensor) -> float:
-    """One p-value for many, valid however they hang together: the least times their number."""
+    """One p-value for many, valid under any dependence: the least times their number."""
     return float((p_values.min() * p_values.numel()).clamp_max(1.0))
 
 
@@ -109,7 +109,8 @@ def _band_counts(n: int, draws: int, level: float) -> tuple[IntArray, IntArray]:
 def _open_corridor(n: int, draws: int, pointwise: float) -> tuple[IntArray, IntArray]:
     """Least and greatest count at each rank whose two-sided pointwise p-value is above ``pointwise``."""
     cdf, pointwise = _cdf(draws), max(pointwise, LEAST)
-    # ppf returns the least count with cdf >= q; nudged so that equality, which is outside, moves one on
+    # ppf returns the least count with cdf >= q; shifted slightly because equality, which is outside, needs the next
+    # count
     low = binom.ppf(0.5 * pointwise, n, cdf).astype(np.int64)
     low += binom.cdf(low, n, cdf) <= 0.5 * pointwise * (1 + 1e-9)
     high = binom.isf(0.5 * pointwise, n, cdf).astype(np.int64)

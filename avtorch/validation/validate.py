@@ -1,4 +1,4 @@
-"""SGLD held against quadrature and NUTS on many windows, and a verdict that knows its own Monte Carlo error."""
+"""SGLD compared with quadrature and NUTS on many windows, and a verdict that includes its own Monte Carlo error."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ Progress = Callable[[float, float], None]
 
 #: Windows at once, so that progress can be shown and the memory of the quadrature stays bounded.
 BLOCK = 50
-#: What a window of NUTS counts for in the progress, where one of SGLD and quadrature counts one.
+#: Weight of a window of NUTS in the progress; one of SGLD and quadrature has weight one.
 NUTS_SHARE = 20
 
 
 @dataclass(frozen=True)
 class Validation:
-    """Everything that `validate` found; W windows and P parameters, named by ``windows.names``.
+    """The result of `validate`; W windows and P parameters, named by ``windows.names``.
 
     Attributes:
-        windows: what was validated.
+        windows: the windows validated.
         settings: of SGLD.
         seed: of everything random.
         reference: "quadrature", or "nuts" where quadrature cannot be (more than three parameters).
@@ -96,7 +96,7 @@ class Validation:
         return self.windows.names
 
     def coverage(self, level: float = 0.9) -> dict[str, Tensor]:
-        """How often, or how far, the central interval of SGLD holds what it promises, ``(P,)`` each.
+        """Coverage of the central interval of SGLD, ``(P,)`` each.
 
         Where the truth is known: shares of windows whose interval covers it, for "sgld" and, on the same windows,
         "quadrature" (synthetic vehicles are not drawn from the prior, so neither need be ``level``). Otherwise "sgld"
@@ -189,7 +189,7 @@ def validate(
         source = windows_of_log(source, window=window, count=windows)
     settings = source.sampler if settings is None else settings
     if settings.chains == 1 and settings.draws < 8:
-        raise InputError(f"draws: found {settings.draws} of a single chain, needs 8 or more to judge it")
+        raise InputError(f"draws: found {settings.draws} of a single chain, needs 8 or more")
     latent = source.form == "latent"
     nuts = (LATENT_NUTS if latent else NutsSettings()) if nuts is None else nuts
     if nuts_windows is None:
@@ -257,7 +257,7 @@ class _Told:
 
 @dataclass(frozen=True)
 class _Block:
-    """What was found of a few windows, and the seconds it took."""
+    """The results of a few windows, and the seconds they took."""
 
     sgld: Posterior
     quadrature: Quadrature | None

@@ -1,4 +1,4 @@
-"""The verdict on many windows: do SGLD's posteriors agree with the reference, and how sure is that."""
+"""The verdict on many windows: do SGLD's posteriors agree with the reference, and how certain is the verdict?"""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SLACK = 2.0
 
 @dataclass(frozen=True)
 class Verdict:
-    """Agree or not, and how sure.
+    """Whether they agree, and how certain that is.
 
     Attributes:
         agree: whether the share is at least `REQUIRED_SHARE` (0.95) and NUTS does not contradict quadrature.
@@ -72,7 +72,7 @@ def judge(
     Args:
         settled: ``(window,)`` bool; a window whose chains or whose reference did not settle does not pass.
         reference: "quadrature", or "nuts", whose own error widens the tolerance by `SLACK` standard errors.
-        numbers: what the windows are called; 0, 1, ... by default.
+        numbers: numbers of the windows for the text; 0, 1, ... by default.
         nuts: NUTS against quadrature, if both were run.
     """
     slack = 0.0 if reference == "quadrature" else SLACK
@@ -124,7 +124,7 @@ def _percent(share: float) -> str:
 
 
 def _furthest(agreement: Agreement, settled: Tensor, numbers: Sequence[int]) -> str:
-    """What is furthest out, of the windows that settled, in units of the tolerance."""
+    """The settled window that is furthest from the reference, in units of the tolerance."""
     off = torch.stack(
         [agreement.mean_difference.abs() / MEAN_TOLERANCE, (agreement.sd_ratio - 1).abs() / SD_TOLERANCE], -1
     )

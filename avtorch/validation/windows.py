@@ -118,7 +118,8 @@ def synthetic_windows(count: int, *, seed: int = 0) -> Windows:
 
 
 def windows_from_prior(count: int, *, seed: int = 0, prior: Prior | None = None) -> Windows:
-    """The same drives with vehicles drawn from the prior: the truths for which intervals must hold what they promise.
+    """The same drives with vehicles drawn from the prior: the truths for which intervals must have their stated
+    coverage.
 
     Raises:
         InputError: for ``count`` below 1.

@@ -1,4 +1,4 @@
-"""What moves: the GLVD, controllers, closed loop and platoons, leaders, performance; stability in its own package.
+"""The GLVD, controllers, closed loop and platoons, leaders, performance; stability has its own package.
 
 Example:
     >>> from avtorch.vehicle import GLVDPlant, Leader, performance, simulate

@@ -1,4 +1,4 @@
-"""Numbers and tensors as the vehicle takes them: checked once, at the border, then trusted in the hot loop."""
+"""Numbers and tensors as the vehicle takes them: checked once, on entry, then trusted in the hot loop."""
 
 from __future__ import annotations
 

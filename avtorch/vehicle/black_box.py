@@ -1,14 +1,14 @@
-r"""A controller of unknown structure: what can be said of its string stability, and what cannot.
+r"""The string stability of a controller of unknown structure, as far as it can be determined.
 
-Two looks, neither of which is a proof for all motions:
+Two methods, neither of which is a proof for all motions:
 
-- `linearise`: the slopes of the controller at one equilibrium speed. Where it is a smooth function of what it is shown
-  (no memory, no delay of its own), small motions about that speed obey a linear law, and every exact verdict holds for
+- `linearise`: the slopes of the controller at one equilibrium speed. Where it is a smooth function of its inputs (no
+  memory, no delay of its own), small motions about that speed obey a linear law, and every exact verdict holds for
   them: k_s = ∂u/∂spacing, k_v = ∂u/∂lead_speed, k_a = ∂u/∂accel, k_f = ∂u/∂lead_accel, and the time gap is that for
-  which k_s tau + k_v = -∂u/∂speed. It says nothing of large motions, of other speeds, nor of a controller with memory.
-- `measured_gain`: the closed loop driven by a leader who swings at one frequency and amplitude, the ratio of the
-  speeds' swings at that frequency. It needs no structure at all. A ratio above one *shows* amplification; ratios of at
-  most one at all frequencies tried are no more than that.
+  which k_s tau + k_v = -∂u/∂speed. It does not cover large motions, other speeds, or a controller with memory.
+- `measured_gain`: the closed loop behind a leader whose speed oscillates at one frequency and amplitude, and the ratio
+  of the speed amplitudes at that frequency. It assumes no structure. A ratio above one *proves* amplification; ratios
+  of at most one at all frequencies tried prove nothing about the others.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from avtorch.vehicle.loop import ClosedLoop
 from avtorch.vehicle.lower_level import LowerLevel
 from avtorch.vehicle.plant import GLVDPlant, Plant, PlantFunction
 
-_FAR_M = 400.0  # no controller keeps a longer gap
+_FAR_M = 400.0  # upper bound on any controller's gap
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """The law for small motions about `speed` [m/s], where the spacing [m] asks for no acceleration.
+    """The law for small motions about `speed` [m/s], at the `spacing` [m] for which no acceleration is demanded.
 
     `gains` (k_s [1/s²], k_v [1/s], k_a [-]), `time_gap` [s] and `feedforward` [-] as a `LinearController`'s.
     `bend` [-]: how much the slopes over a step ten times as large differ from these, as a share of the largest; near
@@ -61,9 +61,9 @@ class Linearised:
 def linearise(controller: Controller, speed: float, *, step: float = 0.02) -> Linearised:
     """Slopes of `controller` at its equilibrium at `speed` [m/s], by central differences of ± `step` [SI units].
 
-    The controller is asked as in the loop, with tensors (scenario,), at time 0. Raises `InputError` where it has no
-    equilibrium spacing up to 400 m, answers a spacing with no or with less acceleration (k_s <= 0: it does not follow),
-    or something that is not finite.
+    The controller is called as in the loop, with tensors (scenario,), at time 0. Raises `InputError` where it has no
+    equilibrium spacing up to 400 m, answers a larger spacing with no more acceleration (k_s <= 0: it does not follow),
+    or returns a number that is not finite.
 
     Example:
         >>> import torch
@@ -97,7 +97,8 @@ def linearise(controller: Controller, speed: float, *, step: float = 0.02) -> Li
 
 
 def _equilibrium(controller: Controller, speed: float) -> float:
-    """The spacing [m] at which `controller` asks for nothing behind a leader at the same steady `speed` [m/s]."""
+    """The spacing [m] at which `controller` demands no acceleration behind a leader at the same steady `speed`
+    [m/s]."""
     if not (math.isfinite(speed) and speed > 0.0):
         raise InputError(f"speed: found {speed!r}, needs a number above 0 m/s")
     low, high = 0.1, _FAR_M
@@ -111,7 +112,7 @@ def _equilibrium(controller: Controller, speed: float) -> float:
 
 
 def _demand(controller: Controller, state: Sequence[float]) -> float:
-    """What is asked at (spacing, speed, accel, lead_speed, lead_accel)."""
+    """The demand at (spacing, speed, accel, lead_speed, lead_accel)."""
     with torch.no_grad():
         u = float(
             controller(FollowerState(0.0, *(torch.tensor([x], dtype=torch.float64) for x in state))).reshape(-1)[0]
@@ -135,9 +136,9 @@ def measured_gain(
     spacing: float | None = None,
     dt: float = 0.01,
 ) -> Float[Tensor, " frequency"]:
-    """Swing of the follower's speed over that of its leader's, (frequency,), at each `omega` [rad/s].
+    """Amplitude of the follower's speed over that of its leader's, (frequency,), at each `omega` [rad/s].
 
-    The leader drives `speed` + `amplitude` sin(omega t) [m/s]; all frequencies run side by side, one a scenario, so a
+    The leader drives `speed` + `amplitude` sin(omega t) [m/s]; all frequencies run in one batch, one per scenario, so a
     `controller` with memory must keep it by scenario. After `settle` [s] the part at `omega` alone is taken over
     `cycles` whole cycles of the slowest (harmonics of a controller that is not linear are left out). `plant` has no
     noise by default; `spacing` [m] at the start, None for the controller's equilibrium. Infinite where the follower

@@ -1,4 +1,4 @@
-"""What a run leaves behind: time series by scenario, as the car's own log would hold them."""
+"""The result of a run: time series by scenario, as in the car's own log."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Block:
     time), in a replay of candidates (candidate, scenario, time).
 
     One row: the state at `time`, and the command sent then, which acts until the next row. `demanded` is the upper
-    level's wish, `accel_cmd` what the lower level sent after clipping, `clipped` where it sits at the limits.
-    `accel` is kinematic (0 while standing), `jerk` the instantaneous jerk of that row with its own noise (0 while
-    standing, NaN where the plant does not give it). SI units.
+    level's output, `accel_cmd` the lower level's after clipping, `clipped` where it is at the limits. `accel` is
+    kinematic (0 while standing), `jerk` the instantaneous jerk of that row with its own noise (0 while standing, NaN
+    where the plant does not give it). SI units.
 
     Example:
         >>> from avtorch.vehicle import Block, ClosedLoop, Leader
@@ -49,7 +49,7 @@ class Block:
 
     @classmethod
     def concatenate(cls: type[B], blocks: Sequence[B]) -> B:
-        """Blocks that follow each other, as one."""
+        """Join consecutive blocks into one."""
         return cls(*(torch.cat([getattr(b, f.name) for b in blocks], -1) for f in fields(cls)))
 
     def __getitem__(self: B, part: slice) -> B:
@@ -62,7 +62,7 @@ class Block:
         return (self.spacing <= 0).any(-1)
 
     def log(self, scenario: int = 0, vehicle: int = 0) -> Log:
-        """One vehicle's drive as a `Log`; ends with the row before a collision, as a real one would."""
+        """One vehicle's drive as a `Log`; it ends with the row before a collision."""
         from avtorch.io import Log
 
         def row(x: Tensor) -> Tensor:

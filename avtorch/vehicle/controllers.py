@@ -1,4 +1,4 @@
-"""Upper level: what acceleration is demanded, given what the follower sees.
+"""Upper level: the demanded acceleration as a function of the follower's state.
 
 A controller is any callable `controller(state: FollowerState) -> demanded acceleration (..., scenario)`: the linear
 law here, the MPC in `mpc.py`, a policy network, a function of unknown structure.
@@ -29,7 +29,8 @@ Example:
 
 
 class FollowerState(NamedTuple):
-    """What a follower sees at one tick. `time` [s] is a float, the same for all; the rest are tensors (..., scenario).
+    """Inputs of the controller at one tick. `time` [s] is a float, the same for all; the rest are tensors (...,
+    scenario).
 
     `lead_accel` is what the link delivers: the leader's acceleration `link_delay` ago (see `ClosedLoop`).
 
@@ -51,7 +52,7 @@ class FollowerState(NamedTuple):
 
 
 Controller = Callable[[FollowerState], Tensor]
-"""Takes what a follower sees, returns the demanded acceleration [m/s²].
+"""Takes a follower's state, returns the demanded acceleration [m/s²].
 
 Example:
     >>> from avtorch.vehicle import Controller, FollowerState, Leader, simulate
@@ -70,9 +71,9 @@ class LinearController:
     `Δs = spacing - (time_gap speed + standstill)`, `Δv = lead_speed - speed`.
 
     `gains` (k_s [1/s²], k_v [1/s], k_a [-]) on the last dimension, (..., 3); `time_gap` [s], `standstill` [m] and
-    `feedforward` k_f [-] floats or tensors; all broadcast with (..., scenario). `ramp`, if given, is how the gap moves
-    toward `time_gap` (made by `retargeted`). Frozen: a new setting is a new object. Raises `InputError` for non-finite
-    values, gains that are not three, or a negative time gap or standstill spacing.
+    `feedforward` k_f [-] floats or tensors; all broadcast with (..., scenario). `ramp`, if given, moves the gap toward
+    `time_gap` (made by `retargeted`). Frozen: a new setting is a new object. Raises `InputError` for non-finite values,
+    gains that are not three, or a negative time gap or standstill spacing.
 
     Example:
         >>> from avtorch.vehicle import Leader, LinearController, simulate

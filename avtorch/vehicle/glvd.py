@@ -9,8 +9,8 @@ acceleration [m/s²], `eps` jerk noise [m/s³]. Over a step `dt` in which `u` is
 - `"zoh"`, exact zero-order hold: `alpha = exp(-dt / T_L)`;
 - `"euler"`, what the paper's simulation does: `alpha = 1 - dt / T_L` (diverges where `dt > 2 T_L`).
 
-The functions are the hot path and look at no values (so they also run under `torch.func`): `GLVD` and the plant
-check theirs once. Everything broadcasts over leading dimensions and keeps the dtype of the tensors given.
+The functions are the hot path and do not check values (so they also run under `torch.func`): `GLVD` and the plant check
+their parameters once. Everything broadcasts over leading dimensions and keeps the dtype of the tensors given.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def glvd_rollout(
     while reach < steps:
         x = torch.cat([x[..., :reach], x[..., reach:] + power * x[..., :-reach]], dim=-1)
         reach *= 2
-        # exp(-reach dt/T) rather than repeated squaring: keeps float32 right to its last digits
+        # exp(-reach dt/T) rather than repeated squaring: keeps float32 accurate to its last digits
         power = torch.exp(-reach * dt / lag).unsqueeze(-1) if method == "zoh" else power * power
     return x
 
@@ -153,7 +153,7 @@ def exact_motion(
     """Exact integration of Eq. 1 over one step with command `u` and jerk noise `eps` held; all broadcast.
 
     Args: `a` [m/s²], `v` [m/s], `u` [m/s²], `eps` [m/s³], `dt` [s], `T_L` [s], `K_L` [-].
-    Returns acceleration, speed and displacement [m] at the end of the step. Standstill is the loop's affair.
+    Returns acceleration, speed and displacement [m] at the end of the step. The loop handles standstill.
 
     Example:
         >>> import torch

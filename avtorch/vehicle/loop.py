@@ -30,10 +30,10 @@ class ClosedLoop:
 
     Within a step command and noise are held and the plant integrates (exactly, by default).
 
-    Limits of the world: a car does not roll back. At standstill the speed is 0 and the kinematic acceleration (logged,
-    and seen by the controllers) is 0 until the actuator's own acceleration, which goes on obeying the plant, turns
-    positive. A collision is recorded, not acted out: the spacing goes through zero and on, so that its minimum tells
-    how hard it was; `collided` stays set, and no later row of that scenario means anything physical.
+    Physical limits: a car does not roll back. At standstill the speed is 0 and the kinematic acceleration (logged, and
+    passed to the controllers) is 0 until the actuator's own acceleration, which goes on obeying the plant, turns
+    positive. A collision is recorded but not simulated: the spacing becomes negative, so that its minimum shows how
+    hard the collision was; `collided` stays set, and later rows of that scenario are not physical.
 
     Args:
         leader: its `dt` must be the loop's.
@@ -47,7 +47,7 @@ class ClosedLoop:
         spacing0: [m], None for the controller's equilibrium at the leader's first speed (5 m + 1 s where it has
             no time gap).
         speed0: [m/s], None for the leader's first speed.
-        link_delay: [s], age of the leader's acceleration that the controller sees (a radio link; rounded to steps).
+        link_delay: [s], age of the leader's acceleration that the controller receives (a radio link; rounded to steps).
 
     Raises `InputError` for bad arguments, and from `advance` where the leader ends before the block does.
 
@@ -114,7 +114,7 @@ class ClosedLoop:
 
     @property
     def link_delay(self) -> float:
-        """Age of the leader's acceleration that the controller sees [s], in whole steps."""
+        """Age of the leader's acceleration that the controller receives [s], in whole steps."""
         return self._link_steps * self.dt
 
     @property
@@ -126,8 +126,8 @@ class ClosedLoop:
         """An independent loop in the same state; tensors are shared (they are never written to), so this is cheap.
 
         With `candidates=n` the state gains a leading dimension: settings of shape (candidate, 1) or (candidate,
-        scenario) may then be tried side by side under common noise, and blocks come back (candidate, scenario, time).
-        `seeds` gives the copy noise of its own: a strategist must not replay the noise the future holds.
+        scenario) may then be compared under common noise, and blocks have shape (candidate, scenario, time).
+        `seeds` gives the copy its own noise: a strategist must not replay the loop's future noise.
         """
         if candidates is not None and (candidates < 1 or self.vehicles is not None):
             raise InputError(f"candidates: found {candidates}, needs 1 or more, and no platoon")
@@ -193,7 +193,7 @@ class ClosedLoop:
         return torch.cat([leader_value.expand(1, self.scenarios), own[:-1]])
 
     def _through_link(self, lead_accel: Tensor) -> Tensor:
-        """What the link delivers now; before its first message arrives, the oldest one there is."""
+        """The acceleration that the link delivers now; before its first message arrives, the leader's first."""
         self._link.append(lead_accel)
         return self._link.pop(0) if len(self._link) > self._link_steps else self._link[0]
 
@@ -226,7 +226,7 @@ class ClosedLoop:
         return Block(time, *columns)
 
     def _jerk(self, a: Tensor, u: Tensor, eps: Tensor) -> Tensor:
-        """Noise-free jerk of every row plus that row's own draw; NaN where the plant does not tell."""
+        """Noise-free jerk of every row plus that row's own draw; NaN where the plant does not give it."""
         jerk = getattr(self.plant, "jerk", None)
         if jerk is None:
             return torch.full_like(a, torch.nan)
@@ -242,9 +242,10 @@ def _time_first(eps: Float[Tensor, "time ... scenario"], dims: int) -> Float[Ten
 def _stop(
     v: Float[Tensor, "*state"], v_next: Float[Tensor, "*state"], moved: Float[Tensor, "*state"], dt: float
 ) -> tuple[Float[Tensor, "*state"], Float[Tensor, "*state"]]:
-    """A step that would end rolling back ends at rest, after the way to the stop at that step's mean deceleration."""
+    """A step that would end with negative speed ends at rest, after the distance to the stop at its mean
+    deceleration."""
     back = v_next < 0
-    # an actuator that turns positive within the step has pulled backward before, on a car that stood
+    # an actuator that turns positive within the step pulled backward before, on a standing car
     moved = torch.clamp(moved, min=0.0)
     to_rest = 0.5 * dt * v * v / torch.where(back, v - v_next, 1.0)
     return torch.where(back, 0.0, v_next), torch.where(back, to_rest, moved)

@@ -56,7 +56,7 @@ class LowerLevel:
         low, high = checked("accel_min", self.accel_min), checked("accel_max", self.accel_max)
         if bool((low >= high).any()):
             raise InputError(f"accel_min: found {self.accel_min} with accel_max {self.accel_max}, needs a lower value")
-        # written so that T_hat = T_d, K_hat = K_d gives exactly 0 and 1: u passes through to the bit
+        # written so that T_hat = T_d, K_hat = K_d gives exactly 0 and 1: u passes through unchanged
         on_accel, on_demand = (1 - T_hat / T_d) / K_hat, (T_hat * K_d) / (K_hat * T_d)
         both_floats = not isinstance(self.accel_min, Tensor) and not isinstance(self.accel_max, Tensor)
         limits = (float(self.accel_min), float(self.accel_max)) if both_floats else (low, high)
@@ -77,9 +77,9 @@ class LowerLevel:
         return torch.clamp(raw, *self._limits)  # pyright: ignore[reportCallIssue, reportArgumentType, reportUnknownVariableType]
 
     def at_limit(self, command: Float[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
-        """Where a command sits at the vehicle's limits, whoever put it there (an MPC keeps to them by itself), bool."""
+        """Where a command is at the vehicle's limits, clipped here or limited by the controller (an MPC), bool."""
         low, high = self._limits
-        slack = 1e-6  # [m/s²], what a solver leaves
+        slack = 1e-6  # [m/s²], tolerance of a solver
         return (command <= low + slack) | (command >= high - slack)
 
     def command(self, a: Tensor, u: Tensor) -> Tensor:
@@ -87,15 +87,15 @@ class LowerLevel:
         return self.clip(self.raw_command(a, u))
 
     def amplification(self) -> Tensor:
-        """Command effort `T_hat K_d / (K_hat T_d)` [-]: how much louder a fast demand leaves than it came."""
+        """Command effort `T_hat K_d / (K_hat T_d)` [-]: the amplification of a fast demand."""
         return self._on_demand
 
     def effective(self, T_L: Batched, K_L: Batched) -> tuple[Tensor, Tensor]:
-        """`(T_e [s], K_e [-])` the loop behaves as, unclipped, with a plant `(T_L, K_L)`; broadcasts.
+        """Effective `(T_e [s], K_e [-])` of the unclipped loop with a plant `(T_L, K_L)`; broadcasts.
 
-        `1/T_e = 1/T - r (1/T_hat - 1/T_d)`, `r = K T_hat / (T K_hat)`. Where the model promises more than the plant
-        has, `1/T_e` can be zero or negative: the inner loop is then itself unstable and `T_e` comes back infinite or
-        negative, to be judged unstable.
+        `1/T_e = 1/T - r (1/T_hat - 1/T_d)`, `r = K T_hat / (T K_hat)`. Where the model overestimates the plant, `1/T_e`
+        can be zero or negative: the inner loop is then itself unstable and `T_e` is infinite or negative, which every
+        verdict counts as unstable.
         """
         T, K = tensor(T_L), tensor(K_L)
         r_over_T_hat = K / (T * self.K_hat)

@@ -8,11 +8,11 @@ Every tick it minimises `Σ_j q_s Δs_j² + q_v Δv_j² + q_a a_j² + r u_j²` o
 demands the first move. The states are eliminated (condensed form), which leaves a strongly convex box problem
 `½ Uᵀ H U + (F x)ᵀ U` of `horizon / step` variables with `H` constant.
 
-Where the unconstrained optimum `-H⁻¹ F x` lies inside the box it is the answer. Elsewhere: the primal-dual active set
+Where the unconstrained optimum `-H⁻¹ F x` lies inside the box it is the solution. Elsewhere: the primal-dual active set
 method (a semismooth Newton method; Hintermüller, Ito and Kunisch 2002), which ends after a few solves at the exact
-optimum and, started afresh each tick, answers a scenario the same whatever batch it is in. It can cycle in theory;
-what has not settled after 20 rounds is handed to Nesterov's projected gradient method, whose rate `1 - 1/sqrt(cond)`
-fixes the number of iterations beforehand. Library solvers take one problem at a time.
+optimum and, started afresh each tick, gives a scenario the same result in any batch. It can cycle in theory; problems
+not settled after 20 rounds are solved by Nesterov's projected gradient method, whose rate `1 - 1/sqrt(cond)` fixes the
+number of iterations beforehand. Library solvers are not used, because they take one problem at a time.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class MPC:
             return free
         out = free.clone()
         out[outside] = self._solve(x[outside] @ self._F.T, free[outside])
-        return torch.clamp(out, self.accel_min, self.accel_max)  # rounding: a limit kept is not a command clipped
+        return torch.clamp(out, self.accel_min, self.accel_max)  # set the exact limit: not counted as clipped
 
     def _solve(
         self, linear: Float[Tensor, "problem move"], guess: Float[Tensor, "problem move"]
@@ -143,7 +143,7 @@ class MPC:
         eye = torch.eye(linear.shape[-1], dtype=linear.dtype)
         out, moved = guess, (above | below).any(-1)
         for _ in range(_ROUNDS):
-            # one linear system: the free moves' gradient vanishes, the others sit on their bound
+            # one linear system: the gradient of the free moves vanishes, the others are at their bound
             bound = torch.where(above, self.accel_max, self.accel_min)
             pinned = above | below
             rows = torch.where(pinned.unsqueeze(-1), eye, self._H)
@@ -174,7 +174,7 @@ class MPC:
         return old * self._scale
 
     def equivalent_gains(self) -> tuple[float, float, float]:
-        """`(k_s, k_v, k_a)` of the law away from the limits, which is linear: `u = k_s Δs + k_v Δv + k_a a`.
+        """`(k_s, k_v, k_a)` of the MPC away from the limits, where it is linear: `u = k_s Δs + k_v Δv + k_a a`.
 
         With these the stability analysis of the linear controller holds for the MPC (small motions).
         """

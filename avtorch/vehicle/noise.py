@@ -1,7 +1,7 @@
 """Jerk noise by scenario seed and step number.
 
 Counter-based (Philox), hence random access: the draw at a step depends on the seed, the vehicle and the step alone. A
-scenario runs the same in a batch as by itself, however the run is cut into blocks, and copying a loop copies no
+scenario therefore gives the same run alone or in a batch, for any division into blocks, and copying a loop copies no
 generator. numpy, because torch's CPU generator keeps 32 bits of a seed and cannot jump.
 """
 

@@ -1,4 +1,4 @@
-"""How a run went: comfort, safety, stability and throughput, by scenario."""
+"""Measures of a run: comfort, safety, stability and throughput, by scenario."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ VEHICLE_LENGTH_M = 4.5
 class Performance:
     """Tensors (scenario,), in a platoon (scenario, vehicle), float64.
 
-    - `speed_rms_ratio` [-]: RMS of the follower's speed about its mean over that of the leader (about the mean, or the
-      ratio would be 1 whatever happens); `accel_rms_ratio` [-]: RMS acceleration over the leader's. Above 1 the
-      follower amplifies. NaN behind a leader at constant speed. In a platoon against the vehicle in front; the
-      product over the vehicles is tail against head.
+    - `speed_rms_ratio` [-]: RMS of the follower's speed about its mean over that of the leader (without removing the
+      mean the ratio would always be near 1); `accel_rms_ratio` [-]: RMS acceleration over the leader's. Above 1 the
+      follower amplifies. NaN behind a leader at constant speed. In a platoon against the vehicle in front; the product
+      over the vehicles is tail against head.
     - `min_spacing_m`: zero or less means a collision. `min_ttc_s`: least spacing / closing speed over rows that close
       in; infinite if none does, 0 after a collision. `safe_share`: rows from which the follower could still stop behind
       a leader who brakes at 6 m/s², if it does so itself half a second later (Shalev-Shwartz et al. 2017, without the
@@ -63,7 +63,7 @@ class Performance:
     throughput_vph: Float[Tensor, "*scenario"]
 
     def row(self, *index: int) -> dict[str, float | None]:
-        """One scenario's (or vehicle's) figures by name; what is not finite is None, as JSON has no other word."""
+        """One scenario's (or vehicle's) figures by name; a number that is not finite is None, for JSON."""
         out: dict[str, float | None] = {}
         for f in fields(self):
             value = float(getattr(self, f.name)[index or (0,)].reshape(-1)[0])

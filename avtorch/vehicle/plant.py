@@ -1,4 +1,4 @@
-"""The plant: what the car makes of the command, over one step.
+"""The plant: the car's response to the command over one step.
 
 A plant is an object with `step(a, v, u, dt, eps)` (or a callable of the same arguments) that returns acceleration,
 speed and displacement after `dt`; (..., scenario) tensors, no standstill logic. Two optional members: `sigma`
@@ -24,7 +24,7 @@ Motion = tuple[Tensor, Tensor, Tensor]
 
 
 class Plant(Protocol):
-    """What the loop asks of a plant.
+    """The interface that the loop needs of a plant.
 
     Example:
         >>> import torch
@@ -50,9 +50,9 @@ class GLVDPlant:
     """Eq. 1 with jerk noise `eps ~ N(0, sigma²)`, one draw per step, held over it; floats or tensors (scenario,).
 
     `"zoh"` integrates acceleration, speed and position exactly; `"euler"` is the paper's explicit step. `accel_min`
-    and `accel_max` [m/s²] bound what the vehicle can physically follow: `K_L u` is clipped to them (the car does not
-    tell; the log still shows the command sent). Frozen: another car is another object. Raises `InputError` for
-    `T_L <= 0`, `K_L < 0`, `sigma < 0`, non-finite values or crossed limits.
+    and `accel_max` [m/s²] bound what the vehicle can physically follow: `K_L u` is clipped to them (the log does not
+    show this; it still contains the command sent). Frozen: another car is another object. Raises `InputError` for `T_L
+    <= 0`, `K_L < 0`, `sigma < 0`, non-finite values or crossed limits.
 
     Example:
         >>> import torch
@@ -85,7 +85,7 @@ class GLVDPlant:
         object.__setattr__(self, "_coefficients", {})
 
     def target(self, u: Tensor) -> Tensor:
-        """What the acceleration tends to under a held `u`, noise apart: `K_L u` within the physical limits [m/s²]."""
+        """Steady-state acceleration under a held `u`, without noise: `K_L u` within the physical limits [m/s²]."""
         wanted = self._gain * u
         if self.accel_min is None and self.accel_max is None:
             return wanted
@@ -99,7 +99,7 @@ class GLVDPlant:
         """See `Plant.step`."""
         if self.method == "euler":
             return a + dt * (self.jerk(a, u) + eps), v + dt * a, dt * v
-        if dt not in self._coefficients:  # a few operations a step saved; the object is frozen, so they stay right
+        if dt not in self._coefficients:  # saves a few operations per step; the object is frozen, so they stay valid
             self._coefficients[dt] = motion_coefficients(self._lag, dt)
         alpha, m1, m2 = self._coefficients[dt]
         a_inf = torch.addcmul(self.target(u), self._lag, eps)

@@ -1,7 +1,7 @@
-r"""Second-order lags, in speed and in location, one derivative below Eq. 1: what the paper leaves to further work.
+r"""Second-order lags, in speed and in location, one derivative below Eq. 1, which the paper leaves to further work.
 
-The GLVD's lag lies in the acceleration, which makes a car a third-order system. Cars driven by a speed or a position
-command have theirs lower down, and are of second order:
+The GLVD's lag lies in the acceleration, which makes a car a third-order system. For cars driven by a speed or a
+position command the lag is in a lower derivative, and the system is of second order:
 
 .. math::
     \text{speed:}\quad & \dot v = -v/T_V + (K_V/T_V)\, v_{cmd} + \epsilon \\

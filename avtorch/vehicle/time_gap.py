@@ -1,8 +1,8 @@
-"""A time gap that moves at a limited rate, so that a new setting does not turn into a jump of the spacing error.
+"""A time gap that moves at a limited rate, so that a new setting does not cause a jump of the spacing error.
 
 From 1 to 2.5 s at 27 m/s the wanted spacing grows by 40 m: applied at once, `k_s` times 40 m is an emergency stop.
-The ramp is a function of time alone (no state): a controller stays a pure function of what it is shown, and a
-copied loop replays the same ramp.
+The ramp is a function of time alone (no state): a controller stays a pure function of its inputs, and a copied loop
+replays the same ramp.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""The bias table: how far SGLD's law lies from the posterior, arm by arm. ``python -m benchmarks.bias``."""
+"""The bias table: distance of SGLD's law from the posterior, arm by arm. ``python -m benchmarks.bias``."""

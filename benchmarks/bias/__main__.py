@@ -1,13 +1,13 @@
-"""How far SGLD's law lies from the posterior: step, batch, preconditioner, control variates, noise, schedule.
+"""Distance of SGLD's law from the posterior: step, batch, preconditioner, control variates, noise, schedule.
 
     python -m benchmarks.bias [--quick] [--markdown] [--only WORD]
 
 Twelve windows of 200 points and twelve of 2000 (four vehicles, weak to strong excitation), truth by quadrature. Every
-arm walks at the window's automatic pace, one row an arm, and for either length: largest difference of means in
+arm samples at the window's automatic pace. One row per arm has, for either length: largest difference of means in
 posterior SDs over the three parameters, the SD ratio of the worst of them, what the closed form predicts for it (for
-schedules: the SD ratio within a single chain instead), effective draws a step of one chain, and the share of windows
-whose chains diverged or never came near. Where there are two numbers the first is the median over windows and the
-second the worst. The last section holds NUTS and SGLD to the same number of gradients over all points.
+schedules: the SD ratio within a single chain instead), effective draws per step of one chain, and the share of windows
+whose chains diverged or never approached the mode. Where there are two numbers the first is the median over windows and
+the second the worst. The last section compares NUTS and SGLD at the same number of gradients over all points.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ def worst_ratio(ratio: Tensor) -> Tensor:
 
 
 def arm_cells(arm: Arm) -> tuple[str, ...]:
-    """What the arm is."""
+    """The arm's settings."""
     batch = "full" if arm.batch is None else str(arm.batch)
     return (f"{arm.step:g}", batch, arm.whitening, "yes" if arm.cv else "", arm.label)
 
 
 def cells(arm: Arm, found: Measured, predicted: Tensor | None) -> tuple[str, ...]:
-    """How it did on the windows of one length."""
+    """Its results on the windows of one length."""
     if bool(found.lost.all()):
         return ("-", "-", "-", "-", "100%")
     told = number(found.one_chain.nanmedian()) if arm.section == LONG else "-"
@@ -82,7 +82,7 @@ def check(problem: Problem, found: Measured, predicted: Tensor) -> Tensor:
 
 
 class Printer:
-    """Lines of a table for eyes or for Markdown."""
+    """Lines of a table in plain text or Markdown."""
 
     def __init__(self, *, markdown: bool) -> None:
         self.markdown = markdown

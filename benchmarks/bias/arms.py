@@ -1,4 +1,4 @@
-"""The arms of the bias table: one way to walk each."""
+"""The arms of the bias table: one sampler setting each."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Arm:
     """One row. Chains start at the posterior's mode unless ``start`` is ``"prior"``, the prior's centre.
 
     ``friction`` makes it SGHMC; ``whitening="rmsprop"`` is pSGLD with Gamma and floor ``eps`` on isotropic coordinates,
-    started around the mode: at the mode itself the first gradient is zero, and so would be the scale it sets.
+    started around the mode: at the mode itself the first gradient is zero, and so would be the scale derived from it.
     """
 
     section: str
@@ -96,7 +96,7 @@ def length(arm: Arm, *, quick: bool) -> Length:
 
 
 def settings(arm: Arm, size: Length) -> SamplerSettings:
-    """The arm in the sampler's own words."""
+    """The arm as settings of the sampler."""
     optimizer: Callable[[list[Tensor], float, torch.Generator | None], torch.optim.Optimizer] | None = None
     if arm.whitening == "rmsprop":
 
@@ -112,7 +112,7 @@ def settings(arm: Arm, size: Length) -> SamplerSettings:
 
     return SamplerSettings(
         chains=size.chains,
-        # the sampler tames its burn-in; here every step is the law's own
+        # the sampler limits slopes in its burn-in; here every step follows the law
         draws=size.burn_in + size.steps,
         burn_in=0,
         thinning=1,
@@ -151,7 +151,7 @@ def predict(arm: Arm, problem: Problem, covariances: dict[bool, Tensor]) -> Tens
     covariance = None if arm.batch is None else covariances[arm.cv] / arm.batch
     averaged = arm.noise == "averaged"
     if arm.friction is not None:
-        # momentum gathers the noise of (1 + c)/(1 - c) steps
+        # momentum accumulates the noise of (1 + c)/(1 - c) steps
         c = torch.exp(torch.tensor(-arm.friction * arm.step**0.5, dtype=torch.float64))
         covariance = None if covariance is None else covariance * (1 + c) / (1 - c)
     return sd_ratio(problem, coordinates, arm.step, covariance, averaged=averaged, grows=arm.cv)

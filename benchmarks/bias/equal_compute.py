@@ -71,7 +71,7 @@ def one_window(problem: Problem, window: int) -> Problem:
 
 
 def by_nuts(problem: Problem, *, warmup: int, draws: int) -> Result:
-    """Pyro's NUTS, one chain; its gradients are counted, the mode search left out."""
+    """Pyro's NUTS, one chain; its gradients are counted without those of the mode search."""
     from avtorch.inference.nuts import nuts
 
     density = JerkDensity(problem.density.statistics, problem.density.prior)
@@ -101,7 +101,7 @@ def by_langevin(problem: Problem, arm: Arm, gradients: int, method: str) -> Resu
 
 
 def equal_compute(problem: Problem, printer: _Printer, *, quick: bool) -> None:
-    """Print the section: the vehicle (0.3 s, 1.0), or the first there is, at each strength."""
+    """Print the section: the vehicle (0.3 s, 1.0), or else the first one, at each strength."""
     printer.section("equal compute: NUTS and Langevin, 200 points", HEADS, WIDTHS)
     warmup, draws = (100, 100) if quick else (200, 800)
     per_strength = len(problem.strength) // len(AMPLITUDES)
@@ -122,8 +122,8 @@ def equal_compute(problem: Problem, printer: _Printer, *, quick: bool) -> None:
 
 
 def effective_of_average(centred: Tensor) -> Tensor:
-    """Effective draws from how the average over chains wanders: chains that share their noise count as far as they do
-    not."""
+    """Effective draws from the variation of the average over chains: chains that share noise count only by their own
+    part."""
     squares = centred.square()
     both = torch.stack([centred, squares - squares.mean((0, 1))])
     average = both.mean(1)

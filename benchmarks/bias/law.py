@@ -1,4 +1,4 @@
-"""What the closed form says an arm's stationary spread is, for posteriors that are nearly Gaussian.
+"""The stationary spread of an arm in closed form, for posteriors that are nearly Gaussian.
 
 Near the mode the walk is linear, ``w' = (I - hP/2) w + noise`` of covariance ``h I + h^2/4 S`` with ``P`` the precision
 and ``S`` the covariance of the gradient's noise, so its stationary covariance solves a discrete Lyapunov equation. In
@@ -22,10 +22,10 @@ PLACES = 16
 
 
 def point_covariance(problem: Problem, *, control_variates: bool, seed: int = 0) -> Tensor:
-    """Covariance over points of the gradient of the log density that one point alone tells, ``(window, d, d)``.
+    """Covariance over points of the gradient of the log density estimated from one point alone, ``(window, d, d)``.
 
-    A minibatch of ``b`` points, drawn with replacement, has the ``b``-th part. With control variates it is that of what
-    they leave, averaged over the Laplace approximation.
+    A minibatch of ``b`` points, drawn with replacement, has a ``b``-th of it. With control variates it is the
+    covariance of the remaining noise, averaged over the Laplace approximation.
     """
     density, mode = problem.density, problem.mode
     at_mode = gradients_by_point(density, mode.z)
@@ -35,7 +35,7 @@ def point_covariance(problem: Problem, *, control_variates: bool, seed: int = 0)
     total = torch.zeros_like(mode.scale)
     for _ in range(PLACES):
         normal = torch.randn(mode.z.shape, generator=g, dtype=mode.z.dtype)
-        # antithetic, so that the mean over places lies at the mode
+        # antithetic, so that the mean over points lies at the mode
         for sign in (1.0, -1.0):
             z = mode.z + sign * torch.einsum("wij,wj->wi", mode.scale, normal)
             total += _covariance(gradients_by_point(density, z) - at_mode) / (2 * PLACES)

@@ -1,4 +1,4 @@
-"""How far draws lie from the truth, and how fast they move."""
+"""Distance of draws from the truth, and how fast the chains mix."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from benchmarks.bias.windows import Problem
 
-#: A chain with a draw so many posterior SDs from the mode has diverged, or never came near: it is lost.
+#: A chain with a draw this many posterior SDs from the mode has diverged, or never approached it: it is lost.
 FAR = 50.0
 #: Blocks of steps whose means give the Monte Carlo error, also where all chains share their minibatches.
 BLOCKS = 20
@@ -42,7 +42,7 @@ def measure(problem: Problem, z: Tensor) -> Measured:
     """Draws of ``z`` ``(chain, step, window, parameter)``, one a step, against quadrature."""
     mode, truth = problem.mode, problem.truth
     whitened = torch.einsum("wij,cnwj->cnwi", torch.linalg.inv(mode.scale), z - mode.z)
-    lost = ~(whitened.abs() < FAR).all(-1).all(0).all(0)  # NaN is far, too
+    lost = ~(whitened.abs() < FAR).all(-1).all(0).all(0)  # NaN counts as far
     score = (torch.where(lost[:, None], 0.0, z.exp()) - truth.mean) / truth.sd
     shift = score.mean((0, 1))
     centred = score - shift
@@ -83,7 +83,7 @@ def effective(centred: Tensor) -> Tensor:
 def autocorrelation_time(centred: Tensor) -> Tensor:
     """Integrated autocorrelation time [steps] of ``(chain, step, ...)``, mean over chains, as Geyer's initial sequence.
 
-    About the common mean of all chains, so that chains that sit still are seen; below one where steps alternate.
+    About the common mean of all chains, so that chains that stand still are detected; below one where steps alternate.
     """
     steps = centred.shape[1]
     spectrum = torch.fft.rfft(centred, 2 * steps, dim=1)

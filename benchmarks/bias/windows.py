@@ -20,7 +20,7 @@ NOISE = 0.1
 class Problem:
     """Windows of one length: the density point by point, its mode, and the truth by quadrature.
 
-    ``strength`` ``(window,)`` says which amplitude, 0 weak to 2 strong.
+    ``strength`` ``(window,)`` is the number of the amplitude, 0 weak to 2 strong.
     """
 
     points: int

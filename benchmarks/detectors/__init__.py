@@ -1,1 +1,1 @@
-"""Detectors side by side: delay against false alarms, all judging the same beliefs."""
+"""Detectors compared: delay against false alarms, all on the same beliefs."""

@@ -1,7 +1,7 @@
-"""Drives with and without a change of the vehicle, and what each window of them lets one believe.
+"""Drives with and without a change of the vehicle, and the belief after each of their windows.
 
-The change comes at a moment of its own in each run, so that no detector lives off what the leader does just then.
-Beliefs are computed once a run; every detector judges the same ones.
+The moment of the change differs from run to run, so that no detector profits from the leader's motion at that moment.
+Beliefs are computed once per run; every detector gets the same ones.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ HEALTHY = (0.3, 1.0)
 EARLIEST_S, LATEST_S = 40.0, 120.0
 STEP_S = 0.5  # the vehicle may change this often; a change then mostly falls inside a window
 SWING_S = 30.0
-DRAWS_CHAINS = 128  # 1024 draws a window: their own scatter adds a thousandth to the spread of a window's mean
+DRAWS_CHAINS = 128  # 1024 draws per window: their scatter adds a thousandth to the spread of a window's mean
 
 
 @dataclass(frozen=True)
 class Change:
-    """What becomes of the vehicle: `to` (T_L [s], K_L [-]), reached in equal steps over `ramp_s` [s] (0: at once).
+    """The change of the vehicle: `to` (T_L [s], K_L [-]), reached in equal steps over `ramp_s` [s] (0: at once).
 
-    `since_ever`: it was like that from the start, so that there is no change to find. `swing`: the gain swings by this
-    share over half a minute, all the time, as no car is quite what GLVD says. `noise`: of the jerk [m/s³].
+    `since_ever`: it is like that from the start, so that there is no change to detect. `swing`: the gain swings by this
+    share over half a minute throughout, because no real car follows GLVD exactly. `noise`: of the jerk [m/s³].
     """
 
     name: str
@@ -65,7 +65,7 @@ CHANGES = {
 
 @dataclass(frozen=True)
 class Beliefs:
-    """What a detector is shown, (window, run) each; `belief` mean (window, run, 2) and covariance of the logs.
+    """The input of a detector, (window, run) each; `belief` mean (window, run, 2) and covariance of the logs.
 
     `used`: the window was excited and its chains settled. `p_stable`: P(string stable) under the default setting;
     `T_L`, `K_L`: posterior means; `sure`: what `accepted_change` compares. `end_s` (window,) and `change_s` (run,) [s].
@@ -93,7 +93,7 @@ def drive(
     duration: float,
     progress: Callable[[float], None] | None = None,
 ) -> Beliefs:
-    """`runs` closed loops side by side behind `leader`, and the belief about each after every 2 s."""
+    """`runs` closed loops in one batch behind `leader`, and the belief about each after every 2 s."""
     generator = torch.Generator().manual_seed(first_seed)
     moments = torch.rand(runs, generator=generator, dtype=torch.float64)
     phase = torch.rand(runs, generator=generator, dtype=torch.float64)

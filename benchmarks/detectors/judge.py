@@ -1,8 +1,8 @@
-"""When each detector would first have alarmed, for any threshold, from one pass over the beliefs.
+"""Time of each detector's first alarm, for any threshold, from one pass over the beliefs.
 
 Up to its first alarm a detector's path does not depend on its threshold: nothing was accepted, no window was kept out
-of the baseline and no chart was restarted. So one pass with the thresholds out of reach serves the whole operating
-curve, and each detector is judged as if it ran alone. What follows a first alarm is not used.
+of the baseline and no chart was restarted. So one pass with unreachable thresholds gives the whole operating curve, and
+each detector is scored as if it ran alone. Windows after a first alarm are not used.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _ARLS = (20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 3e4, 1e5, 1e6, 1e7
 
 @dataclass(frozen=True)
 class Detector:
-    """A detector with its one tuning number: the name of it, its default, the values tried from most to least ready
-    to alarm, and the least score that alarms at each."""
+    """A detector with its one tuning parameter: name, default, the values tried from most to least sensitive, and the
+    least score that alarms at each."""
 
     name: str
     tuned: str
@@ -57,7 +57,7 @@ DETECTORS: dict[str, Detector] = {
 
 
 def scores(beliefs: Beliefs, unevenness: tuple[float, float] = (0.0, 0.0)) -> dict[str, Tensor]:
-    """Each detector's score (window, run), the higher the more alarmed; -inf where the window says nothing.
+    """Each detector's score (window, run), the higher the more alarmed; -inf where the window was not used.
 
     `unevenness` as `Monitor` takes it.
     """

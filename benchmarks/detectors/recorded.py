@@ -1,4 +1,4 @@
-"""Recorded drives of one unchanged car: every alarm is a false one, whatever the car's model lacks."""
+"""Recorded drives of one unchanged car: every alarm is a false one, whatever effects the model lacks."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from avtorch.decision.monitor import DETECTORS
 from avtorch.inference.sequential import Belief
 from avtorch.io import Log
 
-# A log does not tell its controller, so nothing is said of the loop's stability.
+# A log does not contain its controller, so the stability of the loop is not evaluated.
 JUDGED = tuple(name for name in DETECTORS if name != "stability")
 
 
 def alarmed(beliefs: Sequence[Belief], unevenness: tuple[float, float]) -> dict[str, int]:
-    """Windows with an alarm, by detector, each alone and at its default, over the beliefs of one car in their order."""
+    """Windows with an alarm, by detector, each alone and at its default, over the beliefs of one car in order."""
     out = {}
     for name in JUDGED:
         monitor, count = Monitor(1, detectors=[name], unevenness=unevenness), 0
@@ -30,7 +30,7 @@ def alarmed(beliefs: Sequence[Belief], unevenness: tuple[float, float]) -> dict[
 
 
 def judge(paths: Sequence[Path], unevenness: tuple[float, float], *, window: float = 10.0) -> None:
-    """Print what every detector says of drives `paths` of one car, with and without `unevenness` granted."""
+    """Print every detector's alarms on drives `paths` of one car, with and without `unevenness`."""
     torch.set_num_threads(1)
     beliefs = []
     for path in paths:

@@ -1,4 +1,5 @@
-"""Figures of the comparison: false alarms with intervals, delays, what was found, and the settings chosen for quiet."""
+"""Figures of the comparison: false alarms with intervals, delays, detections, and the settings chosen for few
+alarms."""
 
 from __future__ import annotations
 
@@ -78,9 +79,9 @@ def found(first: Tensor, change_s: Tensor) -> Found:
 
 
 def chosen(runs: Mapping[str, tuple[Beliefs, Scores]], most: float) -> dict[str, float]:
-    """For each detector the readiest value that alarms in at most a share `most` of each kind of unchanged runs.
+    """For each detector the most sensitive value that alarms in at most a share `most` of each kind of unchanged runs.
 
-    A detector that no value tried makes quiet enough is left out.
+    A detector without such a value is left out.
     """
     out = {}
     for name, detector in DETECTORS.items():
@@ -109,7 +110,7 @@ def curve(
 def rows(
     kept: Mapping[str, tuple[Beliefs, Scores]], values: Mapping[str, float], unchanged: list[str], changed: list[str]
 ) -> list[dict[str, object]]:
-    """One row a detector, as plain numbers."""
+    """One row per detector, as plain numbers."""
     first = {kind: times(score, beliefs, values) for kind, (beliefs, score) in kept.items()}
     table = []
     for name in [*values, DEFAULT]:
@@ -149,7 +150,7 @@ def delays(table: list[dict[str, object]], kinds: list[str]) -> str:
 
 
 def _table(table: list[dict[str, object]], kinds: list[str], told: Callable[[dict], str]) -> str:
-    """A row a detector, a column a kind of run."""
+    """One row per detector, one column per kind of run."""
     head = ["detector", "set to", *kinds]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for row in table:

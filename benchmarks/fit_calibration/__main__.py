@@ -1,11 +1,11 @@
-"""Fit the constants behind probabilities to simulated cases, and write them with where they come from.
+"""Fit the constants behind probabilities to simulated cases, and write them with their provenance.
 
 ``python -m benchmarks.fit_calibration --seed 515151 --cases 170 --out FILE [--resume]``
 
-Draws cases of the blind test's reference vehicle with the families outside the table that serve to calibrate, searches
-each once (hours: a minute or more of processor time a case) and keeps what the fit needs in `--kept`. Then it fits the
-constants, holds out a quarter for the figures, and writes `--out`; chosen constants stay as they are. With `--resume`
-an interrupted run goes on, and a finished one is only fitted again.
+Draws cases of the blind test's reference vehicle, with the calibration families of causes outside the table, searches
+each once (hours: a minute or more of processor time per case) and keeps what the fit needs in `--kept`. Then it fits
+the constants, holds out a quarter for the figures, and writes `--out`; constants that were chosen by hand are kept.
+With `--resume` an interrupted run continues, and a finished one is only fitted again.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from benchmarks.fit_calibration.fingerprint import Numbers, fingerprint
 from benchmarks.fit_calibration.fit import Fitted, fit
 
 COMMAND = "python -m benchmarks.fit_calibration"
-_DIGITS = 4  # more than any standard error leaves
+_DIGITS = 4  # larger than any standard error
 
 
 def made(
     old: Mapping[str, Any], found: Fitted, provenance: Mapping[str, Any], numbers: Mapping[str, Numbers]
 ) -> dict[str, Any]:
-    """The new file: `old` with what was fitted, where it comes from, and the likelihood's fingerprint."""
+    """The new file: `old` with the fitted constants, their provenance, and the likelihood's fingerprint."""
     groups = {"odds": asdict(found.odds), "unknown": asdict(found.unknown)}
     constants = {
         group: {
@@ -44,12 +44,12 @@ def made(
         }
         for group, entries in old["constants"].items()
     }
-    Calibration.of(constants)  # what is written can be read
+    Calibration.of(constants)  # check that the written file can be read
     return {"schema": SCHEMA, "constants": constants, "provenance": dict(provenance), "fingerprint": dict(numbers)}
 
 
 def origin(cases: Sequence[KeptCase], seed: int, *, commit: str, today: str) -> dict[str, Any]:
-    """Where constants fitted to these cases come from, and what they reach on the quarter held out."""
+    """Provenance of the constants fitted to these cases, and their figures on the held-out quarter."""
     return {
         "made_by": f"{COMMAND} --seed {seed} --cases {len(cases)}",
         "note": "Final constants are fitted to all cases, the figures' to three quarters.",
@@ -66,7 +66,7 @@ def origin(cases: Sequence[KeptCase], seed: int, *, commit: str, today: str) -> 
 
 
 def commit_of(tree: Path) -> str:
-    """The commit of the likelihood. Raises `InputError` where what runs is not what was committed."""
+    """The commit of the likelihood. Raises `InputError` where the running code differs from the committed one."""
 
     def git(*words: str) -> str:
         try:

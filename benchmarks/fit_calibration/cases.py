@@ -1,7 +1,7 @@
-"""Cases drawn, searched once, and kept: of each what the fit needs, some 2 kB, in one file.
+"""Cases drawn, searched once, and stored in one file: for each the data that the fit needs, some 2 kB.
 
-Searching takes hours, fitting seconds. So the file grows case by case, an interrupted run goes on from it, and it can
-be fitted again in other ways.
+Searching takes hours, fitting seconds. So the file grows case by case, an interrupted run continues from it, and the
+fit can be repeated in other ways.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from benchmarks.fit_calibration.fingerprint import Numbers, differences
 
 SCHEMA = "avtorch.calibration.cases/1"
 CASE_MIX = {"none": 0.20, "single": 0.40, "pair": 0.15, "outside": 0.25}
-"""More causes outside the table than in the blind test, as five constants are learnt from these alone. The deck keeps
-whole numbers in every 20 cases; of 170 it makes 20, 40, 14 and 26 %."""
+"""More causes outside the table than in the blind test, as five constants are fitted to these alone. The deck has whole
+numbers in every 20 cases; in 170 cases the shares are 20, 40, 14 and 26 %."""
 
 _REMEDY = "needs another --kept, or all cases searched anew"
 
 
 @dataclass(frozen=True)
 class KeptCandidate:
-    """A candidate as `odds` weighs it; `log_evidence` over none [nats]."""
+    """A candidate as `odds` weights it; `log_evidence` over none [nats]."""
 
     name: str
     log_evidence: float
@@ -44,7 +44,7 @@ class KeptCandidate:
 
 @dataclass(frozen=True)
 class KeptCase:
-    """`truth`: as an answer would have to name it. `left`: by name, of each `possible_favourites`."""
+    """`truth`: the right answer. `left`: by name, of each of `possible_favourites`."""
 
     index: int
     kind: str
@@ -54,7 +54,7 @@ class KeptCase:
 
     @classmethod
     def of(cls, entry: Mapping[str, Any]) -> KeptCase:
-        """From what `asdict` made of one."""
+        """The inverse of `asdict`."""
         found = tuple(KeptCandidate(**c) for c in entry["found"])
         left = {name: Adequacy(**nats) for name, nats in entry["left"].items()}
         return cls(entry["index"], entry["kind"], entry["truth"], found, left)
@@ -65,10 +65,10 @@ class KeptCase:
 
 
 def possible_favourites(found: Sequence[Weighed]) -> set[str]:
-    """Names of the candidates that any prices at all, none below 0, can make the favourite.
+    """Names of the candidates that some non-negative prices make the favourite.
 
-    All single effects pay alike, so only the best of them can. A pair cannot where another one of its group gains as
-    much and pays no more.
+    All single effects pay the same price, so only the best of them can be. A pair cannot where another one of its group
+    gains as much and pays no more.
     """
     gained = odds.gains(found)
     names = {"none"}
@@ -145,11 +145,11 @@ def _kept(path: Path, of: Mapping[str, Any]) -> dict[int, KeptCase]:
 
 
 def weights(cases: Sequence[KeptCase]) -> dict[str, float]:
-    """By kind: its share in the blind test in units of that among `cases`."""
+    """By kind: its share in the blind test over its share among `cases`."""
     counts = Counter(case.kind for case in cases)
     return {kind: MIX[kind] * len(cases) / count for kind, count in counts.items()}
 
 
 def families() -> list[str]:
-    """Names of the causes outside the table that serve to calibrate."""
+    """Names of the calibration causes outside the table."""
     return sorted(FAMILIES)

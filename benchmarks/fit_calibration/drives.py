@@ -1,6 +1,6 @@
 """Short fixed drives, the same to the last digit with any version of NumPy, for the likelihood's fingerprint.
 
-They share no code with avtorch, so that only a change of the likelihood can change what it says of them.
+They share no code with avtorch, so that only a change of the likelihood can change its values on them.
 """
 
 from __future__ import annotations

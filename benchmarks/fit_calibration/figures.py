@@ -1,4 +1,4 @@
-"""How good the constants are: a quarter of the cases is held out and answered with what the others gave."""
+"""Quality of the constants: a quarter of the cases is held out and answered with the constants fitted to the rest."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def held_out(cases: Sequence[KeptCase], seed: int) -> dict[str, float]:
 
 
 def answered(case: KeptCase, found: Fitted) -> Answered:
-    """The probabilities of a case; of a verdict's other parts the figures know nothing."""
+    """The probabilities of a case; the figures do not use the other parts of a verdict."""
     calibration = replace(CALIBRATION, odds=found.odds, unknown=found.unknown)
     left = case.left[odds.favourite(case.found, found.odds).name]
     chances = odds.model_probabilities(case.found, left, calibration=calibration)

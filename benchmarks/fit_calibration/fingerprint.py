@@ -1,8 +1,8 @@
-"""Numbers that pin the likelihood: log evidences of short fixed drives, by the search itself, and what is left over.
+"""Numbers that pin the likelihood: log evidences of short fixed drives by the search itself, and residual statistics.
 
-Names and formatting may change without a new fit, numbers may not. So the fingerprint is of numbers. Each drive asks
-for another part: noise and onset, pairs and the sensor, outliers and lost messages, the road, groups of rows; `effects`
-holds every effect of the table at one fixed place, from the start and from an onset on.
+Names and formatting may change without a new fit, numbers may not. So the fingerprint consists of numbers. Each drive
+exercises another part: noise and onset, pairs and the sensor, outliers and lost messages, the road, groups of rows;
+`effects` evaluates every effect of the table at one fixed point, from the start and from an onset on.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ Numbers = dict[str, float]
 
 FIXED_PLACE = "effects"
 RELATIVE, NATS = 1e-6, 0.05
-"""By how much numbers may differ. At a fixed place nothing decides anything, and round-off moves them by 1e-11 (inputs
-moved by 1e-12): there by the relative amount. A search stops where a round gains less than 0.01 to 0.05 nats, which
-round-off can bring a round earlier (7e-3 nats for the gust): elsewhere by so many nats, far below what any probability
-feels."""
+"""Tolerances. At a fixed point there are no decisions, and round-off moves the numbers by 1e-11 (inputs moved by
+1e-12): there the tolerance is relative. A search stops where a round gains less than 0.01 to 0.05 nats, which round-off
+can cause a round earlier (7e-3 nats for the gust): elsewhere the tolerance is in nats, far below any effect on a
+probability."""
 
 
 def late() -> Numbers:
@@ -52,17 +52,17 @@ def chance() -> Numbers:
 
 
 def road() -> Numbers:
-    """A road's slope beside a gust."""
+    """A road's slope together with a gust."""
     return searched(drive(4, seconds=24.0, rate_hz=20, slope=0.03), ["road_grade", "gust"], left="road_grade")
 
 
 def grouped() -> Numbers:
-    """A log of 100 Hz, whose rows are taken in groups of five."""
+    """A log of 100 Hz, with rows in groups of five."""
     return searched(drive(5, seconds=14.0, rate_hz=100, delay_s=0.2), ["dead_time"], left="none", pairs=False)
 
 
 def effects() -> Numbers:
-    """All that is no chance, and a gust's noise: at one place, the effects from the start and from an onset on."""
+    """All deterministic effects, and a gust's noise, at one point: from the start and from an onset on."""
     record = Record.of(drive(6, seconds=14.0, rate_hz=20))
     noise = NoiseModel(force_sd=0.02, accel_sd=0.06)
     bare = Hypothesis.named(record, "none", plant())
@@ -92,7 +92,8 @@ def fingerprint() -> dict[str, Numbers]:
 
 
 def searched(log: Log, names: Sequence[str], *, left: str, pairs: bool = True) -> Numbers:
-    """Log evidence of every hypothesis among effects of these names, and what the one called `left` leaves over."""
+    """Log evidence of every hypothesis among effects of these names, and the residual statistic of the one named
+    `left`."""
     race = Search([log], plant(), effects=[EFFECTS[name] for name in names], pairs=pairs).run()
     found = {f.name: f for f in race.found}
     of = found[left]
@@ -102,7 +103,7 @@ def searched(log: Log, names: Sequence[str], *, left: str, pairs: bool = True) -
 
 
 def differences(part: str, stored: Mapping[str, float], now: Mapping[str, float]) -> list[str]:
-    """Each number of a part that is not the same, in words."""
+    """Each number of a part that differs, in words."""
     told = [f"{part}: {name}: only {'stored' if name in stored else 'computed'}" for name in stored.keys() ^ now.keys()]
     for name in stored.keys() & now.keys():
         allowed = RELATIVE * abs(stored[name]) if part == FIXED_PLACE else NATS

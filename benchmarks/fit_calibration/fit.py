@@ -2,8 +2,8 @@
 
 A case's probability is that of a named candidate, `(1 - P(unknown)) * share`, or `P(unknown)`. Its logarithm is a sum
 of two: one of the eight constants of `odds.relative`, over the cases with a named truth, and a logistic regression of
-`unknown` over all. The first decides whom the second takes for the favourite, a step function with no slope of its own,
-so fitting one after the other is the maximum of both.
+`unknown` over all. The first determines the favourite in the second, by a step function of zero slope, so fitting one
+after the other maximises both.
 """
 
 from __future__ import annotations
@@ -31,14 +31,15 @@ PRIORS: Mapping[str, tuple[float, float]] = {
     "power": (np.log(2.0), 0.7),
 }
 """Normal, of the logarithm (mean, sd), but for `effect` [nats], which is held near 4 so that a car without any effect
-is seldom blamed. The others are wide: a factor of three either way."""
+rarely gets one named. The others are wide: a factor of three either way."""
 WEIGHT_SD = 2.0
 """Of the weights of `unknown`, normal about 0. Their regressors are of the order of 1."""
 MISSED = 1e-3
-"""Share of truths that no candidate stands for: one case in which the search lost the truth must not set a constant."""
+"""Share of truths without a candidate: a single case in which the search missed the truth must not determine a
+constant."""
 
 _FAR = 5.0  # prior sds at which a constant is held
-_TURNS, _ENOUGH = 5, 1e-3  # rounds of the search at most, and nats by less of which one gains no more
+_TURNS, _ENOUGH = 5, 1e-3  # maximum rounds of the search, and the gain [nats] below which it stops
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,8 @@ class Fitted:
 
 
 def fit(cases: Sequence[KeptCase], weights: Mapping[str, float]) -> Fitted:
-    """To `cases`, each of the weight of its kind. Raises `InputError` without named and outside causes among them."""
+    """Fit to `cases`, each with the weight of its kind. Raises `InputError` without named and outside causes among
+    them."""
     outside = np.array([case.truth == "unknown" for case in cases])
     if outside.all() or not outside.any():
         raise InputError(f"cases: found {int(outside.sum())} of {len(cases)} from outside the table, needs both kinds")
@@ -71,7 +73,7 @@ def fit(cases: Sequence[KeptCase], weights: Mapping[str, float]) -> Fitted:
 
 
 def loss_of(cases: Sequence[KeptCase], weights: Mapping[str, float]) -> Callable[[FloatArray], float]:
-    """Negative log posterior, but for a constant, of the eight constants of the odds [nats].
+    """Negative log posterior of the eight constants of the odds [nats], up to a constant.
 
     Its argument (8,) are their coordinates in prior sds from the prior's means.
     """
@@ -92,7 +94,7 @@ def odds_at(z: FloatArray) -> Odds:
 
 
 def regressors(case: KeptCase, constants: Odds) -> tuple[float, ...]:
-    """What tells `unknown` of a case, given whom these constants make its favourite."""
+    """Regressors of `unknown` for a case, given the favourite under these constants."""
     top = odds.favourite(case.found, constants)
     return odds.signs(top, case.none, case.left[top.name])
 
@@ -105,7 +107,7 @@ def logistic(seen: FloatArray, outside: BoolArray, weigh: FloatArray) -> tuple[F
         slope = seen.T @ (weigh * (outside - chance)) - learnt / WEIGHT_SD**2
         curvature = (seen.T * (weigh * chance * (1 - chance))) @ seen + np.eye(len(learnt)) / WEIGHT_SD**2
         step = np.linalg.solve(curvature, slope)
-        # far from the maximum a whole step can overshoot into where the curve is flat
+        # far from the maximum a full step can overshoot into a flat region
         learnt = learnt + step / max(1.0, float(np.abs(step).max()))
         if np.abs(step).max() < 1e-10:
             break
@@ -113,14 +115,14 @@ def logistic(seen: FloatArray, outside: BoolArray, weigh: FloatArray) -> tuple[F
 
 
 def _share(case: KeptCase, constants: Odds) -> float:
-    """Of the truth among the named candidates; 0 where it is none of them."""
+    """Probability of the truth among the named candidates; 0 where it is none of them."""
     shares = odds.relative(case.found, constants)
     return shares.get(case.truth, 0.0) / sum(shares.values())
 
 
 def _lowest(loss: Callable[[FloatArray], float], size: int) -> FloatArray:
-    """Where `loss` (size,) is least. It has a kink wherever two candidates are worth the same: slopes stall there, so
-    lines along which no slope is needed take over, in turn until neither gains."""
+    """Minimise `loss` (size,). It has a kink wherever two candidates score the same, where gradient steps stall;
+    derivative-free line searches alternate with them until neither gains."""
     x, value = np.zeros(size), np.inf
     for _ in range(_TURNS):
         for method in ("L-BFGS-B", "Powell"):
@@ -134,7 +136,7 @@ def _lowest(loss: Callable[[FloatArray], float], size: int) -> FloatArray:
 def _curvature(loss: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
     """Second derivatives by central differences over about one standard error, no less than the prior's own.
 
-    A shorter step would take a kink for curvature, a longer one leave where the loss is a parabola.
+    A shorter step would turn a kink into curvature, a longer one would leave the parabolic region of the loss.
     """
     size = len(at)
     here, steps = loss(at), np.full(size, 0.3)

@@ -1,1 +1,1 @@
-"""What the paper names and leaves open, each option with its figures (docs/options.md)."""
+"""Options that the paper names but does not work out, each with its figures (docs/options.md)."""

@@ -1,8 +1,8 @@
-"""What the paper names and leaves open, each option with its figures.
+"""Options that the paper names but does not work out, each with its figures.
 
 ``python -m benchmarks.options [--only gap,settings,driver,link,strategy,controllers,bounds,measures] [--out DIR]``
 
-All drives are behind US06, the vehicle becomes (1.5 s, 0.5) at 26 s unless said otherwise; seeds from 0 on.
+All drives are behind US06, the vehicle becomes (1.5 s, 0.5) at 26 s unless stated otherwise; seeds from 0 on.
 """
 
 from __future__ import annotations

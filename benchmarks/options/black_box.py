@@ -1,4 +1,5 @@
-"""An MPC, a small network and a table under the same monitor, and what can be said of their string stability."""
+"""An MPC, a small network and a table under the same monitor, and their string stability as far as it can be
+determined."""
 
 from __future__ import annotations
 
@@ -69,14 +70,14 @@ class Network:
 
 
 def table(state: FollowerState) -> Tensor:
-    """A look-up table: errors read to 0.5 m and 0.25 m/s, accelerations to 0.2 m/s²."""
+    """A look-up table: errors rounded to 0.5 m and 0.25 m/s, accelerations to 0.2 m/s²."""
     rounded = [0.5 * torch.round((state.spacing - state.speed - 5.0) / 0.5)]
     rounded += [0.25 * torch.round((state.lead_speed - state.speed) / 0.25), 0.2 * torch.round(state.accel / 0.2)]
     return 1.5 * rounded[0] + 1.5 * rounded[1] - 0.8 * rounded[2]
 
 
 def judged() -> None:
-    """Slopes, their exact verdict, what is measured, and what the monitor says of a change."""
+    """Slopes, their exact verdict, the measured gain, and the monitor's report on a change."""
     network = Network()
     print(f"network: RMS error against the law it imitates {network.error:.3f} m/s²")
     print(
@@ -123,7 +124,7 @@ def judged() -> None:
 
 
 def _slopes(name: str, controller: Controller) -> tuple[Linearised, str]:
-    """The slopes at 20 m/s, of small steps; where there are none, of steps of ±1, and the name says so."""
+    """The slopes at 20 m/s from small steps; where these are zero, from steps of ±1, as the name then states."""
     try:
         return linearise(controller, 20.0), name
     except InputError:

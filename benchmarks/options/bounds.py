@@ -49,7 +49,7 @@ def rechecked() -> None:
 
 
 def measures(runs: int) -> None:
-    """Comfort, energy, safe spacing and throughput after the change, with nobody acting and with the strategist."""
+    """Comfort, energy, safe spacing and throughput after the change, without action and with the strategist."""
     done = {
         "no action": watched(runs=runs),
         "strategist": watched(runs=runs, strategist=Strategist()),

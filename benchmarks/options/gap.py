@@ -1,4 +1,5 @@
-"""The time gap: what it costs the road, what it buys, what the driver's settings reach, and a driver who takes time."""
+"""The time gap: its cost in throughput, its benefit, the range of the driver's settings, and a driver who reacts
+late."""
 
 from __future__ import annotations
 
@@ -44,7 +45,7 @@ def trade_off(out: Path | None) -> None:
 
 
 def settings() -> None:
-    """Which of the driver's settings the strategist takes, vehicle by vehicle, when it may change nothing else.
+    """Which of the driver's settings the strategist selects, vehicle by vehicle, when it may change nothing else.
 
     Commands from -12 to 12 m/s², so that clipping does not decide.
     """

@@ -1,4 +1,4 @@
-"""Feed-forward on the leader's acceleration with a link that takes time: verdict, simulation, strategy."""
+"""Feed-forward on the leader's acceleration over a link with delay: verdict, simulation, strategy."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def verdict() -> None:
 
 
 def strategy() -> None:
-    """What the strategist takes, with and without a link, when the lower level is not to be touched.
+    """What the strategist selects, with and without a link, when the lower level must not be changed.
 
     Decided twice: with the first belief after the change, 2 s later, and with the last one of the drive, 14 s later.
     """
@@ -53,7 +53,7 @@ def strategy() -> None:
 
 
 def _strong(leader: Leader) -> ClosedLoop:
-    """An actuator that clips nothing here: the question is stability."""
+    """An actuator without clipping, as the question here is stability."""
     return ClosedLoop(leader, lower_level=LowerLevel(accel_min=-12.0, accel_max=12.0), seeds=0)
 
 

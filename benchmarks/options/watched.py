@@ -44,7 +44,7 @@ def belief(vehicle: tuple[float, float] = WORN) -> tuple[Tensor, Tensor]:
 
 
 def last_used(run: SupervisedRun) -> Belief:
-    """The last belief of a run of one car that came of an excited window."""
+    """The last belief of a run of one car that followed from an excited window."""
     beliefs = [w.window.belief for w in run.windows]
     return [b for b in beliefs if bool(b.excited[0] & b.converged[0])][-1]
 

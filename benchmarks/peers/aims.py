@@ -6,7 +6,7 @@ from typing import Any
 
 from benchmarks.peers.single import Row
 
-#: Of one window: by what factor avtorch is to be faster. The peers in two forms are judged in both.
+#: For one window: the factor by which avtorch is to be faster. Peers in two forms are compared in both.
 PEERS_TO_BEAT = (
     ("blackjax-nuts-stan", 10),
     ("blackjax-nuts", 10),
@@ -26,7 +26,8 @@ def aims(one: list[Row], many: list[Row], growth: dict[str, Any] | None) -> list
 
     own = single.get("avtorch")
     if own is not None:
-        # to equal ESS: the default settings overshoot, so the row with fewer chains counts where it is there
+        # to equal ESS: the default settings give more draws than needed, so the row with fewer chains counts where
+        # present
         matched = single.get("avtorch-matched", own)
         for name, factor in PEERS_TO_BEAT:
             if name in single:

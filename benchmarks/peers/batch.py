@@ -61,7 +61,7 @@ def batch(plan: Plan, count: int) -> list[Row]:
 
 
 def _fill(row: Row, score: Score) -> None:
-    """Quantiles over windows in place of extremes: of a hundred windows one always looks bad by chance."""
+    """Quantiles over windows in place of extremes: of a hundred windows one is always poor by chance."""
     row.shift = float(np.nanquantile(np.abs(score.shift), 0.95))
     row.shift_rms = float(np.sqrt(np.nanmean(score.shift**2)))
     low, high = np.nanquantile(score.ratio, [0.025, 0.975])

@@ -1,4 +1,4 @@
-"""What a method of the comparison is: a description that costs nothing, and a runner that its own process builds."""
+"""The interface of a method of the comparison: a cheap description, and a runner that its own process builds."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Settings = dict[str, Any]
 
 @dataclass(frozen=True)
 class Answer:
-    """What a method says about some windows.
+    """A method's result for some windows.
 
     Attributes:
         draws: ``(chain, draw, window, parameter)`` in the parameters' own units, or ``None`` without draws.
@@ -33,7 +33,7 @@ class Answer:
 
 
 class Runner(Protocol):
-    """A method with its settings, built in its own process. What it compiled it keeps from call to call."""
+    """A method with its settings, built in its own process. It keeps compiled code between calls."""
 
     def log_density(self, windows: Windows, z: FloatArray) -> FloatArray | None:
         """Its log density of the first window at ``z = log(parameter)``, ``(point, 3)`` to ``(point,)``.
@@ -43,7 +43,7 @@ class Runner(Protocol):
         ...
 
     def run(self, windows: Windows, seed: int) -> Answer:
-        """From the rows of the windows to the answer: one window, or as many as there are at once."""
+        """From the rows of the windows to the answer: one window, or all of them at once."""
         ...
 
 
@@ -62,7 +62,7 @@ class Method:
         batch: settings for many windows at once, or ``None``; ``batch_windows``: at most so many. Where ``scales`` is
             not ``draws`` the settings found for one window are taken.
         gets: what was done for its speed, in words.
-        same_density: whether it works on the density of all; else the table says that it does not.
+        same_density: whether it samples the common density; otherwise the table marks it.
         exact: the truth itself.
         slow: the number of windows is cut, and no trial is made.
     """
@@ -101,6 +101,6 @@ def moments(answer: Answer) -> tuple[FloatArray, FloatArray]:
 
 
 def as_log(windows: Windows) -> FloatArray:
-    """Random places around the truth in ``z``, ``(point, 3)``, for comparing densities."""
+    """Random points around the truth in ``z``, ``(point, 3)``, for comparing densities."""
     g = np.random.default_rng(len(windows))
     return np.log(windows.truth[0]) + 0.5 * g.standard_normal((20, 3))

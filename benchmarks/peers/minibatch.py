@@ -1,11 +1,11 @@
-"""From which size mini-batches pay, for a likelihood without sums: full batch, mini-batch, and with control variates.
+"""The size from which mini-batches pay, for a likelihood without sums: full batch, mini-batch, with control variates.
 
 All arms sample one window row by row. The full batch takes averaged noise and avtorch's default step. A mini-batch
 takes the longest step that keeps the SD ratio at 1.04 by the law of SGLD on a Gaussian,
 ``Var = (1 + h s2/4) / (1 - h/4)``, with the gradient's variance ``s2`` measured over mini-batches in the whitened
-space. The effective draws of a step follow from the same law, less what is lost because all chains share their
-mini-batches. The seconds of a step are measured. Where a run to the effective draws wanted is affordable it is made,
-and its SD ratio is told.
+space. The effective draws of a step follow from the same law, less the loss from mini-batches that all chains share.
+The seconds of a step are measured. A run to the wanted number of effective draws is made where affordable, and its SD
+ratio is reported.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def seconds_a_step(density: SubsampledDensity, mode: Mode, batch: int | None) ->
         return min(times)
 
     brief, whole = least(short), least(long)
-    # never less than half of the whole run's share: the clock of a busy machine may even run backwards
+    # at least half of the whole run's share: on a busy machine the difference may even be negative
     return max((whole - brief) / (long - short), 0.5 * whole / long)
 
 

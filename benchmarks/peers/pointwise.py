@@ -1,4 +1,4 @@
-"""The jerk density without its sums: what SGLD meets where a likelihood has no sufficient statistics."""
+"""The jerk density without its sums: the case of SGLD on a likelihood without sufficient statistics."""
 
 from __future__ import annotations
 

@@ -61,9 +61,10 @@ class Windows:
 
 
 def make_windows(count: int, *, points: int = 200, seed: int = 0) -> Windows:
-    """Windows at 100 Hz of unlike cars: T_L 0.1 to 2 s, K_L 0.4 to 1.1, sigma 0.05 to 0.3 m/s^3.
+    """Windows at 100 Hz of different cars: T_L 0.1 to 2 s, K_L 0.4 to 1.1, sigma 0.05 to 0.3 m/s^3.
 
-    The command is a sum of two sines of 0.1 to 1.5 m/s^2, so some windows teach little and are skewed.
+    The command is a sum of two sines of 0.1 to 1.5 m/s^2, so some windows are uninformative and their posteriors
+    skewed.
     """
     g = np.random.default_rng(seed)
     lag = np.exp(g.uniform(np.log(0.1), np.log(2.0), count))

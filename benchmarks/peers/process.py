@@ -23,7 +23,7 @@ class PeerFailed(RuntimeError):
 
 @dataclass(frozen=True)
 class Timed:
-    """Seconds of every repeat of a call by the clock asked for, the last one's answer, peak memory so far [MB]."""
+    """Seconds of every repeat of a call by the requested clock, the last answer, peak memory so far [MB]."""
 
     seconds: list[float]
     answer: Answer
@@ -95,7 +95,7 @@ class Worker:
         return Timed(told[self.clock], answer, float(told["peak_mb"]))
 
     def close(self) -> None:
-        """End the process and let go of its pipes."""
+        """End the process and close its pipes."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         if self._process.poll() is None:
@@ -106,7 +106,7 @@ class Worker:
             except (OSError, subprocess.TimeoutExpired):
                 self._process.kill()
                 self._process.wait()
-        with contextlib.suppress(OSError):  # what was still unsent to a process that has ended
+        with contextlib.suppress(OSError):  # data not yet sent to a process that has ended
             self._process.stdin.close()
         self._process.stdout.close()
         self._log.close()

@@ -1,4 +1,4 @@
-"""SGLD as one writes it first: one chain of one window in a Python loop, the likelihood of every row by autograd.
+"""SGLD as a first version is written: one chain of one window in a Python loop, every row's likelihood by autograd.
 
 Settings:
     whitened: steps along the Laplace covariance at the mode; else one step for all three parameters, as large as the

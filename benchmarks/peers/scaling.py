@@ -62,7 +62,7 @@ def grow(*, quick: bool = False) -> dict[str, Any]:
         print(f"{name} {value}: {1e3 * row['total_s']:.1f} ms", file=sys.stderr, flush=True)
         return {name: value, **row}
 
-    update(make_windows(2), 4)  # what the first call loads is no part of the growth
+    update(make_windows(2), 4)  # the loading time of the first call is not part of the growth
     return {
         "windows": [told("windows", n, update(make_windows(n, seed=3))) for n in windows],
         "chains": [told("chains", n, update(make_windows(1, seed=4), n)) for n in chains],

@@ -1,4 +1,4 @@
-"""How good an answer is: effective draws, and its distance from the exact posterior."""
+"""Quality of an answer: effective draws, and its distance from the exact posterior."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from avtorch.arrays import FloatArray
 from benchmarks.peers.contract import Answer, moments
 from benchmarks.peers.problem import Windows
 
-#: Effective draws that every sampler is asked for.
+#: Effective draws requested of every sampler.
 WANTED = 2000
-#: ArviZ reads autocorrelation off halves of chains; shorter chains than this show it nothing, and the spread of their
-#: means tells more.
+#: ArviZ estimates autocorrelation from halves of chains; chains shorter than this are uninformative for it, and the
+#: spread of their means is used instead.
 SHORT = 50
 LEAST_CHAINS = 64
 
@@ -43,7 +43,7 @@ class Exact:
 
 @dataclass(frozen=True)
 class Score:
-    """Of the windows of an answer.
+    """Scores of the windows of an answer.
 
     Attributes:
         bulk, tail: least effective draws over the parameters, ``(window,)``; NaN without draws.
@@ -73,7 +73,7 @@ def effective(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Bulk and tail effective draws of the worst parameter, each ``(window,)``; never above the number of draws.
 
     ArviZ's, but for many chains of fewer than ``SHORT`` draws: there its estimate saturates, and the variance of the
-    chains' means over that of independent draws counts instead, of the same rank-normalised draws and tail indicators.
+    chains' means over that of independent draws is used instead, on the same rank-normalised draws and tail indicators.
     """
     chains, length, windows, parameters = draws.shape
     bulk, tail = np.empty((windows, parameters)), np.empty((windows, parameters))
@@ -112,7 +112,7 @@ def _arviz():
 
 
 def seconds_to(wanted: float, seconds: float, ess: float) -> float:
-    """Seconds to ``wanted`` effective draws: what it took if that many came out, else scaled up in proportion.
+    """Seconds to ``wanted`` effective draws: as measured if there were that many, else scaled up in proportion.
 
     Not scaled down: warm-up and the search for the mode do not shrink with the draws.
     """

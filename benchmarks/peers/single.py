@@ -68,7 +68,7 @@ def say(text: str) -> None:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is run, on how many windows of how many points, and how; ``log`` takes the peers' own output."""
+    """The plan of a run: methods, numbers of windows and points, options; ``log`` takes the peers' own output."""
 
     methods: list[Method]
     windows: int
@@ -145,7 +145,7 @@ def single(plan: Plan) -> list[Row]:
 
 
 def choose(method: Method, plan: Plan, folder: Path, exact: Exact) -> tuple[Settings, list[dict[str, Any]]]:
-    """Settings that reach the effective draws wanted the fastest and stay accurate, on windows for trial only."""
+    """The fastest accurate settings that reach the wanted effective draws, found on separate trial windows."""
     if plan.quick:
         return quick(method.candidates[-1]), []
     if method.fixed:
@@ -180,7 +180,7 @@ def choose(method: Method, plan: Plan, folder: Path, exact: Exact) -> tuple[Sett
 
 
 def quick(settings: Settings) -> Settings:
-    """The same with few draws, to see that it runs."""
+    """The same with few draws, as a test that it runs."""
     return {**settings, "draws": min(settings["draws"], 200)} if "draws" in settings else settings
 
 

@@ -1,6 +1,6 @@
 """One method in a process of its own: ``python -m benchmarks.peers.worker NAME SETTINGS FOLDER CORE``.
 
-It reads a JSON command a line and answers with a JSON line; arrays go through files in FOLDER. What libraries print
+It reads one JSON command per line and answers with a JSON line; arrays go through files in FOLDER. Output of libraries
 goes to standard error.
 """
 
@@ -43,7 +43,7 @@ def memory_mb(*, peak: bool) -> float:
 
 
 def forget_peak() -> None:
-    """Start the peak again at what is resident now (Linux only)."""
+    """Reset the peak to the present resident memory (Linux only)."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 

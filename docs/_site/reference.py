@@ -1,6 +1,6 @@
 """The API reference: a page for each public package, written before the build; after it every public name must be in.
 
-A package is public if its `__all__` says what it offers; a new one gets its page without an edit anywhere. A name that
+A package is public if its `__all__` lists its names; a new one gets its page without an edit anywhere. A name that
 several packages offer stands in full with the innermost, and in short with the others.
 """
 

@@ -1,4 +1,4 @@
-"""The comparison of estimators: one stream for all, and figures that say what they are said to say."""
+"""The comparison of estimators: one stream for all, and figures that match their definitions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Constants are those of this likelihood: the numbers stored when they were fitted come out again."""
+"""Constants belong to this likelihood: it reproduces the numbers stored when they were fitted."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_every_part_is_stored() -> None:
     assert document()["fingerprint"].keys() == PARTS.keys()
 
 
-def test_a_difference_is_told() -> None:
+def test_a_difference_is_reported() -> None:
     stored = {"none": 1000.0, "dead_time": 1100.0}
     assert differences("late", stored, {"none": 1000.04, "dead_time": 1100.0}) == []
     assert differences("late", stored, {"none": 1000.06, "dead_time": 1100.0}) == [

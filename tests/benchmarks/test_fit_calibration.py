@@ -1,4 +1,5 @@
-"""The fit finds constants again that cases were drawn with; cases are kept, resumed and refused; the file is made."""
+"""The fit recovers the constants that cases were drawn with; cases are stored, resumed and refused; the file is
+written."""
 
 from __future__ import annotations
 
@@ -72,7 +73,7 @@ def test_constants_are_found_again(rotating_seed: int) -> None:
 @pytest.mark.statistical
 @pytest.mark.slow
 def test_nothing_fits_better_and_the_truth_hardly_worse(rotating_seed: int) -> None:
-    """Whatever the constants were, also where a price near 0 makes its logarithm's posterior anything but normal."""
+    """For any constants, also where a price near 0 makes its logarithm's posterior far from normal."""
     rng = np.random.default_rng(rotating_seed)
     means, sds = (np.array([p[k] for p in PRIORS.values()]) for k in (0, 1))
     truth = np.concatenate([means + sds * rng.standard_normal(len(means)), shipped()[8:]])

@@ -1,4 +1,4 @@
-"""The comparison with peers: its command runs without them, all densities are one, and what is missing is said."""
+"""The comparison with peers: its command runs without them, all densities agree, and missing peers are reported."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_every_method_works_on_the_same_density(name: str, windows: Windows) -> 
     z, ours = as_log(windows), own_log_density(windows, as_log(windows))
     with warnings.catch_warnings():
         if name in PEERS:
-            warnings.simplefilter("ignore")  # what a peer announces on import is not ours to mend
+            warnings.simplefilter("ignore")  # a peer's warnings on import are not our fault
         theirs = method.build(method.candidates[0]).log_density(windows, z)
     assert (theirs is not None) == method.same_density
     if theirs is not None:
@@ -102,7 +102,7 @@ def test_missing_peer_is_a_line_with_its_pip_command(
 
 
 def test_failing_method_is_a_line_not_the_end(capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
-    # its process looks it up in the registry, where this name is not
+    # its process does not find this name in the registry
     broken = Method("broken", "Broken sampler", "laplace", fixed=True)
     monkeypatch.setitem(METHODS, "broken", broken)
     assert command.main(["--quick", "--windows", "1", "--only", "broken", "--parts", "one"]) == 0

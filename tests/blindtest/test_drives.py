@@ -1,4 +1,4 @@
-"""Drives are drives: no collision, no runaway, commands within limits, the manoeuvre it says."""
+"""Drives are plausible: no collision, no runaway, commands within limits, the stated manoeuvre."""
 
 from __future__ import annotations
 

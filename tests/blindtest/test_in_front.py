@@ -1,6 +1,6 @@
 """An effect in front of a recorded car: the simulator with the effect answers the new command as the car did the old.
 
-The effects of `avtorch.gap` share no code with the rewriting, so the two are held against each other.
+The effects of `avtorch.gap` share no code with the rewriting, so the two are compared.
 """
 
 from __future__ import annotations

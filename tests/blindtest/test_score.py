@@ -1,4 +1,4 @@
-"""The score, on answers whose worth is known beforehand."""
+"""The score, on answers whose score is known beforehand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The reference vehicle: GLVD exactly when nothing is on, and every cause does what its equation says."""
+"""The reference vehicle: GLVD exactly without a cause, and every cause follows its equation."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_speed_and_position_are_the_integrals() -> None:
     np.testing.assert_allclose(run.position, simpson, atol=1e-4, rtol=0)
 
 
-def test_noise_of_the_car_is_superposed_and_told() -> None:
+def test_noise_of_the_car_is_superposed_and_reported() -> None:
     run = drive(car=Car(T_L=CAR.T_L, K_L=CAR.K_L, process_sd=0.1, accel_sd=0.1, speed_sd=0.05, speed_quantum=0.02))
     np.testing.assert_allclose(run.accel - run.noise_accel, glvd(run.command), atol=1e-6, rtol=0)
     clean = drive().speed

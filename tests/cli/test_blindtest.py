@@ -15,7 +15,7 @@ from avtorch.io import Log
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """In place of the diagnosis one that says `none` at once; the list names the cases it was asked about."""
+    """In place of the diagnosis one that answers `none` at once; the list names the cases it was given."""
     asked: list[str] = []
 
     def says_none(log: Log) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""`avtorch compare`: what it says and writes, and one line for what it cannot use."""
+"""`avtorch compare`: its output and files, and one line for input that it cannot use."""
 
 import json
 from pathlib import Path

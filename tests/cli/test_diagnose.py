@@ -1,6 +1,6 @@
-"""`avtorch diagnose`: what it hands on, shows and writes, how it goes on, and one line for what it cannot use.
+"""`avtorch diagnose`: what it passes on, prints and writes, how it resumes, and one line for input it cannot use.
 
-The search itself is tested where it lives; here a stand-in answers in its place.
+The search has its own tests; here a stub replaces it.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def answer(logs: Sequence[Log], candidates: tuple[Candidate, ...] = CANDIDATES, 
 
 
 class Search:
-    """Stands in for `avtorch.gap.diagnose`: remembers what it was given, keeps fits as it does, answers."""
+    """A stub of `avtorch.gap.diagnose`: records its arguments, stores fits in the same way, and answers."""
 
     def __init__(self) -> None:
         self.calls: list[dict[str, Any]] = []
@@ -217,7 +217,7 @@ def test_interrupted_then_on_again(
     assert "the same command resumes there" in told
     assert not (out / "diagnosis.json").exists()
     search.interrupted_after = None
-    # neither the budget nor the prior over causes belongs to the fits, nor how the posterior is drawn
+    # budget, prior over causes and sampling of the posterior do not belong to the fits
     more = ["--budget", "9", "--prior", "none=2", "--seed", "3", "--posterior", "laplace"]
     assert main(["diagnose", drive, *more, "--quiet", "--out", str(out)]) == 0
     assert [call["fits_before"] for call in search.calls] == [0, 2]

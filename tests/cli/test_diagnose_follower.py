@@ -51,7 +51,7 @@ def test_answer_and_page(log: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
         ([], "`--follower` diagnoses"),
     ],
 )
-def test_what_cannot_be_is_told(
+def test_impossible_options_are_refused(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], needs: str
 ) -> None:
     assert main(["diagnose", str(log), *options, "--out", str(tmp_path / "out")]) == 2

@@ -1,4 +1,4 @@
-"""`avtorch diagnose` from a file to the page with nothing stood in for: Unix time, overrides, a second run."""
+"""`avtorch diagnose` from a file to the page without stubs: Unix time, overrides, a second run."""
 
 from __future__ import annotations
 

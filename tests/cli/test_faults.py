@@ -1,8 +1,7 @@
-"""Whatever fails while a command writes: its folder holds the whole earlier answer or the whole new one.
+"""Faults while a command writes: its folder holds the whole earlier answer or the whole new one.
 
-What is computed and drawn is stood in for, so that a command runs in milliseconds and its writing can fail at every
-call; the reading of arguments, every check, and all that writes is the command's own. `of` names which of two answers
-the stand-ins give.
+Stubs replace computation and drawing, so that a command runs in milliseconds and its writing can fail at every call;
+argument parsing, checks and writing are the command's own. `of` selects one of two answers of the stubs.
 """
 
 from __future__ import annotations
@@ -40,11 +39,11 @@ from tests.cli.test_diagnose import answer, columns, write
 from tests.faulty_disk import disk, fails, interrupts, tree, visible
 
 STATE = frozenset({"fits.json", "fits_of.json", "trial.json"})
-"""What is kept to go on with; it belongs to no answer."""
+"""Files kept for resuming; they belong to no answer."""
 
 
 class Command:
-    """A command with stand-ins for its work: the line that gives the `old` answer, and the one for the `new`."""
+    """A command with stubs for its work: the command line for the `old` answer, and the one for the `new`."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         self.monkeypatch, self.tmp_path, self.out = monkeypatch, tmp_path, tmp_path / "out"
@@ -110,7 +109,7 @@ def diagnose(c: Command) -> None:
 
 @dataclass(frozen=True)
 class Followed:
-    """As much of a follower's diagnosis as the command needs."""
+    """The parts of a follower's diagnosis that the command needs."""
 
     of: str
     diagnosis: Any
@@ -232,7 +231,8 @@ class Answers:
         shutil.copytree(self.command.tmp_path / "before", self.command.out, symlinks=True)
 
     def follow(self) -> None:
-        """The next run needs nobody's help, from all that lies there now; what has been tried is not tried again."""
+        """The next run succeeds without intervention from every folder state that occurs; equal states are tried
+        once."""
         lies = tree(self.command.out)
         if lies in self.followed:
             return
@@ -272,7 +272,7 @@ def test_a_disk_that_fails_at_the_nth_call(command: Command, onwards: bool, caps
 
 
 def test_a_reader_at_any_moment_and_a_kill(command: Command) -> None:
-    """A process that is killed leaves what a reader sees at that moment; the next run must follow from it."""
+    """A killed process leaves what a reader finds at that moment; the next run must succeed from it."""
     answers, seen = Answers(command), []
     killed = command.tmp_path / "killed"
 

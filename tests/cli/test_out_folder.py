@@ -31,7 +31,7 @@ def test_every_command_that_writes_holds_its_folder() -> None:
         assert "out" in inspect.signature(command).parameters
 
 
-def test_a_second_process_is_told_of_the_first(tmp_path: Path) -> None:
+def test_a_second_process_gets_the_name_of_the_first(tmp_path: Path) -> None:
     out = tmp_path / "out"
     line = [sys.executable, "-m", "avtorch.cli", "stability", "--quiet", "--out", str(out)]
     with sole_use(out, work="avtorch diagnose"):
@@ -83,7 +83,7 @@ def test_where_there_are_no_locks_a_line_says_so(
 def test_two_diagnoses_in_one_folder_do_not_mix(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One is interrupted, another is begun in its folder, the first goes on: it answers as if left alone."""
+    """One is interrupted, another starts in its folder, the first resumes: its answer is as if it had run alone."""
     logs = []
     for i, bias in enumerate((0.25, 0.1)):
         logs.append(str(tmp_path / f"{i}.csv"))

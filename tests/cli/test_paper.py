@@ -1,4 +1,4 @@
-"""`avtorch paper`: its files, its answer, its words, and one line for whatever it cannot use."""
+"""`avtorch paper`: its files, its answer, its text, and one line for input that it cannot use."""
 
 from __future__ import annotations
 

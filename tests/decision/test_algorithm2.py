@@ -1,4 +1,4 @@
-"""Algorithm 2, branch by branch, and the paper's own settings judged both ways."""
+"""Algorithm 2, branch by branch, and the paper's own settings tested both ways."""
 
 import pytest
 import torch
@@ -40,7 +40,7 @@ def test_the_printed_check_is_only_sufficient():
     assert algorithm2(lag, gain, Setting(), check="print").stable.tolist() == [False]
 
 
-def test_the_boundary_may_be_told():
+def test_the_boundary_may_be_given():
     taken = algorithm2(T[2:3], K[2:3], Setting(), accepted=(1.4, 0.55))
     assert taken.outside.tolist() == [False]
     assert algorithm2(T[2:3], K[2:3], Setting(), accepted=(1.4, 0.55), change=(0.05, 0.15)).outside.tolist() == [True]

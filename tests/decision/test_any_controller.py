@@ -1,4 +1,4 @@
-"""A controller of unknown structure under the monitor: its slopes tell the setting, the belief needs neither."""
+"""A controller of unknown structure under the monitor: its slopes give the setting; the belief needs neither."""
 
 import torch
 
@@ -11,7 +11,7 @@ def network(state):
     return 4.0 * torch.tanh(LinearController(time_gap=1.1)(state) / 4.0)
 
 
-def test_a_change_is_seen_and_judged_by_the_slopes():
+def test_a_change_is_detected_and_evaluated_by_the_slopes():
     law = linearise(network, 15.0)
     setting = Setting(time_gap=law.time_gap, gains=law.gains, feedforward=law.feedforward)
     loop = ClosedLoop(Leader.default(start=48), network, plant=GLVDPlant(0.3, 1.0, 0.1), scenarios=2, seeds=4)

@@ -87,7 +87,7 @@ def test_the_monitor_given_is_the_one_asked(healthy):
 
 
 def test_a_drivers_rows_and_those_at_standstill_are_masked():
-    """Rows that another hand or the brakes at rest made are rubbish here, and no rubbish reaches the belief."""
+    """Rows under a driver or at standstill hold arbitrary numbers here, and none of them affects the belief."""
     log = drive(seconds=16.0, leader=Leader.default(start=44))
     given = columns(log)
     still = log.speed < 0.3
@@ -139,7 +139,7 @@ def test_a_gap_restarts_the_grid(healthy):
 
 @pytest.mark.slow
 def test_a_clock_that_starts_anew_with_a_segment(healthy):
-    """Two drives in one file, both on a clock from zero: the windows tell each drive's own time."""
+    """Two drives in one file, both on a clock from zero: windows have each drive's own time."""
     again = drive(seed=2, seconds=12.0)
     log = joined(healthy, again)
     assert [float(log.time[part][0]) for part in log.segments()] == [0.0, 0.0]
@@ -147,7 +147,7 @@ def test_a_clock_that_starts_anew_with_a_segment(healthy):
     own = [span for part in (healthy, again) for span in spans(estimate(part))]
     assert np.array(spans(found)) == pytest.approx(np.array(own))
     assert [s for s, _ in spans(found)[10:]] == [2.0 * k for k in range(6)]
-    # the clock is only a name: told on one that goes on, the belief is the same
+    # the clock is only a label: on a continuous one the belief is the same
     later = columns(log)
     later["time"] = np.concatenate([healthy.time, again.time + 1000.0])
     on = estimate(Log.from_arrays(**later))
@@ -168,7 +168,7 @@ def test_segments_that_follow_at_once_are_still_two_drives(healthy):
     assert ends[:4] == pytest.approx([2.0, 4.0, 5.0, 7.0])
 
 
-def test_progress_is_told_in_rows(healthy):
+def test_progress_is_reported_in_rows(healthy):
     log, seen = joined(healthy, drive(seed=2, seconds=8.0)), []
     estimate(log, progress=lambda done, of: seen.append((done, of)), settings=QUICK)
     assert [of for _, of in seen] == [log.rows] * len(seen)
@@ -197,7 +197,7 @@ def test_the_seed_decides(healthy):
         assert_same_belief(a.window.belief, b.window.belief)
     last, another = (x.windows[-1].window.belief for x in (one, other))
     assert not torch.equal(last.draws, another.draws)
-    # but not what is believed: thousands of draws leave far less than a tenth of an SD, the windows before add alike
+    # but not the belief: thousands of draws leave far less than a tenth of an SD, and earlier windows about as much
     assert bool(((last.mean - another.mean).abs() < 0.3 * last.sd).all())
 
 
@@ -247,7 +247,8 @@ def test_the_jerk_form_as_it_is_answered(healthy):
 
 @pytest.mark.slow
 def test_behind_a_recorded_leader_rest_and_cruise_teach_nothing(data_dir):
-    """A production car at AstaZero stands, pulls off to 19 m/s and cruises: only the pull-off tells of the actuator."""
+    """A production car at AstaZero stands, pulls off to 19 m/s and cruises: only the pull-off is informative about the
+    actuator."""
     path = data_dir / "openacc_astazero" / "ASta_040719_platoon7.csv"
     leader = Leader.read(path, vehicle=1, duration=100.0)
     log = drive(0.5, 0.9, seconds=100.0, seed=3, leader=leader)
@@ -333,7 +334,8 @@ def test_an_unknown_estimator_is_refused(healthy):
 
 @pytest.mark.statistical
 def test_a_known_dead_time_is_taken_out(rotating_seed):
-    """Commands that were sent 0.2 s earlier: without saying so the lag is too long, with it right, and P knows it."""
+    """Commands sent 0.2 s earlier: without the dead time the lag is too long; with it the lag is right, and P accounts
+    for it."""
     late = 20
     log = drive(0.5, 0.9, seed=rotating_seed, seconds=16.0)
     sent = columns(log)
@@ -378,7 +380,7 @@ def test_a_dead_time_out_of_range_is_refused(healthy, seconds):
 @pytest.mark.statistical
 @pytest.mark.parametrize("form", ["jerk", "latent"])
 def test_a_driver_who_acts_against_the_command_teaches_nothing(form, rotating_seed):
-    """What he leaves behind is forgotten first: lag and gain are those of the car, told to as much as is left."""
+    """The state after an override decays first: lag and gain are the car's, as precise as the remaining rows permit."""
     rng = np.random.default_rng(rotating_seed)
     truth = {"T_L": 0.5, "K_L": 0.9}
     overrides = [(4.0, 6.0), (10.0, 12.0), (16.0, 18.0)]
@@ -398,7 +400,7 @@ def test_a_driver_who_acts_against_the_command_teaches_nothing(form, rotating_se
 
 @pytest.mark.slow
 def test_a_dead_time_reaches_for_no_command_that_nobody_obeyed(healthy):
-    """A log whose commands under the driver are rubbish says the same, also where they would act after the return."""
+    """Arbitrary commands under the driver change nothing, even where they would act after the return."""
     given = columns(healthy)
     given["engaged"] = np.where((healthy.time >= 5.0) & (healthy.time < 7.0), 0, 1)
     clean = Log.from_arrays(**given)

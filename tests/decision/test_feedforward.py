@@ -1,4 +1,5 @@
-"""Feed-forward as Strategy 4: judged with its delay, priced, chosen where it is the least that suffices, in force."""
+"""Feed-forward as Strategy 4: evaluated with its delay, costed, chosen where it is the least sufficient, put in
+force."""
 
 import pytest
 import torch
@@ -103,7 +104,7 @@ def test_it_is_put_in_force_and_watched_with_its_delay():
     assert float(last.report.p_string_stable[0]) == float(told[0]) > float(Setting().p_string_stable(T, K)[0])
 
 
-def test_a_loop_that_hears_already_is_judged_as_it_is():
+def test_a_loop_with_a_link_is_evaluated_with_it():
     loop = ClosedLoop(LEADER, LinearController(feedforward=0.75), link_delay=0.5)
     supervisor = Supervisor(loop)
     assert supervisor.setting.feedforward.tolist() == [0.75]

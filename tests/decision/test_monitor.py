@@ -1,4 +1,4 @@
-"""The monitor: the honest form of the paper's rule, precedence, silence of unexcited windows, rates, resuming."""
+"""The monitor: the paper's rule with certainty, precedence, no alarms in unexcited windows, rates, resuming."""
 
 import math
 
@@ -44,7 +44,7 @@ def test_accepted_change(T, K, sd, alarmed):
     assert bool(report.any[0]) is alarmed
 
 
-def test_accepting_moves_the_accepted_value_only_where_told():
+def test_accepting_moves_the_accepted_value_only_where_given():
     monitor = Monitor(2, detectors=["accepted_change"])
     changed = cloud([1.5, 1.5], [0.5, 0.5])
     assert monitor.update(*changed, yes(2), Setting()).any.tolist() == [True, True]
@@ -84,7 +84,7 @@ def test_unexcited_windows_neither_alarm_nor_move_anything():
         m.update(*cloud([0.3], [1.0]), yes(), Setting())
     report = monitor.update(*cloud([1.9], [0.3]), ~yes(), Setting())
     assert report.names() == []
-    assert float(report.p_string_stable[0]) == 0.0  # still told
+    assert float(report.p_string_stable[0]) == 0.0  # still reported
     monitor.accept(~yes())
     for seed in range(3):
         seen = cloud([0.31], [1.0], seed=seed)
@@ -120,7 +120,7 @@ def test_saved_state_resumes_to_the_bit():
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", [*DIVERGENCES, *CHARTS])
 def test_rates_of_false_alarm_in_control(name, rotating_seed, draws_factor):
-    """Window posteriors scatter about one truth as wide as they claim: alarms come at the stated rate."""
+    """Window posteriors scatter about one truth as widely as their SDs: alarms come at the stated rate."""
     generator = torch.Generator().manual_seed(rotating_seed)
     n, windows, rate = 3000 * draws_factor, 12, 0.02
     monitor = Monitor(n, detectors=[name], false_alarm_rate=rate, arl=50.0)
@@ -152,7 +152,7 @@ def test_a_baseline_may_come_from_elsewhere_and_inflation_quiets():
 
 
 def test_a_vehicle_that_swings_by_a_few_per_cent_is_quiet_only_where_it_may():
-    """A gain that swings by 2 % with a belief ten times as narrow: an alarm to whoever takes the belief at its word."""
+    """A gain that swings by 2 % with a belief ten times as narrow: an alarm unless unevenness is allowed for."""
     for unevenness, alarmed in (((0.0, 0.0), True), ((0.1, 0.03), False)):
         monitor = Monitor(1, detectors=[*DIVERGENCES, *CHARTS], unevenness=unevenness)
         seen = False

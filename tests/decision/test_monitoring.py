@@ -1,4 +1,4 @@
-"""The monitor's and the strategist's promises over many seeds of the closed loop, at the paper's change."""
+"""Stated properties of monitor and strategist over many seeds of the closed loop, at the paper's change."""
 
 import math
 
@@ -101,7 +101,7 @@ def test_all_three_strategies_occur_over_changes_and_limits(rotating_seed):
     assert all(said(a) for actions in run.actions for a in actions)
     gains = torch.tensor([a.peak_gain_true for a in last.values()])
     assert int((gains <= 1.001).sum()) >= 0.9 * len(gains)
-    # who was not acted upon is string stable as he is, or was not driven hard enough to tell
+    # a car without action is string stable already, or was not excited enough for detection
     for i in set(range(n)) - set(last):
         assert run.alerts[i] == []
     assert len(last) >= n // 2

@@ -1,4 +1,4 @@
-"""A simulated log without any noise is an ordinary user's first try: it must teach, not diverge."""
+"""A simulated log without any noise is many users' first trial: the estimate must converge."""
 
 from __future__ import annotations
 

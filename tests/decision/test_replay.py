@@ -1,4 +1,4 @@
-"""The replay: it repeats what happened, knows the limits, and judges a scenario alike in any company."""
+"""The replay: it repeats what happened, respects the limits, and does not depend on the batch."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The setting: verdicts through the effective actuation, strategies told apart, bad values refused."""
+"""The setting: verdicts through the effective actuation, strategies distinguished, bad values refused."""
 
 import pytest
 import torch
@@ -47,7 +47,7 @@ def test_reference_values_of_the_specification():
     assert float(Setting(T_hat=1.5, K_hat=0.5).amplification()) == pytest.approx(10.0)
 
 
-def test_strategies_are_told_apart():
+def test_strategies_are_distinguished():
     default = Setting(scenarios=5)
     changed = Setting(
         T_hat=torch.tensor([0.3, 1.5, 0.3, 0.3, 1.5]),

@@ -1,4 +1,4 @@
-"""The strategist: least intrusive and sufficient by brute force, honest about clipping and about having no answer."""
+"""The strategist: least intrusive and sufficient by brute force, and right about clipping and insufficient settings."""
 
 import time
 
@@ -51,7 +51,7 @@ def decide(T, K, *, strategist=None, default=None, limits=(-6.0, 4.0), sd=0.05, 
 
 
 def test_the_choice_is_the_least_of_all_sufficient_ones():
-    """Against every setting of the grid, judged one by one without the search's shortcuts."""
+    """Against every setting of the grid, evaluated one by one without the search's shortcuts."""
     T, K = [0.3, 1.0, 1.5, 1.5, 2.0], [0.6, 0.6, 0.5, 0.8, 1.0]
     strategist, default = Strategist(grid=SMALL), Setting(scenarios=5)
     draws, past = belief(T, K), history(T, K)

@@ -1,4 +1,4 @@
-"""The supervisor end to end: what it is told, what it says, what it puts in force, and when."""
+"""The supervisor end to end: its input, its alerts, the settings it puts in force, and when."""
 
 import dataclasses
 
@@ -68,7 +68,7 @@ def obedient(answer, **rules):
 
 
 def test_events_between_windows_happen_when_they_are_due():
-    """Rows equal to the bit those of the same drive with nobody watching; windows stay on their grid."""
+    """Rows equal bit for bit those of the same drive without monitoring; windows stay on their grid."""
     events = [(7.31, becomes(0.8, 0.7)), (3.07, becomes(0.5, 0.9)), (20.0, becomes(9.0, 0.1))]
     run = Supervisor(make_loop()).run(11.0, events=events)
     schedule = [(3.07, {"plant": GLVDPlant(0.5, 0.9, 0.1)}), (7.31, {"plant": GLVDPlant(0.8, 0.7, 0.1)})]
@@ -108,7 +108,7 @@ def test_alerts_are_those_of_the_windows_and_begin_with_the_change():
     assert {a.detector for a in run.alerts[2]} >= {"accepted_change"}
 
 
-def test_the_estimator_sees_the_command_after_clipping():
+def test_the_estimator_gets_the_command_after_clipping():
     """A narrow actuator and a lower level that inverts: what was demanded is far from what was sent."""
     lower = LowerLevel(1.0, 0.8, accel_min=-1.5, accel_max=1.2)
     loop = make_loop(lower_level=lower, plant=GLVDPlant(1.0, 0.8, 0.1))
@@ -163,7 +163,7 @@ def test_what_is_decided_is_put_in_force(setting, delay):
     assert torch.allclose(r.demanded[0], demand, rtol=0, atol=1e-11)
     sent = setting.lower_level().command(r.accel[0], r.demanded[0])
     assert torch.equal(r.accel_cmd[0], torch.where(new, sent, r.demanded[0].clamp(-6.0, 4.0)))
-    # judged by what is in force: the longer gap only from the first window that ends after the driver has set it
+    # evaluated with the setting in force: the longer gap only from the first window after the driver has set it
     for w in run.windows:
         expected = Setting().as_dict() if w.window.start_s < 9.99 else setting.as_dict()
         if w.window.end_s <= 10.0 + waits + 1e-6:
@@ -171,7 +171,7 @@ def test_what_is_decided_is_put_in_force(setting, delay):
         assert w.setting.as_dict() == expected
 
 
-def test_an_action_is_told_with_its_truth():
+def test_an_action_is_reported_with_its_true_peak_gain():
     supervisor = Supervisor(make_loop(limits=WIDE), strategist=Strategist())
     run = supervisor.run(12.0, events=[(8.0, becomes(1.5, 0.5))])
     (action,) = run.actions[0]
@@ -198,7 +198,7 @@ def test_a_chosen_setting_that_still_works_stays():
     later = [a for a in run.alerts[0] if a.time_s > 14.01]
     assert [a.detector for a in later] == ["accepted_change"]
     assert float(supervisor.watch.monitor.accepted[0][0]) == pytest.approx(1.2, abs=0.1)
-    # not for want of an idea: asked, the strategist would have changed the lower level again
+    # the strategist, if called, would have changed the lower level again
     (args, how, _) = strategist.asked[0]
     last = run.windows[-1].window.belief.draws
     fresh = Strategist().decide(
@@ -229,7 +229,7 @@ def test_the_strategist_replays_the_last_seconds():
     lengths = []
     for (_, _, history), _, _ in strategist.asked:
         rows = history.lead_speed.shape[1]
-        # the leader is one and the same for all, so its stretch tells the time
+        # all scenarios have the same leader, so its stretch identifies the time
         ends = [w.window.end_s for w in run.windows]
         at = [e for e in ends if rows <= round(e / 0.01)]
         matches = [
@@ -278,7 +278,7 @@ def test_a_loop_under_way_is_watched_on_its_own_grid():
     assert [a.time_s for a in run.actions[0]] == pytest.approx([9.33])
 
 
-def test_a_scenario_sees_the_same_noise_in_any_company():
+def test_a_scenario_gets_the_same_noise_in_any_batch():
     change = (6.0, becomes(1.5, 0.5))
     batch = Supervisor(make_loop(3, seeds=[3, 8, 11])).run(12.0, events=[change])
     alone = Supervisor(make_loop(1, seeds=[8])).run(12.0, events=[change])
@@ -295,7 +295,7 @@ def test_a_scenario_sees_the_same_noise_in_any_company():
 
 @pytest.mark.slow
 def test_an_action_leaves_the_other_scenarios_alone():
-    """Scenario 0 is on its way to a longer gap when scenario 1 is changed: it goes on as if nothing were."""
+    """Scenario 0 is on its way to a longer gap when scenario 1 is changed: it continues undisturbed."""
 
     def drive(n):
         longer = Setting(time_gap=2.5, scenarios=n)
@@ -333,7 +333,7 @@ def test_the_seed_decides():
     assert not torch.equal(one.windows[3].window.belief.draws, other.windows[3].window.belief.draws)
 
 
-def test_a_crashed_car_is_believed_nothing_of():
+def test_rows_of_a_crashed_car_are_not_used():
     loop = make_loop(2, spacing0=torch.tensor([0.5, 10.0]), speed0=torch.tensor([8.0, 0.0]), seeds=1)
     supervisor = Supervisor(loop, strategist=Strategist())
     run = supervisor.run(14.0, events=[(6.0, becomes(torch.tensor([1.5, 1.5]), torch.tensor([0.5, 0.5])))])
@@ -381,7 +381,7 @@ def test_a_controller_of_unknown_structure_takes_a_given_setting():
     assert float(run.windows[-1].report.mean[0][0]) == pytest.approx(1.5, abs=0.3)
 
 
-def test_an_mpc_is_judged_by_its_equivalent_gains_and_given_a_new_time_gap():
+def test_an_mpc_is_evaluated_by_its_equivalent_gains_and_given_a_new_time_gap():
     loop = make_loop(controller=MPC(), leader=LEADER)
     supervisor = Supervisor(loop, strategist=mpc_strategist())
     assert supervisor.setting.gains[0].tolist() == list(mpc_gains(1.0))
@@ -465,7 +465,7 @@ def test_an_order_overtaken_before_the_driver_complies():
 
 
 @pytest.mark.slow
-def test_a_plant_that_tells_no_jerk_is_believed_by_the_latent_form():
+def test_a_plant_without_jerk_is_estimated_by_the_latent_form():
     truth = GLVDPlant(0.3, 1.0, 0.1)
 
     def silent():
@@ -481,7 +481,7 @@ def test_a_plant_that_tells_no_jerk_is_believed_by_the_latent_form():
     assert any(bool(w.window.belief.excited) for w in run.windows)
 
 
-def test_progress_is_told_window_by_window():
+def test_progress_is_reported_window_by_window():
     seen = []
     Supervisor(make_loop()).run(5.0, progress=seen.append)
     assert seen == pytest.approx([2.0, 4.0, 5.0])

@@ -1,4 +1,4 @@
-"""The price of a longer gap: throughput against stability, as the exact verdicts say."""
+"""The price of a longer gap: throughput against stability, by the exact verdicts."""
 
 import pytest
 import torch

@@ -163,7 +163,7 @@ def test_a_watch_of_another_kind_is_refused():
 
 
 def test_a_refused_state_leaves_the_whole_watch_as_it_was(blocks):
-    """A monitor's state that is not sound takes the stream's with it."""
+    """A damaged monitor state makes the whole state refused, the stream's included."""
     state = drive(make(), blocks[:2])[0].state_dict()
     changes = [
         lambda s: s.pop("monitor"),

@@ -1,4 +1,4 @@
-"""Manoeuvres keep to their limits, come back to the speed they began at, and say what they are."""
+"""Manoeuvres stay within their limits, return to the speed they began at, and describe themselves."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_a_manoeuvre_as_driven_is_a_log_that_is_read(limits: Limits, car: str, t
 
 
 @pytest.mark.parametrize("limits", [Limits(), Limits(0, 3.7, -1.4, 5)])
-def test_turned_round_it_is_refused_where_the_sign_can_be_told(limits: Limits) -> None:
+def test_a_wrong_sign_is_refused_where_it_is_identifiable(limits: Limits) -> None:
     """All but what comes back with the other sign within 2.5 s, and what hardly moves the car."""
     refused = 0
     for m in library(limits):
@@ -160,7 +160,7 @@ def test_limits_come_from_what_the_car_did(top: float) -> None:
     assert "where not given" in told.source
 
 
-def test_a_cruise_still_leaves_room_and_a_log_without_speed_says_what_is_assumed() -> None:
+def test_a_cruise_leaves_room_and_a_log_without_speed_states_assumptions() -> None:
     log = log_of(seconds=30.0)
     narrow = Limits.of_log(LogFacts(100, 1, 60.0, 20.0, speeds=(25.0, 25.2), commands=(-0.1, 0.1)))
     assert (narrow.speed_min, narrow.speed_max) == pytest.approx((24.35, 25.85))

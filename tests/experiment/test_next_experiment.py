@@ -1,4 +1,4 @@
-"""What a manoeuvre is expected to tell, and which one is chosen."""
+"""The expected information of a manoeuvre, and which one is chosen."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_margin_is_half_the_square_of_the_distance(rotating_seed: int) -> None:
     assert told.margin == pytest.approx(distance**2 / 2, abs=BAR * 1.26 * distance / np.sqrt(32))
 
 
-def test_the_same_cause_twice_is_never_told_apart(fresh_seed: int) -> None:
+def test_the_same_cause_twice_is_never_distinguished(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     one = contender([DeadBand(0.1)], rng=rng)
     m = library()[:1]
@@ -106,7 +106,7 @@ def test_a_resistance_and_a_bias_differ_in_the_speed_alone(rotating_seed: int) -
 
 @pytest.mark.statistical
 @pytest.mark.slow
-def test_of_what_surely_tells_the_gentlest_is_driven(rotating_seed: int) -> None:
+def test_of_the_sure_manoeuvres_the_gentlest_is_chosen(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     found = left([contender([], rng=rng), contender([DeadBand(0.1)], rng=rng)], [0.6, 0.3])
     told = next_experiment(found)
@@ -133,11 +133,11 @@ def test_limits_hold_for_the_speed_that_the_car_will_drive(fresh_seed: int) -> N
     assert m.metres <= 700
     assert m.speed.min() >= 3
     np.testing.assert_allclose(speed, m.speed, atol=0.3)
-    # resistance is met by a push: the speed comes back all the same
+    # a push compensates the resistance: the speed still returns
     assert m.speed[-1] == pytest.approx(m.speed[0], abs=0.5)
 
 
-def test_an_unknown_road_widens_what_is_foretold(fresh_seed: int) -> None:
+def test_an_unknown_road_widens_the_prediction(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     hilly = contender([RoadGrade(0.02)], rng=rng)
     m = library()[:1]
@@ -188,7 +188,7 @@ def test_a_slow_car_is_offered_what_it_can_drive(fresh_seed: int) -> None:
 
 @pytest.mark.slow
 def test_drag_on_a_fast_road_leaves_manoeuvres_that_come_back(fresh_seed: int) -> None:
-    """What drag takes depends on the speed that is left once it is made up for."""
+    """The effect of drag depends on the speed that remains after compensation."""
     rng = np.random.default_rng(fresh_seed)
     rivals = [contender([AerodynamicDrag(2.7e-4)], rng=rng), contender([ConstantResistance(0.2)], rng=rng)]
     limits = Limits(23, 29.6, -1.3, 1.3)

@@ -1,4 +1,4 @@
-"""A follower whose law and plant are known: found again, with its loop's stability, and bad input told."""
+"""A follower with known law and plant: both are recovered, with the loop's stability, and bad input is refused."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def drawn_z(found: FollowerDiagnosis) -> np.ndarray:
 
 @pytest.mark.statistical
 @pytest.mark.slow
-def test_a_gap_that_was_changed_midway_is_not_told_to_a_hair(rotating_seed: int) -> None:
+def test_a_gap_changed_midway_gets_a_wide_interval(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     near, far = (followed_log("constant_time_gap", CTG | {"time_gap_s": h}, seconds=120, rng=rng) for h in (1.2, 1.8))
     columns = {n: np.concatenate([getattr(near, n), getattr(far, n)]) for n in ("speed", "spacing", "lead_speed")}
@@ -66,14 +66,14 @@ def test_a_gap_that_was_changed_midway_is_not_told_to_a_hair(rotating_seed: int)
     wide = widened(found, candidate.record)
     assert (np.diag(wide) >= np.diag(found.covariance)).all()
     assert (np.linalg.eigvalsh(wide) > 0).all()
-    # the two are 0.6 s apart; one gap alone is told to 0.01 s
+    # the two are 0.6 s apart; each time gap is identified to 0.01 s
     assert found.draws(wide)["law.time_gap_s"].std() > 0.1
 
 
 @pytest.mark.slow
 @pytest.mark.statistical
 def test_a_driver_who_falls_back_is_no_part_of_the_law(rotating_seed: int) -> None:
-    """He brakes while the law asks for more; rolled out through, he came out as half a second of delay."""
+    """The driver brakes while the law demands more; rollouts through those rows gave half a second of delay."""
     overrides = [(30.0, 34.0), (62.0, 66.0), (95.0, 99.0), (130.0, 134.0)]
     rng = np.random.default_rng(rotating_seed)
     log = followed_log("constant_time_gap", CTG, seconds=170, rng=rng, overrides=overrides)
@@ -83,7 +83,7 @@ def test_a_driver_who_falls_back_is_no_part_of_the_law(rotating_seed: int) -> No
     assert total.mean == pytest.approx(T_L + DELAY, abs=6 * total.sd + 0.03)
     assert total.mean < T_L + DELAY + 0.2
     assert gap.sd < 0.03
-    # judged within one drive: the longest between overrides
+    # tested within one drive: the longest between overrides
     assert found.loops["constant_time_gap"].speed < found.keeps_speed
 
 
@@ -97,7 +97,7 @@ def test_loop_of_the_truth_goes_with_the_drive(name: str, rotating_seed: int) ->
     assert log.lead_speed is not None
     seen = Seen(*(torch.as_tensor(x) for x in (log.spacing, log.speed, log.lead_speed)))
     errors = loop_errors(LAWS[name], key_values(TRUTHS[name]), seen, DT, seconds=40.0)
-    # sensors' noise of 0.01 m/s and 0.02 m, the start's acceleration told by a difference, and steps of 0.1 s
+    # sensors' noise of 0.01 m/s and 0.02 m, the initial acceleration from a difference, and steps of 0.1 s
     assert errors.speed < 0.05
     assert errors.spacing < 0.15
 
@@ -124,7 +124,7 @@ def test_stability_is_that_of_the_exact_verdicts_without_delay(fresh_seed: int) 
 
 @pytest.mark.statistical
 @pytest.mark.slow
-def test_cause_is_told_conditionally(rotating_seed: int) -> None:
+def test_cause_is_conditional_on_the_law(rotating_seed: int) -> None:
     log = followed_log("constant_time_gap", CTG, seconds=240, rng=np.random.default_rng(rotating_seed))
     found = diagnose_follower(log, law="constant_time_gap", effects=["aerodynamic_drag", "road_grade"])
     assert found.diagnosis is not None

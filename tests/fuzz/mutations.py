@@ -1,4 +1,4 @@
-"""How the fuzzer damages what was whole, how many inputs it tries, and what it takes for an answer.
+"""How the fuzzer damages valid inputs, how many it tries, and which outcomes it accepts.
 
 Every run draws anew; AVTORCH_SEED repeats one, and a failure prints it. AVTORCH_FUZZ is the number of inputs in all
 (default 1,500; 100,000 for a night: `make fuzz`), shared out by the weights of the targets.
@@ -54,7 +54,7 @@ _count = 0
 
 
 def outcome(read: Callable[[], T], *, most: int = _LONGEST) -> T | None:
-    """What `read` gives, or None where it refuses with one printable line. Anything else fails: another exception, a
+    """The result of `read`, or None where it refuses with one printable line. Anything else fails: another exception, a
     warning, an input that takes longer than 20 s, or, of every 25th input, more than 50 MB."""
     global _count
     _count += 1
@@ -111,7 +111,7 @@ class Raw(bytes):
 
 @st.composite
 def other_number(draw: st.DrawFn, whole: bytes) -> Raw:
-    """With one digit exchanged: what an editor, or a wrong bit, makes of a number that still reads well."""
+    """With one digit exchanged, as by an editor or a wrong bit: the number is still readable."""
     at = draw(st.sampled_from([found.start() for found in re.finditer(rb"[0-9]", whole)]))
     digit = draw(st.sampled_from([x for x in b"0123456789" if x != whole[at]]))
     return Raw(whole[:at] + bytes([digit]) + whole[at + 1 :])

@@ -1,4 +1,4 @@
-"""Damaged TOML and odd options: refused in one printable line, or taken for what they say."""
+"""Damaged TOML and odd options: refused in one printable line, or read as written."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_damaged_plant(folder: Path, raw: bytes) -> None:
 
 
 def check_plant(car: GapPlant) -> None:
-    """It holds finite numbers, or says that there is no limit; its own text is TOML and brings it back."""
+    """It holds finite numbers or states that there is no limit; its own text is TOML and restores it."""
     again = GapPlant.from_toml(car.to_toml())
     assert again.to_toml() == car.to_toml()
     for name, value in car.values().items():

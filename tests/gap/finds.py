@@ -1,4 +1,4 @@
-"""Finds made by hand from short drives, for what takes a find and not a search."""
+"""Fitted models made by hand from short drives, for tests that need a fit and not a search."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def found_of(
 ) -> FittedModel:
     """The hypothesis of these effects fitted to a drive of a car that has them, begun at their true values.
 
-    With a `noise`, errors are drawn from it and it is held. Random effects get what a search would have told of them.
+    With a `noise`, errors are drawn from it and it is held. Random effects get the attributes that a search would set.
     """
     sure = [e for e in effects if not e.random]
     car = plant(sure, T_L=0.35, K_L=0.95, baseline=baseline)

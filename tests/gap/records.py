@@ -39,7 +39,7 @@ def log_of(
     command = command_over(time)
     rough = speed0 + np.concatenate([[0.0], np.cumsum(command)[:-1] / rate_hz])
     car = plant() if car is None else car
-    # effects that depend on speed look at the car's own
+    # effects that depend on speed use the car's own
     for _ in range(3):
         response = car.response(Drive(torch.as_tensor(time), torch.as_tensor(command), torch.as_tensor(rough), 0.0))
         rough = response.speed.numpy()
@@ -117,5 +117,5 @@ def log_normal_density(x: FloatArray, covariance: FloatArray) -> float:
 
 
 def record_of(seconds: float, **options: object) -> Record:
-    """A record of a drive with `seconds` of rows that count, at 20 Hz unless told."""
+    """A record of a drive with `seconds` of usable rows, at 20 Hz by default."""
     return Record.of(log_of(seconds=seconds + 2.0, **options))  # type: ignore[arg-type]

@@ -24,12 +24,12 @@ def _drive(rng: np.random.Generator, *, seconds: float = 120.0, **of: float) -> 
 
 
 @pytest.mark.statistical
-def test_a_slower_car_is_told_and_by_how_much(rotating_seed: int) -> None:
+def test_a_slower_car_is_detected_with_its_size(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     told = avtorch.compare(_drive(rng, T_L=0.4, K_L=0.9), _drive(rng, T_L=0.56, K_L=0.9))
     assert told.changed
     lag = told.car["T_L"].ratio
-    # told from ten blocks a side
+    # estimated from ten blocks a side
     assert abs(np.log(lag.mean) - np.log(1.4)) < BAR * max(lag.sd / lag.mean, 0.02)
     assert told.simulator == "farther"
     assert "has changed" in told.why
@@ -76,7 +76,7 @@ def test_a_later_answer_is_not_taken_for_lag_and_gain(what: str, delay: float, r
     json.dumps(answer, allow_nan=False)
 
 
-def test_what_cannot_be_told_is_not(fresh_seed: int) -> None:
+def test_ambiguous_changes_get_no_account(fresh_seed: int) -> None:
     """Where either account would do, neither is given."""
     numbers = np.random.default_rng(fresh_seed).normal(scale=0.01, size=(2, 3))
     spread = np.diag([0.1, 0.1, 0.05]) ** 2
@@ -139,7 +139,7 @@ def test_rollouts_of_both_sides_last_as_long_as_they_are_said_to(rotating_seed: 
     assert "10 s" not in shown
 
 
-def test_wrong_input_is_told() -> None:
+def test_wrong_input_is_refused() -> None:
     rng = np.random.default_rng(0)
     long = _drive(rng, seconds=60.0)
     with pytest.raises(InputError, match="after: found 3 blocks"):

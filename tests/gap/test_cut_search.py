@@ -1,4 +1,5 @@
-"""A search that did not try everything, cut by its budget or without pairs: the answer says so and claims no more."""
+"""A search that did not try everything, cut by its budget or without pairs: the answer reports this and claims no
+more."""
 
 from __future__ import annotations
 
@@ -49,9 +50,7 @@ def _cut(monkeypatch: pytest.MonkeyPatch, log: Log, after: int) -> Diagnosis:
 
 
 @pytest.mark.parametrize("after", [0, 2])
-def test_a_budget_leaves_nothing_told_apart_from_what_it_left_untried(
-    monkeypatch: pytest.MonkeyPatch, after: int
-) -> None:
+def test_a_budget_distinguishes_nothing_from_untried_effects(monkeypatch: pytest.MonkeyPatch, after: int) -> None:
     found = _cut(monkeypatch, _log(), after)
     assert not found.complete
     assert found.scope is not None
@@ -59,7 +58,7 @@ def test_a_budget_leaves_nothing_told_apart_from_what_it_left_untried(
     assert not {c.name for c in found.candidates} & set(found.scope.not_scored)
     answer = json.loads(json.dumps(found.to_dict()))
     assert answer["not_tried"] == {"effects": list(found.scope.not_scored), "pairs": "none"}
-    # the untried are behind `unknown`, and every text says what was not tried
+    # `unknown` stands for the untried, and every text lists what was not tried
     assert "unknown" in found.verdict.alias_set
     for text in (str(found), "\n".join([*diagnosis_headline(found), *diagnosis_notes(found)])):
         assert "old apart from every" not in text
@@ -112,7 +111,7 @@ def test_effects_that_were_not_asked_for_are_not_ruled_out() -> None:
     assert f"tried, 2 of {len(EFFECTS)}" in sentences.headline(found)
 
 
-def test_a_whole_search_says_nothing_of_the_kind() -> None:
+def test_a_complete_search_reports_nothing_untried() -> None:
     found = avtorch.diagnose(_log(), effects=[DeadTime, SensorBias, Outliers])
     assert found.scope is not None
     whole = replace(found, scope=replace(found.scope, not_scored=()), notes=())

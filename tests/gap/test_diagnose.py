@@ -1,4 +1,4 @@
-"""The whole diagnosis on drives of the reference vehicle: what is plain is named, what is not there is not."""
+"""The whole diagnosis on drives of the reference vehicle: clear effects are named, absent ones are not."""
 
 import json
 from pathlib import Path
@@ -48,7 +48,7 @@ def test_a_search_cut_off_goes_on_to_the_same_answer(tmp_path: Path) -> None:
     assert kept.read_bytes() == content
 
 
-def test_wrong_arguments_are_told(tmp_path: Path) -> None:
+def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
     log = _drive("sensor_bias")
     with pytest.raises(InputError, match="posterior"):
         avtorch.diagnose(log, posterior="guess")  # type: ignore[arg-type]

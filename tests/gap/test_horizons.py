@@ -1,4 +1,4 @@
-"""Every rollout error is that of rollouts as long as its own label says: computed anew here, by the label alone."""
+"""Every rollout error is that of rollouts of the length in its label: computed here again from the label alone."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_what_was_held_out_too_and_it_is_the_same_measure(late: tuple[Log, Diagn
             told = metrics[f"rollout_rmse_{channel}{horizon}"]
             assert told["horizon_s"] == float(horizon.strip("_s") or 10.0)
             want = rolled(log, found.baseline["T_L"].mean, found.baseline["K_L"].mean, channel, told["horizon_s"])
-            # fitted to four fifths of the rows, judged on the last: within a tenth
+            # fitted to four fifths of the rows, tested on the last: within a tenth
             assert told["before"] == pytest.approx(want, rel=0.1), (channel, horizon)
         whole = metrics[f"rollout_rmse_{channel}_whole"]
         assert whole["horizon_s"] is None

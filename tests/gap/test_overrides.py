@@ -31,7 +31,7 @@ def test_a_weak_brake_and_a_delay_are_found_although_a_driver_took_over(rotating
     assert ratio.mean == pytest.approx(RATIO, abs=BAR * ratio.sd)
     assert delay.mean == pytest.approx(DELAY, abs=BAR * delay.sd + 0.001)
     assert delay.sd < 0.01
-    # what a driver interrupts is one drive: blocks of it are held out, not the parts between overrides
+    # a drive with overrides is one drive: blocks of it are held out, not the parts between overrides
     assert found.log.segments == 1
     assert found.shrinkage is not None
     assert not found.shrinkage.by_drives
@@ -43,7 +43,7 @@ def test_a_weak_brake_and_a_delay_are_found_although_a_driver_took_over(rotating
 
 
 @pytest.mark.slow
-def test_a_log_without_the_drivers_rows_says_the_same(fresh_seed: int) -> None:
+def test_a_log_without_the_drivers_rows_gives_the_same_answer(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     log = taken_over(seconds=60.0, overrides=OVERRIDES, rng=rng, brake_gain_ratio=RATIO, delay_s=DELAY)
     one, two = (avtorch.diagnose(x, effects=EFFECTS).candidates[0] for x in (log, deleted(log)))

@@ -1,7 +1,7 @@
 """A real recording: three laps of a Genesis at a test field, commanded acceleration and measured speed, 100 Hz.
 
-No accelerometer is in the log and nobody knows the cause, so the laps are held to what is true of all three of them.
-What the diagnosis names is tested on the demand of the same laps sent to another car, one with an effect in it.
+The log has no accelerometer and the cause is unknown, so the tests check properties common to all three laps. Named
+effects are tested with the demand of the same laps sent to another car, one with an effect in it.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def fitted(race: SearchResult, base: FittedModel, more: type[Effect]) -> tuple[H
 
 @pytest.mark.parametrize("lap", LAPS)
 @pytest.mark.parametrize("on", ["none", "road_grade"])
-def test_what_the_laps_tell_of_lag_delay_and_order(races: dict[int, SearchResult], lap: int, on: str) -> None:
+def test_lag_delay_and_order_from_the_laps(races: dict[int, SearchResult], lap: int, on: str) -> None:
     race = races[lap]
     base = next(f for f in race.found if f.name == on)
     hypothesis, fit, _ = fitted(race, base, DeadTime)
@@ -87,7 +87,7 @@ def test_what_the_laps_tell_of_lag_delay_and_order(races: dict[int, SearchResult
 @pytest.mark.parametrize("on", ["none", "road_grade"])
 @pytest.mark.parametrize("more", [DeadTime, SecondOrderActuator])
 def test_one_pole_will_do(races: dict[int, SearchResult], on: str, more: type[Effect]) -> None:
-    """3 nats are twenty to one: what only one lap of three says is not the car's."""
+    """3 nats are twenty to one: a result of one lap out of three does not belong to the car."""
     bases = [(race, next(f for f in race.found if f.name == on)) for race in races.values()]
     gains = np.array([fitted(race, base, more)[2] for race, base in bases])
     assert (gains > 3).sum() <= 1, gains
@@ -104,7 +104,7 @@ def test_the_measured_speed_trembles_as_no_candidate_does(races: dict[int, Searc
     assert power[(hz > 9) & (hz < 19)].mean() > 1.4
     assert power[(hz > 25) & (hz < 45)].mean() < 0.7
     left = adequacy(none.white, none.errors, none.hypothesis.record.measured - none.errors)
-    assert left.memory > 15  # of a white remainder below exp(-15)
+    assert left.memory > 15  # of white residuals below exp(-15)
 
 
 def test_a_force_returns_at_the_same_places_each_lap(races: dict[int, SearchResult]) -> None:

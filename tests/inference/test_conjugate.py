@@ -1,4 +1,4 @@
-"""The conjugate route against quadrature under every prior, and where it must say that it is not good enough."""
+"""The conjugate route against quadrature under every prior, and where it must report that it is not good enough."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_least_squares_of_negative_lag(rotating_seed: int) -> None:
 
 
 def test_a_prior_far_from_the_data_is_flagged(make_windows) -> None:
-    """A prior that excludes what the window says leaves few proposals of weight; a sound neighbour is not touched."""
+    """A prior that contradicts the window leaves few proposals of weight; a sound neighbour is unaffected."""
     w = make_windows(1, [2.0, 2.0], T=0.3)
     mean = torch.tensor([[3.0, 1.0, 0.1], [0.3, 1.0, 0.1]], dtype=F64).log()
     cov = torch.diag(torch.tensor([1e-6, 1.0, 1.0], dtype=F64)).expand(2, 3, 3)

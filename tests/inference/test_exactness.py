@@ -86,7 +86,7 @@ def test_the_banana_of_the_issue_is_not_claimed(order, rotating_seed):
     x, y = (found[name].flatten() for name in "xy")
     right = abs(x.std().item() - 1) < 0.05 and abs(y.mean().item() - 2) < 0.1 * math.sqrt(8.04)
     assert not right  # else this test asks nothing
-    assert float(found.rhat.max()) < 1.1  # R-hat sees agreement
+    assert float(found.rhat.max()) < 1.1  # R-hat finds agreement
     assert not found.converged[0]
     assert "follow the density" in found.why[0]
     assert "\n" not in found.why[0]

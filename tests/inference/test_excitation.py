@@ -41,7 +41,7 @@ def test_windows_without_excitation_are_not_excited(make_windows):
         assert sd.isposinf().all()
 
 
-def test_the_rule_looks_at_rows_noise_and_signals_only(make_windows):
+def test_the_rule_depends_on_rows_noise_and_signals_only(make_windows):
     quiet, loud = (make_windows(0, [0.6], sigma=s).statistics for s in (0.05, 3.0))
     assert ExcitationRule()(quiet, 200).all()
     assert not ExcitationRule()(loud, 200).any()

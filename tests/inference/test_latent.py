@@ -160,7 +160,7 @@ def test_where_digits_are_lost_the_answer_is_nan_and_no_error() -> None:
 
 
 @pytest.mark.slow
-def test_a_log_simulated_without_noise_is_told_to_the_finest_sensor() -> None:
+def test_a_log_without_noise_is_resolved_to_the_finest_sensor() -> None:
     """Its likelihood grows without end as the noise parameters fall, unless sensors have a finest step."""
     dt, rows = 0.05, 101
     u = f64(*([1.0] * 30 + [-1.0] * 41 + [0.5] * 30))
@@ -175,7 +175,7 @@ def test_a_log_simulated_without_noise_is_told_to_the_finest_sensor() -> None:
     found = sample(density, quiet, generator=torch.Generator().manual_seed(0))
     away = (found.mean[0, :2] - f64(T, K)).abs() / found.sd[0, :2]
     assert bool((away < 5.0).all())
-    # a hundred rows, each read to 1e-4 m/s² while the command is of order one, cannot tell a ratio better than this
+    # a hundred rows, each read to 1e-4 m/s² while the command is of order one, determine a ratio no better than this
     assert bool((found.sd[0, :2] > 0.1 * FINEST / math.sqrt(rows)).all())
     assert bool((found.sd[0, :2] < 0.01).all())
 

@@ -1,4 +1,4 @@
-"""The excitation rule of the latent form: silent commands refused, steps taken, measured values never looked at."""
+"""The excitation rule of the latent form: silent commands rejected, steps accepted, measured values never used."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def window(u: Tensor, **more: Tensor) -> LatentWindow:
 
 
 @pytest.mark.parametrize("size", [0.0, 0.1, 1.0, 2.0])
-def test_constant_command_says_nothing(size: float) -> None:
+def test_constant_command_is_uninformative(size: float) -> None:
     excited, bits = latent_excitation(window(torch.full_like(TIME, size)))
     assert not bool(excited.any())
     assert float(bits) < 1e-3

@@ -1,7 +1,7 @@
-"""No step-size knob: windows in strange units and noise, default settings, judged by quadrature.
+"""No step size to tune: windows in unusual units and noise, default settings, compared with quadrature.
 
 The prior's scales stay those of SI units, so a window in other units is merely a stranger car behind stranger noise:
-its posterior may be odd, and must be right. One that does not settle must say so, and why.
+its posterior may be unusual, and must be right. One that does not converge must report it, with the reason.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def test_strange_units_and_noise(rotating_seed: int) -> None:
         assert (ratio.abs() < BIAS + BAR * ((tail - 1) / (4 * ess)).sqrt())[short].all()
 
 
-def test_a_window_without_motion_settles_on_the_prior_or_says_why(rotating_seed: int) -> None:
+def test_a_window_without_motion_settles_on_the_prior_or_gives_a_reason(rotating_seed: int) -> None:
     """Nothing moves, in any units: the noise is learnt, lag and gain are those of the prior."""
     g = torch.Generator().manual_seed(rotating_seed)
     still = torch.zeros(3, ROWS, dtype=F64)

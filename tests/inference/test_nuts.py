@@ -117,7 +117,7 @@ def test_positive_normal_draws_its_own_law(rotating_seed: int, draws_factor: int
 def standard_error(x: Tensor, batches: int = 10) -> float:
     """Of the mean of a correlated series ``(draw,)``, from the larger of ArviZ's ESS-based one and batch means.
 
-    Batch means see slow drifts that an ESS of a few hundred draws may miss.
+    Batch means detect slow drifts that an ESS of a few hundred draws may miss.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major refactor", FutureWarning)

@@ -1,4 +1,4 @@
-"""What is read off draws, and the nested R-hat that judges them."""
+"""Summaries of draws, and the nested R-hat that tests them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_rhat_of_one_law_is_one(rotating_seed):
 
 
 @pytest.mark.statistical
-def test_rhat_sees_what_it_should(rotating_seed):
+def test_rhat_detects_disagreement_and_drift(rotating_seed):
     draws = normal(rotating_seed, 64, 60, 5)
     draws[:8, :, 0] += 3.0  # one superchain elsewhere
     draws[:, :, 1] += torch.linspace(0, 4, 60, dtype=F64)  # all drift together

@@ -1,4 +1,4 @@
-"""SGLD against reference draws that others made, for posteriors that have nothing to do with vehicles."""
+"""SGLD against independent reference draws, for posteriors unrelated to vehicles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The loop over windows: its three priors, windows that teach nothing, many vehicles at once, divergence, resume."""
+"""The loop over windows: its three priors, windows without excitation, many vehicles at once, divergence, resume."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def test_stationary_variance_with_gradient_noise(rotating_seed, draws_factor):
     """Var = (1 + h s^2/4) / (lambda (1 - h lambda/4)), one parameter group a case.
 
     The chains start at the target's variance 1/lambda; of that, (1 - h lambda/2)^2k is left after k steps. The bar must
-    also see the usual mistakes: noise sqrt(2h), and noise h in place of sqrt(h).
+    also detect the usual mistakes: noise sqrt(2h), and noise h in place of sqrt(h).
     """
     g, chains, steps = generator(rotating_seed), 100_000 * draws_factor, 20
     x = [(torch.randn(chains, generator=g, dtype=F64) / math.sqrt(lam)).requires_grad_() for _, lam, _ in CASES]
@@ -205,7 +205,7 @@ def test_bias_is_of_order_one_in_the_step(rotating_seed, draws_factor):
 def test_averaged_noise_has_hardly_a_bias(rotating_seed, draws_factor):
     """Leimkuhler-Matthews at h = 0.4 on the anharmonic target: below a tenth of the plain scheme's bias, 0.13.
 
-    (Its order, two, shows at steps whose bias would take 10^7 independent draws to see.)
+    (Its order, two, shows only at steps whose bias would take 10^7 independent draws to detect.)
     """
     g, truth, h = generator(rotating_seed), wavy_moment(), 0.4
     x = torch.zeros(20_000 * draws_factor, dtype=F64, requires_grad=True)

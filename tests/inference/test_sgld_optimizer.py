@@ -272,7 +272,7 @@ def test_bad_options_are_refused_by_name(options, name):
         SGLD([{"params": [leaf(1, 2)], **options}], 0.1)
 
 
-def test_the_preconditioner_says_what_it_needs():
+def test_the_preconditioner_reports_what_it_needs():
     x = leaf(1, 2)
     optimizer = SGLD([x], 0.1, preconditioner="rmsprop")
     with pytest.raises(InputError, match=r"^closure: needed"):

@@ -237,7 +237,7 @@ def test_a_driver_masks_his_rows_and_the_settling_after_them(drive, tmp_path_fac
     stream, windows = new(), []
     for k, (first, last) in enumerate(pairwise([0, *sorted(cuts), 1000])):
         part = slice(first, last)
-        # who says nothing of a driver while none is in charge need not: the settling goes on
+        # `engaged` may be omitted while no driver is in charge: the settling continues
         on = None if bool(engaged[:, part].all()) else engaged[:, part]
         windows += stream.feed(time[part], {n: c[:, part] for n, c in garbled.items()}, engaged=on)
         if k == save_at:
@@ -248,7 +248,7 @@ def test_a_driver_masks_his_rows_and_the_settling_after_them(drive, tmp_path_fac
     assert_same(expected, windows + stream.feed(time[:0], {n: c[:, :0] for n, c in columns.items()}, until=10.0))
 
 
-def test_a_driver_is_told_by_vehicle_and_row(drive):
+def test_a_driver_is_given_by_vehicle_and_row(drive):
     time, columns = block(drive, slice(0, 10))
     with pytest.raises(InputError, match=r"engaged: of shape \(2, 9\), needs \(2, 10\)"):
         new().feed(time, columns, engaged=torch.ones(2, 9, dtype=torch.bool))

@@ -156,8 +156,8 @@ CHANGES: dict[str, Callable[[dict[str, Any]], Any]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=list(CHANGES))
-def test_a_checksum_made_anew_helps_nothing(saved: BeliefStream, change: Callable) -> None:
-    """Each is wrong in itself, whatever its checksum says."""
+def test_a_recomputed_checksum_does_not_help(saved: BeliefStream, change: Callable) -> None:
+    """Each is wrong in itself, even with a right checksum."""
     state = copy.deepcopy(saved.state_dict())
     del state["sha256"]
     change(state)
@@ -254,7 +254,7 @@ def test_symlinks_folders_and_fifos_are_refused(saved: BeliefStream, tmp_path: P
 
 
 def test_a_state_of_an_earlier_avtorch_is_refused(saved: BeliefStream, tmp_path: Path) -> None:
-    """Without a checksum nobody knows whether it is as it was saved."""
+    """Without a checksum it is not known whether it is as it was saved."""
     path = tmp_path / "state"
     torch.save({key: value for key, value in saved.state_dict().items() if key != "sha256"}, path)
     with pytest.raises(InputError, match="from an earlier avtorch"):

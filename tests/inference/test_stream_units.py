@@ -111,7 +111,7 @@ def test_weak_slow_and_hardly_moving_cars_are_not_refused(columns, dead, fresh_s
 
 
 def test_the_vehicle_is_named_and_what_is_masked_is_not_looked_at(fresh_seed):
-    # a stretch that holds the turn may say nothing; the one after it does
+    # the stretch with the turn may be inconclusive; the one after it is not
     time, given = drive(fresh_seed, vehicles=3, seconds=80.0)
     flipped = given["accel_cmd"].clone()
     flipped[1, 1000:] *= -1
@@ -142,13 +142,13 @@ def test_a_sign_flip_is_not_believed(fresh_seed):
     """Before it was: T_L 2.94 s and K_L 0.06. The stream is left as it was, and goes on with the right sign."""
     time, given = drive(fresh_seed, seconds=20.0)
     found, fresh = stream(), stream()
-    with pytest.raises(InputError, match=r"wrong sign.* nothing learnt in this time is kept"):
+    with pytest.raises(InputError, match=r"wrong sign.* no estimate from this time is kept"):
         found.feed(time, changed(given, accel_cmd=-1.0))
     assert found.inference.belief.mean.equal(fresh.inference.belief.mean)
     windows, expected = found.feed(time, given), fresh.feed(time, given)
     assert len(windows) == len(expected) == 9
     assert all(a.belief.draws.equal(b.belief.draws) for a, b in zip(windows, expected, strict=True))
-    # one who knows better
+    # check_units=False overrides the check
     assert len(stream(check_units=False).feed(time, changed(given, accel_cmd=-1.0))) == 9
 
 

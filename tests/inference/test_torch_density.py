@@ -58,7 +58,7 @@ def test_it_is_sampled_in_its_own_units(rotating_seed, draws_factor):
     assert ((squares.mean(0) - 1).abs() < BAR * squares.std(0) / len(squares) ** 0.5 + 0.02).all()
 
 
-def test_it_starts_where_it_is_told():
+def test_it_starts_at_the_given_point():
     density = TorchDensity(lambda p: -p["x"], {"x": interval(2.0, 5.0)}, start={"x": 4.0})
     assert density.constrain(density.initial()).item() == pytest.approx(4.0)
 

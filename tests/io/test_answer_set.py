@@ -123,7 +123,7 @@ def test_a_disk_that_fails_at_the_nth_call(start: Callable, onwards: bool, tmp_p
             assert str(folder) in said
             assert ".avtorch" not in said
             assert "\n" not in said
-        # whoever is told of a failure may find the new answer there, but is told that too
+        # a reported failure may leave the new answer there, and the message then states that
         assert visible(folder) == (sweep.new if said is None or "is there" in said else sweep.old)
         sweep.is_whole(folder)
         if len(calls) < n:
@@ -153,7 +153,7 @@ def test_an_interruption_at_the_nth_call(start: Callable, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("start", starts(before, slow=(of_an_earlier_version, touched, copied)))
 def test_a_reader_at_any_moment(start: Callable, tmp_path: Path) -> None:
-    """A process that is killed leaves what a reader sees at that moment; the next answer must follow from it."""
+    """A killed process leaves what a reader finds at that moment; the next answer must succeed from it."""
     sweep = Sweep(tmp_path, start)
     folder = sweep.fresh()
     seen: list[dict[str, str]] = []

@@ -1,4 +1,4 @@
-"""Broken logs: each is refused in one line that says where and what."""
+"""Broken logs: each is refused in one line that states the place and the fault."""
 
 from __future__ import annotations
 

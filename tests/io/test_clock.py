@@ -26,7 +26,7 @@ UNIX_S = 1_700_000_000.123
 def test_microseconds_survive_any_epoch(steps: list[int], first: int) -> None:
     """A recorder's stamps in whole microseconds, read as the nearest float64 [s]: their differences come back exactly.
 
-    From 4.3e9 s on, the year 2106, a float64 tells no microseconds any more.
+    From 4.3e9 s on, the year 2106, a float64 no longer resolves microseconds.
     """
     ticks = np.cumsum([0, *steps])
     stamps = np.array([(first + int(tick)) / 1_000_000 for tick in ticks])
@@ -34,13 +34,13 @@ def test_microseconds_survive_any_epoch(steps: list[int], first: int) -> None:
     assert told.tolist() == [int(tick) / 1_000_000 for tick in ticks]
 
 
-def test_decimals_are_those_that_stamps_of_this_size_tell() -> None:
+def test_decimals_are_those_that_stamps_of_this_size_resolve() -> None:
     assert decimals(1.7e9) == 6  # steps of 2.4e-7 s
     assert decimals(1e5) == 10
     assert decimals(0.0) == decimals(60.0) == 12
 
 
-def test_stamps_closer_than_the_decimals_tell_stay_apart() -> None:
+def test_stamps_closer_than_the_decimals_resolve_stay_apart() -> None:
     stamps = 1.7e9 + np.array([0.0, 2.4e-7, 1.0])
     assert (np.diff(since(stamps, 1.7e9)) > 0).all()
 
@@ -115,7 +115,7 @@ def test_estimates_are_listed_from_the_start_and_kept_on_the_clock(
 
 
 @pytest.mark.parametrize("first", [-(2.0**49), -1e300])
-def test_a_first_stamp_from_which_rows_are_not_told_apart_is_refused(first: float) -> None:
+def test_a_first_stamp_too_large_to_resolve_rows_is_refused(first: float) -> None:
     """Found by the fuzzer: all steps after it are less than what float64 resolves there."""
     time = np.arange(200) / 20.0
     time[0] = first

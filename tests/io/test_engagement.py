@@ -15,7 +15,7 @@ RATE_HZ = 10
 
 
 def log_of(engaged: BoolArray, *, segment: IntArray | None = None, clock: float = 0.0) -> Log:
-    """A car at 20 m/s that does what it is told, in whoever's hands."""
+    """A car at 20 m/s that follows its command, with or without a driver in charge."""
     time = clock + np.arange(len(engaged)) / RATE_HZ
     command = np.sin(time)
     return Log.from_arrays(
@@ -40,7 +40,7 @@ def test_rows_settle_for_two_seconds_after_every_return(engaged: list[bool], clo
 
 
 @given(st.lists(st.booleans(), min_size=2, max_size=60), st.integers(1, 59))
-def test_a_stream_cut_anywhere_tells_the_same_as_a_log(engaged: list[bool], cut: int) -> None:
+def test_a_stream_cut_anywhere_gives_the_same_answer_as_a_log(engaged: list[bool], cut: int) -> None:
     on, time = np.array(engaged), np.arange(len(engaged)) / RATE_HZ
     whole, last = settled(time, on)
     first, before = settled(time[:cut], on[:cut])
@@ -50,7 +50,7 @@ def test_a_stream_cut_anywhere_tells_the_same_as_a_log(engaged: list[bool], cut:
 
 
 def test_a_segment_behind_an_override_begins_with_a_return() -> None:
-    """Nobody knows whether the driver had let go before the gap ended."""
+    """It is unknown whether the driver had let go before the gap ended."""
     on, segment = np.ones(200, bool), np.repeat([0, 1], 100)
     on[90:100] = False
     log = log_of(on, segment=segment)
@@ -93,7 +93,7 @@ def test_the_look_at_a_log_counts_returns_and_what_settles(
 
 
 def test_a_driver_who_drives_on_against_the_brake_is_no_standstill() -> None:
-    """Without a speed a stop is told by a brake that does nothing: here nobody obeys the brake."""
+    """Without a speed a stop is detected by a brake without response: here the car ignores the brake command."""
     time = np.arange(600) / RATE_HZ
     on = (time < 20) | (time >= 35)
     # the command brakes all through the override, the driver cruises

@@ -1,4 +1,5 @@
-"""One process at a time in a folder: the second is told of the first, and a killed one keeps nobody out."""
+"""One process at a time in a folder: the second gets a message that names the first, and a killed one blocks no
+other."""
 
 from __future__ import annotations
 
@@ -42,7 +43,7 @@ def another_process(folder: Path) -> Iterator[subprocess.Popen[str]]:
         other.communicate()
 
 
-def test_the_second_is_told_of_the_first_and_a_killed_one_keeps_nobody_out(tmp_path: Path) -> None:
+def test_the_second_gets_the_name_of_the_first_and_a_killed_one_blocks_no_other(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     with another_process(folder) as other:
         with pytest.raises(InputError) as caught, sole_use(folder, work="mine"):

@@ -36,7 +36,7 @@ def test_a_follower_gets_its_own_gap_and_the_speed_ahead(tmp_path: Path) -> None
     assert read_following(path).name == "p, vehicle 2"
 
 
-def test_the_longest_stretch_is_kept_and_told(tmp_path: Path) -> None:
+def test_the_longest_stretch_is_kept_and_reported(tmp_path: Path) -> None:
     log = read_following(platoon(tmp_path / "p.csv", lost=30), vehicle=3)
     assert log.rows == 69
     assert log.remarks == ("the longest stretch behind one leader with all known, rows 32 to 100 of 100",)
@@ -59,7 +59,7 @@ def test_other_vehicles_are_refused(tmp_path: Path) -> None:
         read_following(path, vehicle=1)
 
 
-def test_a_recording_tells_its_own_columns(tmp_path: Path) -> None:
+def test_a_recording_fixes_its_own_columns(tmp_path: Path) -> None:
     path = platoon(tmp_path / "p.csv")
     with pytest.raises(InputError, match=r"p\.csv: unit has no meaning for a file of this form"):
         read_following(path, vehicle=3, unit={"speed": "km/h"})

@@ -1,4 +1,4 @@
-"""Files that are no logs, or would rather be something else: one printable line each, at once and in little memory."""
+"""Files that are not logs, some of them hostile: one printable line each, at once and in little memory."""
 
 from __future__ import annotations
 
@@ -461,5 +461,5 @@ def test_a_footer_of_another_shape_is_refused(groups: bytes) -> None:
     the fuzzer as an IndexError."""
     footer = b"\x49" + groups + b"\x00"  # FileMetaData with its field 4 alone, a list
     raw = b"PAR1" + footer + len(footer).to_bytes(4, "little") + b"PAR1"
-    with pytest.raises(ValueError, match="a row group does not say how large its columns are"):
+    with pytest.raises(ValueError, match="a row group does not declare the size of its columns"):
         uncompressed_sizes(raw)

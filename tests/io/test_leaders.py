@@ -53,7 +53,7 @@ def test_zalazone_numbers_skip_and_cells_are_empty(zala):
         read_leader(zala, vehicle=3)
 
 
-def test_zalazone_errors_tell_the_line_of_the_file(zala):
+def test_zalazone_errors_name_the_line_of_the_file(zala):
     zala.write_text(ZALA.replace("100.3", "100.1"))
     with pytest.raises(InputError, match=r"row 3 \(line 9\), column 'Time': goes back"):
         read_leader(zala)

@@ -105,7 +105,7 @@ def test_names_units_and_ignored_columns(tmp_path):
         Log.read(path, unit=["time=s"])
 
 
-def test_a_messages_own_line_is_told_for_quoted_line_breaks(tmp_path):
+def test_the_right_line_is_reported_for_quoted_line_breaks(tmp_path):
     path = tmp_path / "lap.csv"
     path.write_text('time,accel_cmd,speed,note\n0,1,2,"two\nlines"\n0.1,1,x,\n')
     with pytest.raises(InputError, match=r"row 2 \(line 4\), column 'speed'"):

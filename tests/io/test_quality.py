@@ -52,7 +52,7 @@ def test_doubtful_units_are_noted():
     assert any("Only speed could show which" in note for note in check(Log.from_arrays(**calm)).notes)
 
 
-def test_witnesses_that_tell_different_drives():
+def test_signals_that_contradict_each_other():
     assert "disagree" in notes(accel=np.roll(GOOD["accel"], 700))
 
 

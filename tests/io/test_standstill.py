@@ -1,4 +1,5 @@
-"""A log without speed: stops are seen by a brake that nothing answers, and a car that moves is never taken for one."""
+"""A log without speed: stops are detected by a brake without response, and a moving car is never taken for a standing
+one."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def test_counts_and_slopes_by_hand() -> None:
 
 @pytest.mark.statistical
 @pytest.mark.slow
-def test_a_small_sweep_covers_and_knows(rotating_seed: int) -> None:
+def test_a_small_sweep_covers_the_truth(rotating_seed: int) -> None:
     found = estimation(Leaders.read(), seeds=2, seed=rotating_seed)
     assert [s.truth.shape for s in found.sweeps] == [(15, 2)]
     sweep = found.sweeps[0]

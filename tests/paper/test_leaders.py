@@ -11,7 +11,7 @@ from avtorch.paper import Leaders
 from avtorch.paper.leaders import DRIVE_S, PLATOON_S, SWEEP_S
 
 
-def test_without_recordings_us06_says_so() -> None:
+def test_without_recordings_us06_is_reported() -> None:
     leaders = Leaders.read()
     assert [a.name for a in (*leaders.sweep, *leaders.drives)] == ["US06", "US06"]
     assert leaders.main.said("As it is.") == ("As it is; no recordings were given, so the embedded US06 drives ahead.")

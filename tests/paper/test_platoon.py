@@ -28,7 +28,7 @@ def test_rows_and_measures(found: Platoon) -> None:
     assert float(found.peak[0]) == pytest.approx(2.2445, abs=5e-5)
 
 
-def test_collisions_are_told(found: Platoon) -> None:
+def test_collisions_are_reported(found: Platoon) -> None:
     hit = (found.run.spacing <= 0).flatten(1).any(-1)
     for i, name in enumerate(found.names):
         told = [r.why for r in found.rows if r.setting.startswith(name)]

@@ -1,4 +1,4 @@
-"""Printed settings have the peak gains of the reference table; a strategist's run is judged by the same rule."""
+"""Printed settings have the peak gains of the reference table; a strategist's run gets its verdict by the same rule."""
 
 from __future__ import annotations
 

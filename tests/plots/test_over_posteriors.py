@@ -118,7 +118,7 @@ def test_regions_hold_the_share_they_name(rotating_seed: int, draws_factor: int)
     assert sum(bool(len(c.get_paths())) for c in ax.collections) == 2
 
 
-def test_a_cloud_that_is_too_wide_is_told() -> None:
+def test_a_cloud_that_is_too_wide_is_detected() -> None:
     own = draws(3)
     wide = dataclasses.replace(own, draws=own.mean + 1.5 * (own.draws - own.mean))
     wide = dataclasses.replace(wide, draws=wide.draws.clamp_min(1e-3))

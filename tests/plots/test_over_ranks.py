@@ -47,7 +47,7 @@ def test_band_holds_all_bars_at_its_level(sizes: tuple[int, ...], rotating_seed:
 
 
 @pytest.mark.statistical
-def test_band_counts_correlated_draws_as_what_they_are_worth(rotating_seed: int, draws_factor: int) -> None:
+def test_band_counts_correlated_draws_by_effective_sample_size(rotating_seed: int, draws_factor: int) -> None:
     rng, trials = np.random.default_rng(rotating_seed), 300 * draws_factor
     held = {"worth": 0, "all": 0}
     for _ in range(trials):

@@ -90,7 +90,7 @@ def test_windows_shown_go_from_wide_to_narrow(validation: Validation) -> None:
     assert all(t[1].startswith("SGLD inside") for t in titles)
 
 
-def test_ecdf_figure_counts_windows_and_sees_a_shift(validation: Validation) -> None:
+def test_ecdf_figure_counts_windows_and_shows_a_shift(validation: Validation) -> None:
     figure = plots.validation_figures(validation)["ecdf.png"]()
     assert len(figure.axes) == 6
     sgld = validation.sgld

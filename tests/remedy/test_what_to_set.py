@@ -54,7 +54,7 @@ def test_a_dead_time_is_not_a_lag(fresh_seed: int) -> None:
     if 1 not in told.strategies:
         assert float(p_string_stable(T, K, told.set.time_gap, told.set.gains, dead_time=theta)) >= 0.9
     assert told.peak_then == pytest.approx(1.0, abs=1e-3)
-    # what is told of the whole is told as plain numbers
+    # the whole answer consists of plain numbers
     assert told.to_dict()["p_string_stable"]["then"] == told.p_then
 
 
@@ -75,7 +75,7 @@ def test_a_late_sensor_and_notes_of_what_bends() -> None:
     assert "backlash" in play.notes[0]
 
 
-def test_wrong_arguments_are_told() -> None:
+def test_wrong_arguments_are_refused() -> None:
     with pytest.raises(InputError, match="required"):
         what_to_set(plant(), _belief(1, 0.3, 1.0), required=1.5)
     with pytest.raises(InputError, match="speeds"):

@@ -1,4 +1,4 @@
-"""The report: whole, self-contained, and deaf to what a log would like to say to the browser."""
+"""The report: complete, self-contained, and safe against markup in a log."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_a_hostile_name_is_text(found: Diagnosis) -> None:
     assert "&lt;script&gt;" in text
 
 
-def test_answers_that_say_less(found: Diagnosis) -> None:
+def test_answers_with_fewer_entries(found: Diagnosis) -> None:
     bare = replace(found, traces=None, shrinkage=None, setting=None, where=(), notes=("<b>note</b>",), complete=False)
     text = report_html(bare)
     _read(text)

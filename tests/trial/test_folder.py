@@ -154,7 +154,7 @@ def test_a_file_in_anothers_place_is_noticed(root: Path) -> None:
 
 
 def test_a_damaged_answer_is_asked_for_again_and_named(root: Path, trial: tuple[Path, dict[str, Any]]) -> None:
-    """It can be had again; a truth may have been changed after the answers were seen."""
+    """It can be computed again; a truth may have been changed after the answers were known."""
     folder = settled(root)
     gone, damaged, moved = (folder.answer_path("says_none", 0), *(folder.answer_path("says_gust", i) for i in (0, 1)))
     gone.unlink()
@@ -218,7 +218,7 @@ def test_an_earlier_avtorchs_folder_and_no_files_are_refused(root: Path) -> None
             again(root)
 
 
-def test_two_processes_in_one_folder_are_told_apart(root: Path) -> None:
+def test_two_processes_in_one_folder_are_distinguished(root: Path) -> None:
     """A thread stands for the other process: to the lock they are alike."""
     import threading
 

@@ -23,7 +23,7 @@ KEYS = {
 
 
 class Asked:
-    """Says `none`, and remembers which logs it was shown."""
+    """Answers `none`, and records the logs that it was given."""
 
     def __init__(self) -> None:
         self.logs: list[Log] = []
@@ -52,7 +52,7 @@ def test_answers_are_kept_and_only_missing_ones_are_asked_for(tmp_path: Path) ->
     assert set(more["baselines"]) == {"random_guess"}
     assert KEYS - {"cases", "seed", "baselines"} <= more["baselines"]["random_guess"].keys()
     assert sum(sum(row.values()) for row in more["confusion"].values()) == 7
-    # truths lie apart from what an answerer is shown
+    # truths are stored apart from the input of an answerer
     assert not {"truth", "logs"} & {p.name for p in (tmp_path / "answers").rglob("*")}
 
 

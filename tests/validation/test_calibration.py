@@ -80,7 +80,7 @@ def test_ranks_of_known_draws():
     found = Calibration.of(Toy(torch.zeros(2, dtype=F64)), truth, draws, torch.tensor([True, False]), draws=19)
     assert found.replications == 1
     assert found.dropped == 1
-    # the nearer to zero in z, the likelier; log 5.5 is passed by log 1 to log 5 only
+    # the nearer to zero in z, the likelier; only log 1 to log 5 are likelier than log 5.5
     assert found.ranks.tolist() == [[5, 14, 14]]
     assert found.below[0, 0] == pytest.approx(5 / 19)
     assert found.counts(20).sum(-1).tolist() == [1, 1, 1]

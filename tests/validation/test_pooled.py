@@ -115,7 +115,7 @@ def test_lambda_follows_a_step_that_posterior_mode_does_not(rotating_seed):
     seen = windows_of(path, generator=g)
     follows, stays = (follow(path, seen, mode=mode, seed=rotating_seed) for mode in ("lambda", "posterior"))
     assert follows.covered.shape == (4, 10, 3)
-    # an SD of about 3 %; posterior mode is between three windows that say 0.3 s and one that says 1 s
+    # an SD of about 3 %; posterior mode is between three windows at 0.3 s and one at 1 s
     assert follows.relative_error[-1, :, 0].median() < 0.2
     assert stays.relative_error[-1, :, 0].median() > 0.3
     assert math.isclose(float(follows.truth[-1, 0, 0]), 1.0)

@@ -30,7 +30,7 @@ WINDOWS = 12
 
 @pytest.fixture(scope="module")
 def windows() -> Windows:
-    """Windows that say much, so that the exact draws of a test need not be many."""
+    """Informative windows, so that few exact draws suffice."""
     found = synthetic_windows(100, seed=8)
     return found.select((found.excited & (found.truth[:, 0] < 0.6)).nonzero().squeeze(-1)[:WINDOWS])  # type: ignore[index]
 

@@ -1,4 +1,4 @@
-"""A controller of unknown structure: its slopes are the law's, and what is measured is what the theory says."""
+"""A controller of unknown structure: its slopes are the law's, and measured gains agree with theory."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_what_is_measured_is_the_transfer_function(k_f: float, delay: float) -> 
 
 
 @pytest.mark.slow
-def test_a_black_box_is_judged_by_its_slopes_for_small_motions_only() -> None:
+def test_a_black_box_gets_its_slopes_verdict_for_small_motions_only() -> None:
     law = linearise(network, 25.0)
     omega = torch.tensor([0.8], dtype=torch.float64)
     said = float(stability.gain(omega, 1.2, 0.6, law.time_gap, law.gains, dead_time=0.005)[0])
@@ -71,7 +71,7 @@ def test_a_black_box_is_judged_by_its_slopes_for_small_motions_only() -> None:
     small, large = (float(measured_gain(network, omega, amplitude=a, **how)[0]) for a in (0.05, 4.0))
     assert said > 1.0
     assert small == pytest.approx(said, rel=5e-3)
-    # saturated units follow otherwise: the slopes do not tell it
+    # saturated units behave differently, which the slopes do not show
     assert abs(large / said - 1.0) > 0.05
 
 

@@ -42,7 +42,7 @@ def test_rigorous_local_form_is_exact_and_the_print_passes_unstable_boxes(boxes)
 
 
 def test_a_box_that_the_print_passes_though_it_holds_an_unstable_vehicle():
-    # k_a > 0: the strong vehicle (T^u, K^u) is the worst, and the print never looks at it.
+    # k_a > 0: the strong vehicle (T^u, K^u) is the worst, and the printed condition ignores it.
     T, K, gains = (0.1, 1.0), (0.2, 1.2), [1.0, 0.3, 0.6]
     assert stability.local_conditions(T, K, 1.0, gains, form="print").holds.item()
     assert not stability.local_conditions(T, K, 1.0, gains, form="rigorous").holds.item()

@@ -96,7 +96,7 @@ def test_a_second_pole_and_drag_against_the_eigenvalues(fresh_seed: int) -> None
             assert bool(seen.locally_stable) == bool(roots.real.max() < 0)
 
 
-def test_wrong_chains_are_told() -> None:
+def test_wrong_chains_are_refused() -> None:
     omega = frequencies(points=20)
     one = torch.ones(20, dtype=torch.complex128)
     with pytest.raises(InputError, match="omega"):

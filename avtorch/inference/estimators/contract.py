@@ -1,4 +1,4 @@
-"""What a stream of windows asks of an estimator."""
+"""The interface of an estimator in a stream of windows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from avtorch.inference.evidence import Evidence, Rows
 
 
 class Estimator(Protocol):
-    """Takes the windows of many vehicles one after the other and holds a belief about them.
+    """Takes the windows of many vehicles one after another and keeps a belief about them.
 
     A window that is not excited leaves the belief of its vehicle as it was.
 
@@ -23,15 +23,15 @@ class Estimator(Protocol):
 
     @property
     def belief(self) -> Belief:
-        """After the last window; before the first, the first prior."""
+        """The belief after the last window; before the first, the first prior."""
         ...
 
     def take(self, rows: Rows, evidence: Evidence) -> Belief:
-        """Take in one window: its rows, each column ``(vehicle, time)``, and what the form made of them."""
+        """Take in one window: its rows, each column ``(vehicle, time)``, and the form's evidence from them."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """Plain tensors and names, from which a resumed estimator goes on equal to the bit."""
+        """Plain tensors and names, from which a resumed estimator continues bit for bit."""
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None: ...

@@ -1,4 +1,4 @@
-"""The state of the jerk form: acceleration is known, so that ``(log T_L, log K_L)`` is all there is to filter."""
+"""The state of the jerk form: acceleration is known, so only ``(log T_L, log K_L)`` is filtered."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from avtorch.inference.estimators.state_model import GaussianState, Observation
 
 
 class JerkState:
-    """``(log T_L, log K_L)`` as a random walk, seen through Eq. 1: ``jerk = (K_L u - a)/T_L + N(0, sigma^2)``.
+    """``(log T_L, log K_L)`` as a random walk, observed through Eq. 1: ``jerk = (K_L u - a)/T_L + N(0, sigma^2)``.
 
     Args:
         sigma: jerk noise [m/s³], ``(vehicle,)``.

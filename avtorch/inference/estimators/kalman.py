@@ -23,16 +23,16 @@ from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.latent_window import GAP
 
 PLAUSIBLE = ((0.01, 20.0), (0.02, 20.0))
-"""Where ``T_L`` [s] and ``K_L`` may lie; a filter that leaves it has diverged, and starts afresh from the prior."""
+"""Bounds of ``T_L`` [s] and ``K_L``; a filter that leaves them has diverged, and restarts from the prior."""
 
 
 class JointKalman(WindowedEstimator):
-    """A filter over the state and ``(log T_L, log K_L)``; how a normal passes the non-linear model is the subclass's.
+    """A filter over the state and ``(log T_L, log K_L)``; subclasses pass a normal through the non-linear model.
 
-    The parameters walk at random by ``drift`` while rows are learnt from. A filter needs its noise levels given. In
-    the jerk form that is the SD of the window's residual under least squares, which becomes the belief's ``sigma``; in
-    the latent form ``noise``, which the belief repeats without any spread. A window in which the filter diverges does
-    not count as converged: the belief is carried over and the filter begins anew.
+    The parameters follow a random walk of ``drift`` over the rows used. A filter needs its noise levels. In the jerk
+    form the level is the SD of the window's residual under least squares, which becomes the belief's ``sigma``; in the
+    latent form it is ``noise``, which the belief repeats without spread. A window in which the filter diverges does not
+    count as converged: the belief is carried over and the filter begins anew.
 
     Args:
         drift: SD of the walk of both logarithms per square root of a second.
@@ -75,20 +75,20 @@ class JointKalman(WindowedEstimator):
     def filter(
         self, model: StateModel, actuation: GaussianState, rows: Rows, columns: tuple[str, ...]
     ) -> tuple[GaussianState, Tensor]:
-        """All usable rows of a window; a run behind a gap or an unused row starts afresh but for the parameters.
+        """Filter all usable rows of a window; after a gap or an unused row all but the parameters restarts.
 
         Args:
-            actuation: of ``(log T_L, log K_L)`` at the first row.
+            actuation: belief in ``(log T_L, log K_L)`` at the first row.
             columns: the measured signals, one a channel.
 
         Returns:
-            The same behind the last row, and the log likelihood ``(vehicle,)``.
+            The belief in them after the last row, and the log likelihood ``(vehicle,)``.
         """
         time, usable = rows["time"], rows["usable"]
         steps = time.diff()
         usual = steps.median() if len(steps) else torch.tensor(math.inf)
         cut = torch.cat([torch.ones(1, dtype=torch.bool), steps > GAP * usual])
-        # a masked row may hold anything, also NaN
+        # a masked row may hold any number or NaN
         signals = {name: value for name, value in rows.items() if name not in ("time", "usable")}
         clean = {name: torch.where(usable, value, 0.0) for name, value in signals.items()}
         measured = torch.stack([clean[name] for name in columns], -1)
@@ -145,7 +145,7 @@ class JointKalman(WindowedEstimator):
 
 
 def _plausible(actuation: GaussianState) -> Tensor:
-    """Where mean and covariance are those of a vehicle, ``(vehicle,)`` bool."""
+    """Where mean and covariance are plausible for a vehicle, ``(vehicle,)`` bool."""
     low, high = (torch.tensor(x, dtype=torch.float64).log() for x in zip(*PLAUSIBLE, strict=True))
     inside = ((actuation.mean > low) & (actuation.mean < high)).all(-1)
     sound = torch.linalg.cholesky_ex(actuation.cov.nan_to_num())[1] == 0

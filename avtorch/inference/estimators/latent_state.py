@@ -1,4 +1,4 @@
-"""The state of the latent form: speed, acceleration and an unknown force, and beside them ``log T_L, log K_L``."""
+"""The state of the latent form: speed, acceleration, an unknown force, and ``log T_L, log K_L``."""
 
 from __future__ import annotations
 

@@ -11,16 +11,18 @@ from avtorch.inference.map import find_mode
 from avtorch.inference.sequential import SequentialInference
 
 WIDEST = 3.0
-"""SD of a logarithm, twice the widest prior's, above which the curvature at the mode tells nothing of the posterior."""
+"""SD of a logarithm, twice the widest prior's, above which the curvature at the mode does not describe the
+posterior."""
 
 
 class MaximumAPosteriori(SequentialInference):
     """The same windows, densities and priors as SGLD's loop; each posterior is replaced by a normal in the log space.
 
     Its mean is the mode and its covariance the inverse curvature there (Laplace), so that the belief's median is the
-    mode and its draws are log-normal. Exact where the log posterior is quadratic; a skewed one loses its long side.
+    mode and its draws are log-normal. Exact where the log posterior is quadratic; the long tail of a skewed one is
+    lost.
 
-    Takes the arguments of :class:`SequentialInference`; ``settings`` have no meaning here.
+    Takes the arguments of :class:`SequentialInference`; ``settings`` do not apply.
 
     Example:
         >>> import torch
@@ -36,7 +38,7 @@ class MaximumAPosteriori(SequentialInference):
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
         mode = find_mode(density)
         settled = mode.converged & (mode.covariance.diagonal(dim1=-2, dim2=-1).amax(-1) < WIDEST**2)
-        # any covariance does for the others, so long as their numbers stay numbers
+        # the others are not used; any finite covariance will do
         covariance = torch.where(
             settled[:, None, None], mode.covariance, torch.eye(mode.z.shape[-1], dtype=mode.z.dtype)
         )

@@ -5,9 +5,9 @@ Eq. 1 of the paper is linear in :math:`\beta = (1/T_L, K_L/T_L)`. In information
 .. math::
     R \leftarrow \lambda R + x x^\top, \qquad r \leftarrow \lambda r + x\,\dot a, \qquad \hat\beta = R^{-1} r,
 
-with ``x = (-a, u)``: the textbook recursion, started without any prior. As the sums are linear in the rows, a window
-enters at once. The covariance is the customary :math:`\hat\sigma^2 R^{-1}`, that of weighted least squares whose older
-rows are noisier. Where nothing has changed it is too wide: by :math:`\sqrt 2` in SD once the memory is full.
+with ``x = (-a, u)``: the textbook recursion, started without any prior. As the sums are linear in the rows, a window is
+added at once. The covariance is the customary :math:`\hat\sigma^2 R^{-1}`, which treats older rows as noisier. Where
+nothing has changed it is too wide, by :math:`\sqrt 2` in SD once the memory is full.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from avtorch.inference.evidence import Form, Rows
 from avtorch.inference.jerk import JerkStatistics
 
 CLEAR = 4.0
-"""SDs that both coefficients must be above zero: nearer to it ``1/x`` has no useful interval, and no mean."""
+"""SDs that both coefficients must be above zero: nearer to zero ``1/x`` has no useful interval, and no mean."""
 
 _SUMS = tuple(f.name for f in fields(JerkStatistics))
 
@@ -33,8 +33,8 @@ _SUMS = tuple(f.name for f in fields(JerkStatistics))
 class RecursiveLeastSquares(WindowedEstimator):
     """Least squares over all excited rows so far, a row that is ``k`` rows old weighted by ``forgetting**k``.
 
-    No prior enters, so a belief needs both coefficients clear of zero (``CLEAR``); until then a window counts as not
-    converged: its sums are kept, the belief is carried over.
+    There is no prior, so a belief needs both coefficients well above zero (``CLEAR``); until then a window counts as
+    not converged: its sums are kept, the belief is carried over.
 
     Args:
         forgetting: in (0, 1], per row; 1 forgets nothing. The memory is ``1 / (1 - forgetting)`` rows: the default
@@ -82,7 +82,7 @@ class RecursiveLeastSquares(WindowedEstimator):
         scale = sigma.square() / (s.aa * s.uu - s.au.square())
         bb, gg, bg = scale * s.uu, scale * s.aa, scale * s.au
         settled = (b > CLEAR * bb.sqrt()) & (g > CLEAR * gg.sqrt()) & (s.n > 4)
-        # any numbers do for the others, so long as they are numbers
+        # the others are not used; any finite numbers will do
         b, g, sigma = (torch.where(settled, x, 1.0) for x in (b, g, sigma))
         bb, gg, bg = (torch.where(settled, x, 0.0) for x in (bb, gg, bg))
         T, K, sd_b = 1 / b, g / b, bb.sqrt()
@@ -100,7 +100,7 @@ class RecursiveLeastSquares(WindowedEstimator):
     def _draws(
         self, b: Tensor, g: Tensor, sigma: Tensor, sd_b: Tensor, gg: Tensor, bg: Tensor, spread: Tensor
     ) -> Tensor:
-        """``(draw, vehicle, 3)`` from the normal of the coefficients, which lies clear of zero."""
+        """``(draw, vehicle, 3)`` from the normal of the coefficients, which lies well above zero."""
         noise = torch.randn(3, self.kept, len(b), generator=self.generator, dtype=b.dtype)
         slope = torch.where(sd_b > 0, bg / sd_b.clamp_min(1e-300), 0.0)
         one = b + sd_b * noise[0]
@@ -111,7 +111,7 @@ class RecursiveLeastSquares(WindowedEstimator):
 
 
 def _fieller(b: Tensor, g: Tensor, bb: Tensor, gg: Tensor, bg: Tensor) -> tuple[Tensor, Tensor]:
-    """The 90 % interval of ``g / b`` of two correlated normals (Fieller 1954), bounded as ``b`` is clear of zero."""
+    """The 90 % interval of ``g / b`` of two correlated normals (Fieller 1954), bounded as ``b`` is well above zero."""
     square = b.square() - Z90**2 * bb
     half = g * b - Z90**2 * bg
     root = (half.square() - square * (g.square() - Z90**2 * gg)).clamp_min(0.0).sqrt()

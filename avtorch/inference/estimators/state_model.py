@@ -1,4 +1,5 @@
-"""What a joint Kalman filter asks of a model: a mean that moves and is observed, with noise, both differentiable."""
+"""The interface of a model for a joint Kalman filter: transition and observation of the mean, both differentiable, and
+noise."""
 
 from __future__ import annotations
 
@@ -34,15 +35,15 @@ class StateModel(Protocol):
 
     @property
     def variance(self) -> Tensor:
-        """Of every channel's noise, ``(vehicle, channel)``."""
+        """Variance of every channel's noise, ``(vehicle, channel)``."""
         ...
 
     def start(self, actuation: GaussianState, row: Observation) -> GaussianState:
-        """The state at the first row of a run, given what is known of ``(log T_L, log K_L)``."""
+        """The state at the first row of a run, given the belief in ``(log T_L, log K_L)``."""
         ...
 
     def advance(self, x: Tensor, row: Observation) -> Tensor:
-        """The state a step later, its noise apart, shape of ``x``."""
+        """The state a step later without noise, shape of ``x``."""
         ...
 
     def slope(self, x: Tensor, row: Observation) -> Tensor:
@@ -54,7 +55,7 @@ class StateModel(Protocol):
         ...
 
     def observe(self, x: Tensor, row: Observation, channel: int) -> Tensor:
-        """What the channel reads, its noise apart, ``(..., vehicle)``."""
+        """The channel's reading without noise, ``(..., vehicle)``."""
         ...
 
     def observed_slope(self, x: Tensor, row: Observation, channel: int) -> Tensor:

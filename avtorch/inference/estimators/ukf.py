@@ -1,7 +1,8 @@
 r"""The joint unscented Kalman filter (Julier and Uhlmann 1997) with ``kappa = 0``: 2d points of equal weight.
 
 The points :math:`x \pm \sqrt{d}\, L_i`, ``L`` the Cholesky factor of the covariance, pass the model itself; mean and
-covariance of where they end are the prediction. Positive weights keep every covariance positive, and no tuning is left.
+covariance of the transformed points are the prediction. Positive weights keep every covariance positive, and there is
+no tuning parameter.
 """
 
 from __future__ import annotations

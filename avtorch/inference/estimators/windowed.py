@@ -1,4 +1,4 @@
-"""What the recursive estimators share: a belief a vehicle, carried over where a window teaches nothing, and resume."""
+"""Shared by the recursive estimators: a belief per vehicle, carried over where a window is not excited, and resume."""
 
 from __future__ import annotations
 
@@ -58,19 +58,19 @@ class WindowedEstimator(ABC):
 
     @abstractmethod
     def _learn(self, rows: Rows, index: Tensor) -> tuple[Summary, Tensor]:
-        """From the rows of the vehicles ``index``, their summary and where it may be used, ``(vehicle,)`` bool."""
+        """The summary of the vehicles ``index`` from their rows, and where it may be used, ``(vehicle,)`` bool."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on equal to the bit; plain tensors and names."""
+        """Everything needed to continue bit for bit; plain tensors and names."""
         memory = {name: value.clone() for name, value in self._memory.items()}
         return {**self.belief.state_dict(), "memory": memory, "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state_dict`.
+        """Continue from :meth:`state_dict`.
 
         Raises:
             InputError: if it was saved by an estimator of other parameters or vehicles, or has other shapes, types or
-                numbers than it saves; it then stays as it was.
+                numbers than it saves; nothing is then changed.
         """
         saved, own = about(state), about(self.state_dict())
         if saved != own:

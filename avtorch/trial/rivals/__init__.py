@@ -1,4 +1,4 @@
-"""Who else could be asked: one file each, a function from a log to an answer."""
+"""Rival methods, one file each: a function from a log to an answer."""
 
 from avtorch.trial.rivals.black_box import black_box
 from avtorch.trial.rivals.likelihood_bic import likelihood_bic

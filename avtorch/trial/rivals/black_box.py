@@ -1,6 +1,6 @@
-"""A black box: what a flexible regression foretells of the residual on blocks held out, beyond the noise's own memory.
+"""A black box: how well a flexible regression predicts the residual on held-out blocks, beyond the noise's own memory.
 
-It can say that something is amiss, not what: its answers are `none` and `unknown`.
+It detects a gap but cannot name its cause: its answers are `none` and `unknown`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _BLOCKS = 20
 _MEMORY_S, _ORDER = 0.3, 8
 _LAGS_S = (0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 _RIDGES = (1e-4, 1e-2, 1.0)
-"""Prices of the flexible part; the one that gains most on held-out blocks counts."""
+"""Ridge penalties of the flexible part; the one that gains most on held-out blocks counts."""
 
 
 def black_box(log: Log) -> dict[str, Any]:
@@ -37,7 +37,7 @@ def black_box(log: Log) -> dict[str, Any]:
     gains = max(tried, key=lambda one: one.sum())
     spread = gains.std(ddof=1) / math.sqrt(len(gains))
     p_value = float(student.sf(gains.mean() / max(spread, 1e-12), len(gains) - 1))
-    p_value = min(max(len(tried) * p_value, 1e-12), 1.0)  # the best of so many
+    p_value = min(max(len(tried) * p_value, 1e-12), 1.0)  # Bonferroni: the best of this many penalties
     for_none = -math.e * p_value * math.log(p_value) if p_value < 1 / math.e else 1.001
     return reply(
         log,
@@ -73,7 +73,7 @@ def held_out_gains(fitter: Fitter, transformed: NDArray[np.complex128], ridge: f
 
 
 def _features(drive: Residuals, residual: FloatArray, rows: NDArray[np.intp]) -> FloatArray:
-    """Lagged commands and responses to them, bent and times speed; nothing that the row's own noise has touched."""
+    """Lagged commands and responses, also nonlinear and times speed; none depends on the row's own noise."""
     command = np.concatenate([one.command.numpy() for one in drive.drives])
     speed = np.concatenate(
         [np.zeros(len(one.time)) if one.speed is None else one.speed.numpy() for one in drive.drives]
@@ -91,7 +91,7 @@ def _features(drive: Residuals, residual: FloatArray, rows: NDArray[np.intp]) ->
 
 
 def _held_out(features: FloatArray, target: FloatArray, block: NDArray[np.intp], free: int, ridge: float) -> FloatArray:
-    """Errors of regressions that have not seen the block; all but the first `free` columns are priced."""
+    """Errors of regressions fitted without the block; all but the first `free` columns are penalised."""
     scaled = features / np.maximum(np.sqrt(np.mean(features**2, 0)), 1e-9)
     edges = np.searchsorted(block, np.arange(_BLOCKS + 1))
     parts = [slice(a, b) for a, b in pairwise(edges.tolist())]

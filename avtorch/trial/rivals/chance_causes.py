@@ -1,4 +1,5 @@
-"""Causes that no response foretells, told by what they do to the noise: each returns -log L with it, given a fit."""
+"""Causes that no response predicts, identified by their effect on the noise: each returns -log L with it, given a
+fit."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from avtorch.arrays import FloatArray
 from avtorch.gap import RoadGrade
 from avtorch.trial.rivals.maximum_likelihood import Fitter, MaximumLikelihoodFit
 
-_ROAD_HZ = 3.0  # what a road does to a car is slower
+_ROAD_HZ = 3.0  # the effect of a road on a car is slower
 
 
 def outliers(fitter: Fitter, fit: MaximumLikelihoodFit) -> float:
@@ -31,9 +32,9 @@ def outliers(fitter: Fitter, fit: MaximumLikelihoodFit) -> float:
 
 
 def command_hold(fitter: Fitter, fit: MaximumLikelihoodFit) -> float:
-    """What a row cannot foretell is larger where the command has just stepped: one more parameter."""
+    """Innovations are larger where the command has just stepped: one more parameter."""
     told, rows = _innovations(fitter, fit)
-    # the step before the row: the row's own command already knows of the row's noise
+    # the step before the row: the row's own command already depends on the row's noise
     push = fitter.drive.push[rows - 1]
     if push.max() <= 0:
         return fit.loss
@@ -48,7 +49,7 @@ def command_hold(fitter: Fitter, fit: MaximumLikelihoodFit) -> float:
 def road_grade(fitter: Fitter, fit: MaximumLikelihoodFit) -> float | None:
     """A slope that is a smooth random function of position, as a mixed model: one more parameter, its size.
 
-    The slope's coefficients are integrated out, T_L, K_L and the effects' parameters move along to first order, and
+    The slope's coefficients are integrated out, T_L, K_L and the effects' parameters are adjusted to first order, and
     the noise is refitted. None where the drive is in pieces.
     """
     drive, spectrum = fitter.drive, fitter.spectrum
@@ -94,10 +95,10 @@ def road_grade(fitter: Fitter, fit: MaximumLikelihoodFit) -> float | None:
 
 
 def _innovations(fitter: Fitter, fit: MaximumLikelihoodFit, order: int = 8) -> tuple[FloatArray, NDArray[np.intp]]:
-    """What the rows before do not foretell of the first channel's residual, and the rows it is of.
+    """Innovations of the first channel's residual given the rows before, and the numbers of their rows.
 
-    By autoregression on all channels: the controller acts on noise, so a filter that looks ahead would take the
-    command for the noise's cause.
+    By autoregression on all channels, because the controller acts on noise: a non-causal filter would take the command
+    for the noise's cause.
     """
     valid = fitter.drive.valid
     residual = np.fft.irfft(fit.transformed, fitter.spectrum.length, 0)[: len(valid)]

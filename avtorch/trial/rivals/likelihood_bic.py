@@ -1,6 +1,6 @@
 """The classical way: maximum likelihood of every candidate, and the Bayesian information criterion to choose.
 
-Output-error models whose noise is process noise, sensor noise and nothing else, fitted in the frequency domain
+Output-error models with process noise and sensor noise only, fitted in the frequency domain
 (`avtorch.trial.rivals.spectrum`), first on the log thinned to 20 Hz. Those that lead are fitted again at the log's own
 rate, and the best one is tried in pairs with each other. There is no answer `unknown`, and no moment of onset.
 """
@@ -21,14 +21,14 @@ from avtorch.trial.rivals.maximum_likelihood import Fitter, MaximumLikelihoodFit
 from avtorch.trial.rivals.residuals import Residuals
 
 CHANCE = ("command_hold", "gust", "outliers", "road_grade")
-"""Causes that are told by the noise, not by the response."""
+"""Causes identified by the noise, not by the response."""
 _SINGLES, _PAIRS = 5, 3  # that are fitted at the full rate
 _THIN_HZ = 20.0
 
 
 @dataclass(frozen=True)
 class Scored:
-    """A candidate with its score, -BIC / 2, and the fit on which it stands."""
+    """A candidate with its score, -BIC / 2, and the fit behind it."""
 
     names: tuple[str, ...]
     score: float
@@ -36,7 +36,7 @@ class Scored:
 
 
 def likelihood_bic(log: Log) -> dict[str, Any]:
-    """Answer with `none`, an effect or a pair; probabilities are those that BIC stands for, exp(-BIC / 2)."""
+    """Answer with `none`, an effect or a pair; probabilities are in proportion to exp(-BIC / 2)."""
     known = candidates(log)
     thin = _Search(Fitter(Residuals.of(log, rate_hz=_THIN_HZ)))
     none = thin.score(())
@@ -53,7 +53,7 @@ def likelihood_bic(log: Log) -> dict[str, Any]:
         pairs = [thin.score(_joined(best.names, name), near, steps=1) for name in known if name not in best.names]
         pairs = sorted(pairs, key=lambda one: -one.score)[:_PAIRS]
         scored += [search.score(one.names, one.fit) for one in pairs]
-        # and back: an effect that came in second may do without the first
+        # backward step: an effect that was added second may suffice without the first
         best = max(scored, key=lambda one: one.score)
         if len(best.names) == 2:
             scored = _with(scored, [search.again((name,), best.fit) for name in best.names if name not in CHANCE])
@@ -71,7 +71,7 @@ def candidates(log: Log) -> list[str]:
 
 
 class _Search:
-    """Scores of candidates on one drive; fits that candidates share are made once."""
+    """Scores of candidates on one drive; fits shared by several candidates are computed once."""
 
     def __init__(self, fitter: Fitter) -> None:
         self.fitter = fitter
@@ -102,7 +102,7 @@ class _Search:
 
 
 def _with(scored: list[Scored], more: list[Scored]) -> list[Scored]:
-    """The better of those of a name."""
+    """The better of two candidates of one name."""
     best = {one.names: one for one in scored}
     for one in more:
         if one.names not in best or one.score > best[one.names].score:

@@ -1,4 +1,4 @@
-"""Maximum likelihood of one plant: the deterministic effects by Gauss and Newton, the noise refitted at every step."""
+"""Maximum likelihood of one plant: deterministic effects by Gauss-Newton, the noise refitted at every step."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from avtorch.trial.rivals.residuals import Residuals
 from avtorch.trial.rivals.spectrum import Complex, Spectrum
 
 _STEPS = 12
-_WIDE = 0.05  # half of the width of differences, in the prior's SDs
-_REACH = 6.0  # how far from its prior's middle a coordinate may go, in the prior's SDs
+_WIDE = 0.05  # half width of the central differences, in the prior's SDs
+_REACH = 6.0  # bound on a coordinate's distance from its prior's centre, in the prior's SDs
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class MaximumLikelihoodFit:
     """A fitted candidate. `z`: coordinates by name, each on the scale of its prior; `loss` = -log L.
 
     `transformed` residual; `sizes`, `gust_time` of the noise; `inverse` its spectrum's; `lag` T_L [s]. `slope` of the
-    response and `sd`, as `z`, are worked out when asked for.
+    response and `sd`, as `z`, are computed on demand.
     """
 
     effects: tuple[str, ...]
@@ -123,7 +123,7 @@ class Fitter:
         new = [i for i, name in enumerate(names) if name not in known and "." in name]
         if not new:
             return begin[None]
-        # a limit far below what the drive asks for is slow to work out, and was never the best start
+        # a limit far below the drive's demand is slow to evaluate, and was never the best start
         firsts = (0.0, 1.5, 3.0) if names[new[0]].startswith("rate_limit.") else (-1.5, 0.0, 1.5)
         if names[new[-1]].startswith("gain_change."):
             seconds = np.linspace(-1.2, 1.2, 7).tolist()
@@ -158,7 +158,7 @@ class Fitter:
         lag = float(made.parameters()["T_L"].constrain(torch.tensor(z[0], dtype=torch.float64)))
         transformed = self.spectrum.transform(missed)
         bands = self.spectrum.bands(transformed)
-        if not np.isfinite(bands).all():  # beyond where the effect is defined
+        if not np.isfinite(bands).all():  # outside the effect's domain
             return np.inf, transformed, sizes, None, None, lag
         loss, sizes, gust_time = self.spectrum.fit_noise(bands, lag, sizes, gust)
         return loss, transformed, sizes, gust_time, self.spectrum.inverse(lag, sizes, gust_time), lag
@@ -166,7 +166,8 @@ class Fitter:
     def _slope(self, made: GapPlant, names: Sequence[str], z: FloatArray) -> Complex:
         """Derivative of the transformed response, (coordinate, frequency, channel), by central differences.
 
-        They are wide, for a response that has kinks (a delay of whole rows) draws a narrower one into the kink.
+        The differences are wide, because at a kink of the response (a delay of whole rows) a narrow one gives a wrong
+        slope.
         """
         away = _WIDE * np.eye(len(names))
         missed = np.nan_to_num(self._misses(made, names, np.concatenate([z - away, z + away])))
@@ -174,7 +175,7 @@ class Fitter:
 
 
 def _normal(slope: Complex, inverse: Complex, transformed: Complex) -> tuple[FloatArray, FloatArray]:
-    """Gauss and Newton's matrix, and the direction downhill."""
+    """The Gauss-Newton matrix, and the direction of descent."""
     weighed = np.einsum("kcd,pkd->pkc", inverse, slope)
     flat = weighed.reshape(len(slope), -1).conj()
     return 2 * (flat @ slope.reshape(len(slope), -1).T).real, 2 * (flat @ transformed.ravel()).real

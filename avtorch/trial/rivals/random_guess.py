@@ -1,4 +1,4 @@
-"""The floor: an answer that does not look at the drive."""
+"""The floor: an answer that does not use the drive."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from avtorch.io import Log
 from avtorch.trial.reply import reply
 
 SHARES = {"none": 0.25, "single": 0.40, "pair": 0.20, "unknown": 0.15}
-"""How often each kind of case comes, which is all that is known before a drive is seen."""
+"""Shares of the kinds of cases, which is all that is known without the drive."""
 
 
 def random_guess(log: Log) -> dict[str, Any]:
-    """A candidate drawn in the shares of the kinds, effects alike among themselves; the same for the same log.
+    """A candidate drawn in the shares of the kinds, all effects equally likely; the same for the same log.
 
-    Its probabilities are those shares: it knows how little it knows, but must name one, and gives that one the weight
-    that puts it first.
+    Its probabilities are those shares, so they are calibrated; the candidate drawn gets just enough weight to come
+    first.
     """
     stamp = b"".join(np.ascontiguousarray(x).tobytes() for x in (log.time, log.accel, log.speed) if x is not None)
     rng = np.random.default_rng(zlib.crc32(stamp))

@@ -1,7 +1,7 @@
-"""A drive at the log's rate or thinned, and how a plant's response misses it.
+"""A drive at the log's rate or thinned, and the residuals of a plant's response.
 
-Thinned rows are for a first look alone. The controller has acted on the rows left out, so the command knows of noise
-that the thinned log does not, and a fit to it takes that for a second pole or a delay of the car.
+Thinned rows serve only a first screening. The controller has acted on the rows left out, so the command depends on
+noise that the thinned log does not contain, and a fit attributes that to a second pole or a delay of the car.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _SETTLE_S = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Every few rows of a log; the command is the mean over the rows left out, which the actuator integrates.
+    """Every n-th row of a log; the command is the mean over the rows between, which the actuator integrates.
 
     `seen` (channel, row): acceleration [m/s²] and gain in speed until the next row [m/s], as far as the log has them,
     named by `channels`. `valid` (row,): moving, engaged, not the last of a stretch, and past the first second of it.
@@ -39,7 +39,7 @@ class Residuals:
 
     @classmethod
     def of(cls, log: Log, *, rate_hz: float) -> Residuals:
-        """At about `rate_hz`, or the log's rate if that is lower. Raises `InputError` for too little to look at."""
+        """At about `rate_hz`, or the log's rate if that is lower. Raises `InputError` for too few rows."""
         if log.accel_cmd is None:
             raise InputError(f"{log.name}: has no accel_cmd, needed to simulate a plant")
         every = max(1, round(log.rate_hz / rate_hz))
@@ -85,7 +85,7 @@ class Residuals:
         return np.where(self.valid, missed, 0.0)
 
     def forced(self, columns: FloatArray) -> FloatArray:
-        """What accelerations (column, row) [m/s²] of the body put into the channels: (column, channel, row)."""
+        """The channels' response (column, channel, row) to accelerations (column, row) [m/s²] of the body."""
         gained = np.zeros_like(columns)
         gained[:, :-1] = 0.5 * self.step * (columns[:, 1:] + columns[:, :-1])
         told = {"accel": columns, "speed": gained}

@@ -1,9 +1,9 @@
-"""Sparse identification of nonlinear dynamics (Brunton et al. 2016) by PySINDy: which term do the equations want?
+"""Sparse identification of nonlinear dynamics (Brunton et al. 2016) by PySINDy: which term belongs in the equations?
 
 da/dt is regressed on the command, on its response and on one effect's terms at a time, at about 20 Hz, by sequentially
-thresholded least squares, and so is what dv/dt has more than the measured acceleration. The effect whose terms gain
-most on held-out blocks is named, `none` where nothing gains. The slopes come from smoothing, as the method has it,
-which looks ahead: where a controller feeds noise back, that looks like a delay.
+thresholded least squares; so is the difference of dv/dt and the measured acceleration. The effect whose terms gain most
+on held-out blocks is named, `none` where nothing gains. The slopes come from smoothing, as the method prescribes.
+Smoothing is not causal: where a controller feeds noise back, it appears as a delay.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def sparse_regression(log: Log) -> dict[str, Any]:
     wide = _SMOOTH_S / step
     lag = _best_lag(u, a, v, moving, step)
     response = lagged(u, lag, step)
-    # of the two slopes the acceleration's tells more of the actuator, the speed's is all there is without it
+    # the slope of the acceleration is more informative about the actuator; without it only the speed's is left
     if a is not None:
         target = {"motion": gaussian_filter1d(a, wide, order=1) / step}
         base = {"motion": [u, response], "difference": []}
@@ -62,7 +62,7 @@ def sparse_regression(log: Log) -> dict[str, Any]:
     else:
         assert v is not None
         target, base = {"motion": gaussian_filter1d(v, wide, order=1) / step}, {"motion": [response]}
-    # the smoothing of the slopes would be taken for a second pole, were the columns not smoothed as well
+    # the columns are smoothed too, or the smoothing of the slopes would be taken for a second pole
     base = {name: [gaussian_filter1d(x, wide) for x in columns] for name, columns in base.items()}
     block = np.arange(len(u)) * _BLOCKS // len(u)
     plain = {name: _held_out(package, target[name], base[name], block, moving, step) for name in target}
@@ -128,7 +128,7 @@ def _held_out(
         )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            # all columns but the first go in as inputs: the equation sought is that of the slope alone
+            # all columns but the first are inputs: only the equation of the slope is identified
             model.fit(x[seen, :1], t=step, x_dot=slope[seen, None], u=x[seen, 1:] if x.shape[1] > 1 else None)
             told = model.predict(x[held, :1], u=x[held, 1:] if x.shape[1] > 1 else None)
         errors.append(slope[held] - np.asarray(told)[:, 0])
@@ -138,7 +138,7 @@ def _held_out(
 
 
 def _worth(errors: FloatArray) -> float:
-    """How many independent rows they are worth, by their first autocorrelations."""
+    """The equivalent number of independent rows, by their first autocorrelations."""
     e = errors - errors.mean()
     lags = [float(e[i:] @ e[: len(e) - i] / (e @ e)) for i in range(1, 20)]
     total = 0.0

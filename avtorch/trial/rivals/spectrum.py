@@ -1,7 +1,7 @@
-r"""Noise of a drive and its likelihood, by Whittle's approximation: what a residual's spectrum says.
+r"""Noise of a drive and its likelihood from the spectrum of a residual, by Whittle's approximation.
 
 The noise of both channels: white jerk through the lag (an Ornstein-Uhlenbeck acceleration of time constant T_L, in both
-channels), white noise of each sensor, and where gusts are asked for a slower acceleration of that kind. Over the
+channels), white noise of each sensor, and, with gusts, a slower Ornstein-Uhlenbeck acceleration. Over the
 frequencies `w` of the real transform of a residual,
 
     -log L = sum_k log det S(w_k) + R_k* S(w_k)^-1 R_k / rows
@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 
 from avtorch.arrays import BoolArray, FloatArray
 
-Complex = NDArray[Any]  # complex, or real where it happens to be
+Complex = NDArray[Any]  # complex or real
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Spectrum:
         self.weight[0] = 0.5
         if self.length % 2 == 0:
             self.weight[-1] = 0.5
-        # bands of the noise fit: the mean by itself, then ever wider ones
+        # bands of the noise fit: the mean alone, then bands of increasing width
         edges = np.unique(np.concatenate([[0, 1], np.geomspace(1, count, 70).astype(int)]))
         self._starts = edges[:-1]
         self._band_weight = np.add.reduceat(self.weight, self._starts)
@@ -87,7 +87,7 @@ class Spectrum:
     def fit_noise(
         self, bands: Complex, lag: float, start: FloatArray | None, gust: bool
     ) -> tuple[float, FloatArray, float | None]:
-        """Sizes (part,) of the noise that make these bands most likely: loss, sizes, time constant of the gusts."""
+        """Maximum likelihood sizes (part,) of the noise given these bands: loss, sizes, time constant of the gusts."""
         if not gust:
             return *self._fit(bands, self.shapes(lag, None, banded=True), start), None
         tries = [(*self._fit(bands, self.shapes(lag, t, banded=True), None), t) for t in (1.0, 2.0, 4.0)]
@@ -120,7 +120,7 @@ class Spectrum:
         return float(found.fun), np.exp(found.x)
 
     def inverse(self, lag: float, sizes: FloatArray, gust_time: float | None) -> Complex:
-        """`S^-1` (frequency, channel, channel), weighed so that `sum R* S^-1 R` is the quadratic form of -log L."""
+        """`S^-1` (frequency, channel, channel), weighted so that `sum R* S^-1 R` is the quadratic form of -log L."""
         inverse, _ = _inverse(self.shapes(lag, gust_time, banded=False).total(sizes))
         return inverse * (self.weight / self.length)[:, None, None]
 

@@ -1,4 +1,4 @@
-"""Terms of a sparse regression, and the effect that each stands for."""
+"""Terms of a sparse regression, and the effect that each represents."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from avtorch.arrays import FloatArray
 def terms(
     command: FloatArray, response: FloatArray, speed: FloatArray | None, step: float, channels: int
 ) -> Iterator[tuple[str, str, list[FloatArray]]]:
-    """Effect, the equation it stands in and its columns (row,): `motion`, and with two channels their `difference`.
+    """Effect, its equation and its columns (row,): `motion`, and with two channels their `difference`.
 
     Columns come from the command, from the lag's `response` to it and from the measured speed, never from the measured
-    acceleration: its noise is in the slope that is to be explained. Effects of chance have no term, so no regression
-    of this kind can name them.
+    acceleration, whose noise is in the slope to be explained. Random effects have no term, so a regression of this kind
+    cannot name them.
     """
     u, a = command, response
     for name, columns in _of_command(u, a, step):

@@ -22,7 +22,7 @@ BLOCK = 1 << 15  # (setting, draw) pairs held at a time: the temporaries then st
 
 
 class Interval(NamedTuple):
-    """Median and 90 % interval, each (setting,) or of the settings' shape: order statistics, so inf is no trouble.
+    """Median and 90 % interval, each (setting,) or of the settings' shape: order statistics, so inf is allowed.
 
     Example:
         >>> import torch
@@ -40,14 +40,14 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True)
 class StabilityBelief:
-    """What a belief says of each setting; every tensor has the settings' shape.
+    """Stability of each setting under a belief; every tensor has the settings' shape.
 
     p_locally_stable, p_string_stable: shares of the draws. error: their Monte Carlo standard error at most, as if the
-    draws were independent (Agresti-Coull, so it is no zero at a share of 0 or 1). margins: intervals of
+    draws were independent (Agresti-Coull, so it is above zero even at a share of 0 or 1). margins: intervals of
 
     - local [1/s]: `(1/K - k_a) g - T k_s / K`, the last line of Eq. 2 (> 0 stable), without dead time;
     - B [-] and C_over_K [1/s^2]: the lines of Eq. 3, without dead time;
-    - dead_time [s]: how much more dead time the loop bears before it is locally unstable, counted from the one it has;
+    - dead_time [s]: how much more dead time the loop tolerates before it becomes locally unstable;
     - peak_gain [-]: with dead time; inf where locally unstable.
 
     Example:
@@ -70,7 +70,7 @@ class StabilityBelief:
 def p_locally_stable(
     T_L: Drawn, K_L: Drawn, time_gap: Value, gains: Gains, *, dead_time: Drawn = 0.0
 ) -> Float[Tensor, "*setting"]:
-    """P(locally stable) of every setting under draws of the actuation, shape (setting,) or whatever the settings have.
+    """P(locally stable) of every setting under draws of the actuation, shape (setting,) or that of the settings.
 
     The vehicle, T_L [s], K_L [-] and dead_time [s], has its draws on the last dimension: (draw,) for all settings
     alike, or (setting, draw) where a setting changes it (a lower level: effective T_L and K_L). Numbers are known
@@ -175,7 +175,7 @@ def _share(verdict: Callable[[Setting], Tensor], blocks: _Blocks) -> Float[Tenso
 
 
 class _Blocks:
-    """Cuts (setting, draw) into row blocks that fit in memory, and puts per-setting answers back into shape."""
+    """Divides (setting, draw) into row blocks that fit in memory, and restores the shape of per-setting results."""
 
     def __init__(
         self,

@@ -1,7 +1,7 @@
 """Stability of the loop around any linear chain: dead time, a second pole, a late sensor, drag.
 
 With `P` from command to acceleration, `S` from acceleration to its reading, a drag `d` and a lower level that sends
-`alpha` times the reading plus `beta` times what the upper level asks, the loop is
+`alpha` times the reading plus `beta` times the upper level's demand, the loop is
 
     F(s) = (1 - alpha P S) s (s + d) + beta P (k_s + g s - k_a S s^2),    g = k_s tau + k_v
     V / V_lead = beta P (k_s + k_v s + k_f s^2 exp(-s theta_f)) / F
@@ -23,15 +23,15 @@ from avtorch.errors import InputError
 from avtorch.vehicle.broadcasting import broadcast
 
 SLACK = 1e-4
-"""A gain above one by less than this is one: responses that were measured on a grid are no better known."""
+"""A gain above one by less than this counts as one: the error of responses measured on a grid."""
 
 
 @dataclass(frozen=True)
 class Chain:
-    """A car for small motions: `omega` (frequency,) [rad/s], rising from near 0 to where nothing is left.
+    """A car for small motions: `omega` (frequency,) [rad/s], rising from near 0 to where the response has vanished.
 
     `motion` (..., frequency): complex acceleration for a unit command; `sensed` (..., frequency): the reading's share
-    of the acceleration; `drag` (...) [1/s]: by how much the acceleration falls with the speed. Raises `InputError` for
+    of the acceleration; `drag` (...) [1/s]: decrease of the acceleration per unit of speed. Raises `InputError` for
     fewer than ten frequencies, frequencies that do not rise from above 0, or responses of another length.
 
     Example:
@@ -123,8 +123,8 @@ def chain_verdict(
     """Stability of a linear controller around `chain`; batches broadcast with each other.
 
     `time_gap` (...) [s], `gains` (..., 3); the lower level sends `inner` times the sensed acceleration plus `forward`
-    times what the upper level asks, (...) (0 and 1: it passes that through). `feedforward` k_f (...) [-] acts on the
-    leader's acceleration `feedforward_delay` [s] ago.
+    times the upper level's demand, (...) (0 and 1: it passes the demand through). `feedforward` k_f (...) [-] acts on
+    the leader's acceleration `feedforward_delay` [s] ago.
 
     Example:
         >>> import torch
@@ -137,7 +137,7 @@ def chain_verdict(
     loop, asked = _loop(chain, time_gap, gains, inner, forward, feedforward, feedforward_delay)
     gain = asked.abs() / loop.abs().clamp_min(1e-300)
     local = _growing(loop / (1j * chain.omega + 1) ** 2) < 0.5
-    # pushed the right way at rest
+    # the static response has the right sign
     local = local & (asked[..., 0].real > 0)
     peak = torch.where(local, gain.amax(-1).clamp_min(1.0), torch.inf)
     return ChainVerdict(local, local & (peak <= 1 + SLACK), peak)
@@ -189,7 +189,7 @@ def _loop(
 
 
 def _growing(curve: Complex[Tensor, "*batch frequency"]) -> Float[Tensor, "*batch"]:
-    """How many modes grow, (...): half turns that `curve` (..., frequency) makes clockwise from above to below."""
+    """Number of growing modes, (...): clockwise half turns of `curve` (..., frequency)."""
     turns = torch.angle(curve[..., 1:] / curve[..., :-1]).sum(-1)
     # from the real axis at omega 0 and back to it at the top
     ends = torch.angle(curve[..., 0]) - torch.angle(curve[..., -1])

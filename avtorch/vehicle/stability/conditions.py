@@ -77,7 +77,7 @@ def string_conditions(
 
     form="print": the three printed lines, K^u in the last term of both squares. form="rigorous": the least value over
     the box of B = (1 - K k_a)^2 - 2 T K g, linear in T_L and a convex quadratic in K_L whose vertex may lie inside, and
-    of C / K, linear in K_L. Neither says anything about local stability: see `string_sufficient`.
+    of C / K, linear in K_L. Neither form implies local stability: see `string_sufficient`.
 
     Example:
         >>> from avtorch.vehicle.stability import string_conditions
@@ -111,8 +111,8 @@ def string_sufficient(
 ) -> Bool[Tensor, "*setting"]:
     """True where Eq. 3 holds over the point or box, shape (...).
 
-    form="rigorous" asks for Eq. 2 as well, for the gain condition alone also passes locally unstable loops; so every
-    vehicle of a box that passes is string stable. form="print" is Eq. 3 as printed and nothing else.
+    form="rigorous" requires Eq. 2 as well, because the gain condition alone also passes locally unstable loops; so
+    every vehicle of a box that passes is string stable. form="print" is Eq. 3 as printed, without Eq. 2.
 
     Example:
         >>> from avtorch.vehicle.stability import string_stable, string_sufficient

@@ -9,7 +9,7 @@ from avtorch.arrays import Float
 from avtorch.vehicle.broadcasting import broadcast
 from avtorch.vehicle.stability.setting import Gains, Setting, Value, read_setting
 
-# A loop on the boundary (C = 0 on paper) must not fall off it by rounding: the sums below have some ten roundings.
+# Rounding must not make a loop on the boundary (C = 0 on paper) unstable: the sums below have some ten roundings.
 ROUNDINGS = 16
 
 
@@ -41,8 +41,8 @@ def string_margin(
     """The least of T^2 x^2 + B x + C over x = omega^2 >= 0: the gain condition holds iff it is >= 0.
 
     T_L [s], K_L [-], time_gap [s] and feedforward [-] broadcast with the leading dimensions of gains (..., 3); returns
-    that shape, in 1/s^2. One number for both cases of the exact condition: C where B >= 0, else C - B^2 / (4 T^2). Not
-    about local stability.
+    that shape, in 1/s^2. One number for both cases of the exact condition: C where B >= 0, else C - B^2 / (4 T^2). It
+    does not imply local stability.
 
     Example:
         >>> from avtorch.vehicle.stability import string_margin
@@ -83,7 +83,7 @@ def peak_omega(s: Setting) -> Tensor:
     With x = omega^2, |G|^2 = N / (N + P), N = K^2 (k_v^2 x + k_s^2), P = T^2 x^3 + B x^2 + C x. P / N is stationary at
     the roots of a cubic; by the signs of its coefficients the only minimum below zero is its largest root. Newton from
     a bound above that root falls on it monotonically (the cubic is convex there). Where no such root exists the
-    iteration ends anywhere, harmlessly: |G| there is below one.
+    iteration may end anywhere; |G| there is below one, so the result is unaffected.
     """
     B, C = coefficients(s)
     n0, n1, T2 = s.ks**2, s.kv**2, s.T**2
@@ -104,7 +104,7 @@ def _above_roots(
 ) -> Float[Tensor, "*setting"]:
     """A number at or above every positive root, where some leading coefficient is positive.
 
-    Each negative term is outweighed by a third of one positive term of higher degree, the cheapest at hand.
+    A third of one positive term of higher degree, the one that gives the smallest bound, outweighs each negative term.
     """
     bound = torch.zeros_like(c0)
     rest = (c0, c1, c2, c3)

@@ -36,7 +36,7 @@ def crossings(
     z = _real_roots(*broadcast(c2, c1, c0))
     c2, c1, c0 = (c.unsqueeze(-1) for c in (c2, c1, c0))
     slope = (3 * z + 2 * c2) * z + c1
-    # Without lag one root is z = 0 (omega infinite) and no crossing; rounding must not make it one.
+    # Without lag one root is z = 0 (omega infinite), which is not a crossing; rounding must not make it one.
     floor = torch.where(s.T.unsqueeze(-1) == 0, 1e-10 * (c2.abs() + c1.abs().sqrt()), torch.zeros_like(c2))
     real = torch.isfinite(z) & (z > floor.clamp_min(torch.finfo(z.dtype).tiny))
     omega = torch.where(real, z, torch.ones_like(z)).rsqrt()
@@ -51,7 +51,7 @@ def nyquist(s: Setting) -> Bool[Tensor, "..."]:
 
     The roots on the right are counted, not sampled: those of the delay-free loop (Routh-Hurwitz: none, or two when
     k_s > 0), plus two each time the dead time has turned a crossing of the unit circle past -1 in the bad direction,
-    minus two in the good one. k_s <= 0 leaves a real root at or above zero whatever the rest.
+    minus two in the good one. k_s <= 0 leaves a real root at or above zero in every case.
     """
     omega, phase, sign = crossings(s)
     turned = omega * s.theta.unsqueeze(-1)
@@ -63,7 +63,7 @@ def nyquist(s: Setting) -> Bool[Tensor, "..."]:
 
 
 def lost_at(s: Setting) -> Tensor:
-    """Smallest dead time [s] at which a loop that is locally stable without any ceases to be; 0 where it never is."""
+    """Smallest dead time [s] at which a loop loses its local stability; 0 where it is unstable without dead time."""
     omega, phase, sign = crossings(s)
     first = torch.where(sign > 0, phase / omega, torch.full_like(phase, torch.inf)).amin(-1)
     neutral = (s.T == 0) & ((s.K * s.ka).abs() >= 1)
@@ -94,7 +94,7 @@ def _real_roots(
     z = torch.where((cosine.abs() <= 1).unsqueeze(-1), three, single) - shift.unsqueeze(-1)
     c2, c1, c0 = (c.unsqueeze(-1) for c in (c2, c1, c0))
     for _ in range(3):
-        # Newton mends what the shift back rounded off; a flat spot is left alone.
+        # Newton removes the rounding of the shift back; points of zero slope are left alone.
         f, df = ((z + c2) * z + c1) * z + c0, (3 * z + 2 * c2) * z + c1
         z = torch.where(df != 0, z - f / torch.where(df != 0, df, torch.ones_like(df)), z)
     return z

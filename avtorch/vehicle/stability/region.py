@@ -68,9 +68,9 @@ def region(
 ) -> Region:
     """Stability over the plane of two axes, each (name, values) with a name out of k_s, k_v, k_a, tau, T, K.
 
-    What no axis names keeps the value given. form="exact" checks points, with any dead_time [s]; "print" and
-    "rigorous" check boxes by Eqs. 2 and 3 (`local_conditions`, `string_sufficient`), where T_L and K_L may be
-    (lower, upper) tuples and no dead time is known: the paper's stability figures are of this kind.
+    Parameters that no axis names keep the value given. form="exact" checks points, with any dead_time [s]; "print" and
+    "rigorous" check boxes by Eqs. 2 and 3 (`local_conditions`, `string_sufficient`), where T_L and K_L may be (lower,
+    upper) tuples and dead time is not allowed: the paper's stability figures are of this kind.
 
     Raises InputError for unknown or equal axes, an axis that is not one-dimensional and finite, a tuple on an axis or
     with form="exact" and a dead time with a box form.
@@ -95,7 +95,7 @@ def region(
         raise InputError("time_gap: expected one number [s], found a tuple")
     axes = {x[0]: x_values[None, :], y[0]: y_values[:, None]}
     T, K, tau = axes.get("T", T_L), axes.get("K", K_L), axes.get("tau", time_gap)
-    # One gain tensor over the whole plane is cheap and spares the callee any thought of axes.
+    # One gain tensor over the whole plane is cheap, and the callee need not handle axes.
     plane = torch.zeros(y_values.numel(), x_values.numel(), dtype=torch.float64)
     k = torch.stack([plane + axes.get(name, held[i]) for i, name in enumerate(("k_s", "k_v", "k_a"))], -1)
     if form == "exact":

@@ -23,7 +23,7 @@ class Setting:
 
     `valid` is False where the actuation is no vehicle: T_L < 0, K_L <= 0 or anything not finite. Such entries come from
     a lower level whose inverted model makes the loop unstable (effective T_L infinite or negative) and
-    carry harmless stand-in numbers so that nothing turns into NaN, and every verdict on them is "unstable".
+    hold placeholder numbers so that nothing becomes NaN, and every verdict on them is "unstable".
     T_L = 0, the paper's ideal actuator, is valid and means the limit from above.
     """
 
@@ -57,7 +57,7 @@ class Setting:
         return x.expand(self.shape)
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Setting:
-        """The setting with `change` done to every field."""
+        """The setting with `change` applied to every field."""
         return Setting(*(change(getattr(self, f.name)) for f in fields(self)))
 
     def pick(self, mask: Tensor) -> Setting:
@@ -127,7 +127,7 @@ def read_setting(
     actuator = torch.isfinite(T) & torch.isfinite(K) & (T >= 0) & (K > 0)
     law = torch.isfinite(tau) & torch.isfinite(k).all(-1) & torch.isfinite(kf)
     one = torch.ones((), dtype=T.dtype, device=T.device)
-    # Stand-ins by torch.where, on each side alone, keep values and gradients finite and the shapes small.
+    # Placeholders by torch.where, on each side separately, keep values and gradients finite and the shapes small.
     lag, share = (torch.where(actuator, x, one) for x in (T, K))
     tau, ks, kv, ka, kf = (torch.where(torch.isfinite(x), x, one) for x in (tau, ks, kv, ka, kf))
     return Setting(lag, share, tau, ks, kv, ka, theta, kf, theta_f, actuator & law)

@@ -14,18 +14,18 @@ from avtorch.vehicle.stability.setting import Setting
 from avtorch.vehicle.stability.transfer import excess
 
 DECADES = 3.5  # below this the sweep is one bracket, down to omega = 0
-POINTS = 320  # 2.5 % apart: the skirts of a resonance are seen however sharp its tip
+POINTS = 320  # 2.5 % apart: the sweep detects the flanks of a resonance of any sharpness
 MOST_POINTS = 8192
 FEW_POINTS = 80  # for a verdict that is not close
-BLOCK = 1 << 17  # numbers held at a time: the temporaries stay in the cache
+BLOCK = 1 << 17  # numbers evaluated at a time: the temporaries stay in the cache
 GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 def sweep(s: Setting) -> tuple[Float[Tensor, " setting"], Bool[Tensor, " setting"]]:
     """(omega, above) of a flat batch (setting,): the frequency of the largest |G| [rad/s] and whether |G| > 1 there.
 
-    omega is 0 where |G| nowhere exceeds one. What is minimised is omega^2 h / N = |G|^-2 - 1, which keeps its sign
-    near omega = 0. The best two dips of the sweep are refined by golden section. Needs valid entries.
+    omega is 0 where |G| nowhere exceeds one. The sweep minimises omega^2 h / N = |G|^-2 - 1, which keeps its sign near
+    omega = 0. The best two dips of the sweep are refined by golden section. Needs valid entries.
     """
     count = s.T.shape[0]
     if count == 0:
@@ -33,8 +33,8 @@ def sweep(s: Setting) -> tuple[Float[Tensor, " setting"], Bool[Tensor, " setting
     parts: list[tuple[Tensor, Tensor, Tensor]] = []
     top = _band(s)
     points = _points(s, top)
-    # Settings whose delay turns many times in the band need a finer sweep: handled apart, so that few do not cost all.
-    # torch gives `unique` no type
+    # Settings whose delay turns many times in the band need a finer sweep: they are swept separately, to spare the
+    # others. torch gives `unique` no type
     sizes = cast(Tensor, torch.unique(points))  # pyright: ignore[reportUnknownMemberType]
     for n in map(int, sizes):
         rows = torch.nonzero(points == n).squeeze(-1)
@@ -45,11 +45,11 @@ def sweep(s: Setting) -> tuple[Float[Tensor, " setting"], Bool[Tensor, " setting
 
 
 def exceeds_anywhere(s: Setting) -> Bool[Tensor, " setting"]:
-    """Whether |G| > 1 at any frequency, for a flat batch (setting,); as `sweep`, but settled on few points if possible.
+    """Whether |G| > 1 at any frequency, for a flat batch (setting,); as `sweep`, but decided on few points if possible.
 
     In ln(omega) no term of h bends more than (4 + omega theta)^2 times its own size, so between points `step` apart h
-    lies at most (step (4 + omega theta))^2 / 8 of that size below its neighbours. One point below zero settles it; all
-    points clear of that bound settle it too; only what is left takes the full sweep.
+    lies at most (step (4 + omega theta))^2 / 8 of that size below its neighbours. One point below zero decides it; all
+    points above that bound decide it too; only the remaining settings need the full sweep.
     """
     above = torch.zeros(s.T.shape, dtype=torch.bool, device=s.T.device)
     grid = torch.logspace(-DECADES, 0, FEW_POINTS, dtype=s.T.dtype, device=s.T.device)
@@ -124,7 +124,7 @@ def _rounding(size: Tensor) -> Tensor:
 
 
 def _size(s: Setting, omega: Tensor) -> Tensor:
-    """Sum of the absolute terms of h: what its rounding and its bending are measured by."""
+    """Sum of the absolute terms of h, the scale of its rounding and its curvature."""
     x = omega * omega
     k2, twice = s.K**2, 2 * s.K
     ks, kv, ka, kf, g = s.ks.abs(), s.kv.abs(), s.ka.abs(), s.kf.abs(), s.g.abs()

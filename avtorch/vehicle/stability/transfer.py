@@ -1,4 +1,4 @@
-"""The transfer function from the leader's speed to the follower's, and how far it stays below one."""
+"""The transfer function from the leader's speed to the follower's, and its distance from one."""
 
 from __future__ import annotations
 
@@ -77,8 +77,8 @@ def magnitude(s: Setting, omega: Tensor) -> Tensor:
 def excess(s: Setting, omega: Tensor) -> tuple[Tensor, Tensor]:
     """(h, N) with |G|^2 = N / (N + omega^2 h): the gain is at most one exactly where h >= 0.
 
-    Without dead time and feed-forward h = T^2 omega^4 + B omega^2 + C. Dividing by omega^2 on paper, not in the
-    machine, keeps the sign of h right down to omega = 0, where |G| itself rounds to one.
+    Without dead time and feed-forward h = T^2 omega^4 + B omega^2 + C. Dividing by omega^2 analytically, not
+    numerically, keeps the sign of h right down to omega = 0, where |G| itself rounds to one.
     """
     x = omega * omega
     k2, twice = s.K**2, 2 * s.K

@@ -43,7 +43,7 @@ def string_stable(
 ) -> Bool[Tensor, "*setting"]:
     """True where the loop is locally stable and `|G(j omega)| <= 1` at every omega; arguments as in `local_stable`.
 
-    Without dead time in closed form (the signs of B and C); with it, or with a feed-forward gain k_f [-] on the
+    Without dead time in closed form (the signs of B and C); with dead time, or with a feed-forward gain k_f [-] on the
     leader's acceleration that is itself delayed [s], by frequency sweep. The only tolerance is rounding: a few tens of
     machine epsilons of the terms summed, so a loop exactly on the boundary counts as stable.
 
@@ -119,7 +119,7 @@ def peak_frequency(
 
 
 def dead_time_margin(T_L: Value, K_L: Value, time_gap: Value, gains: Gains) -> Float[Tensor, "*setting"]:
-    """Smallest dead time [s] that costs the loop its local stability, in closed form; 0 where it has none to lose.
+    """Smallest dead time [s] at which the loop loses its local stability, in closed form; 0 where it has none.
 
     Example:
         >>> from avtorch.vehicle.stability import dead_time_margin
@@ -131,7 +131,7 @@ def dead_time_margin(T_L: Value, K_L: Value, time_gap: Value, gains: Gains) -> F
 
 
 def locally_stable(s: Setting) -> Bool[Tensor, "..."]:
-    """`local_stable` of a setting, in whatever smaller shape suffices."""
+    """`local_stable` of a setting, in the smallest shape that suffices."""
     if not bool((s.theta > 0).any()):
         return hurwitz(s)
     return torch.where(s.theta > 0, nyquist(s), hurwitz(s))
@@ -144,7 +144,7 @@ def string_stable_of(s: Setting) -> Bool[Tensor, "..."]:
         if not bool(delayed.any()):
             return hurwitz(s) & gain_condition(s)
         stable = s.full(locally_stable(s))
-        # C is the same with a dead time and must not be negative: what fails it needs no sweep.
+        # C is the same with a dead time and must not be negative: settings that fail need no sweep.
         flat = s.full(gain_condition(s))
         verdict = stable & torch.where(s.full(delayed), _level(s), flat)
         todo = verdict & s.full(delayed)
@@ -164,7 +164,7 @@ def peak_gain_of(s: Setting) -> Tensor:
 
 
 def _level(s: Setting) -> Tensor:
-    """C >= -slack, generously: the sweep decides the rest."""
+    """C >= -slack, a generous bound: the sweep decides the rest."""
     C = s.K**2 * (s.g**2 - s.kv**2 + 2 * s.ks * s.kf) - 2 * s.K * s.ks * s.b
     return s.full(C + 1e-9 * (1 + C.abs()) >= 0)
 

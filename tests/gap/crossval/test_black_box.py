@@ -1,4 +1,4 @@
-"""A black box finds what is there, and makes up little where nothing is."""
+"""A black box finds structure that exists, and little where there is none."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def test_noise_stays_noise(rotating_seed: int) -> None:
     assert np.median(worse) < 2.0
 
 
-def test_a_force_of_no_name_is_foretold(rotating_seed: int) -> None:
+def test_an_unnamed_force_is_predicted(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     found = found_of([], seconds=120.0, rng=rng, noise=QUIET)
     record = found.hypothesis.record

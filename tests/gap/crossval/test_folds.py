@@ -1,4 +1,4 @@
-"""Every row judges once, far from what fits."""
+"""Every row is scored once, far from the rows fitted."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from tests.gap.records import log_of
 
 @pytest.mark.parametrize("rate_hz", [20, 50])
 @pytest.mark.parametrize("seconds", [40.0, 130.0, 300.0])
-def test_every_row_judges_once(seconds: float, rate_hz: int) -> None:
+def test_every_row_is_scored_once(seconds: float, rate_hz: int) -> None:
     record = Record.of(log_of(seconds=seconds, rate_hz=rate_hz))
     parts = folds(record, apart_s=3.0)
     judging = np.concatenate([p.rows for p in parts])
@@ -33,7 +33,7 @@ def test_drives_apart_need_no_distance() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [20, 100])
-def test_of_three_drives_each_judges_what_the_others_fitted(rate_hz: int) -> None:
+def test_of_three_drives_each_scores_the_fit_to_the_others(rate_hz: int) -> None:
     lengths = (70.0, 60.0, 50.0, 14.0, 13.0, 30.0)
     record = Record.of([log_of(seconds=s, rate_hz=rate_hz) for s in lengths])
     parts = folds(record)

@@ -1,4 +1,4 @@
-"""How far the gap shrinks, told by the find and by one who knows."""
+"""How far the gap shrinks, by the fitted model and by an oracle."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def _raced(effect: str, among: list, seed: int, **more):  # type: ignore[no-unty
 @pytest.mark.parametrize(
     "effect", ["sensor_bias", *(pytest.param(e, marks=pytest.mark.slow) for e in ("aerodynamic_drag", "dead_band"))]
 )
-def test_what_is_closed_is_what_one_who_knows_would_say(effect: str, rotating_seed: int) -> None:
+def test_closed_agrees_with_the_oracle(effect: str, rotating_seed: int) -> None:
     from avtorch.gap import AerodynamicDrag, DeadBand, SensorBias
 
     case, race = _raced(effect, [SensorBias, AerodynamicDrag, DeadBand], rotating_seed, tiers=["easy"])
@@ -38,8 +38,8 @@ def test_what_is_closed_is_what_one_who_knows_would_say(effect: str, rotating_se
     top, floor = told.top, case.oracles[told.metric].floor
     assert top.closed is not None
     knows = (top.before - top.after) / (top.before - floor)
-    # the floor is what both differ in. In 10 s a speed's noise goes one way or the other, so that 5 blocks tell its
-    # square to 0.6 and, where the gap is three times the noise, what is closed to 0.16; an acceleration's to 0.05
+    # the two differ in the floor. In 10 s a speed's noise drifts either way, so that 5 blocks determine its square to
+    # 0.6 and, where the gap is three times the noise, what is closed to 0.16; an acceleration's to 0.05
     assert top.closed.mean == pytest.approx(knows, abs=0.5 if told.metric == "rollout_rmse_speed" else 0.15)
     assert top.closed.mean > 0.5
     assert told.placebo is not None
@@ -56,7 +56,7 @@ def test_a_wrong_effect_is_not_what_the_rest_chooses(rotating_seed: int) -> None
     held = cross_validate(race, wrong)
     assert held is not None
     told = gap_closed(held)
-    # the other blocks alone choose the right one, and so do not choose the one that was asked for
+    # the other blocks alone choose the right one, and therefore not the requested one
     assert told.chosen == 0.0
 
 

@@ -14,7 +14,7 @@ from tests.gap.finds import found_of
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("effects", [[DeadTime(0.2)], [AerodynamicDrag()], [Gust(0.3, 2.0)]])
-def test_a_part_tells_the_same_within_its_uncertainty(effects: list, rotating_seed: int) -> None:
+def test_a_part_agrees_within_its_uncertainty(effects: list, rotating_seed: int) -> None:
     found = found_of(effects, seconds=120.0, rng=np.random.default_rng(rotating_seed))
     for part in folds(found.hypothesis.record):
         refit = Refit.of(found, part.fits)

@@ -1,7 +1,7 @@
-"""A controller feeds the noise of its sensors back into the command: no cause, and not to be taken for one.
+"""A controller feeds the noise of its sensors back into the command: this must not be taken for a cause.
 
 Means over groups of rows alone would: the noise of a group's first rows moves the command of its last ones, so that
-the car seems to act before it is told to. Where every row passes the filter, this is gone.
+the car seems to act before the command. Where every row passes the filter, this disappears.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CAUSES = {
 
 
 class _Means(Hypothesis):
-    """Looks at the groups' means alone."""
+    """Uses the groups' means alone."""
 
     def errors(self, z: FloatArray, onset: int | None = None, *, coarse: bool = False) -> FloatArray:
         return super().errors(z, onset, coarse=coarse).mean(-1, keepdims=True)

@@ -147,7 +147,7 @@ def test_evidence_prefers_the_cause_that_is_there(rotating_seed: int) -> None:
             evidence.append(
                 finish(hypothesis, white, modes(hypothesis, white, start, iterations=12)[0][0]).log_evidence
             )
-        # of the bias alone: its prior is some 0.4 m/s² wide, what the drive tells some 0.005
+        # of the bias alone: its prior is some 0.4 m/s² wide, its posterior some 0.005
         assert sign * (evidence[0] - evidence[1]) > (15 if sign > 0 else -8)
 
 
@@ -161,7 +161,7 @@ def test_an_onset_counts_what_comes_after_it(fresh_seed: int) -> None:
     fit = finish(hypothesis, white, early[0], onset)
     assert fit.log_joint == pytest.approx(float(_log_joint(hypothesis, white, early, onset)[0]), abs=1e-6)
     whole = finish(hypothesis, white, modes(hypothesis, white, start, iterations=12)[0][0])
-    # half of the drive tells less
+    # half of the drive is less informative
     assert fit.covariance[2, 2] > 1.4 * whole.covariance[2, 2]
 
 
@@ -206,7 +206,7 @@ def test_integrating_a_slope_out_is_the_dense_gaussian(onset: int | None, fresh_
 
 
 @pytest.mark.parametrize("onset", [None, 80])
-def test_the_slope_told_is_the_posterior_mean(onset: int | None, fresh_seed: int) -> None:
+def test_the_reported_slope_is_the_posterior_mean(onset: int | None, fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     hypothesis, white = _case(_hills(rng), "road_grade", rng, speed0=30.0, seconds=14.0)
     z = hypothesis.z_of({"T_L": 0.3, "K_L": 1.0})
@@ -233,7 +233,7 @@ def test_the_slope_told_is_the_posterior_mean(onset: int | None, fresh_seed: int
 
 
 @pytest.mark.statistical
-def test_the_slope_told_is_the_roads(rotating_seed: int) -> None:
+def test_the_reported_slope_is_the_roads(rotating_seed: int) -> None:
     """A plant given the profile found does what the log shows, all but the noise."""
     rng = np.random.default_rng(rotating_seed)
     car = _hills(rng)

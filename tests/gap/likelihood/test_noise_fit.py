@@ -49,7 +49,7 @@ def test_parameters_are_found_within_their_own_bars(
         T_L = float(np.exp(rng.uniform(np.log(0.15), np.log(0.9))))
         truth = _drawn(rng, priors, T_L)
         errors = errors_of(truth, record, rng)
-        # begun at the truth: whether it is found from afar is the next test's
+        # started at the truth: the next test starts from afar
         fit = fit_noise(record, errors, truth, T_L=T_L, priors=priors, iterations=12)
         away.append(_away(fit, truth))
         here, there = (_log_posterior(n, record, errors, priors, T_L) for n in (fit.noise, truth))
@@ -84,7 +84,7 @@ def test_the_mode_is_found_from_afar(rotating_seed: int) -> None:
 
 
 @pytest.mark.statistical
-def test_what_is_seen_well_is_told_well(rotating_seed: int) -> None:
+def test_well_observed_noise_is_estimated_well(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     record = record_of(120.0, noise=None)
     truth = NoiseModel(process_sd=0.08, process_time=0.4, force_sd=0.005, accel_sd=0.06, speed_sd=0.03)
@@ -92,7 +92,7 @@ def test_what_is_seen_well_is_told_well(rotating_seed: int) -> None:
     assert fit.sds["accel_sd"] < 0.04
     assert fit.sds["speed_sd"] < 0.04
     assert fit.sds["process_sd"] < 0.15
-    # the prior alone tells the nuisance's size, and what it cannot tell it does not claim to
+    # the prior alone determines the nuisance's size, and its interval is as wide as the prior's
     assert 0.2 < fit.sds["force_sd"] < 0.6
     assert np.abs(_away(fit, truth)).max() < 7
 

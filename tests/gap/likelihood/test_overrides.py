@@ -1,4 +1,4 @@
-"""What a driver does in between says nothing of the car: not to the bit, but for how far it has come."""
+"""Overrides carry no information about the car, to the bit, except the distance covered."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _garbled(log: Log, names: tuple[str, ...], rng: np.random.Generator) -> Log:
         ("speed_dependent_gain", ("accel_cmd", "accel", "speed"), ("accel", "speed")),
         ("dead_time", ("accel_cmd", "accel"), ("accel",)),
         ("dead_time", ("accel_cmd", "speed"), ("speed",)),
-        # the road passes under the car whoever drives: its measured speed counts, all else does not
+        # the road passes under the car during an override too: only its measured speed counts
         ("road_grade", ("accel_cmd", "accel"), ("accel", "speed")),
     ],
 )

@@ -140,7 +140,7 @@ def test_one_row_in_the_drivers_hand_ends_a_drive_at_whole_groups() -> None:
     record = Record.of(replace(log, engaged=engaged))
     assert [cut.rows for cut in record.cuts] == [slice(0, 1500), slice(1504, 2999)]
     np.testing.assert_allclose(_stretches(record), [(2, 14.95), (17.04, 29.94)], atol=1e-6)
-    # single rows of the same drives stand where the groups say
+    # single rows of the same drives are where the groups place them
     raw = Record.of(replace(log, engaged=engaged), rate_hz=1e9, multiple=record.group)
     np.testing.assert_allclose(raw.time[record.source * record.group], record.time[record.source])
     assert set((record.source[:, None] * record.group + np.arange(record.group)).ravel()) <= set(raw.source)

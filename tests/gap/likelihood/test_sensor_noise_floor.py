@@ -85,8 +85,8 @@ def test_what_was_interpolated_is_no_simulation(fresh_seed: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("effects", "sigma"), [((), 0.1), ((DeadTime(0.15),), 0.0)], ids=["none", "dead_time"])
-def test_a_simulators_own_log_is_judged_by_what_is_in_it(effects: tuple[DeadTime, ...], sigma: float) -> None:
-    """Without the noise these ended in `unknown`, `gust` or an oscillation: round-off was told apart from nothing."""
+def test_a_simulators_own_log_is_diagnosed_by_its_content(effects: tuple[DeadTime, ...], sigma: float) -> None:
+    """Without the noise these ended in `unknown`, `gust` or an oscillation, fitted to round-off."""
     found = diagnose(drive(*effects, sigma=sigma, seconds=90.0), pairs=False)
     assert found.verdict.name == (effects[0].name if effects else "none")
     assert any("No sensor noise" in note for note in found.notes)

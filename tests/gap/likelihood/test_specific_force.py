@@ -1,7 +1,7 @@
-"""An accelerometer feels every force but gravity: on hills it and the speed tell two tales, and that is what slopes do.
+"""An accelerometer measures every force but gravity: on hills it differs from the speed, which identifies slopes.
 
-The reference vehicle gives the log. Its actuator does not look at the speed, so under the same commands and the same
-noise what an accelerometer reads on hills is what it shows on the flat.
+The reference vehicle gives the log. Its actuator does not depend on the speed, so under the same commands and noise an
+accelerometer reads the same on hills as on the flat.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def hills() -> Log:
 
 
 @pytest.mark.slow
-def test_hills_are_named_where_the_log_says_what_its_accelerometer_reads(hills: Log) -> None:
+def test_hills_are_named_where_the_log_declares_specific_force(hills: Log) -> None:
     told = avtorch.diagnose(hills, accel_kind="specific-force", pairs=False)
     assert told.verdict.names == ("road_grade",)
     # taken for dv/dt, the same reading contradicts the speed, and no slope explains that

@@ -279,7 +279,7 @@ def test_errors_behind_a_sensor_become_white(
                 assert abs((e[i, lag:] * e[j, :-lag]).mean()) < BAR / np.sqrt(n - lag)
     assert all(abs((e[0] * e[j]).mean()) < BAR / np.sqrt(n) for j in range(1, kinds))
     if channels == BOTH and noise is not SENSORS["hardly late"]:
-        # a filter that knows nothing of the sensor makes far less of them: some 150 nats for a lag, 600 for a scale
+        # a filter without the sensor's model gives a far lower likelihood: by some 150 nats for a lag, 600 for a scale
         blind = replace(noise, sensor_lag=0.0, sensor_scale=1.0)
         assert (
             WhiteningFilter(record, noise).log_likelihood(errors)
@@ -287,7 +287,7 @@ def test_errors_behind_a_sensor_become_white(
         )
 
 
-def test_the_speed_alone_knows_nothing_of_the_accelerometer(fresh_seed: int) -> None:
+def test_the_speed_alone_does_not_depend_on_the_accelerometer(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     noise = SENSORS["late and scaled"]
     record = record_of(12.0, channels=("speed",))
@@ -313,7 +313,7 @@ def test_filters_designed_together_are_each_alone(noise: list[NoiseModel], chann
 @pytest.mark.parametrize("rate_hz", [20, 60])
 @pytest.mark.parametrize("channels", WITNESSES)
 def test_each_part_of_a_record_has_its_own_noise(channels: tuple[str, ...], rate_hz: int, fresh_seed: int) -> None:
-    """As if the other part did not count, but for the speed's offset, which both tell of."""
+    """As if the other part did not count, except for the speed's offset, which both determine."""
     record = record_of(30.0, rate_hz=rate_hz, channels=channels)
     noise, row = NoiseModel(), 300
     calm = noise.replaced(process_sd=0.02, accel_sd=0.1)
@@ -387,7 +387,7 @@ def test_the_sensor_is_the_candidates() -> None:
     assert noise.seen_through((DeadTime,), {"T_L": 0.3, "K_L": 1.0, "dead_time.delay_s": 0.2}) == noise
     late = noise.seen_through((SensorLag, SensorScale), {"sensor_lag.lag_s": 0.2, "sensor_scale.scale": 1.1})
     assert late == replace(noise, sensor_lag=0.2, sensor_scale=1.1)
-    # what the last candidate's was is forgotten, and no lag is told from one of a millisecond
+    # the last candidate's value is forgotten, and no lag is equivalent to one of a millisecond
     assert late.seen_through((), {"T_L": 0.3}) == noise
     assert noise.seen_through((SensorLag,), {"sensor_lag.lag_s": 1e-3}) == noise
 

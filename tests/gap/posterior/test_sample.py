@@ -340,7 +340,7 @@ def test_pairs_have_their_effects_in_front() -> None:
     assert [e.name for e in repaired(found, None, draws).effects] == ["driveline_oscillation", "outliers"]
 
 
-def test_lost_messages_and_gusts_say_what_their_fits_say() -> None:
+def test_lost_messages_and_gusts_match_their_fits() -> None:
     held = reported(found_of([CommandHold()], rounds=1))["hold_fraction"]
     assert held.q05 < 0.1 < held.q95
     found = found_of([Gust()], rounds=1)

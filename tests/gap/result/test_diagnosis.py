@@ -187,7 +187,7 @@ def test_verdict_is_the_most_probable_with_its_aliases() -> None:
         "next is sensor_lag with probability 0.3."
     )
     assert verdict_of(given, aliases=near(0.6)).alias_set == ("dead_time",)
-    # what foretells nothing is a rival only where it is about as probable
+    # a hypothesis without prediction is a rival only where it is about as probable
     assert verdict_of(given, aliases=near(0.6, unknown=0.05)).alias_set == ("dead_time", "unknown")
     doubted = candidates(dead_time=0.6, none=0.05, unknown=0.35)
     assert verdict_of(doubted).alias_set == ("dead_time", "unknown", "none")
@@ -241,7 +241,7 @@ def test_verdict_and_candidates_agree_or_are_refused() -> None:
         diagnosis(given, verdict=Verdict(("dead_time",), ("dead_time",), True, ""))
 
 
-def test_printed_it_says_what_it_found() -> None:
+def test_printed_it_reports_its_result() -> None:
     found = diagnosis(candidates(dead_time=0.8, unknown=0.1, none=0.1), onset_s=12.0, notes=("Mind the gap.",))
     told = str(found).splitlines()
     assert told[0].startswith("Probably the simulator lacks dead_time (probability 0.80)")
@@ -289,7 +289,7 @@ def test_an_onset_is_said_from_the_start_and_on_the_clock() -> None:
     assert found.to_dict()["log"]["epochs_s"] == [1_700_000_000.0]
 
 
-def test_a_plant_says_that_what_set_in_late_is_in_from_the_start(tmp_path: Path) -> None:
+def test_a_plant_notes_that_a_late_effect_acts_from_the_start(tmp_path: Path) -> None:
     def written(onset_s: float | None, **chances: float) -> str:
         given = candidates(**chances, none=0.15, unknown=0.05)
         diagnosis(given, plant=plant([DeadTime(0.2)]), onset_s=onset_s).write(tmp_path)
@@ -347,7 +347,7 @@ def test_several_logs_are_counted_together() -> None:
 
     facts = LogFacts.of([log(101, 0.1), log(201, 0.05, accel=True)])
     assert (facts.rows, facts.segments, facts.name) == (302, 2, "101, 201")
-    # where a log lay is not told
+    # the log's folder is not in the answer
     named = [replace(log(101, 0.1), name=name) for name in ("somebody/at home/a.csv", "b.csv", "arrays")]
     assert LogFacts.of(named).name == "a.csv, b.csv, arrays"
     assert facts.seconds == pytest.approx(20.0)

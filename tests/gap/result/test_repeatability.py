@@ -37,7 +37,7 @@ def steps(seconds: float, rng: np.random.Generator) -> np.ndarray:
 
 
 @pytest.mark.statistical
-def test_a_manoeuvre_driven_twice_tells_the_noise(rotating_seed: int) -> None:
+def test_a_manoeuvre_driven_twice_gives_the_noise(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     manoeuvre = steps(40, rng)
     told = repeatability(Record.of(log_of(np.concatenate([steps(20, rng), manoeuvre, steps(14, rng), manoeuvre]), rng)))
@@ -45,7 +45,7 @@ def test_a_manoeuvre_driven_twice_tells_the_noise(rotating_seed: int) -> None:
     assert told.pairs in (2, 3, 4)  # a window whose commands hardly move is left out
     assert told.seconds == pytest.approx(told.pairs * (WINDOW_S - SETTLED_S))
     rows = told.seconds / DT
-    # a standard deviation told by so many rows is off by 1 / sqrt(2 rows); five of them
+    # a standard deviation from this many rows has an error of 1 / sqrt(2 rows); five of them
     assert told.accel == pytest.approx(NOISE_A, rel=BAR / np.sqrt(2 * rows))
     # the noise of the speed at each start stays in: one squared normal a pair, of mean 1
     excess = (float(told.speed or 0.0) / NOISE_V) ** 2 - 1
@@ -53,7 +53,7 @@ def test_a_manoeuvre_driven_twice_tells_the_noise(rotating_seed: int) -> None:
 
 
 @pytest.mark.statistical
-def test_what_is_driven_once_tells_nothing(rotating_seed: int) -> None:
+def test_a_manoeuvre_driven_once_gives_no_noise(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     assert repeatability(Record.of(log_of(steps(120, rng), rng))) is None
     # a command that stands still is no manoeuvre

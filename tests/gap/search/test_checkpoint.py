@@ -1,4 +1,5 @@
-"""Kept fits are believed only whole and only for their own work; with them a search ends as without, to the bit."""
+"""Stored fits are accepted only intact and for their own search; a search with them gives the same result bit for
+bit."""
 
 from __future__ import annotations
 
@@ -174,7 +175,7 @@ FAULTS: dict[str, Callable[[dict[str, Any]], Any]] = {
 
 
 @pytest.mark.parametrize("change", FAULTS.values(), ids=list(FAULTS))
-def test_entries_are_checked_whatever_the_checksum_says(log: Log, kept: Path, change: Callable) -> None:
+def test_entries_are_checked_even_with_a_right_checksum(log: Log, kept: Path, change: Callable) -> None:
     found = read_sealed(kept, schema=SCHEMA)
     change(found.content)
     write_sealed(kept, found.content, schema=SCHEMA, of=found.of)
@@ -217,7 +218,7 @@ def test_fits_of_other_work_are_refused(log: Log, kept: Path) -> None:
 
 
 def refused_as(path: Path, log: Log, **of: Any) -> str:
-    """Of a file that says so of itself."""
+    """For a file whose schema declares it."""
     found = read_sealed(path, schema=SCHEMA)
     write_sealed(path, found.content, schema=SCHEMA, of={**found.of, **of})
     return refused(path, work(log))

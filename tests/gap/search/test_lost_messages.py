@@ -152,7 +152,7 @@ def test_losses_from_a_moment_on(rotating_seed: int) -> None:
         errors[:, at:] += more[:, at:]
         found = lost_messages(WhiteningFilter(before, NOISE), errors, before.command[before.source], **BARE)
         onsets.append(-1 if found.onset is None else found.onset)
-    # three steps in ten tell, each ten rows from the last; of single drives all but some in a hundred are this close
+    # three steps in ten are informative, ten rows apart; all but a few in a hundred drives are this close
     assert -150 < np.median(onsets) - at < 200
 
 
@@ -191,7 +191,7 @@ def test_no_message_is_held_from_one_stretch_to_the_next() -> None:
     assert found.evidence < 0
 
 
-def test_a_command_that_never_moves_tells_nothing() -> None:
+def test_a_constant_command_is_uninformative() -> None:
     found = _found(np.full(800, 0.3), 0.2, np.random.default_rng(0), 20)
     assert found.evidence < 0
     assert found.fraction == 0.0

@@ -123,7 +123,7 @@ def test_a_baseline_of_effects_keeps_what_it_has_in_mind() -> None:
 
 
 @pytest.mark.parametrize("name", ["speed_dependent_lag", "speed_dependent_gain", "second_order_actuator"])
-def test_what_only_an_onset_tells_rests_without_one(name: str) -> None:
+def test_parameters_of_an_onset_stay_fixed_without_one(name: str) -> None:
     hypothesis = Hypothesis.named(Record.of(log_of(seconds=30.0)), name, plant())
     rests = np.array([c.parameter.of_onset for c in hypothesis.coordinates])
     assert rests.sum() == 1

@@ -89,8 +89,8 @@ def test_the_true_second_effect_is_ranked_first(name: str, rotating_seed: int) -
 
 
 @pytest.mark.statistical
-def test_a_gain_is_told_before_it_is_fitted(rotating_seed: int) -> None:
-    """What one linear step foretells of a faint second effect is what the fit finds."""
+def test_a_gain_is_predicted_before_it_is_fitted(rotating_seed: int) -> None:
+    """One linear step predicts the fit of a faint second effect."""
     record, white = _drive(plant([SensorBias(0.1), ConstantResistance(0.1)]), np.random.default_rng(rotating_seed))
     base, z, values = _alone(record, white, SensorBias)
     hypothesis = Hypothesis(record, (SensorBias, ConstantResistance), plant())
@@ -246,11 +246,11 @@ def test_a_pair_that_sets_in_late_keeps_its_onset(rotating_seed: int) -> None:
     whole = joint_fit(hypothesis, ConstantResistance, begin, None, white, onsets=False)
     assert whole.onset is None
     assert found.value > whole.value + 50
-    # one that is not told is found
+    # an onset that is not given is found
     free = joint_fit(hypothesis, ConstantResistance, begin, None, white, onsets=True)
     assert free.onset is not None
     assert abs(free.onset - onset) * late.dt < 3.6
-    # and where both act from the start, none that is told is kept
+    # and where both act from the start, a given onset is dropped
     record, white = _drive(plant([ConstantResistance(0.2), DeadTime(0.25)]), np.random.default_rng(rotating_seed))
     assert (
         joint_fit(Hypothesis(record, pair, plant()), ConstantResistance, begin, onset, white, onsets=True).onset is None

@@ -1,4 +1,4 @@
-"""A user's random effect, one for each thing that it can say of the noise: named where it acts, and only there."""
+"""A user's random effect, one for each kind of change of the noise: named where it acts, and only there."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Crosstalk(Effect):
 
 @dataclass(frozen=True)
 class ValveJitter(Effect):
-    """Errors of the command in proportion to it; it says that it looks at speed."""
+    """Errors of the command in proportion to it; declared to need the speed."""
 
     share: Any = 0.4
 
@@ -185,7 +185,7 @@ def test_one_derived_from_a_built_in_is_a_users_own(rotating_seed: int) -> None:
         (NoiseChange(command_variance=torch.tensor(-1.0)), "command_variance below 0"),
     ],
 )
-def test_a_noise_that_says_nothing_of_use_is_refused_in_a_line(change: NoiseChange | None, said: str) -> None:
+def test_a_noise_without_a_usable_change_is_refused_in_a_line(change: NoiseChange | None, said: str) -> None:
     class Mute(Outliers):
         name = "mute"
 

@@ -1,4 +1,4 @@
-"""A first look at a hypothesis: which form it takes, from which starts, and whether from an onset on."""
+"""The screening of a hypothesis: its form, its starts, and whether it has an onset."""
 
 from __future__ import annotations
 
@@ -80,10 +80,10 @@ def test_an_onset_late_in_the_drive_is_found_though_the_whole_fit_is_diluted(nam
 
 @pytest.mark.statistical
 @pytest.mark.parametrize("name", ["dead_time", "rate_limit"])
-def test_starts_show_an_onset_of_which_the_whole_fit_tells_nothing(
+def test_starts_show_an_onset_that_the_whole_fit_misses(
     name: str, rotating_seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where the fit to all of the drive ends at no effect at all, no row of it can tell of an onset."""
+    """Where the fit to the whole drive ends at zero effect, no row contains information about an onset."""
     rng = np.random.default_rng(rotating_seed)
     at = float(np.round(rng.uniform(34, 46), 1))
     key, size = CASES[name]
@@ -130,7 +130,7 @@ def test_none_is_looked_for_unless_asked(fresh_seed: int) -> None:
 
 
 def _faint(size: float) -> tuple[Hypothesis, WhiteningFilter, FloatArray, float]:
-    """A bias of `size` [m/s²] from the middle of a drive on, no noise at all: what it tells is no matter of chance."""
+    """A bias of `size` [m/s²] from the middle of a drive on, without noise: the result does not depend on chance."""
     log = log_of(seconds=50.0, noise=None, speed0=25.0)
     accel = log.accel + size * (log.time > 26)
     record = Record.of(Log.from_arrays(time=log.time, accel_cmd=log.accel_cmd, accel=accel, speed=log.speed))
@@ -143,7 +143,7 @@ def test_a_faint_onset_counts_where_the_effect_shows_over_the_whole_drive() -> N
     hypothesis, white, begin, floor = _faint(0.007)
     (whole, late) = screen(hypothesis, white, begin)  # no floor given: anything shows
     gain = late.value - whole.value
-    assert 0.3 < gain < 4.0  # by this little an onset is worth a look only where the effect is there
+    assert 0.3 < gain < 4.0  # with so small a gain an onset is screened only where the effect exists
     assert abs(_at(late) - 26) < 1.0
     assert [look.onset for look in screen(hypothesis, white, begin, floor=whole.value - 5)] == [None, late.onset]
     assert [look.onset for look in screen(hypothesis, white, begin, floor=whole.value - 3)] == [None]
@@ -193,8 +193,8 @@ def test_limits_on_both_sides_are_found_from_the_starts(limits: tuple[float, flo
     assert found.value > top - 2
 
 
-def test_whole_and_late_are_judged_by_the_same_likelihood(fresh_seed: int) -> None:
-    """The value of a look is the joint density of its rollout, spliced where it has an onset."""
+def test_whole_and_late_are_scored_by_the_same_likelihood(fresh_seed: int) -> None:
+    """The value of a screening is the joint density of its rollout, spliced where it has an onset."""
     rng = np.random.default_rng(fresh_seed)
     record = _drive("constant_resistance", {"resistance_mps2": 0.25}, 36.0, int(rng.integers(2**31)))
     white = WhiteningFilter(record, NOISE)

@@ -107,7 +107,7 @@ def test_a_pair_is_found(rotating_seed: int) -> None:
 
 
 @pytest.mark.statistical
-def test_what_is_far_behind_at_first_sight_is_not_fitted_anew(tmp_path: Path, rotating_seed: int) -> None:
+def test_hypotheses_far_behind_in_screening_are_not_refitted(tmp_path: Path, rotating_seed: int) -> None:
     """The plain cause and what comes near it get noise of their own; what does nothing keeps its first figure."""
     path = tmp_path / "fits.json"
     log = _log({"sensor_bias": {"bias_mps2": 0.25}}, rotating_seed)
@@ -119,7 +119,7 @@ def test_what_is_far_behind_at_first_sight_is_not_fitted_anew(tmp_path: Path, ro
     assert set(fitted) == {"none", "sensor_bias"}
     evidence = _evidence(race)
     assert evidence["sensor_bias"] > 100
-    # judged under the noise of the bare car
+    # scored under the noise of the bare car
     behind = [f for f in race.found if f.name in ("dead_time", "saturation")]
     assert len(behind) == 2
     assert all(f.noise is race.none.noise for f in behind)
@@ -154,7 +154,7 @@ def test_lost_messages_on_top_of_a_single_effect(rotating_seed: int) -> None:
     names = {f.name: f for f in race.found}
     assert race.best.name == "command_hold+sensor_bias"
     assert race.best.losses is not None
-    # told too low: the lag and the noise fitted without losses have taken a part of what losses do
+    # estimated too low: lag and noise fitted without losses absorb a part of their effect
     assert 0.1 < race.best.losses.fraction < 0.6
     evidence = _evidence(race)
     assert evidence[race.best.name] == pytest.approx(evidence["sensor_bias"] + race.best.losses.evidence)
@@ -179,7 +179,7 @@ def test_lost_messages_alone(rotating_seed: int) -> None:
 
 
 @pytest.mark.statistical
-def test_lost_messages_alone_are_judged_where_they_look_like_a_delay(rotating_seed: int) -> None:
+def test_lost_messages_alone_are_tested_where_they_resemble_a_delay(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     log = _log({"command_hold": {"hold_fraction": 0.4}}, int(rng.integers(2**31)), command=_steps(rng))
     race = _search(log, [DeadTime, CommandHold])
@@ -197,7 +197,7 @@ def test_an_effect_that_the_log_cannot_show_is_not_tried(fresh_seed: int) -> Non
     assert {f.name for f in race.found} == {"none", "aerodynamic_drag"}
 
 
-def test_out_of_time_it_says_so(fresh_seed: int) -> None:
+def test_a_search_out_of_time_reports_it(fresh_seed: int) -> None:
     race = _search(_log({}, fresh_seed, seconds=30.0), [SensorBias, DeadTime], budget_s=0.0)
     assert not race.complete
     assert [f.name for f in race.found] == ["none"]

@@ -1,4 +1,4 @@
-"""What one channel cannot tell apart: exact in the response, shared in probability, and a set in the verdict."""
+"""Aliases under one channel: exact in the response, equal in probability, and a set in the verdict."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_values_bound_the_aliases() -> None:
         assert exact_aliases("second_order_actuator", ACCEL, values) == {"second_order_actuator"} | same
 
 
-def test_forces_not_judged_look_like_offsets_and_gusts() -> None:
+def test_untested_forces_alias_offsets_and_gusts() -> None:
     assert lookalikes("sensor_bias", ACCEL, BELOW) == {"aerodynamic_drag", "road_grade"}
     assert lookalikes("sensor_bias", ACCEL, ABOVE) == {"low_speed_creep", "road_grade"}
     assert lookalikes("sensor_bias", ACCEL, ABOVE, specific_force=True) == {"low_speed_creep"}
@@ -79,7 +79,7 @@ def test_forces_not_judged_look_like_offsets_and_gusts() -> None:
         assert lookalikes(name, channels) == set()
 
 
-def test_what_is_not_judged_is_said() -> None:
+def test_untested_effects_are_reported() -> None:
     assert all(is_observable(e, BOTH) for e in EFFECTS.values())
     assert note(BOTH, EFFECTS.values()) is None
     unseen = {e.name for e in EFFECTS.values() if not is_observable(e, SPEED)}

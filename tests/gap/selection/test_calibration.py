@@ -37,7 +37,7 @@ def test_every_number_of_the_file_is_a_constant() -> None:
     assert all(e["unit"] and e["meaning"].endswith(".") for own in constants.values() for e in own.values())
 
 
-def test_the_file_says_where_its_numbers_come_from() -> None:
+def test_the_file_has_the_provenance_of_its_numbers() -> None:
     origin = document()["provenance"]
     assert {"seed", "cases", "mix", "kinds", "families", "date", "commit", "held_out", "made_by"} <= origin.keys()
     assert sum(origin["kinds"].values()) == origin["cases"]

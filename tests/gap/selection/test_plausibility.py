@@ -1,4 +1,4 @@
-"""A winner outside what is physically possible says so, everywhere that it is named."""
+"""A winner outside what is physically possible is marked everywhere that it is named."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_one_interval_that_reaches_in_is_no_accusation() -> None:
 
 @dataclass(frozen=True)
 class Trailer(Effect):
-    """Somebody's own, which says nothing of what is possible."""
+    """A user's effect that does not declare what is possible."""
 
     mass_ratio: float = 0.4
 

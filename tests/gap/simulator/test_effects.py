@@ -336,7 +336,7 @@ def test_gust_is_the_process_it_names(rotating_seed: int, draws_factor: int) -> 
 
 
 @pytest.mark.statistical
-def test_outliers_come_as_often_and_as_large_as_told(rotating_seed: int, draws_factor: int) -> None:
+def test_outliers_have_the_stated_rate_and_size(rotating_seed: int, draws_factor: int) -> None:
     rows, fraction, scale = 200_000 * draws_factor, 0.03, 8.0
     time = torch.arange(rows, dtype=D) * 0.1
     car = plant([gap.Outliers(fraction, scale, 0.05)])
@@ -348,7 +348,7 @@ def test_outliers_come_as_often_and_as_large_as_told(rotating_seed: int, draws_f
 
 
 @pytest.mark.statistical
-def test_lost_messages_have_the_mean_square_that_is_told(rotating_seed: int, draws_factor: int) -> None:
+def test_lost_messages_have_the_stated_mean_square(rotating_seed: int, draws_factor: int) -> None:
     p, rows, count = 0.2, 60, 20_000 * draws_factor
     u = torch.sin(torch.arange(rows, dtype=D) * 0.3)
     effect = gap.CommandHold(p)
@@ -392,7 +392,7 @@ def test_slope_columns_are_the_response() -> None:
     torch.testing.assert_close((hilly - flat)[50:], linear[50:], rtol=0, atol=9.81 * 0.08**3)
 
 
-def test_effects_say_what_is_wrong() -> None:
+def test_effects_report_wrong_values() -> None:
     with pytest.raises(InputError, match="delay"):
         gap.DeadTime.of({"delay": 0.2})
     with pytest.raises(InputError, match="natural_frequency"):

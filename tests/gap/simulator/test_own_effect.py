@@ -1,4 +1,4 @@
-"""The page on own effects, docs/own-effect.md: its code runs and does what it says."""
+"""The page on own effects, docs/own-effect.md: its code runs and does what the page states."""
 
 from __future__ import annotations
 

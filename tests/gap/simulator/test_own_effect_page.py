@@ -26,7 +26,7 @@ def test_one_of_each_kind_is_named_by_the_pages_own_code(capsys: pytest.CaptureF
         EFFECTS.clear()
         EFFECTS.update(before)
     said = capsys.readouterr().out
-    # nats as the page says them, and the parameter that was put in; the noise is that of one seed
+    # nats as on the page, and the simulated parameter; the noise is that of one seed
     for key, effect, (least, most), (parameter, true, within) in (
         ("weak", "motor_power", (2400, 9600), ("power_wpkg", 8.0, 0.25)),
         ("hot", "hot_motor", (90, 360), ("fade", 0.15, 0.025)),

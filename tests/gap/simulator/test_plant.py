@@ -32,7 +32,7 @@ def test_adding_an_effect_is_one_line() -> None:
     glvd = avtorch.simulate(leader(), plant=GLVDPlant())
     torch.testing.assert_close(plain.accel, glvd.accel, rtol=0, atol=1e-12)
     assert float((late.accel - glvd.accel).abs().max()) > 0.05
-    assert late.log().jerk is None  # this plant does not tell its jerk
+    assert late.log().jerk is None  # this plant does not report its jerk
 
 
 def test_the_chain_has_one_order() -> None:
@@ -215,12 +215,12 @@ def test_a_string_that_names_a_file_is_one(tmp_path: Path, monkeypatch: pytest.M
         ("[gap]\n", "gap"),
     ],
 )
-def test_wrong_text_is_told(text: str, said: str) -> None:
+def test_wrong_text_is_refused(text: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         GapPlant.from_toml(text)
 
 
-def test_wrong_arguments_are_told(tmp_path: Path) -> None:
+def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at most once"):
         plant([gap.DeadTime(0.1), gap.DeadTime(0.2)])
     with pytest.raises(InputError, match="T_L"):
@@ -275,7 +275,7 @@ def test_parameters_are_standard_normals_in_z(rotating_seed: int) -> None:
     ("low", "high", "constraint"),
     [(2.0, 1.0, "real"), (-1.0, 1.0, "positive"), (0.1, 1.5, "unit"), (-1.0, 2.0, "negative")],
 )
-def test_wrong_ranges_are_told(low: float, high: float, constraint: str) -> None:
+def test_wrong_ranges_are_refused(low: float, high: float, constraint: str) -> None:
     with pytest.raises(InputError, match="gain"):
         Parameter("gain", "-", 0.0, low, high, constraint)  # type: ignore[arg-type]
 

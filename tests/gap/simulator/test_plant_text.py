@@ -1,4 +1,4 @@
-"""Plants in text that somebody else wrote: each value is in its domain, or one line says which is not."""
+"""Plants in text from others: each value is in its domain, or one line names the one that is not."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def test_a_plant_is_a_regular_file(tmp_path: Path) -> None:
         read_simulator("--baseline", str(tmp_path / "pipe.toml"))
 
 
-def test_the_command_line_says_it_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_reports_it_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for baseline in ("dead_time=inf", "\x1b[2J=1", str(tmp_path), "[[", "road_grade.knot_m=0", 50_000 * "a"):
         code = main(["diagnose", "absent.csv", "--baseline", baseline, "--out", str(tmp_path / "out")])
         lines = capsys.readouterr().err.splitlines()

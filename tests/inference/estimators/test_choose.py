@@ -42,7 +42,7 @@ def drive(make_windows):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_estimator_finds_the_vehicles_and_keeps_what_it_knows(name, drive):
+def test_every_estimator_finds_the_vehicles_and_keeps_its_belief(name, drive):
     time, columns, usable = drive
     stream = stream_of(name)
     windows = stream.feed(time, columns, usable=usable) + stream.flush()

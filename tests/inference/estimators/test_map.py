@@ -35,7 +35,7 @@ def _sd(mode):
 
 
 @pytest.mark.statistical
-def test_a_window_that_says_much_is_quadrature_s(make_windows, rotating_seed):
+def test_an_informative_window_agrees_with_quadrature(make_windows, rotating_seed):
     statistics = make_windows(rotating_seed, [1.0, 0.6]).statistics
     belief, exact = updated(statistics), integrate(JerkDensity(statistics))
     off = (belief.mean - exact.mean).abs() / exact.sd

@@ -94,7 +94,7 @@ def test_with_forgetting_the_customary_covariance_is_twice_too_wide(rotating_see
 
 
 @pytest.mark.statistical
-def test_draws_and_quantiles_tell_the_same(make_windows, rotating_seed):
+def test_draws_and_quantiles_agree(make_windows, rotating_seed):
     belief = taken(1.0, make_windows(rotating_seed, [0.3], T=0.6, K=0.8), seed=rotating_seed)
     for i in range(3):
         below = (belief.draws[:, 0, i] < belief.q05[0, i]).double().mean().item()
@@ -105,7 +105,7 @@ def test_draws_and_quantiles_tell_the_same(make_windows, rotating_seed):
 
 
 def test_a_coefficient_near_zero_gives_no_belief():
-    """Jerk that has nothing to do with a and u: 1/T_L is anything, so the prior stays and nobody sees a number."""
+    """Jerk that has nothing to do with a and u: 1/T_L is arbitrary, so the prior stays and no number is reported."""
     g = torch.Generator().manual_seed(0)
     a, u, jerk = (torch.randn(1, 400, generator=g, dtype=F64) for _ in range(3))
     stream = BeliefStream(window=2.0, estimator="rls")
