@@ -28,7 +28,7 @@ def window_entry(watched: WatchedWindow, scenario: int = 0) -> dict[str, Any]:
     the belief was carried over. The jerk form has `sigma` [m/s³], the latent form `noise` with its own parameters.
     """
     window, belief = watched.window, watched.window.belief
-    excited, settled = bool(belief.excited[scenario]), bool(belief.converged[scenario])
+    excited, converged = bool(belief.excited[scenario]), bool(belief.converged[scenario])
     stats = {name: belief.stat(name, scenario) for name in belief.names}
     actuation = {name: stats.pop(name) for name in ("T_L", "K_L")}
     noise = stats if "sigma" in stats else {"noise": stats}
@@ -37,7 +37,7 @@ def window_entry(watched: WatchedWindow, scenario: int = 0) -> dict[str, Any]:
         "end_s": _seconds(window.end_s),
         "n": int(window.n[scenario]),
         "excited": excited,
-        "used": excited and settled,
+        "used": excited and converged,
         **actuation,
         **noise,
         "alerts": watched.report.names(scenario),
@@ -253,9 +253,9 @@ def _method_entries(
         stats = {name: {key: finite(table[key][row][i]) for key in table} for i, name in enumerate(found.names)}
         actuation = {name: stats.pop(name) for name in ("T_L", "K_L")}
         noise = stats if "sigma" in stats else {"noise": stats}
-        settled = bool(found.converged[row])
+        converged = bool(found.converged[row])
         entries.append(
-            {"window": number, "method": method, **actuation, **noise, "seconds": seconds[method], "settled": settled}
+            {"window": number, "method": method, **actuation, **noise, "seconds": seconds[method], "settled": converged}
         )
     return entries
 

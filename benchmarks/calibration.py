@@ -16,7 +16,7 @@ import torch
 from avtorch.inference.excitation import ExcitationRule
 from avtorch.inference.sequential import Mode
 from avtorch.validation.calibration import sbc, sbc_loop, sbc_quadrature
-from avtorch.validation.ranks import LEVELS, Calibration
+from avtorch.validation.ranks import LEVELS, RankCalibration
 
 LEVEL, SEED = 0.01, 20240601
 STRONG, WEAK, VARIED = 1.0, 0.1, (0.1, 2.0)
@@ -29,7 +29,7 @@ def verdict(p_value: float) -> str:
     return f"p = {p_value:.3g}: {'REJECTED' if p_value < LEVEL else 'not rejected'} at {LEVEL:g}"
 
 
-def table(found: Calibration) -> None:
+def table(found: RankCalibration) -> None:
     """p-values and coverage of every quantity."""
     p = found.p_values
     print(f"    {'quantity':16}{'chi2':>9}{'ecdf':>9}{'disp.':>9}   coverage " + " ".join(f"{x:>8.0%}" for x in LEVELS))

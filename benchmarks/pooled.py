@@ -24,8 +24,8 @@ from avtorch.validation.pooled import (
     Track,
     constant,
     drift,
-    follow,
     step,
+    track_loop,
     truth_given_all,
     windows_of,
 )
@@ -67,7 +67,7 @@ def stays(count: int, windows: int, seed: int) -> None:
         worst = float(pooled.error.max())
         print(f"  amplitude {amplitude:g} m/s^2; pooled: 90 % coverage {three(shares, '.1f')}, grid error {worst:.1g}")
         for mode in MODES:
-            track = follow(path, seen, mode=mode, seed=seed)
+            track = track_loop(path, seen, mode=mode, seed=seed)
             row(mode, PooledComparison.of(track, pooled))
             if not bool(track.converged.all()):
                 print(f"    {int((~track.converged).sum())} windows not converged")
@@ -95,7 +95,7 @@ def carried(count: int, windows: int, seed: int) -> None:
             settings = SamplerSettings(chains=factor * default.chains)
             row(
                 f"{settings.chains} chains",
-                PooledComparison.of(follow(path, seen, mode="posterior", settings=settings), pooled),
+                PooledComparison.of(track_loop(path, seen, mode="posterior", settings=settings), pooled),
             )
 
 
@@ -116,7 +116,7 @@ def change(count: int, windows: int, seed: int) -> None:
             seen = windows_of(path, amplitude=amplitude, generator=g)
             print(f"  amplitude {amplitude:g} m/s^2, {name}")
             for mode in MODES:
-                show(mode, follow(path, seen, mode=mode, seed=seed))
+                show(mode, track_loop(path, seen, mode=mode, seed=seed))
 
 
 def show(mode: str, track: Track) -> None:

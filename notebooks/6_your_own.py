@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 import avtorch
 from avtorch import plots
 from avtorch.decision import Grid, Setting, Strategist, SupervisedRun
-from avtorch.gap import EFFECTS, Drive, Effect, Parameter, Row, plant
+from avtorch.gap import EFFECTS, Effect, EffectContext, Parameter, SimulatorInput, plant
 from avtorch.plots import diagnosis as over_diagnosis
 from avtorch.plots import effect_signature
 from avtorch.results import run_answer
@@ -44,7 +44,7 @@ class PedalMap(Effect):
     equation = "u (|u| / 2)^curve"
     parameters = (Parameter("curve", "-", neutral=0.0, low=0.1, high=0.8),)
 
-    def apply(self, x: torch.Tensor, row: Row) -> torch.Tensor:
+    def apply(self, x: torch.Tensor, row: EffectContext) -> torch.Tensor:
         return x * (x.abs().clamp_min(1e-3) / 2.0) ** self.curve
 
 
@@ -62,7 +62,7 @@ plots.show(figure, OUT / "signature.png")
 
 # %%
 time = torch.arange(2000, dtype=torch.float64) * 0.02
-drive = Drive(time, torch.sin(time))
+drive = SimulatorInput(time, torch.sin(time))
 bare, neutral, bent = (plant(e).response(drive).accel for e in ([], [PedalMap(0.0)], [PedalMap(0.4)]))
 error = float((neutral - bare).abs().max())
 print(f"neutral against none: {error:.1e} m/s²; bent against none: {float((bent - bare).abs().max()):.2f} m/s²")

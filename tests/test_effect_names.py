@@ -19,7 +19,7 @@ ALLOWED = {
     "cli/estimate.py": "the dead time is an argument of the estimators, no effect",
     "cli/stability.py": "the dead time is an argument of the stability functions, no effect",
     "vehicle/stability/belief.py": "likewise",
-    "vehicle/stability/setting.py": "likewise",
+    "vehicle/stability/linear_loop.py": "likewise",
 }
 
 

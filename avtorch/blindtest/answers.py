@@ -12,7 +12,7 @@ FAILED = "failed"
 """Verdict of a diagnosis that gave no answer; it counts as wrong for every truth."""
 
 
-def joined(names: Any) -> str:
+def canonical_name(names: Any) -> str:
     """The names of a verdict, or of one hypothesis (`"b+a"`), in the canonical order: `"a+b"`."""
     parts = names.split("+") if isinstance(names, str) else list(names)
     return "+".join(sorted(parts))
@@ -69,7 +69,7 @@ class Answered:
         return missed + sum((p - (name == self.truth)) ** 2 for name, p in self.probabilities.items())
 
 
-def read(truth: Mapping[str, Any], answer: Mapping[str, Any] | None) -> Answered:
+def read_answer(truth: Mapping[str, Any], answer: Mapping[str, Any] | None) -> Answered:
     """Read a truth (`Case.truth()`) and the answer to its log (None: no answer).
 
     Beside the schema's fields, `answer["shrinkage"]["placebo"]["closed"]` may hold the share of the held-out gap that a
@@ -81,12 +81,12 @@ def read(truth: Mapping[str, Any], answer: Mapping[str, Any] | None) -> Answered
         return Answered(
             truth["verdict"], truth["kind"], truth["tier"], FAILED, {}, frozenset(), None, None, None, None, (), 0
         )
-    probabilities = {joined(effect["name"]): float(effect["probability"]) for effect in answer["effects"]}
+    probabilities = {canonical_name(effect["name"]): float(effect["probability"]) for effect in answer["effects"]}
     if abs(sum(probabilities.values()) - 1) > 1e-6 or min(probabilities.values(), default=-1) < 0:
         raise InputError(f"{of}: probabilities sum to {sum(probabilities.values()):.8g}, need 1 and none below 0")
     if not {"none", "unknown"} <= probabilities.keys():
         raise InputError(f"{of}: found {', '.join(probabilities)}, needs none and unknown among the hypotheses")
-    verdict = joined(answer["verdict"]["names"])
+    verdict = canonical_name(answer["verdict"]["names"])
     named_right = verdict == truth["verdict"]
     return Answered(
         truth=truth["verdict"],
@@ -94,7 +94,7 @@ def read(truth: Mapping[str, Any], answer: Mapping[str, Any] | None) -> Answered
         tier=truth["tier"],
         verdict=verdict,
         probabilities=probabilities,
-        alias_set=frozenset(joined(name) for name in answer["verdict"]["alias_set"]),
+        alias_set=frozenset(canonical_name(name) for name in answer["verdict"]["alias_set"]),
         closed_error=_closed_error(truth, answer) if named_right else None,
         closed_covered=_closed_covered(truth, answer) if named_right else None,
         placebo=_placebo(answer),

@@ -18,7 +18,7 @@ from avtorch.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, Family
 from avtorch.blindtest.command import Parameters
 from avtorch.blindtest.deck import MIX, card, kind_of
 from avtorch.blindtest.drives import draw_drive
-from avtorch.blindtest.strength import excess_range, solve
+from avtorch.blindtest.strength import excess_range, solve_strength
 from avtorch.blindtest.vehicle import Pilot, Run, simulate
 from avtorch.blindtest.visibility import TIERS, Sight, oracles, sight, tier_of
 from avtorch.errors import InputError
@@ -190,7 +190,7 @@ def _attempt(
             return seen.excess, (parameters, run, seen)
 
         # where it cannot reach the tier, keep its strongest form
-        found = solve(trial, aim, low, high, begin=begins[f.name], strongest=f.strongest)
+        found = solve_strength(trial, aim, low, high, begin=begins[f.name], strongest=f.strongest)
         return found or (trial(f.strongest)[1] if kind != "pair" else None)
 
     parameters: dict[str, Mapping[str, float]] = {}

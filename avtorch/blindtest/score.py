@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import rankdata
 
 from avtorch.arrays import FloatArray
-from avtorch.blindtest.answers import Answered, read
+from avtorch.blindtest.answers import Answered, read_answer
 from avtorch.blindtest.intervals import Interval, bootstrap, wilson
 from avtorch.blindtest.visibility import TIERS
 from avtorch.errors import InputError
@@ -56,7 +56,7 @@ def score(
     """
     if len(truths) != len(answers) or (seconds is not None and len(seconds) != len(truths)):
         raise InputError(f"answers: found {len(answers)} for {len(truths)} cases, needs one each")
-    rows = [read(truth, answer) for truth, answer in zip(truths, answers, strict=True)]
+    rows = [read_answer(truth, answer) for truth, answer in zip(truths, answers, strict=True)]
     sheet = _Sheet(resamples, seed)
     by_kind = {kind: [r for r in rows if r.kind == kind] for kind in ("none", "single", "pair", "outside")}
     for tier in TIERS:

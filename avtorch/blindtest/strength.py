@@ -19,7 +19,7 @@ def excess_range(tier: str) -> tuple[float, float]:
     return math.sqrt(low**2 - 1), math.sqrt(min(high, _DOMINANT) ** 2 - 1)
 
 
-def solve(
+def solve_strength(
     trial: Callable[[float], tuple[float, T]], aim: float, low: float, high: float, *, begin: float, strongest: float
 ) -> T | None:
     """The trial whose excess falls in [`low`, `high`), near `aim`; None where no strength up to `strongest` reaches it.

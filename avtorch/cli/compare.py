@@ -15,7 +15,7 @@ from avtorch.cli.talk import Talk
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
-    from avtorch.gap.result.comparison import Comparison, Moved
+    from avtorch.gap.result.comparison import Change, Comparison
 
 _ROWS = {
     "T_L": "lag T_L [s]",
@@ -102,7 +102,7 @@ def _table(told: Comparison) -> Table:
     return table
 
 
-def _cells(moved: Moved) -> list[str]:
+def _cells(moved: Change) -> list[str]:
     r = moved.ratio
     return [
         *(f"{q.mean:.3g}" for q in (moved.before, moved.after)),

@@ -181,7 +181,7 @@ def _delayed(log: Log, dead_time: float) -> tuple[Array, Array]:
     if dead_time == 0.0:
         return command, known
     out = command.copy()
-    for part in log.drives():
+    for part in log.engaged_segments():
         time, u = log.elapsed[part], command[part]
         step = np.diff(time, append=2 * time[-1] - time[-2] if len(time) > 1 else time[-1] + 1.0)
         edges = np.append(time, time[-1] + step[-1])

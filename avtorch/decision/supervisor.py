@@ -231,8 +231,8 @@ class Supervisor:
             )
         # a state that was acted on, or found sufficient, is the new baseline; where none is sufficient the alarm
         # continues
-        settled = torch.zeros_like(where).index_put((asked,), decision.sufficient)
-        self.watch.monitor.accept(where | settled)
+        sufficient = torch.zeros_like(where).index_put((asked,), decision.sufficient)
+        self.watch.monitor.accept(where | sufficient)
         self._model_wrong &= ~where
         self._acted |= where
 

@@ -18,8 +18,8 @@ from avtorch.gap.likelihood.noise_draws import noise_draws
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.result.predictive_model import PredictiveModel
-from avtorch.gap.simulator.drive import Drive, Response
 from avtorch.gap.simulator.integrated import Integrated
+from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
 from avtorch.io import Log
 
 _SLOWEST_MPS = 0.5
@@ -33,12 +33,12 @@ def responses(contender: PredictiveModel, manoeuvres: Sequence[Manoeuvre], draws
     belief = {k: torch.as_tensor(x[draws]) for k, x in contender.belief.items()}
     effects = contender.plant.effects
     for effect in effects:  # an effect with an onset in the log acts from the start
-        for name, value in effect.settled().items():
+        for name, value in effect.values_after_onset().items():
             key = f"{effect.name}.{name}"
             if key in belief or name == effect.own_onset:
                 belief |= {key: torch.full_like(belief["T_L"], value)}
     with torch.inference_mode():
-        return contender.plant.response(Drive(time, command, speed, 0.0, contender.specific_force), belief)
+        return contender.plant.response(SimulatorInput(time, command, speed, 0.0, contender.specific_force), belief)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ class PredictiveLaw:
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class ManoeuvrePrediction:
     """One contender on all manoeuvres: `rollouts` (manoeuvre, draw, channel, row); one half gives the distributions,
     the other half the examples."""
 
@@ -87,7 +87,7 @@ class Prediction:
         channels: tuple[str, ...],
         group: int,
         draws: int,
-    ) -> Prediction:
+    ) -> ManoeuvrePrediction:
         """Simulate with this many `draws`; rows of the manoeuvres are means of `group` rows of a log."""
         seen = responses(contender, manoeuvres, slice(0, draws))
         # parts that do not depend on the draw come without that dimension
@@ -123,7 +123,7 @@ class Prediction:
         if not size:
             return None
         m = self.manoeuvres[number]
-        drive = Drive(torch.as_tensor(m.time), torch.as_tensor(m.command), torch.as_tensor(m.speed))
+        drive = SimulatorInput(torch.as_tensor(m.time), torch.as_tensor(m.command), torch.as_tensor(m.speed))
         assert drive.position is not None
         own = next(e for e in self.contender.plant.effects if isinstance(e, Integrated))
         road = own.prepared(drive.time, drive.speed, drive.position)

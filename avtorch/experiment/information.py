@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from avtorch.experiment.foretold import Prediction
+from avtorch.experiment.foretold import ManoeuvrePrediction
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,9 @@ class Information:
     margin: float
 
 
-def information(foretold: Sequence[Prediction], number: int, prior: Sequence[float], *, seed: int = 0) -> Information:
+def information(
+    foretold: Sequence[ManoeuvrePrediction], number: int, prior: Sequence[float], *, seed: int = 0
+) -> Information:
     """The information of manoeuvre `number`, from simulated measurements; `prior` has the causes' probabilities.
 
     Each simulated measurement is scored under the distribution of each cause.
@@ -38,12 +40,12 @@ def information(foretold: Sequence[Prediction], number: int, prior: Sequence[flo
     Example:
         >>> from avtorch import Leader, diagnose, simulate
         >>> from avtorch.experiment import information, library
-        >>> from avtorch.experiment.foretold import Prediction
+        >>> from avtorch.experiment.foretold import ManoeuvrePrediction
         >>> from avtorch.gap import DeadTime, plant
         >>> late = plant([DeadTime(0.4)], sigma=0.0)
         >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
         >>> cause = diagnose(log, effects=["dead_time"], pairs=False).contenders[0]
-        >>> one = Prediction.of(cause, library(), ("accel", "speed"), group=1, draws=20)
+        >>> one = ManoeuvrePrediction.of(cause, library(), ("accel", "speed"), group=1, draws=20)
         >>> round(information([one, one], 0, prior=[0.5, 0.5]).nats, 3)  # two causes that do the same
         0.0
     """

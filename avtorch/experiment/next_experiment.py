@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from avtorch.errors import InputError
-from avtorch.experiment.foretold import Prediction, responses
+from avtorch.experiment.foretold import ManoeuvrePrediction, responses
 from avtorch.experiment.information import Information, information
 from avtorch.experiment.limits import Limits
 from avtorch.experiment.manoeuvres import Manoeuvre, library
@@ -98,7 +98,7 @@ def next_experiment(found: Diagnosis, limits: Limits | None = None, *, seed: int
     weights = np.array([max(found.probability(r.name), 1e-3) for r in rivals])
     weights = weights / weights.sum()
     entropy = float(-(weights * np.log(weights)).sum())
-    foretold = [Prediction.of(r, offers, channels, group, _DRAWS) for r in rivals]
+    foretold = [ManoeuvrePrediction.of(r, offers, channels, group, _DRAWS) for r in rivals]
     judged = [information(foretold, i, weights.tolist(), seed=seed) for i in range(len(offers))]
     best = _chosen(offers, judged)
     names = tuple(r.name for r in rivals)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from avtorch.arrays import FloatArray
-from avtorch.follower.laws import Law, Seen, tensors
+from avtorch.follower.laws import FollowerMeasurements, HeadwayLaw, tensors
 from avtorch.gap.simulator.effect import delay_key
 
 
@@ -32,16 +32,18 @@ class LoopErrors(NamedTuple):
     amplified_simulated: float
 
 
-def loop_errors(law: Law, values: Mapping[str, float], seen: Seen, dt: float, *, seconds: float = 60.0) -> LoopErrors:
+def loop_errors(
+    law: HeadwayLaw, values: Mapping[str, float], seen: FollowerMeasurements, dt: float, *, seconds: float = 60.0
+) -> LoopErrors:
     """Simulate stretches of `seconds` of one drive, in one batch; rows `dt` [s] apart.
 
     `values`: the law's as `law.*`, `T_L` [s], the delay [s] by `delay_key()`; `K_L` is 1.
 
     Example:
         >>> from avtorch import Leader, simulate
-        >>> from avtorch.follower import ConstantTimeGap, Seen, loop_errors
+        >>> from avtorch.follower import ConstantTimeGap, FollowerMeasurements, loop_errors
         >>> run = simulate(Leader.default(start=50.0, duration=60.0, dt=0.1))
-        >>> seen = Seen(run.spacing[0, 0], run.speed[0, 0], run.lead_speed[0, 0])
+        >>> seen = FollowerMeasurements(run.spacing[0, 0], run.speed[0, 0], run.lead_speed[0, 0])
         >>> law = {"spacing_gain_per_s2": 0.9, "speed_gain_per_s": 0.9, "time_gap_s": 1.0, "standstill_m": 5.0}
         >>> values = {"T_L": 0.3, **{f"law.{name}": value for name, value in law.items()}}
         >>> errors = loop_errors(ConstantTimeGap(), values, seen, dt=0.1, seconds=20.0)
@@ -63,7 +65,7 @@ def loop_errors(law: Law, values: Mapping[str, float], seen: Seen, dt: float, *,
     accel = np.gradient(v, dt)[rows[0]]
     speeds, spacings = [speed], [spacing]
     for k in range(length):
-        now = Seen(*(torch.as_tensor(x) for x in (spacing, speed, lead[rows[k]])))
+        now = FollowerMeasurements(*(torch.as_tensor(x) for x in (spacing, speed, lead[rows[k]])))
         sent.append(law.command(own, now).numpy())
         acting = (1 - part) * sent[-1 - whole] + part * sent[-2 - whole]
         ahead = keep * accel + (1 - keep) * acting
@@ -81,7 +83,7 @@ def loop_errors(law: Law, values: Mapping[str, float], seen: Seen, dt: float, *,
     )
 
 
-def keeps_speed(seen: Sequence[Seen], dt: float, *, seconds: float = 60.0) -> float:
+def keeps_speed(seen: Sequence[FollowerMeasurements], dt: float, *, seconds: float = 60.0) -> float:
     """Root mean square error [m/s] over the same stretches of a car that keeps its initial speed."""
     off = []
     for speed in (one.speed.numpy() for one in seen):

@@ -18,7 +18,7 @@ from avtorch.errors import InputError
 from avtorch.follower.closed_loop import LoopErrors, keeps_speed, loop_errors
 from avtorch.follower.followed import Followed, car_of, followed, seen_in
 from avtorch.follower.identify import Identified, identified, widened
-from avtorch.follower.laws import LAWS, Law, Seen, law_named, tensors
+from avtorch.follower.laws import LAWS, FollowerMeasurements, HeadwayLaw, law_named, tensors
 from avtorch.follower.loop_stability import LoopStability, loop_stability
 from avtorch.gap.diagnose import diagnose
 from avtorch.gap.likelihood.record import Record
@@ -54,7 +54,7 @@ class FollowerDiagnosis:
     """
 
     name: str
-    law: Law
+    law: HeadwayLaw
     identified: Identified = field(repr=False)
     draws: Mapping[str, FloatArray] = field(repr=False)
     parameters: Mapping[str, Quantity]
@@ -170,14 +170,14 @@ def _step(record: Record) -> float:
     return record.dt / record.group
 
 
-def _longest(candidate: Followed, half: Record) -> Seen:
+def _longest(candidate: Followed, half: Record) -> FollowerMeasurements:
     """The measurements of the longest stretch of a half."""
     offsets = np.cumsum([0, *(len(s.speed) for s in candidate.seen)])
     number = np.bincount(half.stretch).argmax()
     rows = half.source[half.stretch == number] * half.group
     drive = int(np.searchsorted(offsets, rows[0], side="right") - 1)
     part = slice(int(rows[0] - offsets[drive]), int(rows[-1] - offsets[drive]) + half.group)
-    return Seen(*(x[part] for x in candidate.seen[drive]))
+    return FollowerMeasurements(*(x[part] for x in candidate.seen[drive]))
 
 
 def _cause(
@@ -196,7 +196,7 @@ def _cause(
     return diagnose(late, baseline=car_of(first.values), effects=effects, seed=seed, progress=progress)
 
 
-def _parameters(law: Law, draws: Mapping[str, FloatArray], speed: float) -> dict[str, Quantity]:
+def _parameters(law: HeadwayLaw, draws: Mapping[str, FloatArray], speed: float) -> dict[str, Quantity]:
     told = {
         k.removeprefix("law.").removeprefix(f"{delay_effect().name}."): Quantity.of_draws(x) for k, x in draws.items()
     }
@@ -206,7 +206,7 @@ def _parameters(law: Law, draws: Mapping[str, FloatArray], speed: float) -> dict
     return told | {name: Quantity.of_draws(x) for name, x in more.items()}
 
 
-def _conditional(law: Law, off: float, keeps: float) -> tuple[str, ...]:
+def _conditional(law: HeadwayLaw, off: float, keeps: float) -> tuple[str, ...]:
     return (
         f"The controller is not known: {law.name} is assumed. With it the leader's motion alone predicts the speed "
         f"over a minute, on each half as fitted to the other, to {off:.2g} m/s; a car at constant speed would err by "

@@ -17,12 +17,12 @@ import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.follower.laws import Law, Seen
+from avtorch.follower.laws import FollowerMeasurements, HeadwayLaw
 from avtorch.gap.likelihood.hypothesis import Coordinate, Hypothesis
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.simulator.drive import Drive
 from avtorch.gap.simulator.effect import delay_effect, delay_key
 from avtorch.gap.simulator.plant import GapPlant, plant
+from avtorch.gap.simulator.simulator_input import SimulatorInput
 from avtorch.io import Log
 
 NEEDED = ("speed", "spacing", "lead_speed")
@@ -32,8 +32,8 @@ NEEDED = ("speed", "spacing", "lead_speed")
 class Followed(Hypothesis):
     """`law` and a plant with `effects` over a record of speeds; `seen` of each drive, `begins`: its row of the log."""
 
-    law: Law = field(kw_only=True)
-    seen: tuple[Seen, ...] = field(kw_only=True, repr=False)
+    law: HeadwayLaw = field(kw_only=True)
+    seen: tuple[FollowerMeasurements, ...] = field(kw_only=True, repr=False)
     begins: tuple[int, ...] = field(kw_only=True, repr=False)
 
     @cached_property
@@ -49,7 +49,7 @@ class Followed(Hypothesis):
         out = []
         with torch.inference_mode():
             for drive, seen in zip(self.record.drives, self.seen, strict=True):
-                sent = Drive(drive.time, self.law.command(law, seen), seen.speed)
+                sent = SimulatorInput(drive.time, self.law.command(law, seen), seen.speed)
                 out.append(self.plant.response(sent, car).speed)
         return self._seen(cast(list, [_Speed(x) for x in out]), len(z), coarse)
 
@@ -70,7 +70,7 @@ class _Speed:
     speed: torch.Tensor
 
 
-def followed(log: Log, law: Law, *, dead_time: bool = True) -> Followed:
+def followed(log: Log, law: HeadwayLaw, *, dead_time: bool = True) -> Followed:
     """Make the response for a car-following log; `dead_time` False: the plant is the bare GLVD.
 
     Only its speed is a channel, as the acceleration of public recordings is that speed's derivative. Raises
@@ -82,17 +82,17 @@ def followed(log: Log, law: Law, *, dead_time: bool = True) -> Followed:
     record = Record.of(replace(log, accel=None, accel_cmd=np.zeros(log.rows)))
     whole = seen_in(log)
     rows = [cut.rows for cut in record.cuts]
-    seen = tuple(Seen(*(x[part] for x in whole)) for part in rows)
+    seen = tuple(FollowerMeasurements(*(x[part] for x in whole)) for part in rows)
     kinds = (delay_effect(),) if dead_time else ()
     return Followed(record, kinds, plant([]), law=law, seen=seen, begins=tuple(part.start for part in rows))
 
 
-def seen_in(log: Log) -> Seen:
+def seen_in(log: Log) -> FollowerMeasurements:
     """The law's inputs over all rows of the log."""
     assert log.spacing is not None
     assert log.speed is not None
     assert log.lead_speed is not None
-    return Seen(*(torch.as_tensor(x) for x in (log.spacing, log.speed, log.lead_speed)))
+    return FollowerMeasurements(*(torch.as_tensor(x) for x in (log.spacing, log.speed, log.lead_speed)))
 
 
 def car_of(values: Mapping[str, float]) -> GapPlant:

@@ -18,16 +18,16 @@ from avtorch.gap import Parameter
 Values = Mapping[str, Tensor]
 
 
-class Seen(NamedTuple):
+class FollowerMeasurements(NamedTuple):
     """The law's inputs, (time,): `spacing` [m], own `speed` and `lead_speed` [m/s].
 
     Example:
         >>> import torch
-        >>> from avtorch.follower import ConstantTimeGap, Seen
+        >>> from avtorch.follower import ConstantTimeGap, FollowerMeasurements
         >>> law, v = ConstantTimeGap(), torch.full((3,), 20.0, dtype=torch.float64)
         >>> values = {p.name: p.typical().unsqueeze(-1) for p in law.parameters}
         >>> balanced = law.spacing(values, 20.0) + torch.tensor([-5.0, 0.0, 5.0])
-        >>> law.command(values, Seen(balanced, speed=v, lead_speed=v)).sign().tolist()
+        >>> law.command(values, FollowerMeasurements(balanced, speed=v, lead_speed=v)).sign().tolist()
         [-1.0, 0.0, 1.0]
     """
 
@@ -53,12 +53,12 @@ class Slopes(NamedTuple):
     lead_speed: Tensor
 
 
-class Law(Protocol):
+class HeadwayLaw(Protocol):
     """A headway law by `name`, with `parameters`.
 
     Example:
-        >>> from avtorch.follower import LAWS, Law
-        >>> laws: list[Law] = list(LAWS.values())
+        >>> from avtorch.follower import LAWS, HeadwayLaw
+        >>> laws: list[HeadwayLaw] = list(LAWS.values())
         >>> [law.name for law in laws]
         ['constant_time_gap', 'intelligent_driver']
     """
@@ -66,7 +66,7 @@ class Law(Protocol):
     name: str
     parameters: tuple[Parameter, ...]
 
-    def command(self, values: Values, seen: Seen) -> Tensor:
+    def command(self, values: Values, seen: FollowerMeasurements) -> Tensor:
         """Demanded acceleration (..., time) [m/s²], `values` (..., 1)."""
         ...
 
@@ -100,7 +100,7 @@ class ConstantTimeGap:
         Parameter("standstill_m", "m", None, -2.0, 8.0, "real"),
     )
 
-    def command(self, values: Values, seen: Seen) -> Tensor:
+    def command(self, values: Values, seen: FollowerMeasurements) -> Tensor:
         wanted = values["standstill_m"] + values["time_gap_s"] * seen.speed
         pull = values["spacing_gain_per_s2"] * (seen.spacing - wanted)
         return pull + values["speed_gain_per_s"] * (seen.lead_speed - seen.speed)
@@ -137,7 +137,7 @@ class IntelligentDriver:
         Parameter("desired_speed_mps", "m/s", None, 22.0, 55.0),
     )
 
-    def command(self, values: Values, seen: Seen) -> Tensor:
+    def command(self, values: Values, seen: FollowerMeasurements) -> Tensor:
         a, b = values["max_accel_mps2"], values["comfort_brake_mps2"]
         closing = seen.speed * (seen.speed - seen.lead_speed) / (2 * (a * b).sqrt())
         wanted = values["standstill_m"] + (values["time_gap_s"] * seen.speed + closing).clamp_min(0.0)
@@ -159,7 +159,7 @@ class IntelligentDriver:
         )
 
 
-LAWS: dict[str, Law] = {law.name: law for law in (ConstantTimeGap(), IntelligentDriver())}
+LAWS: dict[str, HeadwayLaw] = {law.name: law for law in (ConstantTimeGap(), IntelligentDriver())}
 """The laws that a follower may obey, by name.
 
 Example:
@@ -169,7 +169,7 @@ Example:
 """
 
 
-def law_named(name: str) -> Law:
+def law_named(name: str) -> HeadwayLaw:
     """Raises `InputError` for a law that is not known."""
     if name not in LAWS:
         raise InputError(f"law: found {name!r}, needs one of {', '.join(LAWS)}")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 
 from avtorch.arrays import FloatArray
-from avtorch.follower.laws import Law
+from avtorch.follower.laws import HeadwayLaw
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.effect import delay_key
 from avtorch.vehicle.stability import chain_verdict, frequencies
@@ -32,7 +32,7 @@ class LoopStability:
     peak_gain: Quantity | None
 
 
-def loop_stability(law: Law, draws: Mapping[str, FloatArray], speeds: Sequence[float]) -> list[LoopStability]:
+def loop_stability(law: HeadwayLaw, draws: Mapping[str, FloatArray], speeds: Sequence[float]) -> list[LoopStability]:
     """Stability for small motions about `speeds` [m/s], of draws (draw,) by key.
 
     The result does not depend on how the loop is divided into controller and car: only the product of gains and `K_L`

@@ -36,12 +36,12 @@ from avtorch.gap.effects import (
     SpeedDependentLag,
 )
 from avtorch.gap.simulator.domain import Domain
-from avtorch.gap.simulator.drive import Drive, Response
 from avtorch.gap.simulator.effect import EFFECTS, PLACES, Effect, NoiseChange, effect_class, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.plant import BASELINE, GapPlant, plant
 from avtorch.gap.simulator.recursion import scan, scan_pair
-from avtorch.gap.simulator.row import Row
+from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
 
 __all__ = [
     "BASELINE",
@@ -55,9 +55,9 @@ __all__ = [
     "DeadBand",
     "DeadTime",
     "Domain",
-    "Drive",
     "DrivelineOscillation",
     "Effect",
+    "EffectContext",
     "GainChange",
     "GapPlant",
     "GearShift",
@@ -69,12 +69,12 @@ __all__ = [
     "RateLimit",
     "Response",
     "RoadGrade",
-    "Row",
     "Saturation",
     "SecondOrderActuator",
     "SensorBias",
     "SensorLag",
     "SensorScale",
+    "SimulatorInput",
     "SpeedDependentGain",
     "SpeedDependentLag",
     "effect_class",

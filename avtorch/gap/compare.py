@@ -4,7 +4,7 @@ The car: `T_L` and `K_L` are fitted to each set. Their spread between drives of 
 the drives, each of which contributes its own score (the sandwich estimator of White 1982), and is never less than the
 posterior's. Differences that a missing effect causes between manoeuvres therefore count as spread, not as a change.
 
-Where `T_L` or `K_L` differ, a change of dead time is tested as a rival explanation (`delay_rival`), because it
+Where `T_L` or `K_L` differ, a change of dead time is tested as a rival explanation (`dead_time_test`), because it
 resembles a longer lag.
 
 The simulator: rollout errors over both sets, and their ratio over bootstrapped blocks.
@@ -23,17 +23,17 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.crossval.folds import blocks_of
-from avtorch.gap.crossval.rollout_errors import HORIZON_S, Measure, products, reached
-from avtorch.gap.delay_rival import WithDelay, later_answer
+from avtorch.gap.crossval.rollout_errors import HORIZON_S, RolloutMetric, products, reached
+from avtorch.gap.dead_time_test import DeadTimeFit, compare_accounts
 from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.comparison import Comparison, LaterAnswer, Moved, Telling
+from avtorch.gap.result.comparison import Change, Comparison, DeadTimeTest, Telling
 from avtorch.gap.result.diagnosis import LogFacts
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
-from avtorch.gap.simulator.drive import Response
 from avtorch.gap.simulator.plant import GapPlant, plant
+from avtorch.gap.simulator.simulator_input import Response
 from avtorch.io import Log
 
 Simulator = GapPlant | str | PathLike[str] | None
@@ -89,7 +89,7 @@ def compare(
     p_value = float(fisher.sf(statistic, count, blocks - count))  # pyright: ignore[reportUnknownMemberType]
     sure = float(student.ppf(0.95, blocks - 1))  # pyright: ignore[reportUnknownMemberType]
     car = {
-        name: Moved(
+        name: Change(
             _log_quantity(one.mean[i], one.covariance[i, i], sure),
             _log_quantity(two.mean[i], two.covariance[i, i], sure),
             _log_quantity(away[i], covariance[i, i], sure),
@@ -102,7 +102,9 @@ def compare(
     gap = _gaps(fitted, simulators, horizon, same=same)
     telling = _telling(gap)
     changed = p_value < level
-    later = later_answer(*(WithDelay.of(x.search, x.found) for x in fitted), level=level) if changed else None
+    dead_time_test = (
+        compare_accounts(*(DeadTimeFit.of(x.search, x.found) for x in fitted), level=level) if changed else None
+    )
     return Comparison(
         before=LogFacts.of(sides[0]),
         after=LogFacts.of(sides[1]),
@@ -111,8 +113,8 @@ def compare(
         p_value=p_value,
         changed=changed,
         simulator=telling,
-        why=_sentence(car, p_value, telling, later, same=same),
-        later=later,
+        why=_sentence(car, p_value, telling, dead_time_test, same=same),
+        dead_time_test=dead_time_test,
         horizon_s=horizon,
     )
 
@@ -168,10 +170,10 @@ def _alike(one: Log, two: Log) -> bool:
 def _horizon(sides: Sequence[_Side]) -> float:
     """Length of the rollouts [s], up to `HORIZON_S`, that fits the stretches of both sides: errors grow with it."""
     records = [side.found.hypothesis.record for side in sides]
-    return min(reached(Measure(r.channels[0], HORIZON_S), r) or HORIZON_S for r in records)
+    return min(reached(RolloutMetric(r.channels[0], HORIZON_S), r) or HORIZON_S for r in records)
 
 
-def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float, *, same: bool) -> dict[str, Moved]:
+def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float, *, same: bool) -> dict[str, Change]:
     """Rollout errors before and after, by metric; both sides use the same bootstrap draws for the `same` drives."""
     drawn: list[dict[str, FloatArray]] = []
     for i, (side, simulator) in enumerate(zip(sides, simulators, strict=True)):
@@ -185,7 +187,7 @@ def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float
         weights = np.concatenate([np.ones((1, len(blocks))), weights])
         drawn.append({name: np.sqrt(weights @ x / (weights @ rows)) for name, x in squares.items()})
     return {
-        name: Moved(*(_of_draws(x) for x in (drawn[0][name], drawn[1][name], drawn[1][name] / drawn[0][name])))
+        name: Change(*(_of_draws(x) for x in (drawn[0][name], drawn[1][name], drawn[1][name] / drawn[0][name])))
         for name in drawn[0]
     }
 
@@ -205,8 +207,8 @@ def _squares(
     """Squared rollout errors by metric; the metric is named after `HORIZON_S` even where the drives are shorter."""
     out: dict[str, FloatArray] = {}
     for channel in record.channels:
-        squares = products(Measure(channel, horizon), record, errors[None], blocks, lag)
-        out[Measure(channel, HORIZON_S).name] = squares[:, 0, 0]
+        squares = products(RolloutMetric(channel, horizon), record, errors[None], blocks, lag)
+        out[RolloutMetric(channel, HORIZON_S).name] = squares[:, 0, 0]
     return out
 
 
@@ -222,7 +224,7 @@ def _log_quantity(mean: float, variance: float, sure: float) -> Quantity:
     return Quantity(middle, middle * sd, float(np.exp(mean - sure * sd)), float(np.exp(mean + sure * sd)))
 
 
-def _telling(gap: Mapping[str, Moved]) -> Telling:
+def _telling(gap: Mapping[str, Change]) -> Telling:
     ratios = [moved.ratio for moved in gap.values()]
     closer, farther = (any(r.q95 < 1 for r in ratios), any(r.q05 > 1 for r in ratios))
     if closer == farther:
@@ -231,7 +233,7 @@ def _telling(gap: Mapping[str, Moved]) -> Telling:
 
 
 def _sentence(
-    car: Mapping[str, Moved], p_value: float, telling: Telling, later: LaterAnswer | None, *, same: bool
+    car: Mapping[str, Change], p_value: float, telling: Telling, dead_time_test: DeadTimeTest | None, *, same: bool
 ) -> str:
     if same:
         of_two = {"closer": "The second simulator is closer", "farther": "The second simulator is farther from it"}
@@ -240,7 +242,7 @@ def _sentence(
     for name, unit in (("T_L", " s"), ("K_L", "")):
         m = car[name]
         parts.append(f"{name} {m.before.mean:.2f} to {m.after.mean:.2f}{unit}")
-    first = _account(", ".join(parts), f"p = {p_value:.2g}", later)
+    first = _account(", ".join(parts), f"p = {p_value:.2g}", dead_time_test)
     words = {
         "closer": "the drives after are closer to the simulator",
         "farther": "the drives after are farther from the simulator",
@@ -249,20 +251,20 @@ def _sentence(
     return f"{first}; {words[telling]}."
 
 
-def _account(numbers: str, chance: str, later: LaterAnswer | None) -> str:
+def _account(numbers: str, chance: str, dead_time_test: DeadTimeTest | None) -> str:
     """The sentence on the car: lag and gain are stated as the explanation only where dead time is none."""
-    if later is None:
+    if dead_time_test is None:
         return f"No change of the car is detected: {numbers} ({chance})"
-    delays = " to ".join(f"{max(q.mean, 0.0):.2f}" for q in (later.before, later.after))
-    if later.account == "lag and gain":
-        more = f"a change of dead time alone does not explain it (p = {later.p_dead_time:.2g})"
+    delays = " to ".join(f"{max(q.mean, 0.0):.2f}" for q in (dead_time_test.before, dead_time_test.after))
+    if dead_time_test.account == "lag and gain":
+        more = f"a change of dead time alone does not explain it (p = {dead_time_test.p_dead_time:.2g})"
         return f"The car has changed: {numbers} ({chance}); {more}"
-    if later.account == "cannot be told":
+    if dead_time_test.account == "cannot be told":
         return (
             f"The car has changed ({chance}), but these drives cannot distinguish a change of lag and gain ({numbers}) "
-            f"from one of dead time ({delays} s, p = {later.p_dead_time:.2g})"
+            f"from one of dead time ({delays} s, p = {dead_time_test.p_dead_time:.2g})"
         )
     return (
-        f"The car has changed ({chance}), but lag and gain do not explain it (p = {later.p_lag_gain:.2g}): a dead time "
-        f"fitted as well goes from {delays} s, and without one they would be {numbers}"
+        f"The car has changed ({chance}), but lag and gain do not explain it (p = {dead_time_test.p_lag_gain:.2g}): "
+        f"a dead time fitted as well goes from {delays} s, and without one they would be {numbers}"
     )

@@ -18,7 +18,7 @@ from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.sensor_noise_floor import with_sensor_noise
 from avtorch.gap.posterior import sample as posteriors
 from avtorch.gap.posterior.draws import Draws
-from avtorch.gap.posterior.summary import belief, drawn, moved, repaired, reported
+from avtorch.gap.posterior.summary import belief, lag_and_gain, repaired, reported, reported_draws
 from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis, LogFacts
 from avtorch.gap.result.gap_size import gap_size
@@ -96,13 +96,13 @@ def diagnose(
     chances = delays.shared(chances, untold)
     candidates = [_told(f, race, chances[f.name], kinds) for f in race.found]
     # for an unknown cause the only model is the bare baseline
-    bare = implausible({}, moved(race.none))
+    bare = implausible({}, lag_and_gain(race.none))
     candidates.append(Candidate("unknown", chances["unknown"], None, {}, {}, None, bare))
     candidates += apart.mirrored(candidates, chances)
     known = "known effect" if race.complete and race.scope.whole else "effect tried"
     verdict = verdict_of(
         candidates,
-        aliases=lambda c: delays.joined(apart.alias_set(c), untold),
+        aliases=lambda c: delays.add_delay_aliases(apart.alias_set(c), untold),
         why=delays.why(chances, untold),
         known=known,
     )
@@ -134,7 +134,7 @@ def diagnose(
     shown = RowAttribution.of(race, winner or top)
     return Diagnosis(
         log=LogFacts.of(each),
-        baseline=moved(race.none),
+        baseline=lag_and_gain(race.none),
         gap=gap_size(race, top, detected=chances["none"] < 0.5, p_value=shown.p_value),
         candidates=tuple(candidates),
         verdict=verdict,
@@ -145,7 +145,7 @@ def diagnose(
         simulator=repaired(race.none, base),
         belief=belief(winner if named and winner is not None else race.none, draws if named else None),
         assumed=belief(race.none),
-        draws=drawn(winner, draws) if draws is not None and winner is not None else None,
+        draws=reported_draws(winner, draws) if draws is not None and winner is not None else None,
         where=()
         if verdict.name == "none"
         else localise(shown, onset_s=None if onset is None else onset.from_start_s, lag=race.none.values["T_L"]),
@@ -196,10 +196,10 @@ def _told(
     """A hypothesis as listed in the answer; its parameters only where they are relevant."""
     gain = float(found.log_evidence - race.none.log_evidence)
     if found.name == "none":
-        return Candidate("none", probability, gain, {}, {}, None, implausible({}, moved(found)))
+        return Candidate("none", probability, gain, {}, {}, None, implausible({}, lag_and_gain(found)))
     if probability < 1e-4:
         return Candidate(found.name, probability, gain, {}, {}, None)
-    parameters, base = reported(found, draws), moved(found, draws)
+    parameters, base = reported(found, draws), lag_and_gain(found, draws)
     own = [kind for kind in kinds if kind.name in found.name.split("+")]
     odd = implausible(parameters, base, own)
     onset = _onset(found, race)

@@ -84,16 +84,16 @@ class Belief:
         i = self.names.index(name)
         return {key: float(getattr(self, key)[vehicle, i]) for key in ("mean", "sd", "q05", "q95")}
 
-    def updated(self, excited: Tensor, index: Tensor, found: Summary, settled: Tensor) -> Belief:
-        """After a window: ``found`` of the vehicles ``index`` where it ``settled``, all others carried over."""
-        used = index[settled]
+    def updated(self, excited: Tensor, index: Tensor, found: Summary, converged: Tensor) -> Belief:
+        """After a window: ``found`` of the vehicles ``index`` where it ``converged``, all others carried over."""
+        used = index[converged]
         table = {key: getattr(self, key) for key in ("mean", "sd", "q05", "q95")}
-        table = {key: value.index_put((used,), getattr(found, key)[settled]) for key, value in table.items()}
+        table = {key: value.index_put((used,), getattr(found, key)[converged]) for key, value in table.items()}
         draws = self.draws
         if len(used):
             draws = draws.clone()
-            draws[:, used] = found.draws[:, settled]
-        converged = torch.ones_like(excited).index_put((index,), settled)
+            draws[:, used] = found.draws[:, converged]
+        converged = torch.ones_like(excited).index_put((index,), converged)
         return Belief(self.names, draws=draws, excited=excited, converged=converged, **table)
 
     def unused(self, excited: Tensor) -> Belief:

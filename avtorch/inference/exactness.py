@@ -147,7 +147,7 @@ class Exactness:
         return cls(each[:, 0].clone(), a, b, c, d, e, f, g, h, i, each[:, 0].clone())
 
 
-def compare(density: Density, z: Tensor) -> Exactness:
+def compare_with_exact(density: Density, z: Tensor) -> Exactness:
     """Compare draws ``z`` ``(chain, draw, window, parameter)`` with their density.
 
     The first test takes few points compared with the draws; windows where it is inconclusive get about AGAIN times as

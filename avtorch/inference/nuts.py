@@ -191,8 +191,8 @@ def nuts(
             walked.append(model.walked(found) if "model" in how else found["z"])
             diverged += sum(len(v) for v in run.diagnostics()["divergences"].values())
     z = torch.stack(walked).unsqueeze(2)
-    settled = (nested_rhat(z).amax(-1) <= rhat_max) & (diverged <= 0.01 * chains * draws)
-    return Posterior(model.names, z.exp(), settled)
+    converged = (nested_rhat(z).amax(-1) <= rhat_max) & (diverged <= 0.01 * chains * draws)
+    return Posterior(model.names, z.exp(), converged)
 
 
 class _Scored(torch.autograd.Function):

@@ -66,12 +66,12 @@ class Posterior:
     @property
     def ess_bulk(self) -> Float[Tensor, "window parameter"]:
         """Effective draws behind the bulk, from their ranks, ``(window, parameter)``."""
-        return effective(normal_scores(self.draws))
+        return effective_sample_size(normal_scores(self.draws))
 
     @property
     def ess_tail(self) -> Float[Tensor, "window parameter"]:
         """Effective draws behind the 5 % or the 95 % quantile, whichever are fewer, ``(window, parameter)``."""
-        below = (effective((self.draws <= self.quantile(q)).to(self.draws)) for q in (0.05, 0.95))
+        below = (effective_sample_size((self.draws <= self.quantile(q)).to(self.draws)) for q in (0.05, 0.95))
         return torch.minimum(*below)
 
     @property
@@ -137,7 +137,7 @@ def normal_scores(draws: Float[Tensor, "chain draw *rest"]) -> Float[Tensor, "ch
     return torch.special.ndtri((rank - 0.375) / (len(flat) + 0.25)).unflatten(0, draws.shape[:2])
 
 
-def effective(values: Float[Tensor, "chain draw *rest"]) -> Float[Tensor, "*rest"]:
+def effective_sample_size(values: Float[Tensor, "chain draw *rest"]) -> Float[Tensor, "*rest"]:
     """Number of independent values that give the mean of ``(chain, draw, ...)`` as precisely; returns the remaining
     shape.
 

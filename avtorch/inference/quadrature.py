@@ -131,7 +131,7 @@ def integrate(density: Density, *, mode: Mode | None = None, nodes: int = 49, to
     place = _Place.at(mode)
     for _ in range(ROUNDS):  # moments need fewer nodes
         found = _integrate(density, place, max(COARSE, nodes // 2 | 1), mode.log_prob)
-        if found.settled():
+        if found.covers_mass():
             break
         place = place.moved(found)
     marginals, log_evidence, edge = [], [], []
@@ -192,7 +192,7 @@ class _Sums:
         """Where a side still has mass, ``(window, axis, 2)`` bool."""
         return self.edge() > FACE
 
-    def settled(self) -> bool:
+    def covers_mass(self) -> bool:
         """Whether the grid of every window lies where its mass is."""
         eye = torch.eye(self.cov.shape[-1], dtype=self.cov.dtype)
         still = (self.mean.abs() < 0.1).all() & ((self.cov - eye).abs() < 0.2).all()

@@ -14,7 +14,7 @@ from torch.optim.lr_scheduler import LRScheduler
 from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
 from avtorch.inference.density import Density, ScoredDensity, SelectableDensity, SubsampledDensity, constrained
-from avtorch.inference.exactness import Exactness, compare
+from avtorch.inference.exactness import Exactness, compare_with_exact
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.planes import empty_planes
 from avtorch.inference.posterior import Posterior, nested_rhat
@@ -171,7 +171,7 @@ def sample(
             values = constrained(density, z)
             draws[:, :, new] = values if len(new) == len(index) else values[:, :, fresh]
             if settings.compare:
-                found = found.put(index, compare(part, z), fresh)
+                found = found.put(index, compare_with_exact(part, z), fresh)
         pace = 2 * pace
         again = strayed | apart
         if settings.compare:
@@ -183,8 +183,8 @@ def sample(
     off = found.why(density.names) if settings.compare else [""] * density.windows
     flags = zip(mode.converged.tolist(), strayed.tolist(), apart.tolist(), stuck.tolist(), off, strict=True)
     why = tuple(_why(*flag) for flag in flags)
-    settled = torch.tensor([not reason for reason in why])
-    return Posterior(density.names, draws, settled, why, found if settings.compare else None)
+    converged = torch.tensor([not reason for reason in why])
+    return Posterior(density.names, draws, converged, why, found if settings.compare else None)
 
 
 def _adapted(

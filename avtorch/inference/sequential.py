@@ -121,12 +121,12 @@ class SequentialInference:
         if not len(index):
             self.belief = self.belief.unused(excited)
             return self.belief
-        found, mean_z, cov_z, settled = self._solve(density(index, self.prior().select(index)))
-        used = index[settled]
-        self._mean_z = self._mean_z.index_put((used,), mean_z[settled])
-        self._cov_z = self._cov_z.index_put((used,), cov_z[settled])
+        found, mean_z, cov_z, converged = self._solve(density(index, self.prior().select(index)))
+        used = index[converged]
+        self._mean_z = self._mean_z.index_put((used,), mean_z[converged])
+        self._cov_z = self._cov_z.index_put((used,), cov_z[converged])
         self._started = self._started.index_put((used,), torch.tensor(True))
-        self.belief = self.belief.updated(excited, index, found, settled)
+        self.belief = self.belief.updated(excited, index, found, converged)
         return self.belief
 
     def take(self, rows: Rows, evidence: Evidence) -> Belief:
@@ -135,7 +135,7 @@ class SequentialInference:
         return self.update(evidence.density, evidence.excited)
 
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
-        """Posterior of some vehicles: its summary, log moments, and where it settled ``(vehicle,)`` bool."""
+        """Posterior of some vehicles: its summary, log moments, and where it converged ``(vehicle,)`` bool."""
         posterior = sample(density, self.settings, generator=self.generator)
         ordered = posterior.flat.sort(0).values
         quantiles = sorted_quantile(ordered, 0.05), sorted_quantile(ordered, 0.95)

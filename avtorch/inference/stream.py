@@ -19,7 +19,7 @@ from avtorch.inference.evidence import Form, JerkForm
 from avtorch.inference.stream_state import check_clock, read_state, with_checksum, without_checksum, write_state
 from avtorch.inference.stream_units import StreamUnits
 from avtorch.io.clock import ROUNDING_S, decimals
-from avtorch.io.engagement import settled
+from avtorch.io.engagement import settled_rows
 
 _LONGEST_S = 1e6  # up to this distance from the first row, times keep its resolution
 
@@ -209,7 +209,7 @@ class BeliefStream:
         if bool(odd.any()):
             raise InputError(f"engaged: found {float(own[odd][0]):g}, needs 0 (driver) or 1 (engaged)")
         before = np.array([-np.inf if x is None else x for x in self._driven])
-        rests, last = settled(time.numpy(), on.numpy(), before)
+        rests, last = settled_rows(time.numpy(), on.numpy(), before)
         counts = on & torch.from_numpy(rests)
         driven = [float(x) if np.isfinite(x) else None for x in last]
         return counts if usable is None else counts & torch.as_tensor(usable, dtype=torch.bool), driven

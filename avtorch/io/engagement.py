@@ -15,7 +15,9 @@ SETTLE_S = 2.0
 """From a drive's start or a return to `engaged` until the state of actuator and sensors is known: dead time and lag."""
 
 
-def settled(time: FloatArray, engaged: BoolArray, driven: FloatArray | float = -np.inf) -> tuple[BoolArray, FloatArray]:
+def settled_rows(
+    time: FloatArray, engaged: BoolArray, driven: FloatArray | float = -np.inf
+) -> tuple[BoolArray, FloatArray]:
     """Rows `SETTLE_S` or more past the return, (..., time), and when the driver was last in charge [s], (...).
 
     `time` (time,) [s], rising; `engaged` (..., time); `driven` (...): when the driver was last in charge before the

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from avtorch.io.consistency import scale_between
-from avtorch.io.raw_leader import RawLeader, checked
+from avtorch.io.raw_leader import RawLeader, checked_leader
 from avtorch.io.tables import Table
 
 NO_LEADER_M = 252.0
@@ -31,4 +31,4 @@ def read(table: Table) -> RawLeader:
     if "SpaceGap" in table.names:
         gap = table.numbers("SpaceGap", empty_is_nan=True)
         spacing = np.where(gap >= NO_LEADER_M, np.nan, gap)
-    return checked(table, time, speed, accel, spacing, columns=columns, note=note)
+    return checked_leader(table, time, speed, accel, spacing, columns=columns, note=note)

@@ -18,7 +18,7 @@ from avtorch.errors import InputError
 from avtorch.io.assemble import assemble
 from avtorch.io.atomic import atomic
 from avtorch.io.clock import since_start
-from avtorch.io.engagement import settled
+from avtorch.io.engagement import settled_rows
 from avtorch.io.mapping import SIGNALS, Pairs, SignalMap, pairs, read_mapping
 from avtorch.io.segments import median_step, stretches
 from avtorch.io.standstill import standing
@@ -203,7 +203,7 @@ class Log:
         moving = np.ones(self.rows, bool)
         if self.accel is None or self.accel_cmd is None:
             return moving
-        for part in self.drives():
+        for part in self.engaged_segments():
             if part.stop - part.start > 1:
                 step = float(np.median(np.diff(self.elapsed[part])))
                 moving[part] = ~standing(self.accel_cmd[part], self.accel[part], step, STANDSTILL_MPS)
@@ -225,7 +225,7 @@ class Log:
             # a drive after one that ended under the driver begins with a return
             driven = part.start > 0 and not self.engaged[part.start - 1]
             since = self.elapsed[part.start] if driven else -np.inf
-            out[part] = settled(self.elapsed[part], self.engaged[part], since)[0]
+            out[part] = settled_rows(self.elapsed[part], self.engaged[part], since)[0]
         return out
 
     def segments(self) -> list[slice]:
@@ -235,7 +235,7 @@ class Log:
         edges = [0, *cuts.tolist(), self.rows]
         return [slice(a, b) for a, b in pairwise(edges)]
 
-    def drives(self) -> list[slice]:
+    def engaged_segments(self) -> list[slice]:
         """The parts of segments in which the command was obeyed, as slices of rows; each return to ``engaged`` begins
         one. Nothing may be rolled out, filtered or differenced from one into the next.
         """

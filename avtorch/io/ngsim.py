@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.io.raw_leader import RawLeader, checked
+from avtorch.io.raw_leader import RawLeader, checked_leader
 from avtorch.io.tables import Table
 
 DURATION_S = 80.0
@@ -114,7 +114,7 @@ def _event(table: Table, numbers: NDArray, event: int) -> RawLeader:
         lines,
         first=part.start,
     )
-    leader = checked(
+    leader = checked_leader(
         piece,
         piece.numbers("time"),
         piece.numbers("lead_speed"),

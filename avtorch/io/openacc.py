@@ -10,7 +10,7 @@ from itertools import islice
 from pathlib import Path
 
 from avtorch.errors import InputError, listed, printable
-from avtorch.io.raw_leader import RawLeader, checked
+from avtorch.io.raw_leader import RawLeader, checked_leader
 from avtorch.io.tables import Table, read_bytes, text_of
 
 
@@ -30,7 +30,7 @@ def astazero(table: Table, vehicle: int | None = None) -> RawLeader:
         accel = table.numbers(columns["accel"], empty_is_nan=True)
     if f"Spacing{number}" in table.names:
         spacing = table.numbers(f"Spacing{number}", empty_is_nan=True)
-    return checked(
+    return checked_leader(
         table,
         table.numbers("Time"),
         table.numbers(columns["speed"], empty_is_nan=True),
@@ -52,7 +52,7 @@ def zalazone(table: Table, vehicle: int | None = None, order: tuple[str, ...] = 
     speed = f"Speed{number}"
     ahead = f"IVS{number - 1}"
     make = order[number - 1] if 0 < number <= len(order) else ""
-    return checked(
+    return checked_leader(
         table,
         table.numbers("Time"),
         table.numbers(speed, empty_is_nan=True),

@@ -42,7 +42,7 @@ class RawLeader:
     events: tuple[int, ...] = ()
 
 
-def checked(
+def checked_leader(
     table: Table,
     time: FloatArray,
     speed: FloatArray,

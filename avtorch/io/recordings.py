@@ -8,7 +8,7 @@ from pathlib import Path
 from avtorch.errors import InputError, listed
 from avtorch.io import i24, ngsim, openacc
 from avtorch.io.mapping import Pairs, pairs
-from avtorch.io.raw_leader import RawLeader, checked
+from avtorch.io.raw_leader import RawLeader, checked_leader
 from avtorch.io.recorded_columns import recorded
 from avtorch.io.tables import Table, read_table
 from avtorch.io.units import to_si
@@ -81,4 +81,4 @@ def _plain(table: Table, unit: Pairs) -> RawLeader:
     for signal, column in names.items():
         values = table.numbers(column)
         got[signal] = to_si(signal, units[signal])(values) if signal in units else values
-    return checked(table, got["time"], got["speed"], got.get("accel"), None, columns=names)
+    return checked_leader(table, got["time"], got["speed"], got.get("accel"), None, columns=names)

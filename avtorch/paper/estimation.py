@@ -14,7 +14,7 @@ from torch import Tensor
 
 from avtorch.paper.drive import Progress
 from avtorch.paper.leaders import Ahead, Leaders
-from avtorch.paper.rows import ClaimRow, listed, middle, resampled, share, sign, spread, within
+from avtorch.paper.rows import ClaimRow, bootstrap_runs, middle, number_list, share, sign, spread, within
 from avtorch.paper.windows import FOR_PRIOR, MORE, ten_windows
 
 LAGS = (0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 1.6, 2.0)
@@ -129,7 +129,7 @@ def _coverage(sweeps: list[Sweep], seed: int) -> ClaimRow:
     """Over used windows and both parameters; whole runs are resampled, as the windows of one run are dependent."""
     held = torch.cat([(s.inside & s.used[..., None]).double().sum((0, 3)).flatten() for s in sweeps])
     asked = torch.cat([2 * s.used.double().sum(0).flatten() for s in sweeps])
-    at = resampled(len(held), seed)
+    at = bootstrap_runs(len(held), seed)
     interval = spread(held[at].sum(-1) / asked[at].sum(-1))
     value = float(held.sum() / asked.sum())
     final = torch.cat([s.inside[-1].double().flatten() for s in sweeps])
@@ -157,7 +157,7 @@ def _excitation(sweep: Sweep) -> ClaimRow:
     value = float((~poor).double().mean())
     lags, gains = len(LAGS), poor.tolist()
     named = [
-        f"{name} {listed([x for x, p in zip(values, flags, strict=True) if p])}{unit}"
+        f"{name} {number_list([x for x, p in zip(values, flags, strict=True) if p])}{unit}"
         for name, values, flags, unit in (("T_L", LAGS, gains[:lags], " s"), ("K_L", GAINS, gains[lags:], ""))
         if any(flags)
     ]
@@ -190,7 +190,7 @@ def _growth(sweep: Sweep, what: str, along: str, relative: bool, seed: int) -> C
         size = size / sweep.truth[part, None, column]
     medians = middle(size)
     value = float(_slope(x, medians[None])[0])
-    again = resampled(size.shape[1], seed)
+    again = bootstrap_runs(size.shape[1], seed)
     interval = spread(_slope(x, middle(size[:, again]).mT))
     verdict = sign(interval, above=0.0) if along == "T_L" else sign(interval, below=0.0)
     ends = medians[[0, -1]].tolist()

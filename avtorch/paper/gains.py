@@ -22,7 +22,7 @@ from torch import Tensor
 
 from avtorch.paper.drive import CHANGED, HEALTHY, NOISE, Progress, noise_seeds, rms
 from avtorch.paper.leaders import DRIVE_S, Ahead, Leaders
-from avtorch.paper.rows import ClaimRow, Verdict, listed, median_interval, middle, sign
+from avtorch.paper.rows import ClaimRow, ClaimVerdict, median_interval, middle, number_list, sign
 from avtorch.vehicle import NOMINAL_GAINS, ClosedLoop, GLVDPlant, LinearController
 from avtorch.vehicle.block import Block
 from avtorch.vehicle.stability import peak_gain
@@ -78,13 +78,13 @@ class Gains:
         values = self.measured[what][NAMES.index(gain)]
         ratio = values[-1] / values[0]
         interval = median_interval(ratio, self.seed)
-        verdicts: dict[Goes, Verdict] = {
+        verdicts: dict[Goes, ClaimVerdict] = {
             "below 1": sign(interval, below=1.0),
             "above 1": sign(interval, above=1.0),
             "0.95 to 1.05": sign(interval, above=0.95, below=1.05),
         }
         steps = ", ".join(f"{x:.3g}" for x in middle(values).tolist())
-        why = f"with {gain} at {listed(FACTORS)} times its value the {what} is {steps} {_UNITS[what]}."
+        why = f"with {gain} at {number_list(FACTORS)} times its value the {what} is {steps} {_UNITS[what]}."
         return ClaimRow(
             "gains",
             f"{gain} three times as large; behind {self.ahead.name}",
@@ -99,7 +99,7 @@ class Gains:
     def _damps(self, index: int) -> ClaimRow:
         peak = self.peak[index]
         steps = ", ".join(f"{x:.3f}" for x in peak.tolist())
-        why = f"with {NAMES[index]} at {listed(FACTORS)} times its value the peak gain is {steps}."
+        why = f"with {NAMES[index]} at {number_list(FACTORS)} times its value the peak gain is {steps}."
         ratio = float(peak[-1] / peak[0])
         return ClaimRow(
             "gains",

@@ -26,14 +26,14 @@ Example:
 """
 
 
-class Experiment(Protocol):
+class ExperimentResult(Protocol):
     """The result of an experiment: its rows, and the data for its picture."""
 
     @property
     def rows(self) -> list[ClaimRow]: ...
 
 
-EXPERIMENTS: Mapping[str, Callable[..., Experiment]] = {
+EXPERIMENTS: Mapping[str, Callable[..., ExperimentResult]] = {
     "regions": regions,
     "estimation": estimation,
     "monitoring": monitoring,
@@ -63,7 +63,7 @@ class Reproduction:
         (['gains'], 2)
     """
 
-    found: dict[str, Experiment]
+    found: dict[str, ExperimentResult]
     leaders: Leaders
     seeds: int
     seed: int

@@ -20,7 +20,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-Verdict = Literal["same", "better", "not reproduced"]
+ClaimVerdict = Literal["same", "better", "not reproduced"]
 
 MOST = 0.95
 """An event that the paper claims must happen in this share of runs."""
@@ -45,7 +45,7 @@ class ClaimRow:
     paper: float | str
     ours: float | str
     interval: tuple[float, float] | None
-    verdict: Verdict
+    verdict: ClaimVerdict
     why: str
 
     def as_dict(self) -> dict[str, Any]:
@@ -53,25 +53,25 @@ class ClaimRow:
         return out | {"interval": None if self.interval is None else list(self.interval)}
 
 
-def error(paper: float, interval: tuple[float, float]) -> Verdict:
+def error(paper: float, interval: tuple[float, float]) -> ClaimVerdict:
     """The rule `error`."""
     if interval[1] < paper:
         return "better"
     return "same" if interval[0] <= paper else "not reproduced"
 
 
-def sign(found: float | tuple[float, float], *, above: float | None = None, below: float | None = None) -> Verdict:
+def sign(found: float | tuple[float, float], *, above: float | None = None, below: float | None = None) -> ClaimVerdict:
     """The rule `sign`; `found` is an interval, or a number where nothing is random."""
     low, high = found if isinstance(found, tuple) else (found, found)
     return "same" if (above is None or low > above) and (below is None or high < below) else "not reproduced"
 
 
-def share(value: float, least: float = MOST) -> Verdict:
+def share(value: float, least: float = MOST) -> ClaimVerdict:
     """The rule `share`."""
     return "same" if value >= least - 1e-9 else "not reproduced"
 
 
-def within(value: float, low: float, high: float) -> Verdict:
+def within(value: float, low: float, high: float) -> ClaimVerdict:
     """The rule `within`."""
     return "same" if low <= value <= high else "not reproduced"
 
@@ -87,7 +87,7 @@ def spread(values: Tensor) -> tuple[float, float]:
     return low, high
 
 
-def resampled(runs: int, seed: int, times: int = _RESAMPLED) -> Tensor:
+def bootstrap_runs(runs: int, seed: int, times: int = _RESAMPLED) -> Tensor:
     """Runs drawn with replacement, (times, run): the bootstrap behind every interval of a median or share.
 
     Whole runs are drawn, because everything within a run shares its noise.
@@ -97,10 +97,10 @@ def resampled(runs: int, seed: int, times: int = _RESAMPLED) -> Tensor:
 
 def median_interval(values: Tensor, seed: int) -> tuple[float, float]:
     """90 % interval of the median of `values` (run,)."""
-    return spread(middle(values[resampled(len(values), seed)]))
+    return spread(middle(values[bootstrap_runs(len(values), seed)]))
 
 
-def listed(numbers: Sequence[float]) -> str:
+def number_list(numbers: Sequence[float]) -> str:
     """`0.1, 0.2 and 0.3`."""
     told = [f"{x:g}" for x in numbers]
     return told[0] if len(told) == 1 else ", ".join(told[:-1]) + " and " + told[-1]

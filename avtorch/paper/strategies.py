@@ -41,7 +41,7 @@ from avtorch.paper.drive import (
     stacked,
 )
 from avtorch.paper.leaders import DRIVE_S, Ahead, Leaders
-from avtorch.paper.rows import ClaimRow, Verdict, median_interval, middle, share, sign, spread
+from avtorch.paper.rows import ClaimRow, ClaimVerdict, median_interval, middle, share, sign, spread
 from avtorch.vehicle import ClosedLoop, GLVDPlant
 from avtorch.vehicle.block import Block
 
@@ -140,7 +140,7 @@ class Strategies:
     def _string(self, name: str, one: Driven) -> ClaimRow:
         good = one.peak <= UNITY
         calm = float(good.double().mean())
-        verdict: Verdict = share(calm)
+        verdict: ClaimVerdict = share(calm)
         value: float | str
         interval: tuple[float, float] | None = None
         if name in PRINTED:

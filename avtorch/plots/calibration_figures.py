@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from avtorch.plots.ranks import ecdf_difference, ecdf_of, rank_plot
 from avtorch.plots.style import BLACK, short, styled
-from avtorch.validation.calibration import Calibration
+from avtorch.validation.calibration import RankCalibration
 from avtorch.validation.uniformity import ecdf_band
 
 #: Points at which the coverage is compared with the level.
@@ -14,16 +14,16 @@ POINTS = 100
 
 
 @styled
-def calibration_figure(calibration: Calibration, *, title: str = "") -> Figure:
+def calibration_figure(calibration: RankCalibration, *, title: str = "") -> Figure:
     """Simulation-based calibration, a row a quantity: histogram of ranks, ECDF difference, coverage of intervals.
 
     Example:
         >>> import torch
         >>> from avtorch.plots import calibration_figure
-        >>> from avtorch.validation.ranks import Calibration
+        >>> from avtorch.validation.ranks import RankCalibration
         >>> g, names = torch.Generator().manual_seed(0), ("T_L", "K_L")
         >>> ranks, below = torch.randint(0, 100, (200, 2), generator=g), torch.rand(200, 2, generator=g)
-        >>> figure = calibration_figure(Calibration(names, ranks, 99, below.double(), dropped=0))
+        >>> figure = calibration_figure(RankCalibration(names, ranks, 99, below.double(), dropped=0))
         >>> len(figure.axes)  # a row each of histogram, ECDF difference and coverage
         6
     """

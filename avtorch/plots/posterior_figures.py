@@ -13,10 +13,10 @@ from torch import Tensor
 from avtorch.inference import Posterior, Quadrature
 from avtorch.plots.posteriors import agreement_reach, agreement_scatter, joint_cloud, marginals
 from avtorch.plots.ranks import METHODS, ecdf_difference, pooled_rank_counts, rank_plot
-from avtorch.plots.shown import ChosenWindows, place, relative_width, settled
+from avtorch.plots.shown import ChosenWindows, converged, place, relative_width
 from avtorch.plots.style import BLACK, short, styled
 from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE
-from avtorch.validation.diagnostics import diagnose
+from avtorch.validation.diagnostics import sampling_diagnostics
 from avtorch.validation.uniformity import ecdf_band
 from avtorch.validation.validate import Validation
 
@@ -112,7 +112,7 @@ def ranks_figure(shown: ChosenWindows) -> Figure:
         figsize=(_wide(names) * len(names) + 1.4, (0.33 * rows + 0.6) * len(shown.windows) + 0.9), layout="constrained"
     )
     axes = figure.subplots(len(shown.windows), len(names), squeeze=False)
-    reference = diagnose(found.nuts) if len(found.nuts_index) else None
+    reference = sampling_diagnostics(found.nuts) if len(found.nuts_index) else None
     for row, (window, line) in enumerate(zip(shown.windows, axes, strict=True)):
         for i, (name, ax) in enumerate(zip(names, line, strict=True)):
             drawn = _grouped(found.sgld[name][..., window.number], groups)
@@ -146,7 +146,7 @@ def ecdf_figure(validation: Validation) -> Figure:
     assert exact is not None
     arms = [("SGLD", validation.sgld, torch.arange(len(exact.mean)), validation.agreement.ess_bulk)]
     if len(validation.nuts_index):
-        arms.append(("NUTS", validation.nuts, validation.nuts_index, diagnose(validation.nuts).ess_bulk))
+        arms.append(("NUTS", validation.nuts, validation.nuts_index, sampling_diagnostics(validation.nuts).ess_bulk))
     figure = Figure(figsize=(_wide(names) * len(names) + 0.5, 2.7 * len(arms) + 0.8), layout="constrained")
     axes = figure.subplots(len(arms), len(names), squeeze=False, sharex=True, sharey="row")
     for line, (method, posterior, index, worth) in zip(axes, arms, strict=True):
@@ -188,7 +188,7 @@ def ecdf_figure(validation: Validation) -> Figure:
 def agreement_figure(validation: Validation) -> Figure:
     """Differences of mean and ratios of SD of every window over the width of its posterior, with the limits."""
     names, found, index = validation.names, validation.agreement, validation.compared
-    width, sound = relative_width(validation, index), settled(validation, index)
+    width, sound = relative_width(validation, index), converged(validation, index)
     figure = Figure(figsize=(_wide(names) * len(names) + 0.4, 6.4), layout="constrained")
     axes = figure.subplots(2, len(names), squeeze=False, sharey="row")
     measures = [
@@ -205,7 +205,7 @@ def agreement_figure(validation: Validation) -> Figure:
                 value[:, i].numpy(),
                 limits=limits,
                 error=error[:, i].numpy(),
-                settled=sound.numpy(),
+                converged=sound.numpy(),
                 reach=reach,
             )
             ax.set_title(f"{short(name)}: {ax.get_title('left')}")

@@ -189,7 +189,7 @@ def agreement_scatter(
     *,
     limits: tuple[float, float],
     error: ArrayLike | None = None,
-    settled: ArrayLike | None = None,
+    converged: ArrayLike | None = None,
     reach: float | None = None,
 ) -> Axes:
     """Distance of each window's posterior from the exact one over the latter's width, with the required limits.
@@ -201,7 +201,7 @@ def agreement_scatter(
         value: a difference or a ratio, ``(window,)``; where it is not finite the window counts as outside.
         limits: between which it should be.
         error: Monte Carlo standard error of ``value``, ``(window,)``; twice its median is drawn as a bar at the left.
-        settled: windows whose chains and reference both settled, ``(window,)``; the others are hollow.
+        converged: windows whose chains and reference both converged, ``(window,)``; the others are hollow.
         reach: half height of the axis; by default it shows nearly all windows, and at least twice the limits.
 
     Example:
@@ -221,7 +221,7 @@ def agreement_scatter(
         ax.axhline(limit, color=EXACT, linewidth=0.9, linestyle="--", zorder=0.6)
     within = (y >= limits[0]) & (y <= limits[1])
     beyond = ~(np.abs(y - middle) <= reach)
-    sound = np.ones(len(y), bool) if settled is None else np.asarray(settled, bool)
+    sound = np.ones(len(y), bool) if converged is None else np.asarray(converged, bool)
     # NaN is drawn at the top
     edge = np.where(y < middle, middle - 0.95 * reach, middle + 0.95 * reach)
     at = np.where(beyond, edge, y)

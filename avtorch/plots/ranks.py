@@ -142,7 +142,7 @@ def ecdf_difference(
     """ECDF of ranks or PIT values less that of the uniform law, in its simultaneous band (Sailynoja et al. 2022).
 
     Args:
-        ecdf: share of ranks at or below ``0..draws``, ``(draws + 1,)``, by name (`Calibration.ecdf`, or
+        ecdf: share of ranks at or below ``0..draws``, ``(draws + 1,)``, by name (`RankCalibration.ecdf`, or
             :func:`ecdf_of`).
         band: lower and upper bound of such an ECDF, ``(draws + 1,)`` each (`validation.uniformity.ecdf_band`).
         label: what the band is, for the legend.

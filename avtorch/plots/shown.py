@@ -27,13 +27,13 @@ class ShownWindow:
 class ChosenWindows:
     """The windows drawn individually: with the widest, a median and the narrowest posterior of the lag.
 
-    They are of those NUTS was run on, if there are any, and settled, if any did.
+    They are of those NUTS was run on, if there are any, and converged, if any did.
     """
 
     def __init__(self, validation: Validation) -> None:
         self.validation = validation
         index = validation.nuts_index if len(validation.nuts_index) else validation.compared
-        sound = settled(validation, index)
+        sound = converged(validation, index)
         index = index[sound] if bool(sound.any()) else index
         width = relative_width(validation, index)[:, 0]
         order = width.argsort(descending=True)
@@ -59,8 +59,8 @@ class ChosenWindows:
         return None if known is None else float(known[window.number, self.validation.names.index(name)])
 
 
-def settled(validation: Validation, index: Tensor) -> Tensor:
-    """Windows whose chains and quadrature settled, ``(index,)`` bool."""
+def converged(validation: Validation, index: Tensor) -> Tensor:
+    """Windows whose chains and quadrature converged, ``(index,)`` bool."""
     own = validation.sgld.converged[index]
     return own if validation.quadrature is None else own & validation.quadrature.converged[index]
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from avtorch.gap import EFFECTS, PLACES, Drive, Effect, Response, plant
+from avtorch.gap import EFFECTS, PLACES, Effect, Response, SimulatorInput, plant
 from avtorch.plots.style import BLACK, BLUE, GREY, VERMILLION, styled
 
 _DT = 0.02
@@ -39,7 +39,7 @@ def standard_response(effect: Effect | None, *, seed: int = _SEED) -> Response:
     """
     time, command = standard_command()
     first = (Effect if effect is None else effect).pictured
-    drive = Drive(
+    drive = SimulatorInput(
         time, command, torch.full_like(time, first), 0.0 if effect is None or effect.place != "body" else None
     )
     car = plant([] if effect is None else [effect])

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from avtorch.gap import Drive, GapPlant
+from avtorch.gap import GapPlant, SimulatorInput
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.vehicle.stability import Chain, frequencies
 
@@ -51,7 +51,7 @@ def linearised(
 
     def answer(u: Tensor, v: float) -> tuple[Tensor, Tensor]:
         with torch.no_grad():
-            response = car.response(Drive(time, u, torch.full_like(time, v)), values)
+            response = car.response(SimulatorInput(time, u, torch.full_like(time, v)), values)
         return response.accel, response.accel_measured
 
     rests, moves = answer(torch.zeros_like(command), speed), answer(command, speed)

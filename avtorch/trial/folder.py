@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from avtorch.blindtest import Case
-from avtorch.blindtest.answers import read
+from avtorch.blindtest.answers import read_answer
 from avtorch.errors import InputError
 from avtorch.io import Damaged, Log, Sealed, fingerprint, read_sealed, write_sealed
 
@@ -178,7 +178,7 @@ def _fault(kept: Any, truth: Mapping[str, Any]) -> str | None:
     ):
         return "needs an answer, or the error that came in its place"
     try:
-        read(truth, kept["answer"])
+        read_answer(truth, kept["answer"])
     except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
         return f"the answer is not of avtorch.diagnosis/1 ({type(error).__name__})"
     return None

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from avtorch.blindtest import draw_case
-from avtorch.blindtest.answers import read
+from avtorch.blindtest.answers import read_answer
 from avtorch.errors import InputError
 from avtorch.io import Log
 from avtorch.io.answers import json_text
@@ -80,7 +80,7 @@ def _answer(folder: TrialFolder, name: str, task: Task, log: Log, truth: Mapping
     spent = {"seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
     if answer is not None:
         try:
-            read(truth, answer)  # the scorer must be able to read it
+            read_answer(truth, answer)  # the scorer must be able to read it
             json_text(answer)
         except (InputError, KeyError, TypeError, ValueError) as error:
             answer, fault = None, f"the answer is not of avtorch.diagnosis/1: {type(error).__name__}: {error}"

@@ -16,7 +16,7 @@ from torch import Tensor
 from avtorch.errors import InputError
 from avtorch.inference.posterior import Posterior
 from avtorch.inference.quadrature import Quadrature
-from avtorch.validation.diagnostics import Diagnostics, diagnose
+from avtorch.validation.diagnostics import Diagnostics, sampling_diagnostics
 
 #: The tolerance asked for: difference of means in SDs of the reference, and of the ratio of SDs from one.
 MEAN_TOLERANCE, SD_TOLERANCE = 0.1, 0.05
@@ -106,7 +106,7 @@ def agreement(posterior: Posterior, quadrature: Quadrature) -> Agreement:
         (True, True)
     """
     _same(posterior, quadrature.names, len(quadrature.mean))
-    found = diagnose(posterior)
+    found = sampling_diagnostics(posterior)
     nodes = quadrature.nodes
     share = torch.linspace(0, 1, GRID, dtype=nodes.dtype)
     grid = torch.lerp(nodes[..., :1], nodes[..., -1:], share).exp()  # (window, parameter, grid)
@@ -138,7 +138,7 @@ def between(posterior: Posterior, other: Posterior) -> Agreement:
         True
     """
     _same(posterior, other.names, other.draws.shape[2])
-    found, reference = diagnose(posterior), diagnose(other)
+    found, reference = sampling_diagnostics(posterior), sampling_diagnostics(other)
     first, second = posterior.flat, other.flat
     value, order = torch.cat([first, second]).sort(0)
     mine = (order < len(first)).to(value)

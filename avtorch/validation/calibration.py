@@ -26,7 +26,7 @@ from avtorch.inference.priors import Joint, Prior, default_actuation_prior, defa
 from avtorch.inference.quadrature import integrate
 from avtorch.inference.sampler import SamplerSettings, sample
 from avtorch.inference.sequential import Mode, SequentialInference
-from avtorch.validation.ranks import Calibration
+from avtorch.validation.ranks import RankCalibration
 from avtorch.validation.simulation import Amplitude, statistics
 
 VARIED = (0.1, 2.0)
@@ -61,7 +61,7 @@ def sbc(
     inflate: float = 1.0,
     seed: int = 0,
     batch: int = 500,
-) -> Calibration:
+) -> RankCalibration:
     """Calibration of a single window's posterior.
 
     Args:
@@ -82,7 +82,7 @@ def sbc(
     parts = []
     for density, truth in _drawn(replications, batch, rows, amplitude, prior, seed):
         posterior, usable = sampler(density, own)
-        parts.append(Calibration.of(density, truth, posterior, usable, draws=draws, inflate=inflate))
+        parts.append(RankCalibration.of(density, truth, posterior, usable, draws=draws, inflate=inflate))
     return _joined(parts)
 
 
@@ -96,7 +96,7 @@ def sbc_quadrature(
     nodes: int = 31,
     seed: int = 0,
     batch: int = 500,
-) -> Calibration:
+) -> RankCalibration:
     """The same by quadrature, for the parameters only: the calibration of an exact posterior on the windows of
     :func:`sbc`.
 
@@ -113,7 +113,7 @@ def sbc_quadrature(
         values = truth.exp().split(QUADRATURE_BATCH)
         below = torch.cat([integrate(d, nodes=nodes).cdf(v) for d, v in zip(few, values, strict=True)])
         ranks = (below * (draws + 1)).long().clamp(0, draws)
-        parts.append(Calibration(density.names, ranks, draws, below))
+        parts.append(RankCalibration(density.names, ranks, draws, below))
     return _joined(parts)
 
 
@@ -147,7 +147,7 @@ def sbc_loop(
     seed: int = 0,
     batch: int = 500,
     **loop: Any,
-) -> list[Calibration]:
+) -> list[RankCalibration]:
     """Calibration of the sequential loop after each of its windows; replications are its vehicles.
 
     With ``truth="constant"`` a vehicle is drawn once from the first prior and stays. Ranks are then uniform after every
@@ -173,7 +173,7 @@ def sbc_loop(
         raise InputError(f"truth: found {truth!r}, need 'constant' or 'claimed'")
     constant = mode == "posterior" if truth is None else truth == "constant"
     generator = torch.Generator().manual_seed(seed)
-    parts: list[list[Calibration]] = [[] for _ in range(windows)]
+    parts: list[list[RankCalibration]] = [[] for _ in range(windows)]
     for number, count in enumerate(_batches(replications, batch)):
         kept = 10 * (draws + 1) - 1
         inference = SequentialInference(vehicles=count, mode=mode, kept=kept, seed=_other(seed, number), **loop)
@@ -188,7 +188,7 @@ def sbc_loop(
             used = excited.nonzero().squeeze(-1)
             density = JerkDensity(seen.select(used), prior.select(used))
             parts[window].append(
-                Calibration.of(
+                RankCalibration.of(
                     density, z[used], belief.draws[:, used], belief.converged[used], draws=draws, inflate=inflate
                 )
             )
@@ -208,7 +208,7 @@ def _batches(total: int, size: int) -> list[int]:
     return [min(size, total - first) for first in range(0, total, size)]
 
 
-def _joined(parts: list[Calibration]) -> Calibration:
+def _joined(parts: list[RankCalibration]) -> RankCalibration:
     first = parts[0]
     ranks, below = (torch.cat([getattr(p, key) for p in parts]) for key in ("ranks", "below"))
-    return Calibration(first.names, ranks, first.draws, below, sum(p.dropped for p in parts))
+    return RankCalibration(first.names, ranks, first.draws, below, sum(p.dropped for p in parts))

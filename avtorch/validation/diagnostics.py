@@ -69,7 +69,7 @@ def superchains(draws: Tensor, count: int = SUPERCHAINS) -> Tensor:
     return draws[: chains // count * count].reshape(count, -1, *draws.shape[2:])
 
 
-def diagnose(posterior: Posterior) -> Diagnostics:
+def sampling_diagnostics(posterior: Posterior) -> Diagnostics:
     """Moments, R-hat and effective sample sizes of every window.
 
     Raises:

@@ -3,7 +3,7 @@
 A vehicle that stays as it is gives windows whose sums add up, so the posterior given all of them is one window's, with
 one sigma throughout (:func:`pool`), or with a sigma of its own for each window (:class:`FreeNoise`, as ``lambda`` mode
 supposes). Both are integrated by quadrature. For a vehicle that changes there is no such reference; there the error and
-the coverage are reported (:func:`follow`).
+the coverage are reported (:func:`track_loop`).
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ def windows_of(
     return [statistics(z, rows=rows, amplitude=amplitude, generator=generator) for z in path]
 
 
-def follow(path: Tensor, windows: Sequence[JerkStatistics], *, mode: Mode, seed: int = 0, **loop: Any) -> Track:
+def track_loop(path: Tensor, windows: Sequence[JerkStatistics], *, mode: Mode, seed: int = 0, **loop: Any) -> Track:
     """Run the loop over ``windows``, all of which are used, and keep its belief after each.
 
     Args:

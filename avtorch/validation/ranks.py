@@ -26,7 +26,7 @@ class SampledDensity(Protocol):
 
 
 @dataclass(frozen=True)
-class Calibration:
+class RankCalibration:
     """Ranks of truths among posterior draws, one row a replication.
 
     Attributes:
@@ -54,7 +54,7 @@ class Calibration:
         *,
         draws: int = 99,
         inflate: float = 1.0,
-    ) -> Calibration:
+    ) -> RankCalibration:
         """Rank truths, one a window.
 
         Args:
@@ -80,9 +80,9 @@ class Calibration:
     def replications(self) -> int:
         return len(self.ranks)
 
-    def select(self, index: Tensor) -> Calibration:
+    def select(self, index: Tensor) -> RankCalibration:
         """The replications named by ``index``."""
-        return Calibration(self.names, self.ranks[index], self.draws, self.below[index], self.dropped)
+        return RankCalibration(self.names, self.ranks[index], self.draws, self.below[index], self.dropped)
 
     def counts(self, bins: int = 20) -> Tensor:
         """Histogram of the ranks, ``(quantity, bin)``."""

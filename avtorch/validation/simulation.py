@@ -19,7 +19,7 @@ Amplitude = float | tuple[float, float]
 """Of a command's first sine [m/s^2]: a number, or a range from which each window's is drawn evenly in the logarithm."""
 
 
-def command(
+def sine_commands(
     windows: int, rows: int, amplitude: Amplitude, *, dt: float = 0.01, generator: torch.Generator | None = None
 ) -> Tensor:
     """Two sines (2 and 5 rad/s, the second half as large) of random phases: demanded acceleration [m/s^2].
@@ -43,7 +43,7 @@ def command(
     return size * (torch.sin(2 * time + phase[0]) + 0.5 * torch.sin(5 * time + phase[1]))
 
 
-def simulate(
+def simulate_windows(
     z: Tensor, u: Tensor, *, dt: float = 0.01, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
     """Acceleration [m/s^2] and jerk [m/s^3] of vehicles ``z = log(T_L, K_L, sigma)`` under commands ``u``.
@@ -78,7 +78,7 @@ def statistics(
     dt: float = 0.01,
     generator: torch.Generator | None = None,
 ) -> JerkStatistics:
-    """The six sums of one fresh window of every vehicle ``z``; arguments as in :func:`command`, :func:`simulate`."""
-    u = command(len(z), rows, amplitude, dt=dt, generator=generator)
-    a, jerk = simulate(z, u, dt=dt, generator=generator)
+    """The six sums of one fresh window of every vehicle ``z``; arguments of `sine_commands`, `simulate_windows`."""
+    u = sine_commands(len(z), rows, amplitude, dt=dt, generator=generator)
+    a, jerk = simulate_windows(z, u, dt=dt, generator=generator)
     return JerkStatistics.from_samples(a, u, jerk)

@@ -29,7 +29,7 @@ from avtorch.validation.nuts_reference import (
 )
 from avtorch.validation.reference import join, reference, select
 from avtorch.validation.stein import Stein, stein_discrepancy
-from avtorch.validation.verdict import Verdict, judge
+from avtorch.validation.verdict import AgreementVerdict, judge
 from avtorch.validation.windows import Windows, windows_of_log
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class Validation:
         sgld_nuts: SGLD against NUTS, ``(M, P)`` each.
         stein: kernel Stein discrepancy of SGLD, its null and p-value, ``(W,)`` each.
         seconds: per window, by method: "sgld", "nuts", "quadrature" (0 where it was not run).
-        verdict: see `Verdict`.
+        verdict: see `AgreementVerdict`.
 
     Example:
         >>> from avtorch.inference import SamplerSettings
@@ -88,7 +88,7 @@ class Validation:
     sgld_nuts: Agreement
     stein: Stein
     seconds: dict[str, float]
-    verdict: Verdict
+    verdict: AgreementVerdict
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -195,7 +195,7 @@ def validate(
     if nuts_windows is None:
         nuts_windows = LATENT_NUTS_WINDOWS if latent else NUTS_WINDOWS
     chosen = torch.linspace(0, len(source) - 1, min(nuts_windows, len(source))).round().long()
-    told = _Told(progress, len(source) + NUTS_SHARE * len(chosen))
+    told = _ProgressCount(progress, len(source) + NUTS_SHARE * len(chosen))
     generator = torch.Generator().manual_seed(seed)
     blocks = [_block(source.select(i), settings, generator, told) for i in torch.arange(len(source)).split(BLOCK)]
     sgld = join_draws([b.sgld for b in blocks])
@@ -215,13 +215,13 @@ def validate(
     sgld_nuts = between(_of_windows(sgld, chosen), walked)
     if quadrature is None:
         compared, found, against = chosen, sgld_nuts, None
-        settled = sgld.converged[chosen] & walked.converged
+        converged = sgld.converged[chosen] & walked.converged
     else:
         compared, found = torch.arange(len(source)), agreement(sgld, quadrature)
         against = agreement(walked, select(quadrature, chosen))
-        settled = sgld.converged & quadrature.converged
+        converged = sgld.converged & quadrature.converged
     held_to = "nuts" if quadrature is None else "quadrature"
-    verdict = judge(found, settled, reference=held_to, numbers=compared.tolist(), nuts=against)
+    verdict = judge(found, converged, reference=held_to, numbers=compared.tolist(), nuts=against)
     return Validation(
         windows=source,
         settings=settings,
@@ -242,7 +242,7 @@ def validate(
 
 
 @dataclass
-class _Told:
+class _ProgressCount:
     """Progress so far."""
 
     progress: Progress | None
@@ -266,7 +266,7 @@ class _Block:
     quadrature_seconds: float
 
 
-def _block(windows: Windows, settings: SamplerSettings, generator: torch.Generator, told: _Told) -> _Block:
+def _block(windows: Windows, settings: SamplerSettings, generator: torch.Generator, told: _ProgressCount) -> _Block:
     density = windows.density
     begun = clock.perf_counter()
     sgld = sample(density, settings, generator=generator)  # search for the mode included

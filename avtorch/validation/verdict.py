@@ -20,7 +20,7 @@ SLACK = 2.0
 
 
 @dataclass(frozen=True)
-class Verdict:
+class AgreementVerdict:
     """Whether they agree, and how certain that is.
 
     Attributes:
@@ -32,9 +32,9 @@ class Verdict:
         why: a plain sentence.
 
     Example:
-        >>> from avtorch.validation import Verdict
+        >>> from avtorch.validation import AgreementVerdict
         >>> why = "98 of 100 windows agree"
-        >>> verdict = Verdict(True, share=0.98, low=0.93, high=1.0, share_if_exact=0.97, nuts_p=0.4, why=why)
+        >>> verdict = AgreementVerdict(True, share=0.98, low=0.93, high=1.0, share_if_exact=0.97, nuts_p=0.4, why=why)
         >>> verdict.agree, verdict.low <= verdict.share <= verdict.high
         (True, True)
     """
@@ -61,22 +61,22 @@ def chi2_of_means(agreement: Agreement) -> float:
 
 def judge(
     agreement: Agreement,
-    settled: Tensor,
+    converged: Tensor,
     *,
     reference: str = "quadrature",
     numbers: Sequence[int] | None = None,
     nuts: Agreement | None = None,
-) -> Verdict:
+) -> AgreementVerdict:
     """The verdict over the windows of ``agreement``.
 
     Args:
-        settled: ``(window,)`` bool; a window whose chains or whose reference did not settle does not pass.
+        converged: ``(window,)`` bool; a window whose chains or whose reference did not settle does not pass.
         reference: "quadrature", or "nuts", whose own error widens the tolerance by `SLACK` standard errors.
         numbers: numbers of the windows for the text; 0, 1, ... by default.
         nuts: NUTS against quadrature, if both were run.
     """
     slack = 0.0 if reference == "quadrature" else SLACK
-    passed = agreement.within(slack=slack) & settled
+    passed = agreement.within(slack=slack) & converged
     count, good = len(passed), int(passed.sum())
     interval = binomtest(good, count).proportion_ci(0.95, method="exact")
     exact = float(agreement.chance_within(slack=slack).nan_to_num(nan=0.0).mean())
@@ -86,11 +86,11 @@ def judge(
     parts = [_counted(good, count, interval.low, interval.high, reference, slack)]
     if not enough:
         parts.append(f"{_percent(REQUIRED_SHARE)} are needed")
-    unsettled = int((~settled).sum())
-    if unsettled:
-        parts.append(f"the chains or the reference of {unsettled} did not converge")
+    unconverged = int((~converged).sum())
+    if unconverged:
+        parts.append(f"the chains or the reference of {unconverged} did not converge")
     if good < count:
-        parts.append(_furthest(agreement, settled, range(count) if numbers is None else numbers))
+        parts.append(_furthest(agreement, converged, range(count) if numbers is None else numbers))
     if interval.low < REQUIRED_SHARE <= interval.high:
         parts.append("more windows could still change the verdict")
     if exact < REQUIRED_SHARE:
@@ -100,7 +100,7 @@ def judge(
     if p is not None and nuts is not None:
         told = "contradicts" if contradicted else "agrees with"
         parts.append(f"NUTS {told} quadrature on {len(nuts.z_mean)} of them (chi² p {p:.2g})")
-    return Verdict(
+    return AgreementVerdict(
         agree=enough and not contradicted,
         share=good / count,
         low=float(interval.low),
@@ -123,12 +123,12 @@ def _percent(share: float) -> str:
     return f"{round(100 * share, 1):g} %"
 
 
-def _furthest(agreement: Agreement, settled: Tensor, numbers: Sequence[int]) -> str:
+def _furthest(agreement: Agreement, converged: Tensor, numbers: Sequence[int]) -> str:
     """The settled window that is furthest from the reference, in units of the tolerance."""
     off = torch.stack(
         [agreement.mean_difference.abs() / MEAN_TOLERANCE, (agreement.sd_ratio - 1).abs() / SD_TOLERANCE], -1
     )
-    off = torch.where(settled[:, None, None], off, 0.0).nan_to_num(nan=0.0)
+    off = torch.where(converged[:, None, None], off, 0.0).nan_to_num(nan=0.0)
     window, parameter, kind = torch.unravel_index(off.argmax(), off.shape)
     name = agreement.names[int(parameter)]
     if int(kind) == 0:

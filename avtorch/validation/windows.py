@@ -19,7 +19,7 @@ from avtorch.inference.sampler import SamplerSettings
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.log import Log
 from avtorch.io.us06 import US06_SPEED_MPS
-from avtorch.validation.simulation import simulate
+from avtorch.validation.simulation import simulate_windows
 
 #: Ranges of the synthetic windows, each log-uniform but the gain, which is uniform: lag [s], gain [-], jerk noise
 #: [m/s^3], largest command [m/s^2].
@@ -195,7 +195,7 @@ def _windows_of(truth: Tensor, prior: Prior, generator: torch.Generator) -> Wind
     u = command(count, max(POINTS), generator=generator)
     points = torch.tensor(POINTS).repeat(-(-count // len(POINTS)))[:count]
     inside = torch.arange(u.shape[-1]) < points[:, None]
-    a, jerk = simulate(truth.log(), u, dt=DT, generator=generator)
+    a, jerk = simulate_windows(truth.log(), u, dt=DT, generator=generator)
     statistics = JerkStatistics.from_samples(a, u, jerk, inside)
     return Windows(
         name="synthetic",

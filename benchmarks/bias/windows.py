@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from avtorch.inference import JerkPoints, Mode, Quadrature, find_mode, integrate
-from avtorch.validation.simulation import simulate
+from avtorch.validation.simulation import simulate_windows
 
 #: Amplitude of the command [m/s^2]: weak, medium and strong excitation.
 AMPLITUDES = (0.1, 0.5, 2.0)
@@ -40,7 +40,7 @@ def problem(points: int, *, vehicles: int = len(VEHICLES), seed: int = 0) -> Pro
     time = 0.01 * torch.arange(points, dtype=torch.float64)
     size = torch.tensor(AMPLITUDES, dtype=torch.float64)[strength, None]
     u = size * (torch.sin(2 * time + phase[0]) + 0.5 * torch.sin(5 * time + phase[1]))
-    a, jerk = simulate(z, u, generator=g)
+    a, jerk = simulate_windows(z, u, generator=g)
     density = JerkPoints(a, u, jerk)
     mode = find_mode(density)
     truth = integrate(density, mode=mode)

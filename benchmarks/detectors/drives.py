@@ -67,7 +67,7 @@ CHANGES = {
 class Beliefs:
     """The input of a detector, (window, run) each; `belief` mean (window, run, 2) and covariance of the logs.
 
-    `used`: the window was excited and its chains settled. `p_stable`: P(string stable) under the default setting;
+    `used`: the window was excited and its chains converged. `p_stable`: P(string stable) under the default setting;
     `T_L`, `K_L`: posterior means; `sure`: what `accepted_change` compares. `end_s` (window,) and `change_s` (run,) [s].
     """
 

@@ -70,7 +70,7 @@ def possible_favourites(found: Sequence[Weighed]) -> set[str]:
     All single effects pay the same price, so only the best of them can be. A pair cannot where another one of its group
     gains as much and pays no more.
     """
-    gained = odds.gains(found)
+    gained = odds.evidence_gains(found)
     names = {"none"}
     single = [f for f in found if f.name != "none" and "+" not in f.name]
     if single:

@@ -13,7 +13,7 @@ import torch
 
 from avtorch.blindtest.in_front import IN_FRONT, put_in_front
 from avtorch.errors import InputError
-from avtorch.gap import Drive, plant
+from avtorch.gap import SimulatorInput, plant
 from avtorch.io import Log
 
 T_L, K_L, RATE = 0.4, 0.9, 100
@@ -25,7 +25,7 @@ def recorded(seconds: float = 60.0, speed0: float = 18.0) -> Log:
     """A bare GLVD car, its command smooth enough that a force's slope is the slope between two rows."""
     time = torch.arange(round(seconds * RATE), dtype=torch.float64) / RATE
     command = 0.9 * torch.sin(0.5 * time) + 0.5 * torch.sin(1.3 * time + 1.0)
-    response = plant([], T_L=T_L, K_L=K_L).response(Drive(time, command, torch.full_like(time, speed0)))
+    response = plant([], T_L=T_L, K_L=K_L).response(SimulatorInput(time, command, torch.full_like(time, speed0)))
     return Log.from_arrays(
         time=time.numpy(), accel_cmd=command.numpy(), accel=response.accel.numpy(), speed=response.speed.numpy()
     )
@@ -33,7 +33,9 @@ def recorded(seconds: float = 60.0, speed0: float = 18.0) -> Log:
 
 def answered(log: Log, described: str) -> np.ndarray:
     """Acceleration of the simulator with an effect, its commands settled as the recorded car's were."""
-    drive = Drive(torch.as_tensor(log.time), torch.as_tensor(log.accel_cmd), torch.as_tensor(log.speed), log.accel[0])
+    drive = SimulatorInput(
+        torch.as_tensor(log.time), torch.as_tensor(log.accel_cmd), torch.as_tensor(log.speed), log.accel[0]
+    )
     car = plant([], baseline=described, T_L=T_L, K_L=K_L)
     return car.prepared(drive).response(drive).accel.numpy()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avtorch.blindtest.answers import joined, read
+from avtorch.blindtest.answers import canonical_name, read_answer
 from avtorch.blindtest.catalogue import EFFECTS
 from avtorch.blindtest.intervals import bootstrap, wilson
 from avtorch.blindtest.score import score
@@ -117,24 +117,24 @@ def test_random_guess(rotating_seed: int) -> None:
 def test_errors_of_size_and_of_time() -> None:
     case = truths()[2] | {"onset_s": 30.0}
     said = answer({case["verdict"]: 0.8, "unknown": 0.2}, case["verdict"], onset=33.5, closed=0.7)
-    one = read(case, said)
+    one = read_answer(case, said)
     assert one.onset_error == pytest.approx(3.5)
     assert one.closed_error == pytest.approx(0.3)
     assert one.brier == pytest.approx(0.08)
-    assert read(case, said | {"onset_s": None}).onset_error == 60.0
-    wrong = read(case, answer({"none": 0.6, "unknown": 0.4}, "none", onset=33.5, closed=0.7))
+    assert read_answer(case, said | {"onset_s": None}).onset_error == 60.0
+    wrong = read_answer(case, answer({"none": 0.6, "unknown": 0.4}, "none", onset=33.5, closed=0.7))
     assert wrong.onset_error is None
     assert wrong.closed_error is None
     assert wrong.brier == pytest.approx(0.36 + 0.16 + 1.0)
     assert one.closed_covered is True  # the interval ends at 1, which is the oracle's
     sham = {"closed": {"mean": 0.02, "q05": -0.01}}
-    assert read(case, said | {"shrinkage": said["shrinkage"] | {"placebo": sham}}).placebo == sham["closed"]
+    assert read_answer(case, said | {"shrinkage": said["shrinkage"] | {"placebo": sham}}).placebo == sham["closed"]
     # half of the error is left, and of that the truth has a third for noise
     half = said["shrinkage"] | {"before": 0.7, "after": 0.4, "closed": {"mean": 0.45, "q05": 0.4, "q95": 0.55}}
-    part = read(case, said | {"shrinkage": half})
+    part = read_answer(case, said | {"shrinkage": half})
     assert part.closed_error == pytest.approx(abs(0.45 - 0.3 / 0.6))
     assert part.closed_covered is True
-    assert read(case, said | {"shrinkage": half | {"after": 0.3}}).closed_covered is False
+    assert read_answer(case, said | {"shrinkage": half | {"after": 0.3}}).closed_covered is False
 
 
 def test_half_right_pairs_missing_answers_and_aliases() -> None:
@@ -143,7 +143,7 @@ def test_half_right_pairs_missing_answers_and_aliases() -> None:
     single = next(t for t in cases if t["kind"] == "single")
     one = pair["verdict"].split("+")[0]
     swapped = "+".join(reversed(pair["verdict"].split("+")))
-    assert joined(swapped) == pair["verdict"]
+    assert canonical_name(swapped) == pair["verdict"]
     s = score([pair, pair], [answer({one: 1.0}, one), answer({swapped: 1.0}, swapped)], resamples=10)
     assert s["pairs_exact"] == 0.5
     assert s["pairs_jaccard"] == 0.75
@@ -170,11 +170,11 @@ def test_calibration_error_of_known_size() -> None:
 def test_bad_answers_are_named() -> None:
     case = truths()[2]
     with pytest.raises(InputError, match=r"case_00002.*sum"):
-        read(case, answer({"none": 0.7}, "none"))
+        read_answer(case, answer({"none": 0.7}, "none"))
     broken = answer({"none": 1.0}, "none")
     broken["effects"] = [e for e in broken["effects"] if e["name"] == "none"]
     with pytest.raises(InputError, match="unknown"):
-        read(case, broken)
+        read_answer(case, broken)
     with pytest.raises(InputError, match="answers"):
         score([case], [])
 

@@ -7,7 +7,7 @@ import pytest
 
 from avtorch.blindtest.car import Car
 from avtorch.blindtest.drives import DrivePlan
-from avtorch.blindtest.strength import excess_range, solve
+from avtorch.blindtest.strength import excess_range, solve_strength
 from avtorch.blindtest.vehicle import simulate
 from avtorch.blindtest.visibility import TIERS, exact_gain, oracles, sight, tier_of
 
@@ -77,10 +77,10 @@ def test_strength_is_found_in_few_trials(power: float, tier: str) -> None:
         trials.append(strength)
         return 2 * strength**power, strength
 
-    found = solve(trial, (low * high) ** 0.5, low, high, begin=1.0, strongest=1e3)
+    found = solve_strength(trial, (low * high) ** 0.5, low, high, begin=1.0, strongest=1e3)
     assert found is not None
     assert low <= 2 * found**power < high
-    assert solve(trial, 1.0, 0.9, 1.1, begin=1.0, strongest=1e-3) is None
+    assert solve_strength(trial, 1.0, 0.9, 1.1, begin=1.0, strongest=1e-3) is None
 
 
 def test_only_what_is_logged_is_seen() -> None:

@@ -23,7 +23,7 @@ from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, DeadTime, GapPlant, plant
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.result.diagnosis import Candidate, Diagnosis, GapSize, LogFacts, Quantity, near, verdict_of
-from avtorch.gap.search.checkpoint import Checkpoint, Kept, Start, read_fits
+from avtorch.gap.search.checkpoint import Checkpoint, FitKey, StoredFit, read_fits
 from avtorch.gap.search.fitted_work import fitted_work
 from avtorch.io import Log
 
@@ -77,8 +77,8 @@ class Search:
             if k == self.interrupted_after:
                 raise KeyboardInterrupt
             progress("single effects", k, 4)
-            start = Start(SimpleNamespace(name=f"effect_{k}"), None, f"{k:064x}")  # type: ignore[arg-type]
-            kept.keep(start, Kept(np.zeros(2), NoiseModel(), 0.0))
+            start = FitKey(SimpleNamespace(name=f"effect_{k}"), None, f"{k:064x}")  # type: ignore[arg-type]
+            kept.keep(start, StoredFit(np.zeros(2), NoiseModel(), 0.0))
         return answer(logs, **self.more)
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from avtorch.errors import InputError
 from avtorch.experiment import Limits, library
-from avtorch.gap import DeadTime, Drive, GapPlant, SecondOrderActuator, SensorLag, plant
+from avtorch.gap import DeadTime, GapPlant, SecondOrderActuator, SensorLag, SimulatorInput, plant
 from avtorch.gap.result.diagnosis import LogFacts
 from avtorch.io import Log
 from tests.gap.records import log_of
@@ -92,7 +92,7 @@ def driven(limits: Limits, car: GapPlant, rng: np.random.Generator) -> list[Log]
     """Every manoeuvre as this car would log it, with a usual sensor's noise; a car does not roll back."""
     logs = []
     for m in library(limits):
-        drive = Drive(torch.as_tensor(m.time), torch.as_tensor(m.command), torch.as_tensor(m.speed), 0.0)
+        drive = SimulatorInput(torch.as_tensor(m.time), torch.as_tensor(m.command), torch.as_tensor(m.speed), 0.0)
         seen = car.response(drive)
         shape = len(m.time)
         accel = seen.accel_measured.numpy() + 0.03 * rng.standard_normal(shape)
@@ -128,7 +128,7 @@ def test_a_wrong_sign_is_refused_where_it_is_identifiable(limits: Limits) -> Non
     """All but what comes back with the other sign within 2.5 s, and what hardly moves the car."""
     refused = 0
     for m in library(limits):
-        drive = Drive(torch.as_tensor(m.time), torch.as_tensor(-m.command), torch.as_tensor(m.speed), 0.0)
+        drive = SimulatorInput(torch.as_tensor(m.time), torch.as_tensor(-m.command), torch.as_tensor(m.speed), 0.0)
         speed = np.maximum(CARS["usual"].response(drive).speed.numpy(), 0.0)
         try:
             Log.from_arrays(name=m.name, time=m.time, accel_cmd=m.command, speed=speed)

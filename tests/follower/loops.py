@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from avtorch.follower import LAWS, Law, Seen
+from avtorch.follower import LAWS, FollowerMeasurements, HeadwayLaw
 from avtorch.gap import DeadTime, plant
 from avtorch.io import Log
 from avtorch.vehicle import ClosedLoop, FollowerState, Leader
@@ -37,13 +37,13 @@ def leader(seconds: float, rng: np.random.Generator) -> Leader:
 
 
 def controller(
-    law: Law, values: dict[str, float], overrides: Sequence[tuple[float, float]] = ()
+    law: HeadwayLaw, values: dict[str, float], overrides: Sequence[tuple[float, float]] = ()
 ) -> Callable[[FollowerState], torch.Tensor]:
     """The law; in `overrides` (begin, end) [s] a driver brakes, and the law asks for more as the gap opens."""
     own = {k: torch.tensor(v, dtype=torch.float64) for k, v in values.items()}
 
     def command(s: FollowerState) -> torch.Tensor:
-        asked = law.command(own, Seen(s.spacing, s.speed, s.lead_speed))
+        asked = law.command(own, FollowerMeasurements(s.spacing, s.speed, s.lead_speed))
         driven = any(begin <= s.time < end for begin, end in overrides)
         return torch.full_like(asked, -0.6) if driven else asked
 

@@ -10,7 +10,14 @@ import pytest
 import torch
 
 from avtorch.errors import InputError
-from avtorch.follower import LAWS, FollowerDiagnosis, Seen, diagnose_follower, loop_errors, loop_stability
+from avtorch.follower import (
+    LAWS,
+    FollowerDiagnosis,
+    FollowerMeasurements,
+    diagnose_follower,
+    loop_errors,
+    loop_stability,
+)
 from avtorch.follower.followed import followed
 from avtorch.follower.identify import identified, widened
 from avtorch.io import Log
@@ -95,7 +102,7 @@ def test_loop_of_the_truth_goes_with_the_drive(name: str, rotating_seed: int) ->
     assert log.speed is not None
     assert log.spacing is not None
     assert log.lead_speed is not None
-    seen = Seen(*(torch.as_tensor(x) for x in (log.spacing, log.speed, log.lead_speed)))
+    seen = FollowerMeasurements(*(torch.as_tensor(x) for x in (log.spacing, log.speed, log.lead_speed)))
     errors = loop_errors(LAWS[name], key_values(TRUTHS[name]), seen, DT, seconds=40.0)
     # sensors' noise of 0.01 m/s and 0.02 m, the initial acceleration from a difference, and steps of 0.1 s
     assert errors.speed < 0.05
@@ -176,7 +183,9 @@ def test_drives_that_begin_their_time_anew_keep_their_own_rows(
     assert late.rows == (rows[1] + rows[2] - 40) // 2
     np.testing.assert_array_equal(late.spacing, whole.spacing[-late.rows :])
     own = {k.removeprefix("law."): torch.tensor(v) for k, v in found.identified.values.items() if k.startswith("law.")}
-    seen = Seen(*(torch.as_tensor(getattr(each[2], n)[-late.rows :]) for n in Seen._fields))
+    seen = FollowerMeasurements(
+        *(torch.as_tensor(getattr(each[2], n)[-late.rows :]) for n in FollowerMeasurements._fields)
+    )
     foretold = LAWS["constant_time_gap"].command(own, seen).numpy()
     # by the half that came first, hence not the same to a hair; another drive's commands would be off by their size
     assert np.std(late.accel_cmd - foretold) < 0.3 * np.std(foretold)

@@ -6,32 +6,32 @@ import pytest
 import torch
 
 from avtorch.errors import InputError
-from avtorch.follower import LAWS, Law, Seen
+from avtorch.follower import LAWS, FollowerMeasurements, HeadwayLaw
 from avtorch.follower.laws import law_named
 
 
-def drawn(law: Law, seed: int) -> dict[str, torch.Tensor]:
+def drawn(law: HeadwayLaw, seed: int) -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     return {p.name: p.sample(generator=generator) for p in law.parameters}
 
 
 @pytest.mark.parametrize("law", LAWS.values(), ids=lambda law: law.name)
-def test_equilibrium_demands_nothing(law: Law, fresh_seed: int) -> None:
+def test_equilibrium_demands_nothing(law: HeadwayLaw, fresh_seed: int) -> None:
     values = drawn(law, fresh_seed)
     for v in (3.0, 12.0, 18.0):
         speed = torch.tensor([v], dtype=torch.float64)
-        seen = Seen(law.spacing(values, v).reshape(1), speed, speed)
+        seen = FollowerMeasurements(law.spacing(values, v).reshape(1), speed, speed)
         if float(seen.spacing) > 0.5 and v < 0.98 * float(values.get("desired_speed_mps", torch.tensor(1e9))):
             assert float(law.command(values, seen)) == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("law", LAWS.values(), ids=lambda law: law.name)
-def test_slopes_are_the_derivatives_of_the_command(law: Law, fresh_seed: int) -> None:
+def test_slopes_are_the_derivatives_of_the_command(law: HeadwayLaw, fresh_seed: int) -> None:
     values = drawn(law, fresh_seed)
     v = 11.0
     at = torch.stack([law.spacing(values, v).clamp_min(1.0), torch.tensor(v).double(), torch.tensor(v).double()])
     slopes = torch.autograd.functional.jacobian(
-        lambda x: law.command(values, Seen(*(x[i : i + 1] for i in range(3)))), at
+        lambda x: law.command(values, FollowerMeasurements(*(x[i : i + 1] for i in range(3)))), at
     )
     told = torch.stack([torch.as_tensor(x) for x in law.slopes(values, v)])
     if float(law.spacing(values, v)) > 1.0 and v < float(values.get("desired_speed_mps", torch.tensor(1e9))):

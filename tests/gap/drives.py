@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from avtorch.gap import Drive, Effect, GapPlant
+from avtorch.gap import Effect, GapPlant, SimulatorInput
 from avtorch.vehicle import Block, ClosedLoop, FollowerState, Leader
 from avtorch.vehicle.plant import Plant
 
@@ -31,17 +31,17 @@ def driven(plant: Plant, *, seconds: float = 9.0, speed0: float = 12.0, scenario
     return loop.advance(len(time) - 1)
 
 
-def drive_of(block: Block, scenario: int = 0) -> Drive:
+def drive_of(block: Block, scenario: int = 0) -> SimulatorInput:
     """The same drive, as a log would hold it."""
-    return Drive(block.time, block.accel_cmd[scenario], block.speed[scenario], 0.0)
+    return SimulatorInput(block.time, block.accel_cmd[scenario], block.speed[scenario], 0.0)
 
 
-def smooth_drive(rows: int = 80, dt: float = 0.05) -> Drive:
+def smooth_drive(rows: int = 80, dt: float = 0.05) -> SimulatorInput:
     """A short drive, its speed crossing the first shift speeds."""
     time = torch.arange(rows, dtype=torch.float64) * dt
     command = 1.1 + 1.3 * torch.sin(1.9 * time) + 0.2 * torch.cos(7.0 * time)
     speed = 3.0 + 1.2 * time + 0.3 * torch.sin(1.3 * time)
-    return Drive(time, command, speed, 0.2)
+    return SimulatorInput(time, command, speed, 0.2)
 
 
 def filled(plant: GapPlant) -> GapPlant:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from avtorch.arrays import FloatArray
-from avtorch.gap import Drive, GapPlant, plant
+from avtorch.gap import GapPlant, SimulatorInput, plant
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
 from avtorch.io import Log
@@ -41,7 +41,9 @@ def log_of(
     car = plant() if car is None else car
     # effects that depend on speed use the car's own
     for _ in range(3):
-        response = car.response(Drive(torch.as_tensor(time), torch.as_tensor(command), torch.as_tensor(rough), 0.0))
+        response = car.response(
+            SimulatorInput(torch.as_tensor(time), torch.as_tensor(command), torch.as_tensor(rough), 0.0)
+        )
         rough = response.speed.numpy()
     accel, speed = response.accel_measured.numpy().copy(), response.speed.numpy().copy()
     if noise is not None:

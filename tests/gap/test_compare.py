@@ -12,7 +12,7 @@ import avtorch
 from avtorch.cli.compare import _table
 from avtorch.errors import InputError
 from avtorch.gap import DeadTime, GapPlant, plant
-from avtorch.gap.delay_rival import WithDelay, later_answer
+from avtorch.gap.dead_time_test import DeadTimeFit, compare_accounts
 from avtorch.io import Log
 from tests.bars import BAR
 from tests.gap.records import QUIET, log_of
@@ -57,15 +57,15 @@ def test_a_later_answer_is_not_taken_for_lag_and_gain(what: str, delay: float, r
     change, account = CHANGES[what]
     told = avtorch.compare(*(log_of(x, seconds=90.0, rng=rng, noise=QUIET) for x in (car(), car(**change))))
     assert told.changed
-    assert told.later is not None
-    later = told.later
+    assert told.dead_time_test is not None
+    dead_time_test = told.dead_time_test
     # of the true account the chance is uniform, so that one of 100 drives rejects it, too; the other one is far off
-    true, other = (later.p_dead_time, later.p_lag_gain)[:: 1 if what == "delay" else -1]
+    true, other = (dead_time_test.p_dead_time, dead_time_test.p_lag_gain)[:: 1 if what == "delay" else -1]
     assert other < 1e-3 < true
-    if what != "delay" and true < 0.25 * later.level:
+    if what != "delay" and true < 0.25 * dead_time_test.level:
         account = "not lag and gain"
-    assert later.account == account
-    gone = later.difference
+    assert dead_time_test.account == account
+    gone = dead_time_test.difference
     assert abs(gone.mean - change.get("delay", 0.0)) < BAR * gone.sd
     if account == "not lag and gain":
         assert "lag and gain do not explain it" in told.why
@@ -80,13 +80,13 @@ def test_ambiguous_changes_get_no_account(fresh_seed: int) -> None:
     """Where either account would do, neither is given."""
     numbers = np.random.default_rng(fresh_seed).normal(scale=0.01, size=(2, 3))
     spread = np.diag([0.1, 0.1, 0.05]) ** 2
-    one, two = (WithDelay(x, spread, 9) for x in numbers)
-    told = later_answer(one, two, level=0.04)
+    one, two = (DeadTimeFit(x, spread, 9) for x in numbers)
+    told = compare_accounts(one, two, level=0.04)
     assert told.account == "cannot be told"
-    far = later_answer(one, WithDelay(two.mean + np.array([1.0, 0.0, 0.0]), spread, 9), level=0.04)
+    far = compare_accounts(one, DeadTimeFit(two.mean + np.array([1.0, 0.0, 0.0]), spread, 9), level=0.04)
     assert far.account == "lag and gain"
     # both have changed: lag and gain alone do not explain it either
-    both = later_answer(one, WithDelay(two.mean + np.array([1.0, 0.0, 0.5]), spread, 9), level=0.04)
+    both = compare_accounts(one, DeadTimeFit(two.mean + np.array([1.0, 0.0, 0.5]), spread, 9), level=0.04)
     assert both.account == "not lag and gain"
 
 
@@ -108,7 +108,7 @@ def test_two_simulators_on_one_drive(rotating_seed: int) -> None:
     log = _drive(np.random.default_rng(rotating_seed), T_L=0.4, K_L=0.9)
     told = avtorch.compare(log, log, baseline=plant(T_L=0.2, K_L=0.8), baseline_after=plant(T_L=0.4, K_L=0.9))
     assert told.p_value == pytest.approx(1.0)
-    assert told.later is None
+    assert told.dead_time_test is None
     assert told.to_dict()["explained"] is None
     assert told.car["K_L"].ratio.mean == pytest.approx(1.0)
     assert told.simulator == "closer"

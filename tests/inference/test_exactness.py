@@ -27,7 +27,7 @@ from avtorch.inference import (
 )
 from avtorch.inference.exactness import exactness
 from avtorch.inference.pareto import pareto_k
-from avtorch.inference.posterior import effective, normal_scores
+from avtorch.inference.posterior import effective_sample_size, normal_scores
 from avtorch.inference.schedules import harmonic
 from avtorch.validation.windows import synthetic_windows
 from tests.bars import BAR
@@ -293,8 +293,8 @@ def test_effective_draws_of_correlated_chains(phi, rotating_seed, draws_factor):
     lags = torch.arange(1, 32, dtype=F64)
     exact = count * 32 / (1 + 2 * ((1 - lags / 32) * phi**lags).sum().item())
     error = BAR * math.sqrt(2 / (count - 1))
-    assert effective(x).item() == pytest.approx(exact, rel=error + 0.02)
-    assert effective(normal_scores(x.exp())).item() == pytest.approx(exact, rel=error + 0.02)
+    assert effective_sample_size(x).item() == pytest.approx(exact, rel=error + 0.02)
+    assert effective_sample_size(normal_scores(x.exp())).item() == pytest.approx(exact, rel=error + 0.02)
     posterior = Posterior(("x",), x[:, :, None].exp(), torch.ones(1, dtype=torch.bool))
     assert posterior.ess_bulk.shape == posterior.ess_tail.shape == posterior.rhat.shape == (1, 1)
     assert posterior.ess_bulk.item() == pytest.approx(exact, rel=error + 0.02)

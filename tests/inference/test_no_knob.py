@@ -58,8 +58,8 @@ def test_strange_units_and_noise(rotating_seed: int) -> None:
     for spread in (0.0, 3.0):
         g = torch.Generator().manual_seed(rotating_seed)
         posterior = sample(density, SamplerSettings(spread=spread), generator=g, mode=mode)
-        for settled, why in zip(posterior.converged.tolist(), posterior.why, strict=True):
-            assert settled == (why == ""), why
+        for converged, why in zip(posterior.converged.tolist(), posterior.why, strict=True):
+            assert converged == (why == ""), why
         judged = posterior.converged & truth.converged
         assert judged.sum() >= WINDOWS - 5, posterior.why
         # the draws of the default settings are all but independent; half of them is on the safe side
@@ -82,8 +82,8 @@ def test_a_window_without_motion_settles_on_the_prior_or_gives_a_reason(rotating
     still = torch.zeros(3, ROWS, dtype=F64)
     jerk = torch.tensor([[0.01], [1.0], [5.0]], dtype=F64) * torch.randn(3, ROWS, generator=g, dtype=F64)
     posterior = sample(JerkDensity(JerkStatistics.from_samples(still, still, jerk)), generator=g)
-    for settled, why in zip(posterior.converged.tolist(), posterior.why, strict=True):
-        assert settled or why
+    for converged, why in zip(posterior.converged.tolist(), posterior.why, strict=True):
+        assert converged or why
     z = posterior.draws.log()[:, :, posterior.converged]
     ess = 0.5 * z.shape[0] * z.shape[1]
     for i, (median, sd) in enumerate(((0.3, 0.7), (1.0, 0.3))):

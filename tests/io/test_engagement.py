@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from avtorch.arrays import BoolArray, IntArray
 from avtorch.io import Log, check
-from avtorch.io.engagement import SETTLE_S, settled
+from avtorch.io.engagement import SETTLE_S, settled_rows
 
 RATE_HZ = 10
 
@@ -35,16 +35,16 @@ def test_rows_settle_for_two_seconds_after_every_return(engaged: list[bool], clo
         assert log.settled[row] == (not len(earlier) or row - earlier[-1] > wait)
     assert not (log.usable & ~on).any()
     # drives hold every engaged row once, and no other
-    held = [r for part in log.drives() for r in range(part.start, part.stop)]
+    held = [r for part in log.engaged_segments() for r in range(part.start, part.stop)]
     assert held == np.flatnonzero(on).tolist()
 
 
 @given(st.lists(st.booleans(), min_size=2, max_size=60), st.integers(1, 59))
 def test_a_stream_cut_anywhere_gives_the_same_answer_as_a_log(engaged: list[bool], cut: int) -> None:
     on, time = np.array(engaged), np.arange(len(engaged)) / RATE_HZ
-    whole, last = settled(time, on)
-    first, before = settled(time[:cut], on[:cut])
-    second, after = settled(time[cut:], on[cut:], before)
+    whole, last = settled_rows(time, on)
+    first, before = settled_rows(time[:cut], on[:cut])
+    second, after = settled_rows(time[cut:], on[cut:], before)
     np.testing.assert_array_equal(np.concatenate([first, second]), whole)
     assert after == last
 
@@ -56,7 +56,7 @@ def test_a_segment_behind_an_override_begins_with_a_return() -> None:
     log = log_of(on, segment=segment)
     assert not log.settled[100:121].any()
     assert log.settled[121:].all()
-    assert log.drives() == [slice(0, 90), slice(100, 200)]
+    assert log.engaged_segments() == [slice(0, 90), slice(100, 200)]
     on[90:100] = True
     on[80:90] = False
     # two seconds after the return the segment has ended; the next one is a drive of its own

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from avtorch.paper.rows import ClaimRow, error, listed, median_interval, share, sign, spread, within
+from avtorch.paper.rows import ClaimRow, error, median_interval, number_list, share, sign, spread, within
 
 
 def test_rules() -> None:
@@ -39,8 +39,8 @@ def test_intervals_hold_the_truth_as_often_as_they_say(rotating_seed: int, draws
 
 def test_spread_and_words() -> None:
     assert spread(torch.arange(101.0)) == (5.0, 95.0)
-    assert listed([0.1, 0.2, 3.0]) == "0.1, 0.2 and 3"
-    assert listed([2.5]) == "2.5"
+    assert number_list([0.1, 0.2, 3.0]) == "0.1, 0.2 and 3"
+    assert number_list([2.5]) == "2.5"
     row = ClaimRow("gains", "s", "q", 1.0, 2.0, (1.0, 3.0), "same", "w.").as_dict()
     assert row["interval"] == [1.0, 3.0]
     assert list(row) == ["name", "setting", "quantity", "paper", "ours", "interval", "verdict", "why"]

@@ -128,9 +128,9 @@ def test_a_cloud_that_is_too_wide_is_detected() -> None:
 
 def test_scatter_counts_what_is_within_and_shows_what_is_far() -> None:
     value = np.array([0.0, 0.09, -0.11, 0.5, math.nan, -9.0])
-    settled = np.array([True, False, True, True, True, True])
+    converged = np.array([True, False, True, True, True, True])
     ax = plots.agreement_scatter(
-        axes(), np.geomspace(1e-3, 0.5, 6), value, limits=(-0.1, 0.1), error=np.full(6, 0.02), settled=settled
+        axes(), np.geomspace(1e-3, 0.5, 6), value, limits=(-0.1, 0.1), error=np.full(6, 0.02), converged=converged
     )
     assert ax.get_title("left") == "33 % within"
     low, high = ax.get_ylim()

@@ -13,11 +13,11 @@ from matplotlib.text import Text
 from avtorch import plots
 from avtorch.inference import Posterior, SamplerSettings, integrate
 from avtorch.validation.agreement import agreement, between
-from avtorch.validation.calibration import Calibration
+from avtorch.validation.calibration import RankCalibration
 from avtorch.validation.exact import exact_draws
 from avtorch.validation.stein import Stein
 from avtorch.validation.validate import Validation
-from avtorch.validation.verdict import Verdict
+from avtorch.validation.verdict import AgreementVerdict
 from avtorch.validation.windows import synthetic_windows
 
 pytest.importorskip("arviz")
@@ -52,7 +52,7 @@ def validation() -> Validation:
         sgld_nuts=between(own, nuts),
         stein=Stein(nothing, nothing, nothing, points=0),
         seconds={},
-        verdict=Verdict(True, 1.0, 0.54, 1.0, 0.9, 0.5, "a test"),
+        verdict=AgreementVerdict(True, 1.0, 0.54, 1.0, 0.9, 0.5, "a test"),
     )
 
 
@@ -98,8 +98,8 @@ def test_ecdf_figure_counts_windows_and_shows_a_shift(validation: Validation) ->
     draws[..., 1] += 0.5 * sgld.sd[:, 1]
     shifted = dataclasses.replace(validation, sgld=dataclasses.replace(sgld, draws=draws))
     titles = [ax.get_title("left") for ax in plots.validation_figures(shifted)["ecdf.png"]().axes]
-    settled = int((sgld.converged & validation.quadrature.converged).sum())  # type: ignore[union-attr]
-    assert titles[1] == f"SGLD, $K_L$: 0 of {settled} inside"
+    converged = int((sgld.converged & validation.quadrature.converged).sum())  # type: ignore[union-attr]
+    assert titles[1] == f"SGLD, $K_L$: 0 of {converged} inside"
 
 
 @pytest.mark.slow
@@ -119,7 +119,7 @@ def test_figure_of_a_calibration() -> None:
     below = torch.from_numpy(rng.random((400, 2)))
     # posteriors of half the SD: the truth is too often near an end
     below[:, 1] = torch.special.ndtr(2 * torch.special.ndtri(below[:, 1]))
-    found = Calibration(("T_L", "log_likelihood"), (100 * below).long(), 99, below, dropped=3)
+    found = RankCalibration(("T_L", "log_likelihood"), (100 * below).long(), 99, below, dropped=3)
     figure = plots.calibration_figure(found, title="one window")
     nothing_runs_out(figure)
     assert figure.get_suptitle().startswith("one window: 400 replications, 3 dropped")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from avtorch.blindtest import Car, DrivePlan, draw_case, simulate
-from avtorch.blindtest.answers import read
+from avtorch.blindtest.answers import read_answer
 from avtorch.errors import InputError
 from avtorch.io import Log
 from avtorch.trial import RIVALS, rivals
@@ -67,7 +67,7 @@ def test_answers_are_of_the_schema(name: str, signals: tuple[str, ...]) -> None:
         needs_pysindy()
     case = draw_case(0, 11, seconds=60.0)
     answer = RIVALS[name](case.log(signals=signals))
-    told = read(case.truth(), answer)
+    told = read_answer(case.truth(), answer)
     assert answer["schema"] == "avtorch.diagnosis/1"
     assert told.verdict in told.alias_set
     assert told.probabilities[told.verdict] == max(told.probabilities.values())

@@ -16,7 +16,7 @@ from avtorch.inference.priors import LogSpaceNormal
 pytest.importorskip("arviz")
 
 from avtorch.validation.agreement import Agreement, agreement, between
-from avtorch.validation.diagnostics import diagnose, superchains
+from avtorch.validation.diagnostics import sampling_diagnostics, superchains
 from tests.bars import BAR
 
 LOG_SD = 0.05
@@ -142,7 +142,7 @@ def test_chance_of_exact_draws_is_the_share_that_meets_the_tolerance(rotating_se
 def test_many_short_chains_are_not_counted_twice(rotating_seed: int) -> None:
     windows, chains, draws, rho = 20, 256, 20, 0.3
     law = LogNormals(windows)
-    found = diagnose(law.posterior(autoregressive((chains, draws, windows, 2), rho, rotating_seed)))
+    found = sampling_diagnostics(law.posterior(autoregressive((chains, draws, windows, 2), rho, rotating_seed)))
     lag = torch.arange(1, draws, dtype=torch.float64)
     exact = chains * draws / float(1 + 2 * ((1 - lag / draws) * rho**lag).sum())
     assert float(found.ess_mean.mean()) == pytest.approx(exact, rel=0.05)
@@ -153,7 +153,7 @@ def test_many_short_chains_are_not_counted_twice(rotating_seed: int) -> None:
 @pytest.mark.statistical
 def test_chains_that_sit_still_count_one_draw_each(rotating_seed: int) -> None:
     still = autoregressive((256, 1, 10, 2), 0.0, rotating_seed).expand(-1, 20, -1, -1)
-    assert float(diagnose(LogNormals(10).posterior(still)).ess_mean.mean()) == pytest.approx(256, rel=0.15)
+    assert float(sampling_diagnostics(LogNormals(10).posterior(still)).ess_mean.mean()) == pytest.approx(256, rel=0.15)
 
 
 def test_superchains() -> None:
@@ -206,10 +206,10 @@ def test_what_cannot_be_compared() -> None:
     with pytest.raises(InputError, match=r"reference: has the parameters"):
         between(draws, Posterior(("a", "b"), draws.draws, draws.converged))
     with pytest.raises(InputError, match=r"posterior: 2 draws a chain"):
-        diagnose(Posterior(draws.names, draws.draws[:, :2], draws.converged))
+        sampling_diagnostics(Posterior(draws.names, draws.draws[:, :2], draws.converged))
 
 
 def test_arviz_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "arviz", None)
     with pytest.raises(InputError, match=r"pip install 'avtorch\[validate\]'"):
-        diagnose(even(100))
+        sampling_diagnostics(even(100))

@@ -15,8 +15,8 @@ from avtorch.errors import InputError
 from avtorch.inference import ExcitationRule, JerkDensity, sample_conjugate
 from avtorch.inference.priors import LogNormalPrior
 from avtorch.validation.calibration import sbc, sbc_loop, sbc_quadrature
-from avtorch.validation.ranks import Calibration
-from avtorch.validation.simulation import command, simulate, statistics
+from avtorch.validation.ranks import RankCalibration
+from avtorch.validation.simulation import simulate_windows, sine_commands, statistics
 from tests.bars import BAR, LEVEL
 
 F64 = torch.float64
@@ -37,13 +37,13 @@ class Toy:
         return self.log_likelihood(z) - 0.5 * z[..., 0].square()
 
 
-def toy(seed: int, count: int, *, stretch: float = 1.0, shift: float = 0.0, inflate: float = 1.0) -> Calibration:
+def toy(seed: int, count: int, *, stretch: float = 1.0, shift: float = 0.0, inflate: float = 1.0) -> RankCalibration:
     g = torch.Generator().manual_seed(seed)
     truth = torch.randn(count, 1, generator=g, dtype=F64)
     y = truth[:, 0] + torch.randn(count, generator=g, dtype=F64)
     noise = torch.randn(99, count, generator=g, dtype=F64)
     draws = y / 2 + math.sqrt(0.5) * (stretch * noise + shift)
-    return Calibration.of(Toy(y), truth, draws.unsqueeze(-1).exp(), inflate=inflate)
+    return RankCalibration.of(Toy(y), truth, draws.unsqueeze(-1).exp(), inflate=inflate)
 
 
 @pytest.mark.statistical
@@ -77,7 +77,7 @@ def test_inflation_stretches_about_the_mean_of_the_logarithm(rotating_seed):
 def test_ranks_of_known_draws():
     draws = torch.arange(1.0, 20.0, dtype=F64).reshape(19, 1, 1).expand(-1, 2, -1)
     truth = torch.tensor([[5.5], [0.5]], dtype=F64).log()
-    found = Calibration.of(Toy(torch.zeros(2, dtype=F64)), truth, draws, torch.tensor([True, False]), draws=19)
+    found = RankCalibration.of(Toy(torch.zeros(2, dtype=F64)), truth, draws, torch.tensor([True, False]), draws=19)
     assert found.replications == 1
     assert found.dropped == 1
     # the nearer to zero in z, the likelier; only log 1 to log 5 are likelier than log 5.5
@@ -90,8 +90,8 @@ def test_ranks_of_known_draws():
 def test_acceleration_moves_by_the_measured_jerk(rotating_seed, draws_factor):
     g = torch.Generator().manual_seed(rotating_seed)
     z = torch.tensor([[0.3, 1.0, 0.5], [0.003, 0.8, 0.1]], dtype=F64).log()
-    u = command(2, 20_000 * draws_factor, (0.1, 2.0), generator=g)
-    a, jerk = simulate(z, u, generator=g)
+    u = sine_commands(2, 20_000 * draws_factor, (0.1, 2.0), generator=g)
+    a, jerk = simulate_windows(z, u, generator=g)
     assert torch.allclose(a[0, 1:], a[0, :-1] + 0.01 * jerk[0, :-1], atol=1e-9)
     # a lag below the step is held for as long as the lag, and stays finite
     assert torch.allclose(a[1, 1:], a[1, :-1] + 0.003 * jerk[1, :-1], atol=1e-9)
@@ -103,7 +103,7 @@ def test_acceleration_moves_by_the_measured_jerk(rotating_seed, draws_factor):
 @pytest.mark.statistical
 def test_amplitudes_span_their_range(rotating_seed):
     g = torch.Generator().manual_seed(rotating_seed)
-    reach = command(2000, 1000, (0.1, 2.0), generator=g).abs().amax(-1)
+    reach = sine_commands(2000, 1000, (0.1, 2.0), generator=g).abs().amax(-1)
     assert 0.05 < reach.min() < 0.2
     assert 2.0 < reach.max() < 3.0 + 1e-9
 
@@ -177,7 +177,7 @@ def test_a_prior_that_claims_too_much_is_seen(rotating_seed):
         (lambda: sbc_quadrature(10, draws=0), "draws"),
         (lambda: sbc_loop(10, truth="drawn"), "truth"),
         (lambda: sbc_loop(10, mode="all"), "mode"),
-        (lambda: simulate(torch.zeros(3, 2), torch.zeros(3, 5)), "z, u"),
+        (lambda: simulate_windows(torch.zeros(3, 2), torch.zeros(3, 5)), "z, u"),
     ],
 )
 def test_bad_arguments_are_refused_by_name(call, name):

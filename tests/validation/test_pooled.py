@@ -14,13 +14,13 @@ from avtorch.validation.pooled import (
     PooledComparison,
     constant,
     drift,
-    follow,
     pool,
     step,
+    track_loop,
     truth_given_all,
     windows_of,
 )
-from avtorch.validation.simulation import command, simulate
+from avtorch.validation.simulation import simulate_windows, sine_commands
 
 F64 = torch.float64
 
@@ -34,7 +34,9 @@ def fleet(count: int) -> torch.Tensor:
 def test_sums_of_windows_are_sums_of_all_rows(fresh_seed):
     g = torch.Generator().manual_seed(fresh_seed)
     z = fleet(3)
-    rows = [(*simulate(z, u, generator=g), u) for u in (command(3, 50, 1.0, generator=g) for _ in range(4))]
+    rows = [
+        (*simulate_windows(z, u, generator=g), u) for u in (sine_commands(3, 50, 1.0, generator=g) for _ in range(4))
+    ]
     parts = [JerkStatistics.from_samples(a, u, jerk) for a, jerk, u in rows]
     a, jerk, u = (torch.cat(column, -1) for column in zip(*rows, strict=True))
     whole = JerkStatistics.from_samples(a, u, jerk)
@@ -74,13 +76,13 @@ def test_posterior_mode_ends_where_the_pooled_posterior_is(rotating_seed):
     path = constant(fleet(10), 4)
     seen = windows_of(path, generator=g)
     pooled = truth_given_all(seen)
-    found = PooledComparison.of(follow(path, seen, mode="posterior", seed=rotating_seed), pooled)
+    found = PooledComparison.of(track_loop(path, seen, mode="posterior", seed=rotating_seed), pooled)
     assert pooled.converged.all()
     assert found.shift.abs().max() < 0.32 + 0.1
     assert (found.sd_ratio - 1).abs().max() < 0.11 + 0.1
     assert found.select(torch.tensor([3])).shift.equal(found.shift[3:4])
     # lambda I forgets all but the last of four windows: twice the SD, within what windows of other phases differ
-    loose = PooledComparison.of(follow(path, seen, mode="lambda", seed=rotating_seed), pooled)
+    loose = PooledComparison.of(track_loop(path, seen, mode="lambda", seed=rotating_seed), pooled)
     assert 1.5 < loose.sd_ratio[:, :2].median() < 2.8
 
 
@@ -113,7 +115,7 @@ def test_lambda_follows_a_step_that_posterior_mode_does_not(rotating_seed):
     later = torch.tensor([[1.0, 0.6, 0.1]], dtype=F64).log().expand(10, -1)
     path = step(z, later, 4, at=3)
     seen = windows_of(path, generator=g)
-    follows, stays = (follow(path, seen, mode=mode, seed=rotating_seed) for mode in ("lambda", "posterior"))
+    follows, stays = (track_loop(path, seen, mode=mode, seed=rotating_seed) for mode in ("lambda", "posterior"))
     assert follows.covered.shape == (4, 10, 3)
     # an SD of about 3 %; posterior mode is between three windows at 0.3 s and one at 1 s
     assert follows.relative_error[-1, :, 0].median() < 0.2
@@ -125,4 +127,4 @@ def test_bad_arguments_are_refused_by_name():
     with pytest.raises(InputError, match=r"^windows: "):
         pool([])
     with pytest.raises(InputError, match=r"^path, windows: "):
-        follow(constant(fleet(2), 3), windows_of(constant(fleet(2), 2)), mode="lambda")
+        track_loop(constant(fleet(2), 3), windows_of(constant(fleet(2), 2)), mode="lambda")

@@ -78,9 +78,9 @@ def test_ten_percent_inflation_disagrees(windows: Windows, exact: Quadrature, ro
 
 
 def test_windows_that_did_not_settle_do_not_pass(windows: Windows, exact: Quadrature) -> None:
-    settled = exact.converged.clone()
-    settled[0] = False
-    verdict = judge(agreement(drawn(windows, exact, 0), exact), settled)
+    converged = exact.converged.clone()
+    converged[0] = False
+    verdict = judge(agreement(drawn(windows, exact, 0), exact), converged)
     assert not verdict.agree
     assert verdict.share <= 1 - 1 / WINDOWS
     assert "the chains or the reference of 1 did not converge" in verdict.why

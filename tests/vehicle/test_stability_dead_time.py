@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from avtorch.vehicle import stability
+from avtorch.vehicle.stability.linear_loop import linear_loop
 from avtorch.vehicle.stability.nyquist import nyquist
-from avtorch.vehicle.stability.setting import read_setting
 from avtorch.vehicle.stability.sweep import exceeds_anywhere, sweep
 
 NOMINAL = [1.5, 1.5, -0.8]
@@ -139,7 +139,7 @@ def test_peak_gain_against_a_finer_sweep(fresh_seed):
 def test_verdict_on_few_points_is_that_of_the_full_sweep(fresh_seed):
     T, K, tau, gains, theta = random_delayed(6000, fresh_seed)
     kf = torch.linspace(-1, 1, 6000, dtype=torch.float64).clamp_min(0)
-    setting = read_setting(T, K, tau, gains, dead_time=theta, feedforward=kf, feedforward_delay=theta / 2)
+    setting = linear_loop(T, K, tau, gains, dead_time=theta, feedforward=kf, feedforward_delay=theta / 2)
     setting = setting.pick(setting.full(nyquist(setting)))
     above = sweep(setting)[1]
     assert 0.1 < above.double().mean() < 0.99

@@ -26,7 +26,7 @@ _LEAST_DECAY = 0.02  # [1/s] a loop that decays more slowly does not forget its 
 
 
 @dataclass(frozen=True)
-class LoopMeasure:
+class ClosedLoopMetric:
     """Closed-loop error of `quantity` ("speed" [m/s] or "spacing" [m]), computed from errors of a `channel`.
 
     `T_L` [s], `K_L`: of the car in the loop. Controller: constant time gap `time_gap` [s], `gains` (k_s, k_v, k_a).
@@ -81,8 +81,8 @@ class LoopMeasure:
         return np.asarray(lfilter(above, below, off - off[..., :1], axis=-1))
 
 
-def loop_measures(channels: Sequence[str], T_L: float, K_L: float) -> tuple[LoopMeasure, ...]:
+def closed_loop_metrics(channels: Sequence[str], T_L: float, K_L: float) -> tuple[ClosedLoopMetric, ...]:
     """Speed and spacing behind a leader, from the better motion channel; empty where the loop is not stable."""
     channel = "speed" if "speed" in channels else "accel"
-    made = tuple(LoopMeasure(channel, quantity, T_L, K_L) for quantity in ("speed", "spacing"))
+    made = tuple(ClosedLoopMetric(channel, quantity, T_L, K_L) for quantity in ("speed", "spacing"))
     return tuple(m for m in made if m.stable)

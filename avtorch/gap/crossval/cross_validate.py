@@ -13,12 +13,12 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.crossval.black_box import BlackBoxRegression
-from avtorch.gap.crossval.closed_loop_errors import LoopMeasure, loop_measures
+from avtorch.gap.crossval.closed_loop_errors import ClosedLoopMetric, closed_loop_metrics
 from avtorch.gap.crossval.folds import Fold, folds, whole_drive_folds
 from avtorch.gap.crossval.noise_floor import NoiseFloor
 from avtorch.gap.crossval.random_effect_density import random_effect_density
 from avtorch.gap.crossval.refit import Refit
-from avtorch.gap.crossval.rollout_errors import Measure, measures
+from avtorch.gap.crossval.rollout_errors import RolloutMetric, rollout_metrics
 from avtorch.gap.crossval.scores import FoldScorer, FoldScores, parameter_spread
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.observability import is_observable
@@ -48,7 +48,7 @@ class CrossValidation:
     """
 
     record: Record
-    measures: Sequence[Measure | LoopMeasure]
+    metrics: Sequence[RolloutMetric | ClosedLoopMetric]
     sums: Mapping[str, FoldScores]
     floor: NoiseFloor
     rows: FloatArray
@@ -79,7 +79,7 @@ def cross_validate(
     contenders = _contenders(race, verdict, price)
     sham = _sham(verdict, {*alike, *verdict.name.split("+")}, record.channels) if blamed else None
     bare = race.none.values
-    kinds = (*measures(record.channels), *loop_measures(record.channels, bare["T_L"], bare["K_L"]))
+    kinds = (*rollout_metrics(record.channels), *closed_loop_metrics(record.channels, bare["T_L"], bare["K_L"]))
     whole = Refit.whole(verdict)
     all_in = {f.name: random_effect_density(f, race.raw, record) for f in contenders}
     # random effects are penalised alike in every fold: by their row gains less their evidence, over all rows
@@ -113,7 +113,7 @@ def cross_validate(
         rows.append(judge.rows)
     return CrossValidation(
         record=record,
-        measures=kinds,
+        metrics=kinds,
         sums={name: FoldScores.joined(each) for name, each in told.items()},
         floor=NoiseFloor.joined(floors),
         rows=np.concatenate(rows),

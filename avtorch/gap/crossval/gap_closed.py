@@ -30,7 +30,7 @@ _TELLS_NATS = 5.0  # the same threshold for densities [nats], over all blocks
 
 
 @dataclass(frozen=True)
-class Closed:
+class MetricShrinkage:
     """Errors by one measure: `before` the effect is added, `after`, and the `floor` that no model can go below.
 
     `closed`: (before - after) / (before - floor), None where there is almost nothing to close. Rollout errors are root
@@ -62,7 +62,7 @@ class Shrinkage:
     """
 
     metric: str
-    by_metric: Mapping[str, Closed]
+    by_metric: Mapping[str, MetricShrinkage]
     placebo_effect: str | None
     placebo: Quantity | None
     ceiling: Mapping[str, float]
@@ -71,7 +71,7 @@ class Shrinkage:
     by_drives: bool = False
 
     @property
-    def top(self) -> Closed:
+    def top(self) -> MetricShrinkage:
         return self.by_metric[self.metric]
 
     def to_dict(self) -> dict[str, Any]:
@@ -92,21 +92,21 @@ class Shrinkage:
 
 def gap_closed(held: CrossValidation) -> Shrinkage:
     """The shrinkage of the gap from cross-validation scores of a verdict."""
-    sums, kinds, blocks = held.sums, held.measures, len(held.rows)
+    sums, kinds, blocks = held.sums, held.metrics, len(held.rows)
     rng = np.random.default_rng(0)
     again = rng.multinomial(blocks, np.full(blocks, 1 / blocks), size=_DRAWS).astype(float)
     z = rng.standard_normal((_DRAWS, held.floor.axes))
-    told: dict[str, _Told] = {}
-    for k, measure in enumerate(kinds):
+    told: dict[str, _MetricSums] = {}
+    for k, kind in enumerate(kinds):
         square = {name: s.squares[k] for name, s in sums.items()}
         form = held.floor.squares[k]
         floors = _floors(square, expected(form), drawn(form, z), rng, better=-1)
-        told[measure.name] = _Told(square, floors, held.rows, again, better=-1)
+        told[kind.name] = _MetricSums(square, floors, held.rows, again, better=-1)
     nats = {name: s.nats for name, s in sums.items()}
     form = held.floor.nats
     best = nats["fitted"] + form[:, 0, 0]
     floors = _floors(nats, best - expected(form), best - drawn(form, z), rng, better=1)
-    told[DENSITY] = _Told(nats, floors, held.rows, again, better=1)
+    told[DENSITY] = _MetricSums(nats, floors, held.rows, again, better=1)
 
     spans = {m.name: reached(m, held.record) for m in kinds}
     by_metric = {name: replace(one.closed, horizon_s=spans.get(name)) for name, one in told.items()}
@@ -147,7 +147,7 @@ def _floors(
 
 
 @dataclass(frozen=True, eq=False)
-class _Told:
+class _MetricSums:
     """Scores by one measure: sums by name (block,), `floors` (1 + draw, block), rows (block,), and bootstrap counts
     `again` (draw, block). `better` -1: sums are of squares, reported as root mean squares."""
 
@@ -162,10 +162,10 @@ class _Told:
         return float(self._mean(self.sums[name], np.ones(len(self.rows))))
 
     @property
-    def closed(self) -> Closed:
+    def closed(self) -> MetricShrinkage:
         before, after = self.all_in("before"), self.all_in("after")
         floor = float(self._mean(self.floors[0], np.ones(len(self.rows))))
-        return Closed(before, after, floor, self._share("before", "after") if self._tells else None)
+        return MetricShrinkage(before, after, floor, self._share("before", "after") if self._tells else None)
 
     @property
     def placebo(self) -> Quantity | None:

@@ -10,7 +10,7 @@ from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search import command_errors
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.full_rate import full_rate_errors, full_rate_filter
-from avtorch.gap.search.lost_messages import rows_gained
+from avtorch.gap.search.lost_messages import lost_message_gains
 from avtorch.gap.search.outliers import heavy_tails
 from avtorch.gap.search.random_effects import variance_of
 
@@ -35,13 +35,13 @@ def random_effect_density(found: FittedModel, raw: Record, fits: Record) -> Floa
         began = found.tails.onset
     if found.losses is not None:
         values, command = found.values, raw.command[raw.source]
-        gained += rows_gained(full_rate_filter(raw, found), errors, command, values["T_L"], values["K_L"], seen)
+        gained += lost_message_gains(full_rate_filter(raw, found), errors, command, values["T_L"], values["K_L"], seen)
         began = found.losses.onset
     if own is not None and own.process_sd is not None:
         plain = full_rate_filter(raw, found)
         white = WhiteningFilter(raw, plain.noise.replaced(process_sd=own.process_sd))
         variance = variance_of(own.law, own.z, found, raw)
-        gained += command_errors.rows_gained(white, errors, variance, found.values["T_L"], found.values["K_L"])
+        gained += command_errors.command_error_gains(white, errors, variance, found.values["T_L"], found.values["K_L"])
         gained += white.row_likelihoods(errors) - plain.row_likelihoods(errors)
     if began is not None:
         gained[:began] = 0.0

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.crossval.closed_loop_errors import LoopMeasure
+from avtorch.gap.crossval.closed_loop_errors import ClosedLoopMetric
 from avtorch.gap.likelihood.record import Record
 
 HORIZON_S = 10.0
@@ -30,7 +30,7 @@ HORIZONS_S = (0.5, 2.0, HORIZON_S)
 
 
 @dataclass(frozen=True)
-class Measure:
+class RolloutMetric:
     """A measure of rollout error: of a `channel`, over rollouts of `horizon_s` [s]; None: the whole drive's."""
 
     channel: str
@@ -79,40 +79,40 @@ def _window(x: FloatArray, length: int, keeps: float) -> FloatArray:
 
 
 def products(
-    measure: Measure | LoopMeasure, record: Record, errors: FloatArray, blocks: Sequence[slice], lag: float
+    metric: RolloutMetric | ClosedLoopMetric, record: Record, errors: FloatArray, blocks: Sequence[slice], lag: float
 ) -> FloatArray:
     """(block, one, other): sums of products of `errors` (one, channel, counted, group) of long rollouts, by a measure.
 
     `blocks` of counted rows, each within a stretch; `lag` [s]. Rollouts start at every measured row of a stretch,
     inside a held-out block or not.
     """
-    long = errors[:, record.channels.index(measure.channel)]
+    long = errors[:, record.channels.index(metric.channel)]
     group, out = record.group, np.zeros((len(blocks), len(errors), len(errors)))
     for begin, end in pairwise([*record.starts.tolist(), record.rows]):
         own = [j for j, b in enumerate(blocks) if begin <= b.start < end]
         if own:
             rows = long[:, begin:end].reshape(len(errors), -1)
             within = [slice((blocks[j].start - begin) * group, (blocks[j].stop - begin) * group) for j in own]
-            out[own] = measure.products(rows, within, record.dt / group, lag)
+            out[own] = metric.products(rows, within, record.dt / group, lag)
     return out
 
 
-def rms(measure: Measure, record: Record, errors: FloatArray, lag: float) -> float:
+def rms(metric: RolloutMetric, record: Record, errors: FloatArray, lag: float) -> float:
     """Root mean square of a long rollout's `errors` (channel, counted, group) by a measure, over all counted rows;
     `lag` [s]."""
     edges = [*record.starts.tolist(), record.rows]
-    total = products(measure, record, errors[None], [slice(a, b) for a, b in pairwise(edges)], lag).sum()
+    total = products(metric, record, errors[None], [slice(a, b) for a, b in pairwise(edges)], lag).sum()
     return float(np.sqrt(total / (record.rows * record.group)))
 
 
-def reached(measure: Measure | LoopMeasure, record: Record) -> float | None:
+def reached(metric: RolloutMetric | ClosedLoopMetric, record: Record) -> float | None:
     """Longest rollouts [s] of a measure that the stretches hold; None: as long as the stretches."""
-    if measure.horizon_s is None or not np.isfinite(measure.horizon_s):
+    if metric.horizon_s is None or not np.isfinite(metric.horizon_s):
         return None
     longest = int(np.diff([*record.starts.tolist(), record.rows]).max()) * record.dt
-    return min(measure.horizon_s, longest)
+    return min(metric.horizon_s, longest)
 
 
-def measures(channels: Iterable[str]) -> tuple[Measure, ...]:
+def rollout_metrics(channels: Iterable[str]) -> tuple[RolloutMetric, ...]:
     """All measures of these channels: over each horizon, and over whole drives."""
-    return tuple(Measure(w, h) for w in channels for h in (*HORIZONS_S, None))
+    return tuple(RolloutMetric(w, h) for w in channels for h in (*HORIZONS_S, None))

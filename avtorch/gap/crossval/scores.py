@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.arrays import BoolArray, FloatArray
-from avtorch.gap.crossval.closed_loop_errors import LoopMeasure
+from avtorch.gap.crossval.closed_loop_errors import ClosedLoopMetric
 from avtorch.gap.crossval.folds import Fold
 from avtorch.gap.crossval.noise_floor import NoiseFloor
 from avtorch.gap.crossval.refit import Refit
-from avtorch.gap.crossval.rollout_errors import Measure, products
+from avtorch.gap.crossval.rollout_errors import RolloutMetric, products
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.posterior.density import root
@@ -38,12 +38,12 @@ class FoldScorer:
 
     record: Record
     part: Fold
-    measures: Sequence[Measure | LoopMeasure]
+    metrics: Sequence[RolloutMetric | ClosedLoopMetric]
     lag: float
 
     def products(self, errors: FloatArray) -> FloatArray:
         """(measure, block, one, other) of errors (one, channel, counted, group)."""
-        return np.stack([products(m, self.record, errors, self.part.blocks, self.lag) for m in self.measures])
+        return np.stack([products(m, self.record, errors, self.part.blocks, self.lag) for m in self.metrics])
 
     def judged(self, refit: Refit, *, less: FloatArray | None = None, chance: FloatArray | None = None) -> FoldScores:
         """Scores of a refit; `less`: prediction (channel, counted, 1) to subtract from its errors, `chance` (counted,)

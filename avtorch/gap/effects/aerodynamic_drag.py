@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -21,9 +21,9 @@ class AerodynamicDrag(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import AerodynamicDrag, Drive, plant
+        >>> from avtorch.gap import AerodynamicDrag, SimulatorInput, plant
         >>> time = torch.arange(200, dtype=torch.float64) * 0.05
-        >>> coasting = Drive(time, 0 * time, speed=torch.full_like(time, 30.0))
+        >>> coasting = SimulatorInput(time, 0 * time, speed=torch.full_like(time, 30.0))
         >>> accel = plant([AerodynamicDrag(4e-4)]).response(coasting).accel
         >>> round(accel[-1].item(), 2)  # 4e-4 times 30²
         -0.36
@@ -47,6 +47,6 @@ class AerodynamicDrag(Effect):
         Parameter("wind_mps", "m/s", None, -4.0, 4.0, "real", reported=False),
     )
 
-    def apply(self, x: Tensor, row: Row) -> Tensor:
+    def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         air = row.speed + tensor(self.wind_mps)
         return -tensor(self.drag_per_m) * air * air.abs()

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -26,9 +26,9 @@ class Backlash(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Backlash, Drive, plant
+        >>> from avtorch.gap import Backlash, SimulatorInput, plant
         >>> time = torch.arange(600, dtype=torch.float64) * 0.02
-        >>> accel = plant([Backlash(0.3)]).response(Drive(time, torch.sin(time))).accel
+        >>> accel = plant([Backlash(0.3)]).response(SimulatorInput(time, torch.sin(time))).accel
         >>> round(accel.max().item(), 1)  # the play of 0.3 m/s² is missing at the top
         0.7
     """
@@ -49,15 +49,15 @@ class Backlash(Effect):
         ),
     )
 
-    def start(self, x: Tensor, row: Row) -> Tensor:
+    def start(self, x: Tensor, row: EffectContext) -> Tensor:
         return x
 
-    def advance(self, x: Tensor, row: Row, state: Tensor) -> tuple[Tensor, Tensor]:
+    def advance(self, x: Tensor, row: EffectContext, state: Tensor) -> tuple[Tensor, Tensor]:
         width = tensor(self.half_width_mps2)
         y = torch.maximum(x - width, torch.minimum(x + width, state))
         return y, y
 
-    def over(self, x: Tensor, row: Row) -> Tensor:
+    def over(self, x: Tensor, row: EffectContext) -> Tensor:
         width = tensor(self.half_width_mps2)
         low, high = x - width, x + width
         with torch.no_grad():

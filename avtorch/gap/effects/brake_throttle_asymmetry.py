@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -22,11 +22,11 @@ class BrakeThrottleAsymmetry(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import BrakeThrottleAsymmetry, Drive, plant
+        >>> from avtorch.gap import BrakeThrottleAsymmetry, SimulatorInput, plant
         >>> time = torch.arange(500, dtype=torch.float64) * 0.02
         >>> command = torch.stack([torch.ones(500), -torch.ones(500)]).double()
         >>> car = plant([BrakeThrottleAsymmetry(brake_gain_ratio=0.7)])
-        >>> [round(a, 1) for a in car.response(Drive(time, command)).accel[:, -1].tolist()]
+        >>> [round(a, 1) for a in car.response(SimulatorInput(time, command)).accel[:, -1].tolist()]
         [1.0, -0.7]
     """
 
@@ -48,7 +48,7 @@ class BrakeThrottleAsymmetry(Effect):
         ),
     )
 
-    def apply(self, x: Tensor, row: Row) -> tuple[Tensor, Tensor]:
+    def apply(self, x: Tensor, row: EffectContext) -> tuple[Tensor, Tensor]:
         braking = x < 0
         return (
             torch.where(braking, tensor(self.brake_gain_ratio), 1.0),

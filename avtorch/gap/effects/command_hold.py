@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.effect import Effect, NoiseChange, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 _ROWS_BACK = 12  # older commands have a weight of 0.5^12 at most, at a loss fraction of 0.5
@@ -51,16 +51,16 @@ class CommandHold(Effect):
         ),
     )
 
-    def start(self, x: Tensor, row: Row) -> Tensor:
+    def start(self, x: Tensor, row: EffectContext) -> Tensor:
         return x
 
-    def advance(self, x: Tensor, row: Row, state: Tensor) -> tuple[Tensor, Tensor]:
+    def advance(self, x: Tensor, row: EffectContext, state: Tensor) -> tuple[Tensor, Tensor]:
         if row.normal is None:
             return x, x
         y = torch.where(self._lost(row.normal), state, x)
         return y, y
 
-    def over(self, x: Tensor, row: Row) -> Tensor:
+    def over(self, x: Tensor, row: EffectContext) -> Tensor:
         if row.normal is None:
             return x
         arrived = ~self._lost(row.normal)

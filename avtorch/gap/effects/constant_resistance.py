@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -23,9 +23,9 @@ class ConstantResistance(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import ConstantResistance, Drive, plant
+        >>> from avtorch.gap import ConstantResistance, SimulatorInput, plant
         >>> time = torch.arange(100, dtype=torch.float64) * 0.05
-        >>> rolling = Drive(time, 0 * time, speed=torch.full_like(time, 10.0))
+        >>> rolling = SimulatorInput(time, 0 * time, speed=torch.full_like(time, 10.0))
         >>> plant([ConstantResistance(0.12)]).response(rolling).accel[-1].item()
         -0.12
     """
@@ -53,7 +53,7 @@ class ConstantResistance(Effect):
         ),
     )
 
-    def apply(self, x: Tensor, row: Row) -> Tensor:
+    def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         force = -tensor(self.resistance_mps2)
         if row.measured_speed is None:
             return force * torch.ones_like(x)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -21,10 +21,10 @@ class DeadBand(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import DeadBand, Drive, plant
+        >>> from avtorch.gap import DeadBand, SimulatorInput, plant
         >>> time = torch.arange(200, dtype=torch.float64) * 0.05
         >>> command = torch.tensor([[0.05], [0.5]], dtype=torch.float64).expand(2, 200)  # a faint and a firm command
-        >>> accel = plant([DeadBand(0.08)]).response(Drive(time, command)).accel
+        >>> accel = plant([DeadBand(0.08)]).response(SimulatorInput(time, command)).accel
         >>> accel[:, -1].round(decimals=2).tolist()
         [0.0, 0.42]
     """
@@ -42,6 +42,6 @@ class DeadBand(Effect):
         Parameter("half_width_mps2", "m/s²", 0.0, 0.02, 0.3, possible=(0.0, 1.0), beyond="no pedal ignores that much"),
     )
 
-    def apply(self, x: Tensor, row: Row) -> Tensor:
+    def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         width = tensor(self.half_width_mps2)
         return (x - width).clamp_min(0.0) + (x + width).clamp_max(0.0)

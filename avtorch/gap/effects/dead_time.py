@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -27,10 +27,10 @@ class DeadTime(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import DeadTime, Drive, plant
+        >>> from avtorch.gap import DeadTime, SimulatorInput, plant
         >>> time = torch.arange(100, dtype=torch.float64) * 0.05
         >>> step = (time >= 1.0).double()
-        >>> accel = plant([DeadTime(0.4)]).response(Drive(time, step)).accel
+        >>> accel = plant([DeadTime(0.4)]).response(SimulatorInput(time, step)).accel
         >>> round(time[accel > 1e-9][0].item(), 2)  # the first row after 1.4 s
         1.45
     """
@@ -48,10 +48,12 @@ class DeadTime(Effect):
     starts = fixed(delay_s=(0.03, 0.07, 0.13, 0.22, 0.35, 0.55))
     parameters = (Parameter("delay_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.5), beyond="no command is that late"),)
 
-    def start(self, x: Tensor, row: Row) -> list[Tensor]:
+    def start(self, x: Tensor, row: EffectContext) -> list[Tensor]:
         return [x]
 
-    def advance(self, x: Tensor, row: Row, state: list[Tensor]) -> tuple[tuple[Tensor, Tensor, Tensor], list[Tensor]]:
+    def advance(
+        self, x: Tensor, row: EffectContext, state: list[Tensor]
+    ) -> tuple[tuple[Tensor, Tensor, Tensor], list[Tensor]]:
         delay = tensor(self.delay_s)
         whole, share = self._split(delay, row.dt)
         reach = int(whole.max()) + 2  # this row's command and those still in transit
@@ -66,7 +68,7 @@ class DeadTime(Effect):
             late, early = stacked.gather(0, index)[0], stacked.gather(0, index - 1)[0]
         return (early, late, share * row.dt), kept
 
-    def over(self, x: Tensor, row: Row) -> tuple[Tensor, Tensor, Tensor]:
+    def over(self, x: Tensor, row: EffectContext) -> tuple[Tensor, Tensor, Tensor]:
         delay = tensor(self.delay_s)
         if row.dt.dim() and bool(row.dt.min() != row.dt.max()):
             return self._over_jitter(x, row, delay)
@@ -82,7 +84,7 @@ class DeadTime(Effect):
         whole = (steps + 1e-9).floor()  # 0.2 s is 20 steps of 0.01 s despite round-off in the division
         return whole.detach().long(), (steps - whole.detach()).clamp_min(0.0)
 
-    def _over_jitter(self, x: Tensor, row: Row, delay: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _over_jitter(self, x: Tensor, row: EffectContext, delay: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Uneven steps: up to three commands act in one step; the last two are averaged."""
         time, dt = row.time, row.dt
         ends = torch.cat([time[1:], (time[-1] + dt[-1]).reshape(1)])

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from avtorch.gap.simulator.actuator import modes_over
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.recursion import scan_pair
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -33,9 +33,9 @@ class DrivelineOscillation(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, DrivelineOscillation, plant
+        >>> from avtorch.gap import SimulatorInput, DrivelineOscillation, plant
         >>> time = torch.arange(400, dtype=torch.float64) * 0.01
-        >>> step = Drive(time, (time >= 1.0).double())
+        >>> step = SimulatorInput(time, (time >= 1.0).double())
         >>> accel = plant([DrivelineOscillation(frequency_hz=2.2, amplitude=0.3)], T_L=0.1).response(step).accel
         >>> round(accel.max().item(), 1)  # the step of 1 m/s² rings
         1.1
@@ -69,11 +69,11 @@ class DrivelineOscillation(Effect):
         amplitude = torch.hypot(tensor(self.amplitude), tensor(self.quadrature))
         return {"frequency_hz": tensor(self.frequency_hz), "amplitude": amplitude}
 
-    def start(self, x: Tensor, row: Row) -> Any:
+    def start(self, x: Tensor, row: EffectContext) -> Any:
         zero = torch.zeros_like(x)
         return x, zero, zero, None
 
-    def advance(self, x: Tensor, row: Row, state: Any) -> tuple[Tensor, Any]:
+    def advance(self, x: Tensor, row: EffectContext, state: Any) -> tuple[Tensor, Any]:
         before, y, rate, dt = state
         if dt is not None:  # from the previous row to this one
             (m00, m01, m10, m11), (b0, b1) = self._step(dt)
@@ -81,7 +81,7 @@ class DrivelineOscillation(Effect):
             y, rate = m00 * y + m01 * rate + b0 * jerk, m10 * y + m11 * rate + b1 * jerk
         return self._seen(y, rate), (x, y, rate, row.dt)
 
-    def over(self, x: Tensor, row: Row) -> Tensor:
+    def over(self, x: Tensor, row: EffectContext) -> Tensor:
         dt = row.dt[..., :-1] if bool(row.dt.dim() and row.dt.min() != row.dt.max()) else row.dt.reshape(-1)[:1]
         matrix, (b0, b1) = self._step(dt)
         jerk = x.diff(dim=-1) / dt

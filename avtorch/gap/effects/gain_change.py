@@ -13,8 +13,8 @@ from torch import Tensor
 
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 _CHANGES = 12  # initial values of the change time over a drive
@@ -33,10 +33,10 @@ class GainChange(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, GainChange, plant
+        >>> from avtorch.gap import SimulatorInput, GainChange, plant
         >>> time = torch.arange(800, dtype=torch.float64) * 0.05
         >>> heavier = plant([GainChange(gain_ratio=0.75, change_s=20.0)])
-        >>> accel = heavier.response(Drive(time, torch.ones_like(time))).accel
+        >>> accel = heavier.response(SimulatorInput(time, torch.ones_like(time))).accel
         >>> accel[[399, 799]].round(decimals=2).tolist()
         [1.0, 0.75]
     """
@@ -66,7 +66,7 @@ class GainChange(Effect):
         Domain("latest_s", -1e12, 1e12, "s"),
     )
 
-    def apply(self, x: Tensor, row: Row) -> tuple[Tensor, float]:
+    def apply(self, x: Tensor, row: EffectContext) -> tuple[Tensor, float]:
         ramp = tensor(self.ramp_s).clamp_min(1e-6)
         since = row.time - tensor(self.change_s)
         share = (_area(since + row.dt, ramp) - _area(since, ramp)) / row.dt
@@ -83,7 +83,7 @@ class GainChange(Effect):
         moments = torch.linspace(first, last, _MOMENTS + 2)[1:-1].tolist()
         return {**cls.starts, "change_s": tuple(moments)}
 
-    def settled(self) -> Mapping[str, float]:
+    def values_after_onset(self) -> Mapping[str, float]:
         return {"change_s": -1e3, "ramp_s": 0.0}
 
     def coordinates(self) -> tuple[Parameter, ...]:

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 _REARMED = 1.5  # [m/s] below a shift speed at which the gear counts as changed back, without interruption
@@ -32,9 +32,9 @@ class GearShift(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, GearShift, plant
+        >>> from avtorch.gap import SimulatorInput, GearShift, plant
         >>> time = torch.arange(200, dtype=torch.float64) * 0.05
-        >>> pulling = Drive(time, torch.ones_like(time), speed=4.0 + time)  # shifts at 4.5, 6.75, 10.1 m/s
+        >>> pulling = SimulatorInput(time, torch.ones_like(time), speed=4.0 + time)  # shifts at 4.5, 6.75, 10.1 m/s
         >>> accel = plant([GearShift(depth=0.7)], T_L=0.1).response(pulling).accel
         >>> accel.max().item() - accel.min().item() > 0.5
         True
@@ -67,13 +67,13 @@ class GearShift(Effect):
     )
     settings = (Domain("speeds", 0.1, 150.0, "m/s", most=16, rising=True),)
 
-    def start(self, x: Tensor, row: Row) -> list[tuple[Tensor, Tensor, Tensor]]:
+    def start(self, x: Tensor, row: EffectContext) -> list[tuple[Tensor, Tensor, Tensor]]:
         """State of each shift: speed one row ago, whether above, start of the last interruption."""
         v = row.speed
         return [(v, v > s, torch.full_like(v, _NEVER)) for s in self._thresholds()]
 
     def advance(
-        self, x: Tensor, row: Row, state: list[tuple[Tensor, Tensor, Tensor]]
+        self, x: Tensor, row: EffectContext, state: list[tuple[Tensor, Tensor, Tensor]]
     ) -> tuple[tuple[Tensor, float], list[tuple[Tensor, Tensor, Tensor]]]:
         v, lost, after = row.speed, torch.zeros(()), []
         for s, (v_before, above, since) in zip(self._thresholds(), state, strict=True):
@@ -84,7 +84,7 @@ class GearShift(Effect):
             after.append((v, above, since))
         return (self._factor(lost, x), 1.0), after
 
-    def over(self, x: Tensor, row: Row) -> tuple[Tensor, float]:
+    def over(self, x: Tensor, row: EffectContext) -> tuple[Tensor, float]:
         v, lost = row.speed, torch.zeros(())
         before = torch.cat([v[..., :1], v[..., :-1]], -1)
         rows = torch.arange(v.shape[-1])
@@ -107,13 +107,13 @@ class GearShift(Effect):
             return [tensor(s) for s in self.speeds]
         return [tensor(self.first_mps) * tensor(self.gear_ratio) ** i for i in range(_SHIFTS)]
 
-    def _crossing(self, before: Tensor, v: Tensor, s: Tensor, row: Row) -> Tensor:
+    def _crossing(self, before: Tensor, v: Tensor, s: Tensor, row: EffectContext) -> Tensor:
         """Start of the interruption: one row after the crossing, so that it is known when a step begins."""
         gained = v - before
         share = ((v - s) / torch.where(gained > 0, gained, 1.0)).clamp(0.0, 1.0)
         return row.time + (1 - share) * row.dt
 
-    def _covered(self, since: Tensor, row: Row) -> Tensor:
+    def _covered(self, since: Tensor, row: EffectContext) -> Tensor:
         begin = torch.maximum(row.time, since)
         end = torch.minimum(row.time + row.dt, since + tensor(self.duration_s))
         return ((end - begin) / row.dt).clamp_min(0.0)

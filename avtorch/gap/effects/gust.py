@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.effect import Effect, NoiseChange, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.recursion import scan
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -27,9 +27,9 @@ class Gust(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, Gust, plant
+        >>> from avtorch.gap import SimulatorInput, Gust, plant
         >>> time = torch.arange(2000, dtype=torch.float64) * 0.05
-        >>> windy, drive = plant([Gust(sd_mps2=0.2)]), Drive(time, 0 * time, speed=torch.full_like(time, 20.0))
+        >>> windy, drive = plant([Gust(sd_mps2=0.2)]), SimulatorInput(time, 0 * time, speed=torch.full_like(time, 20.0))
         >>> accel = windy.response(drive, generator=torch.Generator().manual_seed(0)).accel
         >>> windy.response(drive).accel.std().item(), round(accel.std().item(), 1)  # the mean response, and one drawn
         (0.0, 0.2)
@@ -54,10 +54,10 @@ class Gust(Effect):
         ),
     )
 
-    def start(self, x: Tensor, row: Row) -> Any:
+    def start(self, x: Tensor, row: EffectContext) -> Any:
         return None
 
-    def advance(self, x: Tensor, row: Row, state: Any) -> tuple[Tensor, Any]:
+    def advance(self, x: Tensor, row: EffectContext, state: Any) -> tuple[Tensor, Any]:
         if row.normal is None:
             return torch.zeros_like(x), None
         sd = tensor(self.sd_mps2)
@@ -69,7 +69,7 @@ class Gust(Effect):
             force = keep * before + sd * torch.sqrt(1 - keep.square()) * row.normal
         return force, (force, row.dt)
 
-    def over(self, x: Tensor, row: Row) -> Tensor:
+    def over(self, x: Tensor, row: EffectContext) -> Tensor:
         if row.normal is None:
             return torch.zeros_like(x)
         sd, dt = tensor(self.sd_mps2), row.dt.expand(row.time.shape)[..., :-1]

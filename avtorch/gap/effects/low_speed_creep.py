@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 _FADES_AT = 3.0  # [m/s]
@@ -25,10 +25,10 @@ class LowSpeedCreep(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, LowSpeedCreep, plant
+        >>> from avtorch.gap import SimulatorInput, LowSpeedCreep, plant
         >>> time = torch.arange(100, dtype=torch.float64) * 0.05
         >>> speed = torch.tensor([[0.5], [20.0]], dtype=torch.float64).expand(2, 100)
-        >>> accel = plant([LowSpeedCreep(0.22)]).response(Drive(time, 0 * speed, speed=speed)).accel
+        >>> accel = plant([LowSpeedCreep(0.22)]).response(SimulatorInput(time, 0 * speed, speed=speed)).accel
         >>> accel[:, -1].round(decimals=1).tolist()
         [0.2, 0.0]
     """
@@ -47,5 +47,5 @@ class LowSpeedCreep(Effect):
         Parameter("creep_mps2", "m/s²", 0.0, 0.1, 0.5, possible=(0.0, 1.5), beyond="no car creeps that strongly"),
     )
 
-    def apply(self, x: Tensor, row: Row) -> Tensor:
+    def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         return tensor(self.creep_mps2) * torch.sigmoid((_FADES_AT - row.speed) / _FADES_OVER)

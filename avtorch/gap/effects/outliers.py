@@ -10,8 +10,8 @@ from torch import Tensor
 
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.effect import Effect, NoiseChange, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -28,10 +28,11 @@ class Outliers(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, Outliers, plant
+        >>> from avtorch.gap import SimulatorInput, Outliers, plant
         >>> time = torch.arange(2000, dtype=torch.float64) * 0.05
         >>> car = plant([Outliers(fraction=0.02, noise_sd=0.05)])
-        >>> seen = car.response(Drive(time, 0 * time), generator=torch.Generator().manual_seed(0)).accel_measured
+        >>> parked = SimulatorInput(time, 0 * time)
+        >>> seen = car.response(parked, generator=torch.Generator().manual_seed(0)).accel_measured
         >>> round((seen.abs() > 0.05).double().mean().item(), 2)
         0.02
     """
@@ -57,7 +58,7 @@ class Outliers(Effect):
     )
     settings = (Domain("noise_sd", 0.0, 100.0, "m/s²"),)
 
-    def apply(self, x: Tensor, row: Row) -> Tensor:
+    def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         if row.normal is None:
             return x
         # one draw serves both: within the tail fraction it is uniform again

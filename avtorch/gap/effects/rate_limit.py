@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -24,9 +24,9 @@ class RateLimit(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, RateLimit, plant
+        >>> from avtorch.gap import SimulatorInput, RateLimit, plant
         >>> time = torch.arange(200, dtype=torch.float64) * 0.02
-        >>> step = Drive(time, 2 * (time >= 0.5).double())
+        >>> step = SimulatorInput(time, 2 * (time >= 0.5).double())
         >>> accel = plant([RateLimit(jerk_max_mps3=1.4)]).response(step).accel
         >>> round((accel.diff() / 0.02).max().item(), 2)  # m/s³
         1.4
@@ -53,7 +53,7 @@ class RateLimit(Effect):
         ),
     )
 
-    def apply(self, x: Tensor, row: Row) -> tuple[float, float]:
+    def apply(self, x: Tensor, row: EffectContext) -> tuple[float, float]:
         return 1.0, 1.0  # the limit is applied in the actuator, see `actuator.py`
 
     def actuator_parameters(self) -> Mapping[str, Tensor]:

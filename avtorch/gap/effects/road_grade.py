@@ -13,9 +13,9 @@ from torch import Tensor
 
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.effect import register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 GRAVITY = 9.80665
@@ -37,9 +37,9 @@ class RoadGrade(Integrated):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, RoadGrade, plant
+        >>> from avtorch.gap import SimulatorInput, RoadGrade, plant
         >>> time = torch.arange(1000, dtype=torch.float64) * 0.1
-        >>> drive = Drive(time, 0 * time, speed=torch.full_like(time, 20.0))  # 2 km of road
+        >>> drive = SimulatorInput(time, 0 * time, speed=torch.full_like(time, 20.0))  # 2 km of road
         >>> hilly = plant([RoadGrade(grade_rms=0.03)]).prepared(drive)
         >>> accel = hilly.response(drive, generator=torch.Generator().manual_seed(0)).accel
         >>> bool(accel.abs().max() > 0.2)  # a slope of 3 % pulls with 0.3 m/s²
@@ -66,7 +66,7 @@ class RoadGrade(Integrated):
         Domain("knot_m", 10.0, 10_000.0, "m"),
     )
 
-    def apply(self, x: Tensor, row: Row) -> Tensor:
+    def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         position = row.position
         if self.profile is None:
             return torch.zeros_like(position)

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -22,9 +22,9 @@ class Saturation(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, Saturation, plant
+        >>> from avtorch.gap import SimulatorInput, Saturation, plant
         >>> time = torch.arange(800, dtype=torch.float64) * 0.02
-        >>> accel = plant([Saturation(accel_max_mps2=1.25)]).response(Drive(time, 2 * torch.sin(time))).accel
+        >>> accel = plant([Saturation(accel_max_mps2=1.25)]).response(SimulatorInput(time, 2 * torch.sin(time))).accel
         >>> round(accel.max().item(), 2), round(accel.min().item(), 1)
         (1.25, -1.9)
     """
@@ -60,7 +60,7 @@ class Saturation(Effect):
         ),
     )
 
-    def apply(self, x: Tensor, row: Row) -> Tensor:
+    def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         # clipped before the gain, with limits divided by it, so that a command within them is unchanged to the last bit
         gain = row.K_L.clamp_min(1e-9)
         high, low = tensor(self.accel_max_mps2) / gain, tensor(self.accel_min_mps2) / gain

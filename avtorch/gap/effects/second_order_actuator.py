@@ -12,8 +12,8 @@ from torch import Tensor
 from avtorch.errors import InputError
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 _DAMPED = 0.85  # damping ratio limit: a fit has an error of about 0.1
@@ -34,10 +34,10 @@ class SecondOrderActuator(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, SecondOrderActuator, plant
+        >>> from avtorch.gap import SimulatorInput, SecondOrderActuator, plant
         >>> time = torch.arange(400, dtype=torch.float64) * 0.01
         >>> car = plant([SecondOrderActuator(inverse_frequency_s=0.2, damping_ratio=0.3)])
-        >>> round(car.response(Drive(time, (time >= 0.5).double())).accel.max().item(), 2)  # it overshoots
+        >>> round(car.response(SimulatorInput(time, (time >= 0.5).double())).accel.max().item(), 2)  # it overshoots
         1.37
     """
 
@@ -65,7 +65,7 @@ class SecondOrderActuator(Effect):
     )
     settings = (Domain("natural_frequency_radps", 1e-3, 1e5, "rad/s"), Domain("damping_ratio", 1e-3, 1e3))
 
-    def apply(self, x: Tensor, row: Row) -> tuple[float, Tensor]:
+    def apply(self, x: Tensor, row: EffectContext) -> tuple[float, Tensor]:
         return 1.0, tensor(self.lag_ratio)  # the second derivative is integrated in the actuator, see `actuator.py`
 
     def actuator_parameters(self) -> Mapping[str, Tensor]:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -22,9 +22,9 @@ class SensorBias(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, SensorBias, plant
+        >>> from avtorch.gap import SimulatorInput, SensorBias, plant
         >>> time = torch.arange(100, dtype=torch.float64) * 0.05
-        >>> response = plant([SensorBias(0.12)]).response(Drive(time, torch.sin(time)))
+        >>> response = plant([SensorBias(0.12)]).response(SimulatorInput(time, torch.sin(time)))
         >>> bool(torch.allclose(response.accel_measured, response.accel + 0.12))
         True
     """
@@ -53,7 +53,7 @@ class SensorBias(Effect):
         ),
     )
 
-    def apply(self, x: Tensor, row: Row) -> Tensor:
+    def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         return x + tensor(self.bias_mps2)
 
     @classmethod

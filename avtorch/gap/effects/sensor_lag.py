@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.recursion import scan
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -26,9 +26,9 @@ class SensorLag(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, SensorLag, plant
+        >>> from avtorch.gap import SimulatorInput, SensorLag, plant
         >>> time = torch.arange(500, dtype=torch.float64) * 0.02
-        >>> response = plant([SensorLag(0.16)]).response(Drive(time, torch.sin(time)))
+        >>> response = plant([SensorLag(0.16)]).response(SimulatorInput(time, torch.sin(time)))
         >>> rows = response.accel_measured[:300].argmax() - response.accel[:300].argmax()
         >>> round(0.02 * rows.item(), 2)  # s later than the car
         0.14
@@ -46,17 +46,17 @@ class SensorLag(Effect):
     starts = fixed(lag_s=(0.03, 0.1, 0.2, 0.4))
     parameters = (Parameter("lag_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.0), beyond="no accelerometer is so slow"),)
 
-    def start(self, x: Tensor, row: Row) -> Any:
+    def start(self, x: Tensor, row: EffectContext) -> Any:
         return x, x, None
 
-    def advance(self, x: Tensor, row: Row, state: Any) -> tuple[Tensor, Any]:
+    def advance(self, x: Tensor, row: EffectContext, state: Any) -> tuple[Tensor, Any]:
         shown, before, dt = state
         if dt is not None:
             keep, old, new = self._weights(dt)
             shown = keep * shown + old * before + new * x
         return shown, (shown, x, row.dt)
 
-    def over(self, x: Tensor, row: Row) -> Tensor:
+    def over(self, x: Tensor, row: EffectContext) -> Tensor:
         dt = row.dt[..., :-1] if bool(row.dt.dim() and row.dt.min() != row.dt.max()) else row.dt.reshape(-1)[:1]
         keep, old, new = self._weights(dt)
         later = scan(keep, old * x[..., :-1] + new * x[..., 1:], x[..., 0])

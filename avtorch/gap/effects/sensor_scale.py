@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 
@@ -21,9 +21,9 @@ class SensorScale(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, SensorScale, plant
+        >>> from avtorch.gap import SimulatorInput, SensorScale, plant
         >>> time = torch.arange(100, dtype=torch.float64) * 0.05
-        >>> response = plant([SensorScale(1.12)]).response(Drive(time, torch.sin(time)))
+        >>> response = plant([SensorScale(1.12)]).response(SimulatorInput(time, torch.sin(time)))
         >>> bool(torch.allclose(response.accel_measured, 1.12 * response.accel))
         True
     """
@@ -42,5 +42,5 @@ class SensorScale(Effect):
         Parameter("scale", "-", 1.0, 0.83, 1.2, possible=(0.5, 2.0), beyond="no accelerometer has that scale error"),
     )
 
-    def apply(self, x: Tensor, row: Row) -> Tensor:
+    def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         return tensor(self.scale) * x

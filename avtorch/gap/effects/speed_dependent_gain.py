@@ -9,8 +9,8 @@ from torch import Tensor
 
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 _LEAST = 0.0  # the factor's lower limit, outside a drive's range of speeds
@@ -28,11 +28,12 @@ class SpeedDependentGain(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, SpeedDependentGain, plant
+        >>> from avtorch.gap import SimulatorInput, SpeedDependentGain, plant
         >>> time = torch.arange(200, dtype=torch.float64) * 0.05
         >>> speed = torch.tensor([[5.0], [25.0]], dtype=torch.float64).expand(2, 200)
         >>> car = plant([SpeedDependentGain(0.3, mean_speed=15.0)])
-        >>> car.response(Drive(time, torch.ones_like(speed), speed=speed)).accel[:, -1].round(decimals=2).tolist()
+        >>> pulling = SimulatorInput(time, torch.ones_like(speed), speed=speed)
+        >>> car.response(pulling).accel[:, -1].round(decimals=2).tolist()
         [0.8, 1.2]
     """
 
@@ -54,7 +55,7 @@ class SpeedDependentGain(Effect):
     )
     settings = (Domain("mean_speed", 0.1, 150.0, "m/s"),)
 
-    def apply(self, x: Tensor, row: Row) -> tuple[Tensor, float]:
+    def apply(self, x: Tensor, row: EffectContext) -> tuple[Tensor, float]:
         away = row.speed / (tensor(self.mean_speed) * tensor(self.pivot)) - 1
         factor = (1 + tensor(self.gain_slope) * away).clamp_min(_LEAST)
         return factor, 1.0

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.effect import Effect, fixed, register
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 
 _LEAST = 0.05  # the factor's lower limit, outside a drive's range of speeds
@@ -28,11 +28,11 @@ class SpeedDependentLag(Effect):
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, SpeedDependentLag, plant
+        >>> from avtorch.gap import SimulatorInput, SpeedDependentLag, plant
         >>> time = torch.arange(60, dtype=torch.float64) * 0.05
         >>> speed = torch.tensor([[5.0], [25.0]], dtype=torch.float64).expand(2, 60)
         >>> car, step = plant([SpeedDependentLag(0.5)]), (time >= 0.5).double().expand(2, 60)
-        >>> slow, quick = car.response(Drive(time, step, speed=speed)).accel[:, 20].tolist()
+        >>> slow, quick = car.response(SimulatorInput(time, step, speed=speed)).accel[:, 20].tolist()
         >>> slow > quick  # 0.5 s after the step: the lag grows with the speed
         True
     """
@@ -53,7 +53,7 @@ class SpeedDependentLag(Effect):
     )
     settings = (Domain("mean_speed", 0.1, 150.0, "m/s"),)
 
-    def apply(self, x: Tensor, row: Row) -> tuple[float, Tensor]:
+    def apply(self, x: Tensor, row: EffectContext) -> tuple[float, Tensor]:
         away = row.speed / (tensor(self.mean_speed) * tensor(self.pivot)) - 1
         factor = (1 + tensor(self.lag_slope) * away).clamp_min(_LEAST)
         return 1.0, factor

@@ -19,12 +19,12 @@ import torch
 
 from avtorch.arrays import Float, FloatArray
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.simulator.drive import Drive, Response
 from avtorch.gap.simulator.effect import Effect, effect_class
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.simulator.rollout_from_onset import rollout_from_onset
+from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
 
 _WIDER = 2.0
 
@@ -182,7 +182,7 @@ class Hypothesis:
             known[kind] = self._columns(self.record.coarse, coarse=True)
         return known[kind]
 
-    def _columns(self, drives: Sequence[Drive], *, coarse: bool) -> FloatArray:
+    def _columns(self, drives: Sequence[SimulatorInput], *, coarse: bool) -> FloatArray:
         knots = sum(road.count for road in self._roads)
         forces = []
         for drive, road, own in zip(drives, *self._places, strict=True):
@@ -197,8 +197,8 @@ class Hypothesis:
         return self._seen_forces(drives, forces, coarse=False)[0]
 
     def _each_road(
-        self, drives: Sequence[Drive], coefficients: FloatArray
-    ) -> Iterator[tuple[Integrated, Drive, torch.Tensor]]:
+        self, drives: Sequence[SimulatorInput], coefficients: FloatArray
+    ) -> Iterator[tuple[Integrated, SimulatorInput, torch.Tensor]]:
         """Each drive with its road and that road's `coefficients` (..., knot)."""
         for drive, road, own in zip(drives, *self._places, strict=True):
             yield road, drive, torch.as_tensor(coefficients[..., own])
@@ -211,7 +211,9 @@ class Hypothesis:
         numbers = self.record.segment
         return [self._roads[n] for n in numbers], [own[n] for n in numbers]
 
-    def _seen_forces(self, drives: Sequence[Drive], forces: Sequence[torch.Tensor], *, coarse: bool) -> FloatArray:
+    def _seen_forces(
+        self, drives: Sequence[SimulatorInput], forces: Sequence[torch.Tensor], *, coarse: bool
+    ) -> FloatArray:
         """Response of both channels to forces (column, time) of each drive, (column, channel, counted, group)."""
         accel, speed = [], []
         for drive, force in zip(drives, forces, strict=True):
@@ -244,6 +246,6 @@ class Hypothesis:
         return torch.stack(squares).sum(0).div(sum(len(d.time) for d in drives)).sqrt().numpy()
 
 
-def _position(drive: Drive) -> torch.Tensor:
+def _position(drive: SimulatorInput) -> torch.Tensor:
     assert drive.position is not None
     return drive.position

@@ -7,14 +7,14 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.steady_kalman import motion
+from avtorch.gap.likelihood.steady_kalman import error_dynamics
 
 
 def noise_draws(
     noise: NoiseModel, rows: int, dt: float, channels: tuple[str, ...], count: int, rng: np.random.Generator
 ) -> FloatArray:
     """(draw, channel, row) at rows `dt` [s] apart; the speed's error starts at 0, except for its sensor noise."""
-    move, driven = motion(noise, dt)
+    move, driven = error_dynamics(noise, dt)
     # stationary states start from their stationary distribution
     start = np.zeros_like(move)
     start[1:, 1:] = solve_discrete_lyapunov(move[1:, 1:], driven[1:, 1:])

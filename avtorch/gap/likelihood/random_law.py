@@ -21,9 +21,9 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.likelihood.hypothesis import Coordinate, Hypothesis
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.simulator.drive import Drive
 from avtorch.gap.simulator.effect import Effect, NoiseChange
 from avtorch.gap.simulator.plant import GapPlant
+from avtorch.gap.simulator.simulator_input import SimulatorInput
 
 Form = Literal["force", "tails", "command"]
 
@@ -85,7 +85,7 @@ class RandomLaw:
         fraction = self._single("tail_fraction", change.tail_fraction)
         return min(fraction, 0.5), self._single("tail_scale", change.tail_scale)
 
-    def command_variance(self, z: FloatArray, drives: Sequence[Drive]) -> FloatArray:
+    def command_variance(self, z: FloatArray, drives: Sequence[SimulatorInput]) -> FloatArray:
         """Variance [(m/s²)²] for every row of all drives, concatenated."""
         parts = []
         for drive in drives:

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from avtorch.arrays import BoolArray, Float, FloatArray, Int, IntArray
 from avtorch.errors import InputError
-from avtorch.gap.simulator.drive import Drive, Place
+from avtorch.gap.simulator.simulator_input import Place, SimulatorInput
 from avtorch.io import Log
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.engagement import SETTLE_S
@@ -57,9 +57,9 @@ class Record:
     one segment share a road, and `position` continues along it.
     """
 
-    drives: tuple[Drive, ...]
+    drives: tuple[SimulatorInput, ...]
     cuts: tuple[Cut, ...]
-    coarse: tuple[Drive, ...]
+    coarse: tuple[SimulatorInput, ...]
     time: Float[FloatArray, " row"]
     stamp: Float[FloatArray, " row"]
     log: Int[IntArray, " row"]
@@ -100,9 +100,9 @@ class Record:
         each = [logs] if isinstance(logs, Log) else list(logs)
         if not each:
             raise InputError("logs: none given, needs one or more")
-        drives: list[Drive] = []
+        drives: list[SimulatorInput] = []
         cuts: list[Cut] = []
-        coarse: list[Drive] = []
+        coarse: list[SimulatorInput] = []
         columns: dict[str, list[FloatArray]] = {
             "time": [],
             "stamp": [],
@@ -198,7 +198,7 @@ class Record:
         )
 
     @cached_property
-    def segments(self) -> tuple[tuple[Drive, ...], ...]:
+    def segments(self) -> tuple[tuple[SimulatorInput, ...], ...]:
         """The drives of each segment that has any, in order."""
         numbers = dict.fromkeys(cut.segment for cut in self.cuts)
         return tuple(
@@ -270,7 +270,7 @@ def grouped(rate: float, least: float) -> int:
 
 def rolled(log: Log, group: int) -> Iterator[slice]:
     """The rows of `log` that form a drive each: drives of 40 groups or more, in whole groups."""
-    for part in log.drives():
+    for part in log.engaged_segments():
         rows = (part.stop - part.start) // group
         if rows >= 2 * RATE_HZ:
             yield slice(part.start, part.start + rows * group)
@@ -283,12 +283,12 @@ def _drive(
     accel0: float | None,
     specific: bool,
     position0: float,
-) -> Drive:
+) -> SimulatorInput:
     quiet = None if speed is None else torch.as_tensor(_quiet(speed, float(np.median(np.diff(time)))))
-    return Drive(torch.as_tensor(_even(time)), torch.as_tensor(command), quiet, accel0, specific, position0)
+    return SimulatorInput(torch.as_tensor(_even(time)), torch.as_tensor(command), quiet, accel0, specific, position0)
 
 
-def _position(log: Log, drives: Sequence[Drive], cuts: Sequence[Cut], begun: Cut) -> float:
+def _position(log: Log, drives: Sequence[SimulatorInput], cuts: Sequence[Cut], begun: Cut) -> float:
     """Position on its segment's road [m] at which a drive begins; the car also moves during overrides."""
     if log.speed is None or not cuts or cuts[-1].segment != begun.segment:
         return 0.0

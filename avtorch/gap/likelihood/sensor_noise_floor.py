@@ -63,7 +63,7 @@ def _force(log: Log, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
 
 def _drives(log: Log) -> list[slice]:
     """Drives long enough to estimate noise: `engaged` may change with every row."""
-    return [part for part in log.drives() if part.stop - part.start > 3]
+    return [part for part in log.engaged_segments() if part.stop - part.start > 3]
 
 
 def _scatter(log: Log, signal: FloatArray) -> float:

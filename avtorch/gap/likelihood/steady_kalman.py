@@ -23,7 +23,7 @@ def designed(noises: Sequence[NoiseModel], dt: float, channels: tuple[str, ...])
 
     Either all models or none have a sensor lag, and the same holds for a further force.
     """
-    pairs = [motion(n, dt) for n in noises]
+    pairs = [error_dynamics(n, dt) for n in noises]
     move, driven = np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])
     use = [i for i, name in enumerate(("accel", "speed")) if name in channels]
     keep = slice(0 if 1 in use else 1, move.shape[-1])
@@ -58,7 +58,9 @@ def designed(noises: Sequence[NoiseModel], dt: float, channels: tuple[str, ...])
     return [([list(row) for row in mixed[i]], bottom[i], float(sizes[i])) for i in range(len(noises))]
 
 
-def motion(n: NoiseModel, dt: float) -> tuple[Float[FloatArray, "state state"], Float[FloatArray, "state state"]]:
+def error_dynamics(
+    n: NoiseModel, dt: float
+) -> tuple[Float[FloatArray, "state state"], Float[FloatArray, "state state"]]:
     """Exact transition of the state (error of the speed, p, d) over `dt`, and the covariance of its process noise.
 
     The state holds Ornstein-Uhlenbeck processes (a third where a random effect adds one) and the integral of their sum.

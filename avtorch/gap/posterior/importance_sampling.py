@@ -49,20 +49,20 @@ def importance(
         proposed = np.stack([_density(places, *p) for p in proposals])
         ratios = values - np.asarray(logsumexp(proposed, axis=0)) + np.log(len(proposals))
         weights = np.exp(ratios - logsumexp(ratios))
-        if turn and effective(weights) >= enough:
+        if turn and effective_sample_size(weights) >= enough:
             break
         if turn + 1 < rounds:
             shape = _tempered(ratios)
             mean = shape @ places
             apart = places - mean
             covariance = (apart * shape[:, None]).T @ apart + 1e-4 * scale @ scale.T
-            width = (4 / (dim + 2) / effective(shape)) ** (1 / (dim + 4))
+            width = (4 / (dim + 2) / effective_sample_size(shape)) ** (1 / (dim + 4))
             kernels = places[rng.choice(len(places), _KERNELS, p=shape)]
             proposals.append((kernels, width * np.linalg.cholesky(covariance)))
     return places, weights
 
 
-def effective(weights: FloatArray) -> float:
+def effective_sample_size(weights: FloatArray) -> float:
     """Effective sample size of the weights."""
     return float(1 / np.sum(weights**2))
 
@@ -72,7 +72,7 @@ def _tempered(ratios: FloatArray) -> FloatArray:
     for _ in range(40):
         weights = np.exp(power * (ratios - ratios.max()))
         weights /= weights.sum()
-        if effective(weights) >= _CARRIED:
+        if effective_sample_size(weights) >= _CARRIED:
             break
         power *= 0.8
     return weights

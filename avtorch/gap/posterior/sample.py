@@ -15,15 +15,15 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.posterior.density import RolloutDensity, root
 from avtorch.gap.posterior.draws import Draws
-from avtorch.gap.posterior.importance_sampling import effective, importance
-from avtorch.gap.posterior.summary import drawn, moved, repaired, reported
+from avtorch.gap.posterior.importance_sampling import effective_sample_size, importance
+from avtorch.gap.posterior.summary import lag_and_gain, repaired, reported, reported_draws
 from avtorch.gap.posterior.surrogate import Corrected, Surrogate, trusted_square
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.sampler import SamplerSettings, sample
 from avtorch.inference.whitening import Coordinates, stiffness
 
-__all__ = ["Draws", "drawn", "exact_one_in", "fitted", "moved", "posterior", "repaired", "reported"]
+__all__ = ["Draws", "exact_one_in", "fitted", "lag_and_gain", "posterior", "repaired", "reported", "reported_draws"]
 
 
 STEP = 2.0
@@ -140,7 +140,7 @@ def _weighted(density: RolloutDensity, mode: Mode, chains: int, draws: int, seed
     at = (rng.random() + np.arange(chains * draws)) / (chains * draws)
     chosen = np.searchsorted(np.cumsum(weights), at).clip(0, len(weights) - 1)
     z = places[rng.permutation(chosen)]
-    return torch.as_tensor(z.reshape(chains, draws, -1)), effective(weights)
+    return torch.as_tensor(z.reshape(chains, draws, -1)), effective_sample_size(weights)
 
 
 def _worth(z: Tensor) -> float:

@@ -37,7 +37,7 @@ def reported(found: FittedModel, draws: Draws | None = None) -> dict[str, Quanti
     return _named(found, told | normal)
 
 
-def moved(found: FittedModel, draws: Draws | None = None) -> dict[str, Quantity]:
+def lag_and_gain(found: FittedModel, draws: Draws | None = None) -> dict[str, Quantity]:
     """The baseline's `T_L` [s] and `K_L` [-], fitted together with the model's effects."""
     values = _values(found, draws)
     return {name: Quantity.of_draws(values[name]) for name in ("T_L", "K_L")}
@@ -50,7 +50,7 @@ def belief(found: FittedModel, draws: Draws | None = None, *, count: int = 64) -
     return {key: x[::every][:count] for key, x in values.items()}
 
 
-def drawn(found: FittedModel, draws: Draws) -> dict[str, FloatArray]:
+def reported_draws(found: FittedModel, draws: Draws) -> dict[str, FloatArray]:
     """Draws (chain, draw) under the names of `reported`, `T_L` and `K_L` first."""
     rng = np.random.default_rng(0)
     shape = draws.z.shape[:2]

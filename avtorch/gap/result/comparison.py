@@ -14,7 +14,7 @@ Account = Literal["lag and gain", "not lag and gain", "cannot be told"]
 
 
 @dataclass(frozen=True)
-class Moved:
+class Change:
     """One number before and after, and the ratio of after to before, each with its central 90 %."""
 
     before: Quantity
@@ -26,7 +26,7 @@ class Moved:
 
 
 @dataclass(frozen=True)
-class LaterAnswer:
+class DeadTimeTest:
     """Whether lag and gain explain a change better than a change of dead time.
 
     Dead time [s] `before`, `after` and their `difference`, where every drive is fitted with one; a value below 0 is
@@ -67,18 +67,18 @@ class Comparison:
 
     `changed`: the car's parameters differ, with p-value `p_value` for drives of one car. `simulator`: whether the
     simulator's errors on the drives after are smaller than those on the drives before (each with its own simulator,
-    where two are given). `later`: where the car has changed, whether lag and gain explain it; else None.
+    where two are given). `dead_time_test`: where the car has changed, whether lag and gain explain it; else None.
     """
 
     before: LogFacts
     after: LogFacts
-    car: Mapping[str, Moved]
-    gap: Mapping[str, Moved]
+    car: Mapping[str, Change]
+    gap: Mapping[str, Change]
     p_value: float
     changed: bool
     simulator: Telling
     why: str
-    later: LaterAnswer | None = None
+    dead_time_test: DeadTimeTest | None = None
     horizon_s: float = 10.0
 
     def to_dict(self) -> dict[str, Any]:
@@ -92,7 +92,7 @@ class Comparison:
             "horizon_s": self.horizon_s,
             "p_value": self.p_value,
             "changed": self.changed,
-            "explained": None if self.later is None else self.later.to_dict(),
+            "explained": None if self.dead_time_test is None else self.dead_time_test.to_dict(),
             "simulator": self.simulator,
             "why": self.why,
         }

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.errors import InputError
-from avtorch.gap.crossval.gap_closed import Closed, Shrinkage
+from avtorch.gap.crossval.gap_closed import MetricShrinkage, Shrinkage
 from avtorch.gap.crossval.localisation import Location
 from avtorch.gap.quantity import Quantity, unit_of
 from avtorch.gap.result import sentences
@@ -26,7 +26,7 @@ from avtorch.gap.selection.verdict import (
     Candidate,
     Verdict,
     candidate_name,
-    listed,
+    listed_candidates,
     near,
     plain,
     plausibility,
@@ -42,15 +42,15 @@ if TYPE_CHECKING:
 __all__ = [
     "DIAGNOSIS_FILES",
     "Candidate",
-    "Closed",
     "Diagnosis",
     "GapSize",
     "LogFacts",
+    "MetricShrinkage",
     "Quantity",
     "Shrinkage",
     "Verdict",
     "candidate_name",
-    "listed",
+    "listed_candidates",
     "near",
     "verdict_of",
 ]
@@ -70,7 +70,7 @@ DIAGNOSIS_FILES = (
 class Diagnosis:
     """What the simulator lacks, according to a log; `str()` states it in a few sentences.
 
-    - `candidates`: the hypotheses as `listed` orders them, whatever the order given
+    - `candidates`: the hypotheses as `listed_candidates` orders them, whatever the order given
     - `simulator`: the user's own, with `T_L` and `K_L` fitted without any effect; `plant`: the same with the verdict's
       effects, at the posterior mean, None where nothing was named
     - `assumed`: draws (draw,) of the simulator's `T_L` [s] and `K_L`; `belief`: draws (draw,) of the parameters of
@@ -128,7 +128,7 @@ class Diagnosis:
     def __post_init__(self) -> None:
         if self.onset_s is not None and self.onset_from_start_s is None:
             object.__setattr__(self, "onset_from_start_s", self.onset_s - self.log.epochs_s[self.onset_log])
-        object.__setattr__(self, "candidates", listed(self.candidates))
+        object.__setattr__(self, "candidates", listed_candidates(self.candidates))
         said = self.verdict.name
         if self.probability(said) < self.candidates[0].probability - 1e-12:
             raise InputError(f"verdict: found {said}, needs the most probable, {self.candidates[0].name}")

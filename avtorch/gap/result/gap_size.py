@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.crossval.rollout_errors import HORIZON_S, Measure, reached, rms
+from avtorch.gap.crossval.rollout_errors import HORIZON_S, RolloutMetric, reached, rms
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.result.repeatability import Repeatability, repeatability
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
@@ -58,7 +58,7 @@ def gap_size(race: SearchResult, best: FittedModel, *, detected: bool, p_value: 
     one, lag = [], none.values["T_L"]
     if record.accel is not None:
         one = [_one_step(record, f.errors[0], f.values["T_L"]) for f in (none, best)]
-    usual = {name: Measure(name, HORIZON_S) for name in record.channels}
+    usual = {name: RolloutMetric(name, HORIZON_S) for name in record.channels}
     rollout = {name: [rms(m, record, f.errors, lag) for f in (none, best)] for name, m in usual.items()}
     accel, speed = (rollout.get(name, []) for name in ("accel", "speed"))
     return GapSize(

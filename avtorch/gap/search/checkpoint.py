@@ -40,7 +40,7 @@ _LARGEST = 64  # most coordinates of a fit
 
 
 @dataclass(frozen=True, eq=False)
-class Kept:
+class StoredFit:
     """A converged fit: the mode `z` (coordinate,), its `noise`, and the noise's `log_prior`."""
 
     z: FloatArray
@@ -59,7 +59,7 @@ class Kept:
 
 
 @dataclass(frozen=True)
-class Start:
+class FitKey:
     """The start of a fit; `inputs` is the fingerprint of everything that determines its result."""
 
     hypothesis: Hypothesis
@@ -67,7 +67,7 @@ class Start:
     inputs: str
 
     @classmethod
-    def of(cls, hypothesis: Hypothesis, z: FloatArray, noise: NoiseModel, onset: int | None, rounds: int) -> Start:
+    def of(cls, hypothesis: Hypothesis, z: FloatArray, noise: NoiseModel, onset: int | None, rounds: int) -> FitKey:
         record = hypothesis.record
         if record not in _RECORDS:
             _RECORDS[record] = fingerprint(record)
@@ -91,7 +91,7 @@ class Checkpoint:
         if self.path is not None and os.path.lexists(self.path):
             self._done = {entry["inputs"]: entry for entry in read_fits(self.path, self.work)}
 
-    def next(self, start: Start | None) -> Kept | None:
+    def next(self, start: FitKey | None) -> StoredFit | None:
         """The stored fit with this start, or None."""
         entry = None if start is None else self._done.get(start.inputs)
         if start is None or entry is None:
@@ -99,15 +99,15 @@ class Checkpoint:
         own = (start.hypothesis.name, start.onset, start.hypothesis.size)
         if (entry["name"], entry["onset"], len(entry["z"])) != own:
             raise InputError(f"{self.path}: the fit of {entry['name']} does not match its recorded start; {REMEDY}")
-        return Kept(np.array(entry["z"]), NoiseModel(**entry["noise"]), float(entry["log_prior"]))
+        return StoredFit(np.array(entry["z"]), NoiseModel(**entry["noise"]), float(entry["log_prior"]))
 
     def start(
         self, hypothesis: Hypothesis, z: FloatArray, noise: NoiseModel, onset: int | None, rounds: int
-    ) -> Start | None:
+    ) -> FitKey | None:
         """The start of a fit; None where nothing is stored."""
-        return None if self.path is None else Start.of(hypothesis, z, noise, onset, rounds)
+        return None if self.path is None else FitKey.of(hypothesis, z, noise, onset, rounds)
 
-    def keep(self, start: Start | None, fit: Kept) -> None:
+    def keep(self, start: FitKey | None, fit: StoredFit) -> None:
         """Store one more finished fit."""
         if self.path is None or start is None:
             return

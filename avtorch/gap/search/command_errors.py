@@ -14,7 +14,9 @@ from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.lost_messages import image_of_row, states_of
 
 
-def rows_gained(white: WhiteningFilter, errors: FloatArray, variance: FloatArray, T_L: float, K_L: float) -> FloatArray:
+def command_error_gains(
+    white: WhiteningFilter, errors: FloatArray, variance: FloatArray, T_L: float, K_L: float
+) -> FloatArray:
     """Log likelihood ratio (counted,) of each row: commands with errors of this `variance` against commands as logged.
 
     Args: `errors` (channel, counted, 1) of a rollout with `T_L` [s] and `K_L` at the log's own rate; `variance`

@@ -18,7 +18,7 @@ from avtorch.gap.likelihood.gauss_newton import finish, modes
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.fitted_model import ALIKE, Delays, FittedModel
-from avtorch.gap.simulator.drive import Drive
+from avtorch.gap.simulator.simulator_input import SimulatorInput
 
 _LONGEST_S = 1.0  # twice the longest typical delay
 _TRIED = 40
@@ -29,7 +29,7 @@ _BEGUN_S = 2.0  # start of a stretch, in which commands from before the log may 
 _DIPS = 0.2  # least drop of the correlation between the peaks
 
 
-def repeats_after(drives: Sequence[Drive]) -> float | None:
+def repeats_after(drives: Sequence[SimulatorInput]) -> float | None:
     """The period [s] of a periodic command, from the rows of all drives; None where it is not periodic."""
     longest = max(len(d.time) for d in drives) // 2
     total, norm = np.zeros(longest), np.zeros(longest)

@@ -12,7 +12,7 @@ from avtorch.gap.likelihood.noise_fit import GUST, fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.noise_segments import CALM, whitening_filter
 from avtorch.gap.search.fitted_model import FittedModel, with_or_without_onset
-from avtorch.gap.search.onset import allowed, profile
+from avtorch.gap.search.onset import allowed, onset_profile
 from avtorch.gap.simulator.effect import Effect
 
 
@@ -48,7 +48,7 @@ def _along(blown: FittedModel) -> FloatArray:
         whitening_filter(record, n, onset=blown.onset).row_likelihoods(blown.errors)
         for n in (noise.replaced(force_sd=CALM), noise)
     )
-    return profile(calm, strong)
+    return onset_profile(calm, strong)
 
 
 def _blown(base: FittedModel, kind: type[Effect], start: NoiseModel, lag: float, onset: int | None) -> FittedModel:

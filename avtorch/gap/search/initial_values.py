@@ -70,7 +70,7 @@ def lag_delay_starts(hypothesis: Hypothesis, z: FloatArray) -> FloatArray:
     return np.array(places).reshape(-1, len(z))
 
 
-def starts(hypothesis: Hypothesis, base: Mapping[str, float]) -> FloatArray:
+def start_points(hypothesis: Hypothesis, base: Mapping[str, float]) -> FloatArray:
     """(start, coordinate): `base` (T_L, K_L, known effect parameters) combined with each effect's initial values."""
     sets: list[dict[str, float]] = [dict(base)]
     for effect in hypothesis.effects:

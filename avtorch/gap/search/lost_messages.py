@@ -50,7 +50,7 @@ def lost_messages(
     (counted,) [m/s²], one message per row. A run of losses does not extend into the next stretch.
     """
     record = white.record
-    bank = Bank.of(white, white(errors)[..., 0], command, T_L, K_L)
+    bank = LossHistories.of(white, white(errors)[..., 0], command, T_L, K_L)
     if not len(bank.place):
         return LostMessages(-2.0, 0.0, 1.0, None)  # the command is constant
 
@@ -79,14 +79,14 @@ def lost_messages(
     return LostMessages(evidence, fraction, found.sd * _SD, onset if more > 1 else None)
 
 
-def rows_gained(
+def lost_message_gains(
     white: WhiteningFilter, errors: FloatArray, command: FloatArray, T_L: float, K_L: float, fits: BoolArray
 ) -> FloatArray:
     """Log likelihood ratio (counted,) of each row, losses over none, at the fraction fitted to the rows in `fits`.
 
     Arguments as in `lost_messages`.
     """
-    bank = Bank.of(white, white(errors)[..., 0], command, T_L, K_L)
+    bank = LossHistories.of(white, white(errors)[..., 0], command, T_L, K_L)
     if not len(bank.place):
         return np.zeros(white.record.rows)
     z = np.linspace(-3.0, 3.0, 13)
@@ -129,7 +129,7 @@ def _posterior(z: FloatArray, value: FloatArray) -> _Posterior:
 
 
 @dataclass(frozen=True, eq=False)
-class Bank:
+class LossHistories:
     """Paths over chunks of rows, all chunks and all fractions at once.
 
     `move`, `push`, `see`: state-space model of a path's losses, x' = move x + push (h - u), with whitened errors see x;
@@ -147,7 +147,9 @@ class Bank:
     command: FloatArray
 
     @classmethod
-    def of(cls, white: WhiteningFilter, error: FloatArray, command: FloatArray, T_L: float, K_L: float) -> Bank:
+    def of(
+        cls, white: WhiteningFilter, error: FloatArray, command: FloatArray, T_L: float, K_L: float
+    ) -> LossHistories:
         record = white.record
         image = image_of_row(white, T_L, K_L)
         move, push, see = states_of(image)
@@ -250,7 +252,7 @@ def image_of_row(white: WhiteningFilter, T_L: float, K_L: float) -> FloatArray:
 
 
 def states_of(image: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A small state-space model with unit-pulse response `image` (channel, time): (move, push, see) of `Bank`.
+    """A small state-space model with unit-pulse response `image` (channel, time): (move, push, see) of `LossHistories`.
 
     From the singular vectors of the image's Hankel matrix (Kung 1978), in output-normal coordinates.
     """

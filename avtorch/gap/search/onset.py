@@ -17,7 +17,7 @@ _PLACES = 12  # rows in the first round of the search for a road grade's onset
 _NEAREST_S = 4.0  # an onset closer to the start or the end is not distinguished from none
 
 
-def profile(without: FloatArray, with_cause: FloatArray) -> FloatArray:
+def onset_profile(without: FloatArray, with_cause: FloatArray) -> FloatArray:
     """Log likelihood (row,) of an onset at each row, from those of single rows (row,) without and with the cause."""
     before = np.concatenate([[0.0], np.cumsum(without)[:-1]])
     after = np.cumsum(with_cause[::-1])[::-1]
@@ -36,7 +36,7 @@ def rough_onset(white: WhiteningFilter, hypothesis: Hypothesis, z: FloatArray) -
         return _Road.of(white, hypothesis, z).best(allowed(hypothesis.record.rows, white.record.dt))
     full = hypothesis.errors(z[None], coarse=True)[0]
     silent = hypothesis.record.measured.mean(-1, keepdims=True) - hypothesis.baseline_rollouts(z[None], coarse=True)[0]
-    rows = profile(-0.5 * (white(silent) ** 2).sum((0, 2)), -0.5 * (white(full) ** 2).sum((0, 2)))
+    rows = onset_profile(-0.5 * (white(silent) ** 2).sum((0, 2)), -0.5 * (white(full) ** 2).sum((0, 2)))
     within = allowed(len(rows), white.record.dt)
     best = within.start + int(np.argmax(rows[within]))
     return best, float(rows[best] - rows[0])
@@ -80,7 +80,7 @@ class _Road:
         silent = white(
             hypothesis.record.measured.mean(-1, keepdims=True) - hypothesis.baseline_rollouts(z[None], coarse=True)[0]
         )[..., 0]
-        along = profile(-0.5 * (silent**2).sum(0), -0.5 * (full**2).sum(0))
+        along = onset_profile(-0.5 * (silent**2).sum(0), -0.5 * (full**2).sum(0))
         return cls(grade_marginal(white, hypothesis, None, coarse=True), full, along)
 
     def at(self, rows: Sequence[int]) -> FloatArray:

@@ -13,7 +13,7 @@ from avtorch.gap.likelihood.gauss_newton import modes, whitened_jacobian
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.search.initial_values import effect_starts, starts
+from avtorch.gap.search.initial_values import effect_starts, start_points
 from avtorch.gap.search.onset import allowed
 from avtorch.gap.search.screening import Screened, converge, refine, screen
 from avtorch.gap.simulator.effect import Effect
@@ -25,7 +25,7 @@ _MUCH = 6_000_000  # the same limit for starts times rows
 
 
 @dataclass(frozen=True, eq=False)
-class Base:
+class PairBase:
     """The model to which a second effect is added: a `hypothesis` at `z` (coordinate,), parameter `values`, `white`."""
 
     hypothesis: Hypothesis
@@ -80,7 +80,7 @@ class Base:
             begin = hypothesis.z_of({**self.values, **known})[None]
         rows = self.hypothesis.record.rows * self.hypothesis.record.group
         if not known or len(effect_starts(hypothesis, more.name)) * rows <= _MUCH:
-            begin = np.concatenate([begin, starts(hypothesis, self.values)])
+            begin = np.concatenate([begin, start_points(hypothesis, self.values)])
         if hypothesis.grade_means is not None and self.hypothesis.grade_means is None:
             step, value = modes(hypothesis, self.white, begin[:1], onset=self.onset, iterations=2)
             return float(value[0]) - self.flat, step[0]
@@ -167,7 +167,7 @@ def exchanged(
     for kept in pair.hypothesis.effects:
         base = Hypothesis(record, (kept,), baseline)
         own = {k: v for k, v in values.items() if "." not in k or k.startswith(f"{kept.name}.")}
-        here = Base(base, base.z_of(own), own, pair.onset, white)
+        here = PairBase(base, base.z_of(own), own, pair.onset, white)
         others = [kind for kind in kinds if kind not in pair.hypothesis.effects]
         for hypothesis, start in here.partners(others, alone, most=tries, least=2.0):
             out.append(refine(converge(hypothesis, white, start, pair.onset), white))

@@ -21,7 +21,7 @@ from avtorch.gap.likelihood.observability import is_observable
 from avtorch.gap.likelihood.random_law import Form, RandomLaw
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.search.command_errors import rows_gained
+from avtorch.gap.search.command_errors import command_error_gains
 from avtorch.gap.search.fitted_model import ByChance, FittedModel
 from avtorch.gap.search.full_rate import full_rate_errors, full_rate_filter
 from avtorch.gap.search.outliers import HeavyTails, hessian_of
@@ -145,7 +145,7 @@ def commanded(base: FittedModel, law: RandomLaw, raw: Record) -> FittedModel:
         if abs(x[0]) > 3 or np.abs(x[1:]).max(initial=0.0) > 5:
             return 1e9 * (1 + float(np.abs(x).max()))
         variance = variance_of(law, x[1:], base, raw)
-        gained = float(rows_gained(white(x[0]), errors, variance, T_L, K_L).sum())
+        gained = float(command_error_gains(white(x[0]), errors, variance, T_L, K_L).sum())
         return without(x) - gained + 0.5 * float(x[1:] @ x[1:])
 
     # start with less jerk noise, as it has absorbed part of these errors

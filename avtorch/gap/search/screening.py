@@ -12,7 +12,7 @@ from avtorch.gap.likelihood.gauss_newton import modes
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.initial_values import one_at_a_time
-from avtorch.gap.search.onset import allowed, profile, rough_onset
+from avtorch.gap.search.onset import allowed, onset_profile, rough_onset
 
 ENOUGH = 0.3
 """Least gain of a step [nats]; a smaller one ends the screening fit."""
@@ -134,7 +134,7 @@ def _tried(
             continue
         quiet = -0.5 * (white(measured - hypothesis.baseline_rollouts(z, coarse=True)) ** 2).sum((1, 3))
         for j, row in enumerate(rows):
-            along = profile(quiet[j if len(quiet) > 1 else 0], row)[within]
+            along = onset_profile(quiet[j if len(quiet) > 1 else 0], row)[within]
             late.append(white.constant_of(coarse=True) + float(along.max()) - cost[j])
             when.append(within.start + int(along.argmax()))
     return np.concatenate(whole), np.array(late), np.array(when)

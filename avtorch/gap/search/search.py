@@ -24,7 +24,7 @@ from avtorch.gap.likelihood.observability import is_observable
 from avtorch.gap.likelihood.random_law import Form, RandomLaw
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.search.checkpoint import Checkpoint, Kept
+from avtorch.gap.search.checkpoint import Checkpoint, StoredFit
 from avtorch.gap.search.delays import all_delays
 from avtorch.gap.search.fitted_model import (
     FittedModel,
@@ -37,11 +37,11 @@ from avtorch.gap.search.fitted_model import (
 from avtorch.gap.search.fitted_work import fitted_work
 from avtorch.gap.search.full_rate import full_rate_errors, full_rate_filter
 from avtorch.gap.search.gusts import gust
-from avtorch.gap.search.initial_values import lag_delay_starts, starts
+from avtorch.gap.search.initial_values import lag_delay_starts, start_points
 from avtorch.gap.search.lost_messages import lost_messages
 from avtorch.gap.search.onset import onset_evidence, refined_onset
 from avtorch.gap.search.outliers import HeavyTails, heavy_tails
-from avtorch.gap.search.pairs import Base, exchanged, joint_fit
+from avtorch.gap.search.pairs import PairBase, exchanged, joint_fit
 from avtorch.gap.search.random_effects import commanded, forced, glitched, own_searches, users_own
 from avtorch.gap.search.screening import ENOUGH, Screened, refine, screen
 from avtorch.gap.simulator.effect import EFFECTS, Effect
@@ -147,16 +147,16 @@ class Search:
         white = WhiteningFilter(record, noise)
         z = np.stack([hypothesis.z_of({"T_L": t, "K_L": 1.0}) for t in (0.12, 0.3, 0.8)])
         found, values = modes(hypothesis, white, z, iterations=6)
-        return self._settled(hypothesis, found[values.argmax()], noise, rounds=6)
+        return self._converged_fit(hypothesis, found[values.argmax()], noise, rounds=6)
 
     def with_effects(self, none: FittedModel, kinds: Kinds) -> FittedModel:
         """`none` with effects of these kinds, acting from the drives' start, with noise of its own."""
         hypothesis = Hypothesis(none.hypothesis.record, tuple(kinds), self.baseline)
         white = WhiteningFilter(hypothesis.record, none.noise.noise)
-        places, values = modes(hypothesis, white, starts(hypothesis, none.values), iterations=6, coarse=True)
-        return self._settled(hypothesis, places[values.argmax()], none.noise.noise)
+        places, values = modes(hypothesis, white, start_points(hypothesis, none.values), iterations=6, coarse=True)
+        return self._converged_fit(hypothesis, places[values.argmax()], none.noise.noise)
 
-    def _settled(
+    def _converged_fit(
         self, hypothesis: Hypothesis, z: FloatArray, noise: NoiseModel, *, onset: int | None = None, rounds: int = 2
     ) -> FittedModel:
         """Fit parameters and noise alternately until both converge."""
@@ -187,8 +187,8 @@ class Search:
                     break
                 value = new
             z, noise = best
-        self.checkpoint.keep(start, Kept(z, noise, log_prior))
-        return Kept(z, noise, log_prior).found(hypothesis, onset)
+        self.checkpoint.keep(start, StoredFit(z, noise, log_prior))
+        return StoredFit(z, noise, log_prior).found(hypothesis, onset)
 
     @staticmethod
     def _traded(
@@ -217,7 +217,7 @@ class Search:
             if self._late():
                 break
             hypothesis = Hypothesis(record, (kind,), self.baseline)
-            begin = starts(hypothesis, none.values)
+            begin = start_points(hypothesis, none.values)
             found = screen(hypothesis, white, begin, onsets=kind.own_onset is None, floor=coarse_floor)
             seen += [refine(look, white) for look in found]
         best: dict[str, float] = {}
@@ -262,7 +262,7 @@ class Search:
 
     def _from_onset(self, hypothesis: Hypothesis, z: FloatArray, noise: NoiseModel, onset: int | None) -> FittedModel:
         if onset is None:
-            return self._settled(hypothesis, z, noise)
+            return self._converged_fit(hypothesis, z, noise)
         record = hypothesis.record
         white = whitening_filter(record, noise, onset=onset)
         for _ in range(2):
@@ -271,12 +271,12 @@ class Search:
             if moved == onset:
                 break
             onset = moved
-        settled = self._settled(hypothesis, z, noise, onset=onset)
-        moved, tried = refined_onset(settled.white, hypothesis, settled.z, onset)
+        refitted = self._converged_fit(hypothesis, z, noise, onset=onset)
+        moved, tried = refined_onset(refitted.white, hypothesis, refitted.z, onset)
         if abs(moved - onset) * record.dt > 0.5:
-            settled = self._settled(hypothesis, settled.z, settled.noise.noise, onset=moved)
-            _, tried = refined_onset(settled.white, hypothesis, settled.z, moved)
-        return replace(settled, log_evidence=settled.log_evidence + onset_evidence(tried, record.dt))
+            refitted = self._converged_fit(hypothesis, refitted.z, refitted.noise.noise, onset=moved)
+            _, tried = refined_onset(refitted.white, hypothesis, refitted.z, moved)
+        return replace(refitted, log_evidence=refitted.log_evidence + onset_evidence(tried, record.dt))
 
     # pairs ---------------------------------------------------------------------------------------------------------
     def _pairs(self, record: Record, kinds: Kinds, found: list[FittedModel], none: FittedModel) -> list[FittedModel]:
@@ -328,13 +328,13 @@ class Search:
 
     def _under(self, blown: FittedModel, kinds: Kinds, none: FittedModel, made: dict[str, FittedModel]) -> None:
         """Add to `made` effects that are visible only under a random force's noise, each combined with that force."""
-        on = Base(none.hypothesis, none.z, none.values, none.onset, blown.white)
+        on = PairBase(none.hypothesis, none.z, none.values, none.onset, blown.white)
         for hypothesis, z in on.partners(kinds, {}, most=_BASES, least=_LEAST):
             if self._late():
                 break
             forms = screen(hypothesis, blown.white, z[None], onsets=hypothesis.effects[-1].own_onset is None)
             look = max((refine(form, blown.white) for form in forms), key=lambda form: form.value)
-            under = Kept(look.z, blown.noise.noise, 0.0).found(look.hypothesis, look.onset)
+            under = StoredFit(look.z, blown.noise.noise, 0.0).found(look.hypothesis, look.onset)
             both = gust(under, self._own["force"]) if blown.by_chance is None else forced(under, blown.by_chance.law)
             if both.name not in made or made[both.name].log_evidence < both.log_evidence:
                 made[both.name] = both
@@ -348,7 +348,7 @@ class Search:
         most: int,
     ) -> list[Screened]:
         """The `most` second effects with the largest gains on top of `base`, each fitted with it."""
-        on = Base(base.hypothesis, base.z, base.values, base.onset, white)
+        on = PairBase(base.hypothesis, base.z, base.values, base.onset, white)
         found = [
             joint_fit(hypothesis, base.hypothesis.effects[0], z, base.onset, white, onsets=True)
             for hypothesis, z in on.partners(kinds, alone, most=most, least=4.0)

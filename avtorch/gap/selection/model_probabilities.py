@@ -102,7 +102,7 @@ def complexity_penalties(found: Sequence[Weighed], odds: Odds = CALIBRATION.odds
     """Penalty of each hypothesis [nats]: the gain over none that it must exceed."""
     second = ComplexityPenalty(odds.second, odds.second_share)
     second_by_chance = ComplexityPenalty(odds.second_by_chance, odds.second_by_chance_share)
-    paid, gained = {"none": 0.0}, gains(found)
+    paid, gained = {"none": 0.0}, evidence_gains(found)
     for f in found:
         if f.name == "none":
             continue
@@ -117,7 +117,7 @@ def by_chance(f: Weighed) -> bool:
     return f.by_chance is not None or any(part in EFFECTS and EFFECTS[part].random for part in f.name.split("+"))
 
 
-def gains(found: Sequence[Weighed]) -> dict[str, float]:
+def evidence_gains(found: Sequence[Weighed]) -> dict[str, float]:
     """Log evidence over none by name [nats]."""
     flat = _none(found).log_evidence
     return {f.name: f.log_evidence - flat for f in found}
@@ -135,7 +135,7 @@ def _none(found: Sequence[Weighed]) -> Weighed:
 def _worth(found: Sequence[Weighed], odds: Odds) -> dict[str, float]:
     """Log evidence over none less the penalty of each hypothesis [nats]."""
     paid = complexity_penalties(found, odds)
-    return {name: gained - paid[name] for name, gained in gains(found).items()}
+    return {name: gained - paid[name] for name, gained in evidence_gains(found).items()}
 
 
 def relative(found: Sequence[Weighed], odds: Odds = CALIBRATION.odds) -> dict[str, float]:

@@ -28,7 +28,7 @@ def shared(chances: Mapping[str, float], untold: Mapping[str, FittedModel]) -> d
     return out
 
 
-def joined(aliases: Sequence[str], untold: Mapping[str, FittedModel]) -> list[str]:
+def add_delay_aliases(aliases: Sequence[str], untold: Mapping[str, FittedModel]) -> list[str]:
     """The alias set, verdict first, with the model that differs from the verdict only by an undetermined delay."""
     more = []
     for name, f in untold.items():

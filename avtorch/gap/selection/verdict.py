@@ -69,7 +69,7 @@ def plausibility(implausible: Sequence[str]) -> dict[str, Any]:
     return {"plausible": not implausible, "plausibility": " ".join(implausible) or None}
 
 
-def listed(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
+def listed_candidates(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
     """Hypotheses as listed in an answer: improbable ones left out, renormalised to a sum of 1, most probable first.
 
     Raises `InputError` where `none` or `unknown` is missing, a name occurs twice, or no probability is above 0.
@@ -149,7 +149,7 @@ def verdict_of(
     `aliases` returns the names that cannot be distinguished (the verdict's is put first; default `near(ALIAS_RATIO)`);
     `why` defaults to a sentence on evidence and runner-up, in which `known` describes what was tried.
     """
-    ranked = listed(candidates)
+    ranked = listed_candidates(candidates)
     first = ranked[0]
     others = [name for name in map(candidate_name, (aliases or near(ALIAS_RATIO))(ranked)) if name != first.name]
     names = first.effects or (first.name,)

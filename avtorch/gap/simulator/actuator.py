@@ -52,7 +52,7 @@ class Actuator:
     tau: Tensor | None = None
     jerk: Tensor | None = None
 
-    def settled(self, accel: Tensor) -> ActuatorState:
+    def steady_state(self, accel: Tensor) -> ActuatorState:
         """The state at rest at `accel`."""
         if self.tau is None:
             return ActuatorState(accel)

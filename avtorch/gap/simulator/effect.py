@@ -20,7 +20,7 @@ The defaults suit an ordinary effect:
 | used by                 | declared by                                            | default                         |
 |-------------------------|--------------------------------------------------------|---------------------------------|
 | search: initial values  | `starts`; of a drive `starts_in`, `retried_in`         | typical sizes, and one sd lower |
-| search: onset           | `own_onset`; after it `settled`                        | any row is tried                |
+| search: onset           | `own_onset`; `values_after_onset`                      | any row is tried                |
 | search: randomness      | `noise`; `searched_as`, `noise_parameters`, `in_noise` | fitted by its `noise`           |
 | likelihood              | `reading`; `integrated.Integrated`                     | the accelerometer has no error  |
 | actuator                | `actuator_parameters`                                  | first order, no rate limit      |
@@ -45,8 +45,8 @@ from torch import Tensor
 
 from avtorch.errors import InputError, quoted
 from avtorch.gap.simulator.domain import Domain
+from avtorch.gap.simulator.effect_context import EffectContext, context_at
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row, row_at
 from avtorch.vehicle.arguments import Number, tensor
 from avtorch.vehicle.broadcasting import broadcast
 
@@ -107,8 +107,8 @@ class NoiseChange:
 class Effect:
     """Base of all effects; the module docstring lists the hooks. `order` sorts effects at the same place.
 
-    `gravity`: a body force that an accelerometer does not measure (see `Drive.specific_force`). `derived`: what
-    `report` names in place of coordinates that are not reported, with typical and possible ranges. `shift`: the
+    `gravity`: a body force that an accelerometer does not measure (see `SimulatorInput.specific_force`). `derived`:
+    what `report` names in place of coordinates that are not reported, with typical and possible ranges. `shift`: the
     parameter [s], if there is one, by which it delays commands and does nothing else. `settings`: valid values in a
     text for fields that are not parameters; a field without a domain takes any single finite number.
 
@@ -177,26 +177,26 @@ class Effect:
     pictured: ClassVar[float] = 12.0
 
     # the hook ------------------------------------------------------------------------------------------------------
-    def apply(self, x: Tensor, row: Row) -> Any:
+    def apply(self, x: Tensor, row: EffectContext) -> Any:
         """Output of an effect without memory."""
         raise NotImplementedError(f"{type(self).__name__} has neither apply nor advance")
 
-    def start(self, x: Tensor, row: Row) -> Any:
+    def start(self, x: Tensor, row: EffectContext) -> Any:
         """State before the first row, in steady state at input `x` (...)."""
         return None
 
-    def advance(self, x: Tensor, row: Row, state: Any) -> tuple[Any, Any]:
+    def advance(self, x: Tensor, row: EffectContext, state: Any) -> tuple[Any, Any]:
         """Output of this row and the state after it."""
         return self.apply(x, row), state
 
-    def over(self, x: Tensor, row: Row) -> Any:
+    def over(self, x: Tensor, row: EffectContext) -> Any:
         """Output over whole drives, `x` (..., time)."""
         if not self.memory:
             return self.apply(x, row)
-        state = self.start(x[..., 0], row_at(row, 0))
+        state = self.start(x[..., 0], context_at(row, 0))
         outputs: list[Tensor | tuple[Number, ...]] = []
         for k in range(x.shape[-1]):
-            y, state = self.advance(x[..., k], row_at(row, k), state)
+            y, state = self.advance(x[..., k], context_at(row, k), state)
             outputs.append(y)
         factors = [y for y in outputs if isinstance(y, tuple)]
         if factors:
@@ -223,7 +223,7 @@ class Effect:
         """Largest acceleration of either sign [m/s²] that the car can reach with it; None: no limit."""
         return None
 
-    def settled(self) -> Mapping[str, float]:
+    def values_after_onset(self) -> Mapping[str, float]:
         """Parameter values at which any change during a drive is long past."""
         return {}
 

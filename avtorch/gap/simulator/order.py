@@ -9,7 +9,7 @@ from torch import Tensor
 
 from avtorch.gap.simulator.actuator import Actuator, Substep
 from avtorch.gap.simulator.effect import PLACES, Effect, Place
-from avtorch.gap.simulator.row import Row
+from avtorch.gap.simulator.effect_context import EffectContext
 
 Hook = Callable[[Effect, Tensor], Any]
 """Runs an effect with memory: `hook(effect, x) -> output`, for one row or a whole drive."""
@@ -25,7 +25,7 @@ def at_place(effects: Iterable[Effect], place: Place) -> list[Effect]:
     return [e for e in effects if e.place == place]
 
 
-def substeps(effects: Iterable[Effect], u: Tensor, row: Row, hook: Hook) -> list[Substep]:
+def substeps(effects: Iterable[Effect], u: Tensor, row: EffectContext, hook: Hook) -> list[Substep]:
     """Targets, lags and lengths of each step's parts: the command through its effects, then gains and lags."""
     late, early, first = u, None, None
     for e in at_place(effects, "command"):

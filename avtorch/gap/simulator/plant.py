@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError, quoted
-from avtorch.gap.simulator.drive import Drive, Response
 from avtorch.gap.simulator.effect import Effect, NoiseChange
 from avtorch.gap.simulator.order import in_order
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.plant_text import Described, described, names_a_file, read_file, to_toml
+from avtorch.gap.simulator.plant_text import PlantDescription, names_a_file, parse_plant, read_file, to_toml
 from avtorch.gap.simulator.rollout import rollout
-from avtorch.gap.simulator.stepping import Past, begin, goes_on, move
+from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
+from avtorch.gap.simulator.stepping import SimulationState, begin, goes_on, move
 from avtorch.vehicle.arguments import Number, checked, tensor
 from avtorch.vehicle.plant import Motion
 
@@ -78,7 +78,7 @@ class GapPlant:
         for name, value in (("T_L", T_L), ("K_L", K_L), ("sigma", sigma)):
             checked(name, value, above=0.0 if name == "T_L" else None, least=0.0)
         self.T_L, self.K_L, self.sigma, self.seed = T_L, K_L, sigma, seed
-        self._past: Past | None = None
+        self._past: SimulationState | None = None
 
     def __repr__(self) -> str:
         return f"plant({list(self.effects)}, T_L={self.T_L}, K_L={self.K_L})"
@@ -112,7 +112,7 @@ class GapPlant:
         effects = [e.replaced(own[e.name]) if own[e.name] else e for e in self.effects]
         return GapPlant(effects, **base, sigma=self.sigma, seed=self.seed)
 
-    def prepared(self, *drives: Drive) -> GapPlant:
+    def prepared(self, *drives: SimulatorInput) -> GapPlant:
         """The plant with the settings that effects take from a drive (mean speed, span, length of the road).
 
         Several: parts of one drive, in order.
@@ -134,7 +134,7 @@ class GapPlant:
     # whole drives --------------------------------------------------------------------------------------------------
     def response(
         self,
-        drive: Drive,
+        drive: SimulatorInput,
         parameters: Mapping[str, Tensor] | None = None,
         *,
         generator: torch.Generator | None = None,
@@ -176,7 +176,7 @@ class GapPlant:
 
         `effects`: classes besides the registered ones. Raises `InputError` for unknown names and wrong values.
         """
-        return _from(described(text, effects))
+        return _from(parse_plant(text, effects))
 
 
 def plant(
@@ -237,6 +237,6 @@ def _joined(parts: Sequence[Tensor | None]) -> Tensor | None:
     return torch.cat(flat) if flat else None
 
 
-def _from(told: Described) -> GapPlant:
+def _from(told: PlantDescription) -> GapPlant:
     given = told.baseline
     return plant(told.effects, T_L=given.get("T_L"), K_L=given.get("K_L"), sigma=given.get("sigma"))

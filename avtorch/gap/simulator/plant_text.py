@@ -32,14 +32,14 @@ _LONGEST = 10_000  # most characters of a plant as a short string
 
 
 @dataclass(frozen=True)
-class Described:
+class PlantDescription:
     """A plant read from text: the given values of the `baseline`, and the effects."""
 
     baseline: dict[str, float]
     effects: list[Effect]
 
 
-def described(text: str, more: Iterable[type[Effect]] = ()) -> Described:
+def parse_plant(text: str, more: Iterable[type[Effect]] = ()) -> PlantDescription:
     """A plant from TOML or a short string; `"glvd"` or nothing is bare GLVD. Raises `InputError` for errors in the
     text.
 
@@ -87,7 +87,7 @@ def names_a_file(text: str) -> bool:
         return False
 
 
-def read_file(path: str | PathLike[str], more: Iterable[type[Effect]] = ()) -> Described:
+def read_file(path: str | PathLike[str], more: Iterable[type[Effect]] = ()) -> PlantDescription:
     """A plant from a TOML file of up to 1 MB. Raises `InputError` where it cannot be read."""
     if not os.path.lexists(path):
         raise InputError(f"plant: {place(path)}: no such file; needs a TOML file, or effects such as dead_time=0.2")
@@ -98,7 +98,7 @@ def read_file(path: str | PathLike[str], more: Iterable[type[Effect]] = ()) -> D
 
 
 def to_toml(effects: Iterable[Effect], baseline: Mapping[str, Any]) -> str:
-    """TOML from which `described` reads the same numbers."""
+    """TOML from which `parse_plant` reads the same numbers."""
     lines = [f"{name} = {_number(name, value)}" for name, value in baseline.items()]
     for given in effects:
         effect, _ = given.lag_apart()  # T_L is already written there
@@ -125,7 +125,7 @@ def _number(name: str, value: Any) -> str:
     return repr(value)
 
 
-def _of(tables: Mapping[str, Any], more: Iterable[type[Effect]]) -> Described:
+def _of(tables: Mapping[str, Any], more: Iterable[type[Effect]]) -> PlantDescription:
     baseline: dict[str, float] = {}
     effects = []
     for name, value in tables.items():
@@ -140,7 +140,7 @@ def _of(tables: Mapping[str, Any], more: Iterable[type[Effect]]) -> Described:
         if "profile" in given:
             given["profile"] = tensor(given["profile"])
         effects.append(cls.of(given))
-    return Described(baseline, effects)
+    return PlantDescription(baseline, effects)
 
 
 def _first(cls: type[Effect]) -> str:

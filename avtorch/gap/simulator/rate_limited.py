@@ -23,7 +23,7 @@ _STRETCHES, _SHORTEST = 128, 128  # rows of the shortest stretch
 _SAME = 1e-13  # [m/s²]
 
 
-class Held(Protocol):
+class LimitedSubstep(Protocol):
     """A part of each step: its target, lag and length, (...) or (..., time)."""
 
     @property
@@ -48,7 +48,7 @@ def slewed_row(r: FloatArray, g: FloatArray, T: FloatArray, h: FloatArray, J: Fl
     return r + np.minimum(np.maximum(g - r, -reach), reach)
 
 
-def by_rows(step: RowStep, start: Tensor, parts: Sequence[Held], jerk: Tensor) -> Tensor:
+def by_rows(step: RowStep, start: Tensor, parts: Sequence[LimitedSubstep], jerk: Tensor) -> Tensor:
     """States (..., time) after each row, from `start` (...); no derivatives."""
     limit = jerk.detach().clamp_max(1e9)
     shape = np.broadcast_shapes(
@@ -80,7 +80,7 @@ def by_rows(step: RowStep, start: Tensor, parts: Sequence[Held], jerk: Tensor) -
     return torch.as_tensor(np.ascontiguousarray(whole)).reshape(shape)
 
 
-def _tensors(part: Held) -> tuple[Tensor, Tensor, Tensor]:
+def _tensors(part: LimitedSubstep) -> tuple[Tensor, Tensor, Tensor]:
     return part.target.detach(), part.lag.detach(), part.length.detach()
 
 

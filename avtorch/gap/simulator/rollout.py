@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.drive import Drive, Response
 from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.effect_context import EffectContext, context_at
 from avtorch.gap.simulator.order import actuator_of, at_place, substeps
-from avtorch.gap.simulator.row import Row, row_at
+from avtorch.gap.simulator.simulator_input import Response, SimulatorInput
 
 STANDS_MPS = 0.1
 """Measured speed below which the car stands and its acceleration is zero [m/s]."""
@@ -22,7 +22,7 @@ def rollout(
     effects: Iterable[Effect],
     T_L: Tensor,
     K_L: Tensor,
-    drive: Drive,
+    drive: SimulatorInput,
     generator: torch.Generator | None = None,
     *,
     actuator0: Tensor | None = None,
@@ -30,7 +30,7 @@ def rollout(
     """See `GapPlant.response`; effects with values (...), in the chain's order."""
     single = [e if generator is None else e.drawn(generator) for e in effects]
     dt = drive.dt[0] if drive.uniform else drive.dt
-    row = Row(drive.time, dt, drive.speed, drive.position, T_L[..., None], K_L[..., None])
+    row = EffectContext(drive.time, dt, drive.speed, drive.position, T_L[..., None], K_L[..., None])
     shape = _shape(single, row, drive)
     rows, whole = {}, []
     for e in single:
@@ -53,7 +53,7 @@ def rollout(
         for e in at_place(single, "body"):
             if e.gravity and drive.specific_force:
                 continue
-            at = row_at(rows[e.name], 0)
+            at = context_at(rows[e.name], 0)
             accel0 = accel0 - e.advance(start, at, e.start(start, at))[0]
     a, gained = actuator_of(whole).over(accel0.expand(shape[:-1]), parts)
 
@@ -78,7 +78,7 @@ def rollout(
     return Response(accel, measured, torch.cat([v0, v0 + gained.cumsum(-1)], -1))
 
 
-def _shape(effects: list[Effect], row: Row, drive: Drive) -> torch.Size:
+def _shape(effects: list[Effect], row: EffectContext, drive: SimulatorInput) -> torch.Size:
     """The common shape (..., time) of all inputs."""
     shapes = [drive.command.shape, row.T_L.shape, row.K_L.shape]
     shapes += [x.shape for x in (drive.speed,) if x is not None]

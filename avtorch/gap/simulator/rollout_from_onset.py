@@ -8,12 +8,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from avtorch.gap.simulator.drive import Drive, Place, Response
 from avtorch.gap.simulator.plant import GapPlant
+from avtorch.gap.simulator.simulator_input import Place, Response, SimulatorInput
 
 
 def rollout_from_onset(
-    plant: GapPlant, without: GapPlant, drives: Sequence[Drive], values: Mapping[str, Tensor], place: Place
+    plant: GapPlant, without: GapPlant, drives: Sequence[SimulatorInput], values: Mapping[str, Tensor], place: Place
 ) -> list[Response]:
     """Responses to all drives of `without` before `place` and of `plant` from there on, both with these parameters.
 
@@ -44,7 +44,7 @@ def rollout_from_onset(
     return [*earlier, whole, *later]
 
 
-def _part(drive: Drive, rows: slice) -> Drive:
+def _part(drive: SimulatorInput, rows: slice) -> SimulatorInput:
     speed = None if drive.speed is None else drive.speed[..., rows]
     position0 = 0.0 if drive.position is None else drive.position[..., rows][..., 0]
     return replace(

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from avtorch.gap.simulator.actuator import ActuatorState
 from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.order import actuator_of, at_place, substeps
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.noise import Noise
 from avtorch.vehicle.plant import Motion
 
@@ -25,7 +25,7 @@ _ROUNDS = 5
 
 
 @dataclass(frozen=True)
-class Past:
+class SimulationState:
     """The state of a drive from step to step; never modified, so copies share it."""
 
     effects: tuple[Effect, ...]
@@ -43,7 +43,7 @@ class Past:
     memory: dict[str, Any]
 
 
-def goes_on(past: Past, a: Tensor) -> bool:
+def goes_on(past: SimulationState, a: Tensor) -> bool:
     """Whether `a` is the acceleration that the last step returned, hence the same drive.
 
     This holds for the same memory (also where a loop's copy expanded it), or for equal values. Equal values do not
@@ -58,7 +58,7 @@ def goes_on(past: Past, a: Tensor) -> bool:
 
 def begin(
     effects: tuple[Effect, ...], a: Tensor, v: Tensor, u: Tensor, dt: float, T_L: Tensor, K_L: Tensor, seed: int
-) -> Past:
+) -> SimulationState:
     """A drive that starts at the car's acceleration `a` and speed `v`, its commands in steady state at `u`."""
     effects = tuple(
         e.drawn(torch.Generator().manual_seed(_stream(e.name, seed)) if e.place == "body" else None) for e in effects
@@ -67,7 +67,7 @@ def begin(
     shape = np.broadcast_shapes(a.shape, v.shape, u.shape)
     a, v, u = (x.expand(shape) for x in (a, v, u))
     zero = torch.zeros_like(v)
-    past = Past(effects, T_L, K_L, noise, 0, 0.0, dt, a, v, zero, ActuatorState(a), zero, {})
+    past = SimulationState(effects, T_L, K_L, noise, 0, 0.0, dt, a, v, zero, ActuatorState(a), zero, {})
     row = _row(past, 0.0, v, zero, dt)
     memory: dict[str, Any] = {}
     for e in effects:  # each in steady state at the previous one's output
@@ -89,10 +89,10 @@ def begin(
     for e in at_place(effects, "sensor"):
         at = _draw(past, e, row, past.row)
         shown, memory[e.name] = e.advance(shown, at, e.start(shown, at))
-    return replace(past, actuator=actuator_of(effects).settled(own), force=force, memory=memory)
+    return replace(past, actuator=actuator_of(effects).steady_state(own), force=force, memory=memory)
 
 
-def move(past: Past, v: Tensor, u: Tensor, dt: float, eps: Tensor) -> tuple[Motion, Past]:
+def move(past: SimulationState, v: Tensor, u: Tensor, dt: float, eps: Tensor) -> tuple[Motion, SimulationState]:
     """One step, `u` and jerk noise `eps` held: `(measured acceleration, speed, displacement)` and the new state."""
     # by trapezoids of the speeds, as for a log
     position = past.position if past.row == 0 else past.position + 0.5 * past.dt * (past.speed + v)
@@ -139,12 +139,12 @@ def move(past: Past, v: Tensor, u: Tensor, dt: float, eps: Tensor) -> tuple[Moti
     return (seen, speed, v * dt + moved), kept
 
 
-def _row(past: Past, time: float, v: Tensor, x: Tensor, dt: float) -> Row:
+def _row(past: SimulationState, time: float, v: Tensor, x: Tensor, dt: float) -> EffectContext:
     now, step = torch.tensor(time, dtype=torch.float64), torch.tensor(dt, dtype=torch.float64)
-    return Row(now, step, v, x, past.T_L, past.K_L, whole=False)
+    return EffectContext(now, step, v, x, past.T_L, past.K_L, whole=False)
 
 
-def _draw(past: Past, effect: Effect, row: Row, number: int) -> Row:
+def _draw(past: SimulationState, effect: Effect, row: EffectContext, number: int) -> EffectContext:
     """The row with the effect's own draw, if it is random."""
     if not effect.random:
         return row

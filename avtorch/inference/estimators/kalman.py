@@ -130,10 +130,10 @@ class JointKalman(WindowedEstimator):
             model = JerkState(sigma, self.drift)
             noise_z, noise_var = sigma.log().unsqueeze(-1), (0.5 / statistics.n.clamp_min(1.0)).unsqueeze(-1)
         found, likelihood = self.filter(model, actuation, rows, columns)
-        settled = _plausible(found) & likelihood.isfinite()
+        converged = _plausible(found) & likelihood.isfinite()
         prior_mean, prior_cov = self.actuation_prior.median.log(), torch.diag(self.actuation_prior.log_sd.square())
-        mean = torch.where(settled[:, None], found.mean, prior_mean)
-        cov = torch.where(settled[:, None, None], found.cov, prior_cov)
+        mean = torch.where(converged[:, None], found.mean, prior_mean)
+        cov = torch.where(converged[:, None, None], found.cov, prior_cov)
         self._memory = {
             "mean": self._memory["mean"].index_put((index,), mean),
             "cov": self._memory["cov"].index_put((index,), cov),
@@ -141,7 +141,7 @@ class JointKalman(WindowedEstimator):
         whole = torch.diag_embed(torch.cat([torch.zeros_like(mean), noise_var], -1))
         whole[:, :2, :2] = cov
         mean_z = torch.cat([mean, noise_z], -1)
-        return Summary.log_normal(mean_z, whole, self.kept, self.generator), settled
+        return Summary.log_normal(mean_z, whole, self.kept, self.generator), converged
 
 
 def _plausible(actuation: GaussianState) -> Tensor:

@@ -37,10 +37,10 @@ class MaximumAPosteriori(SequentialInference):
 
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
         mode = find_mode(density)
-        settled = mode.converged & (mode.covariance.diagonal(dim1=-2, dim2=-1).amax(-1) < WIDEST**2)
+        converged = mode.converged & (mode.covariance.diagonal(dim1=-2, dim2=-1).amax(-1) < WIDEST**2)
         # the others are not used; any finite covariance will do
         covariance = torch.where(
-            settled[:, None, None], mode.covariance, torch.eye(mode.z.shape[-1], dtype=mode.z.dtype)
+            converged[:, None, None], mode.covariance, torch.eye(mode.z.shape[-1], dtype=mode.z.dtype)
         )
         summary = Summary.log_normal(mode.z, covariance, len(self.belief.draws), self.generator)
-        return summary, mode.z, covariance, settled
+        return summary, mode.z, covariance, converged

@@ -81,10 +81,10 @@ class RecursiveLeastSquares(WindowedEstimator):
         b, g, sigma = s.least_squares()
         scale = sigma.square() / (s.aa * s.uu - s.au.square())
         bb, gg, bg = scale * s.uu, scale * s.aa, scale * s.au
-        settled = (b > CLEAR * bb.sqrt()) & (g > CLEAR * gg.sqrt()) & (s.n > 4)
+        converged = (b > CLEAR * bb.sqrt()) & (g > CLEAR * gg.sqrt()) & (s.n > 4)
         # the others are not used; any finite numbers will do
-        b, g, sigma = (torch.where(settled, x, 1.0) for x in (b, g, sigma))
-        bb, gg, bg = (torch.where(settled, x, 0.0) for x in (bb, gg, bg))
+        b, g, sigma = (torch.where(converged, x, 1.0) for x in (b, g, sigma))
+        bb, gg, bg = (torch.where(converged, x, 0.0) for x in (bb, gg, bg))
         T, K, sd_b = 1 / b, g / b, bb.sqrt()
         sd_K = (gg - 2 * K * bg + K.square() * bb).clamp_min(0.0).sqrt() / b
         K05, K95 = _fieller(b, g, bb, gg, bg)
@@ -95,7 +95,7 @@ class RecursiveLeastSquares(WindowedEstimator):
             q05=torch.stack([1 / (b + Z90 * sd_b), K05, sigma * (-Z90 * spread).exp()], -1),
             q95=torch.stack([1 / (b - Z90 * sd_b), K95, sigma * (Z90 * spread).exp()], -1),
             draws=self._draws(b, g, sigma, sd_b, gg, bg, spread),
-        ), settled
+        ), converged
 
     def _draws(
         self, b: Tensor, g: Tensor, sigma: Tensor, sd_b: Tensor, gg: Tensor, bg: Tensor, spread: Tensor

@@ -50,8 +50,8 @@ class WindowedEstimator(ABC):
         index = evidence.excited.nonzero().squeeze(-1)
         if len(index):
             excited = {name: rows[name][index] for name in ("usable", *self.form.columns)}
-            found, settled = self._learn({"time": rows["time"], **excited}, index)
-            self.belief = self.belief.updated(evidence.excited, index, found, settled)
+            found, converged = self._learn({"time": rows["time"], **excited}, index)
+            self.belief = self.belief.updated(evidence.excited, index, found, converged)
         else:
             self.belief = self.belief.unused(evidence.excited)
         return self.belief

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError
-from avtorch.gap import Drive, GapPlant
+from avtorch.gap import GapPlant, SimulatorInput
 from avtorch.io import Log
 
 _SETTLE_S = 1.0
@@ -30,7 +30,7 @@ class Residuals:
     `push` (row,) [(m/s²)²]: squared steps of the command within the row. `step` [s].
     """
 
-    drives: tuple[Drive, ...]
+    drives: tuple[SimulatorInput, ...]
     channels: tuple[str, ...]
     seen: FloatArray
     valid: BoolArray
@@ -45,7 +45,7 @@ class Residuals:
         every = max(1, round(log.rate_hz / rate_hz))
         channels = tuple(name for name in ("accel", "speed") if getattr(log, name) is not None)
         drives, seen, valid, push = [], [], [], []
-        for part in log.drives():
+        for part in log.engaged_segments():
             count = (part.stop - part.start) // every
             if count < 3:
                 continue
@@ -59,7 +59,7 @@ class Residuals:
             gained = None if speed is None else np.append(np.diff(speed), 0.0)
             seen.append(np.stack([x for x in (accel, gained) if x is not None]))
             drives.append(
-                Drive(
+                SimulatorInput(
                     torch.as_tensor(time),
                     torch.as_tensor(command.mean(1)),
                     None if speed is None else torch.as_tensor(speed),

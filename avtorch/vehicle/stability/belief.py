@@ -12,8 +12,8 @@ from torch import Tensor
 from avtorch.arrays import Float, Real
 from avtorch.errors import InputError
 from avtorch.vehicle.stability.exact import coefficients
+from avtorch.vehicle.stability.linear_loop import Gains, LinearLoop, Value, as_tensor, linear_loop
 from avtorch.vehicle.stability.nyquist import lost_at
-from avtorch.vehicle.stability.setting import Gains, Setting, Value, as_tensor, read_setting
 from avtorch.vehicle.stability.verdict import locally_stable, peak_gain_of, string_stable_of
 
 Drawn = float | Real[Tensor, ""] | Real[Tensor, "*#setting #draw"]
@@ -152,7 +152,7 @@ def stability_belief(
     )
 
 
-def _margins(s: Setting) -> dict[str, Tensor]:
+def _margins(s: LinearLoop) -> dict[str, Tensor]:
     B, C = coefficients(s)
     rows = {
         "local": (1 / s.K - s.ka) * s.g - s.T * s.ks / s.K,
@@ -170,7 +170,7 @@ def _interval(draws: Float[Tensor, "setting draw"]) -> Interval:
     return Interval(*(ordered[..., min(n - 1, int(q * n))] for q in (0.05, 0.5, 0.95)))
 
 
-def _share(verdict: Callable[[Setting], Tensor], blocks: _Blocks) -> Float[Tensor, "*setting"]:
+def _share(verdict: Callable[[LinearLoop], Tensor], blocks: _Blocks) -> Float[Tensor, "*setting"]:
     return blocks.join([s.full(verdict(s)).double().mean(-1) for s in blocks])
 
 
@@ -196,7 +196,7 @@ class _Blocks:
         k = as_tensor(gains, like, "gains")
         if k.ndim == 0 or k.shape[-1] != 3:
             raise InputError(f"gains: expected (k_s, k_v, k_a) on the last dimension, found shape {tuple(k.shape)}")
-        self.setting = read_setting(
+        self.setting = linear_loop(
             plant[0],
             plant[1],
             law[0],
@@ -210,7 +210,7 @@ class _Blocks:
         if self.draws == 0:
             raise InputError("T_L, K_L: expected at least one draw, found none")
 
-    def __iter__(self) -> Iterator[Setting]:
+    def __iter__(self) -> Iterator[LinearLoop]:
         count = self.shape.numel()
         s = self.setting.map(lambda x: x.detach().expand(*self.shape, x.shape[-1]).reshape(count, x.shape[-1]))
         rows = max(1, BLOCK // self.draws)

@@ -11,7 +11,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
 from avtorch.vehicle.broadcasting import broadcast
-from avtorch.vehicle.stability.setting import Gains, Setting, Value, read_setting
+from avtorch.vehicle.stability.linear_loop import Gains, LinearLoop, Value, linear_loop
 
 Form = Literal["rigorous", "print"]
 PointOrBox = Value | tuple[Value, Value]
@@ -126,7 +126,7 @@ def string_sufficient(
     return string & local_conditions(T_L, K_L, time_gap, gains, form=form).holds
 
 
-def _least_B(T: Tensor, low: Setting, high: Setting) -> Tensor:
+def _least_B(T: Tensor, low: LinearLoop, high: LinearLoop) -> Tensor:
     """Least B over K in [K^l, K^u] at one T: at the vertex (k_a + T g) / k_a^2 if inside, else at an end."""
     ka2 = low.ka**2
     vertex = torch.where(ka2 > 0, (low.ka + T * low.g) / torch.where(ka2 > 0, ka2, torch.ones_like(ka2)), low.K)
@@ -135,16 +135,16 @@ def _least_B(T: Tensor, low: Setting, high: Setting) -> Tensor:
     return torch.minimum(ends, _B(T, K, low))
 
 
-def _B(T: Tensor, K: Tensor, s: Setting) -> Tensor:
+def _B(T: Tensor, K: Tensor, s: LinearLoop) -> Tensor:
     return (1 - K * s.ka) ** 2 - 2 * T * K * s.g
 
 
-def _corners(T_L: PointOrBox, K_L: PointOrBox, tau: Value, gains: Gains, form: str) -> tuple[Setting, Setting]:
+def _corners(T_L: PointOrBox, K_L: PointOrBox, tau: Value, gains: Gains, form: str) -> tuple[LinearLoop, LinearLoop]:
     if form not in ("rigorous", "print"):
         raise InputError(f"form: expected 'rigorous' or 'print', found {form!r}")
     T_low, T_high = _bounds(T_L, "T_L")
     K_low, K_high = _bounds(K_L, "K_L")
-    low, high = read_setting(T_low, K_low, tau, gains), read_setting(T_high, K_high, tau, gains)
+    low, high = linear_loop(T_low, K_low, tau, gains), linear_loop(T_high, K_high, tau, gains)
     if isinstance(T_L, tuple) and not bool((low.T <= high.T).all() & (torch.as_tensor(T_low) >= 0).all()):
         raise InputError("T_L: expected bounds 0 <= lower <= upper [s]")
     if isinstance(K_L, tuple) and not bool((low.K <= high.K).all() & (torch.as_tensor(K_low) > 0).all()):
@@ -160,7 +160,7 @@ def _bounds(value: PointOrBox, name: str) -> tuple[Value, Value]:
     return value
 
 
-def _stack(rows: dict[str, Tensor], low: Setting, high: Setting) -> Conditions:
+def _stack(rows: dict[str, Tensor], low: LinearLoop, high: LinearLoop) -> Conditions:
     values = torch.stack(broadcast(*rows.values()), -1)
     valid = (low.valid & high.valid).unsqueeze(-1)
     return Conditions(tuple(rows), torch.where(valid, values, torch.full_like(values, -torch.inf)))

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from avtorch.arrays import Float
 from avtorch.vehicle.broadcasting import broadcast
-from avtorch.vehicle.stability.setting import Gains, Setting, Value, read_setting
+from avtorch.vehicle.stability.linear_loop import Gains, LinearLoop, Value, linear_loop
 
 # Rounding must not make a loop on the boundary (C = 0 on paper) unstable: the sums below have some ten roundings.
 ROUNDINGS = 16
@@ -29,7 +29,7 @@ def string_margins(
         >>> bool(C >= 0 and (B >= 0 or B**2 <= 4 * 1.5**2 * C))  # the exact condition, though B < 0
         True
     """
-    s = read_setting(T_L, K_L, time_gap, gains, feedforward=feedforward)
+    s = linear_loop(T_L, K_L, time_gap, gains, feedforward=feedforward)
     B, C = broadcast(*coefficients(s))
     low = torch.full_like(B, -torch.inf)
     return s.full(torch.where(s.valid, B, low)), s.full(torch.where(s.valid, C, low))
@@ -50,7 +50,7 @@ def string_margin(
         >>> (margins >= 0).tolist()  # only the longest gap fulfils the gain condition
         [False, False, True]
     """
-    s = read_setting(T_L, K_L, time_gap, gains, feedforward=feedforward)
+    s = linear_loop(T_L, K_L, time_gap, gains, feedforward=feedforward)
     B, C = coefficients(s)
     dip = torch.where(B < 0, B, torch.zeros_like(B)) ** 2 / (4 * torch.where(s.T > 0, s.T, torch.ones_like(s.T)) ** 2)
     endless = (B < 0) & (s.T == 0)
@@ -58,14 +58,14 @@ def string_margin(
     return s.full(torch.where(s.valid, least, torch.full_like(least, -torch.inf)))
 
 
-def coefficients(s: Setting) -> tuple[Tensor, Tensor]:
+def coefficients(s: LinearLoop) -> tuple[Tensor, Tensor]:
     """(B, C), the dead time and the feed-forward's delay ignored."""
     B = s.b**2 - 2 * s.T * s.K * s.g - (s.K * s.kf) ** 2
     C = s.K**2 * (s.g**2 - s.kv**2 + 2 * s.ks * s.kf) - 2 * s.K * s.ks * s.b
     return B, C
 
 
-def gain_condition(s: Setting) -> Tensor:
+def gain_condition(s: LinearLoop) -> Tensor:
     """`|G| <= 1` at every omega, without dead time: C >= 0 and (B >= 0 or B^2 <= 4 T^2 C), to rounding."""
     B, C = coefficients(s)
     eps = ROUNDINGS * torch.finfo(C.dtype).eps
@@ -77,7 +77,7 @@ def gain_condition(s: Setting) -> Tensor:
     return (C + slack >= 0) & ((B + B_slack >= 0) | (room >= 0))
 
 
-def peak_omega(s: Setting) -> Tensor:
+def peak_omega(s: LinearLoop) -> Tensor:
     """Frequency [rad/s] at which |G| is largest, 0 where |G| nowhere exceeds one; no dead time, no feed-forward.
 
     With x = omega^2, |G|^2 = N / (N + P), N = K^2 (k_v^2 x + k_s^2), P = T^2 x^3 + B x^2 + C x. P / N is stationary at

@@ -9,16 +9,16 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float
 from avtorch.vehicle.broadcasting import broadcast
-from avtorch.vehicle.stability.setting import Setting
+from avtorch.vehicle.stability.linear_loop import LinearLoop
 
 
-def hurwitz(s: Setting) -> Bool[Tensor, "..."]:
+def hurwitz(s: LinearLoop) -> Bool[Tensor, "..."]:
     """Eq. 2 at one point (Routh-Hurwitz, the dead time ignored): all roots of the cubic in the open left half plane."""
     return s.valid & (s.b > 0) & (s.g > 0) & (s.ks > 0) & (s.b * s.g > s.T * s.ks)
 
 
 def crossings(
-    s: Setting,
+    s: LinearLoop,
 ) -> tuple[Float[Tensor, "*setting 3"], Float[Tensor, "*setting 3"], Float[Tensor, "*setting 3"]]:
     """Where the open loop L = K q / p, p = s^2 (T s + 1), q = -k_a s^2 + g s + k_s, has |L(j omega)| = 1.
 
@@ -46,7 +46,7 @@ def crossings(
     return omega, phase, torch.where(real, torch.sign(slope), torch.zeros_like(slope))
 
 
-def nyquist(s: Setting) -> Bool[Tensor, "..."]:
+def nyquist(s: LinearLoop) -> Bool[Tensor, "..."]:
     """Locally stable with the dead time: no root of T s^3 + s^2 + K exp(-theta s) q(s) with Re s >= 0, shape (...).
 
     The roots on the right are counted, not sampled: those of the delay-free loop (Routh-Hurwitz: none, or two when
@@ -62,7 +62,7 @@ def nyquist(s: Setting) -> Bool[Tensor, "..."]:
     return s.valid & (s.ks > 0) & neutral & (right == 0)
 
 
-def lost_at(s: Setting) -> Tensor:
+def lost_at(s: LinearLoop) -> Tensor:
     """Smallest dead time [s] at which a loop loses its local stability; 0 where it is unstable without dead time."""
     omega, phase, sign = crossings(s)
     first = torch.where(sign > 0, phase / omega, torch.full_like(phase, torch.inf)).amin(-1)

@@ -12,7 +12,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
 from avtorch.vehicle.stability.conditions import PointOrBox, local_conditions, string_sufficient
-from avtorch.vehicle.stability.setting import Gains, Value
+from avtorch.vehicle.stability.linear_loop import Gains, Value
 from avtorch.vehicle.stability.verdict import local_stable, peak_gain, string_stable
 
 AXES = ("k_s", "k_v", "k_a", "tau", "T", "K")

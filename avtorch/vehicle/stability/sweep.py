@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float
 from avtorch.vehicle.stability.exact import ROUNDINGS
-from avtorch.vehicle.stability.setting import Setting
+from avtorch.vehicle.stability.linear_loop import LinearLoop
 from avtorch.vehicle.stability.transfer import excess
 
 DECADES = 3.5  # below this the sweep is one bracket, down to omega = 0
@@ -21,7 +21,7 @@ BLOCK = 1 << 17  # numbers evaluated at a time: the temporaries stay in the cach
 GOLDEN = (math.sqrt(5) - 1) / 2
 
 
-def sweep(s: Setting) -> tuple[Float[Tensor, " setting"], Bool[Tensor, " setting"]]:
+def sweep(s: LinearLoop) -> tuple[Float[Tensor, " setting"], Bool[Tensor, " setting"]]:
     """(omega, above) of a flat batch (setting,): the frequency of the largest |G| [rad/s] and whether |G| > 1 there.
 
     omega is 0 where |G| nowhere exceeds one. The sweep minimises omega^2 h / N = |G|^-2 - 1, which keeps its sign near
@@ -44,7 +44,7 @@ def sweep(s: Setting) -> tuple[Float[Tensor, " setting"], Bool[Tensor, " setting
     return torch.cat([p[1] for p in parts])[order], torch.cat([p[2] for p in parts])[order]
 
 
-def exceeds_anywhere(s: Setting) -> Bool[Tensor, " setting"]:
+def exceeds_anywhere(s: LinearLoop) -> Bool[Tensor, " setting"]:
     """Whether |G| > 1 at any frequency, for a flat batch (setting,); as `sweep`, but decided on few points if possible.
 
     In ln(omega) no term of h bends more than (4 + omega theta)^2 times its own size, so between points `step` apart h
@@ -71,7 +71,7 @@ def exceeds_anywhere(s: Setting) -> Bool[Tensor, " setting"]:
 
 
 def _sweep(
-    s: Setting, top: Float[Tensor, " setting"], points: int
+    s: LinearLoop, top: Float[Tensor, " setting"], points: int
 ) -> tuple[Float[Tensor, " setting"], Bool[Tensor, " setting"]]:
     col = s.column()
     grid = torch.logspace(-DECADES, 0, points, dtype=top.dtype, device=top.device)
@@ -93,7 +93,7 @@ def _sweep(
 
 
 def _golden(
-    col: Setting, a: Float[Tensor, "setting dip"], d: Float[Tensor, "setting dip"]
+    col: LinearLoop, a: Float[Tensor, "setting dip"], d: Float[Tensor, "setting dip"]
 ) -> Float[Tensor, "setting dip"]:
     """Minimum of the shortfall between a and d, (setting, dip), to about 1e-8 of the bracket."""
     b, c = d - GOLDEN * (d - a), a + GOLDEN * (d - a)
@@ -108,13 +108,13 @@ def _golden(
     return (a + d) / 2
 
 
-def _shortfall(s: Setting, omega: Tensor) -> Tensor:
+def _shortfall(s: LinearLoop, omega: Tensor) -> Tensor:
     """|G|^-2 - 1."""
     h, n = excess(s, omega)
     return omega * omega * h / n.clamp_min(torch.finfo(n.dtype).tiny)
 
 
-def _exceeds(s: Setting, omega: Tensor) -> Tensor:
+def _exceeds(s: LinearLoop, omega: Tensor) -> Tensor:
     """h < 0 by more than rounding."""
     return excess(s, omega)[0] < -_rounding(_size(s, omega))
 
@@ -123,7 +123,7 @@ def _rounding(size: Tensor) -> Tensor:
     return 2 * ROUNDINGS * torch.finfo(size.dtype).eps * size
 
 
-def _size(s: Setting, omega: Tensor) -> Tensor:
+def _size(s: LinearLoop, omega: Tensor) -> Tensor:
     """Sum of the absolute terms of h, the scale of its rounding and its curvature."""
     x = omega * omega
     k2, twice = s.K**2, 2 * s.K
@@ -135,7 +135,7 @@ def _size(s: Setting, omega: Tensor) -> Tensor:
     return torch.addcmul(even, omega, torch.addcmul(c1, x, twice * s.T * ka))
 
 
-def _band(s: Setting) -> Tensor:
+def _band(s: LinearLoop) -> Tensor:
     """Frequency [rad/s] above which |G| < 1 for sure: |p| outgrows K (|q| + |numerator|), with Fujiwara's bound."""
     a = s.K * (s.ka.abs() + s.kf.abs())
     b = s.K * (s.g.abs() + s.kv.abs())
@@ -150,7 +150,7 @@ def _band(s: Setting) -> Tensor:
     return torch.where(torch.isfinite(top) & (top > 0), top, torch.full_like(top, 1e3))
 
 
-def _points(s: Setting, top: Tensor) -> Tensor:
+def _points(s: LinearLoop, top: Tensor) -> Tensor:
     """Points of the sweep, a power of two times POINTS: steps of at most a quarter radian of delay at the top."""
     turn = top * torch.maximum(s.theta, s.theta_f) * (DECADES * math.log(10)) / (0.25 * POINTS)
     doubled = torch.ceil(torch.log2(turn.clamp_min(1)))

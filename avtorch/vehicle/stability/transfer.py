@@ -7,7 +7,7 @@ from torch import Tensor
 
 from avtorch.arrays import Complex, Float
 from avtorch.vehicle.broadcasting import broadcast
-from avtorch.vehicle.stability.setting import Gains, Setting, Value, as_tensor, read_setting
+from avtorch.vehicle.stability.linear_loop import Gains, LinearLoop, Value, as_tensor, linear_loop
 
 
 def transfer_function(
@@ -33,7 +33,7 @@ def transfer_function(
         (torch.complex128, [1.0, 1.632])
     """
     w = as_tensor(omega, [omega, T_L, K_L, time_gap, gains], "omega")
-    s = read_setting(
+    s = linear_loop(
         T_L, K_L, time_gap, gains, dead_time=dead_time, feedforward=feedforward, feedforward_delay=feedforward_delay
     )
     (nr, ni), (fr, fi) = _numerator(s, w), _denominator(s, w)
@@ -62,19 +62,19 @@ def gain(
         [1.21, 1.63, 0.03]
     """
     w = as_tensor(omega, [omega, T_L, K_L, time_gap, gains], "omega")
-    s = read_setting(
+    s = linear_loop(
         T_L, K_L, time_gap, gains, dead_time=dead_time, feedforward=feedforward, feedforward_delay=feedforward_delay
     )
     size = magnitude(s, w)
     return torch.where(s.valid, size, torch.zeros_like(size))
 
 
-def magnitude(s: Setting, omega: Tensor) -> Tensor:
+def magnitude(s: LinearLoop, omega: Tensor) -> Tensor:
     """`|G(j omega)|` of a setting."""
     return torch.hypot(*_numerator(s, omega)) / torch.hypot(*_denominator(s, omega))
 
 
-def excess(s: Setting, omega: Tensor) -> tuple[Tensor, Tensor]:
+def excess(s: LinearLoop, omega: Tensor) -> tuple[Tensor, Tensor]:
     """(h, N) with |G|^2 = N / (N + omega^2 h): the gain is at most one exactly where h >= 0.
 
     Without dead time and feed-forward h = T^2 omega^4 + B omega^2 + C. Dividing by omega^2 analytically, not
@@ -100,13 +100,13 @@ def excess(s: Setting, omega: Tensor) -> tuple[Tensor, Tensor]:
     return h, n
 
 
-def _numerator(s: Setting, w: Tensor) -> tuple[Tensor, Tensor]:
+def _numerator(s: LinearLoop, w: Tensor) -> tuple[Tensor, Tensor]:
     x = w * w
     angle = w * s.theta_f
     return s.K * (s.ks - s.kf * x * torch.cos(angle)), s.K * (s.kv * w + s.kf * x * torch.sin(angle))
 
 
-def _denominator(s: Setting, w: Tensor) -> tuple[Tensor, Tensor]:
+def _denominator(s: LinearLoop, w: Tensor) -> tuple[Tensor, Tensor]:
     x = w * w
     c, d = torch.cos(w * s.theta), torch.sin(w * s.theta)
     qr, qi = s.ks + s.ka * x, s.g * w

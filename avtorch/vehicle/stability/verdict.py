@@ -7,8 +7,8 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float
 from avtorch.vehicle.stability.exact import gain_condition, peak_omega
+from avtorch.vehicle.stability.linear_loop import Gains, LinearLoop, Value, linear_loop
 from avtorch.vehicle.stability.nyquist import hurwitz, lost_at, nyquist
-from avtorch.vehicle.stability.setting import Gains, Setting, Value, read_setting
 from avtorch.vehicle.stability.sweep import exceeds_anywhere, sweep
 from avtorch.vehicle.stability.transfer import magnitude
 
@@ -27,7 +27,7 @@ def local_stable(
         >>> local_stable(0.3, 1.0, 1.0, (1.5, 1.5, -0.8), dead_time=[0.0, 0.5, 0.6]).tolist()
         [True, True, False]
     """
-    s = read_setting(T_L, K_L, time_gap, gains, dead_time=dead_time)
+    s = linear_loop(T_L, K_L, time_gap, gains, dead_time=dead_time)
     return s.full(locally_stable(s))
 
 
@@ -52,7 +52,7 @@ def string_stable(
         >>> string_stable(T_L=1.5, K_L=0.5, time_gap=[1.0, 2.0, 2.5], gains=(1.5, 1.5, -0.8)).tolist()
         [False, False, True]
     """
-    s = read_setting(
+    s = linear_loop(
         T_L, K_L, time_gap, gains, dead_time=dead_time, feedforward=feedforward, feedforward_delay=feedforward_delay
     )
     return s.full(string_stable_of(s))
@@ -85,7 +85,7 @@ def peak_gain(
         >>> round(float(T_L.grad), 3)  # per second of lag
         2.446
     """
-    s = read_setting(
+    s = linear_loop(
         T_L, K_L, time_gap, gains, dead_time=dead_time, feedforward=feedforward, feedforward_delay=feedforward_delay
     )
     return peak_gain_of(s)
@@ -111,7 +111,7 @@ def peak_frequency(
         >>> round(float(peak_frequency(T_L=0.3, K_L=1.0, time_gap=1.0, gains=(1.5, 1.5, -0.8), dead_time=0.4)), 2)
         3.02
     """
-    s = read_setting(
+    s = linear_loop(
         T_L, K_L, time_gap, gains, dead_time=dead_time, feedforward=feedforward, feedforward_delay=feedforward_delay
     )
     with torch.no_grad():
@@ -126,18 +126,18 @@ def dead_time_margin(T_L: Value, K_L: Value, time_gap: Value, gains: Gains) -> F
         >>> round(float(dead_time_margin(T_L=0.3, K_L=1.0, time_gap=1.0, gains=(1.5, 1.5, -0.8))), 3)
         0.521
     """
-    s = read_setting(T_L, K_L, time_gap, gains)
+    s = linear_loop(T_L, K_L, time_gap, gains)
     return s.full(lost_at(s))
 
 
-def locally_stable(s: Setting) -> Bool[Tensor, "..."]:
+def locally_stable(s: LinearLoop) -> Bool[Tensor, "..."]:
     """`local_stable` of a setting, in the smallest shape that suffices."""
     if not bool((s.theta > 0).any()):
         return hurwitz(s)
     return torch.where(s.theta > 0, nyquist(s), hurwitz(s))
 
 
-def string_stable_of(s: Setting) -> Bool[Tensor, "..."]:
+def string_stable_of(s: LinearLoop) -> Bool[Tensor, "..."]:
     """`string_stable` of a setting, likewise."""
     with torch.no_grad():
         delayed = (s.theta > 0) | ((s.kf != 0) & (s.theta_f > 0))
@@ -153,7 +153,7 @@ def string_stable_of(s: Setting) -> Bool[Tensor, "..."]:
         return verdict
 
 
-def peak_gain_of(s: Setting) -> Tensor:
+def peak_gain_of(s: LinearLoop) -> Tensor:
     """`peak_gain` of a setting, in its full shape."""
     with torch.no_grad():
         stable = s.full(locally_stable(s))
@@ -163,13 +163,13 @@ def peak_gain_of(s: Setting) -> Tensor:
     return torch.where(stable, size, torch.full_like(size, torch.inf))
 
 
-def _level(s: Setting) -> Tensor:
+def _level(s: LinearLoop) -> Tensor:
     """C >= -slack, a generous bound: the sweep decides the rest."""
     C = s.K**2 * (s.g**2 - s.kv**2 + 2 * s.ks * s.kf) - 2 * s.K * s.ks * s.b
     return s.full(C + 1e-9 * (1 + C.abs()) >= 0)
 
 
-def _peak_frequency(s: Setting, wanted: Bool[Tensor, "*setting"]) -> Float[Tensor, "*setting"]:
+def _peak_frequency(s: LinearLoop, wanted: Bool[Tensor, "*setting"]) -> Float[Tensor, "*setting"]:
     """Peak frequency of the full shape where `wanted`, else 0."""
     s = s.map(torch.detach)
     swept = s.full((s.theta > 0) | (s.kf != 0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avtorch.gap.crossval.closed_loop_errors import LoopMeasure, loop_measures
+from avtorch.gap.crossval.closed_loop_errors import ClosedLoopMetric, closed_loop_metrics
 
 DT = 0.005
 GAINS = (0.4, 0.9, -0.3)
@@ -39,18 +39,18 @@ def test_superposition_is_what_the_loops_differ_by(channel: str, fresh_seed: int
     (v1, s1), (v0, s0) = loops(T, K, push), loops(T, K, np.zeros_like(push))
     error = push if channel == "accel" else np.concatenate([[0.0], np.cumsum(push[:-1]) * DT])
     for quantity, want in (("speed", v1 - v0), ("spacing", s1 - s0)):
-        measure = LoopMeasure(channel, quantity, T, K, GAP, GAINS)
-        told = measure.of(np.stack([error, 2 * error]), DT)
+        metric = ClosedLoopMetric(channel, quantity, T, K, GAP, GAINS)
+        told = metric.of(np.stack([error, 2 * error]), DT)
         # Euler steps of 5 ms against a bilinear transform
         np.testing.assert_allclose(told[0], want, atol=0.01 * np.abs(want).max() + 1e-4)
         np.testing.assert_allclose(told[1], 2 * told[0])
 
 
 def test_a_loop_that_does_not_forget_is_no_measure() -> None:
-    assert {m.name for m in loop_measures(("accel", "speed"), 0.3, 1.0)} == {
+    assert {m.name for m in closed_loop_metrics(("accel", "speed"), 0.3, 1.0)} == {
         "closed_loop_rmse_speed",
         "closed_loop_rmse_spacing",
     }
-    assert all(m.channel == "speed" for m in loop_measures(("accel", "speed"), 0.3, 1.0))
-    assert loop_measures(("accel",), 0.3, 1.0)[0].channel == "accel"
-    assert not LoopMeasure("speed", "speed", 4.0, 1.0, 0.1, (1.5, 0.05, 0.0)).stable
+    assert all(m.channel == "speed" for m in closed_loop_metrics(("accel", "speed"), 0.3, 1.0))
+    assert closed_loop_metrics(("accel",), 0.3, 1.0)[0].channel == "accel"
+    assert not ClosedLoopMetric("speed", "speed", 4.0, 1.0, 0.1, (1.5, 0.05, 0.0)).stable

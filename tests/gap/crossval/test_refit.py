@@ -7,7 +7,7 @@ from avtorch.gap import AerodynamicDrag, DeadTime, Gust, SensorScale
 from avtorch.gap.crossval.folds import folds
 from avtorch.gap.crossval.noise_floor import drawn, expected
 from avtorch.gap.crossval.refit import Refit
-from avtorch.gap.crossval.rollout_errors import measures
+from avtorch.gap.crossval.rollout_errors import rollout_metrics
 from avtorch.gap.crossval.scores import FoldScorer, parameter_spread
 from tests.gap.finds import found_of
 
@@ -41,7 +41,7 @@ def test_what_is_owed_is_what_draws_of_the_posterior_cost(rotating_seed: int) ->
     record = found.hypothesis.record
     part = folds(record)[0]
     refit = Refit.of(found, part.fits)
-    judge = FoldScorer(record, part, measures(record.channels), 0.35)
+    judge = FoldScorer(record, part, rollout_metrics(record.channels), 0.35)
     floor = judge.floor(refit, parameter_spread(refit))
     draws = rng.multivariate_normal(np.zeros(len(refit.z)), refit.covariance, size=400)
     around = refit.around(np.concatenate([np.zeros((1, len(refit.z))), draws]))

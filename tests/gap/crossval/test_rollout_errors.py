@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from avtorch.gap.crossval.rollout_errors import Measure, measures
-from avtorch.gap.simulator.drive import Drive
+from avtorch.gap.crossval.rollout_errors import RolloutMetric, rollout_metrics
 from avtorch.gap.simulator.plant import plant
+from avtorch.gap.simulator.simulator_input import SimulatorInput
 from tests.gap.records import command_over
 
 RATE = 10
@@ -24,7 +24,9 @@ def test_they_are_those_of_rollouts_begun_at_what_was_measured(channel: str, hor
     def rolled(first: int, last: int, accel0: float) -> dict[str, np.ndarray]:
         part = slice(first, last)
         speed = torch.as_tensor(seen["speed"][part])
-        answer = car.response(Drive(torch.as_tensor(time[part]), torch.as_tensor(command[part]), speed, accel0))
+        answer = car.response(
+            SimulatorInput(torch.as_tensor(time[part]), torch.as_tensor(command[part]), speed, accel0)
+        )
         return {"accel": answer.accel.numpy(), "speed": answer.speed.numpy()}
 
     whole = rolled(0, len(time), seen["accel"][0])
@@ -32,7 +34,7 @@ def test_they_are_those_of_rollouts_begun_at_what_was_measured(channel: str, hor
     begun = seen["accel"] if channel == "accel" else whole["accel"]
     long = seen[channel] - whole[channel]
     blocks = [slice(0, 40), slice(40, 45), slice(70, len(time))]
-    told = Measure(channel, horizon).products(np.stack([long, -2 * long]), blocks, 1 / RATE, 0.4)
+    told = RolloutMetric(channel, horizon).products(np.stack([long, -2 * long]), blocks, 1 / RATE, 0.4)
     length = round(horizon * RATE)
     squares: list[list[float]] = [[] for _ in time]
     squares[-1].append(0.0)  # a rollout begun at the last row
@@ -47,9 +49,9 @@ def test_they_are_those_of_rollouts_begun_at_what_was_measured(channel: str, hor
 
 
 def test_the_usual_ones_have_the_schemas_names() -> None:
-    names = [m.name for m in measures(("accel", "speed"))]
+    names = [m.name for m in rollout_metrics(("accel", "speed"))]
     assert {"rollout_rmse_accel", "rollout_rmse_speed", "rollout_rmse_accel_2s", "rollout_rmse_speed_whole"} <= {*names}
     assert len(set(names)) == len(names) == 8
     rows = np.arange(1.0, 6.0)[None]
-    assert Measure("accel", None).products(rows, [slice(1, 5)], 0.1, 0.3).tolist() == [[[4 + 9 + 16 + 25]]]
-    assert Measure("speed", None).products(rows, [slice(1, 5)], 0.1, 0.3).tolist() == [[[1 + 4 + 9 + 16]]]
+    assert RolloutMetric("accel", None).products(rows, [slice(1, 5)], 0.1, 0.3).tolist() == [[[4 + 9 + 16 + 25]]]
+    assert RolloutMetric("speed", None).products(rows, [slice(1, 5)], 0.1, 0.3).tolist() == [[[1 + 4 + 9 + 16]]]

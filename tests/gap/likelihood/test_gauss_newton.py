@@ -11,14 +11,23 @@ import torch
 from scipy.optimize import minimize
 
 from avtorch.arrays import FloatArray
-from avtorch.gap import AerodynamicDrag, ConstantResistance, DeadTime, Drive, GapPlant, RoadGrade, SensorBias, plant
+from avtorch.gap import (
+    AerodynamicDrag,
+    ConstantResistance,
+    DeadTime,
+    GapPlant,
+    RoadGrade,
+    SensorBias,
+    SimulatorInput,
+    plant,
+)
 from avtorch.gap.effects.road_grade import GRAVITY
 from avtorch.gap.likelihood.gauss_newton import finish, modes
 from avtorch.gap.likelihood.grade_marginal import SIZES
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.simulator.row import Row
+from avtorch.gap.simulator.effect_context import EffectContext
 from tests.gap.records import QUIET, log_of
 
 
@@ -260,7 +269,7 @@ def test_slope_columns_are_the_rollouts_derivatives(fresh_seed: int) -> None:
     hypothesis, _ = _case(plant(), "road_grade", rng)
     columns, record = hypothesis.grade_columns, hypothesis.record
     assert columns is not None
-    drive: Drive = record.drives[0]
+    drive: SimulatorInput = record.drives[0]
     flat = plant().response(drive)
     for k in (0, len(columns) // 2, len(columns) - 1):
         unit = torch.zeros(len(columns), dtype=torch.float64)
@@ -327,13 +336,13 @@ def test_what_a_slope_does_is_the_sum_of_its_columns(rate_hz: int, fresh_seed: i
     assert columns[knots:][:, :, others].any()
 
 
-def _road(drive: Drive) -> RoadGrade:
+def _road(drive: SimulatorInput) -> RoadGrade:
     return RoadGrade().prepared(drive.time, drive.speed, drive.position)
 
 
-def _row(drive: Drive) -> Row:
+def _row(drive: SimulatorInput) -> EffectContext:
     one = torch.tensor(1.0, dtype=torch.float64)
-    return Row(drive.time, drive.dt, drive.speed, drive.position, one, one)
+    return EffectContext(drive.time, drive.dt, drive.speed, drive.position, one, one)
 
 
 @pytest.mark.parametrize("rate_hz", [20, 100])

@@ -12,7 +12,7 @@ from avtorch.gap.likelihood.noise_fit import GUST, PRIORS, Prior, fit_noise
 from avtorch.gap.likelihood.noise_model import NAMES, NoiseModel
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.search.onset import allowed, profile
+from avtorch.gap.search.onset import allowed, onset_profile
 from tests.gap.records import BOTH, drawn_errors, errors_of, log_of, ornstein, record_of
 
 
@@ -125,7 +125,7 @@ def test_the_moment_a_force_sets_in_is_found(rotating_seed: int) -> None:
 
     quiet = WhiteningFilter(record, calm).row_likelihoods(errors)
     loud = WhiteningFilter(record, truth).row_likelihoods(errors)
-    along = profile(quiet, loud)
+    along = onset_profile(quiet, loud)
     within = allowed(record.rows, record.dt)
     onset = within.start + int(np.argmax(along[within]))
     # the force begins at any size, now and then near nought: it grows by 0.3 m/s² within its time constant

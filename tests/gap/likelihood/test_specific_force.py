@@ -18,7 +18,7 @@ from avtorch.blindtest.drives import DrivePlan as Plan
 from avtorch.blindtest.drives import Recorded
 from avtorch.blindtest.vehicle import Run, simulate
 from avtorch.errors import InputError
-from avtorch.gap import AerodynamicDrag, Drive, RoadGrade, SensorLag, plant
+from avtorch.gap import AerodynamicDrag, RoadGrade, SensorLag, SimulatorInput, plant
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.record import Record
 from avtorch.io import Log
@@ -60,7 +60,7 @@ def test_a_drive_with_an_accelerometer_shows_the_slope_in_the_speed_alone() -> N
     road = RoadGrade(0.04, torch.linspace(-1, 1, 8, dtype=D), 8)
     car, flat = plant([road, AerodynamicDrag(), SensorLag(0.2)]), plant([AerodynamicDrag(), SensorLag(0.2)])
     time = torch.arange(200, dtype=D) * 0.05
-    drive = Drive(time, torch.sin(time), 20 + torch.sin(time), 0.3)
+    drive = SimulatorInput(time, torch.sin(time), 20 + torch.sin(time), 0.3)
     bus, fixed = car.response(drive), car.response(replace(drive, specific_force=True))
     level = flat.response(drive)
     # the drag is felt, the slope is not; the start is the actuator's own in both, gravity in it or not
@@ -77,7 +77,7 @@ def test_the_kind_travels_with_the_log() -> None:
     record = Record.of(log)
     assert record.accel_kind == "specific-force"
     assert all(d.specific_force for d in (*record.drives, *record.coarse))
-    assert Drive.from_log(log).specific_force
+    assert SimulatorInput.from_log(log).specific_force
     columns = [Hypothesis(Record.of(x), (RoadGrade,), plant()).grade_columns for x in (log, log_of(seconds=20.0))]
     assert columns[0] is not None
     assert columns[1] is not None

@@ -14,7 +14,7 @@ from avtorch.gap import DeadTime, SensorLag, SensorScale
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.noise_segments import CALM, before_onset
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.steady_kalman import _steady, motion
+from avtorch.gap.likelihood.steady_kalman import _steady, error_dynamics
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from tests.bars import BAR
 from tests.gap.records import BOTH, dense_covariance, errors_of, log_normal_density, log_of, record_of
@@ -353,7 +353,7 @@ def test_motion_in_closed_form_is_van_loans(noise: NoiseModel, dt: float) -> Non
     drift, spectrum, _ = _process(noise)
     n = len(drift)
     both = expm(np.block([[-drift, spectrum], [np.zeros((n, n)), drift.T]]) * dt)
-    move, driven = motion(noise, dt)
+    move, driven = error_dynamics(noise, dt)
     np.testing.assert_allclose(move, both[n:, n:].T, rtol=1e-12, atol=1e-15)
     want = both[n:, n:].T @ both[:n, n:]
     scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
@@ -364,7 +364,7 @@ def test_motion_in_closed_form_is_van_loans(noise: NoiseModel, dt: float) -> Non
 @pytest.mark.parametrize("lag", [0.0021, 0.02, 0.2, 0.5])
 def test_motion_behind_a_late_sensor_is_the_integral(lag: float, dt: float) -> None:
     noise = replace(NOISES["windy"], sensor_lag=lag)
-    move, driven = motion(noise, dt)
+    move, driven = error_dynamics(noise, dt)
     exact, want = _over(noise, dt)
     np.testing.assert_allclose(move, exact, rtol=1e-10, atol=1e-14)
     scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))

@@ -32,15 +32,15 @@ from avtorch.gap import (
 from avtorch.gap.likelihood.noise_segments import CALM
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.posterior.density import RolloutDensity, root
-from avtorch.gap.posterior.importance_sampling import effective, importance
+from avtorch.gap.posterior.importance_sampling import effective_sample_size, importance
 from avtorch.gap.posterior.sample import (
-    drawn,
     exact_one_in,
     fitted,
-    moved,
+    lag_and_gain,
     posterior,
     repaired,
     reported,
+    reported_draws,
     stein_discrepancy,
 )
 from avtorch.gap.posterior.surrogate import Corrected
@@ -275,7 +275,7 @@ def test_importance_on_a_cliff(rotating_seed: int) -> None:
         return np.where(z[:, 0] > 0, -0.5 * z[:, 0] ** 2, -np.inf) - 0.5 * (z[:, 1] / 5) ** 2
 
     places, weights = importance(log_prob, np.zeros(2), np.eye(2), rounds=5, size=400, enough=1e9, seed=rotating_seed)
-    worth = effective(weights)
+    worth = effective_sample_size(weights)
     assert worth > 300
     assert weights.sum() == pytest.approx(1)
     mean = weights @ places
@@ -303,7 +303,7 @@ def test_reported_and_repaired(name: str) -> None:
     told = reported(found)
     assert set(told) == NAMES[name]
     assert all(q.sd > 0 for q in told.values())
-    assert set(moved(found)) == {"T_L", "K_L"}
+    assert set(lag_and_gain(found)) == {"T_L", "K_L"}
     car = repaired(found)
     assert [e.name for e in car.effects] == [name]
     again = GapPlant.from_toml(car.to_toml())
@@ -315,7 +315,7 @@ def test_reported_and_repaired(name: str) -> None:
 def test_truth_is_within_what_is_reported() -> None:
     found = found_of([SecondOrderActuator(0.15)], seconds=60)
     for draws in (None, posterior(found, draws=20)):
-        told = reported(found, draws) | moved(found, draws)
+        told = reported(found, draws) | lag_and_gain(found, draws)
         truth = {"natural_frequency_radps": 1 / 0.15, "damping_ratio": 0.35 / 0.3, "T_L": 0.35, "K_L": 0.95}
         for key, value in truth.items():
             assert abs(told[key].mean - value) < 5 * told[key].sd
@@ -331,7 +331,7 @@ def test_pairs_have_their_effects_in_front() -> None:
         "outliers.scale",
     }
     assert set(reported(found)) == set(reported(found, draws)) == keys
-    each = drawn(found, draws)
+    each = reported_draws(found, draws)
     assert list(each)[:2] == ["T_L", "K_L"]
     assert set(each) == {"T_L", "K_L", *keys}
     assert {x.shape for x in each.values()} == {(16, 10)}

@@ -25,7 +25,7 @@ from avtorch.gap.result.diagnosis import (
     Quantity,
     Verdict,
     candidate_name,
-    listed,
+    listed_candidates,
     near,
     verdict_of,
 )
@@ -142,7 +142,7 @@ def test_units_by_the_key() -> None:
 
 def test_listed_sums_to_one_and_drops_the_improbable() -> None:
     given = candidates(none=0.0, gust=5e-5, dead_time=0.7, dead_time_and_gust=0.2, unknown=1e-9)
-    ranked = listed(given)
+    ranked = listed_candidates(given)
     assert [c.name for c in ranked] == ["dead_time", "dead_time+gust", "unknown", "none"]
     assert math.fsum(c.probability for c in ranked) == 1.0
     assert ranked[0].probability == pytest.approx(0.7 / 0.9)
@@ -158,12 +158,12 @@ def test_listed_sums_to_one_and_drops_the_improbable() -> None:
 )
 def test_listed_refuses(weights: dict[str, float], fault: str) -> None:
     with pytest.raises(InputError, match=fault):
-        listed(candidates(**weights))
+        listed_candidates(candidates(**weights))
 
 
 def test_a_name_listed_twice_is_refused() -> None:
     with pytest.raises(InputError, match="each name once"):
-        listed((*candidates(none=0.5, unknown=0.5), *candidates(none=0.5)))
+        listed_candidates((*candidates(none=0.5, unknown=0.5), *candidates(none=0.5)))
 
 
 def test_a_pair_has_one_name() -> None:

@@ -9,7 +9,7 @@ import torch
 
 import avtorch
 from avtorch.arrays import FloatArray
-from avtorch.gap import DeadTime, Drive, plant
+from avtorch.gap import DeadTime, SimulatorInput, plant
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.search.delays import repeats_after
 from avtorch.io import Log
@@ -27,7 +27,7 @@ def _log(shape: str, period: float, rate: float, *, delay: float = 0.0, seconds:
     command = _command(shape, period, time)
     car = plant([DeadTime(delay)] if delay else [])
     speed = torch.full((len(time),), 20.0, dtype=torch.float64)
-    seen = car.response(Drive(torch.as_tensor(time), torch.as_tensor(command), speed, 0.0))
+    seen = car.response(SimulatorInput(torch.as_tensor(time), torch.as_tensor(command), speed, 0.0))
     noisy = [x.numpy() + sd * rng.standard_normal(len(time)) for x, sd in ((seen.accel, 0.02), (seen.speed, 0.01))]
     return Log.from_arrays(time=time, accel_cmd=command, accel=noisy[0], speed=noisy[1])
 
@@ -96,7 +96,7 @@ def test_a_delay_within_the_period_is_known_up_to_the_period() -> None:
 def test_periods() -> None:
     def after(command: FloatArray, dt: float) -> float | None:
         time = torch.arange(len(command), dtype=torch.float64) * dt
-        return repeats_after([Drive(time, torch.as_tensor(command))])
+        return repeats_after([SimulatorInput(time, torch.as_tensor(command))])
 
     time = np.arange(2000) * 0.01
     for shape in ("square", "sine"):

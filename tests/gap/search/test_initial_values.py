@@ -11,7 +11,7 @@ from avtorch.blindtest.drives import Manoeuvre
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.search.fitted_model import first_noise
-from avtorch.gap.search.initial_values import lag_delay_starts, one_at_a_time, starts
+from avtorch.gap.search.initial_values import lag_delay_starts, one_at_a_time, start_points
 from avtorch.gap.search.search import Search
 from avtorch.gap.simulator.plant import plant
 from avtorch.io import Log
@@ -39,7 +39,7 @@ def test_one_parameter_moves_at_a_time() -> None:
     z = hypothesis.z_of({"T_L": 0.3, "K_L": 0.9})
     places = one_at_a_time(hypothesis, z)
     assert ((places != z).sum(1) <= 1).all()
-    assert len(starts(hypothesis, {"T_L": 0.3, "K_L": 0.9})) == 42  # every limit above with every one below
+    assert len(start_points(hypothesis, {"T_L": 0.3, "K_L": 0.9})) == 42  # every limit above with every one below
 
 
 @pytest.mark.statistical
@@ -57,7 +57,7 @@ def test_a_delay_is_found_from_either_side_of_its_valley(manoeuvre: Manoeuvre, r
         record = Record.of(log)
         hypothesis = Hypothesis.named(record, "dead_time", plant())
         found = [
-            Search([log], plant())._settled(
+            Search([log], plant())._converged_fit(
                 hypothesis, hypothesis.z_of({"T_L": 0.82 - d, "K_L": 1.0, "dead_time.delay_s": d}), first_noise(record)
             )
             for d in (0.38, 0.46, 0.54)

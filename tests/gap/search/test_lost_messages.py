@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from avtorch.arrays import FloatArray
-from avtorch.gap import CommandHold, DeadTime, Drive, Effect, RateLimit, Saturation, plant
+from avtorch.gap import CommandHold, DeadTime, Effect, RateLimit, Saturation, SimulatorInput, plant
 from avtorch.gap.likelihood.gauss_newton import modes
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.search.lost_messages import Bank, LostMessages, lost_messages
+from avtorch.gap.search.lost_messages import LossHistories, LostMessages, lost_messages
 from avtorch.io import Log
 from tests.bars import BAR
 from tests.gap.records import command_over, drawn_errors
@@ -31,7 +31,7 @@ def _record(
 ) -> Record:
     time = np.arange(len(command)) / rate_hz
     speed = torch.full((len(time),), 20.0, dtype=torch.float64)
-    drive = Drive(torch.as_tensor(time), torch.as_tensor(command), speed, 0.0)
+    drive = SimulatorInput(torch.as_tensor(time), torch.as_tensor(command), speed, 0.0)
     response = plant(effects).response(drive, generator=torch.Generator().manual_seed(int(rng.integers(2**31))))
     errors = drawn_errors(NOISE, len(time), 1 / rate_hz, rng)
     accel, speeds = response.accel_measured.numpy() + errors[0], response.speed.numpy() + errors[1]
@@ -88,12 +88,12 @@ def _bank_and_sum(rng: np.random.Generator) -> list[float]:
     pulses = np.zeros((rows, len(command)))
     pulses[np.arange(rows), record.source[start] + np.arange(rows)] = 1.0
     still = torch.zeros(len(command), dtype=torch.float64)
-    unit = plant().response(Drive(drive.time, torch.as_tensor(pulses), still, 0.0))
+    unit = plant().response(SimulatorInput(drive.time, torch.as_tensor(pulses), still, 0.0))
     seen = np.stack([unit.accel.numpy(), unit.speed.numpy()], 1)[:, :, record.source, None]
     images = white(seen)[..., 0].reshape(rows, -1)
     match, square = images @ white(errors).ravel(), images @ images.T
     gains = apart @ match - 0.5 * ((apart @ square) * apart).sum(1)
-    bank = Bank.of(white, white(errors)[..., 0], u, **BARE)
+    bank = LossHistories.of(white, white(errors)[..., 0], u, **BARE)
     lost, out = ways.sum(1), []
     for p in (0.05, 0.3):
         exact = np.logaddexp.reduce(gains + lost * np.log(p) + (rows - lost) * np.log1p(-p))

@@ -14,7 +14,7 @@ from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.search.onset import allowed, onset_evidence, profile, refined_onset, rough_onset
+from avtorch.gap.search.onset import allowed, onset_evidence, onset_profile, refined_onset, rough_onset
 from avtorch.io import Log
 from tests.gap.records import command_over, log_of
 
@@ -152,7 +152,7 @@ def _slope_that_sets_in(rng: np.random.Generator) -> tuple[float, float, FloatAr
     slope = grade_marginal(white, hypothesis, None, coarse=False)
     full = white(hypothesis.errors(z[None])[0])[..., 0]
     silent = white(record.measured - hypothesis.baseline_rollouts(z[None])[0])[..., 0]
-    cut = profile(-0.5 * (silent**2).sum(0), -0.5 * (full**2).sum(0))[rows] + slope.from_rows(full, rows)
+    cut = onset_profile(-0.5 * (silent**2).sum(0), -0.5 * (full**2).sum(0))[rows] + slope.from_rows(full, rows)
     return float(record.time[record.source[row]]) - 60.0, gain, np.diff(cut) / np.diff(exact)
 
 
@@ -174,7 +174,7 @@ def test_the_profile_is_the_sum_on_both_sides(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     a, b = rng.standard_normal((2, 50))
     want = [a[:k].sum() + b[k:].sum() for k in range(50)]
-    np.testing.assert_allclose(profile(a, b), want, atol=1e-12)
+    np.testing.assert_allclose(onset_profile(a, b), want, atol=1e-12)
 
 
 def test_rows_at_the_edges_are_no_onset() -> None:

@@ -30,11 +30,11 @@ from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search import pairs
-from avtorch.gap.search.initial_values import effect_starts, starts
-from avtorch.gap.search.pairs import Base, exchanged, joint_fit
+from avtorch.gap.search.initial_values import effect_starts, start_points
+from avtorch.gap.search.pairs import PairBase, exchanged, joint_fit
 from avtorch.gap.search.screening import Screened
+from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
-from avtorch.gap.simulator.row import Row
 from avtorch.vehicle.arguments import Number, tensor
 from tests.gap.records import QUIET, log_of
 
@@ -46,7 +46,7 @@ def _alone(
 ) -> tuple[Hypothesis, FloatArray, dict[str, float]]:
     """One effect fitted alone, as a search does it."""
     base = Hypothesis(record, (kind,), plant())
-    found, values = modes(base, white, starts(base, {"T_L": 0.3, "K_L": 1.0}), iterations=10, coarse=True)
+    found, values = modes(base, white, start_points(base, {"T_L": 0.3, "K_L": 1.0}), iterations=10, coarse=True)
     z = found[values.argmax()]
     return base, z, _values(base, z)
 
@@ -80,9 +80,9 @@ def test_the_true_second_effect_is_ranked_first(name: str, rotating_seed: int) -
     for kind in KINDS:
         if kind is not type(first):
             hypothesis = Hypothesis(record, (type(first), kind), plant())
-            gains[kind.name], begin = Base(base, z, values, None, white).score(hypothesis, {})
+            gains[kind.name], begin = PairBase(base, z, values, None, white).score(hypothesis, {})
             # what it starts from is one of its own starts, with the base where it is
-            assert any((begin == row).all() for row in starts(hypothesis, values))
+            assert any((begin == row).all() for row in start_points(hypothesis, values))
     order = sorted(gains, key=lambda k: -gains[k])
     assert order[0] == second.name
     assert gains[order[0]] > 20
@@ -94,7 +94,7 @@ def test_a_gain_is_predicted_before_it_is_fitted(rotating_seed: int) -> None:
     record, white = _drive(plant([SensorBias(0.1), ConstantResistance(0.1)]), np.random.default_rng(rotating_seed))
     base, z, values = _alone(record, white, SensorBias)
     hypothesis = Hypothesis(record, (SensorBias, ConstantResistance), plant())
-    told, begin = Base(base, z, values, None, white).score(hypothesis, {})
+    told, begin = PairBase(base, z, values, None, white).score(hypothesis, {})
     fitted = modes(hypothesis, white, begin[None], coarse=True, iterations=10)[0]
     before, after = (
         float(white.log_likelihood(c.errors(at[None], coarse=True))[0])
@@ -117,7 +117,7 @@ class _Gain(Effect):
     equation = "(1 + m) u"
     parameters = (Parameter("more", "-", 0.0, 0.02, 0.2),)
 
-    def apply(self, x: Tensor, row: Row) -> Tensor:
+    def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         return (1 + tensor(self.more)) * x
 
 
@@ -130,7 +130,7 @@ def test_what_the_base_itself_can_do_is_no_gain(sign: int, kind: type[Effect]) -
     off = base.z_of({"T_L": 0.4 + 0.004 * sign, "K_L": 1 + 0.01 * sign, "sensor_bias.bias_mps2": 0.02 * sign})
     worth = 0.5 * float((white(base.errors(off[None], coarse=True)) ** 2).sum())
     assert worth > 40
-    gain, _ = Base(base, off, _values(base, off), None, white).score(
+    gain, _ = PairBase(base, off, _values(base, off), None, white).score(
         Hypothesis(record, (SensorBias, kind), plant()), {}
     )
     assert 0 <= gain < 0.001 * worth
@@ -142,7 +142,7 @@ def test_a_second_gain_is_no_second_effect(rotating_seed: int) -> None:
     base = Hypothesis(record, (), plant())
     off = base.z_of({"T_L": 0.4, "K_L": 1.0})
     hypothesis = Hypothesis(record, (_Gain,), plant())
-    gain, _ = Base(base, off, {"T_L": 0.4, "K_L": 1.0}, None, white).score(hypothesis, {})
+    gain, _ = PairBase(base, off, {"T_L": 0.4, "K_L": 1.0}, None, white).score(hypothesis, {})
     best = modes(hypothesis, white, hypothesis.z_of({"T_L": 0.4, "K_L": 1.0})[None], coarse=True)[1][0]
     flat = float(white.log_likelihood(base.errors(off[None], coarse=True))[0])
     assert best > flat + 100
@@ -160,7 +160,7 @@ def test_a_slope_of_the_base_is_taken_out_too(rotating_seed: int) -> None:
     kinds = (AerodynamicDrag, ConstantResistance)
     flat, sloped = (
         [
-            Base(b, z, _values(b, z), None, white).score(Hypothesis(record, (*b.effects, k), plant()), {})[0]
+            PairBase(b, z, _values(b, z), None, white).score(Hypothesis(record, (*b.effects, k), plant()), {})[0]
             for k in kinds
         ]
         for b in (bare, base)
@@ -179,7 +179,7 @@ def test_a_slope_as_the_second_effect_is_fitted(rotating_seed: int) -> None:
         record, white = _drive(plant([*hills, DeadTime(0.25)]), rng)
         base, z, values = _alone(record, white, DeadTime)
         hypothesis = Hypothesis(record, (DeadTime, RoadGrade), plant())
-        gain, begin = Base(base, z, values, None, white).score(hypothesis, {})
+        gain, begin = PairBase(base, z, values, None, white).score(hypothesis, {})
         assert sign * gain > (50 if sign > 0 else -12)
         assert begin.shape == (hypothesis.size,)
 
@@ -191,13 +191,13 @@ def test_an_effect_of_many_starts_begins_where_it_came_to_rest_alone(monkeypatch
     shift = {"gear_shift.first_mps": 4.1, "gear_shift.gear_ratio": 1.5}
     hypothesis = Hypothesis.named(record, "dead_time+gear_shift", plant())
     assert len(effect_starts(hypothesis, "gear_shift")) > 50
-    _, begin = Base(base, z, values, None, white).score(hypothesis, {"gear_shift": {**values, "T_L": 0.9, **shift}})
+    _, begin = PairBase(base, z, values, None, white).score(hypothesis, {"gear_shift": {**values, "T_L": 0.9, **shift}})
     np.testing.assert_array_equal(begin, hypothesis.z_of({**values, **shift}))
     # one of few starts has its own besides, so that coming to rest at no effect takes nothing from it
     hypothesis = Hypothesis(record, (DeadTime, Saturation), plant())
-    own, _ = Base(base, z, values, None, white).score(hypothesis, {})
+    own, _ = PairBase(base, z, values, None, white).score(hypothesis, {})
     nothing = {"saturation": {"T_L": 0.9, "saturation.accel_max_mps2": 5.0, "saturation.accel_min_mps2": -8.0}}
-    more, _ = Base(base, z, values, None, white).score(hypothesis, nothing)
+    more, _ = PairBase(base, z, values, None, white).score(hypothesis, nothing)
     assert more == own > 100
 
 
@@ -218,7 +218,7 @@ def test_a_pair_comes_to_rest_at_the_truth_from_a_new_start_only(case: str) -> N
     base, z, values = _alone(record, white, ConstantResistance)
     assert values["K_L"] < 0.65 * gain
     hypothesis = Hypothesis(record, (ConstantResistance, Saturation), plant())
-    _, begin = Base(base, z, values, None, white).score(hypothesis, {})
+    _, begin = PairBase(base, z, values, None, white).score(hypothesis, {})
     truth = hypothesis.z_of({k: float(v) for k, v in car.values().items()})
     top = float(modes(hypothesis, white, truth[None], coarse=True)[1][0])
     # on from the first effect, however long, it stays behind a hill
@@ -274,7 +274,7 @@ def test_the_wrong_half_of_a_pair_is_exchanged(wrong: type[Effect], rotating_see
     record, white = _drive(car, np.random.default_rng(rotating_seed))
     pair = Hypothesis(record, (ConstantResistance, wrong), plant())
     _, _, values = _alone(record, white, ConstantResistance)
-    found, reached = modes(pair, white, starts(pair, values), coarse=True)
+    found, reached = modes(pair, white, start_points(pair, values), coarse=True)
     here = Screened(pair, found[reached.argmax()], float(reached.max()))
     tries = 2
     others = exchanged(here, KINDS, white, {}, tries=tries)

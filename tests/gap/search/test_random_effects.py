@@ -13,12 +13,23 @@ from torch import Tensor
 import avtorch
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.gap import DeadTime, Drive, Effect, GapPlant, Gust, NoiseChange, Outliers, Parameter, Row, plant
+from avtorch.gap import (
+    DeadTime,
+    Effect,
+    EffectContext,
+    GapPlant,
+    Gust,
+    NoiseChange,
+    Outliers,
+    Parameter,
+    SimulatorInput,
+    plant,
+)
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.steady_kalman import motion
+from avtorch.gap.likelihood.steady_kalman import error_dynamics
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.search.command_errors import rows_gained
+from avtorch.gap.search.command_errors import command_error_gains
 from avtorch.gap.search.lost_messages import image_of_row
 from avtorch.io import Log
 from tests.gap.records import QUIET, covariance, drawn_errors
@@ -38,7 +49,7 @@ class RoadRoughness(Effect):
         Parameter("time_s", "s", None, 0.05, 0.5),
     )
 
-    def advance(self, x: Tensor, row: Row, state: Any) -> tuple[Tensor, Any]:
+    def advance(self, x: Tensor, row: EffectContext, state: Any) -> tuple[Tensor, Any]:
         if row.normal is None:
             return torch.zeros_like(x), None
         keep = torch.zeros(()) if state is None else torch.exp(-row.dt / self.time_s)
@@ -64,7 +75,7 @@ class Crosstalk(Effect):
         Parameter("size", "sigma", None, 3.0, 12.0),
     )
 
-    def apply(self, x: Tensor, row: Row) -> Tensor:
+    def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         if row.normal is None:
             return x
         level = torch.special.ndtr(row.normal)
@@ -86,7 +97,7 @@ class ValveJitter(Effect):
     meaning, equation = "the valve hits the command only roughly", "u (1 + share e)"
     parameters = (Parameter("share", "-", 0.0, 0.05, 1.0),)
 
-    def apply(self, x: Tensor, row: Row) -> Tensor:
+    def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         return x if row.normal is None else x * (1 + self.share * row.normal)
 
     def noise(self, u: Tensor) -> NoiseChange:
@@ -101,7 +112,9 @@ def _log(effects: list[Effect], seed: int, *, seconds: float = 50.0, rate: int =
     rng = np.random.default_rng(seed)
     time = np.arange(round(seconds * rate)) / rate
     command = np.repeat(rng.uniform(-1.5, 1.5, round(2 * seconds)), rate // 2)
-    drive = Drive(torch.as_tensor(time), torch.as_tensor(command), torch.full((len(time),), 20.0).double(), 0.0)
+    drive = SimulatorInput(
+        torch.as_tensor(time), torch.as_tensor(command), torch.full((len(time),), 20.0).double(), 0.0
+    )
     seen = plant(effects).response(drive, generator=torch.Generator().manual_seed(seed))
     accel, speed = drawn_errors(QUIET, len(time), 1 / rate, rng) + np.stack([seen.accel_measured, seen.speed])
     return Log.from_arrays(time=time, accel_cmd=command, accel=accel, speed=speed)
@@ -200,7 +213,7 @@ def test_a_noise_without_a_usable_change_is_refused_in_a_line(change: NoiseChang
 def test_a_further_force_has_its_own_state() -> None:
     """The filter's steps against the covariance of both processes and their integral, by another formula."""
     noise, dt = NoiseModel(process_sd=1e-6, force_sd=0.2, force_time=1.5, more_sd=0.3, more_time=0.4), 0.05
-    move, driven = motion(noise, dt)
+    move, driven = error_dynamics(noise, dt)
     at = np.diag([0.0, 1e-12, 0.2**2, 0.3**2])
     for _ in range(7):
         at = move @ at @ move.T + driven
@@ -209,7 +222,7 @@ def test_a_further_force_has_its_own_state() -> None:
     assert at[0, 0] == pytest.approx(sum(x[3, 3] for x in each), rel=1e-6)
     assert [at[0, 2], at[0, 3]] == pytest.approx([x[1, 3] for x in each], rel=1e-6)
     # and behind a late sensor the same motion
-    late, more = motion(noise.replaced(sensor_lag=0.1), dt)
+    late, more = error_dynamics(noise.replaced(sensor_lag=0.1), dt)
     assert late[:4, :4] == pytest.approx(move, abs=1e-9)
     assert more[:4, :4] == pytest.approx(driven, abs=1e-9)
 
@@ -223,7 +236,7 @@ def test_errors_of_the_command_against_the_whole_covariance() -> None:
     rng = np.random.default_rng(4)
     errors = 0.05 * rng.standard_normal((2, record.rows, 1))
     variance: FloatArray = rng.uniform(0.0, 0.4, record.rows)
-    gained = rows_gained(white, errors, variance, 0.3, 1.0)
+    gained = command_error_gains(white, errors, variance, 0.3, 1.0)
     image = image_of_row(white, 0.3, 1.0)
     rows, length = record.rows, image.shape[1]
     columns = np.zeros((rows, 2, rows))  # white image of one unit of error in each row's command
@@ -236,4 +249,4 @@ def test_errors_of_the_command_against_the_whole_covariance() -> None:
     expected = 0.5 * (e @ e - e @ np.linalg.solve(dense, e) - np.linalg.slogdet(dense)[1])
     # the few states of the image, and chunks that begin with a warm-up, cost some thousandths
     assert gained.sum() == pytest.approx(expected, rel=0.01)
-    assert np.abs(rows_gained(white, errors, 0 * variance, 0.3, 1.0)).max() < 1e-12
+    assert np.abs(command_error_gains(white, errors, 0 * variance, 0.3, 1.0)).max() < 1e-12

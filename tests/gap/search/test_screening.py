@@ -15,7 +15,7 @@ from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search import screening
-from avtorch.gap.search.initial_values import starts
+from avtorch.gap.search.initial_values import start_points
 from avtorch.gap.search.screening import Screened, screen
 from avtorch.gap.simulator.plant import plant
 from avtorch.io import Log
@@ -49,7 +49,7 @@ def _begin(record: Record, white: WhiteningFilter, name: str) -> tuple[Hypothesi
     """The hypothesis, its starts as a search makes them, and what the bare baseline comes to."""
     none, hypothesis = (Hypothesis.named(record, n, plant()) for n in ("none", name))
     z, value = modes(none, white, none.z_of({"T_L": 0.3, "K_L": 1.0})[None], coarse=True)
-    return hypothesis, starts(hypothesis, {k: float(v) for k, v in none.values(z).items()}), float(value[0])
+    return hypothesis, start_points(hypothesis, {k: float(v) for k, v in none.values(z).items()}), float(value[0])
 
 
 def _at(look: Screened) -> float:

@@ -12,12 +12,12 @@ from avtorch.gap import (
     EFFECTS,
     ConstantResistance,
     DeadTime,
-    Drive,
     Effect,
     Saturation,
     SecondOrderActuator,
     SensorBias,
     SensorLag,
+    SimulatorInput,
     plant,
 )
 from avtorch.gap.likelihood.observability import is_observable
@@ -101,7 +101,7 @@ def test_untested_effects_are_reported() -> None:
 
 def _shown(effects: Sequence[Effect], T_L: float = 0.35, K_L: float = 1.0, rate_hz: int = 100) -> torch.Tensor:
     time = np.arange(20 * rate_hz) / rate_hz
-    drive = Drive(torch.as_tensor(time), torch.as_tensor(command_over(time)))
+    drive = SimulatorInput(torch.as_tensor(time), torch.as_tensor(command_over(time)))
     return plant(effects, T_L=T_L, K_L=K_L).response(drive).accel_measured
 
 

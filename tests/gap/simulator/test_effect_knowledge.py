@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from avtorch.gap import EFFECTS, Drive, Effect, plant
+from avtorch.gap import EFFECTS, Effect, SimulatorInput, plant
 from avtorch.gap.simulator.effect import delay_effect, delay_key
 from avtorch.gap.simulator.integrated import Integrated
 
@@ -20,7 +20,7 @@ def answer(kind: type[Effect], step: float) -> Tensor:
     command = torch.where(time > 1e3 + 1.0, step, 0.0)
     car = plant([kind])
     speed = torch.full_like(time, 12.0)
-    shown = [car.response(Drive(time, u, speed)).accel_measured for u in (command, 0 * command)]
+    shown = [car.response(SimulatorInput(time, u, speed)).accel_measured for u in (command, 0 * command)]
     return shown[0] - shown[1]
 
 
@@ -38,7 +38,7 @@ def test_a_one_sided_one_answers_brakes_otherwise(kind: type[Effect]) -> None:
 @pytest.mark.parametrize("kind", EFFECTS.values(), ids=lambda kind: kind.name)
 def test_what_it_declares_is_of_its_own_parameters(kind: type[Effect]) -> None:
     names = {p.name for p in kind.parameters}
-    named = {*kind.starts, *kind.starts_in(0.0, 60.0), *kind.retried_in(0.0, 60.0), *kind().settled()}
+    named = {*kind.starts, *kind.starts_in(0.0, 60.0), *kind.retried_in(0.0, 60.0), *kind().values_after_onset()}
     named |= {*kind.noise_parameters.values(), *kind.reading.values()}
     named |= {name for name in (kind.own_onset, kind.shift) if name is not None}
     assert named <= names
@@ -52,7 +52,7 @@ def test_what_it_declares_is_of_its_own_parameters(kind: type[Effect]) -> None:
 def test_a_constant_force_points_as_declared() -> None:
     for kind in (k for k in SURE if k.force_sign):
         time = torch.arange(50, dtype=torch.float64) * 0.1
-        drive = Drive(time, torch.zeros_like(time), torch.full_like(time, kind.pictured))
+        drive = SimulatorInput(time, torch.zeros_like(time), torch.full_like(time, kind.pictured))
         force = plant([kind]).response(drive).accel_measured
         assert bool((force * kind.force_sign > 0).all())
 

@@ -10,7 +10,7 @@ import torch
 
 from avtorch import gap
 from avtorch.errors import InputError
-from avtorch.gap import EFFECTS, Drive, Effect, GapPlant, plant
+from avtorch.gap import EFFECTS, Effect, GapPlant, SimulatorInput, plant
 from avtorch.vehicle import GLVDPlant
 from tests.bars import BAR
 from tests.gap.drives import drive_of, driven, filled, smooth_drive
@@ -126,8 +126,8 @@ def test_the_step_does_not_matter(effect: Effect, late: bool) -> None:
     coarse = torch.arange(120, dtype=D) * 0.1
     command = torch.sin(0.8 * coarse) + (coarse > 4).double() - 1.5 * (coarse > 8)
     fine = torch.arange(120 * 50, dtype=D) * 0.002
-    one = car.response(Drive(coarse, command))
-    two = car.response(Drive(fine, command.repeat_interleave(50)))
+    one = car.response(SimulatorInput(coarse, command))
+    two = car.response(SimulatorInput(fine, command.repeat_interleave(50)))
     # where brakes have another lag, a late command and its sign switch together: still the same
     torch.testing.assert_close(one.accel, two.accel[::50], rtol=0, atol=1e-9)
     torch.testing.assert_close(one.speed, two.speed[::50], rtol=0, atol=1e-9)
@@ -142,7 +142,7 @@ def test_driveline_at_any_damping_against_an_ode_solver(damping: float) -> None:
     time = torch.arange(200, dtype=D) * 0.01
     lagged = 1 - torch.exp(-time / T)
     got = effect.over(
-        lagged, gap.Row(time, torch.tensor(0.01, dtype=D), None, None, torch.tensor(T), torch.tensor(1.0))
+        lagged, gap.EffectContext(time, torch.tensor(0.01, dtype=D), None, None, torch.tensor(T), torch.tensor(1.0))
     )
     assert bool(torch.autograd.grad(got.square().sum(), effect.mode_damping)[0].isfinite())  # type: ignore[arg-type]
     # the effect holds the mean jerk of a step, and so does the reference
@@ -164,7 +164,7 @@ def test_second_order_against_an_ode_solver() -> None:
     for omega, zeta in ((6.0, 0.4), (4.0, 1.0), (9.0, 1.6)):
         car = plant([gap.SecondOrderActuator.of({"natural_frequency_radps": omega, "damping_ratio": zeta})])
         time = torch.arange(60, dtype=D) * 0.05
-        got = car.response(Drive(time, torch.ones_like(time), None, 0.0)).accel
+        got = car.response(SimulatorInput(time, torch.ones_like(time), None, 0.0)).accel
         exact = solve_ivp(
             lambda _, y, w=omega, z=zeta: [y[1], w * w * (1 - y[0]) - 2 * z * w * y[1]],
             (0, 3), [0.0, 0.0], t_eval=time.numpy(), rtol=1e-11, atol=1e-12,
@@ -180,7 +180,7 @@ def test_second_order_against_an_ode_solver() -> None:
 def test_gradients(cls: type[Effect], start: str) -> None:
     drive = smooth_drive()
     if start == "settled":
-        drive = Drive(drive.time, drive.command, drive.speed)
+        drive = SimulatorInput(drive.time, drive.command, drive.speed)
     car = plant([cls]).prepared(drive)
     known = car.parameters()
     gen = torch.Generator().manual_seed(11)
@@ -229,21 +229,21 @@ def test_batches_are_the_single_ones(cls: type[Effect]) -> None:
 def test_drives_are_batched_too() -> None:
     drive = smooth_drive()
     command, speed = torch.stack([drive.command, -drive.command]), torch.stack([drive.speed, drive.speed + 1])  # type: ignore[list-item,operator]
-    both = Drive(drive.time, command, speed)
+    both = SimulatorInput(drive.time, command, speed)
     car = plant([gap.DeadTime(0.13), gap.Backlash(0.1), gap.GearShift(), gap.AerodynamicDrag()])
     delays = torch.tensor([[0.1], [0.2], [0.33]], dtype=D)
     out = car.response(both, {"dead_time.delay_s": delays})
     assert out.speed.shape == (3, 2, len(drive.time))
-    one = car.response(Drive(drive.time, command[1], speed[1]), {"dead_time.delay_s": delays[2, 0]})
+    one = car.response(SimulatorInput(drive.time, command[1], speed[1]), {"dead_time.delay_s": delays[2, 0]})
     torch.testing.assert_close(one.accel, out.accel[2, 1], rtol=0, atol=1e-12)
 
 
 def test_dead_time_shifts() -> None:
     time = torch.arange(200, dtype=D) * 0.05
-    late = plant([gap.DeadTime(0.237)]).response(Drive(time, torch.ones_like(time), None, 0.0)).accel
+    late = plant([gap.DeadTime(0.237)]).response(SimulatorInput(time, torch.ones_like(time), None, 0.0)).accel
     assert float(late[0]) == 0.0  # before the first row its command acted, so a start at 0 m/s² heads for it
     step = torch.where(time < 1.0, 0.0, 1.0).to(D)
-    late = plant([gap.DeadTime(0.237)]).response(Drive(time, step)).accel
+    late = plant([gap.DeadTime(0.237)]).response(SimulatorInput(time, step)).accel
     exact = torch.where(time < 1.237, 0.0, 1 - torch.exp(-(time - 1.237) / 0.3)).to(D)
     torch.testing.assert_close(late, exact, rtol=0, atol=1e-12)
 
@@ -258,13 +258,13 @@ def test_uneven_steps() -> None:
     fast = [gap.DeadTime(0.0333), gap.SecondOrderActuator(0.2), gap.Backlash(0.05)]
     for effects in (fast, [gap.RateLimit(1.1), gap.DeadTime(0.011)], [gap.GainChange(0.7, 5.003, 1.0)]):
         car = plant(effects)
-        even = car.response(Drive(time, command, speed))
-        uneven = car.response(Drive(time[keep], command[keep], speed[keep]))
+        even = car.response(SimulatorInput(time, command, speed))
+        uneven = car.response(SimulatorInput(time[keep], command[keep], speed[keep]))
         size = 2e-3 if effects[0].name == "gain_change" else 1e-9  # a row takes the ramp's mean
         torch.testing.assert_close(uneven.accel, even.accel[keep], rtol=0, atol=size)
         torch.testing.assert_close(uneven.speed, even.speed[keep], rtol=0, atol=size)
     for effect in (gap.SensorLag(0.2), gap.DrivelineOscillation(), gap.Gust()):
-        whole = plant([effect]).response(Drive(time[keep], command[keep], speed[keep]))
+        whole = plant([effect]).response(SimulatorInput(time[keep], command[keep], speed[keep]))
         assert torch.isfinite(whole.accel_measured).all()
 
 
@@ -273,7 +273,7 @@ def test_a_late_sensor_shows_the_standstill_after_it() -> None:
     time = 0.05 * torch.arange(400, dtype=D)
     command = torch.where(time < 10, -1.5, 1.0).to(D)
     speed = torch.where(time < 4, 6 - 1.5 * time, torch.where(time < 10, 0.0, time - 10)).to(D)
-    drive = Drive(time, command, speed)
+    drive = SimulatorInput(time, command, speed)
     seen = plant([gap.SensorLag(1.0)], T_L=0.2, K_L=1.0).response(drive).accel_measured
     assert float(seen[199]) == pytest.approx(-1.5 * math.exp(-6.0), abs=0.01)
     without = replace(drive, speed=None)
@@ -293,7 +293,7 @@ def test_sensor_faults_leave_the_car_alone() -> None:
 
 def test_speed_is_needed_where_it_counts() -> None:
     time = torch.arange(30, dtype=D) * 0.1
-    drive = Drive(time, torch.ones_like(time))
+    drive = SimulatorInput(time, torch.ones_like(time))
     for cls in EVERY:
         if cls.needs_speed:
             with pytest.raises(InputError, match="speed"):
@@ -320,7 +320,7 @@ def test_random_effects_have_no_deterministic_response(cls: type[Effect]) -> Non
 def test_gust_is_the_process_it_names(rotating_seed: int, draws_factor: int) -> None:
     sd, tau, dt, rows, count = 0.3, 2.0, 0.1, 400, 400 * draws_factor
     time = torch.arange(rows, dtype=D) * dt
-    drive = Drive(time, torch.zeros(count, rows, dtype=D))
+    drive = SimulatorInput(time, torch.zeros(count, rows, dtype=D))
     force = plant([gap.Gust(sd, tau)]).response(drive, generator=torch.Generator().manual_seed(rotating_seed)).accel
     effective = count * rows * dt / (2 * tau)  # independent pieces of an OU process
     assert float(force.square().mean()) == pytest.approx(sd**2, abs=BAR * sd**2 * math.sqrt(2 / effective))
@@ -340,7 +340,9 @@ def test_outliers_have_the_stated_rate_and_size(rotating_seed: int, draws_factor
     rows, fraction, scale = 200_000 * draws_factor, 0.03, 8.0
     time = torch.arange(rows, dtype=D) * 0.1
     car = plant([gap.Outliers(fraction, scale, 0.05)])
-    r = car.response(Drive(time, torch.zeros_like(time)), generator=torch.Generator().manual_seed(rotating_seed))
+    r = car.response(
+        SimulatorInput(time, torch.zeros_like(time)), generator=torch.Generator().manual_seed(rotating_seed)
+    )
     error = r.accel_measured[r.accel_measured != 0]
     assert len(error) / rows == pytest.approx(fraction, abs=BAR * math.sqrt(fraction / rows))
     size = scale * 0.05
@@ -352,9 +354,11 @@ def test_lost_messages_have_the_stated_mean_square(rotating_seed: int, draws_fac
     p, rows, count = 0.2, 60, 20_000 * draws_factor
     u = torch.sin(torch.arange(rows, dtype=D) * 0.3)
     effect = gap.CommandHold(p)
-    row = gap.Row(torch.arange(rows, dtype=D), torch.tensor(0.1, dtype=D), None, None, torch.ones(1), torch.ones(1))
+    row = gap.EffectContext(
+        torch.arange(rows, dtype=D), torch.tensor(0.1, dtype=D), None, None, torch.ones(1), torch.ones(1)
+    )
     normal = torch.randn(count, rows, generator=torch.Generator().manual_seed(rotating_seed), dtype=D)
-    held = effect.over(u, gap.Row(**{**vars(row), "normal": normal}))
+    held = effect.over(u, gap.EffectContext(**{**vars(row), "normal": normal}))
     seen = (held - u).square()
     told = effect.noise(u).command_variance
     assert told is not None
@@ -363,7 +367,7 @@ def test_lost_messages_have_the_stated_mean_square(rotating_seed: int, draws_fac
     # step by step the very same messages are lost
     state, out = effect.start(u[0], row), []
     for k in range(rows):
-        y, state = effect.advance(u[k], gap.Row(**{**vars(row), "normal": normal[:, k]}), state)
+        y, state = effect.advance(u[k], gap.EffectContext(**{**vars(row), "normal": normal[:, k]}), state)
         out.append(y.expand(count))
     assert torch.equal(torch.stack(out, -1), held)
 

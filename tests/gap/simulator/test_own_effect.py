@@ -10,7 +10,7 @@ import torch
 
 import avtorch
 from avtorch.errors import InputError
-from avtorch.gap import EFFECTS, Drive, Effect, GapPlant, effect_class, plant
+from avtorch.gap import EFFECTS, Effect, GapPlant, SimulatorInput, effect_class, plant
 from tests.gap.drives import drive_of, driven
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "own-effect.md"
@@ -46,7 +46,7 @@ def test_it_is_neutral_and_differentiable(shown: dict) -> None:
     neutral = driven(plant([shown["Trailer"].neutral()]))
     assert torch.equal(neutral.accel, driven(plant()).accel)
     time = torch.arange(60, dtype=torch.float64) * 0.1
-    drive = Drive(time, torch.sin(time), 10 + time)
+    drive = SimulatorInput(time, torch.sin(time), 10 + time)
     ratio = torch.tensor([0.2, 0.4], dtype=torch.float64, requires_grad=True)
     car = plant([shown["Trailer"]])
     assert torch.autograd.gradcheck(lambda m: car.response(drive, {"trailer.mass_ratio": m}).accel[:, ::9], (ratio,))
@@ -74,7 +74,9 @@ def test_one_with_speed_pulls_less_the_faster_it_is(shown: dict) -> None:
     torch.testing.assert_close(response.accel_measured[1:], block.accel[0, 1:], rtol=0, atol=1e-9)
     assert torch.equal(driven(plant([shown["MotorPower"].neutral()])).accel, driven(plant()).accel)
     time = torch.arange(200, dtype=torch.float64) * 0.1
-    drives = [Drive(time, torch.full_like(time, 1.5), torch.full_like(time, speed)) for speed in (4.0, 8.0, 16.0)]
+    drives = [
+        SimulatorInput(time, torch.full_like(time, 1.5), torch.full_like(time, speed)) for speed in (4.0, 8.0, 16.0)
+    ]
     reached = [float(car.response(drive).accel[..., -1]) for drive in drives]
     # power over speed, once the lag is over; 1.5 where the bound is 2
     assert reached == pytest.approx([1.5, 1.0, 0.5], abs=1e-6)

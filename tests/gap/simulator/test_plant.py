@@ -10,7 +10,7 @@ import torch
 import avtorch
 from avtorch import gap
 from avtorch.errors import InputError
-from avtorch.gap import EFFECTS, Drive, GapPlant, plant
+from avtorch.gap import EFFECTS, GapPlant, SimulatorInput, plant
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle import ClosedLoop, GLVDPlant, Leader
@@ -234,21 +234,21 @@ def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
     time = torch.arange(5, dtype=D)
     for bad in ({"time": -time}, {"command": time[:3]}, {"speed": time[:2]}, {"command": time / 0}):
         with pytest.raises(InputError, match=next(iter(bad))):
-            Drive(**{"time": time, "command": time, **bad})  # type: ignore[arg-type]
+            SimulatorInput(**{"time": time, "command": time, **bad})  # type: ignore[arg-type]
 
 
 def test_drives_of_logs() -> None:
     time = torch.arange(100, dtype=D).numpy() * 0.1
     log = avtorch.Log.from_arrays(time=time, accel_cmd=0 * time + 0.5, accel=0 * time + 0.2, speed=10 + 0.5 * time)
-    drive = Drive.from_log(log)
+    drive = SimulatorInput.from_log(log)
     assert float(drive.accel0) == 0.2  # type: ignore[arg-type]
     assert drive.uniform
     response = plant([gap.AerodynamicDrag()]).response(drive)
     assert float(response.accel[0]) == pytest.approx(0.2)
-    settled = plant().response(Drive.from_log(log, settled=True))
-    torch.testing.assert_close(settled.accel, torch.full((100,), 0.5, dtype=D))
+    steady_start = plant().response(SimulatorInput.from_log(log, steady_start=True))
+    torch.testing.assert_close(steady_start.accel, torch.full((100,), 0.5, dtype=D))
     with pytest.raises(InputError, match="segment"):
-        Drive.from_log(log, 3)
+        SimulatorInput.from_log(log, 3)
 
 
 # parameters ------------------------------------------------------------------------------------------
@@ -282,7 +282,7 @@ def test_wrong_ranges_are_refused(low: float, high: float, constraint: str) -> N
 
 def test_settings_come_from_the_drive() -> None:
     time = torch.arange(200, dtype=D) * 0.5 + 40
-    drive = Drive(time, torch.zeros_like(time), torch.full_like(time, 8.0))
+    drive = SimulatorInput(time, torch.zeros_like(time), torch.full_like(time, 8.0))
     car = plant([gap.SpeedDependentLag, gap.GainChange, gap.RoadGrade]).prepared(drive)
     known = car.parameters()
     assert car.effects[1] == gap.SpeedDependentLag(mean_speed=8.0)

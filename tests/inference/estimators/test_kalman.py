@@ -162,8 +162,8 @@ def test_nearly_linear_is_nearly_quadrature(kind, rotating_seed):
     truth = TIGHT.sample(1, 4, generator=g)[0].exp()
     rows = windows_of(truth, 1.0, g)
     loop = kind(JerkForm(), vehicles=4, drift=0.0, actuation_prior=TIGHT)
-    found, settled = loop._learn(rows, torch.arange(4))
-    assert settled.all()
+    found, converged = loop._learn(rows, torch.arange(4))
+    assert converged.all()
     evidence = JerkForm().evidence(rows, 200)
     density = evidence.density(torch.arange(4), Joint(TIGHT, default_jerk_noise_prior()))
     assert isinstance(density, JerkDensity)
@@ -179,8 +179,8 @@ def test_intervals_cover_truths_of_a_tight_prior(kind, rotating_seed, draws_fact
     count, g = 2000 * draws_factor, torch.Generator().manual_seed(rotating_seed)
     truth = TIGHT.sample(1, count, generator=g)[0].exp()
     loop = kind(JerkForm(), vehicles=count, drift=0.0, actuation_prior=TIGHT, kept=2)
-    found, settled = loop._learn(windows_of(truth, 1.0, g), torch.arange(count))
-    assert settled.all()
+    found, converged = loop._learn(windows_of(truth, 1.0, g), torch.arange(count))
+    assert converged.all()
     covered = ((found.q05[:, :2] <= truth) & (truth <= found.q95[:, :2])).double().mean(0)
     assert ((covered - 0.9).abs() < BAR * math.sqrt(0.09 / count) + 0.01).all()
 
@@ -192,10 +192,10 @@ def test_a_filter_that_diverges_begins_anew(kind):
     a, u = torch.randn(2, 1, 400, generator=g, dtype=F64)
     loop = kind(JerkForm(), drift=1.0)
     before = loop.belief
-    found, settled = loop._learn(rows_of(a, u, -glvd_jerk(a, u, 0.3, 1.0)), torch.tensor([0]))
-    assert not settled.any()
+    found, converged = loop._learn(rows_of(a, u, -glvd_jerk(a, u, 0.3, 1.0)), torch.tensor([0]))
+    assert not converged.any()
     assert loop._memory["mean"].equal(loop.actuation_prior.median.log()[None])
-    after = before.updated(torch.tensor([True]), torch.tensor([0]), found, settled)
+    after = before.updated(torch.tensor([True]), torch.tensor([0]), found, converged)
     assert after.draws.equal(before.draws)
 
 

@@ -24,8 +24,8 @@ def taken(forgetting, *windows, seed=0):
     every = torch.arange(vehicles)
     for w in windows:
         rows = {"time": w.time, "usable": torch.ones_like(w.a, dtype=torch.bool), **w.columns}
-        found, settled = loop._learn(rows, every)
-        loop.belief = loop.belief.updated(torch.ones(vehicles, dtype=torch.bool), every, found, settled)
+        found, converged = loop._learn(rows, every)
+        loop.belief = loop.belief.updated(torch.ones(vehicles, dtype=torch.bool), every, found, converged)
     return loop.belief
 
 
@@ -73,9 +73,9 @@ def test_intervals_cover(rotating_seed, draws_factor):
     """Of 4000 vehicles; normal in place of Student's t (198) costs 0.0015."""
     count = 4000 * draws_factor
     loop = RecursiveLeastSquares(JerkForm(), vehicles=count, forgetting=1.0, kept=2)
-    found, settled = loop._learn(white(count, 200, 0.6, 0.8, 1.0, rotating_seed), torch.arange(count))
+    found, converged = loop._learn(white(count, 200, 0.6, 0.8, 1.0, rotating_seed), torch.arange(count))
     truth = torch.tensor([0.6, 0.8, 1.0], dtype=F64)
-    assert settled.all()
+    assert converged.all()
     covered = ((found.q05 <= truth) & (truth <= found.q95)).double().mean(0)
     # sigma's interval is normal in its logarithm: off by a skewness of order 1/sqrt(2n) = 0.05, in the tails 0.01
     assert ((covered - 0.9).abs() < BAR * math.sqrt(0.09 / count) + torch.tensor([0.0015, 0.0015, 0.01])).all()
@@ -86,8 +86,8 @@ def test_with_forgetting_the_customary_covariance_is_twice_too_wide(rotating_see
     """White regressors: the estimate's variance is (1-f)/(1+f), what the covariance claims 1-f, of sigma^2/s^2."""
     count, factor = 2000 * draws_factor, 0.99
     loop = RecursiveLeastSquares(JerkForm(), vehicles=count, forgetting=factor, kept=2)
-    found, settled = loop._learn(white(count, 1000, 0.5, 0.8, 0.3, rotating_seed), torch.arange(count))
-    assert settled.all()
+    found, converged = loop._learn(white(count, 1000, 0.5, 0.8, 0.3, rotating_seed), torch.arange(count))
+    assert converged.all()
     ratio = (found.mean[:, 0].std() / found.sd[:, 0].mean()).item()
     # a standard deviation of n is good to 1/sqrt(2 n); the inverse of a random matrix of 100 rows adds 1 to 2 %
     assert ratio == pytest.approx(1 / math.sqrt(1 + factor), rel=BAR / math.sqrt(2 * count) + 0.03)

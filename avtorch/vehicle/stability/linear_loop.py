@@ -18,7 +18,7 @@ Loose = float | Sequence[float] | Tensor
 
 
 @dataclass(frozen=True)
-class Setting:
+class LinearLoop:
     """A loop around `A (T s + 1) = K exp(-theta s) u`, every field a tensor that broadcasts with the others.
 
     `valid` is False where the actuation is no vehicle: T_L < 0, K_L <= 0 or anything not finite. Such entries come from
@@ -56,16 +56,16 @@ class Setting:
         """`x` broadcast to the shape of the whole setting."""
         return x.expand(self.shape)
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> Setting:
+    def map(self, change: Callable[[Tensor], Tensor]) -> LinearLoop:
         """The setting with `change` applied to every field."""
-        return Setting(*(change(getattr(self, f.name)) for f in fields(self)))
+        return LinearLoop(*(change(getattr(self, f.name)) for f in fields(self)))
 
-    def pick(self, mask: Tensor) -> Setting:
+    def pick(self, mask: Tensor) -> LinearLoop:
         """The entries where `mask` (of the full shape) holds, as a flat (setting,) batch."""
         mask = mask.reshape(1) if mask.ndim == 0 else mask
         return self.map(lambda x: x.expand(mask.shape)[mask])
 
-    def column(self) -> Setting:
+    def column(self) -> LinearLoop:
         """The same batch with a trailing axis for frequencies."""
         return self.map(lambda x: x.unsqueeze(-1))
 
@@ -83,7 +83,7 @@ def as_tensor(x: Loose, like: Sequence[Loose], name: str) -> Tensor:
         raise InputError(f"{name}: expected a number or a tensor of numbers, found {type(x).__name__}") from error
 
 
-def read_setting(
+def linear_loop(
     T_L: Value,
     K_L: Value,
     time_gap: Value,
@@ -92,7 +92,7 @@ def read_setting(
     dead_time: Value = 0.0,
     feedforward: Value = 0.0,
     feedforward_delay: Value = 0.0,
-) -> Setting:
+) -> LinearLoop:
     """Check and gather the arguments that every stability function takes.
 
     T_L [s], K_L [-], time_gap [s], dead_time [s], feedforward k_f [-] and its delay [s] broadcast with each other and
@@ -130,7 +130,7 @@ def read_setting(
     # Placeholders by torch.where, on each side separately, keep values and gradients finite and the shapes small.
     lag, share = (torch.where(actuator, x, one) for x in (T, K))
     tau, ks, kv, ka, kf = (torch.where(torch.isfinite(x), x, one) for x in (tau, ks, kv, ka, kf))
-    return Setting(lag, share, tau, ks, kv, ka, theta, kf, theta_f, actuator & law)
+    return LinearLoop(lag, share, tau, ks, kv, ka, theta, kf, theta_f, actuator & law)
 
 
 def _first_bad(delay: Tensor) -> float:

@@ -11,7 +11,7 @@ from avtorch.errors import InputError
 
 
 @dataclass(frozen=True)
-class Row:
+class EffectContext:
     """The input of an effect besides its signal: one row (...) in simulation, whole drives (..., time) otherwise.
 
     `time` [s] and step `dt` [s] to the next row; `position` [m] since the drive's start; the baseline's `T_L` [s],
@@ -19,9 +19,10 @@ class Row:
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import AerodynamicDrag, Row
+        >>> from avtorch.gap import AerodynamicDrag, EffectContext
         >>> speed, one = torch.tensor([10.0, 30.0]), torch.tensor(1.0)
-        >>> row = Row(torch.tensor([0.0, 0.1]), 0.1 * one, measured_speed=speed, travelled=None, T_L=0.3 * one, K_L=one)
+        >>> time, dt, T_L = torch.tensor([0.0, 0.1]), 0.1 * one, 0.3 * one
+        >>> row = EffectContext(time, dt, measured_speed=speed, travelled=None, T_L=T_L, K_L=one)
         >>> [round(a, 2) for a in AerodynamicDrag(4e-4).apply(0 * speed, row).tolist()]
         [-0.04, -0.36]
     """
@@ -50,11 +51,11 @@ class Row:
         return self.travelled
 
 
-def row_at(row: Row, k: int) -> Row:
+def context_at(row: EffectContext, k: int) -> EffectContext:
     """One row of a whole drive."""
 
     def pick(x: Tensor | None) -> Any:
         return None if x is None else x if x.dim() == 0 else x[..., 0 if x.shape[-1] == 1 else k]
 
     parts = (row.time, row.dt, row.measured_speed, row.travelled, row.T_L, row.K_L, row.normal)
-    return Row(*(pick(x) for x in parts), whole=False)
+    return EffectContext(*(pick(x) for x in parts), whole=False)

@@ -19,7 +19,7 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.crossval.folds import blocks_of
 from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.comparison import LaterAnswer
+from avtorch.gap.result.comparison import DeadTimeTest
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
 from avtorch.gap.simulator.effect import delay_effect, delay_key
@@ -28,7 +28,7 @@ _FELT_S = 0.03  # [s] shorter delays: the link's scale, a logarithm, has no usab
 
 
 @dataclass(frozen=True, eq=False)
-class WithDelay:
+class DeadTimeFit:
     """One set of drives: `mean` and `covariance` of ln T_L, ln K_L and the dead time [s], from `blocks` blocks."""
 
     mean: FloatArray
@@ -36,7 +36,7 @@ class WithDelay:
     blocks: int
 
     @classmethod
-    def of(cls, search: Search, none: FittedModel) -> WithDelay:
+    def of(cls, search: Search, none: FittedModel) -> DeadTimeFit:
         """Fit a dead time on top of `none`, the fit without effects; it replaces one of the baseline's."""
         found = search.with_effects(none, [delay_effect()])
         candidate, record = found.hypothesis, found.hypothesis.record
@@ -63,8 +63,8 @@ class WithDelay:
         return cls(mean, root @ axes @ np.diag(np.maximum(sizes, 1.0)) @ axes.T @ root.T, len(blocks))
 
 
-def later_answer(before: WithDelay, after: WithDelay, *, level: float) -> LaterAnswer:
-    """Test both explanations at `level` (see `LaterAnswer`)."""
+def compare_accounts(before: DeadTimeFit, after: DeadTimeFit, *, level: float) -> DeadTimeTest:
+    """Test both explanations at `level` (see `DeadTimeTest`)."""
     away, covariance = after.mean - before.mean, after.covariance + before.covariance
     blocks = min(before.blocks, after.blocks)
     same_delay, same_car = _chance(away, covariance, [2], blocks), _chance(away, covariance, [0, 1], blocks)
@@ -75,7 +75,7 @@ def later_answer(before: WithDelay, after: WithDelay, *, level: float) -> LaterA
         return Quantity(mean, sd, mean - sure * sd, mean + sure * sd)
 
     sides = [delay(float(x.mean[2]), float(x.covariance[2, 2])) for x in (before, after)]
-    return LaterAnswer(
+    return DeadTimeTest(
         before=sides[0],
         after=sides[1],
         difference=delay(float(away[2]), float(covariance[2, 2])),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Drive:
+class SimulatorInput:
     """Stretches without gaps: `time` (time,) [s], `command` (..., time) [m/s²] and, where measured, `speed` [m/s].
 
     A row's command acts from its time until the next row's. `accel0` (...) [m/s²] is the car's acceleration at the
@@ -30,12 +30,14 @@ class Drive:
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive
+        >>> from avtorch.gap import SimulatorInput
         >>> time = torch.arange(100, dtype=torch.float64) * 0.05
-        >>> drive = Drive(time, torch.sin(time), speed=torch.full_like(time, 20.0))
+        >>> drive = SimulatorInput(time, torch.sin(time), speed=torch.full_like(time, 20.0))
         >>> bool(drive.uniform), round(drive.position[-1].item(), 2)  # metres
         (True, 99.0)
     """
+
+    fingerprint_name: ClassVar[str] = "avtorch.gap.simulator.drive.Drive"
 
     time: Tensor
     command: Tensor
@@ -78,10 +80,10 @@ class Drive:
             object.__setattr__(self, name, value)
 
     @classmethod
-    def from_log(cls, log: Log, segment: int = 0, *, settled: bool = False) -> Drive:
+    def from_log(cls, log: Log, segment: int = 0, *, steady_start: bool = False) -> SimulatorInput:
         """One segment of a log, with time from the log's start.
 
-        It starts from the measured acceleration, if there is one, unless `settled`.
+        It starts from the measured acceleration, if there is one, unless `steady_start`.
 
         Rows with `engaged` 0 are included: their commands act in the response, although the car did not follow them.
 
@@ -93,7 +95,7 @@ class Drive:
         if rows.sum() < 2:
             raise InputError(f"segment: found {segment}, needs a segment of the log with two rows or more")
         speed = None if log.speed is None else torch.as_tensor(log.speed[rows])
-        accel0 = None if log.accel is None or settled else float(log.accel[rows][0])
+        accel0 = None if log.accel is None or steady_start else float(log.accel[rows][0])
         time, command = torch.as_tensor(log.elapsed[rows]), torch.as_tensor(log.accel_cmd[rows])
         return cls(time, command, speed, accel0, log.accel_kind == "specific-force")
 
@@ -114,9 +116,9 @@ class Response:
 
     Example:
         >>> import torch
-        >>> from avtorch.gap import Drive, SensorBias, plant
+        >>> from avtorch.gap import SimulatorInput, SensorBias, plant
         >>> time = torch.arange(100, dtype=torch.float64) * 0.05
-        >>> response = plant([SensorBias(0.12)]).response(Drive(time, 0 * time))
+        >>> response = plant([SensorBias(0.12)]).response(SimulatorInput(time, 0 * time))
         >>> round((response.accel_measured - response.accel)[-1].item(), 2)
         0.12
     """
