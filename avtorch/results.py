@@ -21,6 +21,17 @@ if TYPE_CHECKING:
     from avtorch.vehicle import Block
 
 
+__all__ = [
+    "alert_entries",
+    "estimates_answer",
+    "finite",
+    "run_answer",
+    "stability_answer",
+    "validation_answer",
+    "window_entry",
+]
+
+
 def window_entry(watched: WatchedWindow, scenario: int = 0) -> dict[str, Any]:
     """One window of `estimates.json` and `run.json`, for one scenario.
 

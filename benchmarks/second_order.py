@@ -14,8 +14,14 @@ import math
 import torch
 from torch import Tensor
 
-from avtorch.inference import PositionLagDensity, SpeedLagDensity, integrate, sample
-from avtorch.inference.second_order import default_position_lag_prior, default_speed_lag_prior
+from avtorch.inference import (
+    PositionLagDensity,
+    SpeedLagDensity,
+    default_position_lag_prior,
+    default_speed_lag_prior,
+    integrate,
+    sample,
+)
 from avtorch.vehicle.second_order import PositionLag, SpeedLag, position_lag_accel, speed_lag_accel
 
 SEED = 20261122

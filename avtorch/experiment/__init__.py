@@ -1,5 +1,6 @@
 """Which experiment next: the manoeuvre that separates causes that a log does not distinguish."""
 
+from avtorch.experiment.foretold import ManoeuvrePrediction
 from avtorch.experiment.information import Information, information
 from avtorch.experiment.limits import Limits
 from avtorch.experiment.manoeuvres import Manoeuvre, library
@@ -10,6 +11,7 @@ __all__ = [
     "Information",
     "Limits",
     "Manoeuvre",
+    "ManoeuvrePrediction",
     "information",
     "library",
     "next_experiment",

@@ -70,8 +70,21 @@ class PredictiveLaw:
 
 @dataclass(frozen=True, eq=False)
 class ManoeuvrePrediction:
-    """One contender on all manoeuvres: `rollouts` (manoeuvre, draw, channel, row); one half gives the distributions,
-    the other half the examples."""
+    """One contender on all manoeuvres: `rollouts` (manoeuvre, draw, channel, row), half of which make the laws and
+    half the examples.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, simulate
+        >>> from avtorch.experiment import ManoeuvrePrediction, library
+        >>> from avtorch.gap import DeadTime, plant
+        >>> late = plant([DeadTime(0.4)], sigma=0.0)
+        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
+        >>> cause = diagnose(log, effects=["dead_time"], pairs=False).contenders[0]
+        >>> manoeuvres = library()
+        >>> predicted = ManoeuvrePrediction.of(cause, manoeuvres, ("accel", "speed"), group=1, draws=20)
+        >>> predicted.rollouts.shape == (len(manoeuvres), 20, 2, len(manoeuvres[0].time))
+        True
+    """
 
     contender: PredictiveModel
     channels: tuple[str, ...]

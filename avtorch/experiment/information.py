@@ -39,8 +39,7 @@ def information(
 
     Example:
         >>> from avtorch import Leader, diagnose, simulate
-        >>> from avtorch.experiment import information, library
-        >>> from avtorch.experiment.foretold import ManoeuvrePrediction
+        >>> from avtorch.experiment import ManoeuvrePrediction, information, library
         >>> from avtorch.gap import DeadTime, plant
         >>> late = plant([DeadTime(0.4)], sigma=0.0)
         >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()

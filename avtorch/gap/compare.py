@@ -103,7 +103,7 @@ def compare(
     telling = _telling(gap)
     changed = p_value < level
     dead_time_test = (
-        compare_accounts(*(DeadTimeFit.of(x.search, x.found) for x in fitted), level=level) if changed else None
+        compare_accounts(*(DeadTimeFit.of(x.search.fits, x.found) for x in fitted), level=level) if changed else None
     )
     return Comparison(
         before=LogFacts.of(sides[0]),

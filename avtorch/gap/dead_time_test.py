@@ -21,7 +21,7 @@ from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import DeadTimeTest
 from avtorch.gap.search.fitted_model import FittedModel
-from avtorch.gap.search.search import Search
+from avtorch.gap.search.own_noise_fit import OwnNoiseFits
 from avtorch.gap.simulator.effect import delay_effect, delay_key
 
 _FELT_S = 0.03  # [s] shorter delays: the link's scale, a logarithm, has no usable derivative there
@@ -36,9 +36,9 @@ class DeadTimeFit:
     blocks: int
 
     @classmethod
-    def of(cls, search: Search, none: FittedModel) -> DeadTimeFit:
-        """Fit a dead time on top of `none`, the fit without effects; it replaces one of the baseline's."""
-        found = search.with_effects(none, [delay_effect()])
+    def of(cls, fits: OwnNoiseFits, none: FittedModel) -> DeadTimeFit:
+        """With a dead time on top of `none`, the fit without any effect, in place of one of the baseline's."""
+        found = fits.with_effects(none, [delay_effect()])
         candidate, record = found.hypothesis, found.hypothesis.record
         keys, own = [c.key for c in candidate.coordinates], _keys()
         here = found.z.copy()

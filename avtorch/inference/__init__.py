@@ -27,7 +27,12 @@ from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.posterior import Posterior, nested_rhat
 from avtorch.inference.quadrature import Quadrature, integrate
 from avtorch.inference.sampler import SamplerSettings, sample
-from avtorch.inference.second_order import PositionLagDensity, SpeedLagDensity
+from avtorch.inference.second_order import (
+    PositionLagDensity,
+    SpeedLagDensity,
+    default_position_lag_prior,
+    default_speed_lag_prior,
+)
 from avtorch.inference.second_order_form import PositionLagForm, SpeedLagForm
 from avtorch.inference.sequential import SequentialInference
 from avtorch.inference.sghmc import SGHMC
@@ -65,6 +70,8 @@ __all__ = [
     "SubsampledDensity",
     "TorchDensity",
     "Window",
+    "default_position_lag_prior",
+    "default_speed_lag_prior",
     "find_mode",
     "integrate",
     "jerk_log_likelihood",

@@ -22,12 +22,24 @@ def _log_normal(median: tuple[float, float], log_sd: tuple[float, float]) -> Log
 
 
 def default_speed_lag_prior() -> LogNormalPrior:
-    """Of ``(T_V [s], K_V [-])``; 90 % of the lags lie in 0.16 to 1.6 s, around the delays recorded on cars on sale."""
+    """Of ``(T_V [s], K_V [-])``; 90 % of the lags lie in 0.16 to 1.6 s, around the delays recorded on cars on sale.
+
+    Example:
+        >>> from avtorch.inference import default_speed_lag_prior
+        >>> default_speed_lag_prior().median.tolist()
+        [0.5, 1.0]
+    """
     return _log_normal((0.5, 1.0), (0.7, 0.3))
 
 
 def default_position_lag_prior() -> LogNormalPrior:
-    """Of ``(T_P [s], zeta [-])``; around critical damping, with overshoot not excluded."""
+    """Of ``(T_P [s], zeta [-])``; around critical damping, with overshoot not excluded.
+
+    Example:
+        >>> from avtorch.inference import default_position_lag_prior
+        >>> default_position_lag_prior().median.tolist()
+        [0.7, 1.0]
+    """
     return _log_normal((0.7, 1.0), (0.7, 0.5))
 
 

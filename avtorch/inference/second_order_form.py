@@ -23,8 +23,7 @@ class SpeedLagForm:
     Give the stream ``actuation_prior=default_speed_lag_prior()``.
 
     Example:
-        >>> from avtorch.inference import BeliefStream, SpeedLagForm
-        >>> from avtorch.inference.second_order import default_speed_lag_prior
+        >>> from avtorch.inference import BeliefStream, SpeedLagForm, default_speed_lag_prior
         >>> form = SpeedLagForm()
         >>> stream = BeliefStream(window=2.0, form=form, actuation_prior=default_speed_lag_prior())
         >>> form.columns, form.names
@@ -56,8 +55,7 @@ class PositionLagForm:
     ``actuation_prior=default_position_lag_prior()``.
 
     Example:
-        >>> from avtorch.inference import BeliefStream, PositionLagForm
-        >>> from avtorch.inference.second_order import default_position_lag_prior
+        >>> from avtorch.inference import BeliefStream, PositionLagForm, default_position_lag_prior
         >>> form = PositionLagForm()
         >>> stream = BeliefStream(window=2.0, form=form, actuation_prior=default_position_lag_prior())
         >>> form.columns, form.names

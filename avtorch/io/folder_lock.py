@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from avtorch.errors import InputError
-from avtorch.io.sealed import regular_bytes
+from avtorch.io.opening import read_regular
 
 LOCK = ".avtorch.lock"
 """The locked file's name; it is removed with the lock, and one that a killed process left locks nothing."""
@@ -113,7 +113,7 @@ def _sign(path: Path, work: str) -> None:
 def _holder(path: Path) -> str:
     """The process that holds the lock, for a message: short and sanitised, as anyone can write the file."""
     try:
-        told = json.loads(regular_bytes(path, 4096).decode("utf-8"))
+        told = json.loads(read_regular(path, most=4096, need="a lock", links=False).decode("utf-8"))
         words = {key: "".join(c for c in str(told[key])[:80] if c.isprintable()) for key in ("pid", "host", "work")}
         since = "".join(c for c in str(told["since"])[:40] if c.isprintable())
     except (ValueError, TypeError, KeyError, RecursionError):

@@ -10,6 +10,7 @@ from pathlib import Path
 from avtorch.errors import InputError, printable
 
 _KINDS = {
+    stat.S_IFLNK: "a symbolic link",
     stat.S_IFDIR: "a directory",
     stat.S_IFIFO: "a named pipe",
     stat.S_IFSOCK: "a socket",
@@ -17,6 +18,15 @@ _KINDS = {
     stat.S_IFBLK: "a device",
 }
 _PATH = 200  # characters of a path in a message
+
+
+class TooLarge(InputError):
+    """A file with more bytes than its reader takes."""
+
+
+def kind_of(mode: int) -> str:
+    """What lies there instead of a regular file, by the `mode` of its status."""
+    return _KINDS.get(stat.S_IFMT(mode), "no regular file")
 
 
 def place(path: str | os.PathLike[str]) -> str:
@@ -27,13 +37,16 @@ def place(path: str | os.PathLike[str]) -> str:
 def read_regular(path: str | os.PathLike[str], *, most: int, need: str, links: bool = True) -> bytes:
     """The content of a regular file of up to `most` bytes; `need` names the expected file in messages.
 
-    The checks apply to the opened file, so it cannot be exchanged in between, and opening never blocks: a pipe without
-    a writer, a device or a directory is refused at once. `links` False refuses a symbolic link too. Raises InputError.
+    The checks look at the opened file, so it cannot be exchanged in between, and opening never waits: a pipe without a
+    writer, a device or a directory is refused at once. `links` False refuses a symbolic link too. Raises InputError,
+    for more bytes `TooLarge`.
     """
     shown = place(path)
     # O_NONBLOCK: a pipe would wait for its writer; both flags are missing on Windows, where neither is needed
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
     if not links:
+        if os.path.islink(path):  # on Windows nothing else refuses it
+            raise InputError(f"{shown}: is a symbolic link; {need} is needed")
         flags |= getattr(os, "O_NOFOLLOW", 0)
     try:
         handle = os.open(path, flags)
@@ -44,9 +57,8 @@ def read_regular(path: str | os.PathLike[str], *, most: int, need: str, links: b
     try:
         info = os.fstat(handle)
         if not stat.S_ISREG(info.st_mode):
-            kind = _KINDS.get(stat.S_IFMT(info.st_mode), "no regular file")
-            raise InputError(f"{shown}: is {kind}; {need} is needed")
-        # some system files report size 0: rely on what is read
+            raise InputError(f"{shown}: is {kind_of(info.st_mode)}; {need} is needed")
+        # some files of the system say that they hold nothing: what is read counts, not what is said
         raw = b"" if info.st_size > most else _read(handle, most + 1)
     except OSError as fault:
         raise InputError(f"{shown}: cannot be read ({fault.strerror or type(fault).__name__})") from None
@@ -54,7 +66,7 @@ def read_regular(path: str | os.PathLike[str], *, most: int, need: str, links: b
         os.close(handle)
     size = max(info.st_size, len(raw))
     if size > most:
-        raise InputError(f"{shown}: has {size:,} bytes; needs {most:,} at most")
+        raise TooLarge(f"{shown}: has {size:,} bytes; needs {most:,} at most")
     return raw
 
 

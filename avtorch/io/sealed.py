@@ -27,6 +27,7 @@ from typing import Any, NamedTuple, NoReturn
 from avtorch.errors import InputError
 from avtorch.io.answers import json_text
 from avtorch.io.atomic import atomic
+from avtorch.io.opening import TooLarge, kind_of, read_regular
 
 MOST = 64 * 2**20
 """Maximum size of a state file [bytes], unless its reader sets another."""
@@ -132,41 +133,18 @@ def read_sealed_bytes(path: Path, *, schema: str, most: int = MOST, remedy: str 
     return Sealed(found["of"], content)
 
 
-def regular_bytes(path: Path, most: int, *, remedy: str = REMEDY) -> bytes:
-    """All bytes of a regular file, at most `most` of them.
-
-    Raises `InputError` for a symlink, a folder, a FIFO, a device, a file that is missing, not readable or too large;
-    it neither blocks on these nor reads them.
-    """
+def _content(path: Path, most: int, remedy: str) -> bytes:
     try:
-        kind = os.lstat(path).st_mode
-        if not stat.S_ISREG(kind):
-            raise InputError(f"{path}: is {_kind(kind)}, needs a regular file; {remedy}")
-        # the file may have been exchanged since: check the open one
-        flags = os.O_RDONLY | sum(
-            getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY")
-        )
-        with os.fdopen(os.open(path, flags), "rb") as stream:
-            facts = os.fstat(stream.fileno())
-            if not stat.S_ISREG(facts.st_mode):
-                raise InputError(f"{path}: is {_kind(facts.st_mode)}, needs a regular file; {remedy}")
-            # read() allocates the size requested: request the reported size and one byte more, to detect growth
-            content = stream.read(facts.st_size + 1) if facts.st_size <= most else None
-            if content is not None and len(content) > facts.st_size:
-                raise InputError(f"{path}: grows while it is read, or does not report its size; {remedy}")
-    except (OSError, ValueError) as fault:
-        if isinstance(fault, InputError):
-            raise
-        told = fault.strerror if isinstance(fault, OSError) and fault.strerror else fault
-        raise InputError(f"{path}: cannot be read ({told}); {remedy}") from None
-    if content is None or len(content) > most:
+        return read_regular(path, most=most, need="a regular file", links=False)
+    except TooLarge:
         _refuse(path, f"is larger than {most / 2**20:.0f} MiB, which no file of its kind is", remedy)
-    return content
+    except InputError as fault:
+        raise InputError(f"{fault}; {remedy}") from None
 
 
 def _verified(path: Path, schema: str, most: int, remedy: str) -> bytes:
     """What follows the first line, once the checksum is found right."""
-    first, newline, rest = regular_bytes(path, most, remedy=remedy).partition(b"\n")
+    first, newline, rest = _content(path, most, remedy).partition(b"\n")
     match = _FIRST.fullmatch(first)
     if not match or not newline:
         _refuse(path, "is damaged, or from an earlier avtorch that wrote no checksum", remedy)
@@ -212,12 +190,7 @@ def _free_or_regular(path: Path) -> None:
     except (OSError, ValueError):
         return  # no file yet; the writer reports any other fault
     if not stat.S_ISREG(kind):
-        raise InputError(f"{path}: is {_kind(kind)}, needs a regular file or a free name")
-
-
-def _kind(mode: int) -> str:
-    kinds = {stat.S_IFLNK: "a symlink", stat.S_IFDIR: "a folder", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
-    return kinds.get(stat.S_IFMT(mode), "a device")
+        raise InputError(f"{path}: is {kind_of(kind)}; a regular file or a free name is needed")
 
 
 def _refuse(path: Path, what: str, remedy: str) -> NoReturn:

@@ -12,7 +12,7 @@ from avtorch.gap.likelihood import hypothesis as candidate
 from avtorch.gap.likelihood import noise_fit
 from avtorch.gap.search import lost_messages as losses
 from avtorch.gap.search import outliers as chance
-from avtorch.gap.search import search
+from avtorch.gap.search import own_noise_fit
 from avtorch.gap.selection import adequacy as remainder
 from avtorch.gap.selection.calibration import document
 from benchmarks.fit_calibration.__main__ import COMMAND
@@ -64,7 +64,7 @@ def test_a_prior_of_the_effects_is_felt(monkeypatch: pytest.MonkeyPatch) -> None
     ("part", "of", "name", "value"),
     [
         ("late", noise_fit.PRIORS, "force_sd", (np.log(0.01), 0.5, 1.5)),
-        ("late", search, "averaged", lambda tried, dt: 0.0),
+        ("late", own_noise_fit, "onset_evidence", lambda tried, dt: 0.0),
         ("late", remainder, "SCALES", replace(remainder.SCALES, sizes=(2.0, 5.0, 15.0, 50.0))),
         ("chance", chance, "_TAIL_PRIOR", ((np.log(0.02), 1.5), (np.log(7.0), 0.4))),
         ("chance", losses, "_CENTRE", losses._CENTRE + 0.5),

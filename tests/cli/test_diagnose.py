@@ -297,7 +297,7 @@ def test_fits_that_cannot_be_believed(
     (out / "fits.json").unlink()
     (out / "fits.json").symlink_to(tmp_path / "elsewhere")
     assert main(["diagnose", drive, "--quiet", "--out", str(out)]) == 2
-    assert "fits.json: is a symlink" in capsys.readouterr().err
+    assert "fits.json: is a symbolic link" in capsys.readouterr().err
     assert main(["diagnose", drive, "--no-resume", "--quiet", "--out", str(out)]) == 0
     (out / "fits.json").unlink()
     (out / "fits.json").mkdir()

@@ -14,7 +14,7 @@ from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes
 from avtorch.gap import DeadTime, Outliers, SensorBias, plant
 from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis
-from avtorch.gap.search.search import Search
+from avtorch.gap.search.budget import Budget
 from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.io import Log
 from avtorch.report import report_html
@@ -39,13 +39,13 @@ def _cut(monkeypatch: pytest.MonkeyPatch, log: Log, after: int) -> Diagnosis:
     """Diagnosed with a budget that is spent at the search's question number `after`, whatever the machine's speed."""
     asked = 0
 
-    def late(self: Search) -> bool:
+    def spent(self: Budget) -> bool:
         nonlocal asked
         asked += 1
         self.complete = self.complete and asked <= after
         return asked > after
 
-    monkeypatch.setattr(Search, "_late", late)
+    monkeypatch.setattr(Budget, "spent", spent)
     return avtorch.diagnose(log, effects=AMONG)
 
 

@@ -240,7 +240,7 @@ def test_symlinks_folders_and_fifos_are_refused(saved: BeliefStream, tmp_path: P
     link.symlink_to(path)
     folder.mkdir()
     os.mkfifo(fifo)
-    for place, told in ((link, "a symlink"), (folder, "a folder"), (fifo, "a FIFO")):
+    for place, told in ((link, "a symbolic link"), (folder, "a directory"), (fifo, "a named pipe")):
         with pytest.raises(InputError, match=f"{place.name}: is {told}"):
             saved.save(place)
         with pytest.raises(InputError, match=f"{place.name}: is {told}"):
@@ -249,7 +249,7 @@ def test_symlinks_folders_and_fifos_are_refused(saved: BeliefStream, tmp_path: P
     assert link.is_symlink()
     with pytest.raises(InputError, match="is a device"):
         new().load("/dev/zero")
-    with pytest.raises(InputError, match="missing: cannot be read"):
+    with pytest.raises(InputError, match="missing: no such file"):
         new().load(tmp_path / "missing")
 
 

@@ -113,14 +113,21 @@ def test_only_regular_files_are_read_or_replaced(tmp_path: Path) -> None:
     link.symlink_to(real)
     os.mkfifo(fifo)
     folder.mkdir()
-    for path, kind in ((link, "a symlink"), (fifo, "a FIFO"), (folder, "a folder"), (Path("/dev/zero"), "a device")):
+    for path, kind in (
+        (link, "a symbolic link"),
+        (fifo, "a named pipe"),
+        (folder, "a directory"),
+        (Path("/dev/zero"), "a device"),
+    ):
         with pytest.raises(InputError, match=f"{path.name}: is {kind}") as caught:
             read_sealed(path, schema=SCHEMA)
         assert not isinstance(caught.value, Damaged)
         with pytest.raises(InputError, match=f"{path.name}: is {kind}"):
             write_sealed(path, CONTENT, schema=SCHEMA, of={})
     assert real.read_bytes() == before
-    for path in (tmp_path / "missing", tmp_path / ("x" * 300), tmp_path / "zero\0byte", real / "inside"):
+    with pytest.raises(InputError, match="missing: no such file; remove it"):
+        read_sealed(tmp_path / "missing", schema=SCHEMA)
+    for path in (tmp_path / ("x" * 300), tmp_path / "zero\0byte", real / "inside"):
         with pytest.raises(InputError, match="cannot be read"):
             read_sealed(path, schema=SCHEMA)
 

@@ -19,6 +19,7 @@ from avtorch.errors import InputError
 from avtorch.io import Damaged, Log, read_sealed, sole_use, write_sealed
 from avtorch.trial import reply, run_trial
 from avtorch.trial.folder import ANSWER, TRIAL, TRUTH, TrialFolder
+from tests.damage import KINDS, damaged
 
 SHORT: dict[str, Any] = {"seconds": 60.0, "tiers": ("easy",)}
 TIMES = ("seconds_per_case", "cpu_seconds_per_case", "intervals", "notes")
@@ -87,23 +88,8 @@ def test_damaged_files_are_refused(root: Path, name: str, fresh_seed: int) -> No
     rng, path = random.Random(fresh_seed), root / name
     settings = read_sealed(root / "trial.json", schema=TRIAL).content
     whole, before = path.read_bytes(), read(root, name, settings)
-    digits = [i for i, byte in enumerate(whole) if chr(byte).isdigit()]
     for turn in range(100):
-        content = bytearray(whole)
-        at, more = sorted(rng.sample(range(len(whole)), 2))
-        match turn % 5:
-            case 0:
-                content[at] ^= 1 << rng.randrange(8)
-            case 1:
-                i = rng.choice(digits)
-                content[i] = rng.choice([d for d in b"0123456789" if d != content[i]])
-            case 2:
-                del content[at:]
-            case 3:
-                content[at:more] = b""
-            case 4:
-                content[at:at] = rng.choice([b" ", b"\n", b"\0", b"-", b"1", b'"', b"[[", rng.randbytes(9)])
-        path.write_bytes(content)
+        path.write_bytes(damaged(whole, turn % KINDS, rng))
         with pytest.raises(InputError, match=f"{path.name}: ") as caught:
             read(root, name, settings)
         assert str(caught.value).isprintable()

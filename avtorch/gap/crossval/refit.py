@@ -12,13 +12,13 @@ from functools import cached_property
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.likelihood.gauss_newton import GaussNewtonFit, acting, finish, grade_marginal, modes, residuals
+from avtorch.gap.likelihood.gauss_newton import GaussNewtonFit, finish, grade_marginal, modes, residuals
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import GUST, PRIORS, fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.noise_segments import whitening_filter
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.whitening_filter import WhiteningFilter, sensed
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter, acting, sensed
 from avtorch.gap.search.fitted_model import FittedModel
 
 _TURNS = 3  # alternations of parameters and noise
@@ -142,7 +142,7 @@ class Refit:
         noise = self.noise.seen_through(
             hypothesis.effects, {k: float(x[0]) for k, x in hypothesis.values(z[None]).items()}
         )
-        return rolled + sensed(record, noise, acting(whitening_filter(record, noise, onset=onset), part, onset))
+        return rolled + sensed(record, noise, acting(record, part, onset))
 
     def around(self, steps: FloatArray) -> FloatArray:
         """Rollouts over the whole record at `z` plus `steps` (step, coordinate): (step, channel, counted, group)."""
@@ -161,7 +161,7 @@ class Refit:
         taken = slope.weighed(white(errors)[0].reshape(1, -1) @ slope.image.T)[1][0]
         columns = whole.grade_columns
         assert columns is not None
-        columns = acting(self.white(whole.record), columns, self.onset)
+        columns = acting(whole.record, columns, self.onset)
         axes = (slope.axes * np.sqrt(taken)).T
         return sensed(whole.record, self.noise, np.einsum("ak,kwrg->awrg", axes, columns))
 

@@ -1,20 +1,23 @@
 """The mode of a hypothesis's parameters: Gauss-Newton on whitened errors, from many starts at once.
 
-Derivatives are forward differences: all columns of all starts form one batch of rollouts, which costs hardly more than
-one rollout. The road grade is linear in its coefficients, which are integrated out exactly.
+Derivatives are forward differences: all columns of all starts are one batch of rollouts, which costs hardly more than
+one. The slope of a road is linear in its coefficients, which are integrated out exactly.
+
+Some likelihoods have creases, where their slope jumps: that of a dead time at every whole number of rows, because a
+command is held until the next. Where the last step has crossed one, the crease itself is tried, too.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from weakref import WeakKeyDictionary
+from typing import NamedTuple
 
 import numpy as np
 
 from avtorch.arrays import Float, FloatArray
 from avtorch.gap.likelihood.grade_marginal import GradeMarginal
 from avtorch.gap.likelihood.hypothesis import Hypothesis
-from avtorch.gap.likelihood.whitening_filter import WhiteningFilter, sensed
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter, acting, sensed
 
 _STEP = 1e-4
 _LONGEST = 1.0
@@ -60,11 +63,16 @@ def modes(
     gradient, square = np.zeros((count, size)), np.tile(np.eye(size), (count, 1, 1))
     trial = z
     live = np.ones(count, bool)
+    on_crease, promised = z.copy(), np.full(count, np.nan)
     for _ in range(iterations):
         g, h, v = _quadratic(hypothesis, white, trial[live], onset, coarse)
         where = np.flatnonzero(live)
         good = v < value[where]
         gain = value[where] - v
+        step = trial[where] - best[where]
+        crease = _crease(step, value[where], gradient[where], square[where], v, g)
+        on_crease[where] = best[where] + crease.share[:, None] * step
+        promised[where] = np.minimum(value[where], v) - crease.value
         up = where[good]
         best[up], value[up], gradient[up], square[up] = trial[up], v[good], g[good], h[good]
         damping[where] = np.where(good, damping[where] * 0.2, np.maximum(damping[where] * 8, 1e-2))
@@ -76,7 +84,41 @@ def modes(
         step = step[:, :, 0]
         step *= np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(1, keepdims=True), 1e-12))
         trial = np.clip(best + step, -5.0, 5.0)
+    last = np.flatnonzero(promised > enough)
+    if last.size:
+        _, _, v = _quadratic(hypothesis, white, on_crease[last], onset, coarse)
+        up = last[v < value[last]]
+        best[up], value[up] = on_crease[up], v[v < value[last]]
     return best, white.constant_of(coarse=coarse) - value
+
+
+class _Crease(NamedTuple):
+    """Where the parabolas of a step's two ends meet: `share` of the step (start,), `value` there (start,)."""
+
+    share: FloatArray
+    value: FloatArray
+
+
+def _crease(
+    step: Float[FloatArray, "start coordinate"],
+    value: Float[FloatArray, " start"],
+    gradient: Float[FloatArray, "start coordinate"],
+    square: Float[FloatArray, "start coordinate coordinate"],
+    end_value: Float[FloatArray, " start"],
+    end_gradient: Float[FloatArray, "start coordinate"],
+) -> _Crease:
+    """Of steps from `value` and `gradient` to `end_value` and `end_gradient`; nan where one crosses no crease.
+
+    A Gauss-Newton step on a smooth function ends where it is flat; one that ends on a rise half as steep as the descent
+    at its start has crossed a crease. Both parabolas have the curvature of `square`.
+    """
+    slope, end_slope = (gradient * step).sum(1), (end_gradient * step).sum(1)
+    curvature = np.einsum("cp,cpq,cq->c", step, square, step)
+    jump = end_slope - slope - curvature
+    crossed = np.isfinite(value) & (slope < 0) & (end_slope > -0.5 * slope) & (jump > 0)
+    fall = np.where(crossed, value - end_value, np.nan)
+    share = np.clip((fall + end_slope - 0.5 * curvature) / np.where(crossed, jump, 1.0), 0.0, 1.0)
+    return _Crease(share, value + slope * share + 0.5 * curvature * share**2)
 
 
 def _quadratic(
@@ -136,33 +178,11 @@ def _integrated(
     return square, cross, value - total
 
 
-_LAST: WeakKeyDictionary[WhiteningFilter, tuple[FloatArray, int | None, GradeMarginal]] = WeakKeyDictionary()
-
-
 def grade_marginal(white: WhiteningFilter, hypothesis: Hypothesis, onset: int | None, *, coarse: bool) -> GradeMarginal:
-    """The marginal of the hypothesis's road grade under this noise; the last one of each noise model is cached."""
+    """Of the hypothesis's slope under this noise."""
     grade = hypothesis.grade_means if coarse else hypothesis.grade_columns
     assert grade is not None
-    kept = _LAST.get(white)
-    if kept is not None and kept[0] is grade and kept[1] == onset:
-        return kept[2]
-    felt = sensed(white.record, white.noise, acting(white, grade, onset))
-    made = GradeMarginal.of(white(felt).reshape(len(grade), -1))
-    _LAST[white] = (grade, onset, made)
-    return made
-
-
-def acting(
-    white: WhiteningFilter, force: Float[FloatArray, "*column channel counted group"], onset: int | None
-) -> Float[FloatArray, "*column channel counted group"]:
-    """Response to the road grade (..., channel, counted, group), limited to rows from `onset` on."""
-    if onset is None:
-        return force
-    force = force.copy()
-    if white.record.speed is not None:
-        force[..., -1, :, :] -= force[..., -1, onset, :1][..., None, :]
-    force[..., :onset, :] = 0.0
-    return force
+    return white.grade_marginal(grade, onset)
 
 
 def residuals(
@@ -188,7 +208,7 @@ def _sloped(
     rms, profile = grade_marginal(white, hypothesis, onset, coarse=errors.shape[-1] == 1).told(white(errors).ravel())
     part = hypothesis.grade_response(profile)
     part = part.mean(-1, keepdims=True) if errors.shape[-1] == 1 else part
-    return rms, profile, sensed(white.record, white.noise, acting(white, part, onset))
+    return rms, profile, sensed(white.record, white.noise, acting(white.record, part, onset))
 
 
 def finish(

@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -43,10 +42,6 @@ class Coordinate:
     def z_of(self, value: float) -> float:
         z = float(self.parameter.unconstrain(torch.tensor(value, dtype=torch.float64))) / self.wider
         return float(np.clip(z, -4.0, 4.0))
-
-
-_MEANS: WeakKeyDictionary[Record, dict[type[Integrated], FloatArray]] = WeakKeyDictionary()
-_ROWS: WeakKeyDictionary[Record, dict[type[Integrated], FloatArray]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,24 +158,23 @@ class Hypothesis:
 
         Every segment has coefficients of its own, because its position on another segment's road is unknown.
         """
-        kind = self.integrated
-        if kind is None or not self._roads:
-            return None
-        known = _ROWS.setdefault(self.record, {})
-        if kind not in known:
-            known[kind] = self._columns(self.record.drives, coarse=False)
-        return known[kind]
+        return self._shared_columns(coarse=False)
 
     @cached_property
     def grade_means(self) -> Float[FloatArray, "knot channel counted 1"] | None:
-        """The same for each group's mean, (knot, channel, counted, 1): within a group the grade is constant."""
+        """The same of each group's mean, (knot, channel, counted, 1): within a group no slope changes."""
+        return self._shared_columns(coarse=True)
+
+    def _shared_columns(self, *, coarse: bool) -> FloatArray | None:
+        """Made once for all hypotheses over this record; the record keeps them."""
         kind = self.integrated
         if kind is None or not self._roads:
             return None
-        known = _MEANS.setdefault(self.record, {})
-        if kind not in known:
-            known[kind] = self._columns(self.record.coarse, coarse=True)
-        return known[kind]
+        shared = self.record.shared_columns
+        if (kind, coarse) not in shared:
+            drives = self.record.coarse if coarse else self.record.drives
+            shared[kind, coarse] = self._columns(drives, coarse=coarse)
+        return shared[kind, coarse]
 
     def _columns(self, drives: Sequence[SimulatorInput], *, coarse: bool) -> FloatArray:
         knots = sum(road.count for road in self._roads)

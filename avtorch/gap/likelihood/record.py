@@ -255,6 +255,14 @@ class Record:
         return whole.numpy()[..., self.source, :]
 
     @cached_property
+    def shared_columns(self) -> dict[tuple[type, bool], FloatArray]:
+        """What hypotheses over this record share: what an integrated effect does, at every row or as groups' means.
+
+        `(class, coarse)` to (knot, channel, counted, group); filled by the first hypothesis that needs them.
+        """
+        return {}
+
+    @cached_property
     def measured(self) -> Float[FloatArray, "channel counted group"]:
         """Measurements of the channels, (channel, counted, group)."""
         return np.stack([x[self.source] for x in (self.accel, self.speed) if x is not None])

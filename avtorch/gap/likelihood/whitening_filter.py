@@ -17,6 +17,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from avtorch.arrays import Float, FloatArray
+from avtorch.gap.likelihood.grade_marginal import GradeMarginal
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.steady_kalman import Filter, designed
@@ -149,6 +150,22 @@ class WhiteningFilter:
         errors[..., -1, :, :] -= errors[..., -1, self.record.starts, :1][..., self.record.stretch, :]
         return self._without_offset(self._filtered(errors))
 
+    @cached_property
+    def _last_grade(self) -> list[tuple[FloatArray, int | None, GradeMarginal]]:
+        return []
+
+    def grade_marginal(
+        self, columns: Float[FloatArray, "knot channel counted group"], onset: int | None
+    ) -> GradeMarginal:
+        """Of a slope that does `columns` per unit of each coefficient, from `onset` on. The last one is kept."""
+        for kept, since, marginal in self._last_grade:
+            if kept is columns and since == onset:
+                return marginal
+        felt = sensed(self.record, self.noise, acting(self.record, columns, onset))
+        made = GradeMarginal.of(self(felt).reshape(len(columns), -1))
+        self._last_grade[:] = [(columns, onset, made)]
+        return made
+
     def constants(self, *, coarse: bool) -> Float[FloatArray, " counted"]:
         """Each row's term (counted,) of the log likelihood that does not depend on the errors."""
         record = self.record
@@ -188,3 +205,16 @@ def sensed(
         accel = np.asarray(lfilter([lost], [1, lost - 1], flat, axis=-1)).reshape(accel.shape)
     motion[..., 0, :, :] = accel
     return motion
+
+
+def acting(
+    record: Record, force: Float[FloatArray, "*column channel counted group"], onset: int | None
+) -> Float[FloatArray, "*column channel counted group"]:
+    """What a slope does (..., channel, counted, group), if only from `onset` on."""
+    if onset is None:
+        return force
+    force = force.copy()
+    if record.speed is not None:
+        force[..., -1, :, :] -= force[..., -1, onset, :1][..., None, :]
+    force[..., :onset, :] = 0.0
+    return force

@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.likelihood.gauss_newton import acting
 from avtorch.gap.likelihood.grade_marginal import GradeMarginal
 from avtorch.gap.likelihood.hypothesis import Hypothesis
-from avtorch.gap.likelihood.whitening_filter import WhiteningFilter, sensed
+from avtorch.gap.likelihood.whitening_filter import WhiteningFilter, acting, sensed
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.simulator.rollout_from_onset import rollout_from_onset
 from avtorch.inference.priors import LogSpaceNormal
@@ -125,7 +124,7 @@ class RolloutDensity:
         columns = self.hypothesis.grade_columns
         if columns is None:
             return None
-        columns = acting(self.white, columns, self.onset)
+        columns = acting(self.white.record, columns, self.onset)
         return GradeMarginal.of(self._image(sensed(self.white.record, self.white.noise, columns)))
 
     def _prior(self, z: Tensor) -> Tensor:

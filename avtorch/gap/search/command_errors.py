@@ -11,7 +11,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.search.lost_messages import image_of_row, states_of
+from avtorch.gap.search.row_response import RowResponse
 
 
 def command_error_gains(
@@ -22,18 +22,9 @@ def command_error_gains(
     Args: `errors` (channel, counted, 1) of a rollout with `T_L` [s] and `K_L` at the log's own rate; `variance`
     (counted,) [(m/s²)²], independent from row to row.
     """
-    record = white.record
-    image = image_of_row(white, T_L, K_L)
-    move, push, see = states_of(image)
-    energy = np.cumsum((image**2).sum(0))
-    warm = 8 + int(np.searchsorted(energy, 0.995 * energy[-1]))
-    size = max(3 * warm, 120)
-    place, valid = [], []
-    for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
-        for begin in range(first, last, size):
-            rows = np.arange(begin - warm, begin + size)
-            place.append(rows.clip(first, last - 1))
-            valid.append((rows >= first) & (rows < last))
+    record, response = white.record, RowResponse.of(white, T_L, K_L)
+    move, push, see, warm = response.move, response.push, response.see, response.warm
+    place, valid = zip(*response.chunks(record), strict=True)
     at, own = np.array(place), np.array(valid)
     e = np.where(own, white(errors)[:, at, 0], 0.0)  # (channel, chunk, step)
     driven = np.where(own, variance[at], 0.0)

@@ -22,13 +22,13 @@ import numpy as np
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.outliers import onset_of
+from avtorch.gap.search.row_response import RowResponse
 
 _CENTRE, _SD = float(np.log(0.08 / 0.92)), 1.0  # of the prior of the fraction's logit
 _FIRST = np.array([-3.0, -1.0, 1.0, 3.0])  # fractions tried first, in sds of the prior
 _ROUNDS = 4
 _PATHS = 6
-_ORDER = 4  # largest number of states of the image
-_FAINT = 1e-3  # [nats] a chunk of rows is skipped if all its command steps together can contribute no more than this
+_FAINT = 1e-3  # what all jumps within a chunk of rows may tell together [nats] and still be skipped
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,23 +150,16 @@ class LossHistories:
     def of(
         cls, white: WhiteningFilter, error: FloatArray, command: FloatArray, T_L: float, K_L: float
     ) -> LossHistories:
-        record = white.record
-        image = image_of_row(white, T_L, K_L)
-        move, push, see = states_of(image)
-        energy = np.cumsum((image**2).sum(0))
-        warm = 8 + int(np.searchsorted(energy, 0.995 * energy[-1]))
-        size = max(3 * warm, 120)
+        record, response = white.record, RowResponse.of(white, T_L, K_L)
         place, valid = [], []
         jumps = np.diff(command, prepend=command[0]) ** 2
         jumps[record.starts] = 0.0
-        for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
-            for begin in range(first, last, size):
-                rows = np.arange(begin - warm, begin + size)
-                inside = (rows >= first) & (rows < last)
-                if jumps[rows[inside]].sum() * energy[-1] > _FAINT:
-                    place.append(rows.clip(first, last - 1))
-                    valid.append(inside)
-        rows = np.array(place, np.int64).reshape(-1, warm + size)
+        for rows, inside in response.chunks(record):
+            if jumps[rows[inside]].sum() * response.energy > _FAINT:
+                place.append(rows)
+                valid.append(inside)
+        move, push, see, warm = response.move, response.push, response.see, response.warm
+        rows = np.array(place, np.int64).reshape(-1, warm + response.size)
         return cls(move, push, see, rows, np.array(valid, bool).reshape(rows.shape), warm, error, command)
 
     def ratios(self, fractions: FloatArray) -> FloatArray:
@@ -236,32 +229,3 @@ def _merged(weight: FloatArray, path: FloatArray, scale: FloatArray) -> tuple[Fl
 
 
 _HEAVIER = np.triu(np.full((2 * _PATHS, 2 * _PATHS), 1e30))
-
-
-def image_of_row(white: WhiteningFilter, T_L: float, K_L: float) -> FloatArray:
-    """Whitened errors (channel, time) caused by a command one unit above the logged one in a single row."""
-    dt = white.record.dt
-    length = 2 * max(16, round(6 * T_L / dt) + 8)
-    decay = np.exp(-dt / T_L)
-    accel, speed = np.zeros(length), np.zeros(length)
-    accel[1:] = K_L * (1 - decay) * decay ** np.arange(length - 1)
-    # its integral, exact for the command's row
-    speed[1] = K_L * (dt - T_L * (1 - decay))
-    speed[2:] = speed[1] + T_L * K_L * (1 - decay) * (1 - decay ** np.arange(1, length - 1))
-    return white.response(np.stack([{"accel": accel, "speed": speed}[name] for name in white.record.channels]))
-
-
-def states_of(image: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A small state-space model with unit-pulse response `image` (channel, time): (move, push, see) of `LossHistories`.
-
-    From the singular vectors of the image's Hankel matrix (Kung 1978), in output-normal coordinates.
-    """
-    channels, length = image.shape
-    half = length // 2
-    index = 1 + np.arange(half)[:, None] + np.arange(half - 1)
-    hankel = image[:, index].transpose(1, 0, 2).reshape(half * channels, half - 1)  # (later row and channel, earlier)
-    u, s, v = np.linalg.svd(hankel, full_matrices=False)
-    order = max(1, min(_ORDER, int((s > 1e-3 * s[0]).sum())))
-    u, push = u[:, :order], s[:order] * v[:order, 0]
-    move = np.linalg.lstsq(u[:-channels], u[channels:], rcond=None)[0]
-    return move, push, u[:channels]

@@ -7,8 +7,9 @@ noise; errors of the command together with the jerk noise, which they resemble; 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import minimize
@@ -24,6 +25,7 @@ from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.command_errors import command_error_gains
 from avtorch.gap.search.fitted_model import ByChance, FittedModel
 from avtorch.gap.search.full_rate import full_rate_errors, full_rate_filter
+from avtorch.gap.search.gusts import gust
 from avtorch.gap.search.outliers import HeavyTails, hessian_of
 from avtorch.gap.simulator.effect import Effect, SearchedAs
 from avtorch.gap.simulator.plant import GapPlant
@@ -33,25 +35,39 @@ _ENOUGH = 0.1  # nats
 _SIMPLEX = -0.7  # initial step in prior standard deviations
 
 
-def own_searches(effects: Sequence[type[Effect]]) -> dict[SearchedAs, type[Effect]]:
-    """Random effects with a search of their own, the first of each kind."""
-    out: dict[SearchedAs, type[Effect]] = {}
-    for kind in effects:
-        form = kind.own_search()
-        if form is not None:
-            out.setdefault(form, kind)
-    return out
+@dataclass(frozen=True, eq=False)
+class RandomEffects:
+    """Those of a search: `own` with a search of their own, the first of each kind; `laws` of all others, by form."""
 
+    own: Mapping[SearchedAs, type[Effect]]
+    laws: Mapping[Form, Sequence[RandomLaw]]
 
-def users_own(effects: Sequence[type[Effect]], raw: Record, baseline: GapPlant) -> dict[Form, list[RandomLaw]]:
-    """Random effects without a search of their own, by their change of the noise."""
-    laws: dict[Form, list[RandomLaw]] = {"force": [], "tails": [], "command": []}
-    searched = own_searches(effects).values()
-    for kind in effects:
-        if kind.random and kind not in searched and is_observable(kind, raw.channels):
-            law = RandomLaw.of(kind, raw, baseline)
-            laws[law.form].append(law)
-    return laws
+    @classmethod
+    def of(cls, effects: Sequence[type[Effect]], raw: Record, baseline: GapPlant) -> RandomEffects:
+        own: dict[SearchedAs, type[Effect]] = {}
+        for kind in effects:
+            searched = kind.own_search()
+            if searched is not None:
+                own.setdefault(searched, kind)
+        laws: dict[Form, list[RandomLaw]] = {"force": [], "tails": [], "command": []}
+        for kind in effects:
+            if kind.random and kind not in own.values() and is_observable(kind, raw.channels):
+                law = RandomLaw.of(kind, raw, baseline)
+                laws[law.form].append(law)
+        return cls(own, laws)
+
+    def has(self, form: Literal["force", "tails"]) -> bool:
+        """Whether any of them is a force, or tails."""
+        return form in self.own or bool(self.laws[form])
+
+    def forced(self, on: FittedModel) -> list[FittedModel]:
+        """Every random force on top of a find."""
+        own = [gust(on, self.own["force"])] if "force" in self.own else []
+        return [*own, *(forced(on, law) for law in self.laws["force"])]
+
+    def forced_as(self, blown: FittedModel, on: FittedModel) -> FittedModel:
+        """The random force of `blown` on top of another find."""
+        return gust(on, self.own["force"]) if blown.by_chance is None else forced(on, blown.by_chance.law)
 
 
 def forced(base: FittedModel, law: RandomLaw) -> FittedModel:

@@ -51,11 +51,19 @@ CARS = {
 }
 
 
-@pytest.mark.statistical
+TRUTH = {
+    "none": {"T_L": 0.4, "K_L": 0.95},
+    "dead_time": {"T_L": 0.4, "K_L": 1.0, "dead_time.delay_s": 0.23},
+    "aerodynamic_drag": {"T_L": 0.4, "K_L": 1.0, "aerodynamic_drag.drag_per_m": 5e-4},
+}
+
+
+@pytest.mark.parametrize("pinned", [None, 187353542])
 @pytest.mark.parametrize("rate_hz", [20, 50])
 @pytest.mark.parametrize("name", CARS)
-def test_the_mode_is_the_optimisers(name: str, rate_hz: int, rotating_seed: int) -> None:
-    rng = np.random.default_rng(rotating_seed)
+def test_the_mode_is_the_optimisers(name: str, rate_hz: int, pinned: int | None, fresh_seed: int) -> None:
+    """Under the pinned seed a dead time at 50 Hz has its mode at 11 rows exactly, where its density has a crease."""
+    rng = np.random.default_rng(fresh_seed if pinned is None else pinned)
     hypothesis, white = _case(CARS[name], name, rng, rate_hz=rate_hz)
     start = hypothesis.z_of({"T_L": 0.3, "K_L": 1.0})
     found, values = modes(hypothesis, white, start[None], iterations=15)
@@ -70,13 +78,17 @@ def test_the_mode_is_the_optimisers(name: str, rate_hz: int, rotating_seed: int)
     assert values[0] == pytest.approx(-best.fun, abs=0.05)
     assert fit.log_joint == pytest.approx(-cost(np.zeros(hypothesis.size)), abs=1e-6)
     assert np.abs(best.x).max() < 0.3
-    # and it is where the truth is, 6 standard deviations (the noise model is the errors' own)
-    truth = {
-        "none": {},
-        "dead_time": {"dead_time.delay_s": 0.23},
-        "aerodynamic_drag": {"aerodynamic_drag.drag_per_m": 5e-4},
-    }
-    for key, value in {"T_L": 0.4, "K_L": 0.95 if name == "none" else 1.0, **truth[name]}.items():
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("rate_hz", [20, 50])
+@pytest.mark.parametrize("name", CARS)
+def test_the_mode_is_where_the_truth_is(name: str, rate_hz: int, rotating_seed: int) -> None:
+    """Within 6 standard deviations: the noise model is the errors' own."""
+    hypothesis, white = _case(CARS[name], name, np.random.default_rng(rotating_seed), rate_hz=rate_hz)
+    found, _ = modes(hypothesis, white, hypothesis.z_of({"T_L": 0.3, "K_L": 1.0})[None], iterations=15)
+    fit = finish(hypothesis, white, found[0])
+    for key, value in TRUTH[name].items():
         i = [c.key for c in hypothesis.coordinates].index(key)
         assert abs(found[0, i] - hypothesis.z_of({key: value})[i]) < 6 * np.sqrt(fit.covariance[i, i])
 

@@ -21,10 +21,12 @@ from avtorch.blindtest import Car, simulate
 from avtorch.blindtest.drives import Recorded
 from avtorch.errors import InputError
 from avtorch.gap import DeadTime, SensorBias, plant
+from avtorch.gap.search.budget import Budget
 from avtorch.gap.search.checkpoint import SCHEMA, read_fits
 from avtorch.gap.search.fitted_work import difference, fitted_work
 from avtorch.gap.search.search import Search
 from avtorch.io import Log, read_sealed, write_sealed
+from tests.damage import KINDS, damaged
 from tests.gap.records import command_over
 
 ONLY: dict[str, Any] = {"effects": ["sensor_bias", "dead_time"], "pairs": False}
@@ -104,7 +106,7 @@ def test_a_spent_budget_is_gone_on_from_to_the_same_answer(
     whole = avtorch.diagnose(log, **given).to_dict()
     left = [0]
 
-    def late(self: Search) -> bool:
+    def spent(self: Budget) -> bool:
         left[0] -= 1
         self.complete = self.complete and left[0] >= 0
         return left[0] < 0
@@ -113,7 +115,7 @@ def test_a_spent_budget_is_gone_on_from_to_the_same_answer(
         path = tmp_path / f"{chances}.json"
         left[0] = chances
         with monkeypatch.context() as patch:
-            patch.setattr(Search, "_late", late)
+            patch.setattr(Budget, "spent", spent)
             assert not avtorch.diagnose(log, checkpoint=path, **given).complete
         assert avtorch.diagnose(log, checkpoint=path, **given).to_dict() == whole
 
@@ -124,27 +126,15 @@ def test_damaged_files_of_fits_are_refused(
     """A hundred of them: bits, numbers, ends, pieces, and structure."""
     rng, whole, of = random.Random(fresh_seed), diagnosed[1], work(log)
     fits = read_fits(kept, of)
-    digits = [i for i, byte in enumerate(whole) if chr(byte).isdigit()]
     for turn in range(100):
-        content = bytearray(whole)
-        at, more = sorted(rng.sample(range(len(whole)), 2))
-        match turn % 6:
-            case 0:
-                content[at] ^= 1 << rng.randrange(8)
-            case 1:  # another number
-                i = rng.choice(digits)
-                content[i] = rng.choice([d for d in b"0123456789" if d != content[i]])
-            case 2:
-                del content[at:]
-            case 3:
-                content[at:more] = b""
-            case 4:
-                content[at:at] = rng.choice([b" ", b"\n", b"\0", b"-", b"1", b'"', b"[[", rng.randbytes(9)])
-            case 5:  # by hand, as JSON
-                text = json.loads(whole)
-                entry = rng.choice(text["content"]["fits"])
-                entry[rng.choice(sorted(entry))] = rng.choice([None, [], 1e9, "none", {"a": 1}])
-                content = bytearray(json.dumps(text, indent=rng.choice([None, 1])).encode())
+        kind = turn % (KINDS + 1)
+        if kind < KINDS:
+            content = damaged(whole, kind, rng)
+        else:  # by hand, as JSON
+            text = json.loads(whole)
+            entry = rng.choice(text["content"]["fits"])
+            entry[rng.choice(sorted(entry))] = rng.choice([None, [], 1e9, "none", {"a": 1}])
+            content = json.dumps(text, indent=rng.choice([None, 1])).encode()
         kept.write_bytes(content)
         refused(kept, of)
     kept.write_bytes(whole)
@@ -243,7 +233,12 @@ def test_a_symlink_a_fifo_and_a_large_file_are_refused(log: Log, kept: Path, tmp
     os.mkfifo(fifo)
     with large.open("wb") as stream:
         stream.truncate(2**40)
-    for path, told in ((link, "a symlink"), (nowhere, "a symlink"), (fifo, "a FIFO"), (large, "larger than 16 MiB")):
+    for path, told in (
+        (link, "a symbolic link"),
+        (nowhere, "a symbolic link"),
+        (fifo, "a named pipe"),
+        (large, "larger than 16 MiB"),
+    ):
         with pytest.raises(InputError, match=rf"{path.name}: is {told}"):
             avtorch.diagnose(log, checkpoint=path, **ONLY)
     assert not (tmp_path / "missing").exists()

@@ -57,7 +57,7 @@ def test_a_delay_is_found_from_either_side_of_its_valley(manoeuvre: Manoeuvre, r
         record = Record.of(log)
         hypothesis = Hypothesis.named(record, "dead_time", plant())
         found = [
-            Search([log], plant())._converged_fit(
+            Search([log], plant()).fits.settled(
                 hypothesis, hypothesis.z_of({"T_L": 0.82 - d, "K_L": 1.0, "dead_time.delay_s": d}), first_noise(record)
             )
             for d in (0.38, 0.46, 0.54)

@@ -30,7 +30,7 @@ from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.steady_kalman import error_dynamics
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.command_errors import command_error_gains
-from avtorch.gap.search.lost_messages import image_of_row
+from avtorch.gap.search.row_response import image_of_row
 from avtorch.io import Log
 from tests.gap.records import QUIET, covariance, drawn_errors
 
