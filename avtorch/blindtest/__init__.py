@@ -14,6 +14,8 @@ from avtorch.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, Family, fa
 from avtorch.blindtest.deck import MIX
 from avtorch.blindtest.drives import DURATIONS_S, MANOEUVRES, RATES_HZ, DrivePlan, Recorded, draw_drive
 from avtorch.blindtest.in_front import IN_FRONT, put_in_front
+from avtorch.blindtest.in_front_score import Injected, score_in_front
+from avtorch.blindtest.recorder import Recorder, draw_recorder
 from avtorch.blindtest.score import score
 from avtorch.blindtest.vehicle import Run, simulate
 from avtorch.blindtest.visibility import TIERS, Oracle, Sight, sight, tier_of
@@ -32,17 +34,21 @@ __all__ = [
     "Case",
     "DrivePlan",
     "Family",
+    "Injected",
     "Oracle",
     "Recorded",
+    "Recorder",
     "Run",
     "Sight",
     "draw_car",
     "draw_case",
     "draw_cases",
     "draw_drive",
+    "draw_recorder",
     "family",
     "put_in_front",
     "score",
+    "score_in_front",
     "sight",
     "simulate",
     "tier_of",

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.blindtest.car import Car
 from avtorch.blindtest.catalogue import family
 from avtorch.blindtest.command import Parameters
 from avtorch.blindtest.drives import DrivePlan
+from avtorch.blindtest.recorder import Recorder
 from avtorch.blindtest.vehicle import Run
 from avtorch.blindtest.visibility import Oracle, Sight, exact_gain
 from avtorch.errors import InputError
@@ -32,6 +35,7 @@ class Case:
     `avtorch.blindtest.visibility`; `visibility_each`: visibility of each effect of a pair, alone on the same drive.
     `oracles`: rollout errors, by metric, of GLVD and of a model that knows the cause. `without`, `with_cause` (row,)
     [m/s²]: noise-free measured acceleration under the logged command, without the cause and with its predictable part.
+    `recorder`: what the log is written by; visibility, tier and oracles are those of the drive before it.
 
     Example:
         >>> from avtorch.blindtest import draw_case
@@ -55,6 +59,7 @@ class Case:
     run: Run
     refit: Sight
     oracles: Mapping[str, Oracle]
+    recorder: Recorder = field(default_factory=Recorder.ideal)
 
     @property
     def name(self) -> str:
@@ -91,16 +96,30 @@ class Case:
         return parts
 
     def log(self, *, signals: Sequence[str] = ("accel", "speed")) -> Log:
-        """The log given to a diagnosis: `time`, `accel_cmd` and the channels in `signals`."""
+        """The log given to a diagnosis, as the recorder wrote it: `time`, `accel_cmd`, the channels in `signals`."""
         columns = {"accel": self.run.accel, "speed": self.run.speed}
         if not signals or set(signals) - columns.keys():
             raise InputError(f"signals: found {tuple(signals)}, needs accel, speed or both")
-        accel, speed = (columns[name] if name in signals else None for name in columns)
-        return Log.from_arrays(name=self.name, time=self.run.time, accel_cmd=self.run.command, accel=accel, speed=speed)
+        columns |= {"time": self.run.time, "accel_cmd": self.run.command}
+        if self.recorder != Recorder.ideal():
+            seed = int(np.random.default_rng([self.seed, self.index, 5]).integers(2**63))
+            written = self.recorder.record(self._from(columns), seed)
+            columns = {name: getattr(written, name) for name in columns}
+        return self._from({name: x for name, x in columns.items() if name in ("time", "accel_cmd", *signals)})
+
+    def _from(self, columns: Mapping[str, FloatArray]) -> Log:
+        accel, speed = columns.get("accel"), columns.get("speed")
+        return Log.from_arrays(
+            name=self.name, time=columns["time"], accel_cmd=columns["accel_cmd"], accel=accel, speed=speed
+        )
 
     def truth(self) -> dict[str, Any]:
-        """The hidden truth as plain numbers and strings: the input of `avtorch.blindtest.score`."""
-        return {
+        """The hidden truth as plain numbers and strings: the input of `avtorch.blindtest.score`.
+
+        Where the recorder is not the ideal one, its numbers are in `recorder`, and `oracle` is empty: the floors of the
+        oracles lack its noise.
+        """
+        told = {
             "schema": "avtorch.blindtest.truth/1",
             "case": self.name,
             "index": self.index,
@@ -121,6 +140,10 @@ class Case:
             "drive": asdict(self.drive),
             "oracle": {metric: {**asdict(o), "closed": o.closed} for metric, o in self.oracles.items()},
         }
+        # truths kept by trials without recorders stay as they are
+        if self.recorder == Recorder.ideal():
+            return told
+        return told | {"recorder": asdict(self.recorder), "oracle": {}}
 
 
 def write(case: Case, folder: str | os.PathLike[str]) -> Path:

@@ -8,7 +8,8 @@ in any order.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Literal
+from dataclasses import replace
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -18,11 +19,13 @@ from avtorch.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, Family
 from avtorch.blindtest.command import Parameters
 from avtorch.blindtest.deck import MIX, card, kind_of
 from avtorch.blindtest.drives import draw_drive
+from avtorch.blindtest.recorder import draw_recorder
 from avtorch.blindtest.strength import excess_range, solve_strength
 from avtorch.blindtest.vehicle import Pilot, Run, simulate
 from avtorch.blindtest.visibility import TIERS, Sight, oracles, sight, tier_of
 from avtorch.errors import InputError
 
+Recording = Literal["ideal", "ordinary"]
 _ATTEMPTS = 10
 SIGNALS = ("accel", "speed")
 _PAIR_EXCESS = (1.25, 8.0)
@@ -42,6 +45,7 @@ def draw_cases(
     seconds: float | None = None,
     manoeuvre: str | None = None,
     signals: Sequence[str] = SIGNALS,
+    recorder: Recording = "ideal",
 ) -> Iterator[Case]:
     """Cases `start` to `start + n - 1` of the set `seed`, one after another.
 
@@ -50,9 +54,10 @@ def draw_cases(
     from all `tiers`. `outside`: which of the two groups of families outside the table. `seconds`, `manoeuvre`: fixed
     instead of drawn. `signals`: the channels of the logs, in which a cause must be visible. Where a cause cannot reach
     the visibility asked for on a drive, another drive is drawn; after ten drives another cause takes its place, or else
-    the case keeps the drive where it is most visible, in the tier that it has there.
+    the case keeps the drive where it is most visible, in the tier that it has there. `recorder`: `ordinary` passes each
+    log, whatever its kind, through a recorder drawn for it (`draw_recorder`); the drives are those of `ideal`.
 
-    Raises `InputError` for unknown kinds, tiers, effects or signals.
+    Raises `InputError` for unknown kinds, tiers, effects, signals or recorders.
 
     Example:
         >>> from avtorch.blindtest import draw_cases
@@ -70,6 +75,7 @@ def draw_cases(
             seconds=seconds,
             manoeuvre=manoeuvre,
             signals=signals,
+            recorder=recorder,
         )
 
 
@@ -84,8 +90,9 @@ def draw_case(
     seconds: float | None = None,
     manoeuvre: str | None = None,
     signals: Sequence[str] = SIGNALS,
+    recorder: Recording = "ideal",
 ) -> Case:
-    """Draw case `index` of the set `seed`; other arguments and errors are those of `draw_cases`.
+    """Draw case `index` of the set `seed`; other arguments are those of `draw_cases`, as is what raises `InputError`.
 
     Example:
         >>> from avtorch.blindtest import draw_case
@@ -99,7 +106,29 @@ def draw_case(
         raise InputError(f"effects: found {tuple(effects)}, needs some of {', '.join(EFFECTS)}")
     if set(signals) - set(SIGNALS) or not signals:
         raise InputError(f"signals: found {tuple(signals)}, needs accel, speed or both")
-    kind, count = kind_of(index, seed, MIX if mix is None else mix)
+    if recorder not in get_args(Recording):
+        raise InputError(f"recorder: found {recorder!r}, needs ideal or ordinary")
+    case = _drawn(index, seed, MIX if mix is None else mix, tiers, effects, outside, seconds, manoeuvre, signals)
+    if recorder == "ideal":
+        return case
+    # draws of its own: the drive is the same behind either recorder
+    rng = np.random.default_rng([seed, index, 4])
+    return replace(case, recorder=draw_recorder(rng, case.drive.rate_hz))
+
+
+def _drawn(
+    index: int,
+    seed: int,
+    mix: Mapping[str, float],
+    tiers: Sequence[str],
+    effects: Sequence[str],
+    outside: Literal["sealed", "calibration"],
+    seconds: float | None,
+    manoeuvre: str | None,
+    signals: Sequence[str],
+) -> Case:
+    """A case before its recorder is drawn."""
+    kind, count = kind_of(index, seed, mix)
     rng = np.random.default_rng([seed, index, 3])
     group = SEALED if outside == "sealed" else CALIBRATION
     best: Case | None = None

@@ -13,9 +13,8 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from avtorch.blindtest import Case
 from avtorch.blindtest.answers import read_answer
 from avtorch.errors import InputError
 from avtorch.io import Damaged, Log, Sealed, fingerprint, read_sealed, write_sealed
@@ -27,6 +26,15 @@ _MOST = 16 * 2**20
 _ELSEWHERE = "needs another folder"
 _DRAW_AGAIN = "remove it to have the case drawn again, or use another folder"
 _ANSWER_AGAIN = "remove it to have the case answered again, or use another folder"
+
+
+class Drawn(Protocol):
+    """What is kept as the truth of number `index`: a case, or a recording with an effect in front of it."""
+
+    @property
+    def index(self) -> int: ...
+
+    def truth(self) -> dict[str, Any]: ...
 
 
 class TrialFolder:
@@ -98,7 +106,7 @@ class TrialFolder:
         case."""
         return self._answer(answerer, index, self.truth(index))
 
-    def keep_truth(self, case: Case, *, log: bytes | None = None) -> None:
+    def keep_truth(self, case: Drawn, *, log: bytes | None = None) -> None:
         """Write the truth, and the checksum of the `log` that is kept beside it.
 
         Raises `InputError` where this case differed when it was answered before.

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from avtorch.blindtest import MIX
-from avtorch.blindtest.cases import SIGNALS
+from avtorch.blindtest.cases import SIGNALS, Recording
 from avtorch.errors import InputError
 from avtorch.io import answer_set, sole_use, write_json
 from avtorch.trial.folder import TrialFolder
+from avtorch.trial.pool import worked
 from avtorch.trial.tally import tally
-from avtorch.trial.work import Answerer, Task, begin_worker, work
+from avtorch.trial.work import Answerer, Task, work
 
 BLINDTEST_FILES = ("blindtest.json", "confusion.png")
 """The score and its picture; truths and answers are kept beside them."""
@@ -34,6 +31,7 @@ def run_trial(
     mix: Mapping[str, float] | None = None,
     signals: Sequence[str] = SIGNALS,
     outside: Literal["sealed", "calibration"] = "sealed",
+    recorder: Recording = "ideal",
     keep_logs: bool = False,
     progress: Callable[[int, int], None] | None = None,
     publish: bool = True,
@@ -53,7 +51,7 @@ def run_trial(
         answerers: by name (letters, digits, `_`, `-`): `Log` to a dict of `avtorch.diagnosis/1`.
         workers: processes, each with one thread; more than one needs answerers that can be pickled, and a script that
             begins work under `if __name__ == "__main__"`.
-        mix, outside, draw_options: as `avtorch.blindtest.draw_cases`.
+        mix, outside, recorder, draw_options: as `avtorch.blindtest.draw_cases`.
         signals: the channels in the logs, in which a cause must show.
         keep_logs: keep `out/logs/NAME.csv`, so that a rerun need not draw the cases again.
         progress: called with (cases done, of).
@@ -74,7 +72,10 @@ def run_trial(
         (0.0, 'avtorch.blindtest/1')
     """
     names = list(answerers)
-    _check(n, seed, names, workers, signals)
+    _check(n, seed, names, workers, signals, recorder)
+    if recorder != "ideal":
+        # without the key where it is ideal: trials that were kept before recorders can be resumed
+        draw_options |= {"recorder": recorder}
     with sole_use(out, work="a blind test"):
         found = _run(n, seed, Path(out), answerers, workers, mix, signals, outside, keep_logs, progress, draw_options)
         if publish:
@@ -121,14 +122,14 @@ def _run(
     done = n - len(tasks)
     if progress:
         progress(done, n)
-    for _ in _worked(tasks, workers):
+    for _ in worked(work, tasks, workers):
         done += 1
         if progress:
             progress(done, n)
     return tally(folder, n, names, settings) | {"notes": [note for _, damaged in state for note in damaged]}
 
 
-def _check(n: int, seed: int, names: Sequence[str], workers: int, signals: Sequence[str]) -> None:
+def _check(n: int, seed: int, names: Sequence[str], workers: int, signals: Sequence[str], recorder: Recording) -> None:
     if n < 1:
         raise InputError(f"n: found {n}, needs 1 case or more")
     if not 0 <= seed < 2**63:
@@ -142,40 +143,5 @@ def _check(n: int, seed: int, names: Sequence[str], workers: int, signals: Seque
             raise InputError(f"answerers: found the name {name!r}, needs letters, digits, _ and -")
     if not signals or set(signals) - set(SIGNALS):
         raise InputError(f"signals: found {tuple(signals)}, needs accel, speed or both")
-
-
-def _worked(tasks: Sequence[Task], workers: int) -> Iterator[int]:
-    """Yield cases as they are finished."""
-    if workers == 1 or len(tasks) < 2:
-        yield from map(work, tasks)
-        return
-    # spawned, since a fork of a process whose torch has threads may hang
-    context = multiprocessing.get_context("spawn")
-    with _one_thread(), ProcessPoolExecutor(workers, mp_context=context, initializer=begin_worker) as pool:
-        waiting = [pool.submit(work, task) for task in tasks]
-        try:
-            for one in as_completed(waiting):
-                yield one.result()
-        except BrokenProcessPool:
-            raise InputError(
-                "workers: one was ended from outside, perhaps for lack of memory; what was answered is kept, "
-                "needs fewer workers"
-            ) from None
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Child processes started within use one thread each; this must be set before their libraries are loaded."""
-    names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+    if recorder not in get_args(Recording):
+        raise InputError(f"recorder: found {recorder!r}, needs ideal or ordinary")

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any
 
@@ -64,17 +61,17 @@ def work(task: Task) -> int:
         log = case.log(signals=task.signals)
     truth = folder.truth(task.index)
     for name in task.missing:
-        _answer(folder, name, task, log, truth)
+        ask(folder, name, task.index, task.answerers[name], log, truth)
     return task.index
 
 
-def _answer(folder: TrialFolder, name: str, task: Task, log: Log, truth: Mapping[str, Any]) -> None:
-    """One answer and its time; a failure counts as an answer, and its message is kept."""
+def ask(folder: TrialFolder, name: str, index: int, answerer: Answerer, log: Log, truth: Mapping[str, Any]) -> None:
+    """Keep one answer, with what it cost; a failure is an answer too, and its message is kept."""
     answer: dict[str, Any] | None = None
     fault = ""
     wall, cpu = time.perf_counter(), time.process_time()
     try:
-        answer = task.answerers[name](log)
+        answer = answerer(log)
     except Exception as error:
         fault = f"{type(error).__name__}: {error}"
     spent = {"seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
@@ -84,20 +81,5 @@ def _answer(folder: TrialFolder, name: str, task: Task, log: Log, truth: Mapping
             json_text(answer)
         except (InputError, KeyError, TypeError, ValueError) as error:
             answer, fault = None, f"the answer is not of avtorch.diagnosis/1: {type(error).__name__}: {error}"
-    # a full disk is not the answerer's fault
-    folder.keep_answer(name, task.index, answer, error=fault if answer is None else None, **spent)
-
-
-def begin_worker() -> None:
-    """Set up a worker process: one thread, and it ends with the process that started it."""
-    import torch
-
-    torch.set_num_threads(1)
-    parent = parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-
-
-def _end_with(parent: Any) -> None:
-    parent.join()
-    os._exit(1)
+    # a disk that is full is no fault of the answer's
+    folder.keep_answer(name, index, answer, error=fault if answer is None else None, **spent)

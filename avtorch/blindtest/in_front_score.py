@@ -1,0 +1,196 @@
+"""Scores of answers to recordings with a known effect in front of them, each beside the answer to the untouched log.
+
+What else a recorded car lacks is not known, so an answer is judged by its difference from that of its control: is the
+effect named, is its size what was added to the size that the control already had, and is any name new that was not put
+in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from avtorch.blindtest.answers import canonical_name
+from avtorch.blindtest.intervals import wilson
+
+SIZE_WITHIN = 0.25
+"""A size is right within this share of what was put in."""
+_NOTHING = ("none", "unknown")
+
+
+def _sum(found: float, before: float, put_in: float) -> float | None:
+    return (found - before) / put_in
+
+
+def _ratio(found: float, before: float, put_in: float) -> float | None:
+    """Factors multiply: compared as logarithms, so that a gain of 0.65 is as far from 1 as one of 1/0.65."""
+    return math.log(found / before) / math.log(put_in) if min(found, before) > 0 else None
+
+
+def _squares(found: float, before: float, put_in: float) -> float | None:
+    """Independent disturbances add in squares."""
+    return math.sqrt(max(found**2 - before**2, 0.0)) / put_in
+
+
+SIZE_OF: Mapping[str, tuple[str, float, Callable[[float, float, float], float | None]]] = {
+    "dead_time": ("delay_s", 0.0, _sum),
+    "dead_band": ("half_width_mps2", 0.0, _sum),
+    "backlash": ("half_width_mps2", 0.0, _sum),
+    "brake_throttle_asymmetry": ("brake_gain_ratio", 1.0, _ratio),
+    "gain_change": ("gain_ratio", 1.0, _ratio),
+    "speed_dependent_gain": ("gain_slope", 0.0, _sum),
+    "constant_resistance": ("resistance_mps2", 0.0, _sum),
+    "aerodynamic_drag": ("drag_per_m", 0.0, _sum),
+    "road_grade": ("grade_rms", 0.0, _squares),
+    "gust": ("sd_mps2", 0.0, _squares),
+    "sensor_bias": ("bias_mps2", 0.0, _sum),
+    "sensor_scale": ("scale", 1.0, _ratio),
+    "sensor_lag": ("lag_s", 0.0, _sum),
+    "outliers": ("fraction", 0.0, _sum),
+}
+"""By effect: the parameter that is its size, its value without the effect, and how a second one adds to a first.
+
+A diagnosis tells the size of outliers in units of a noise that nobody knows, so their share is compared instead.
+"""
+
+
+@dataclass(frozen=True)
+class Injected:
+    """One `effect` of relative `size` in front of the recording `background`.
+
+    `put_in`: its parameters; `control`, `answer`: what was said of the untouched log and of the changed one (dicts of
+    `avtorch.diagnosis/1`; None: no answer).
+
+    Example:
+        >>> from avtorch.blindtest import Injected
+        >>> said = (["gust"], ["gust", "dead_time"])
+        >>> control, answer = ({"verdict": {"names": names}, "effects": []} for names in said)
+        >>> trial = Injected("lap", "dead_time", 1.0, {"delay_s": 0.3}, control, answer)
+        >>> trial.held, trial.extra, trial.size_ratio  # no size is told
+        (True, (), None)
+    """
+
+    background: str
+    effect: str
+    size: float
+    put_in: Mapping[str, float]
+    control: Mapping[str, Any]
+    answer: Mapping[str, Any] | None
+
+    @property
+    def names(self) -> tuple[str, ...] | None:
+        """The verdict's names; None where there is no answer."""
+        return None if self.answer is None else tuple(self.answer["verdict"]["names"])
+
+    @property
+    def held(self) -> bool:
+        """Whether the verdict names the effect, alone or among others."""
+        return self.effect in (self.names or ())
+
+    @property
+    def in_control(self) -> bool:
+        """Whether the untouched log's verdict names it too."""
+        return self.effect in self.control["verdict"]["names"]
+
+    @property
+    def size_ratio(self) -> float | None:
+        """The size found on top of the control's, over the size put in; None where the verdict tells none."""
+        parameter, without, relative = SIZE_OF[self.effect]
+        found = None if self.answer is None else _told(self.answer, self.effect, parameter)
+        before = _told(self.control, self.effect, parameter) if self.in_control else without
+        if found is None or before is None:
+            return None
+        return relative(found, before, self.put_in[parameter])
+
+    @property
+    def size_right(self) -> bool | None:
+        """Whether that is within a quarter of 1."""
+        ratio = self.size_ratio
+        return None if ratio is None else abs(ratio - 1) <= SIZE_WITHIN + 1e-12
+
+    @property
+    def extra(self) -> tuple[str, ...]:
+        """Names in the verdict that are neither put in nor in the control's."""
+        known = {self.effect, *_NOTHING, *self.control["verdict"]["names"]}
+        return tuple(name for name in self.names or () if name not in known)
+
+    @property
+    def nothing_named(self) -> bool:
+        """Whether the verdict is `unknown`, `none` or empty."""
+        return self.names is not None and set(self.names) <= set(_NOTHING)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "background": self.background,
+            "effect": self.effect,
+            "size": self.size,
+            "put_in": dict(self.put_in),
+            "answered": self.answer is not None,
+            "names": list(self.names or ()),
+            "control": list(self.control["verdict"]["names"]),
+            "held": self.held,
+            "in_control": self.in_control,
+            "size_ratio": self.size_ratio,
+            "size_right": self.size_right,
+            "extra": list(self.extra),
+            "nothing_named": self.nothing_named,
+        }
+
+
+def score_in_front(trials: Sequence[Injected]) -> dict[str, Any]:
+    """Counts by effect and size in the order of their first trial (`table`), and over all trials (`totals`).
+
+    Of the `trials`, `held` counts those whose verdict names the effect, `in_control` those whose control names it too,
+    `sized` those held whose size is told, and `size_right` those of them within a quarter of what was put in; `extra`
+    those with a name that neither control nor injection has, `nothing_named` those answered `unknown`, `none` or
+    nothing, `failed` those without an answer. `totals` also has shares with Wilson's 90 % intervals: of the trials, but
+    `size_right` of the `sized`.
+
+    Example:
+        >>> from avtorch.blindtest import Injected, score_in_front
+        >>> unknown = {"verdict": {"names": ["unknown"]}, "effects": []}
+        >>> late = {"verdict": {"names": ["dead_time"]}, "effects": [
+        ...     {"name": "dead_time", "probability": 1.0, "parameters": {"delay_s": {"mean": 0.28}}}]}
+        >>> put_in = {"delay_s": 0.3}
+        >>> trials = [Injected("lap", "dead_time", 1.0, put_in, unknown, answer) for answer in (late, unknown)]
+        >>> totals = score_in_front(trials)["totals"]
+        >>> totals["held"], totals["size_right"], totals["shares"]["held"], totals["nothing_named"]
+        (1, 1, 0.5, 1)
+    """
+    cells: dict[tuple[str, float], list[Injected]] = {}
+    for one in trials:
+        cells.setdefault((one.effect, one.size), []).append(one)
+    table = [{"effect": effect, "size": size, **_counts(some)} for (effect, size), some in cells.items()]
+    totals = _counts(trials)
+    of = {"held": "trials", "size_right": "sized", "extra": "trials", "nothing_named": "trials"}
+    shares = {key: totals[key] / totals[n] if totals[n] else None for key, n in of.items()}
+    intervals = {key: wilson(totals[key], totals[n]) for key, n in of.items()}
+    known = {key: None if interval is None else list(interval) for key, interval in intervals.items()}
+    return {"table": table, "totals": {**totals, "shares": shares, "intervals": known}}
+
+
+def _counts(trials: Sequence[Injected]) -> dict[str, int]:
+    sized = [one for one in trials if one.held and one.size_right is not None]
+    return {
+        "trials": len(trials),
+        "held": sum(one.held for one in trials),
+        "in_control": sum(one.in_control for one in trials),
+        "sized": len(sized),
+        "size_right": sum(bool(one.size_right) for one in sized),
+        "extra": sum(bool(one.extra) for one in trials),
+        "nothing_named": sum(one.nothing_named for one in trials),
+        "failed": sum(one.answer is None for one in trials),
+    }
+
+
+def _told(answer: Mapping[str, Any], effect: str, parameter: str) -> float | None:
+    """Mean of a parameter under the verdict; a set of effects tells it as `effect.parameter`."""
+    said = canonical_name(answer["verdict"]["names"])
+    for entry in answer["effects"]:
+        if canonical_name(entry["name"]) == said:
+            known = entry["parameters"]
+            quantity = known.get(parameter if said == effect else f"{effect}.{parameter}")
+            return None if quantity is None else float(quantity["mean"])
+    return None
