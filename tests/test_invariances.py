@@ -173,9 +173,8 @@ def _same(found: Any, expected: Any, *, offset: float = 0.0, rel: float = 0.0, a
 # 1. where the clock begins
 
 
-@pytest.mark.parametrize(
-    "offset", [OFFSETS[1], *(pytest.param(x, marks=pytest.mark.slow) for x in (OFFSETS[0], OFFSETS[2]))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("offset", OFFSETS)
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_where_the_clock_begins_changes_nothing(
     name: str, offset: float, drive: Log, answers: dict[str, Numbers]

@@ -131,7 +131,7 @@ def test_quality_shows_what_was_masked() -> None:
     assert spans == {"recorded": 2, "driver in charge": 1, "standstill": 1, "excited windows": 3}
 
 
-@pytest.mark.parametrize("cloud", [1, 2, 3])
+@pytest.mark.parametrize("cloud", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
 def test_figures_are_written_whole(tmp_path: Path, cloud: int) -> None:
     draws = (torch.rand(200) * 0.1 + 0.3, torch.rand(200) * 0.1 + 0.9)
     clouds = {f"moment {i}": draws for i in range(cloud)}

@@ -48,6 +48,7 @@ def test_import_is_light() -> None:
     assert done.stdout.split() == []
 
 
+@pytest.mark.slow
 def test_numerics_need_no_plotting() -> None:
     code = "import sys, avtorch; avtorch.GLVD, avtorch.SGLD, avtorch.simulate; print('matplotlib' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -92,6 +92,7 @@ def test_quick_run_of_many_windows(tmp_path: Path) -> None:
     assert all(row["windows"] == 3 and row["seconds"] > 0 for row in rows.values())
 
 
+@pytest.mark.slow
 def test_missing_peer_is_a_line_with_its_pip_command(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

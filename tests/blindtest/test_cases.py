@@ -52,6 +52,7 @@ def test_mix_is_kept_in_every_twenty_and_every_combination_comes_once() -> None:
         kind_of(0, 0, {"none": 0.5})
 
 
+@pytest.mark.slow
 def test_cases_are_what_they_say(cases: list[Case]) -> None:
     for case in cases:
         wanted = {"none": 0, "single": 1, "pair": 2, "outside": 1}[case.kind]
@@ -75,6 +76,7 @@ def test_cases_are_what_they_say(cases: list[Case]) -> None:
             assert floor.floor <= floor.before * 1.001
 
 
+@pytest.mark.slow
 def test_log_shows_the_contract_columns_and_no_more(cases: list[Case]) -> None:
     for case in cases:
         log = case.log()
@@ -88,6 +90,7 @@ def test_log_shows_the_contract_columns_and_no_more(cases: list[Case]) -> None:
         cases[0].log(signals=("jerk",))
 
 
+@pytest.mark.slow
 def test_seal_on_disk(cases: list[Case], tmp_path) -> None:
     case = next(c for c in cases if c.kind == "pair")
     path = write(case, tmp_path)
@@ -109,7 +112,7 @@ def test_a_case_depends_on_seed_and_index_alone(cases: list[Case]) -> None:
     assert draw_case(7, 6, seconds=60.0).drive != again.drive
 
 
-@pytest.mark.parametrize("tier", TIERS)
+@pytest.mark.parametrize("tier", [pytest.param(t, marks=[] if t == "easy" else pytest.mark.slow) for t in TIERS])
 def test_tier_on_request(tier: str) -> None:
     some = ("sensor_bias", "backlash", "road_grade")
     for case in draw_cases(3, 1, mix={"single": 1.0}, tiers=(tier,), effects=some, seconds=60.0):

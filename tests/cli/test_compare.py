@@ -10,6 +10,7 @@ from avtorch.gap import plant
 from tests.gap.records import log_of
 
 
+@pytest.mark.slow
 def test_it_says_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     one, two = tmp_path / "one.csv", tmp_path / "two.csv"
     log_of(plant(T_L=0.3, K_L=1.0), seconds=60.0).write(one)

@@ -68,6 +68,7 @@ def test_the_jerk_form_recovers_the_truth(rotating_seed):
     assert len(found.windows) == 12
 
 
+@pytest.mark.slow
 def test_the_verdict_is_on_the_setting_given(healthy):
     weak = drive(1.5, 0.5)
     for setting in (None, Setting(T_hat=1.5, K_hat=0.5), Setting(time_gap=2.5)):
@@ -107,6 +108,7 @@ def test_a_drivers_rows_and_those_at_standstill_are_masked():
     assert not bool(clean.windows[4].window.belief.excited)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rest", ["cruise", "standstill", "constant"])
 def test_a_window_that_says_nothing_leaves_the_belief(healthy, rest):
     n, rng = 1000, np.random.default_rng(4)
@@ -332,6 +334,7 @@ def test_an_unknown_estimator_is_refused(healthy):
         estimate(healthy, estimator="oracle")
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_a_known_dead_time_is_taken_out(rotating_seed):
     """Commands sent 0.2 s earlier: without the dead time the lag is too long; with it the lag is right, and P accounts

@@ -214,6 +214,7 @@ VALUES = st.one_of(
 DTYPES = ["f2", "f4", "i4", "i8", "u1", "?", "U8", "S8", "O", "c16", "M8[ns]", "m8[s]"]
 
 
+@pytest.mark.slow
 @fuzzed("arrays")
 @given(data=st.data())
 def test_odd_arrays(data: st.DataObject) -> None:

@@ -26,7 +26,8 @@ def _drive(effect: str, index: int = 0) -> Log:
     return case.log()
 
 
-@pytest.mark.parametrize("effect", ["sensor_bias", pytest.param("outliers", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", ["sensor_bias", "outliers"])
 def test_a_plain_cause_leads_by_evidence(effect: str) -> None:
     answer = avtorch.diagnose(_drive(effect), effects=[effect, "aerodynamic_drag", "sensor_scale"], pairs=False)
     named = [c for c in answer.candidates if c.log_evidence is not None and "+" not in c.name]

@@ -55,6 +55,7 @@ def rolled(log: Log, T_L: float, K_L: float, channel: str, horizon_s: float) -> 
     return float(np.sqrt((sums[begin] / counts[begin]).mean()))
 
 
+@pytest.mark.slow
 def test_the_gap_is_over_the_horizon_that_it_names(late: tuple[Log, Diagnosis]) -> None:
     log, found = late
     told = found.to_dict()["gap"]["rollout"]
@@ -65,6 +66,7 @@ def test_the_gap_is_over_the_horizon_that_it_names(late: tuple[Log, Diagnosis]) 
         assert told[f"rmse_{channel}"] == pytest.approx(want, rel=0.02), channel
 
 
+@pytest.mark.slow
 def test_what_was_held_out_too_and_it_is_the_same_measure(late: tuple[Log, Diagnosis]) -> None:
     log, found = late
     answer = found.to_dict()
@@ -83,6 +85,7 @@ def test_what_was_held_out_too_and_it_is_the_same_measure(late: tuple[Log, Diagn
     assert answer["shrinkage"]["horizon_s"] == metrics[answer["shrinkage"]["metric"]]["horizon_s"]
 
 
+@pytest.mark.slow
 def test_sentences_and_page_name_it(late: tuple[Log, Diagnosis]) -> None:
     _, found = late
     told = str(found)

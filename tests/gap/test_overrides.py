@@ -16,6 +16,7 @@ RATIO, DELAY = 0.70, 0.15
 OVERRIDES = ((20.0, 26.0), (44.0, 49.0))
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_a_weak_brake_and_a_delay_are_found_although_a_driver_took_over(rotating_seed: int) -> None:
     """Rolled out through, they came out as unknown and as a hill that begins where the driver let go."""

@@ -150,9 +150,8 @@ def driven(lap: Log, effects: dict[str, dict[str, float]], seed: int) -> Log:
     return Log.from_arrays(time=run.time, accel_cmd=run.command, accel=run.accel, speed=run.speed)
 
 
-@pytest.mark.parametrize(
-    "effect", [pytest.param(e, marks=[] if e.startswith("sensor") else pytest.mark.slow) for e in EFFECTS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", EFFECTS)
 def test_an_effect_injected_into_a_recording_is_named(laps: dict[int, Log], effect: str) -> None:
     # one seed of five that were tried on the three laps; all were named, the delay by 17 to 48 nats over none
     given = EFFECTS[effect]

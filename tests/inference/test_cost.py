@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 
+import pytest
 import torch
 
 from avtorch.inference import JerkDensity, JerkStatistics, SamplerSettings, SequentialInference
@@ -22,6 +23,7 @@ def cost(statistics: JerkStatistics) -> float:
     return min(spent[1:])
 
 
+@pytest.mark.slow
 def test_a_hundred_vehicles_cost_far_less_than_a_hundred_times_one(make_windows):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

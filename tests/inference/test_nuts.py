@@ -127,7 +127,8 @@ def standard_error(x: Tensor, batches: int = 10) -> float:
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("name", ["first", pytest.param("lambda", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["first", "lambda"])
 def test_nuts_agrees_with_quadrature_and_conjugate(name: str, make_windows, rotating_seed: int) -> None:
     w = make_windows(rotating_seed, [0.2, 1.0])
     window = 0 if name == "lambda" else 1

@@ -131,7 +131,7 @@ def test_a_window_that_diverges_never_reaches_the_belief(mode, make_windows):
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", [pytest.param(m, marks=[] if m == "posterior" else pytest.mark.slow) for m in MODES])
 def test_vehicles_side_by_side_are_vehicles_alone(mode, make_windows, rotating_seed, draws_factor):
     """Three vehicles at once, 16 copies of each for the error, against loops of their own: the same posterior means."""
     copies, lags, gains = 16 * draws_factor, [0.3, 0.3, 1.5], [1.0, 0.7, 0.5]

@@ -8,6 +8,8 @@ import torch
 from avtorch.paper import Leaders, Monitoring, monitoring
 from avtorch.paper.monitoring import PAPER_ALERT_S, Watched
 
+pytestmark = pytest.mark.slow  # all tests need the experiment itself
+
 
 @pytest.fixture(scope="module")
 def found() -> Monitoring:

@@ -9,6 +9,8 @@ from avtorch.paper import Leaders, Platoon, platoon
 from avtorch.paper.drive import rms_about_mean, rows_from
 from avtorch.paper.platoon import ACT_S, PASSED_S, VEHICLES
 
+pytestmark = pytest.mark.slow  # all tests need the experiment itself
+
 
 @pytest.fixture(scope="module")
 def found() -> Platoon:

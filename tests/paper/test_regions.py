@@ -9,6 +9,8 @@ from avtorch.paper import Leaders, regions
 from avtorch.paper.regions import CASES, FORMS, Regions
 from avtorch.vehicle.stability import region, string_stable
 
+pytestmark = pytest.mark.slow  # all tests need the experiment itself
+
 
 @pytest.fixture(scope="module")
 def found() -> Regions:

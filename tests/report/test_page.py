@@ -82,6 +82,7 @@ def test_it_is_whole_and_needs_no_network(found: Diagnosis, tmp_path: Path) -> N
     assert report_html(found, quality=["2 rows masked"]) == text
 
 
+@pytest.mark.slow
 def test_a_hostile_name_is_text(found: Diagnosis) -> None:
     text = report_html(found, quality=[HOSTILE])
     assert "<script" not in text

@@ -110,7 +110,9 @@ def test_draws_beyond_the_grid_count_with_their_distance() -> None:
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize(("chains", "draws", "rho"), [(4, 500, 0.0), (256, 10, 0.4), (2, 1500, 0.7)])
+@pytest.mark.parametrize(
+    ("chains", "draws", "rho"), [(4, 500, 0.0), (256, 10, 0.4), pytest.param(2, 1500, 0.7, marks=pytest.mark.slow)]
+)
 def test_z_scores_are_standard_and_the_expected_w1_is_met(
     chains: int, draws: int, rho: float, rotating_seed: int, draws_factor: int
 ) -> None:
@@ -126,6 +128,7 @@ def test_z_scores_are_standard_and_the_expected_w1_is_met(
     assert 1 - bar - 0.3 * rho < ratio < 1 + bar
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_chance_of_exact_draws_is_the_share_that_meets_the_tolerance(rotating_seed: int, draws_factor: int) -> None:
     windows = 150 * draws_factor
@@ -165,6 +168,7 @@ def test_superchains() -> None:
     assert superchains(draws[:1].expand(1, 3, 1, 1)).shape == (2, 1, 1, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_two_sets_of_draws(rotating_seed: int, draws_factor: int) -> None:
     windows = 80 * draws_factor

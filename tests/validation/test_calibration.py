@@ -116,6 +116,7 @@ def test_windows_are_calibrated_and_the_stretched_are_not(rotating_seed):
     assert sbc(300, inflate=1.4, seed=rotating_seed).p_value < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_another_prior_and_an_exact_sampler(rotating_seed):
     prior = LogNormalPrior(torch.tensor([0.6, 0.8, 0.2]), torch.tensor([0.3, 0.2, 0.5]))
@@ -129,6 +130,7 @@ def test_another_prior_and_an_exact_sampler(rotating_seed):
     assert found.dropped < 30
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_sgld_and_quadrature_see_the_same_windows(rotating_seed):
     ours, exact = sbc(30, seed=rotating_seed), sbc_quadrature(30, seed=rotating_seed)
@@ -139,9 +141,8 @@ def test_sgld_and_quadrature_see_the_same_windows(rotating_seed):
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize(
-    "mode", ["posterior", *(pytest.param(m, marks=pytest.mark.slow) for m in ("lambda", "forgetting"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["posterior", "lambda", "forgetting"])
 def test_the_loop_is_calibrated(mode, rotating_seed):
     found = sbc_loop(120, windows=3, mode=mode, amplitude=1.0, seed=rotating_seed)
     assert len(found) == 3

@@ -77,7 +77,10 @@ def test_null_is_what_exact_draws_give(rotating_seed: int, draws_factor: int) ->
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize(("factor", "shift"), [(1.2, 0.0), (0.8, 0.0), (1.0, 0.25)])
+@pytest.mark.parametrize(
+    ("factor", "shift"),
+    [pytest.param(1.2, 0.0, marks=pytest.mark.slow), pytest.param(0.8, 0.0, marks=pytest.mark.slow), (1.0, 0.25)],
+)
 def test_wrong_draws_are_refused(factor: float, shift: float, rotating_seed: int) -> None:
     z = factor * draws(10, rotating_seed, (128, 8))
     z[..., 0] += shift

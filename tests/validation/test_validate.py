@@ -141,6 +141,7 @@ def test_reference_of_weak_windows_takes_the_finer_grid() -> None:
     assert torch.equal(both.mean, exact.mean[:2])
 
 
+@pytest.mark.slow
 def test_answer_of_synthetic_windows(windows: Windows, quick_nuts: None) -> None:
     part = windows.select(torch.arange(4))
     seen: list[tuple[float, float]] = []

@@ -12,6 +12,7 @@ from tests.gap.records import QUIET, errors_of
 pytestmark = pytest.mark.statistical
 
 
+@pytest.mark.slow
 def test_noise_stays_noise(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     found = found_of([], seconds=120.0, rng=rng, noise=QUIET)

@@ -23,9 +23,8 @@ def _raced(effect: str, among: list, seed: int, **more):  # type: ignore[no-unty
     return case, race
 
 
-@pytest.mark.parametrize(
-    "effect", ["sensor_bias", *(pytest.param(e, marks=pytest.mark.slow) for e in ("aerodynamic_drag", "dead_band"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", ["sensor_bias", "aerodynamic_drag", "dead_band"])
 def test_closed_agrees_with_the_oracle(effect: str, rotating_seed: int) -> None:
     from avtorch.gap import AerodynamicDrag, DeadBand, SensorBias
 

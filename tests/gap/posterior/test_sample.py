@@ -202,6 +202,7 @@ def moments(z: np.ndarray, worth: float) -> tuple[np.ndarray, np.ndarray, np.nda
     return mean, sd / math.sqrt(worth), sd, sd * np.sqrt((fourth - 1) / (4 * worth))
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_sgld_is_laplaces_where_that_is_right(rotating_seed: int) -> None:
     """A bias of the sensor and the gain are linear; the lag nearly so."""

@@ -83,6 +83,7 @@ def refused(path: Path, of: dict[str, Any]) -> str:
     return told
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_to_the_same_answer(log: Log, diagnosed: tuple[dict[str, Any], bytes], kept: Path) -> None:
     """From any of its fits on, and from a search that had taken another way."""
     found = read_sealed(kept, schema=SCHEMA)

@@ -49,6 +49,7 @@ def _diagnosed(log: Log) -> Diagnosis:
     return avtorch.diagnose(log, effects=["dead_time", "sensor_bias"])
 
 
+@pytest.mark.slow
 def test_alternating_commands_of_20_hz_show_no_dead_time() -> None:
     """Once called a dead time of 0.217 ± 0.002 s, or of 0.117 s, and distinguished from everything."""
     found = _diagnosed(_euler())

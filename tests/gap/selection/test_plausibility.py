@@ -48,6 +48,7 @@ def shaken() -> Diagnosis:
     return avtorch.diagnose(log, effects=["gust"], pairs=False)
 
 
+@pytest.mark.slow
 def test_a_gust_that_no_wind_makes_is_remarked_with_its_name(shaken: Diagnosis) -> None:
     assert shaken.verdict.names == ("gust",)
     assert shaken.winner.parameters["sd_mps2"].mean > 1.0
@@ -57,11 +58,13 @@ def test_a_gust_that_no_wind_makes_is_remarked_with_its_name(shaken: Diagnosis) 
     assert Gust.meaning not in first
 
 
+@pytest.mark.slow
 def test_a_lag_of_5_ms_is_remarked() -> None:
     found = avtorch.diagnose(log_of(plant(T_L=0.005, K_L=0.9)), effects=[], pairs=False)
     said_everywhere(found, "no actuator is that quick")
 
 
+@pytest.mark.slow
 def test_a_gain_of_a_sixteenth_is_remarked() -> None:
     found = avtorch.diagnose(log_of(plant(T_L=0.3, K_L=0.06)), effects=[], pairs=False)
     said_everywhere(found, "no actuator has that gain")

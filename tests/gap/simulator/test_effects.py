@@ -71,7 +71,9 @@ def test_neutral_is_glvd(cls: type[Effect]) -> None:
         torch.testing.assert_close(getattr(car, name), getattr(glvd, name), rtol=0, atol=size)
 
 
-@pytest.mark.parametrize("cls", FIXED, **BY_NAME)
+@pytest.mark.parametrize(
+    "cls", [pytest.param(cls, marks=pytest.mark.slow if cls.name == "road_grade" else []) for cls in FIXED], **BY_NAME
+)
 def test_whole_drive_is_step_by_step(cls: type[Effect]) -> None:
     car = filled(plant([active(cls)], sigma=0.0))
     first = 2.0 if cls.name == "low_speed_creep" else 12.0
@@ -91,8 +93,12 @@ def test_whole_drive_is_step_by_step(cls: type[Effect]) -> None:
         ("dead_time", "rate_limit", "brake_throttle_asymmetry"),
         ("dead_time", "second_order_actuator", "brake_throttle_asymmetry", "speed_dependent_lag"),
         ("second_order_actuator", "rate_limit", "dead_time"),
-        ("aerodynamic_drag", "driveline_oscillation", "sensor_lag", "sensor_scale"),
-        ("backlash", "dead_band", "saturation", "dead_time", "gear_shift", "road_grade"),
+        pytest.param(
+            ("aerodynamic_drag", "driveline_oscillation", "sensor_lag", "sensor_scale"), marks=pytest.mark.slow
+        ),
+        pytest.param(
+            ("backlash", "dead_band", "saturation", "dead_time", "gear_shift", "road_grade"), marks=pytest.mark.slow
+        ),
     ],
     ids="+".join,
 )

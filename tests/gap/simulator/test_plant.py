@@ -66,6 +66,7 @@ def test_copies_go_on_by_themselves() -> None:
     torch.testing.assert_close(side.accel, own.accel.expand(4, 3, 100), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_platoons_and_scenarios() -> None:
     delays = torch.tensor([0.0, 0.1, 0.25], dtype=D)
     car = plant([gap.DeadTime(delays), gap.Outliers(0.1), gap.RoadGrade()], sigma=0.0)
@@ -78,6 +79,7 @@ def test_platoons_and_scenarios() -> None:
         torch.testing.assert_close(own.accel[i], single.accel[0], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_random_effects_follow_their_seed() -> None:
     for effect in (gap.Gust(), gap.Outliers(0.2), gap.CommandHold(0.2), gap.RoadGrade(0.05)):
         one, two, three = (driven(plant([effect], sigma=0.0, seed=s), seconds=2.0).accel for s in (1, 1, 2))

@@ -93,7 +93,7 @@ def test_the_supervisor_takes_every_stream(name):
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("name", ["map", "ekf", "ukf"])
+@pytest.mark.parametrize("name", ["map", pytest.param("ekf", marks=pytest.mark.slow), "ukf"])
 def test_noisy_acceleration_alone_will_do(name, make_windows, rotating_seed):
     w = make_windows(rotating_seed, [1.0], T=0.5, K=0.9, rows=500)
     g = torch.Generator().manual_seed(rotating_seed)
