@@ -92,7 +92,9 @@ def draw_case(
     signals: Sequence[str] = SIGNALS,
     recorder: Recording = "ideal",
 ) -> Case:
-    """Draw case `index` of the set `seed`; other arguments are those of `draw_cases`, as is what raises `InputError`.
+    """Draw case `index` of the set `seed`; other arguments are those of `draw_cases`.
+
+    Raises `InputError` as that does.
 
     Example:
         >>> from avtorch.blindtest import draw_case

@@ -11,6 +11,7 @@ Example:
 """
 
 from avtorch.gap import effects
+from avtorch.gap.budget.gap_budget import Budget, ChannelError, Part, Unexplained, gap_budget
 from avtorch.gap.effects import (
     AerodynamicDrag,
     Backlash,
@@ -50,6 +51,8 @@ __all__ = [
     "AerodynamicDrag",
     "Backlash",
     "BrakeThrottleAsymmetry",
+    "Budget",
+    "ChannelError",
     "CommandHold",
     "ConstantResistance",
     "DeadBand",
@@ -66,6 +69,7 @@ __all__ = [
     "NoiseChange",
     "Outliers",
     "Parameter",
+    "Part",
     "RateLimit",
     "Response",
     "RoadGrade",
@@ -77,8 +81,10 @@ __all__ = [
     "SimulatorInput",
     "SpeedDependentGain",
     "SpeedDependentLag",
+    "Unexplained",
     "effect_class",
     "effects",
+    "gap_budget",
     "plant",
     "register",
     "scan",

@@ -61,8 +61,8 @@ class DrivelineOscillation(Effect):
         Parameter(
             "amplitude", "-", 0.0, -0.5, 0.5, "real", possible=(-2.0, 2.0), beyond="no driveline rings that strongly"
         ),
-        Parameter("quadrature", "-", 0.0, -0.5, 0.5, "real", reported=False),
-        Parameter("mode_damping", "-", None, 0.03, 0.2, reported=False),
+        Parameter("quadrature", "-", 0.0, -0.5, 0.5, "real", reported=False, possible=(-1.0, 1.0)),
+        Parameter("mode_damping", "-", None, 0.03, 0.2, reported=False, possible=(0.005, 0.35)),
     )
 
     def report(self, T_L: Tensor) -> dict[str, Tensor]:

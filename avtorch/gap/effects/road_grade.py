@@ -104,6 +104,9 @@ class RoadGrade(Integrated):
         """The grade [-]."""
         return self.force(position, coefficients) / GRAVITY
 
+    def spaced(self, knot_m: float) -> Self:
+        return replace(self, knot_m=max(self.knot_m, knot_m))
+
     def along(self, coefficients: Tensor, size: float) -> Self:
         profile = coefficients / size
         return replace(self, grade_rms=size, profile=profile, knots=len(profile))

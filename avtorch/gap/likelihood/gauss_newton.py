@@ -3,8 +3,8 @@
 Derivatives are forward differences: all columns of all starts are one batch of rollouts, which costs hardly more than
 one. The slope of a road is linear in its coefficients, which are integrated out exactly.
 
-Some likelihoods have creases, where their slope jumps: that of a dead time at every whole number of rows, because a
-command is held until the next. Where the last step has crossed one, the crease itself is tried, too.
+The likelihood in a dead time has a crease, where its slope jumps, at every whole number of rows, because a command is
+held until the next. Where the last step has crossed one, the crease itself is tried, too.
 """
 
 from __future__ import annotations
@@ -84,7 +84,8 @@ def modes(
         step = step[:, :, 0]
         step *= np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(1, keepdims=True), 1e-12))
         trial = np.clip(best + step, -5.0, 5.0)
-    last = np.flatnonzero(promised > enough)
+    delayed = any(effect.shift is not None for effect in hypothesis.effects)
+    last = np.flatnonzero(promised > enough) if delayed else np.empty(0, int)
     if last.size:
         _, _, v = _quadratic(hypothesis, white, on_crease[last], onset, coarse)
         up = last[v < value[last]]

@@ -40,6 +40,10 @@ class Integrated(Effect):
         """The quantity whose root mean square is the size, (..., time), with the same arguments."""
         raise NotImplementedError(f"{type(self).__name__} has no magnitude")
 
+    def spaced(self, knot_m: float) -> Self:
+        """The effect with knots at least `knot_m` [m] apart."""
+        return self
+
     def along(self, coefficients: Tensor, size: float) -> Self:
         """The effect with this `size`, and `coefficients` (knot,) at size 1."""
         raise NotImplementedError(f"{type(self).__name__} has no along")

@@ -1,0 +1,187 @@
+"""The drives as the budget takes them: every channel as an acceleration, at one modest rate, in blocks.
+
+Sensors' noise lies mostly above a few hertz and no rollout foretells it. So commands are averaged over rows of some
+50 ms (exact for what a command does to a slower actuator), speed is differenced over the same rows, and the residuals
+of both channels are accelerations. Blocks of a few seconds are what is held out and what a standard error counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avtorch.arrays import BoolArray, FloatArray, IntArray
+from avtorch.errors import InputError
+from avtorch.gap.simulator.simulator_input import SimulatorInput
+from avtorch.io import Log
+
+RATE_HZ = 20.0
+"""Rows a second at most: the noise above half of this is not modelled, and no effect but a ring shows there."""
+_SETTLE_S = 3.0  # at the beginning of a stretch, and after rows that are masked, until the start no longer matters
+_LONGEST_BLOCK_S = 10.0
+_SHORTEST_BLOCK_S = 4.0
+_BLOCKS = 24  # aimed at, within those lengths
+_FEWEST_BLOCKS = 6
+_COUNTED_SHARE = 0.4  # of a block that must count
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Rows without a gap, `rows` of the record, and the `drive` (row,) that a plant responds to."""
+
+    drive: SimulatorInput
+    rows: slice
+
+
+@dataclass(frozen=True, eq=False)
+class AnalysisRecord:
+    """All stretches one after another.
+
+    `measured` (channel, row) [m/s²]: the derivative of `speed`, and `accel`. `counts` (row,): whether a row counts.
+    `block` (row,): the number of its block, -1 where it belongs to none. `time` (row,) [s] from its log's start, `log`
+    (row,) the number of its log, `command` [m/s²] and `speed` [m/s] (row,), the latter nought where not measured.
+    """
+
+    stretches: tuple[Stretch, ...]
+    channels: tuple[str, ...]
+    measured: FloatArray
+    counts: BoolArray
+    block: IntArray
+    time: FloatArray
+    log: IntArray
+    command: FloatArray
+    speed: FloatArray
+    dt: float
+
+    @property
+    def rows(self) -> int:
+        return len(self.time)
+
+    @property
+    def blocks(self) -> int:
+        return int(self.block.max(initial=-1)) + 1
+
+    @property
+    def has_speed(self) -> bool:
+        return "speed" in self.channels
+
+    @classmethod
+    def of(cls, logs: Sequence[Log], *, rate_hz: float = RATE_HZ) -> AnalysisRecord:
+        """Raises `InputError` where what counts is less than six blocks of four seconds."""
+        channels = tuple(c for c in ("speed", "accel") if all(getattr(log, c) is not None for log in logs))
+        if not channels:
+            raise InputError("logs: found no channel that all of them have, needs speed or accel in each")
+        usable = sum(float(log.usable.sum()) / log.rate_hz for log in logs)
+        length = float(np.clip(usable / _BLOCKS, _SHORTEST_BLOCK_S, _LONGEST_BLOCK_S))
+        step = 1.0 / min(rate_hz, min(log.rate_hz for log in logs))
+        pieces = [piece for number, log in enumerate(logs) for piece in _pieces(log, number, step, channels, length)]
+        if not pieces:
+            raise InputError(f"logs: found no stretch of {2 * _SHORTEST_BLOCK_S:g} s, needs some")
+        starts = np.cumsum([0, *(len(p.time) for p in pieces)])
+        stretches = tuple(
+            Stretch(p.drive, slice(a, b)) for p, a, b in zip(pieces, starts[:-1], starts[1:], strict=True)
+        )
+        counts = np.concatenate([p.counts for p in pieces])
+        offsets = np.cumsum([0, *(int(p.block.max()) + 1 for p in pieces)])
+        block = np.concatenate([p.block + first for p, first in zip(pieces, offsets[:-1], strict=True)])
+        block = _numbered(block, counts, length / step)
+        record = cls(
+            stretches=stretches,
+            channels=channels,
+            measured=np.concatenate([p.measured for p in pieces], -1),
+            counts=counts & (block >= 0),
+            block=block,
+            time=np.concatenate([p.time for p in pieces]),
+            log=np.concatenate([np.full(len(p.time), p.log) for p in pieces]),
+            command=np.concatenate([p.drive.command.numpy() for p in pieces]),
+            speed=np.concatenate([p.speed for p in pieces]),
+            dt=step,
+        )
+        if record.blocks < _FEWEST_BLOCKS:
+            raise InputError(
+                f"logs: found {record.blocks} blocks of {length:g} s that count, needs {_FEWEST_BLOCKS} for a budget"
+            )
+        return record
+
+    def filtered(self, x: FloatArray, taps: FloatArray) -> FloatArray:
+        """`x` (..., row) through a causal filter, each stretch by itself."""
+        from scipy.signal import lfilter
+
+        out = np.empty_like(x)
+        for stretch in self.stretches:
+            out[..., stretch.rows] = lfilter(taps, [1.0], x[..., stretch.rows], axis=-1)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Piece:
+    drive: SimulatorInput
+    measured: FloatArray
+    counts: BoolArray
+    block: IntArray
+    time: FloatArray
+    speed: FloatArray
+    log: int
+
+
+def _pieces(log: Log, number: int, step: float, channels: Sequence[str], length: float) -> list[_Piece]:
+    if log.accel_cmd is None:
+        raise InputError(f"{log.name}: has no accel_cmd, needed for a budget of the gap")
+    pieces, travelled = [], 0.0
+    for part in log.segments():
+        time = log.elapsed[part]
+        rows = int((time[-1] - time[0]) / step) if len(time) > 1 else 0
+        if rows * step < 2 * _SHORTEST_BLOCK_S:
+            continue
+        grid = time[0] + step * np.arange(rows)
+        edges = np.append(grid, grid[-1] + step)
+        # a command is held until the next row: what it sums to is linear between rows
+        summed = np.concatenate([[0.0], np.cumsum(log.accel_cmd[part][:-1] * np.diff(time))])
+        command = np.diff(np.interp(edges, time, summed)) / step
+        near = max(1, round(step / float(np.median(np.diff(time)))))
+        at = {c: np.interp(edges, time, _mean_around(getattr(log, c)[part], near)) for c in channels}
+        speed = at.get("speed")
+        measured = [np.diff(at["speed"]) / step if c == "speed" else at[c][:-1] for c in channels]
+        usable = np.interp(grid, time, log.usable[part].astype(float)) > 0.999
+        drive = SimulatorInput(
+            torch.as_tensor(grid),
+            torch.as_tensor(command),
+            None if speed is None else torch.as_tensor(np.maximum(speed[:-1], 0.0)),
+            position0=travelled,
+        )
+        if drive.position is not None:
+            travelled = float(drive.position[-1])
+        block = np.arange(rows) * max(1, round(rows * step / length)) // rows
+        settled = _settled(usable, round(_SETTLE_S / step))
+        plain = np.zeros(rows) if speed is None else speed[:-1]
+        pieces.append(_Piece(drive, np.stack(measured), settled, block, grid, plain, number))
+    return pieces
+
+
+def _mean_around(x: FloatArray, rows: int) -> FloatArray:
+    """Mean over `rows` rows around each."""
+    padded = np.pad(x, (rows // 2, rows - 1 - rows // 2), mode="edge")
+    return np.convolve(padded, np.full(rows, 1.0 / rows), "valid")
+
+
+def _settled(usable: BoolArray, rows: int) -> BoolArray:
+    """Rows before which `rows` rows were usable too."""
+    lost = np.concatenate([np.ones(rows), ~usable])
+    return np.convolve(lost, np.ones(rows + 1), "valid") == 0
+
+
+def _numbered(block: IntArray, counts: BoolArray, rows: float) -> IntArray:
+    """Blocks numbered anew, those of which too little counts left out."""
+    counted = np.bincount(block[counts], minlength=int(block.max()) + 1)
+    kept = counted >= _COUNTED_SHARE * rows
+    number = np.where(kept, np.cumsum(kept) - 1, -1)
+    return number[block]
+
+
+def stacked(responses: Sequence[Tensor]) -> FloatArray:
+    """(..., channel, row) of the responses (..., row) of one stretch, a channel each."""
+    return torch.stack(torch.broadcast_tensors(*responses), -2).numpy()

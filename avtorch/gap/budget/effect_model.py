@@ -1,0 +1,211 @@
+"""GLVD with some effects as a function of one vector: what it does to the channels of a record.
+
+The coordinates are those of the effects' priors, standard normal each, and kept within what physics allows. An effect
+may set in during the drives: before its onset the model is the one without it. Recorders do not read two channels at
+the same moment (filters, holds, clocks that differ): speed has a lateness against the accelerometer, which is no cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from avtorch.arrays import FloatArray
+from avtorch.gap.budget.analysis_record import AnalysisRecord, stacked
+from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.integrated import Integrated
+from avtorch.gap.simulator.parameter import Parameter
+from avtorch.gap.simulator.plant import GapPlant, plant
+
+LATENESS = "recorder.lateness"
+"""The coordinate that is no parameter of an effect: how late speed is read against acceleration."""
+_LATENESS_S = 0.04  # its standard deviation [s]
+_WIDEST = 6.0  # prior standard deviations, where physics sets no limit
+_BEYOND = 3.0
+_AT_LIMIT = 0.02  # prior standard deviations from a limit
+
+
+@dataclass(frozen=True, eq=False)
+class EffectModel:
+    """`effects` on top of `base`, whose own effects keep their values; `T_L` and `K_L` are free.
+
+    `onsets` [s from a log's start] by effect, of those that set in during the drives.
+    """
+
+    record: AnalysisRecord
+    base: GapPlant
+    effects: tuple[type[Effect], ...] = ()
+    onsets: Mapping[str, float] = field(default_factory=dict)
+    plant: GapPlant = field(init=False)
+    index: Mapping[str, slice] = field(init=False)
+    low: FloatArray = field(init=False)
+    high: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        whole = plant([_coarse(e(), self.record) for e in self.effects], baseline=self.base)
+        whole = whole.prepared(*(s.drive for s in self.record.stretches))
+        own = {e.name for e in self.effects}
+        index: dict[str, slice] = {}
+        low: list[float] = []
+        high: list[float] = []
+        for key, parameter in whole.parameters().items():
+            effect = key.partition(".")[0]
+            if effect not in {"T_L", "K_L", *own} or key in _sizes(self.effects):
+                continue
+            index[key] = slice(len(low), len(low) + parameter.size)
+            ends = sorted(
+                float(parameter.unconstrain(torch.tensor(x, dtype=torch.float64))) for x in parameter.physical
+            )
+            interval = parameter.constraint == "interval"
+            low += [-_WIDEST if interval else max(ends[0], -_WIDEST)] * parameter.size
+            high += [_WIDEST if interval else min(ends[1], _WIDEST)] * parameter.size
+        if len(self.record.channels) == 2:
+            index[LATENESS] = slice(len(low), len(low) + 1)
+            low.append(-_WIDEST)
+            high.append(_WIDEST)
+        for name, value in (("plant", whole), ("index", index), ("low", np.array(low)), ("high", np.array(high))):
+            object.__setattr__(self, name, value)
+
+    @property
+    def size(self) -> int:
+        return len(self.low)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.effects)
+
+    def with_effect(self, effect: type[Effect]) -> EffectModel:
+        return replace(self, effects=(*self.effects, effect))
+
+    def without(self, name: str) -> EffectModel:
+        onsets = {key: value for key, value in self.onsets.items() if key != name}
+        return replace(self, effects=tuple(e for e in self.effects if e.name != name), onsets=onsets)
+
+    def setting_in(self, name: str, onset: float) -> EffectModel:
+        return replace(self, onsets={**self.onsets, name: onset})
+
+    # coordinates ---------------------------------------------------------------------------------------------------
+    def values(self, z: FloatArray) -> dict[str, Tensor]:
+        """Parameters by name, (...), of coordinates `z` (..., size)."""
+        inside = torch.as_tensor(np.clip(z, self.low, self.high))
+        parameters, out = self.plant.parameters(), {}
+        for key, at in self.index.items():
+            if key == LATENESS:
+                continue
+            value = parameters[key].constrain(inside[..., at])
+            out[key] = value if parameters[key].size > 1 else value[..., 0]
+        return out
+
+    def coordinates(self, known: Mapping[str, FloatArray]) -> FloatArray:
+        """A vector (size,) with the coordinates `known` by name, and the prior's centre for the others."""
+        z = np.zeros(self.size)
+        for key, value in known.items():
+            if key in self.index:
+                z[self.index[key]] = value
+        return z
+
+    def named(self, z: FloatArray) -> dict[str, FloatArray]:
+        """`coordinates` undone: by name."""
+        return {key: z[at] for key, at in self.index.items()}
+
+    def traded(self, z: FloatArray) -> FloatArray:
+        """Places (place, size) where a delay has given some of its time to the lag, or taken it.
+
+        Commands are held within rows, so the likelihood in a delay has a crease at every row, and a mode at some.
+        """
+        keys = [f"{e.name}.{e.shift}" for e in self.effects if e.shift is not None]
+        if not keys:
+            return np.empty((0, self.size))
+        parameters, values, out = self.plant.parameters(), self.values(z), []
+        for seconds in (-0.12, -0.05, -0.02, 0.02, 0.05, 0.12):
+            place = z.copy()
+            for key, moved in ((keys[0], seconds), ("T_L", -seconds)):
+                value = (values[key] + moved).clamp_min(0.01)
+                place[self.index[key]] = float(parameters[key].unconstrain(value))
+            out.append(np.clip(place, self.low, self.high))
+        return np.array(out)
+
+    def at_limit(self, z: FloatArray, effect: str) -> bool:
+        """Whether a parameter of `effect` rests where physics ends."""
+        own = [at for key, at in self.index.items() if key.startswith(f"{effect}.")]
+        return any(
+            bool(((z[at] < self.low[at] + _AT_LIMIT) & (self.low[at] > -_WIDEST)).any())
+            or bool(((z[at] > self.high[at] - _AT_LIMIT) & (self.high[at] < _WIDEST)).any())
+            for at in own
+        )
+
+    # response ------------------------------------------------------------------------------------------------------
+    @torch.no_grad()
+    def simulate(self, z: FloatArray) -> FloatArray:
+        """Noise-free channels (..., channel, row) [m/s²] of coordinates `z` (..., size)."""
+        values = self.values(z)
+        if not self.onsets:
+            return self._late(self._simulate(self.plant, values), z)
+        out: FloatArray | None = None
+        active = [e for e in self.plant.effects if e.name not in self.onsets]
+        for name, onset in [("", -np.inf), *sorted(self.onsets.items(), key=lambda item: item[1])]:
+            active += [e for e in self.plant.effects if e.name == name]
+            names = {e.name for e in active}
+            present = GapPlant(active, T_L=self.plant.T_L, K_L=self.plant.K_L, sigma=self.plant.sigma)
+            some = {k: v for k, v in values.items() if "." not in k or k.partition(".")[0] in names}
+            later = self._simulate(present, some)
+            out = later if out is None else np.where(self.record.time >= onset, later, out)
+        assert out is not None
+        return self._late(out, z)
+
+    def _late(self, channels: FloatArray, z: FloatArray) -> FloatArray:
+        """`channels` with speed as late as it is read, to first order."""
+        if LATENESS not in self.index:
+            return channels
+        speed = self.record.channels.index("speed")
+        slope = np.empty_like(channels[..., speed, :])
+        for stretch in self.record.stretches:
+            slope[..., stretch.rows] = np.gradient(channels[..., speed, stretch.rows], self.record.dt, axis=-1)
+        out = np.array(np.broadcast_to(channels, (*z.shape[:-1], *channels.shape[-2:])))
+        out[..., speed, :] -= _LATENESS_S * z[..., self.index[LATENESS]] * slope
+        return out
+
+    def _simulate(self, car: GapPlant, values: Mapping[str, Tensor]) -> FloatArray:
+        channels = []
+        for stretch in self.record.stretches:
+            response = car.response(stretch.drive, values)
+            gained = response.speed.diff(dim=-1) / self.record.dt
+            by_channel = {"speed": torch.cat([gained, gained[..., -1:]], -1), "accel": response.accel_measured}
+            channels.append(stacked([by_channel[c] for c in self.record.channels]))
+        return np.concatenate(channels, -1)
+
+
+def _box(parameter: Parameter) -> tuple[float, float]:
+    """Coordinates that a fit may take: what physics allows, and three times as far where that is said in logarithms.
+
+    A car beyond what physics allows is a finding, and said to be implausible; one far beyond it is no fit.
+    """
+    if parameter.constraint == "interval":
+        return -_WIDEST, _WIDEST
+    low, high = parameter.physical
+    if parameter.constraint == "positive":
+        low, high = low / _BEYOND, high * _BEYOND
+    elif parameter.constraint == "negative":
+        low, high = low * _BEYOND, high / _BEYOND
+    ends = [float(parameter.unconstrain(torch.tensor(x, dtype=torch.float64))) for x in (low, high)]
+    return max(min(ends), -_WIDEST), min(max(ends), _WIDEST)
+
+
+def _coarse(effect: Effect, record: AnalysisRecord) -> Effect:
+    """A force along the road with knots far enough apart that neighbours of a held-out block foretell it."""
+    if not isinstance(effect, Integrated):
+        return effect
+    ends = [float(s.drive.position[-1]) for s in record.stretches if s.drive.position is not None]
+    return effect.spaced(max(ends, default=0.0) / _KNOTS)
+
+
+_KNOTS = 12
+
+
+def _sizes(effects: Sequence[type[Effect]]) -> set[str]:
+    """Of forces along the road: their size, which the coefficients hold already."""
+    return {f"{e.name}.{e.size}" for e in effects if issubclass(e, Integrated)}

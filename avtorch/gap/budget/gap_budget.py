@@ -1,0 +1,407 @@
+"""The budget: of the gap in held-out rollouts, what each cause takes off, what is left, what is noise.
+
+An energy is the mean squared error of rollouts over 10 s, each channel over its own floor, the mean of the channels.
+Every block's error is that of a model fitted without it. The floor is what no model that knows commands, speed and
+time could foretell: what a regression on these leaves of held-out blocks, once the causes are in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.special import ndtr
+
+from avtorch.arrays import FloatArray, IntArray
+from avtorch.errors import InputError
+from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.flexible_regression import foretold
+from avtorch.gap.budget.forward_selection import (
+    Selection,
+    Step,
+    select,
+    strength,
+    without_effect,
+)
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
+from avtorch.gap.simulator.plant import GapPlant, plant
+from avtorch.io import Log
+
+HORIZON_S = 10.0
+"""Of the rollouts [s]."""
+MATERIAL = 0.03
+"""Share of the gap from which something counts, unless a user says otherwise."""
+_LEAST_GAP = 0.1  # of the floor's energy, that there is a gap
+_DRAWS = 2000
+_BEGIN_S = 0.5  # over which the measured start of a rollout is averaged
+
+
+@dataclass(frozen=True)
+class Part:
+    """A cause: its `share` of the gap, `after` it the root of the energy that is left, and its parameters.
+
+    `alias_set`: effects that held-out blocks cannot tell from it, itself among them. `onset_s` on the log's own clock,
+    None: from the start.
+
+    Example:
+        >>> from avtorch import Leader, simulate
+        >>> from avtorch.gap import ConstantResistance, gap_budget, plant
+        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
+        >>> log = simulate(Leader.default(start=30.0, duration=40.0, dt=0.1), plant=dragging).log()
+        >>> budget = gap_budget(log, effects=["constant_resistance"])
+        >>> part = budget.parts[0]
+        >>> part.name, round(part.parameters["resistance_mps2"].mean, 1)
+        ('constant_resistance', 0.2)
+    """
+
+    name: str
+    alias_set: tuple[str, ...]
+    probability: float
+    share: Quantity
+    after: float
+    parameters: Mapping[str, Quantity]
+    onset_s: float | None
+    plausible: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "names": [self.name],
+            "alias_set": list(self.alias_set),
+            "probability": self.probability,
+            "share": _interval(self.share),
+            "after": self.after,
+            "parameters": {key: value.to_dict() for key, value in self.parameters.items()},
+            "onset_s": self.onset_s,
+            "plausible": self.plausible,
+        }
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """The share that is reproducible and that no cause explains; `material`: surely more than a user cares for.
+
+    Example:
+        >>> from avtorch import Leader, simulate
+        >>> from avtorch.gap import ConstantResistance, gap_budget, plant
+        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
+        >>> log = simulate(Leader.default(start=30.0, duration=40.0, dt=0.1), plant=dragging).log()
+        >>> budget = gap_budget(log, effects=["constant_resistance"])
+        >>> budget.unexplained.material
+        False
+    """
+
+    share: Quantity
+    material: bool
+    resembles: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "share": _interval(self.share),
+            "material": self.material,
+            "where": [],
+            "resembles": self.resembles,
+        }
+
+
+@dataclass(frozen=True)
+class ChannelError:
+    """Root mean squared error of rollouts in one channel [m/s or m/s²]: before, at the floor, and with all causes.
+
+    Example:
+        >>> from avtorch import Leader, simulate
+        >>> from avtorch.gap import ConstantResistance, gap_budget, plant
+        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
+        >>> log = simulate(Leader.default(start=30.0, duration=40.0, dt=0.1), plant=dragging).log()
+        >>> budget = gap_budget(log, effects=["constant_resistance"])
+        >>> speed = budget.by_channel["speed"]
+        >>> speed.before > 3 * speed.left
+        True
+    """
+
+    before: float
+    floor: float
+    left: float
+
+    def to_dict(self) -> dict[str, float]:
+        return {"before": self.before, "floor": self.floor, "left": self.left}
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The gap's budget: roots of energies `before`, `left` and `floor` (1 by definition), and where they come from.
+
+    `baseline`: `T_L` [s] and `K_L` [-] of the simulator as fitted without any cause.
+    Where rollouts show no gap there are no parts, whatever single rows may tell.
+
+    Example:
+        >>> from avtorch import Leader, simulate
+        >>> from avtorch.gap import ConstantResistance, gap_budget, plant
+        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
+        >>> log = simulate(Leader.default(start=30.0, duration=40.0, dt=0.1), plant=dragging).log()
+        >>> budget = gap_budget(log, effects=["constant_resistance"])
+        >>> print(str(budget).split(" (")[0])
+        Chiefly constant_resistance
+        >>> budget.verdict
+        ('constant_resistance',)
+    """
+
+    before: float
+    left: float
+    by_channel: Mapping[str, ChannelError]
+    parts: tuple[Part, ...]
+    unexplained: Unexplained
+    baseline: Mapping[str, float]
+    material: float = MATERIAL
+    floor: float = 1.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Causes that are more likely there than not, the largest first."""
+        return tuple(part.name for part in self.parts if part.probability >= 0.5)
+
+    @property
+    def verdict(self) -> tuple[str, ...]:
+        """`names`; without any `("unknown",)` where something material is reproducible, else `("none",)`."""
+        return self.names or (("unknown",) if self.unexplained.material else ("none",))
+
+    def __str__(self) -> str:
+        """What a person reads first."""
+        if not self.names:
+            return {"none": "Nothing material is missing.", "unknown": "No known effect explains the gap."}[
+                self.verdict[0]
+            ]
+        words = [f"{p.name} ({p.share.mean:.0%} of the gap)" for p in self.parts if p.name in self.names]
+        rest = f"{self.unexplained.share.mean:.0%} is reproducible and no known effect explains it"
+        return f"Chiefly {', then '.join(words)}; {rest}; the remaining error is noise."
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "metric": "rollout_10s_over_floor",
+            "horizon_s": HORIZON_S,
+            "heldout_by": "blocks",
+            "before": self.before,
+            "floor": self.floor,
+            "left": self.left,
+            "by_channel": {name: error.to_dict() for name, error in self.by_channel.items()},
+            "parts": [part.to_dict() for part in self.parts],
+            "chance": [],
+            "unexplained": self.unexplained.to_dict(),
+            "material": self.material,
+        }
+
+
+def _interval(share: Quantity) -> dict[str, float]:
+    return {"mean": share.mean, "q05": share.q05, "q95": share.q95}
+
+
+def gap_budget(
+    logs: Log | Sequence[Log],
+    *,
+    baseline: GapPlant | str | PathLike[str] | None = None,
+    effects: Sequence[str | type[Effect]] | None = None,
+    material: float = MATERIAL,
+    seed: int = 0,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Budget:
+    """The budget of the gap between `baseline` (default: bare GLVD) and the car of these drives.
+
+    Args: `effects`: candidates by name or class (default: all registered); random ones foretell nothing and are left
+    out. `material`: share of the gap, or of the response, below which a cause is not a part. `seed`: of the drawing of
+    blocks for the intervals. `progress(what, done, of)` is called at each effect tried.
+
+    Raises `InputError` for a log without `accel_cmd`, for logs with less than six blocks of four seconds that count,
+    or for wrong arguments.
+
+    Example:
+        >>> from avtorch import Leader, simulate
+        >>> from avtorch.gap import ConstantResistance, gap_budget, plant
+        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
+        >>> log = simulate(Leader.default(start=30.0, duration=60.0, dt=0.05), plant=dragging).log()
+        >>> gap_budget(log, effects=["constant_resistance", "dead_time"]).names
+        ('constant_resistance',)
+    """
+    each = [logs] if isinstance(logs, Log) else list(logs)
+    if not 0 < material < 1:
+        raise InputError(f"material: found {material}, needs a share between 0 and 1")
+    base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
+    kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
+    selection = select(AnalysisRecord.of(each), base, kinds, progress=progress)
+    return budget_of(largest_first(selection, material), material=material, seed=seed)
+
+
+def largest_first(selection: Selection, material: float = MATERIAL) -> Selection:
+    """The selection's effects in the order of what each takes off the energy on top of those before it.
+
+    One that changes neither the energy nor the response by `material` is left out: a delay of ten milliseconds may be
+    certain, and is no part of a gap.
+    """
+    fitting, bare, last = selection.fitting, selection.steps[0], selection.last
+    entered = {s.entered: s for s in selection.steps[1:]}
+    steps, rest = [bare], list(last.fit.model.names)
+    while rest:
+        tried = []
+        for name in rest:
+            fit = last.fit
+            for other in rest:
+                if other != name:
+                    fit = without_effect(fitting, fit, other)
+            held = last.held if fit is last.fit else fitting.hold_out(fit, iterations=1)
+            tried.append(replace(entered[name], fit=fit, held=held))
+        energies = [_energy(selection, step) for step in tried]
+        best = tried[int(np.argmin(energies))]
+        before, after = _energy(selection, steps[-1]), float(np.min(energies))
+        name = str(best.entered)
+        if before - after < material * _energy(selection, bare) and _change(steps[-1], best) < material:
+            last = Step(without_effect(fitting, last.fit, name), last.held)
+            last = replace(last, held=fitting.hold_out(last.fit))
+        else:
+            steps.append(best)
+        rest.remove(name)
+    return Selection(fitting, tuple(steps))
+
+
+def _energy(selection: Selection, step: Step) -> float:
+    """Mean squared error of held-out rollouts, in units of what the bare baseline's are, mean of the channels."""
+    errors = _rollout_squares(selection, _held_residuals(selection, step))
+    bare = _rollout_squares(selection, _held_residuals(selection, selection.steps[0]))
+    return float((_typical(selection, errors) / _typical(selection, bare)).mean())
+
+
+def _change(before: Step, after: Step) -> float:
+    """Share of the response (root mean square) that one more effect changes; of the channel that it changes most."""
+    one, other = before.fit.model.simulate(before.fit.z), after.fit.model.simulate(after.fit.z)
+    rows = after.fit.model.record.counts
+    size = np.sqrt((other[:, rows] ** 2).mean(-1)) + 1e-12
+    return float((np.sqrt(((other - one)[:, rows] ** 2).mean(-1)) / size).max())
+
+
+def budget_of(selection: Selection, *, material: float = MATERIAL, seed: int = 0) -> Budget:
+    """The budget of a selection, as it is ordered; intervals of shares by drawing blocks anew."""
+    fitting, record = selection.fitting, selection.fitting.whitening.record
+    held = [_held_residuals(selection, step) for step in selection.steps]
+    floor = held[-1] - foretold(fitting, selection.last.fit, held[-1])
+    errors = np.stack([_rollout_squares(selection, x) for x in [*held, floor]])  # (model, channel, block)
+    calm = _calm(selection)
+    blocks = len(calm)
+    draws = np.random.default_rng(seed).multinomial(blocks, np.ones(blocks) / blocks, _DRAWS)
+    weights = np.concatenate([np.ones((1, blocks)), draws]) * _rows(selection)[calm]
+    means = np.einsum("db,mcb->mdc", weights, errors[..., calm]) / weights.sum(-1)[:, None]  # (model, draw, channel)
+    floors = np.minimum(means[-1, 0], means[-2, 0])
+    energy = (means / floors).mean(-1)  # (model, draw)
+    whole = energy[0] - np.minimum(energy[-1], energy[-2])
+    # a gap that drives drawn anew would not have, or that is a small part of the noise, is none
+    there = bool(whole[0] > _LEAST_GAP and np.quantile(whole[1:], 0.05) > 0)
+    taken = np.maximum(energy[:-2] - energy[1:-1], 0.0)
+    rest = np.maximum(energy[-2] - energy[-1], 0.0)
+    total = np.maximum(taken.sum(0) + rest, 1e-12)
+    parts = tuple(
+        _part(selection, step, share / total, float(np.sqrt(energy[number + 1, 0])))
+        for number, (step, share) in enumerate(zip(selection.steps[1:], taken, strict=True))
+    )
+    unexplained = _quantity(rest / total)
+    bare = selection.steps[0].fit
+    return Budget(
+        before=float(np.sqrt(energy[0, 0])),
+        left=float(np.sqrt(energy[-2, 0])),
+        by_channel={
+            name: ChannelError(*(float(np.sqrt(x[c])) for x in (means[0, 0], floors, means[-2, 0])))
+            for c, name in enumerate(record.channels)
+        },
+        parts=parts if there else (),
+        unexplained=Unexplained(unexplained, bool(there and unexplained.q05 > material)),
+        baseline={key: float(value) for key, value in bare.model.values(bare.z).items() if key in ("T_L", "K_L")},
+        material=material,
+    )
+
+
+def _rows(selection: Selection) -> FloatArray:
+    record = selection.fitting.whitening.record
+    return np.bincount(record.block[record.counts], minlength=record.blocks).astype(float)
+
+
+def _calm(selection: Selection) -> IntArray:
+    """Blocks but the tenth that the selected model foretells worst: a kerb is not to decide what a budget is."""
+    squares = _rollout_squares(selection, _held_residuals(selection, selection.last))
+    worst = (squares / (np.median(squares, -1, keepdims=True) + 1e-12)).max(0)
+    return np.sort(np.argsort(worst)[: max(1, round(0.9 * len(worst)))])
+
+
+def _typical(selection: Selection, squares: FloatArray) -> FloatArray:
+    """Mean (channel,) over the calm blocks of `squares` (channel, block)."""
+    calm = _calm(selection)
+    return squares[:, calm].mean(-1) + 1e-12
+
+
+def _held_residuals(selection: Selection, step: Step) -> FloatArray:
+    """(channel, row): each block's by the fit that was made without it."""
+    fold, record = selection.fitting.fold, selection.fitting.whitening.record
+    response = step.fit.model.simulate(step.held.z)  # (fold, channel, row)
+    which = np.where(record.block >= 0, fold[np.clip(record.block, 0, len(fold) - 1)], 0)
+    return record.measured - response[which, :, np.arange(record.rows)].T
+
+
+def _rollout_squares(selection: Selection, residuals: FloatArray) -> FloatArray:
+    """Mean squared errors (channel, block) of rollouts of `residuals` (channel, row), begun anew every 10 s."""
+    record = selection.fitting.whitening.record
+    out = np.zeros((len(record.channels), record.blocks))
+    window, begin = round(HORIZON_S / record.dt), max(1, round(_BEGIN_S / record.dt))
+    errors = residuals.copy()
+    if record.has_speed:
+        drift = np.zeros(record.rows)
+        for stretch in record.stretches:
+            for start in range(stretch.rows.start, stretch.rows.stop, window):
+                rows = slice(start, min(start + window, stretch.rows.stop))
+                gained = np.cumsum(residuals[0, rows]) * record.dt
+                drift[rows] = gained - gained[:begin].mean()
+        errors[0] = drift
+    for c in range(len(out)):
+        squares = np.bincount(record.block[record.counts], errors[c, record.counts] ** 2, record.blocks)
+        out[c] = squares / np.maximum(np.bincount(record.block[record.counts], minlength=record.blocks), 1)
+    return out
+
+
+def _part(selection: Selection, step: Step, share: FloatArray, after: float) -> Part:
+    assert step.entered is not None
+    assert step.gains is not None
+    model, z = selection.last.fit.model, selection.last.fit.z
+    onset = model.onsets.get(step.entered)
+    return Part(
+        name=step.entered,
+        alias_set=step.aliases,
+        # on another drive its gain would scatter by one standard error
+        probability=float(ndtr(strength(step.gains))),
+        share=_quantity(share),
+        after=after,
+        parameters=_parameters(selection, step.entered),
+        onset_s=onset,
+        plausible=not model.at_limit(z, step.entered),
+    )
+
+
+def _parameters(selection: Selection, name: str) -> dict[str, Quantity]:
+    """By jackknife over the folds: what parts of the drives disagree on is in the interval."""
+    model, z, folds = selection.last.fit.model, selection.last.fit.z, selection.last.held.z
+    count = len(folds)
+    every = np.concatenate([z[None], folds])
+    plants = model.plant.with_values(model.values(every))
+    reported = next(e for e in plants.effects if e.name == name).report(torch.as_tensor(plants.T_L))
+    out = {}
+    for key, value in reported.items():
+        x = np.broadcast_to(value.numpy(), (count + 1,) if value.dim() < 2 else value.shape)
+        if x.ndim != 1:
+            continue
+        sd = float(np.sqrt((count - 1) / count * ((x[1:] - x[1:].mean()) ** 2).sum()))
+        out[key] = Quantity(float(x[0]), sd, float(x[0] - 1.8 * sd), float(x[0] + 1.8 * sd))
+    return out
+
+
+def _quantity(draws: FloatArray) -> Quantity:
+    """Of what all blocks once, then draws of them, say."""
+    q05, q95 = np.quantile(draws[1:], (0.05, 0.95))
+    mean = float(draws[0])
+    return Quantity(mean, float(draws[1:].std()), min(float(q05), mean), max(float(q95), mean))

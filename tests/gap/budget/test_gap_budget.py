@@ -1,0 +1,97 @@
+"""The budget names what was put in, divides the gap among it, and holds what is known of real cars by other means."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avtorch.errors import InputError
+from avtorch.gap import ConstantResistance, DeadBand, DeadTime, Effect, SensorBias, gap_budget
+from avtorch.gap.budget.forward_selection import strength
+from avtorch.io import Log
+from tests.gap.budget.cars import log_of
+
+FEW = ["dead_time", "dead_band", "constant_resistance", "sensor_bias", "sensor_scale"]
+
+
+def test_gains_must_be_large_or_alike() -> None:
+    even, one = np.full(12, 3.0), np.append(np.zeros(11), 60.0)
+    assert strength(even + 0.1 * np.arange(12)) > 0
+    assert strength(one) < 0  # one block is one event
+    assert strength(np.tile([8.0, 1.0, -2.0], 8)) > 0
+    assert strength(np.tile([0.2, 0.1], 6)) < 0  # consistent, and nothing
+
+
+@pytest.mark.parametrize(
+    ("effect", "key", "within"),
+    [
+        # a few per cent of each: 150 s, noise of 0.05 m/s² that lasts 1.5 s
+        (ConstantResistance(0.2), "resistance_mps2", 0.05),
+        (DeadBand(0.25), "half_width_mps2", 0.06),
+        (DeadTime(0.3), "delay_s", 0.06),
+        (SensorBias(0.2), "bias_mps2", 0.05),
+    ],
+)
+def test_a_single_cause_is_the_whole_budget(effect: Effect, key: str, within: float) -> None:
+    budget = gap_budget(log_of([effect], seed=11), effects=FEW)
+    assert budget.names == (effect.name,)
+    part = budget.parts[0]
+    assert part.parameters[key].mean == pytest.approx(getattr(effect, key), abs=within)
+    assert part.share.mean > 0.85
+    assert part.onset_s is None
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_coloured_noise_is_no_cause(seed: int) -> None:
+    budget = gap_budget(log_of(seed=seed), effects=FEW)
+    assert budget.verdict == ("none",)
+
+
+def test_parts_are_in_order_and_sum_to_one() -> None:
+    log = log_of([ConstantResistance(0.3), SensorBias(0.1), DeadBand(0.1)], seed=2)
+    budget = gap_budget(log, effects=FEW)
+    assert set(budget.names) == {"constant_resistance", "sensor_bias", "dead_band"}
+    shares = [part.share.mean for part in budget.parts]
+    assert sum(shares) + budget.unexplained.share.mean == pytest.approx(1.0, abs=1e-9)
+    for part in budget.parts:
+        assert part.name in part.alias_set
+        assert part.share.q05 <= part.share.mean <= part.share.q95
+    assert budget.before > budget.left >= 1.0
+    assert "constant_resistance" in str(budget)
+
+
+def test_the_same_log_has_the_same_budget() -> None:
+    log = log_of([DeadBand(0.25)], seed=4, seconds=60.0)
+    assert gap_budget(log, effects=FEW).to_dict() == gap_budget(log, effects=FEW).to_dict()
+
+
+def test_wrong_arguments_are_refused() -> None:
+    log = log_of(seconds=60.0)
+    with pytest.raises(InputError, match="material"):
+        gap_budget(log, material=0.0)
+    with pytest.raises(InputError, match="perhaps dead_time"):
+        gap_budget(log, effects=["dead_tim"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "known"),
+    # mean of accel - dv/dt while moving, by the columns themselves
+    [("Normal_1weight", -0.235), ("tire_set_1", -0.174)],
+)
+def test_the_bias_of_a_real_accelerometer_is_in_its_interval(data_dir: Path, name: str, known: float) -> None:
+    budget = gap_budget(Log.read(data_dir / "roboracer" / f"{name}.csv"))
+    part = next(part for part in budget.parts if part.name == "sensor_bias")
+    bias = part.parameters["bias_mps2"]
+    assert bias.q05 <= known <= bias.q95
+
+
+@pytest.mark.slow
+def test_a_model_cars_resistance_is_what_its_authors_say(data_dir: Path) -> None:
+    budget = gap_budget(Log.read(data_dir / "dart" / "09_16_2024_10_27_02_onboard10Hz.csv"))
+    part = next(part for part in budget.parts if part.name == "constant_resistance")
+    resistance = part.parameters["resistance_mps2"]
+    assert budget.parts[0] is part
+    assert resistance.q05 <= 2.9 <= resistance.q95

@@ -1,0 +1,48 @@
+"""The noise's spectrum: an autoregression finds the innovations, and each stretch is filtered by itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.noise_whitening import NoiseWhitening
+from tests.bars import BAR
+from tests.gap.budget.cars import log_of
+
+
+@pytest.mark.statistical
+def test_what_an_autoregression_leaves_is_white_and_of_size_one(rotating_seed: int) -> None:
+    record = AnalysisRecord.of([log_of(seconds=400.0)])
+    rng = np.random.default_rng(rotating_seed)
+    noise = np.asarray(lfilter([1.0], [1.0, -1.4, 0.7], rng.normal(0.0, 0.3, (2, record.rows)), axis=-1))
+    whitening = NoiseWhitening.autoregressive(record, noise)
+    white = whitening(noise)
+    n = white.shape[-1]
+    # the SD's own error, and that of twenty more coefficients than there are
+    assert np.abs(white.std(-1) - 1).max() < BAR / np.sqrt(2 * n) + 20 / n
+    # sorted by block, and blocks follow each other: neighbours are neighbours
+    correlation = [(x[1:] * x[:-1]).mean() for x in white]
+    assert np.abs(correlation).max() < BAR / np.sqrt(n)
+
+
+def test_a_stretch_knows_nothing_of_the_one_before() -> None:
+    log = log_of(seconds=90.0)
+    record = AnalysisRecord.of([replace(log, segment=(log.time > 45.0).astype(int))])
+    taps = np.array([1.0, -0.5, 0.25])
+    x = np.random.default_rng(0).normal(size=record.rows)
+    other = x.copy()
+    other[record.stretches[0].rows] = 7.0
+    second = record.stretches[1].rows
+    np.testing.assert_array_equal(record.filtered(x, taps)[second], record.filtered(other, taps)[second])
+
+
+def test_rows_whose_past_does_not_count_do_not_count() -> None:
+    record = AnalysisRecord.of([log_of()])
+    whitening = NoiseWhitening.of(record, np.ones((2, 21)), np.ones(2))
+    first = int(np.nonzero(record.counts)[0][0])
+    assert whitening.order.min() == first + 20
+    assert whitening.lengths.sum() == len(whitening.order)

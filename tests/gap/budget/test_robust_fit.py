@@ -1,0 +1,86 @@
+"""Fits under a free noise spectrum: right without noise, steady under one wild block, blind to what is held out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from avtorch.arrays import FloatArray
+from avtorch.gap import EFFECTS, ConstantResistance, plant
+from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.effect_model import EffectModel
+from avtorch.gap.budget.noise_whitening import NoiseWhitening
+from avtorch.gap.budget.robust_fit import RobustFit
+from tests.gap.budget.cars import log_of
+
+
+def white_noise(record: AnalysisRecord, sd: float = 0.05) -> NoiseWhitening:
+    taps = np.tile(np.array([1.0, 0.0]), (len(record.channels), 1))
+    return NoiseWhitening.of(record, taps, np.full(len(record.channels), sd))
+
+
+def test_lag_gain_and_resistance_come_back_exactly_from_an_exact_log() -> None:
+    record = AnalysisRecord.of([log_of([ConstantResistance(0.2)], noise=0.0, T_L=0.4, K_L=0.9)])
+    model = EffectModel(record, plant(), (EFFECTS["constant_resistance"],))
+    # small noise, so that the priors say nothing
+    fit = RobustFit(white_noise(record, 1e-4)).fit(model, np.zeros((1, model.size)), iterations=40)
+    values = model.values(fit.z)
+    # commands are constant within rows of 50 ms; only speed's own difference quotient is approximate
+    assert float(values["T_L"]) == pytest.approx(0.4, abs=0.01)
+    assert float(values["K_L"]) == pytest.approx(0.9, abs=0.005)
+    assert float(values["constant_resistance.resistance_mps2"]) == pytest.approx(0.2, abs=0.005)
+
+
+def test_the_slope_is_that_of_the_cost() -> None:
+    record = AnalysisRecord.of([log_of([ConstantResistance(0.2)], seed=3)])
+    model = EffectModel(record, plant(), (EFFECTS["constant_resistance"],))
+    fitting = RobustFit(white_noise(record))
+    fit = fitting.fit(model, np.zeros((1, model.size)), iterations=40)
+
+    def cost(z: FloatArray) -> float:
+        return float(fitting.nats(fitting.white(model, z[None])[0]).sum() + 0.5 * (z**2).sum())
+
+    for step in np.eye(model.size) * 0.02:
+        assert cost(fit.z + step) > cost(fit.z) - 1e-3
+        assert cost(fit.z - step) > cost(fit.z) - 1e-3
+
+
+def test_one_wild_block_hardly_moves_a_fit() -> None:
+    record = AnalysisRecord.of([log_of(seed=5)])
+    model = EffectModel(record, plant())
+    fitting = RobustFit(white_noise(record))
+    calm = fitting.fit(model, np.zeros((1, model.size)), iterations=20)
+    wild = record.measured.copy()
+    wild[:, record.block == 4] += 3.0
+    object.__setattr__(record, "measured", wild)
+    moved = fitting.fit(model, np.zeros((1, model.size)), iterations=20)
+    # least squares would take 3 m/s² over a twentieth of the drive for a change of the gain
+    np.testing.assert_allclose(moved.z, calm.z, atol=0.15)
+
+
+def test_a_block_that_is_held_out_has_no_part_in_its_own_fit() -> None:
+    record = AnalysisRecord.of([log_of(seed=7)])
+    model = EffectModel(record, plant())
+    fitting = RobustFit(white_noise(record))
+    fit = fitting.fit(model, np.zeros((1, model.size)), iterations=20)
+    before = fitting.hold_out(fit)
+    changed = record.measured.copy()
+    own = np.isin(record.block, np.nonzero(fitting.fold == 2)[0])
+    changed[:, own] = 0.0
+    object.__setattr__(record, "measured", changed)
+    after = fitting.hold_out(fit)
+    # the whitening filter looks one row back, into the last row of a neighbour
+    np.testing.assert_allclose(after.z[2], before.z[2], atol=0.02)
+    assert np.abs(after.z[0] - before.z[0]).max() > 0.02
+
+
+def test_an_effect_that_sets_in_is_absent_before() -> None:
+    record = AnalysisRecord.of([log_of(seed=1)])
+    kind = EFFECTS["constant_resistance"]
+    late = EffectModel(record, plant(), (kind,)).setting_in(kind.name, 60.0)
+    always, bare = EffectModel(record, plant(), (kind,)), EffectModel(record, plant())
+    z = late.coordinates({"constant_resistance.resistance_mps2": np.array([1.0])})
+    with_it, without = always.simulate(z), bare.simulate(bare.coordinates({}))
+    before = record.time < 60.0
+    np.testing.assert_array_equal(late.simulate(z)[..., before], without[..., before])
+    np.testing.assert_array_equal(late.simulate(z)[..., ~before], with_it[..., ~before])
