@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from scipy.special import ndtr
 
-from avtorch.arrays import FloatArray, IntArray
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.flexible_regression import foretold
@@ -27,18 +27,23 @@ from avtorch.gap.budget.forward_selection import (
     strength,
     without_effect,
 )
+from avtorch.gap.budget.rollout_energy import (
+    HORIZON_S,
+    calm_blocks,
+    counted_rows,
+    held_out_residuals,
+    relative_energy,
+    rollout_squares,
+)
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log
 
-HORIZON_S = 10.0
-"""Of the rollouts [s]."""
 MATERIAL = 0.03
 """Share of the gap from which something counts, unless a user says otherwise."""
 _LEAST_GAP = 0.1  # of the floor's energy, that there is a gap
 _DRAWS = 2000
-_BEGIN_S = 0.5  # over which the measured start of a rollout is averaged
 
 
 @dataclass(frozen=True)
@@ -252,24 +257,17 @@ def largest_first(selection: Selection, material: float = MATERIAL) -> Selection
                     fit = without_effect(fitting, fit, other)
             held = last.held if fit is last.fit else fitting.hold_out(fit, iterations=1)
             tried.append(replace(entered[name], fit=fit, held=held))
-        energies = [_energy(selection, step) for step in tried]
+        energies = [relative_energy(selection, step) for step in tried]
         best = tried[int(np.argmin(energies))]
-        before, after = _energy(selection, steps[-1]), float(np.min(energies))
+        before, after = relative_energy(selection, steps[-1]), float(np.min(energies))
         name = str(best.entered)
-        if before - after < material * _energy(selection, bare) and _change(steps[-1], best) < material:
+        if before - after < material * relative_energy(selection, bare) and _change(steps[-1], best) < material:
             last = Step(without_effect(fitting, last.fit, name), last.held)
             last = replace(last, held=fitting.hold_out(last.fit))
         else:
             steps.append(best)
         rest.remove(name)
     return Selection(fitting, tuple(steps))
-
-
-def _energy(selection: Selection, step: Step) -> float:
-    """Mean squared error of held-out rollouts, in units of what the bare baseline's are, mean of the channels."""
-    errors = _rollout_squares(selection, _held_residuals(selection, step))
-    bare = _rollout_squares(selection, _held_residuals(selection, selection.steps[0]))
-    return float((_typical(selection, errors) / _typical(selection, bare)).mean())
 
 
 def _change(before: Step, after: Step) -> float:
@@ -283,13 +281,13 @@ def _change(before: Step, after: Step) -> float:
 def budget_of(selection: Selection, *, material: float = MATERIAL, seed: int = 0) -> Budget:
     """The budget of a selection, as it is ordered; intervals of shares by drawing blocks anew."""
     fitting, record = selection.fitting, selection.fitting.whitening.record
-    held = [_held_residuals(selection, step) for step in selection.steps]
+    held = [held_out_residuals(selection, step) for step in selection.steps]
     floor = held[-1] - foretold(fitting, selection.last.fit, held[-1])
-    errors = np.stack([_rollout_squares(selection, x) for x in [*held, floor]])  # (model, channel, block)
-    calm = _calm(selection)
+    errors = np.stack([rollout_squares(selection, x) for x in [*held, floor]])  # (model, channel, block)
+    calm = calm_blocks(selection)
     blocks = len(calm)
     draws = np.random.default_rng(seed).multinomial(blocks, np.ones(blocks) / blocks, _DRAWS)
-    weights = np.concatenate([np.ones((1, blocks)), draws]) * _rows(selection)[calm]
+    weights = np.concatenate([np.ones((1, blocks)), draws]) * counted_rows(selection)[calm]
     means = np.einsum("db,mcb->mdc", weights, errors[..., calm]) / weights.sum(-1)[:, None]  # (model, draw, channel)
     floors = np.minimum(means[-1, 0], means[-2, 0])
     energy = (means / floors).mean(-1)  # (model, draw)
@@ -317,52 +315,6 @@ def budget_of(selection: Selection, *, material: float = MATERIAL, seed: int = 0
         baseline={key: float(value) for key, value in bare.model.values(bare.z).items() if key in ("T_L", "K_L")},
         material=material,
     )
-
-
-def _rows(selection: Selection) -> FloatArray:
-    record = selection.fitting.whitening.record
-    return np.bincount(record.block[record.counts], minlength=record.blocks).astype(float)
-
-
-def _calm(selection: Selection) -> IntArray:
-    """Blocks but the tenth that the selected model foretells worst: a kerb is not to decide what a budget is."""
-    squares = _rollout_squares(selection, _held_residuals(selection, selection.last))
-    worst = (squares / (np.median(squares, -1, keepdims=True) + 1e-12)).max(0)
-    return np.sort(np.argsort(worst)[: max(1, round(0.9 * len(worst)))])
-
-
-def _typical(selection: Selection, squares: FloatArray) -> FloatArray:
-    """Mean (channel,) over the calm blocks of `squares` (channel, block)."""
-    calm = _calm(selection)
-    return squares[:, calm].mean(-1) + 1e-12
-
-
-def _held_residuals(selection: Selection, step: Step) -> FloatArray:
-    """(channel, row): each block's by the fit that was made without it."""
-    fold, record = selection.fitting.fold, selection.fitting.whitening.record
-    response = step.fit.model.simulate(step.held.z)  # (fold, channel, row)
-    which = np.where(record.block >= 0, fold[np.clip(record.block, 0, len(fold) - 1)], 0)
-    return record.measured - response[which, :, np.arange(record.rows)].T
-
-
-def _rollout_squares(selection: Selection, residuals: FloatArray) -> FloatArray:
-    """Mean squared errors (channel, block) of rollouts of `residuals` (channel, row), begun anew every 10 s."""
-    record = selection.fitting.whitening.record
-    out = np.zeros((len(record.channels), record.blocks))
-    window, begin = round(HORIZON_S / record.dt), max(1, round(_BEGIN_S / record.dt))
-    errors = residuals.copy()
-    if record.has_speed:
-        drift = np.zeros(record.rows)
-        for stretch in record.stretches:
-            for start in range(stretch.rows.start, stretch.rows.stop, window):
-                rows = slice(start, min(start + window, stretch.rows.stop))
-                gained = np.cumsum(residuals[0, rows]) * record.dt
-                drift[rows] = gained - gained[:begin].mean()
-        errors[0] = drift
-    for c in range(len(out)):
-        squares = np.bincount(record.block[record.counts], errors[c, record.counts] ** 2, record.blocks)
-        out[c] = squares / np.maximum(np.bincount(record.block[record.counts], minlength=record.blocks), 1)
-    return out
 
 
 def _part(selection: Selection, step: Step, share: FloatArray, after: float) -> Part:

@@ -1,0 +1,70 @@
+"""Errors of rollouts over 10 s, every block's by a model that was fitted without it.
+
+Speed is rolled out from its measured value at the beginning of each 10 s. The tenth of the blocks that the selected
+model foretells worst is left out: a kerb is not to decide what a budget is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avtorch.arrays import FloatArray, IntArray
+from avtorch.gap.budget.forward_selection import Selection, Step
+
+HORIZON_S = 10.0
+"""Of the rollouts [s]."""
+_BEGIN_S = 0.5  # over which the measured start of a rollout is averaged
+
+
+def held_out_residuals(selection: Selection, step: Step) -> FloatArray:
+    """(channel, row): each block's by the fit that was made without it."""
+    fold, record = selection.fitting.fold, selection.fitting.whitening.record
+    response = step.fit.model.simulate(step.held.z)  # (fold, channel, row)
+    which = np.where(record.block >= 0, fold[np.clip(record.block, 0, len(fold) - 1)], 0)
+    return record.measured - response[which, :, np.arange(record.rows)].T
+
+
+def rollout_squares(selection: Selection, residuals: FloatArray) -> FloatArray:
+    """Mean squared errors (channel, block) of rollouts of `residuals` (channel, row), begun anew every 10 s."""
+    record = selection.fitting.whitening.record
+    out = np.zeros((len(record.channels), record.blocks))
+    window, begin = round(HORIZON_S / record.dt), max(1, round(_BEGIN_S / record.dt))
+    errors = residuals.copy()
+    if record.has_speed:
+        drift = np.zeros(record.rows)
+        for stretch in record.stretches:
+            for start in range(stretch.rows.start, stretch.rows.stop, window):
+                rows = slice(start, min(start + window, stretch.rows.stop))
+                gained = np.cumsum(residuals[0, rows]) * record.dt
+                drift[rows] = gained - gained[:begin].mean()
+        errors[0] = drift
+    for c in range(len(out)):
+        squares = np.bincount(record.block[record.counts], errors[c, record.counts] ** 2, record.blocks)
+        out[c] = squares / np.maximum(np.bincount(record.block[record.counts], minlength=record.blocks), 1)
+    return out
+
+
+def calm_blocks(selection: Selection) -> IntArray:
+    """Blocks but the tenth that the selected model foretells worst: a kerb is not to decide what a budget is."""
+    squares = rollout_squares(selection, held_out_residuals(selection, selection.last))
+    worst = (squares / (np.median(squares, -1, keepdims=True) + 1e-12)).max(0)
+    return np.sort(np.argsort(worst)[: max(1, round(0.9 * len(worst)))])
+
+
+def counted_rows(selection: Selection) -> FloatArray:
+    """Rows (block,) that count."""
+    record = selection.fitting.whitening.record
+    return np.bincount(record.block[record.counts], minlength=record.blocks).astype(float)
+
+
+def relative_energy(selection: Selection, step: Step) -> float:
+    """Mean squared error of held-out rollouts, in units of what the bare baseline's are, mean of the channels."""
+    errors = rollout_squares(selection, held_out_residuals(selection, step))
+    bare = rollout_squares(selection, held_out_residuals(selection, selection.steps[0]))
+    return float((_typical(selection, errors) / _typical(selection, bare)).mean())
+
+
+def _typical(selection: Selection, squares: FloatArray) -> FloatArray:
+    """Mean (channel,) over the calm blocks of `squares` (channel, block)."""
+    calm = calm_blocks(selection)
+    return squares[:, calm].mean(-1) + 1e-12
