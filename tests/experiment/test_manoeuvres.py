@@ -123,6 +123,13 @@ def test_a_manoeuvre_as_driven_is_a_log_that_is_read(limits: Limits, car: str, t
     np.testing.assert_array_equal(again.accel_cmd, logs[0].accel_cmd)
 
 
+@pytest.mark.parametrize("seed", [2055135581, 4])
+def test_a_very_late_car_is_not_taken_for_one_of_the_wrong_sign(seed: int) -> None:
+    """Ramps return with the other sign after some 2 s, as late as this car follows them; both seeds were refused."""
+    limits = Limits(accel_min=-1, accel_max=1, seconds=30)
+    assert driven(limits, CARS["later"], np.random.default_rng(seed))
+
+
 @pytest.mark.parametrize("limits", [Limits(), Limits(0, 3.7, -1.4, 5)])
 def test_a_wrong_sign_is_refused_where_it_is_identifiable(limits: Limits) -> None:
     """All but what comes back with the other sign within 2.5 s, and what hardly moves the car."""
