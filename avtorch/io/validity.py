@@ -114,7 +114,7 @@ def check_rate(step: float, where: str) -> None:
 WITNESS = (0.45, 2.2)
 _COMMAND = (0.02, 2.5)
 _SURE = 0.9
-# a late car whose manoeuvre of 30 s is noisy, of the right sign, correlates by 0.69 (its inversion, too early, by -0.95)
+# a late car on a noisy manoeuvre of 30 s: 0.69 at its own delay, and -0.95 half a period earlier
 _MAY_BE = 0.5
 
 SPEED_FACTORS = {"km/h": 3.6, "mph": 3600 / 1609.344, "ft/s": 1 / 0.3048, "cm/s": 100.0, "mm/s": 1000.0}
