@@ -50,7 +50,7 @@ _DRAWS = 2000
 class Part:
     """A cause: its `share` of the gap, `after` it the root of the energy that is left, and its parameters.
 
-    `alias_set`: effects that held-out blocks cannot tell from it, itself among them. `onset_s` on the log's own clock,
+    `alias_set`: effects that held-out blocks cannot tell from it, itself among them. `onset_s` from the log's start,
     None: from the start.
 
     Example:
