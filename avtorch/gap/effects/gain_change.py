@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from avtorch.errors import InputError
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.effect import Effect, fixed, register
 from avtorch.gap.simulator.effect_context import EffectContext
@@ -27,7 +28,7 @@ class GainChange(Effect):
     """`K_L` times `gain_ratio` from `change_s` on, reached over `ramp_s` (near 0: a step); neutral at ratio 1.
 
     A row takes the mean over its step, so the response is differentiable in the change time. The prior of that time is
-    uniform over the drive, `earliest_s … latest_s`.
+    uniform over the drive, `earliest_s … latest_s`; raises `InputError` unless the former is less.
 
     Possible are ratios up to five either way: the payload of a truck, brake fade. The change time is unrestricted.
 
@@ -66,6 +67,13 @@ class GainChange(Effect):
         Domain("latest_s", -1e12, 1e12, "s"),
     )
 
+    def __post_init__(self) -> None:
+        if not self.earliest_s < self.latest_s:
+            raise InputError(
+                f"gain_change: found earliest_s {self.earliest_s:g} and latest_s {self.latest_s:g}, needs the earliest "
+                "before the latest"
+            )
+
     def apply(self, x: Tensor, row: EffectContext) -> tuple[Tensor, float]:
         ramp = tensor(self.ramp_s).clamp_min(1e-6)
         since = row.time - tensor(self.change_s)
@@ -91,7 +99,8 @@ class GainChange(Effect):
         return ratio, replace(change, low=self.earliest_s, high=self.latest_s), ramp
 
     def prepared(self, time: Tensor, speed: Tensor | None, position: Tensor | None) -> Self:
-        return replace(self, earliest_s=float(time[0]), latest_s=float(time[-1]))
+        first, last = float(time[0]), float(time[-1])
+        return replace(self, earliest_s=first, latest_s=max(last, math.nextafter(first, math.inf)))
 
 
 def _area(since: Tensor, ramp: Tensor) -> Tensor:

@@ -215,6 +215,7 @@ def test_a_string_that_names_a_file_is_one(tmp_path: Path, monkeypatch: pytest.M
         ("[dead_time\n", "TOML"),
         ("[dead_time]\ndelay_s = 'x'\n", "delay_s"),
         ("[gap]\n", "gap"),
+        ("[gain_change]\nearliest_s = 60.0\n", "gain_change: found earliest_s 60 and latest_s 60, needs the earliest"),
     ],
 )
 def test_wrong_text_is_refused(text: str, said: str) -> None:
