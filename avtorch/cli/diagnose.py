@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, positive, seed_number
-from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes, diagnosis_table
+from avtorch.cli.diagnosis_table import budget_table, diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.cli.follower import follow, refuse
 from avtorch.cli.resume import FITS, begin_anew
 from avtorch.cli.simulator import read_simulator
@@ -65,8 +65,9 @@ def diagnose(
         Parameter(help="What accel is: dv/dt, or an accelerometer's reading of specific force."),
     ] = "kinematic",
     budget: Annotated[float | None, Parameter(help="Stop the search after this time [s]; default: none.")] = None,
+    material: Annotated[float, Parameter(help="Share of the gap from which something counts, between 0 and 1.")] = 0.03,
     effects: Annotated[str | None, Parameter(help="Only these effects, NAME,NAME,...; default: all.")] = None,
-    pairs: Annotated[bool, Parameter(help="Look for two effects at once.")] = True,
+    pairs: Annotated[bool, Parameter(help="Look for several effects at once.")] = True,
     posterior: Annotated[
         Literal["laplace", "sgld"],
         Parameter(help="Posterior of the winner's parameters: normal approximation, or SGLD."),
@@ -112,6 +113,8 @@ def diagnose(
     """
     if budget is not None:
         positive("--budget", budget, "s")
+    if not 0 < material < 1:
+        raise InputError(f"--material: found {material:g}, needs a share between 0 and 1, such as 0.05")
     seed_number(seed)
     free_folder(out)
     track = {
@@ -167,6 +170,7 @@ def diagnose(
                 pairs=pairs,
                 posterior=posterior,
                 budget_s=budget,
+                material=material,
                 seed=seed,
                 progress=step,
                 checkpoint=out / FITS,
@@ -203,6 +207,9 @@ def diagnose(
         return
     talk.out.print(*diagnosis_headline(found), sep="\n")
     talk.out.print()
+    if found.budget is not None and (found.budget.parts or found.budget.chance):
+        talk.out.print(budget_table(found.budget))
+        talk.out.print()
     talk.out.print(diagnosis_table(found))
     talk.out.print()
     for note in diagnosis_notes(found):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from math import floor, log10
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from avtorch.gap.budget.parts import Budget
     from avtorch.gap.result.diagnosis import Candidate, Diagnosis, Quantity
 
 ROWS = 8
@@ -20,15 +21,43 @@ _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 
 def diagnosis_headline(found: Diagnosis) -> list[str]:
-    """The verdict in one sentence, its implausible parameters, and the diagnosis' reason below."""
-    from avtorch.gap.result.sentences import headline
+    """The verdict in one sentence, its budget, its implausible parameters, and the diagnosis' reason below."""
+    from avtorch.gap.result.sentences import budget, headline
 
     odd = found.winner.implausible
     style = (
         "bold yellow" if odd else {"unknown": "bold yellow", "none": "bold green"}.get(found.verdict.name, "bold cyan")
     )
     lines = [f"[{style}]{escape(headline(found))}[/]", *(f"[yellow]{escape(line)}[/]" for line in odd)]
-    return [*lines, f"[dim]{escape(found.verdict.why)}[/]"]
+    return [*lines, *map(escape, budget(found)), f"[dim]{escape(found.verdict.why)}[/]"]
+
+
+def budget_table(budget: Budget) -> Table:
+    """One row per part of the gap, what chance decides, and what is unexplained."""
+    from avtorch.gap.budget.parts import percent
+    from avtorch.gap.result.sentences import number
+
+    table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column("of the gap", no_wrap=True)
+    table.add_column("share", no_wrap=True)
+    table.add_column("probability", no_wrap=True)
+    table.add_column("parameters (90 %)")
+
+    def words(parameters: Mapping[str, Quantity], plausible: bool) -> str:
+        lines = [_parameter(key, parameters, q) for key, q in parameters.items()]
+        return "\n".join([*lines, *([] if plausible else ["physically implausible"])])
+
+    for part in budget.parts:
+        share = f"{percent(part.share.mean):>10} {bar(part.share.mean)}"
+        parameters = words(part.parameters, part.plausible)
+        table.add_row(escape(part.name), share, number(part.probability), parameters, style="bold")
+    for part in budget.chance:
+        parameters = words(part.parameters or {}, part.plausible)
+        table.add_row(escape(part.name), "     noise", number(part.probability), parameters, style="bold")
+    rest = budget.unexplained
+    style = "yellow" if rest.material else "dim"
+    table.add_row("unexplained", f"{percent(rest.share.mean):>10} {bar(rest.share.mean)}", "", "", style=style)
+    return table
 
 
 def diagnosis_table(found: Diagnosis) -> Table:
@@ -46,7 +75,7 @@ def diagnosis_table(found: Diagnosis) -> Table:
         style = "bold" if first else None if c.name in found.verdict.alias_set else "dim"
         gain = round(c.log_evidence or 0.0)
         nats = "" if c.log_evidence is None else f"{gain:+d}" if gain else "0"
-        lines = [_parameter(name, c, q) for name, q in c.parameters.items()]
+        lines = [_parameter(name, c.parameters, q) for name, q in c.parameters.items()]
         lines += ["physically implausible"] if c.implausible and c.name != "unknown" else []
         name = c.name.replace("+", " +\n")
         table.add_row(
@@ -101,12 +130,12 @@ def _shown(candidates: Iterable[Candidate]) -> tuple[list[Candidate], list[Candi
     return shown, [c for c in ranked if c not in shown]
 
 
-def _parameter(key: str, candidate: Candidate, q: Quantity) -> str:
+def _parameter(key: str, parameters: Mapping[str, Quantity], q: Quantity) -> str:
     from avtorch.gap.quantity import unit_of, words_of
 
     effect, _, own = key.rpartition(".")
     # a pair's parameters need the effect's name only where both have one of that name
-    twice = sum(k.rpartition(".")[2] == own for k in candidate.parameters) > 1
+    twice = sum(k.rpartition(".")[2] == own for k in parameters) > 1
     unit = unit_of(own)
     words = f"{effect}: {words_of(own)}" if twice else words_of(own)
     mean, interval = _interval(q, "" if unit == "-" else " " + unit)

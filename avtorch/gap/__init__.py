@@ -11,7 +11,8 @@ Example:
 """
 
 from avtorch.gap import effects
-from avtorch.gap.budget.gap_budget import Budget, ChannelError, Part, Unexplained, gap_budget
+from avtorch.gap.budget.gap_budget import gap_budget
+from avtorch.gap.budget.parts import Budget, ChancePart, ChannelError, Part, Unexplained
 from avtorch.gap.effects import (
     AerodynamicDrag,
     Backlash,
@@ -52,6 +53,7 @@ __all__ = [
     "Backlash",
     "BrakeThrottleAsymmetry",
     "Budget",
+    "ChancePart",
     "ChannelError",
     "CommandHold",
     "ConstantResistance",

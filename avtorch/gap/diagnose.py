@@ -10,6 +10,11 @@ from typing import Literal
 import numpy as np
 
 from avtorch.errors import InputError
+from avtorch.gap.budget.account import account
+from avtorch.gap.budget.forward_selection import MOST_PARTS
+from avtorch.gap.budget.parts import MATERIAL
+from avtorch.gap.budget.repaired_model import parameter_draws, repaired_plant
+from avtorch.gap.budget.shrinkage import shrinkage_of
 from avtorch.gap.crossval.attribution import RowAttribution
 from avtorch.gap.crossval.cross_validate import cross_validate
 from avtorch.gap.crossval.gap_closed import gap_closed
@@ -23,7 +28,7 @@ from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis, LogFacts
 from avtorch.gap.result.gap_size import gap_size
 from avtorch.gap.result.predictive_model import predictive_models
-from avtorch.gap.result.traces import Traces
+from avtorch.gap.result.traces import Traces, rolled_out
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 from avtorch.gap.search.search import Search
 from avtorch.gap.selection import periodic_commands as delays
@@ -48,20 +53,25 @@ def diagnose(
     pairs: bool = True,
     posterior: Literal["laplace", "sgld"] = "laplace",
     budget_s: float | None = None,
+    material: float = MATERIAL,
     seed: int = 0,
     progress: Callable[[str, int, int], None] | None = None,
     checkpoint: str | PathLike[str] | None = None,
 ) -> Diagnosis:
-    """Name the effect, or the two, that `baseline` lacks on these drives of one car.
+    """Name what `baseline` lacks on these drives of one car, and how much of the gap each effect contributes.
+
+    The likelihood's verdict holds where it names something. Where it is `unknown`, effects are selected on held-out
+    blocks under noise of any spectrum: any number of them.
 
     Args: `baseline`: the user's simulator (default: bare GLVD); its effects keep their values, `T_L` and `K_L` are
     fitted. `prior`: weights over causes, see `model_probabilities`. `effects`: those to test, by name or class
-    (default: all registered). `pairs`: also test two at once. `posterior` of the verdict's parameters: by SGLD, or
-    Laplace's approximation. `budget_s`: after this time no new hypothesis is fitted; where that cuts the search short,
-    `complete` is False and the verdict provisional: `scope` lists what was tested, and the verdict is distinguished
-    only from that. `accel_kind`: whether `accel` is dv/dt or an accelerometer's reading (default: as the logs state).
-    `progress(what, done, of)` is called at each step. `checkpoint`: a file that stores fits; a later search of the same
-    logs with the same settings continues from it, to the same answer.
+    (default: all registered). `pairs`: also test several at once. `posterior` of the verdict's parameters: by SGLD, or
+    Laplace's approximation. `material`: share of the gap from which something counts. `budget_s`: after this time no
+    new hypothesis is fitted; where that cuts the search short, `complete` is False and the verdict provisional: `scope`
+    lists what was tested, and the verdict is distinguished only from that. `accel_kind`: whether `accel` is dv/dt or an
+    accelerometer's reading (default: as the logs state). `progress(what, done, of)` is called at each step.
+    `checkpoint`: a file that stores fits; a later search of the same logs with the same settings continues from it, to
+    the same answer.
 
     Raises `InputError` for a log without `accel_cmd`, without 10 s of usable driving, for wrong arguments, or for a
     `checkpoint` that is damaged or belongs to other logs or settings.
@@ -82,7 +92,9 @@ def diagnose(
         each = [replace(log, accel_kind=accel_kind) for log in each]
     if posterior not in ("laplace", "sgld"):
         raise InputError(f"posterior: found {posterior!r}, needs 'laplace' or 'sgld'")
-    read = [with_sensor_noise(log) for log in each]
+    if not 0 < material < 1:
+        raise InputError(f"material: found {material}, needs a share between 0 and 1")
+    measured, read = each, [with_sensor_noise(log) for log in each]
     each, noise_added = [log for log, _ in read], dict.fromkeys(note for _, note in read if note)
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
@@ -106,7 +118,23 @@ def diagnose(
         why=delays.why(chances, untold),
         known=known,
     )
-    winner = next((f for f in race.found if f.name == verdict.name), None)
+    won = next((f for f in race.found if f.name == verdict.name), None)
+    accounted = account(
+        measured,
+        base,
+        kinds,
+        candidates,
+        verdict,
+        won,
+        material=material,
+        most=(MOST_PARTS if pairs else 1) if race.complete else 0,
+        seed=seed,
+        progress=progress,
+    )
+    if accounted is not None:
+        candidates, verdict = list(accounted.candidates), accounted.verdict
+    selected = accounted.selection if accounted is not None and accounted.held_out else None
+    winner = None if selected is not None else next((f for f in race.found if f.name == verdict.name), None)
     draws = None
     one_mode = winner is not None and (winner.delays is None or len(winner.delays.lengths) == 1)
     if winner is not None and winner.hypothesis.size and winner.name != "none" and posterior == "sgld" and one_mode:
@@ -128,10 +156,20 @@ def diagnose(
         noted += (apart.note,)
     named = winner is not None and winner.name != "none"
     # an unknown cause gets the onset of the most probable named effect
-    onset = None if verdict.name == "none" else _onset(winner or top, race)
+    onset = None if verdict.name == "none" or selected is not None else _onset(winner or top, race)
     alike = {part for name in verdict.alias_set for part in name.split("+")}
     held = cross_validate(race, winner or top, blamed=named, alike=sorted(alike), progress=progress)
     shown = RowAttribution.of(race, winner or top)
+    simulator = repaired(race.none, base)
+    car, beliefs = None, belief(race.none)
+    if named and winner is not None:
+        car, beliefs = repaired(winner, base, draws), belief(winner, draws)
+    elif selected is not None and accounted is not None and accounted.budget.parts:
+        car = repaired_plant(selected, base, float(simulator.sigma))
+        beliefs = parameter_draws(selected, seed=seed)
+    shrinkage = gap_closed(held) if held is not None and named else None
+    if selected is not None and car is not None:
+        shrinkage = shrinkage_of(selected)
     return Diagnosis(
         log=LogFacts.of(each),
         baseline=lag_and_gain(race.none),
@@ -141,21 +179,22 @@ def diagnose(
         onset_s=None if onset is None else onset.stamp_s,
         onset_from_start_s=None if onset is None else onset.from_start_s,
         onset_log=0 if onset is None else onset.log,
-        plant=repaired(winner, base, draws) if named and winner is not None else None,
-        simulator=repaired(race.none, base),
-        belief=belief(winner if named and winner is not None else race.none, draws if named else None),
+        plant=car,
+        simulator=simulator,
+        belief=beliefs,
         assumed=belief(race.none),
         draws=reported_draws(winner, draws) if draws is not None and winner is not None else None,
         where=()
         if verdict.name == "none"
         else localise(shown, onset_s=None if onset is None else onset.from_start_s, lag=race.none.values["T_L"]),
-        shrinkage=gap_closed(held) if held is not None and named else None,
+        shrinkage=shrinkage,
         contenders=predictive_models(race, verdict),
-        traces=_traces(race, winner, shown),
+        traces=_traces(race, winner, shown, car if selected is not None else None),
         remaining=given_dead_time(candidates, verdict, base),
         complete=race.complete,
         scope=race.scope,
         notes=noted,
+        budget=None if accounted is None else accounted.budget,
     )
 
 
@@ -166,17 +205,20 @@ def left_over(top: FittedModel, race: SearchResult) -> Adequacy:
     return adequacy(top.white, top.errors, measured - top.errors, explained=explained)
 
 
-def _traces(race: SearchResult, winner: FittedModel | None, shown: RowAttribution) -> Traces:
+def _traces(race: SearchResult, winner: FittedModel | None, shown: RowAttribution, car: GapPlant | None) -> Traces:
+    """`car`: the simulator with the effects that held-out blocks selected."""
     record = race.record
     measured = record.measured.mean(-1)
-    after = race.none if winner is None else winner
+    errors = (race.none if winner is None else winner).errors
+    if car is not None:
+        errors = record.measured - rolled_out(record, car)
     return Traces(
         time=record.time[record.source],
         command=record.command[record.source],
         channels=record.channels,
         measured=measured,
         before=measured - race.none.errors.mean(-1),
-        after=measured - after.errors.mean(-1),
+        after=measured - errors.mean(-1),
         does=shown.does,
         stretch=record.stretch,
     )

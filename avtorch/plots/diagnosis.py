@@ -7,9 +7,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
+from avtorch.gap.budget.parts import LIKELY, Budget, percent
 from avtorch.gap.crossval.localisation import UNITS, Axis
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.io.clock import time_label
@@ -18,6 +20,25 @@ from avtorch.vehicle.stability import Chain, chain_gain
 
 _SECONDS = 25.0  # seconds of a drive in a picture
 _NAMES = {"accel": "acceleration [m/s²]", "speed": "speed [m/s]"}
+
+
+def budget_bars(ax: Axes, budget: Budget) -> Axes:
+    """The gap's budget: each part's share begins where the one before it ends; whiskers are central 90 % intervals."""
+    named = [(p.name, p.share, BLUE if p.probability >= LIKELY else SKY) for p in budget.parts]
+    rows = [*named, ("unexplained", budget.unexplained.share, ORANGE)]
+    begun = 0.0
+    for i, (_, share, colour) in enumerate(rows):
+        ax.barh(i, share.mean, left=begun, color=colour, height=0.62)
+        ax.plot([begun + share.q05, begun + share.q95], [i, i], color=BLACK, lw=1.0)
+        ax.text(max(begun + share.q95, begun + share.mean) + 0.012, i, percent(share.mean), va="center", fontsize=9)
+        if i:
+            ax.plot([begun, begun], [i - 1, i], color=GREY, lw=0.6)
+        begun += share.mean
+    ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+    ax.set(xlabel="share of the gap in held-out 10 s rollouts", xlim=(0, 1.12), ylim=(len(rows) - 0.4, -0.6))
+    ax.xaxis.set_major_formatter(PercentFormatter(1.0, 0, " %"))
+    ax.grid(axis="y", visible=False)
+    return ax
 
 
 def gap_on_the_road(ax: Axes, found: Diagnosis, *, seconds: float = _SECONDS) -> Axes:
@@ -163,6 +184,16 @@ def loop_gain(ax: Axes, chains: Mapping[str, tuple[Chain, dict]], *, colours: Ma
     ax.set(xscale="log", xlim=(0.005, 2.0), xlabel="frequency [Hz]", ylabel="speed, follower / leader")
     ax.set_ylim(0, min(max(1.3, ax.get_ylim()[1]), 4.0))
     return ax
+
+
+@styled
+def budget_figure(found: Diagnosis) -> Figure:
+    """The budget of the gap. Raises `InputError` where the diagnosis has none."""
+    if found.budget is None:
+        raise InputError("budget: the diagnosis has none to draw; its drives are too short to hold out blocks")
+    figure = Figure(figsize=(8.6, 1.0 + 0.36 * (len(found.budget.parts) + 1)), layout="constrained")
+    budget_bars(figure.add_subplot(), found.budget)
+    return figure
 
 
 @styled

@@ -18,12 +18,13 @@ from matplotlib.figure import Figure
 
 from avtorch.errors import printable
 from avtorch.experiment import Experiment
+from avtorch.gap.budget.parts import Budget
 from avtorch.gap.crossval.localisation import UNITS
 from avtorch.gap.quantity import unit_of, words_of
 from avtorch.gap.result import sentences
-from avtorch.gap.result.diagnosis import Diagnosis, Quantity
+from avtorch.gap.result.diagnosis import Diagnosis, Quantity, Shrinkage
 from avtorch.io import atomic
-from avtorch.plots.diagnosis import road_figure, shrinkage_figure, where_figure, which_figure
+from avtorch.plots.diagnosis import budget_figure, road_figure, shrinkage_figure, where_figure, which_figure
 from avtorch.plots.experiment import experiment_figure
 from avtorch.version import __version__
 
@@ -73,13 +74,14 @@ def report_html(
         log=found.log,
         headline=sentences.headline(found),
         odd=found.winner.implausible,
-        lead=[found.verdict.why, sentences.aliases(found), *sentences.onset(found)],
+        lead=[*sentences.budget(found), found.verdict.why, sentences.aliases(found), *sentences.onset(found)],
         tone="amber"
         if found.winner.implausible
         else {"unknown": "amber", "none": "green"}.get(found.verdict.name, "blue"),
         where=sentences.where(found),
         parts=[_part(found, w) for w in found.where],
         gap=[*sentences.gap(found), *sentences.moved(found), *sentences.remains(found)],
+        budget=[] if found.budget is None else _budget(found.budget),
         candidates=[_candidate(found, c) for c in found.candidates[:10]],
         shrinkage=sentences.shrinkage(found),
         measures=_measures(found),
@@ -127,13 +129,19 @@ def write_report(
 
 def _pictures(found: Diagnosis, experiment: Experiment | None) -> dict[str, Markup | None]:
     drawn: dict[str, tuple[bool, Callable[[Diagnosis], Figure]]] = {
+        "budget": (found.budget is not None and bool(found.budget.parts), budget_figure),
         "road": (found.traces is not None, road_figure),
         "where": (found.traces is not None and bool(found.traces.does.any()), where_figure),
         "which": (True, which_figure),
-        "shrinkage": (found.shrinkage is not None, shrinkage_figure),
+        "shrinkage": (found.shrinkage is not None and _over_horizons(found.shrinkage), shrinkage_figure),
     }
     pictures = {name: _svg(name, draw(found)) if there else None for name, (there, draw) in drawn.items()}
     return pictures | {"next": None if experiment is None else _svg("next", experiment_figure(experiment))}
+
+
+def _over_horizons(shrinkage: Shrinkage) -> bool:
+    """Whether errors are known over several horizons, so that there is a line to draw."""
+    return len({metric.horizon_s for metric in shrinkage.by_metric.values()}) > 1
 
 
 def _svg(name: str, figure: Figure) -> Markup:
@@ -153,10 +161,7 @@ def _number(q: Quantity | None, digits: int = 3) -> str:
 
 
 def _candidate(found: Diagnosis, c: Any) -> Mapping[str, Any]:
-    parameters = []
-    for key, q in c.parameters.items():
-        unit = unit_of(key)
-        parameters.append(f"{words_of(key.rpartition('.')[2])} {_number(q)}{'' if unit == '-' else ' ' + unit}")
+    parameters = _parameters(c.parameters)
     parameters += ["physically implausible"] if c.implausible and c.name != "unknown" else []
     return {
         "name": c.name.replace("+", " + "),
@@ -166,6 +171,40 @@ def _candidate(found: Diagnosis, c: Any) -> Mapping[str, Any]:
         "parameters": parameters,
         "near": c.name in found.verdict.alias_set,
     }
+
+
+def _budget(budget: Budget) -> list[Mapping[str, Any]]:
+    """Rows of the budget's table."""
+    rows: list[Mapping[str, Any]] = [
+        {
+            "name": part.name,
+            "share": _percent(part.share),
+            "probability": sentences.number(part.probability),
+            "parameters": _parameters(part.parameters) + ([] if part.plausible else ["physically implausible"]),
+            "alike": [name for name in part.alias_set if name != part.name],
+        }
+        for part in budget.parts
+    ]
+    rows += [
+        {
+            "name": part.name,
+            "share": "by chance, part of the noise",
+            "probability": sentences.number(part.probability),
+            "parameters": _parameters(part.parameters or {}) + ([] if part.plausible else ["physically implausible"]),
+            "alike": [],
+        }
+        for part in budget.chance
+    ]
+    rest = {"probability": "", "parameters": [], "alike": []}
+    return [*rows, {"name": "unexplained", "share": _percent(budget.unexplained.share), **rest}] if rows else []
+
+
+def _parameters(parameters: Mapping[str, Quantity]) -> list[str]:
+    words = []
+    for key, q in parameters.items():
+        unit = unit_of(key)
+        words.append(f"{words_of(key.rpartition('.')[2])} {_number(q)}{'' if unit == '-' else ' ' + unit}")
+    return words
 
 
 def _part(found: Diagnosis, part: Any) -> Mapping[str, str]:

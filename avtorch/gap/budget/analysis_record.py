@@ -70,17 +70,19 @@ class AnalysisRecord:
         return "speed" in self.channels
 
     @classmethod
-    def of(cls, logs: Sequence[Log], *, rate_hz: float = RATE_HZ) -> AnalysisRecord:
+    def of(
+        cls, logs: Sequence[Log], *, rate_hz: float = RATE_HZ, shortest_block_s: float = _SHORTEST_BLOCK_S
+    ) -> AnalysisRecord:
         """Raises `InputError` where what counts is less than six blocks of four seconds."""
         channels = tuple(c for c in ("speed", "accel") if all(getattr(log, c) is not None for log in logs))
         if not channels:
             raise InputError("logs: found no channel that all of them have, needs speed or accel in each")
         usable = sum(float(log.usable.sum()) / log.rate_hz for log in logs)
-        length = float(np.clip(usable / _BLOCKS, _SHORTEST_BLOCK_S, _LONGEST_BLOCK_S))
+        length = float(np.clip(usable / _BLOCKS, shortest_block_s, _LONGEST_BLOCK_S))
         step = 1.0 / min(rate_hz, min(log.rate_hz for log in logs))
         pieces = [piece for number, log in enumerate(logs) for piece in _pieces(log, number, step, channels, length)]
         if not pieces:
-            raise InputError(f"logs: found no stretch of {2 * _SHORTEST_BLOCK_S:g} s, needs some")
+            raise InputError(f"logs: found no stretch of {shortest_block_s + _SETTLE_S + 1.0:g} s, needs some")
         starts = np.cumsum([0, *(len(p.time) for p in pieces)])
         stretches = tuple(
             Stretch(p.drive, slice(a, b)) for p, a, b in zip(pieces, starts[:-1], starts[1:], strict=True)
@@ -135,7 +137,7 @@ def _pieces(log: Log, number: int, step: float, channels: Sequence[str], length:
     for part in log.segments():
         time = log.elapsed[part]
         rows = int((time[-1] - time[0]) / step) if len(time) > 1 else 0
-        if rows * step < 2 * _SHORTEST_BLOCK_S:
+        if rows * step < min(length, _SHORTEST_BLOCK_S) + _SETTLE_S + 1.0:
             continue
         grid = time[0] + step * np.arange(rows)
         edges = np.append(grid, grid[-1] + step)
@@ -151,6 +153,7 @@ def _pieces(log: Log, number: int, step: float, channels: Sequence[str], length:
             torch.as_tensor(grid),
             torch.as_tensor(command),
             None if speed is None else torch.as_tensor(np.maximum(speed[:-1], 0.0)),
+            specific_force=log.accel_kind == "specific-force",
             position0=travelled,
         )
         if drive.position is not None:

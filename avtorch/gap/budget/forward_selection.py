@@ -28,7 +28,8 @@ _ERRORS = 2.5  # standard errors of the gain over held-out blocks that are enoug
 _NATS, _FEWER_ERRORS = 20.0, 1.2  # or so many nats, with so many standard errors
 _LEAST_NATS = 4.0
 _STAYS = -1.0  # strength down to which an effect holds its place
-_MOST = 5
+MOST_PARTS = 5
+"""Effects that a selection may hold."""
 _SCREENING = 2  # iterations of the fits that decide which effects are held out
 _SCREENED = 6  # effects that are held out, of those fitted
 _ONSET_NATS = 6.0  # that an onset must gain
@@ -77,20 +78,27 @@ def select(
     base: GapPlant,
     kinds: Sequence[type[Effect]],
     *,
+    begun: Selection | None = None,
+    most: int = MOST_PARTS,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Selection:
-    """The effects of `kinds` that `base` lacks on these drives, with every step on the way."""
+    """The effects of `kinds` that `base` lacks on these drives, at `most` so many, with every step on the way.
+
+    `begun`: a selection of the same record, which is continued.
+    """
     present = {e.name for e in base.effects}
     kinds = [k for k in kinds if not k.random and k.name not in present and _observable(k, record)]
-    fitting, start = _noise(record, base)
-    steps = [Step(start, fitting.hold_out(start))]
-    while len(steps) <= _MOST:
+    if begun is None:
+        fitting, start = baseline_noise(record, base)
+        begun = Selection(fitting, (Step(start, fitting.hold_out(start)),))
+    fitting, steps = begun.fitting, list(begun.steps)
+    while len(steps) <= most:
         entered = _enter(fitting, steps[-1], kinds, progress, len(steps))
         if entered is None:
             break
         steps.append(entered)
         steps = _without_the_redundant(fitting, steps)
-    return Selection(fitting, tuple(_in_order(fitting, steps)))
+    return Selection(fitting, tuple(in_order(fitting, steps)))
 
 
 def _observable(kind: type[Effect], record: AnalysisRecord) -> bool:
@@ -99,7 +107,7 @@ def _observable(kind: type[Effect], record: AnalysisRecord) -> bool:
     return kind.place != "sensor" or len(record.channels) == 2
 
 
-def _noise(record: AnalysisRecord, base: GapPlant) -> tuple[RobustFit, Fit]:
+def baseline_noise(record: AnalysisRecord, base: GapPlant) -> tuple[RobustFit, Fit]:
     """The noise of these drives, and the bare baseline under it."""
     bare = EffectModel(record, base)
     starts = np.array(
@@ -237,7 +245,7 @@ def without_effect(fitting: RobustFit, fit: Fit, name: str) -> Fit:
     return fitting.fit(model, model.coordinates(fit.known)[None])
 
 
-def _in_order(fitting: RobustFit, steps: list[Step]) -> list[Step]:
+def in_order(fitting: RobustFit, steps: list[Step]) -> list[Step]:
     """Steps whose models grow by one effect each, as removal may have left gaps between them."""
     aliases = {s.entered: s.aliases for s in steps if s.entered is not None}
     last, out = steps[-1], [steps[0]]

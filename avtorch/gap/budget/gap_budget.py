@@ -7,13 +7,11 @@ time could foretell: what a regression on these leaves of held-out blocks, once 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from os import PathLike
-from typing import Any
 
 import numpy as np
-import torch
 from scipy.special import ndtr
 
 from avtorch.arrays import FloatArray
@@ -27,8 +25,9 @@ from avtorch.gap.budget.forward_selection import (
     strength,
     without_effect,
 )
+from avtorch.gap.budget.parts import MATERIAL, Budget, ChannelError, Part, Unexplained
+from avtorch.gap.budget.repaired_model import lag_and_gain, parameters_of
 from avtorch.gap.budget.rollout_energy import (
-    HORIZON_S,
     calm_blocks,
     counted_rows,
     held_out_residuals,
@@ -40,168 +39,9 @@ from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log
 
-MATERIAL = 0.03
-"""Share of the gap from which something counts, unless a user says otherwise."""
 _LEAST_GAP = 0.1  # of the floor's energy, that there is a gap
 _DRAWS = 2000
-
-
-@dataclass(frozen=True)
-class Part:
-    """A cause: its `share` of the gap, `after` it the root of the energy that is left, and its parameters.
-
-    `alias_set`: effects that held-out blocks cannot tell from it, itself among them. `onset_s` from the log's start,
-    None: from the start.
-
-    Example:
-        >>> from avtorch import Leader, simulate
-        >>> from avtorch.gap import ConstantResistance, gap_budget, plant
-        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
-        >>> log = simulate(Leader.default(start=30.0, duration=40.0, dt=0.1), plant=dragging).log()
-        >>> budget = gap_budget(log, effects=["constant_resistance"])
-        >>> part = budget.parts[0]
-        >>> part.name, round(part.parameters["resistance_mps2"].mean, 1)
-        ('constant_resistance', 0.2)
-    """
-
-    name: str
-    alias_set: tuple[str, ...]
-    probability: float
-    share: Quantity
-    after: float
-    parameters: Mapping[str, Quantity]
-    onset_s: float | None
-    plausible: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "names": [self.name],
-            "alias_set": list(self.alias_set),
-            "probability": self.probability,
-            "share": _interval(self.share),
-            "after": self.after,
-            "parameters": {key: value.to_dict() for key, value in self.parameters.items()},
-            "onset_s": self.onset_s,
-            "plausible": self.plausible,
-        }
-
-
-@dataclass(frozen=True)
-class Unexplained:
-    """The share that is reproducible and that no cause explains; `material`: surely more than a user cares for.
-
-    Example:
-        >>> from avtorch import Leader, simulate
-        >>> from avtorch.gap import ConstantResistance, gap_budget, plant
-        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
-        >>> log = simulate(Leader.default(start=30.0, duration=40.0, dt=0.1), plant=dragging).log()
-        >>> budget = gap_budget(log, effects=["constant_resistance"])
-        >>> budget.unexplained.material
-        False
-    """
-
-    share: Quantity
-    material: bool
-    resembles: str | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "share": _interval(self.share),
-            "material": self.material,
-            "where": [],
-            "resembles": self.resembles,
-        }
-
-
-@dataclass(frozen=True)
-class ChannelError:
-    """Root mean squared error of rollouts in one channel [m/s or m/s²]: before, at the floor, and with all causes.
-
-    Example:
-        >>> from avtorch import Leader, simulate
-        >>> from avtorch.gap import ConstantResistance, gap_budget, plant
-        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
-        >>> log = simulate(Leader.default(start=30.0, duration=40.0, dt=0.1), plant=dragging).log()
-        >>> budget = gap_budget(log, effects=["constant_resistance"])
-        >>> speed = budget.by_channel["speed"]
-        >>> speed.before > 3 * speed.left
-        True
-    """
-
-    before: float
-    floor: float
-    left: float
-
-    def to_dict(self) -> dict[str, float]:
-        return {"before": self.before, "floor": self.floor, "left": self.left}
-
-
-@dataclass(frozen=True)
-class Budget:
-    """The gap's budget: roots of energies `before`, `left` and `floor` (1 by definition), and where they come from.
-
-    `baseline`: `T_L` [s] and `K_L` [-] of the simulator as fitted without any cause.
-    Where rollouts show no gap there are no parts, whatever single rows may tell.
-
-    Example:
-        >>> from avtorch import Leader, simulate
-        >>> from avtorch.gap import ConstantResistance, gap_budget, plant
-        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
-        >>> log = simulate(Leader.default(start=30.0, duration=40.0, dt=0.1), plant=dragging).log()
-        >>> budget = gap_budget(log, effects=["constant_resistance"])
-        >>> print(str(budget).split(" (")[0])
-        Chiefly constant_resistance
-        >>> budget.verdict
-        ('constant_resistance',)
-    """
-
-    before: float
-    left: float
-    by_channel: Mapping[str, ChannelError]
-    parts: tuple[Part, ...]
-    unexplained: Unexplained
-    baseline: Mapping[str, float]
-    material: float = MATERIAL
-    floor: float = 1.0
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Causes that are more likely there than not, the largest first."""
-        return tuple(part.name for part in self.parts if part.probability >= 0.5)
-
-    @property
-    def verdict(self) -> tuple[str, ...]:
-        """`names`; without any `("unknown",)` where something material is reproducible, else `("none",)`."""
-        return self.names or (("unknown",) if self.unexplained.material else ("none",))
-
-    def __str__(self) -> str:
-        """What a person reads first."""
-        if not self.names:
-            return {"none": "Nothing material is missing.", "unknown": "No known effect explains the gap."}[
-                self.verdict[0]
-            ]
-        words = [f"{p.name} ({p.share.mean:.0%} of the gap)" for p in self.parts if p.name in self.names]
-        rest = f"{self.unexplained.share.mean:.0%} is reproducible and no known effect explains it"
-        return f"Chiefly {', then '.join(words)}; {rest}; the remaining error is noise."
-
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "metric": "rollout_10s_over_floor",
-            "horizon_s": HORIZON_S,
-            "heldout_by": "blocks",
-            "before": self.before,
-            "floor": self.floor,
-            "left": self.left,
-            "by_channel": {name: error.to_dict() for name, error in self.by_channel.items()},
-            "parts": [part.to_dict() for part in self.parts],
-            "chance": [],
-            "unexplained": self.unexplained.to_dict(),
-            "material": self.material,
-        }
-
-
-def _interval(share: Quantity) -> dict[str, float]:
-    return {"mean": share.mean, "q05": share.q05, "q95": share.q95}
+_SURELY = 0.95  # share of the draws that find more unexplained than is material
 
 
 def gap_budget(
@@ -236,7 +76,7 @@ def gap_budget(
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
     selection = select(AnalysisRecord.of(each), base, kinds, progress=progress)
-    return budget_of(largest_first(selection, material), material=material, seed=seed)
+    return budget_of(largest_first(selection, material), material=material, seed=seed, epoch_s=each[0].epoch_s)
 
 
 def largest_first(selection: Selection, material: float = MATERIAL) -> Selection:
@@ -278,8 +118,19 @@ def _change(before: Step, after: Step) -> float:
     return float((np.sqrt(((other - one)[:, rows] ** 2).mean(-1)) / size).max())
 
 
-def budget_of(selection: Selection, *, material: float = MATERIAL, seed: int = 0) -> Budget:
-    """The budget of a selection, as it is ordered; intervals of shares by drawing blocks anew."""
+def budget_of(
+    selection: Selection,
+    *,
+    material: float = MATERIAL,
+    seed: int = 0,
+    epoch_s: float = 0.0,
+    given: bool = False,
+) -> Budget:
+    """The budget of a selection, as it is ordered; intervals of shares by drawing blocks anew.
+
+    `epoch_s`: the first log's start on its own clock. `given`: the effects are known by other means, and are parts
+    even where rollouts show no gap.
+    """
     fitting, record = selection.fitting, selection.fitting.whitening.record
     held = [held_out_residuals(selection, step) for step in selection.steps]
     floor = held[-1] - foretold(fitting, selection.last.fit, held[-1])
@@ -294,14 +145,16 @@ def budget_of(selection: Selection, *, material: float = MATERIAL, seed: int = 0
     whole = energy[0] - np.minimum(energy[-1], energy[-2])
     # a gap that drives drawn anew would not have, or that is a small part of the noise, is none
     there = bool(whole[0] > _LEAST_GAP and np.quantile(whole[1:], 0.05) > 0)
-    taken = np.maximum(energy[:-2] - energy[1:-1], 0.0)
+    taken = np.maximum(energy[:-2] - energy[1:-1], 0.0) if there or given else np.zeros((0, _DRAWS + 1))
     rest = np.maximum(energy[-2] - energy[-1], 0.0)
     total = np.maximum(taken.sum(0) + rest, 1e-12)
+    shares = taken / total
+    unexplained = 1.0 - shares.sum(0)
     parts = tuple(
-        _part(selection, step, share / total, float(np.sqrt(energy[number + 1, 0])))
-        for number, (step, share) in enumerate(zip(selection.steps[1:], taken, strict=True))
+        _part(selection, step, _quantity(share), float(np.sqrt(energy[number + 1, 0])), epoch_s)
+        for number, (step, share) in enumerate(zip(selection.steps[1:], shares, strict=False))
     )
-    unexplained = _quantity(rest / total)
+    likely = float((unexplained[1:] > material).mean()) if there else 0.0
     bare = selection.steps[0].fit
     return Budget(
         before=float(np.sqrt(energy[0, 0])),
@@ -310,14 +163,15 @@ def budget_of(selection: Selection, *, material: float = MATERIAL, seed: int = 0
             name: ChannelError(*(float(np.sqrt(x[c])) for x in (means[0, 0], floors, means[-2, 0])))
             for c, name in enumerate(record.channels)
         },
-        parts=parts if there else (),
-        unexplained=Unexplained(unexplained, bool(there and unexplained.q05 > material)),
+        parts=parts,
+        unexplained=Unexplained(_quantity(unexplained), likely > _SURELY, likely),
         baseline={key: float(value) for key, value in bare.model.values(bare.z).items() if key in ("T_L", "K_L")},
+        repaired=lag_and_gain(selection),
         material=material,
     )
 
 
-def _part(selection: Selection, step: Step, share: FloatArray, after: float) -> Part:
+def _part(selection: Selection, step: Step, share: Quantity, after: float, epoch_s: float) -> Part:
     assert step.entered is not None
     assert step.gains is not None
     model, z = selection.last.fit.model, selection.last.fit.z
@@ -327,29 +181,12 @@ def _part(selection: Selection, step: Step, share: FloatArray, after: float) -> 
         alias_set=step.aliases,
         # on another drive its gain would scatter by one standard error
         probability=float(ndtr(strength(step.gains))),
-        share=_quantity(share),
+        share=share,
         after=after,
-        parameters=_parameters(selection, step.entered),
-        onset_s=onset,
+        parameters=parameters_of(selection, step.entered),
+        onset_s=None if onset is None else onset + epoch_s,
         plausible=not model.at_limit(z, step.entered),
     )
-
-
-def _parameters(selection: Selection, name: str) -> dict[str, Quantity]:
-    """By jackknife over the folds: what parts of the drives disagree on is in the interval."""
-    model, z, folds = selection.last.fit.model, selection.last.fit.z, selection.last.held.z
-    count = len(folds)
-    every = np.concatenate([z[None], folds])
-    plants = model.plant.with_values(model.values(every))
-    reported = next(e for e in plants.effects if e.name == name).report(torch.as_tensor(plants.T_L))
-    out = {}
-    for key, value in reported.items():
-        x = np.broadcast_to(value.numpy(), (count + 1,) if value.dim() < 2 else value.shape)
-        if x.ndim != 1:
-            continue
-        sd = float(np.sqrt((count - 1) / count * ((x[1:] - x[1:].mean()) ** 2).sum()))
-        out[key] = Quantity(float(x[0]), sd, float(x[0] - 1.8 * sd), float(x[0] + 1.8 * sd))
-    return out
 
 
 def _quantity(draws: FloatArray) -> Quantity:

@@ -10,9 +10,8 @@ import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.budget.forward_selection import Selection, Step
+from avtorch.gap.budget.parts import HORIZON_S
 
-HORIZON_S = 10.0
-"""Of the rollouts [s]."""
 _BEGIN_S = 0.5  # over which the measured start of a rollout is averaged
 
 

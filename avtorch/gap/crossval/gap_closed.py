@@ -57,8 +57,8 @@ class Shrinkage:
 
     `metric`: the one of `by_metric` in which the gap is clearest. `placebo`: what `placebo_effect`, a wrong effect with
     about as many parameters, closes when added. `ceiling`: error after a flexible black box is added to the bare
-    baseline, by metric. `chosen`: share of the folds in which the other folds alone select the verdict. `blocks`:
-    number of held-out blocks. `by_drives`: whole drives were held out.
+    baseline, by metric. `chosen`: share of the folds in which the other folds alone select the verdict, None where
+    they were not asked. `blocks`: number of held-out blocks. `by_drives`: whole drives were held out.
     """
 
     metric: str
@@ -66,7 +66,7 @@ class Shrinkage:
     placebo_effect: str | None
     placebo: Quantity | None
     ceiling: Mapping[str, float]
-    chosen: float
+    chosen: float | None
     blocks: int
     by_drives: bool = False
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.errors import InputError
+from avtorch.gap.budget.parts import Budget
 from avtorch.gap.crossval.gap_closed import MetricShrinkage, Shrinkage
 from avtorch.gap.crossval.localisation import Location
 from avtorch.gap.quantity import Quantity, unit_of
@@ -78,6 +79,7 @@ class Diagnosis:
       (chain, draw) by the table's names
     - `where`, `shrinkage`: where the gap lies, and how far it shrinks on held-out folds; empty where there is no gap,
       None where the drives are too short to split or nothing was named
+    - `budget`: what each cause contributes to the gap; None where the drives are too short to hold out blocks
     - `traces`: the drives beside the rollouts of `simulator` and `plant`
     - `contenders`: predictive models of the alias set, as far as it was fitted
     - `next_experiment`, `setting`: objects as in `diagnosis.json`, None where they were not requested
@@ -87,7 +89,8 @@ class Diagnosis:
     - `complete` False: the budget ended the search; `scope`: what was tried, None where unknown. Where that is not
       everything, probabilities cover what was tried, and `unknown` includes the causes that were not
 
-    Raises `InputError` where verdict and hypotheses are inconsistent.
+    The verdict is the budget's where there is one, else the most probable hypothesis. Raises `InputError` where they
+    are inconsistent.
 
     Example:
         >>> from avtorch import Leader, diagnose, simulate
@@ -124,14 +127,17 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     onset_from_start_s: float | None = None
     onset_log: int = 0
+    budget: Budget | None = None
 
     def __post_init__(self) -> None:
         if self.onset_s is not None and self.onset_from_start_s is None:
             object.__setattr__(self, "onset_from_start_s", self.onset_s - self.log.epochs_s[self.onset_log])
         object.__setattr__(self, "candidates", listed_candidates(self.candidates))
         said = self.verdict.name
-        if self.probability(said) < self.candidates[0].probability - 1e-12:
+        if self.budget is None and self.probability(said) < self.candidates[0].probability - 1e-12:
             raise InputError(f"verdict: found {said}, needs the most probable, {self.candidates[0].name}")
+        if self.budget is not None and candidate_name(self.budget.verdict) != said:
+            raise InputError(f"verdict: found {said}, needs that of the budget, {candidate_name(self.budget.verdict)}")
         if said not in self.verdict.alias_set or self.verdict.abstained != (said == "unknown"):
             raise InputError(f"verdict: found {self.verdict}, needs itself in its alias set, and to abstain on unknown")
 
@@ -139,6 +145,7 @@ class Diagnosis:
         """The sentences of the terminal, one per line."""
         told = [
             sentences.headline(self),
+            *sentences.budget(self),
             *self.winner.implausible,
             self.verdict.why,
             sentences.aliases(self),
@@ -153,8 +160,9 @@ class Diagnosis:
 
     @property
     def winner(self) -> Candidate:
-        """The verdict's entry among the hypotheses."""
-        return next(c for c in self.candidates if c.name == self.verdict.name)
+        """The verdict's entry among the hypotheses; where it is too improbable to be listed, one without numbers."""
+        name = self.verdict.name
+        return next((c for c in self.candidates if c.name == name), Candidate(name, 0.0))
 
     def probability(self, names: str | Iterable[str]) -> float:
         """Probability of a hypothesis, by name or names; 0 where it is not listed."""
@@ -167,8 +175,9 @@ class Diagnosis:
         `complete`, `not_tried` (`effects` by name; `pairs`, of which "all", "some" or "none" were tried) and `notes`.
         """
         return {
-            "schema": "avtorch.diagnosis/1",
+            "schema": "avtorch.diagnosis/2",
             "log": self.log.to_dict(),
+            "budget": None if self.budget is None else self.budget.to_dict(),
             "baseline": plain(self.baseline),
             "gap": self.gap.to_dict(),
             "where": [w.to_dict() for w in self.where],

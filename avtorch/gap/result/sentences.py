@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
+from avtorch.gap.budget.parts import Budget
 from avtorch.gap.crossval.gap_closed import Shrinkage
 from avtorch.gap.crossval.localisation import UNITS, Location
 from avtorch.gap.quantity import Quantity
@@ -16,6 +17,7 @@ from avtorch.io.clock import clock_words
 
 SURE = 0.9
 """Probability from which a headline is unqualified."""
+_UNIT = {"speed": "m/s", "accel": "m/s²"}
 _ALIASES = 4  # hypotheses named beside the verdict
 _UNTRIED = 6  # names of effects listed as not tried
 _MEASURES = {
@@ -33,6 +35,8 @@ class Findings(Protocol):
     def baseline(self) -> Mapping[str, Quantity]: ...
     @property
     def gap(self) -> GapSize: ...
+    @property
+    def budget(self) -> Budget | None: ...
     @property
     def verdict(self) -> Verdict: ...
     @property
@@ -79,6 +83,8 @@ def _verdict(found: Findings) -> str:
     if verdict.name == "none":
         first = "The" if found.winner.probability >= SURE else "No effect stands out: probably the"
         return f"{first} simulator lacks nothing that this log shows ({p}){but}."
+    if found.budget is not None and (len(verdict.names) > 1 or verdict.partial):
+        return str(found.budget)
     told = meanings(verdict.name)
     # an implausible fit is not described by the effect's usual meaning
     told = ", but as fitted that is physically implausible." if odd else f": {told}." if told else "."
@@ -87,8 +93,24 @@ def _verdict(found: Findings) -> str:
     return f"{who} simulator lacks {' and '.join(verdict.names)} ({p}){told}"
 
 
+def budget(found: Findings) -> list[str]:
+    """The sentence on the budget of the gap, and what it divides."""
+    if found.budget is None or not found.budget.parts:
+        return []
+    line = [] if headline(found).endswith(str(found.budget)) else [str(found.budget)]
+    errors = [
+        f"{name} {error.before:.2g} to {error.left:.2g} {_UNIT[name]} (noise floor {error.floor:.2g})"
+        for name, error in found.budget.by_channel.items()
+    ]
+    return [*line, f"Error of held-out 10 s rollouts, without and with these effects: {', '.join(errors)}."]
+
+
 def onset(found: Findings) -> list[str]:
-    """The sentence on the onset."""
+    """The sentence on the onset; with several causes one for each that sets in during the drive."""
+    late = [] if found.budget is None else [p for p in found.budget.parts if p.onset_s is not None]
+    if late and len(found.verdict.names) > 1 and found.onset_s is None:
+        began = found.log.epochs_s[0]
+        return [f"Onset of {p.name}: {(p.onset_s or 0.0) - began:.1f} s after the log's start." for p in late]
     if found.onset_s is not None:
         return [f"Onset: at {moment(found)}."]
     return ["Onset: present from the start."] if found.winner.effects else []
@@ -130,7 +152,7 @@ def shrinkage(found: Findings) -> list[str]:
     told = found.shrinkage
     if told is None:
         return []
-    top, few = told.top, "" if told.chosen == 1 else f"; {100 * told.chosen:.0f} % of the folds selected it"
+    top, few = told.top, "" if told.chosen in (1, None) else f"; {100 * told.chosen:.0f} % of the folds selected it"
     parts = "drives" if told.by_drives else "blocks"
     if told.metric in _MEASURES:
         words, unit = _MEASURES[told.metric]
@@ -161,6 +183,12 @@ def moved(found: Findings) -> list[str]:
 def aliases(found: Findings) -> str:
     """The hypotheses that the log cannot distinguish from the verdict."""
     from_words = {"none": "no effect at all", "unknown": "a cause outside the table"}
+    if found.budget is not None and len(found.verdict.names) > 2:
+        alike = [(p.name, [n for n in p.alias_set if n != p.name]) for p in found.budget.parts]
+        told = [f"{name} from {' or '.join(others)}" for name, others in alike if others]
+        return (
+            f"This log cannot distinguish {', nor '.join(told)}." if told else "This log distinguishes these effects."
+        )
     if _cut(found):
         from_words["unknown"] = "a cause that was not tried"
     others = [from_words.get(n, n.replace("+", " with ")) for n in found.verdict.alias_set if n != found.verdict.name]

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from avtorch.arrays import FloatArray, IntArray
+from avtorch.gap.likelihood.record import Record
+from avtorch.gap.simulator.plant import GapPlant
+from avtorch.gap.simulator.simulator_input import Response
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,3 +34,13 @@ class Traces:
     def speed(self) -> FloatArray | None:
         """Measured speed, (row,); None where it was not measured."""
         return self.measured[self.channels.index("speed")] if "speed" in self.channels else None
+
+
+def rolled_out(record: Record, simulator: GapPlant) -> FloatArray:
+    """Rollouts (channel, counted, group) of a simulator over the whole drives of a record."""
+    responses: list[Response] = []
+    for drives in record.segments:
+        own = simulator.prepared(*drives)
+        responses += [own.response(drive) for drive in drives]
+    channels = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
+    return np.stack([record.seen(channels[name]) for name in record.channels])

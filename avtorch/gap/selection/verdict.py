@@ -94,14 +94,16 @@ def listed_candidates(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
 class Verdict:
     """The named causes, and the hypotheses that cannot be distinguished from them.
 
-    `names`: `("none",)`, `("unknown",)`, or one or two effects, the most probable. `alias_set`: the hypotheses that
-    this log cannot distinguish, including the verdict. `abstained`: it is `unknown`. `why`: one sentence.
+    `names`: `("none",)`, `("unknown",)`, or the effects, the one with the largest share of the gap first. `alias_set`:
+    the hypotheses that this log cannot distinguish, including the verdict. `abstained`: it is `unknown`. `why`: one
+    sentence. `partial`: effects are named, and something reproducible is left that no known effect explains.
     """
 
     names: tuple[str, ...]
     alias_set: tuple[str, ...]
     abstained: bool
     why: str
+    partial: bool = False
 
     @property
     def name(self) -> str:
@@ -113,6 +115,7 @@ class Verdict:
             "names": list(self.names),
             "alias_set": list(self.alias_set),
             "abstained": self.abstained,
+            "partial": self.partial,
             "why": self.why,
         }
 

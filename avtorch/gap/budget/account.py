@@ -1,0 +1,239 @@
+"""Who accounts for the gap: the likelihood's verdict where it holds, selection on held-out blocks where it does not.
+
+The likelihood is the sharper of the two where its equations hold: it names a cause that no rollout shows yet. Where it
+answers `unknown`, or calls for a random force that swallows whatever is reproducible, its noise model does not hold.
+Colour alone is no cause, so the blocks that were held out decide then, under a noise of free spectrum.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from avtorch.errors import InputError
+from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.forward_selection import MOST_PARTS, Selection, baseline_noise, select
+from avtorch.gap.budget.gap_budget import budget_of, largest_first
+from avtorch.gap.budget.given_effects import given_effects
+from avtorch.gap.budget.parts import LIKELY, MATERIAL, Budget, ChancePart, Part
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.search.fitted_model import FittedModel
+from avtorch.gap.selection.plausibility import implausible
+from avtorch.gap.selection.verdict import ALWAYS, Candidate, Verdict, candidate_name
+from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.plant import GapPlant
+from avtorch.io import Log
+
+_SHORT_S = 1.0  # blocks of drives too short for blocks of the usual length
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Account:
+    """A budget with the `verdict` and the `candidates` that agree with it.
+
+    `held_out`: the parts were selected on held-out blocks, with the steps in `selection`; else by the likelihood.
+    """
+
+    budget: Budget
+    selection: Selection
+    candidates: tuple[Candidate, ...]
+    verdict: Verdict
+    held_out: bool
+
+
+def account(
+    logs: Sequence[Log],
+    base: GapPlant,
+    kinds: Sequence[type[Effect]],
+    candidates: Sequence[Candidate],
+    verdict: Verdict,
+    winner: FittedModel | None,
+    *,
+    material: float = MATERIAL,
+    most: int = MOST_PARTS,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Account | None:
+    """The account of these drives, given the likelihood's `candidates`, its `verdict`, and the fit that won.
+
+    None where the drives are too short to hold out blocks.
+    """
+    record = _record(logs)
+    if record is None:
+        return None
+    if progress is not None:
+        progress("Budget of the gap", 0, 1)
+    fitting, bare = baseline_noise(record, base)
+    named = [] if winner is None else list(winner.hypothesis.effects)
+    values = {} if winner is None else winner.values
+    begun = given_effects(fitting, bare, named, values=values, onsets=_onsets(winner, logs))
+    epoch, options = logs[0].epoch_s, {"material": material, "seed": seed}
+    if winner is not None and not winner.blown:
+        selection = largest_first(begun, 0.0)
+        budget = budget_of(selection, epoch_s=epoch, given=True, **options)
+        if named or not budget.unexplained.material:
+            budget = _by_likelihood(budget, candidates, verdict, named, winner)
+            return Account(budget, selection, tuple(candidates), _verdict(budget, verdict), held_out=False)
+    selection = select(record, base, kinds, begun=begun, most=most, progress=progress)
+    selection = largest_first(selection, material)
+    budget = budget_of(selection, epoch_s=epoch, **options)
+    budget = replace(budget, chance=_chance(candidates, verdict, winner))
+    held_out = tuple(_spread(candidates, budget, kinds))
+    return Account(budget, selection, held_out, _verdict(budget, verdict), held_out=True)
+
+
+def _record(logs: Sequence[Log]) -> AnalysisRecord | None:
+    for shortest in (None, _SHORT_S):
+        try:
+            return AnalysisRecord.of(logs) if shortest is None else AnalysisRecord.of(logs, shortest_block_s=shortest)
+        except InputError:
+            continue
+    return None
+
+
+def _onsets(winner: FittedModel | None, logs: Sequence[Log]) -> dict[str, float]:
+    """When the winner's effects set in [s from the log's start]; of several drives nothing is said."""
+    if winner is None or winner.onset is None or len(logs) > 1:
+        return {}
+    record = winner.hypothesis.record
+    time = float(record.time[record.source[winner.onset]])
+    return {e.name: time for e in winner.hypothesis.effects if e.own_onset is None}
+
+
+# by the likelihood -------------------------------------------------------------------------------------------------
+def _by_likelihood(
+    budget: Budget,
+    candidates: Sequence[Candidate],
+    verdict: Verdict,
+    named: Sequence[type[Effect]],
+    winner: FittedModel,
+) -> Budget:
+    """The budget whose parts have the likelihood's probabilities, aliases, parameters and onset."""
+    by_name = {kind.name: kind for kind in named}
+    own = next(c for c in candidates if c.name == verdict.name)
+    parts = tuple(_part(part, by_name[part.name], own, candidates, verdict, winner) for part in budget.parts)
+    return replace(budget, parts=parts, chance=_chance(candidates, verdict, winner))
+
+
+def _part(
+    part: Part,
+    kind: type[Effect],
+    own: Candidate,
+    candidates: Sequence[Candidate],
+    verdict: Verdict,
+    winner: FittedModel,
+) -> Part:
+    aliases = _aliases(part.name, verdict)
+    parameters = _own_parameters(part.name, own)
+    late = kind.own_onset is not None or winner.onset is not None
+    return replace(
+        part,
+        alias_set=aliases,
+        probability=_probability(aliases, candidates),
+        parameters=parameters or part.parameters,
+        onset_s=own.onset_s if late else None,
+        plausible=not implausible(parameters, {}, [kind]),
+    )
+
+
+def _chance(candidates: Sequence[Candidate], verdict: Verdict, winner: FittedModel | None) -> tuple[ChancePart, ...]:
+    """The verdict's effects that chance decides."""
+    if winner is None:
+        return ()
+    random = list(winner.searched) + ([] if winner.by_chance is None else [type(winner.by_chance.law.effect)])
+    own = next(c for c in candidates if c.name == verdict.name)
+    out = []
+    for kind in random:
+        parameters = _own_parameters(kind.name, own)
+        probability = _probability(_aliases(kind.name, verdict), candidates)
+        out.append(ChancePart(kind.name, probability, None, parameters, not implausible(parameters, {}, [kind])))
+    return tuple(sorted(out, key=lambda part: -part.probability))
+
+
+def _aliases(name: str, verdict: Verdict) -> tuple[str, ...]:
+    """Effects that can take the place of `name` in the verdict, itself first."""
+    others = [n for n in verdict.names if n != name]
+    alike = [set(alias.split("+")) - set(others) for alias in verdict.alias_set if alias not in ALWAYS]
+    swapped = sorted(
+        next(iter(left))
+        for alias, left in zip([a for a in verdict.alias_set if a not in ALWAYS], alike, strict=True)
+        if len(left) == 1 and len(alias.split("+")) == len(verdict.names) and name not in left
+    )
+    return (name, *swapped)
+
+
+def _probability(aliases: Sequence[str], candidates: Sequence[Candidate]) -> float:
+    """That one of them is there: of all hypotheses that hold one."""
+    total = math.fsum(c.probability for c in candidates)
+    held = math.fsum(c.probability for c in candidates if set(aliases) & set(c.effects))
+    return min(held / total, 1.0)
+
+
+def _own_parameters(name: str, candidate: Candidate) -> Mapping[str, Quantity]:
+    if candidate.effects == (name,):
+        return candidate.parameters
+    return {key.partition(".")[2]: q for key, q in candidate.parameters.items() if key.partition(".")[0] == name}
+
+
+# by held-out blocks ------------------------------------------------------------------------------------------------
+def _spread(candidates: Sequence[Candidate], budget: Budget, kinds: Sequence[type[Effect]]) -> list[Candidate]:
+    """The hypotheses, with what `none` and `unknown` held shared out as held-out blocks decide.
+
+    The likelihood cannot say how probable a hypothesis is whose noise does not hold; what it left to `unknown` goes to
+    the parts that held-out blocks select, as far as these are sure, and to `unknown` as far as something material is
+    left besides.
+    """
+    free = math.fsum(c.probability for c in candidates if c.name in ALWAYS)
+    left = budget.unexplained.probability
+    name, sure = candidate_name(budget.names), min((p.probability for p in budget.parts), default=0.0)
+    shares = {"unknown": free * left, "none": free * (1 - left)}
+    if budget.names:
+        sure = min(p.probability for p in (*budget.parts, *budget.chance) if p.name in budget.names)
+        shares = {"unknown": free * ((1 - sure) + sure * left), "none": 0.0, name: free * sure * (1 - left)}
+    out = [replace(c, probability=shares.get(c.name, c.probability)) for c in candidates if c.name != name]
+    if budget.names:
+        before = next((c.probability for c in candidates if c.name == name), 0.0)
+        out.append(_selected(budget, name, min(before + shares[name], 1.0), kinds))
+    elif name:
+        out += [replace(c, probability=shares[name]) for c in candidates if c.name == name]
+    return out
+
+
+def _selected(budget: Budget, name: str, probability: float, kinds: Sequence[type[Effect]]) -> Candidate:
+    """The named parts as a hypothesis."""
+    parts = [p for p in (*budget.parts, *budget.chance) if p.probability >= LIKELY]
+    alone = len(parts) == 1
+    parameters = {key if alone else f"{p.name}.{key}": q for p in parts for key, q in (p.parameters or {}).items()}
+    onsets = [p.onset_s for p in budget.parts if p.probability >= LIKELY and p.onset_s is not None]
+    own = [k for k in kinds if k.name in budget.names]
+    odd = implausible(parameters, budget.repaired, own)
+    return Candidate(name, probability, None, parameters, budget.repaired, min(onsets, default=None), odd)
+
+
+# the verdict -------------------------------------------------------------------------------------------------------
+def _verdict(budget: Budget, by_likelihood: Verdict) -> Verdict:
+    """The budget's names, with the sets that these drives cannot distinguish from them."""
+    names = budget.verdict
+    if set(names) == set(by_likelihood.names):
+        return replace(by_likelihood, names=names, partial=budget.partial)
+    own = candidate_name(names)
+    swapped = [
+        candidate_name({*names} - {part.name} | {alias})
+        for part in budget.parts
+        if part.name in names
+        for alias in part.alias_set
+        if alias not in names
+    ]
+    return Verdict(names, (own, *dict.fromkeys(swapped)), own == "unknown", _why(budget), budget.partial)
+
+
+def _why(budget: Budget) -> str:
+    if not budget.names:
+        if budget.unexplained.material:
+            return "On held-out blocks no known effect reduces the error, though part of it is reproducible."
+        return "What the residuals hold is noise: commands, speed and place do not predict it on held-out blocks."
+    count = len(budget.names)
+    effects = "this effect" if count == 1 else f"these {count} effects"
+    return f"Held-out blocks select {effects}; residual noise may have any spectrum."

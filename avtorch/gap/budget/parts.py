@@ -1,0 +1,223 @@
+"""The result of a budget: its parts, what chance decides, what is unexplained, and the sentence a person reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from avtorch.gap.quantity import Quantity
+
+HORIZON_S = 10.0
+"""Of the rollouts whose errors a budget divides [s]."""
+MATERIAL = 0.03
+"""Share of the gap from which something counts, unless a user says otherwise."""
+LIKELY = 0.5
+"""Probability from which a part is named."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A cause: its `share` of the gap, `after` it the root of the energy that is left, and its parameters.
+
+    `alias_set`: effects that these drives cannot distinguish from it, itself among them. `probability`: that one of
+    them is really there. `onset_s` on the log's own clock, None: from the start. `plausible`: its parameters are
+    physically possible.
+
+    Example:
+        >>> from avtorch.gap import Part, Quantity
+        >>> share, size = Quantity(0.6, 0.05, 0.5, 0.7), Quantity(0.31, 0.02, 0.28, 0.34)
+        >>> part = Part("sensor_bias", ("sensor_bias",), 0.97, share, 1.2, {"bias_mps2": size})
+        >>> part.to_dict()["names"], part.to_dict()["share"]["mean"]
+        (['sensor_bias'], 0.6)
+    """
+
+    name: str
+    alias_set: tuple[str, ...]
+    probability: float
+    share: Quantity
+    after: float
+    parameters: Mapping[str, Quantity]
+    onset_s: float | None = None
+    plausible: bool = True
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "names": [self.name],
+            "alias_set": list(self.alias_set),
+            "probability": self.probability,
+            "share": _interval(self.share),
+            "after": self.after,
+            "parameters": {key: value.to_dict() for key, value in self.parameters.items()},
+            "onset_s": self.onset_s,
+            "plausible": self.plausible,
+        }
+
+
+@dataclass(frozen=True)
+class ChancePart:
+    """A cause that chance decides, such as a gust: no rollout foretells it, so it is a part of the noise.
+
+    `share_of_noise`: of the variance that is left with all parts; None where it was not estimated.
+
+    Example:
+        >>> from avtorch.gap import ChancePart
+        >>> ChancePart("outliers", 0.97).to_dict()["probability"]
+        0.97
+    """
+
+    name: str
+    probability: float
+    share_of_noise: float | None = None
+    parameters: Mapping[str, Quantity] | None = None
+    plausible: bool = True
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "names": [self.name],
+            "probability": self.probability,
+            "share_of_noise": self.share_of_noise,
+            "parameters": {key: value.to_dict() for key, value in (self.parameters or {}).items()},
+            "plausible": self.plausible,
+        }
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """The share that is reproducible and that no cause explains.
+
+    `material`: surely more than a user cares for; `probability`: that it is more.
+
+    Example:
+        >>> from avtorch.gap import Quantity, Unexplained
+        >>> Unexplained(Quantity(0.2, 0.04, 0.12, 0.27), material=True, probability=0.99).to_dict()["material"]
+        True
+    """
+
+    share: Quantity
+    material: bool
+    probability: float = 0.0
+    resembles: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "share": _interval(self.share),
+            "material": self.material,
+            "probability": self.probability,
+            "where": [],
+            "resembles": self.resembles,
+        }
+
+
+@dataclass(frozen=True)
+class ChannelError:
+    """Root mean squared error of rollouts in one channel [m/s or m/s²]: before, at the floor, and with all causes.
+
+    Example:
+        >>> from avtorch.gap import ChannelError
+        >>> ChannelError(before=0.5, floor=0.1, left=0.12).to_dict()
+        {'before': 0.5, 'floor': 0.1, 'left': 0.12}
+    """
+
+    before: float
+    floor: float
+    left: float
+
+    def to_dict(self) -> dict[str, float]:
+        return {"before": self.before, "floor": self.floor, "left": self.left}
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The gap's budget: roots of energies `before`, `left` and `floor` (1 by definition), and where they come from.
+
+    `parts` in the order of their shares; these and `unexplained` sum to 1. `baseline`, `repaired`: `T_L` [s] and `K_L`
+    [-] without any cause, and with all parts. Where rollouts show no gap, `unexplained` is the whole of nothing.
+
+    Example:
+        >>> from avtorch import Leader, simulate
+        >>> from avtorch.gap import ConstantResistance, gap_budget, plant
+        >>> dragging = plant([ConstantResistance(0.2)], sigma=0.02)
+        >>> log = simulate(Leader.default(start=30.0, duration=40.0, dt=0.1), plant=dragging).log()
+        >>> budget = gap_budget(log, effects=["constant_resistance"])
+        >>> part = budget.parts[0]
+        >>> part.name, round(part.parameters["resistance_mps2"].mean, 1), budget.verdict
+        ('constant_resistance', 0.2, ('constant_resistance',))
+        >>> print(budget)
+        Chiefly constant_resistance (100 % of the gap); the rest is noise.
+        >>> speed = budget.by_channel["speed"]
+        >>> speed.before > 3 * speed.left
+        True
+    """
+
+    before: float
+    left: float
+    by_channel: Mapping[str, ChannelError]
+    parts: tuple[Part, ...]
+    unexplained: Unexplained
+    baseline: Mapping[str, float]
+    repaired: Mapping[str, Quantity]
+    chance: tuple[ChancePart, ...] = ()
+    material: float = MATERIAL
+    floor: float = 1.0
+    by_drives: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Causes that are more likely there than not: parts, the largest first, then those that chance decides."""
+        return tuple(x.name for x in (*self.parts, *self.chance) if x.probability >= LIKELY)
+
+    @property
+    def verdict(self) -> tuple[str, ...]:
+        """`names`; without any `("unknown",)` where something material is reproducible, else `("none",)`."""
+        return self.names or (("unknown",) if self.unexplained.material else ("none",))
+
+    @property
+    def partial(self) -> bool:
+        """Whether causes are named and something material is left besides."""
+        return bool(self.names) and self.unexplained.material
+
+    def __str__(self) -> str:
+        """What a person reads first."""
+        if not self.names:
+            found = "No known effect explains the gap." if self.unexplained.material else "Nothing material is missing."
+            return found
+        named = [p for p in self.parts if p.probability >= LIKELY]
+        large = [p for p in named if p.share.mean >= self.material] or named[:1]
+        small = [p.name for p in named if p not in large]
+        words = [f"{p.name} ({percent(p.share.mean)} of the gap)" for p in large]
+        lines = [f"Chiefly {', then '.join(words)}"] if words else []
+        if small:
+            lines.append(f"{' and '.join(small)} with under {percent(self.material)}{' each' if small[1:] else ''}")
+        if self.unexplained.share.mean >= 0.005 and named:
+            lines.append(f"{percent(self.unexplained.share.mean)} is reproducible and no known effect explains it")
+        by_chance = [c.name for c in self.chance if c.probability >= LIKELY]
+        noise = "noise" if not by_chance else f"noise, in part by {' and '.join(by_chance)}"
+        lines.append(f"the rest is {noise}")
+        text = "; ".join(lines) + "."
+        return text[0].upper() + text[1:]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The object `budget` of `diagnosis.json`."""
+        return {
+            "metric": "rollout_10s_over_floor",
+            "horizon_s": HORIZON_S,
+            "heldout_by": "drives" if self.by_drives else "blocks",
+            "before": self.before,
+            "floor": self.floor,
+            "left": self.left,
+            "by_channel": {name: error.to_dict() for name, error in self.by_channel.items()},
+            "parts": [part.to_dict() for part in self.parts],
+            "chance": [part.to_dict() for part in self.chance],
+            "unexplained": self.unexplained.to_dict(),
+            "material": self.material,
+        }
+
+
+def percent(share: float) -> str:
+    """A share as it is printed."""
+    return "under 1 %" if 0 < share < 0.01 else f"{100 * share:.0f} %"
+
+
+def _interval(share: Quantity) -> dict[str, float]:
+    return {"mean": share.mean, "q05": share.q05, "q95": share.q95}

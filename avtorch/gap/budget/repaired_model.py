@@ -1,0 +1,73 @@
+"""The car with all parts of a budget: its parameters with intervals, and the simulator that holds them.
+
+What the folds disagree on is the uncertainty (a jackknife): it counts what differs from one stretch of driving to
+another, where a posterior of misspecified equations does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
+
+from avtorch.arrays import FloatArray
+from avtorch.gap.budget.forward_selection import Selection
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.plant import GapPlant, plant
+
+
+def parameters_of(selection: Selection, name: str) -> dict[str, Quantity]:
+    """The parameters of one effect under the answer's names."""
+    model, every = selection.last.fit.model, _folds(selection)
+    plants = model.plant.with_values(model.values(every))
+    reported = next(e for e in plants.effects if e.name == name).report(torch.as_tensor(plants.T_L))
+    out = {}
+    for key, value in reported.items():
+        x = np.broadcast_to(value.numpy(), (len(every),) if value.dim() < 2 else value.shape)
+        if x.ndim == 1:
+            out[key] = _jackknife(x)
+    return out
+
+
+def lag_and_gain(selection: Selection) -> dict[str, Quantity]:
+    """`T_L` [s] and `K_L` [-], fitted together with all parts."""
+    values = selection.last.fit.model.values(_folds(selection))
+    return {key: _jackknife(values[key].numpy()) for key in ("T_L", "K_L")}
+
+
+def repaired_plant(selection: Selection, base: GapPlant, sigma: float) -> GapPlant:
+    """The simulator with all parts, from the start of a drive even where the car has them from an onset.
+
+    `sigma`: its jerk noise.
+    """
+    model, z = selection.last.fit.model, selection.last.fit.z
+    values = {key: x if x.dim() else float(x) for key, x in model.values(z).items()}
+    filled = model.plant.with_values(values)
+    own = set(model.names)
+    effects: Sequence[Effect] = [e for e in filled.effects if e.name in own]
+    return plant(effects, baseline=base, T_L=float(filled.T_L), K_L=float(filled.K_L), sigma=sigma)
+
+
+def parameter_draws(selection: Selection, *, count: int = 64, seed: int = 0) -> dict[str, FloatArray]:
+    """Draws (draw,) of the repaired simulator's parameters, normal with the folds' covariance."""
+    model, z, folds = selection.last.fit.model, selection.last.fit.z, selection.last.held.z
+    away = (folds - folds.mean(0)) * np.sqrt((len(folds) - 1) / len(folds))
+    normal = np.random.default_rng(seed).standard_normal((count, len(folds)))
+    values = model.values(z + normal @ away)
+    return {key: x.numpy() for key, x in values.items() if x.dim() == 1}
+
+
+def _folds(selection: Selection) -> FloatArray:
+    """(1 + fold, size): all blocks, then without each fold."""
+    return np.concatenate([selection.last.fit.z[None], selection.last.held.z])
+
+
+def _jackknife(x: FloatArray) -> Quantity:
+    """Of values with all blocks, then without each fold."""
+    count = len(x) - 1
+    half = float(student.ppf(0.95, count - 1))  # pyright: ignore[reportUnknownMemberType]
+    sd = float(np.sqrt((count - 1) / count * ((x[1:] - x[1:].mean()) ** 2).sum()))
+    return Quantity(float(x[0]), sd, float(x[0] - half * sd), float(x[0] + half * sd))
