@@ -137,7 +137,7 @@ def test_files_and_words(
     assert "T_L 0.52 → 0.31 s, K_L 1.02 → 0.99" in told.out
     assert "diagnosis.json, plant.toml (the repaired simulator)" in told.out
     written = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
-    assert written["schema"] == "avtorch.diagnosis/1"
+    assert written["schema"] == "avtorch.diagnosis/1"  # as its stand-in for the search has no budget
     assert written["log"]["rows"] == 2 * ROWS
     repaired = GapPlant.from_toml((out / "plant.toml").read_text(encoding="utf-8"))
     assert float(repaired.values()["dead_time.delay_s"]) == 0.182

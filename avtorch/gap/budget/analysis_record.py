@@ -21,6 +21,8 @@ from avtorch.io import Log
 
 RATE_HZ = 20.0
 """Rows a second at most: the noise above half of this is not modelled, and no effect but a ring shows there."""
+_USUAL_LAG_S = 0.3
+_ROWS_A_PERIOD = 6
 _SETTLE_S = 3.0  # at the beginning of a stretch, and after rows that are masked, until the start no longer matters
 _LONGEST_BLOCK_S = 10.0
 _SHORTEST_BLOCK_S = 4.0
@@ -79,7 +81,9 @@ class AnalysisRecord:
             raise InputError("logs: found no channel that all of them have, needs speed or accel in each")
         usable = sum(float(log.usable.sum()) / log.rate_hz for log in logs)
         length = float(np.clip(usable / _BLOCKS, shortest_block_s, _LONGEST_BLOCK_S))
-        step = 1.0 / min(rate_hz, min(log.rate_hz for log in logs))
+        slowest = min(log.rate_hz for log in logs)
+        # whole rows of the slowest log, so that nothing is interpolated there
+        step = max(1, int(slowest / _rate_needed(logs, rate_hz) + 1e-6)) / slowest
         pieces = [piece for number, log in enumerate(logs) for piece in _pieces(log, number, step, channels, length)]
         if not pieces:
             raise InputError(f"logs: found no stretch of {shortest_block_s + _SETTLE_S + 1.0:g} s, needs some")
@@ -165,10 +169,31 @@ def _pieces(log: Log, number: int, step: float, channels: Sequence[str], length:
     return pieces
 
 
+def _rate_needed(logs: Sequence[Log], rate_hz: float) -> float:
+    """`rate_hz`, or more where commands are too quick for it: a row's mean command hides what moves within the row.
+
+    Six rows a period keep a sine's response to 5 %; the power that counts is what a usual lag lets through.
+    """
+    for log in logs:
+        for part in log.segments() if log.accel_cmd is not None else ():
+            command = log.accel_cmd[part]
+            if len(command) < 2:
+                continue
+            frequency = np.fft.rfftfreq(len(command), 1.0 / log.rate_hz)
+            power = np.abs(np.fft.rfft(command - command.mean())) ** 2 / (
+                1 + (2 * np.pi * frequency * _USUAL_LAG_S) ** 2
+            )
+            below = np.searchsorted(np.cumsum(power), 0.95 * power.sum())
+            rate_hz = max(rate_hz, _ROWS_A_PERIOD * float(frequency[min(int(below), len(frequency) - 1)]))
+    return rate_hz
+
+
 def _mean_around(x: FloatArray, rows: int) -> FloatArray:
-    """Mean over `rows` rows around each."""
-    padded = np.pad(x, (rows // 2, rows - 1 - rows // 2), mode="edge")
-    return np.convolve(padded, np.full(rows, 1.0 / rows), "valid")
+    """Mean over `rows` rows around each; of an even number the outermost two count half, so that nothing shifts."""
+    weights = np.full(rows, 1.0 / rows)
+    if rows % 2 == 0:
+        weights = np.convolve(weights, [0.5, 0.5])
+    return np.convolve(np.pad(x, len(weights) // 2, mode="edge"), weights, "valid")
 
 
 def _settled(usable: BoolArray, rows: int) -> BoolArray:

@@ -170,12 +170,14 @@ class Diagnosis:
         return next((c.probability for c in self.candidates if c.name == name), 0.0)
 
     def to_dict(self) -> dict[str, Any]:
-        """The object of `diagnosis.json`. Beyond the schema's keys it has `moved`, `onset_s`, `plausible` and
-        `plausibility` of each effect, the last two of the verdict, `onset_from_start_s`, `setting`, `remaining`,
-        `complete`, `not_tried` (`effects` by name; `pairs`, of which "all", "some" or "none" were tried) and `notes`.
+        """The object of `diagnosis.json`, schema `avtorch.diagnosis/2`, or `/1` where there is no budget.
+
+        Beyond the schema's keys it has `moved`, `onset_s`, `plausible` and `plausibility` of each effect, the last two
+        of the verdict, `onset_from_start_s`, `setting`, `remaining`, `complete`, `not_tried` (`effects` by name;
+        `pairs`, of which "all", "some" or "none" were tried) and `notes`.
         """
         return {
-            "schema": "avtorch.diagnosis/2",
+            "schema": f"avtorch.diagnosis/{1 if self.budget is None else 2}",
             "log": self.log.to_dict(),
             "budget": None if self.budget is None else self.budget.to_dict(),
             "baseline": plain(self.baseline),

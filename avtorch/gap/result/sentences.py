@@ -186,9 +186,7 @@ def aliases(found: Findings) -> str:
     if found.budget is not None and len(found.verdict.names) > 2:
         alike = [(p.name, [n for n in p.alias_set if n != p.name]) for p in found.budget.parts]
         told = [f"{name} from {' or '.join(others)}" for name, others in alike if others]
-        return (
-            f"This log cannot distinguish {', nor '.join(told)}." if told else "This log distinguishes these effects."
-        )
+        return f"This log cannot distinguish {', nor '.join(told)}." if told else "This log distinguishes them."
     if _cut(found):
         from_words["unknown"] = "a cause that was not tried"
     others = [from_words.get(n, n.replace("+", " with ")) for n in found.verdict.alias_set if n != found.verdict.name]
