@@ -75,9 +75,10 @@ def diagnosis_table(found: Diagnosis) -> Table:
         style = "bold" if first else None if c.name in found.verdict.alias_set else "dim"
         gain = round(c.log_evidence or 0.0)
         nats = "" if c.log_evidence is None else f"{gain:+d}" if gain else "0"
-        lines = [_parameter(name, c.parameters, q) for name, q in c.parameters.items()]
+        several = len(c.effects) > 2
+        lines = [] if several else [_parameter(name, c.parameters, q) for name, q in c.parameters.items()]
         lines += ["physically implausible"] if c.implausible and c.name != "unknown" else []
-        name = c.name.replace("+", " +\n")
+        name = f"these {len(c.effects)} effects" if several else c.name.replace("+", " +\n")
         table.add_row(
             escape(name), f"{number(c.probability)} {bar(c.probability)}", nats, "\n".join(lines), style=style
         )

@@ -13,7 +13,7 @@ from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.budget.parts import LIKELY, Budget, percent
 from avtorch.gap.crossval.localisation import UNITS, Axis
-from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.diagnosis import Candidate, Diagnosis
 from avtorch.io.clock import time_label
 from avtorch.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILLION, styled
 from avtorch.vehicle.stability import Chain, chain_gain
@@ -62,9 +62,9 @@ def gap_on_the_road(ax: Axes, found: Diagnosis, *, seconds: float = _SECONDS) ->
     ax.plot(time, traces.measured[k][inside], color=BLACK, lw=1.2, label="measured")
     ax.plot(time, traces.before[k][inside] + offset[0], color=VERMILLION, label="baseline simulator")
     if found.winner.effects:
-        ax.plot(
-            time, traces.after[k][inside] + offset[1], color=BLUE, label=f"with {' and '.join(found.verdict.names)}"
-        )
+        named = found.verdict.names
+        label = f"with {' and '.join(named)}" if len(named) < 3 else f"with all {len(named)} effects"
+        ax.plot(time, traces.after[k][inside] + offset[1], color=BLUE, label=label)
     ax.set(
         xlabel=time_label(found.log.epochs_s[0] if len(found.log.epochs_s) == 1 else 0.0),
         ylabel=_NAMES[traces.channels[k]],
@@ -124,12 +124,18 @@ def probabilities(ax: Axes, found: Diagnosis, *, most: int = 7) -> Axes:
     some = list(found.candidates[:most])[::-1]
     colours = [BLUE if c.name in found.verdict.alias_set else "#BBBBBB" for c in some]
     ax.barh(range(len(some)), [c.probability for c in some], color=colours, height=0.7)
-    ax.set_yticks(range(len(some)), [c.name.replace("+", " +\n") for c in some])
+    ax.set_yticks(range(len(some)), [_label(c) for c in some])
     for i, c in enumerate(some):
         ax.text(c.probability + 0.01, i, f"{c.probability:.2f}", va="center", fontsize=9, color=BLACK)
     ax.set(xlabel="probability", xlim=(0, 1.1))
     ax.grid(axis="y", visible=False)
     return ax
+
+
+def _label(candidate: Candidate) -> str:
+    """A hypothesis's name on at most two lines."""
+    count = len(candidate.effects)
+    return candidate.name.replace("+", " +\n") if count < 3 else f"the {count} effects\nof the budget"
 
 
 _HORIZONS = ("0.5s", "2s", "10s", "whole")

@@ -161,10 +161,10 @@ def _number(q: Quantity | None, digits: int = 3) -> str:
 
 
 def _candidate(found: Diagnosis, c: Any) -> Mapping[str, Any]:
-    parameters = _parameters(c.parameters)
+    parameters = _parameters(c.parameters) if len(c.effects) < 3 else []
     parameters += ["physically implausible"] if c.implausible and c.name != "unknown" else []
     return {
-        "name": c.name.replace("+", " + "),
+        "name": c.name.replace("+", " + ") if len(c.effects) < 3 else f"these {len(c.effects)} effects",
         "probability": sentences.number(c.probability),
         "width": round(100 * c.probability, 1),
         "nats": "" if c.log_evidence is None else f"{c.log_evidence:+.0f}",
@@ -244,7 +244,8 @@ def _measures(found: Diagnosis) -> Sequence[Mapping[str, Any]]:
 
 
 def _percent(q: Quantity) -> str:
-    return f"{100 * q.mean:.0f} % ({100 * q.q05:.0f} to {100 * q.q95:.0f})"
+    mean, low, high = (round(100 * x) for x in (q.mean, q.q05, q.q95))
+    return f"{mean} % ({low} to {high})"
 
 
 def _placebo(found: Diagnosis) -> str | None:

@@ -144,6 +144,7 @@ def test_files_and_words(
     (call,) = search.calls
     assert [log.name for log in call.pop("logs")] == [drive, other]
     assert call == {
+        "material": 0.03,
         "fits_before": 0,
         "baseline": None,
         "prior": None,

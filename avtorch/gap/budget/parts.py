@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -188,7 +188,7 @@ class Budget:
         words = [f"{p.name} ({percent(p.share.mean)} of the gap)" for p in large]
         lines = [f"Chiefly {', then '.join(words)}"] if words else []
         if small:
-            lines.append(f"{' and '.join(small)} with under {percent(self.material)}{' each' if small[1:] else ''}")
+            lines.append(f"{listing(small)} with under {percent(self.material)}{' each' if small[1:] else ''}")
         if self.unexplained.share.mean >= 0.005 and named:
             lines.append(f"{percent(self.unexplained.share.mean)} is reproducible and no known effect explains it")
         by_chance = [c.name for c in self.chance if c.probability >= LIKELY]
@@ -212,6 +212,11 @@ class Budget:
             "unexplained": self.unexplained.to_dict(),
             "material": self.material,
         }
+
+
+def listing(names: Sequence[str]) -> str:
+    """Names in a sentence."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def percent(share: float) -> str:

@@ -154,20 +154,21 @@ def shrinkage(found: Findings) -> list[str]:
         return []
     top, few = told.top, "" if told.chosen in (1, None) else f"; {100 * told.chosen:.0f} % of the folds selected it"
     parts = "drives" if told.by_drives else "blocks"
+    effect, it, closes = ("effects", "them", "close") if len(found.verdict.names) > 1 else ("effect", "it", "closes")
     if told.metric in _MEASURES:
         words, unit = _MEASURES[told.metric]
         over = _over(top.horizon_s)
-        errors = f"{words} error {top.before:.2g} {unit} without the effect, {top.after:.2g} {unit} with it"
+        errors = f"{words} error {top.before:.2g} {unit} without the {effect}, {top.after:.2g} {unit} with {it}"
         line = f"On held-out {parts}{over}: {errors}"
     else:
         gain = top.after - top.before
-        density = f"log predictive density {gain:+.2g} nats per row with the effect"
+        density = f"log predictive density {gain:+.2g} nats per row with the {effect}"
         line = f"On held-out {parts}: {density}; rollouts do not show it"
     if top.closed is None:
         return [f"{line}; almost none of the gap is reducible{few}."]
     q = top.closed
     share = f"{100 * q.mean:.0f} % ({100 * q.q05:.0f} to {100 * q.q95:.0f})"
-    return [f"{line}; the effect closes {share} of the reducible gap{few}."]
+    return [f"{line}; the {effect} {closes} {share} of the reducible gap{few}."]
 
 
 def moved(found: Findings) -> list[str]:
@@ -177,7 +178,8 @@ def moved(found: Findings) -> list[str]:
         if name in with_it and name in baseline:
             unit = " s" if name == "T_L" else ""
             told.append(f"{name} {baseline[name].mean:.2f} → {with_it[name].mean:.2f}{unit}")
-    return [f"Baseline fitted without and with the effect: {', '.join(told)}."] if told else []
+    effects = "effects" if len(found.verdict.names) > 1 else "effect"
+    return [f"Baseline fitted without and with the {effects}: {', '.join(told)}."] if told else []
 
 
 def aliases(found: Findings) -> str:
