@@ -24,7 +24,7 @@ from torch import Tensor
 from avtorch.arrays import BoolArray, Float, FloatArray, Int, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.simulator.simulator_input import Place, SimulatorInput
-from avtorch.io import Log
+from avtorch.io import Log, fingerprint
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import AccelKind
@@ -253,6 +253,11 @@ class Record:
             parts.append(x.unflatten(-1, (-1, 1 if coarse else self.group)))
         whole = parts[0] if len(parts) == 1 else torch.cat(parts, -2)
         return whole.numpy()[..., self.source, :]
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Of the data, to the bit: what a stored fit belongs to."""
+        return fingerprint(self)
 
     @cached_property
     def shared_columns(self) -> dict[tuple[type, bool], FloatArray]:
