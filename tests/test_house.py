@@ -69,7 +69,7 @@ def test_types_of_arrays_are_defined_once() -> None:
 
 FILLED = {
     "gap/simulator/effect.py": "the table of effects, one for all, to which a user adds",
-    "io/answer_set.py": "folders that this process is writing and those it has published, for a message after an interruption",
+    "io/answer_set.py": "folders that this process writes or has published, for a message after an interruption",
 }
 
 
@@ -77,10 +77,11 @@ FILLED = {
 def test_what_a_file_has_computed_belongs_to_an_object(path: Path) -> None:
     """No empty container at the top of a module, to be filled as calls come: two searches would share it."""
     empty = re.compile(r"^(?:\{\}|\[\]|(?:\w+\.)?(?:dict|list|set|Weak\w+|defaultdict|OrderedDict|deque)\([^()]*\))$")
+    if path.relative_to(PACKAGE).as_posix() in FILLED:
+        return
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
         if isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
-            if str(path.relative_to(PACKAGE)) not in FILLED:
-                assert not empty.match(ast.unparse(node.value)), f"line {node.lineno}: {ast.unparse(node)}"
+            assert not empty.match(ast.unparse(node.value)), f"line {node.lineno}: {ast.unparse(node)}"
 
 
 def imports() -> dict[str, set[str]]:

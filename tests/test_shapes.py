@@ -13,6 +13,7 @@ from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.gap.likelihood.basis import lowpass
 from avtorch.inference import JerkStatistics
+from avtorch.inference.estimators.state_model import GaussianState
 from avtorch.vehicle import Block
 from avtorch.vehicle.stability import local_stable
 from tests.shapes import ShapeError, checked
@@ -73,6 +74,13 @@ def test_inference_is_under_the_check() -> None:
     JerkStatistics(*[sums] * 7)
     with pytest.raises(ShapeError, match=r"JerkStatistics\.__init__, uu"):
         JerkStatistics(*[sums] * 6, torch.ones(3, dtype=torch.float64))
+
+
+def test_the_fields_of_a_named_tuple_are_under_the_check() -> None:
+    mean = torch.ones(2, 3, dtype=torch.float64)
+    GaussianState(mean, torch.ones(2, 3, 3, dtype=torch.float64))
+    with pytest.raises(ShapeError, match="cov"):
+        GaussianState(mean, mean)
 
 
 def test_likelihood_is_under_the_check() -> None:

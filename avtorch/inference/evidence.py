@@ -8,6 +8,7 @@ from typing import Protocol
 
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float
 from avtorch.inference.density import Density
 from avtorch.inference.excitation import ExcitationRule
 from avtorch.inference.jerk import JerkDensity, JerkStatistics
@@ -38,8 +39,8 @@ class Evidence:
         ([200.0], [True])
     """
 
-    n: Tensor
-    excited: Tensor
+    n: Float[Tensor, " vehicle"]
+    excited: Bool[Tensor, " vehicle"]
     density: Callable[[Tensor, Prior], Density]
 
 

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief, Summary
 from avtorch.inference.density import Density
@@ -110,7 +111,7 @@ class SequentialInference:
             later = LogSpaceNormal(self._mean_z, widening * self._cov_z)
         return Switch(self._started, self.first_prior, later)
 
-    def update(self, density: Callable[[Tensor, Prior], Density], excited: Tensor) -> Belief:
+    def update(self, density: Callable[[Tensor, Prior], Density], excited: Bool[Tensor, " vehicle"]) -> Belief:
         """Take in one window of every vehicle.
 
         Args:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief
 from avtorch.inference.estimators.choose import make_estimator
@@ -45,7 +46,7 @@ class Window:
 
     start_s: float
     end_s: float
-    n: Tensor
+    n: Float[Tensor, " vehicle"]
     belief: Belief
 
 

@@ -40,11 +40,11 @@ class Coordinates:
         narrowest = torch.linalg.eigvalsh(mode.covariance)[:, :1].clamp_min(0.0).sqrt()
         return cls(mode.z, torch.diag_embed(narrowest.expand_as(mode.z)))
 
-    def z(self, w: Tensor) -> Tensor:
+    def z(self, w: Float[Tensor, "*draw window d"]) -> Float[Tensor, "*draw window d"]:
         """``w`` ``(..., window, d)`` as log parameters (or whatever the density's unconstrained space is)."""
         return lower_times(self.lower, w).add_(self.mode)
 
-    def pull_back(self, score: Tensor) -> Tensor:
+    def pull_back(self, score: Float[Tensor, "*draw window d"]) -> Float[Tensor, "*draw window d"]:
         """A gradient in ``z`` as one in ``w``."""
         return lower_transposed_times(self.lower, score)
 

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.arrays import BoolArray, Float, FloatArray, Int, IntArray
+from avtorch.arrays import Bool, BoolArray, Float, FloatArray, Int, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.simulator.simulator_input import Place, SimulatorInput
 from avtorch.io import Log, fingerprint
@@ -88,7 +88,7 @@ class Record:
         return tuple(name for name in ("accel", "speed") if getattr(self, name) is not None)
 
     @property
-    def starts(self) -> IntArray:
+    def starts(self) -> Int[IntArray, " stretch"]:
         """Index of each stretch's first counted row."""
         return np.flatnonzero(np.diff(self.stretch, prepend=-1))
 
@@ -212,7 +212,7 @@ class Record:
         numbers = {n: i for i, n in enumerate(dict.fromkeys(cut.segment for cut in self.cuts))}
         return tuple(numbers[cut.segment] for cut in self.cuts)
 
-    def only(self, rows: BoolArray) -> Record:
+    def only(self, rows: Bool[BoolArray, " counted"]) -> Record:
         """The same drives, of which only these `rows` (counted,) still count, in stretches of 2 s or more.
 
         Rollouts cover whole drives as before; rows that no longer count are neither fitted nor scored.

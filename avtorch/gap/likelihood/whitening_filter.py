@@ -181,7 +181,9 @@ class WhiteningFilter:
         """The term of the log likelihood that does not depend on the errors."""
         return float(self.constants(coarse=coarse).sum())
 
-    def log_likelihood(self, errors: Float[FloatArray, "*column channel counted group"]) -> FloatArray:
+    def log_likelihood(
+        self, errors: Float[FloatArray, "*column channel counted group"]
+    ) -> Float[FloatArray, "*column"]:
         """Log likelihood (...) of errors (..., channel, counted, group)."""
         e = self(errors)
         return self.constant_of(coarse=errors.shape[-1] == 1) - 0.5 * (e**2).sum((-1, -2, -3))

@@ -33,9 +33,9 @@ class Interval(NamedTuple):
         [1.42, 1.82, 2.43]
     """
 
-    q05: Tensor
-    q50: Tensor
-    q95: Tensor
+    q05: Float[Tensor, "*setting"]
+    q50: Float[Tensor, "*setting"]
+    q95: Float[Tensor, "*setting"]
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ def nyquist(s: LinearLoop) -> Bool[Tensor, "..."]:
     return s.valid & (s.ks > 0) & neutral & (right == 0)
 
 
-def lost_at(s: LinearLoop) -> Tensor:
+def lost_at(s: LinearLoop) -> Float[Tensor, "*setting"]:
     """Smallest dead time [s] at which a loop loses its local stability; 0 where it is unstable without dead time."""
     omega, phase, sign = crossings(s)
     first = torch.where(sign > 0, phase / omega, torch.full_like(phase, torch.inf)).amin(-1)
