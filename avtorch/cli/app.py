@@ -52,9 +52,9 @@ def main(tokens: Sequence[str] | None = None) -> int:
         app(tokens, exit_on_error=False, print_error=False)
     except (InputError, CycloptsError) as fault:
         # one line, however many the parser's own message has
-        said = _missing(fault) if isinstance(fault, MissingArgumentError) else str(fault)
+        message = _missing(fault) if isinstance(fault, MissingArgumentError) else str(fault)
         most = None if isinstance(fault, InputError) else 400
-        print("avtorch: " + printable(" ".join(said.split()), most), file=sys.stderr)
+        print("avtorch: " + printable(" ".join(message.split()), most), file=sys.stderr)
         return 2
     except OSError as fault:
         # a file system that fails where no command expects it to

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from torch import Tensor
 
-from avtorch.arrays import Bool, Float
+from avtorch.arrays import Bool, Real
 from avtorch.inference.density import Density
 from avtorch.inference.excitation import ExcitationRule
 from avtorch.inference.jerk import JerkDensity, JerkStatistics
@@ -39,7 +39,7 @@ class Evidence:
         ([200.0], [True])
     """
 
-    n: Float[Tensor, " vehicle"]
+    n: Real[Tensor, " vehicle"]
     excited: Bool[Tensor, " vehicle"]
     density: Callable[[Tensor, Prior], Density]
 

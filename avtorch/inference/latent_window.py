@@ -57,7 +57,7 @@ class LatentWindow:
         *,
         accel: Real[Tensor, " time"] | None = None,
         speed: Real[Tensor, " time"] | None = None,
-        mask: Bool[Tensor, " time"] | None = None,
+        mask: Bool[Tensor, " time"] | Real[Tensor, " time"] | None = None,
     ) -> LatentWindow:
         """One window from rows ``(time,)``."""
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Float
+from avtorch.arrays import Real
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief
 from avtorch.inference.estimators.choose import make_estimator
@@ -46,7 +46,7 @@ class Window:
 
     start_s: float
     end_s: float
-    n: Float[Tensor, " vehicle"]
+    n: Real[Tensor, " vehicle"]
     belief: Belief
 
 
@@ -322,8 +322,8 @@ class BeliefStream:
         own = {"estimator": self.estimator, "form": type(self.form).__name__, "window": self.window}
         for name, value in {**own, "vehicles": self.vehicles}.items():
             if type(state.get(name)) is not type(value) or state[name] != value:
-                said = "by the estimator" if name == "estimator" else f"with {name}"
-                raise InputError(f"state: saved {said} {str(state.get(name))[:40]!r}, not {value!r}")
+                setting = "by the estimator" if name == "estimator" else f"with {name}"
+                raise InputError(f"state: saved {setting} {str(state.get(name))[:40]!r}, not {value!r}")
         if set(state) != {"rows", "epoch", "origin", "index", "last", "driven", "inference", "vehicles", "units", *own}:
             raise InputError(f"state: holds {', '.join(sorted(map(str, state)))[:200]}, not what a stream saves")
         check_clock(state, columns=self._rows, vehicles=self.vehicles)

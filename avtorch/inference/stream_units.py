@@ -104,8 +104,8 @@ class StreamUnits:
         if float(time[-1] - time[0]) < LOOKS_S[self.looks]:
             return
         self.looks += 1
-        sure = [self._judge(pair) for pair in self.pairs]
-        self._judge_swap()
+        sure = [self._check(pair) for pair in self.pairs]
+        self._check_swap()
         if all(sure) or self.looks == len(LOOKS_S):
             self.clear()
 
@@ -140,7 +140,7 @@ class StreamUnits:
             for name, value in new.items()
         }
 
-    def _judge(self, pair: Pair) -> bool:
+    def _check(self, pair: Pair) -> bool:
         """Whether the stretch decides ``pair`` for every vehicle; raises InputError where one of them is wrong."""
         found = [self._compare(pair, span) for span in SPANS_S]
         slope, correlation = (torch.cat(x) for x in zip(*found, strict=True))  # (span x delay, vehicle)
@@ -151,12 +151,12 @@ class StreamUnits:
         wrong = sure & ~((slope >= pair.limits[0]) & (slope <= pair.limits[1]))
         for v in wrong.nonzero().squeeze(-1).tolist():
             moves = f"{pair.level} responds with" if pair.integrated else f"{pair.level} changes"
-            told = f"{moves} {float(slope[v]):.3g} times as much as {pair.rate} implies"
+            scale = f"{moves} {float(slope[v]):.3g} times as much as {pair.rate} implies"
             if float(slope[v]) < 0:
-                raise self._refusal(v, pair.level, pair.rate, f"{told}, so one has the wrong sign")
+                raise self._refusal(v, pair.level, pair.rate, f"{scale}, so one has the wrong sign")
             hints = _HINTS[pair.level, pair.rate]
             near = min(hints, key=lambda name: abs(math.log(float(slope[v]) / hints[name])))
-            raise self._refusal(v, pair.level, pair.rate, f"{told}, so their units differ; perhaps {near}")
+            raise self._refusal(v, pair.level, pair.rate, f"{scale}, so their units differ; perhaps {near}")
         return bool(sure.all())
 
     def _compare(self, pair: Pair, span: float) -> tuple[Tensor, Tensor]:
@@ -188,7 +188,7 @@ class StreamUnits:
         slope = torch.where(moves, correlation * (yy / xx.clamp_min(1e-300)).sqrt(), 1.0)
         return slope.mT, correlation.mT
 
-    def _judge_swap(self) -> None:
+    def _check_swap(self) -> None:
         """Least squares of the jerk on ``(-accel, accel_cmd)``: where lag and gain are both negative, the columns are
         swapped."""
         if self.sums is None:
@@ -203,11 +203,11 @@ class StreamUnits:
         for v in swapped.nonzero().squeeze(-1).tolist():
             raise self._refusal(v, "accel", "accel_cmd", "accel leads accel_cmd, so the two may be swapped")
 
-    def _refusal(self, vehicle: int, one: str, other: str, told: str) -> InputError:
+    def _refusal(self, vehicle: int, one: str, other: str, finding: str) -> InputError:
         start, end = float(self.rows["time"][0]), float(self.rows["time"][-1])
         which = f" of vehicle {vehicle}" if self.vehicles > 1 else ""
         return InputError(
-            f"stream: columns {one!r} and {other!r}{which}, {start:.10g} to {end:.10g} s: {told}; no estimate "
+            f"stream: columns {one!r} and {other!r}{which}, {start:.10g} to {end:.10g} s: {finding}; no estimate "
             f"from this time is kept"
         )
 

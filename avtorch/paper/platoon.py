@@ -82,7 +82,7 @@ class Platoon:
             float(middle(ratio)),
             interval,
             sign(interval, below=1.0),
-            self.ahead.said(why),
+            self.ahead.with_note(why),
         )
 
     def _attenuates(self, i: int, name: str) -> ClaimRow:
@@ -103,7 +103,7 @@ class Platoon:
             float(middle(ratio)),
             interval,
             sign(interval, above=1.0) if i == 0 else sign(interval, below=1.0),
-            self.ahead.said(why),
+            self.ahead.with_note(why),
         )
 
     def _crashes(self, i: int) -> str:

@@ -121,8 +121,8 @@ class Record:
         specific = "specific-force" in kinds
         rates = [log.rate_hz for log in each]
         if max(rates) > 1.02 * min(rates):
-            told = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in each)
-            raise InputError(f"logs: found rates of {told}; needs one rate in all, or one diagnosis each")
+            given = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in each)
+            raise InputError(f"logs: found rates of {given}; needs one rate in all, or one diagnosis each")
         group = grouped(min(rates), rate_hz)
         steps = []
         segments = 0
