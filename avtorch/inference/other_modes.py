@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Float
+from avtorch.inference.coordinates import score_of
 from avtorch.inference.density import Density, SelectableDensity
 from avtorch.inference.map import find_mode
 from avtorch.inference.planes import lower_times, lower_transposed_times
-from avtorch.inference.whitening import score_of
 
 #: Distances of the starts in SDs of the draws, evenly spaced; these are half of them, the others are mirror images.
 RADII = (4.0, 16.0)

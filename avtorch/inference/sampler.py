@@ -13,13 +13,13 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
+from avtorch.inference.coordinates import Coordinates, Whitening, stiffness
 from avtorch.inference.density import Density, ScoredDensity, SelectableDensity, SubsampledDensity, constrained
 from avtorch.inference.exactness import Exactness, compare_with_exact
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.planes import empty_planes
 from avtorch.inference.posterior import Posterior, nested_rhat
 from avtorch.inference.sgld import SGLD, Noise
-from avtorch.inference.whitening import Coordinates, Whitening, stiffness
 
 #: Chains times windows sampled at once: enough to make the cost of a call negligible, few enough for the processor's
 #: cache.

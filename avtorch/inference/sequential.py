@@ -12,7 +12,7 @@ from avtorch.arrays import Bool
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief, Summary
 from avtorch.inference.density import Density
-from avtorch.inference.evidence import Evidence, Rows
+from avtorch.inference.form import Rows, WindowLikelihood
 from avtorch.inference.posterior import sorted_quantile
 from avtorch.inference.priors import (
     Joint,
@@ -130,10 +130,10 @@ class SequentialInference:
         self.belief = self.belief.updated(excited, index, found, converged)
         return self.belief
 
-    def take(self, rows: Rows, evidence: Evidence) -> Belief:
-        """:meth:`update` with the interface of an estimator of a stream; the evidence contains all that is needed of
+    def take(self, rows: Rows, likelihood: WindowLikelihood) -> Belief:
+        """:meth:`update` with the interface of an estimator of a stream; the likelihood contains all that is needed of
         the rows."""
-        return self.update(evidence.density, evidence.excited)
+        return self.update(likelihood.density, likelihood.excited)
 
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
         """Posterior of some vehicles: its summary, log moments, and where it converged ``(vehicle,)`` bool."""

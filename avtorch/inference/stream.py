@@ -16,7 +16,7 @@ from avtorch.arrays import Real
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief
 from avtorch.inference.estimators.choose import make_estimator
-from avtorch.inference.evidence import Form, JerkForm
+from avtorch.inference.form import Form, JerkForm
 from avtorch.inference.stream_state import check_clock, read_state, with_checksum, without_checksum, write_state
 from avtorch.inference.stream_units import StreamUnits
 from avtorch.io.clock import ROUNDING_S, decimals
@@ -281,11 +281,11 @@ class BeliefStream:
             end = min(end, float(rows["time"][-1]) + (self.window / full))
         if self._units is not None:
             self._units.take(rows, self.inference.state_dict())
-        evidence = self.form.evidence(rows, full)
-        belief = self.inference.take(rows, evidence)
+        likelihood = self.form.likelihood(rows, full)
+        belief = self.inference.take(rows, likelihood)
         self._index += 1
         clock = 0.0 if self._epoch is None else self._epoch
-        return Window(start + clock, end + clock, evidence.n, belief)
+        return Window(start + clock, end + clock, likelihood.n, belief)
 
     @staticmethod
     def _since(time: Tensor, epoch: float | None) -> Tensor:

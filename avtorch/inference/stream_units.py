@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference.evidence import Rows
+from avtorch.inference.form import Rows
 from avtorch.inference.jerk import JerkStatistics
 from avtorch.inference.state import tensor_as
 from avtorch.io.consistency import MIN_SPANS, SPANS_S

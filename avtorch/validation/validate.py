@@ -18,6 +18,7 @@ from avtorch.inference.quadrature import Quadrature
 from avtorch.inference.sampler import SamplerSettings, sample
 from avtorch.io.log import Log
 from avtorch.validation.agreement import Agreement, agreement, between
+from avtorch.validation.agreement_verdict import AgreementVerdict, agreement_verdict
 from avtorch.validation.exact import exact_draws
 from avtorch.validation.nuts_reference import (
     LATENT_NUTS,
@@ -29,7 +30,6 @@ from avtorch.validation.nuts_reference import (
 )
 from avtorch.validation.reference import join, reference, select
 from avtorch.validation.stein import Stein, stein_discrepancy
-from avtorch.validation.verdict import AgreementVerdict, agreement_verdict
 from avtorch.validation.windows import Windows, windows_of_log
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from avtorch.inference import SGLD, SamplerSettings
 from avtorch.inference.control_variates import ControlVariates
+from avtorch.inference.coordinates import Coordinates, Whitening, stiffness
 from avtorch.inference.map import Mode
 from avtorch.inference.sampler import walk
 from avtorch.inference.schedules import harmonic, polynomial
 from avtorch.inference.sghmc import SGHMC
-from avtorch.inference.whitening import Coordinates, Whitening, stiffness
 from benchmarks.bias.law import sd_ratio
 from benchmarks.bias.windows import Problem
 

@@ -18,10 +18,10 @@ from avtorch.results import validation_answer
 pytest.importorskip("arviz")
 
 from avtorch.validation import agreement, synthetic_windows, validate
+from avtorch.validation.agreement_verdict import agreement_verdict, chi2_of_means
 from avtorch.validation.exact import exact_draws
 from avtorch.validation.reference import NODES, join, reference, select
 from avtorch.validation.validate import NutsSettings, Validation, check_installed
-from avtorch.validation.verdict import agreement_verdict, chi2_of_means
 from avtorch.validation.windows import Windows
 from tests.bars import BAR, LEVEL
 

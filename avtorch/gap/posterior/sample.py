@@ -19,9 +19,9 @@ from avtorch.gap.posterior.importance_sampling import effective_sample_size, imp
 from avtorch.gap.posterior.summary import lag_and_gain, repaired, reported, reported_draws
 from avtorch.gap.posterior.surrogate import Corrected, Surrogate, trusted_square
 from avtorch.gap.search.fitted_model import FittedModel
+from avtorch.inference.coordinates import Coordinates, stiffness
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.sampler import SamplerSettings, sample
-from avtorch.inference.whitening import Coordinates, stiffness
 
 __all__ = ["Draws", "exact_one_in", "fitted", "lag_and_gain", "posterior", "repaired", "reported", "reported_draws"]
 

@@ -17,7 +17,7 @@ from avtorch.inference.estimators.jerk_state import JerkState
 from avtorch.inference.estimators.latent_state import LatentState
 from avtorch.inference.estimators.state_model import GaussianState, Observation, StateModel
 from avtorch.inference.estimators.windowed import WindowedEstimator
-from avtorch.inference.evidence import Form, JerkForm, Rows
+from avtorch.inference.form import Form, JerkForm, Rows
 from avtorch.inference.jerk import JerkStatistics
 from avtorch.inference.latent import NOISE_PRIOR
 from avtorch.inference.latent_form import LatentForm
