@@ -18,7 +18,7 @@ from avtorch.errors import InputError
 from avtorch.inference.form import Rows
 from avtorch.inference.jerk import JerkStatistics
 from avtorch.inference.state import tensor_as
-from avtorch.io.consistency import MIN_SPANS, SPANS_S
+from avtorch.io.consistency import LATER_S, MIN_SPANS, SPANS_S, may_be_late
 from avtorch.io.units import GRAVITY
 from avtorch.io.validity import ACCEL_FACTORS, SPEED_FACTORS, WITNESS
 
@@ -142,11 +142,11 @@ class StreamUnits:
 
     def _check(self, pair: Pair) -> bool:
         """Whether the stretch decides ``pair`` for every vehicle; raises InputError where one of them is wrong."""
-        found = [self._compare(pair, span) for span in SPANS_S]
-        slope, correlation = (torch.cat(x) for x in zip(*found, strict=True))  # (span x delay, vehicle)
-        # a periodic drive correlates as strongly, with the other sign, half a period off: the agreeing sign goes first
-        best = (correlation.abs() + (correlation > 0.5)).argmax(0, keepdim=True)
-        slope, correlation = slope.gather(0, best)[0], correlation.gather(0, best)[0]
+        slope, correlation = self._best(pair)
+        if len(pair.delays) > 1 and bool((correlation <= -SURE).any()):
+            later = self._best(pair._replace(delays=LATER_S))
+            late = (correlation <= -SURE) & may_be_late(later[1], known=later[1] != 0)
+            slope, correlation = torch.where(late, later[0], slope), torch.where(late, later[1], correlation)
         sure = correlation.abs() >= SURE
         wrong = sure & ~((slope >= pair.limits[0]) & (slope <= pair.limits[1]))
         for v in wrong.nonzero().squeeze(-1).tolist():
@@ -158,6 +158,14 @@ class StreamUnits:
             near = min(hints, key=lambda name: abs(math.log(float(slope[v]) / hints[name])))
             raise self._refusal(v, pair.level, pair.rate, f"{scale}, so their units differ; perhaps {near}")
         return bool(sure.all())
+
+    def _best(self, pair: Pair) -> tuple[Tensor, Tensor]:
+        """Slope and correlation, each ``(vehicle,)``, at the delay and the span where they correlate best."""
+        found = [self._compare(pair, span) for span in SPANS_S]
+        slope, correlation = (torch.cat(x) for x in zip(*found, strict=True))  # (span x delay, vehicle)
+        # a periodic drive correlates as strongly, with the other sign, half a period off: the agreeing sign goes first
+        best = (correlation.abs() + (correlation > 0.5)).argmax(0, keepdim=True)
+        return slope.gather(0, best)[0], correlation.gather(0, best)[0]
 
     def _compare(self, pair: Pair, span: float) -> tuple[Tensor, Tensor]:
         """Slope and correlation of level on rate for every delay, ``(delay, vehicle)``; a correlation of 0: unknown."""

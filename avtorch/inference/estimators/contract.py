@@ -27,7 +27,7 @@ class Estimator(Protocol):
         ...
 
     def take(self, rows: Rows, likelihood: WindowLikelihood) -> Belief:
-        """Take in one window: its rows, each column ``(vehicle, time)``, and the likelihood that the form gives of them."""
+        """Take in one window: its rows, each column ``(vehicle, time)``, and what the form makes of them."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
