@@ -33,7 +33,10 @@ def drive(
     noise: float = 0.1,
     dead: float = 0.0,
 ) -> tuple[Tensor, Columns]:
-    """Time ``(time,)`` and columns ``(vehicle, time)`` at 100 Hz, behind three sines of 0.05 to 1 Hz."""
+    """Time ``(time,)`` and columns ``(vehicle, time)`` at 100 Hz, behind three sines of 0.05 to 1 Hz.
+
+    The largest sine takes 8 s or more: from 2.5 s, a third of a period, an inverted car may be one that is so late.
+    """
     g = torch.Generator().manual_seed(seed)
 
     def between(low: float, high: float) -> Tensor:
@@ -42,7 +45,7 @@ def drive(
     time = 0.01 * torch.arange(round(100 * seconds), dtype=F64)
     T, K, amplitude = between(*lag), between(*gain), between(*size)
     u = torch.zeros(vehicles, len(time), dtype=F64)
-    for share, band in ((1.0, (0.05, 0.15)), (0.6, (0.15, 0.4)), (0.3, (0.4, 1.0))):
+    for share, band in ((1.0, (0.05, 0.12)), (0.6, (0.12, 0.4)), (0.3, (0.4, 1.0))):
         u += share * amplitude * torch.sin(2 * math.pi * (between(*band) * time + between(0.1, 1.0)))
     acts = torch.cat([torch.zeros(vehicles, round(100 * dead), dtype=F64), u], -1)[:, : len(time)]
     later = glvd_rollout(torch.zeros(vehicles, dtype=F64), acts, T[:, 0], K[:, 0], 0.01)
