@@ -53,9 +53,9 @@ class Coordinates:
         seen = torch.linalg.solve_triangular(self.lower, mode.scale, upper=False)
         return torch.linalg.matrix_norm(seen, ord=2)
 
-    def slowed(self, pace: Float[Tensor, " window"]) -> Coordinates:
-        """A step ``h/pace`` in ``w`` is a step ``h`` in these; ``pace`` ``(window,)``."""
-        return Coordinates(self.mode, self.lower / pace.sqrt()[:, None, None])
+    def slowed(self, slowdown: Float[Tensor, " window"]) -> Coordinates:
+        """A step ``h/slowdown`` in ``w`` is a step ``h`` in these; ``slowdown`` ``(window,)``."""
+        return Coordinates(self.mode, self.lower / slowdown.sqrt()[:, None, None])
 
 
 def stiffness(density: Density, coordinates: Coordinates, *, radius: float = 3.0) -> Float[Tensor, " window"]:

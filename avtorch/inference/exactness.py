@@ -160,7 +160,7 @@ def compare_with_exact(density: Density, z: Float[Tensor, "chain draw window par
     points = min(1024, max(256, total // 8))
     closer = min(AGAIN * points, max(4 * points, total))
     # few draws mean that the density is expensive
-    looks = (closer, AGAIN * closer) if total >= 4096 else (closer,)
+    counts = (closer, AGAIN * closer) if total >= 4096 else (closer,)
     everyone = torch.arange(z.shape[2])
 
     def chosen(where: Tensor) -> Tensor:
@@ -170,7 +170,7 @@ def compare_with_exact(density: Density, z: Float[Tensor, "chain draw window par
 
     moments = Moments.of(z)
     found = weighed(density, moments, points)
-    for count in looks:
+    for count in counts:
         # more points do not help where the ratios' tail is clearly heavy
         index = chosen(~(found.clear() if count == closer else found.clear() | found.sure()))
         if len(index):

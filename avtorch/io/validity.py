@@ -111,7 +111,7 @@ def check_rate(step: float, where: str) -> None:
 
 # how far two signals of one motion may differ in scale before their units are certainly not the same: recordings exist
 # whose acceleration is 1.8 times the derivative of their speed; an actuator that gives 2.5 times the demand does not
-WITNESS = (0.45, 2.2)
+SAME_MOTION = (0.45, 2.2)
 _COMMAND = (0.02, 2.5)
 _SURE = 0.9
 
@@ -159,7 +159,7 @@ def check_units(
         found = scale_between(time, parts, speed, accel)
         options = {f"speed={unit}": factor for unit, factor in SPEED_FACTORS.items()}
         options |= {f"accel={unit}": factor for unit, factor in ACCEL_FACTORS.items()}
-        _refuse_scale(source, "speed", "accel", found, WITNESS, options, "accel=-1")
+        _refuse_scale(source, "speed", "accel", found, SAME_MOTION, options, "accel=-1")
     if accel_cmd is not None:
         found = command_scale(time, parts, speed, accel, accel_cmd)
         options = {"accel_cmd=g": GRAVITY, "accel_cmd=cm/s2": 0.01}

@@ -153,9 +153,9 @@ def _coverage(sweeps: list[Sweep], seed: int) -> ClaimRow:
 
 def _excitation(sweep: Sweep) -> ClaimRow:
     known = sweep.known
-    poor = known < KNOWN
-    value = float((~poor).double().mean())
-    lags, gains = len(LAGS), poor.tolist()
+    too_few = known < KNOWN
+    value = float((~too_few).double().mean())
+    lags, gains = len(LAGS), too_few.tolist()
     named = [
         f"{name} {number_list([x for x, p in zip(values, flags, strict=True) if p])}{unit}"
         for name, values, flags, unit in (("T_L", LAGS, gains[:lags], " s"), ("K_L", GAINS, gains[lags:], ""))
