@@ -37,7 +37,7 @@ class GaussNewtonFit:
     log_joint: float
     log_evidence: float
     grade_rms: float | None = None
-    profile: FloatArray | None = None
+    profile: Float[FloatArray, " knot"] | None = None
 
 
 def modes(
@@ -96,8 +96,8 @@ def modes(
 class _Crease(NamedTuple):
     """Where the parabolas of a step's two ends meet: `share` of the step (start,), `value` there (start,)."""
 
-    share: FloatArray
-    value: FloatArray
+    share: Float[FloatArray, " start"]
+    value: Float[FloatArray, " start"]
 
 
 def _crease(
