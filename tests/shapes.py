@@ -16,7 +16,7 @@ from collections.abc import Callable
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from types import FunctionType, ModuleType
-from typing import Any, get_args
+from typing import Any, ForwardRef, get_args
 
 import jaxtyping
 import numpy as np
@@ -69,7 +69,13 @@ class _Loader(SourceFileLoader):
 
 
 def _check_methods(cls: type) -> None:
+    if issubclass(cls, tuple) and "_fields" in vars(cls):
+        # typing builds the constructor of a NamedTuple elsewhere: its annotations refer to the class's own module
+        made = vars(cls)["__new__"].__func__
+        cls.__new__ = checked(made, vars(sys.modules[cls.__module__]))
     for name, member in list(vars(cls).items()):
+        if name == "__new__":
+            continue
         if isinstance(member, FunctionType):
             setattr(cls, name, checked(member))
         elif isinstance(member, (classmethod, staticmethod)):
@@ -78,9 +84,10 @@ def _check_methods(cls: type) -> None:
             setattr(cls, name, property(checked(member.fget), member.fset, member.fdel, member.__doc__))
 
 
-def checked(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function`, held to the shapes it names; itself where it names none."""
-    hints = _shapes_named(function)
+def checked(function: Callable[..., Any], names: dict[str, Any] | None = None) -> Callable[..., Any]:
+    """`function`, held to the shapes it names; itself where it names none. `names`: of its annotations, if not its own
+    module's."""
+    hints = _shapes_named(function, names)
     if not hints:
         return function
     answer = hints.pop("return", None)
@@ -106,13 +113,15 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     return held
 
 
-def _shapes_named(function: Callable[..., Any]) -> dict[str, Any]:
+def _shapes_named(function: Callable[..., Any], names: dict[str, Any] | None) -> dict[str, Any]:
     """The annotations of `function` that name a shape, evaluated."""
     origin = inspect.unwrap(function)
+    names = getattr(origin, "__globals__", {}) if names is None else names
     hints = {}
     for name, text in getattr(origin, "__annotations__", {}).items():
+        text = text.__forward_arg__ if isinstance(text, ForwardRef) else text
         try:
-            hint = eval(text, origin.__globals__) if isinstance(text, str) else text
+            hint = eval(text, names) if isinstance(text, str) else text
         except NameError:  # imported for type checkers alone, as no shape is
             continue
         if _is_shape(hint):

@@ -19,7 +19,7 @@ SKIPPED: dict[str, str] = {}
 # Whole experiments and diagnoses, though small ones: seconds each.
 SLOW = frozenset(
     {
-        "avtorch.experiment.foretold.ManoeuvrePrediction",
+        "avtorch.experiment.prediction.ManoeuvrePrediction",
         "avtorch.experiment.information.information",
         "avtorch.experiment.next_experiment.next_experiment",
         "avtorch.follower.diagnose_follower.FollowerDiagnosis",

@@ -67,6 +67,23 @@ def test_types_of_arrays_are_defined_once() -> None:
     ]
 
 
+FILLED = {
+    "gap/simulator/effect.py": "the table of effects, one for all, to which a user adds",
+    "io/answer_set.py": "folders that this process writes or has published, for a message after an interruption",
+}
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_what_a_file_has_computed_belongs_to_an_object(path: Path) -> None:
+    """No empty container at the top of a module, to be filled as calls come: two searches would share it."""
+    empty = re.compile(r"^(?:\{\}|\[\]|(?:\w+\.)?(?:dict|list|set|Weak\w+|defaultdict|OrderedDict|deque)\([^()]*\))$")
+    if path.relative_to(PACKAGE).as_posix() in FILLED:
+        return
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is not None:
+            assert not empty.match(ast.unparse(node.value)), f"line {node.lineno}: {ast.unparse(node)}"
+
+
 def imports() -> dict[str, set[str]]:
     """Which files a file imports, anywhere in it: within functions and for types only, too."""
     names = {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in SOURCES}

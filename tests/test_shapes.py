@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import math
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.gap.likelihood.basis import lowpass
 from avtorch.inference import JerkStatistics
+from avtorch.inference.estimators.state_model import GaussianState
 from avtorch.vehicle import Block
 from avtorch.vehicle.stability import local_stable
 from tests.shapes import ShapeError, checked
@@ -75,7 +79,55 @@ def test_inference_is_under_the_check() -> None:
         JerkStatistics(*[sums] * 6, torch.ones(3, dtype=torch.float64))
 
 
+def test_the_fields_of_a_named_tuple_are_under_the_check() -> None:
+    mean = torch.ones(2, 3, dtype=torch.float64)
+    GaussianState(mean, torch.ones(2, 3, 3, dtype=torch.float64))
+    with pytest.raises(ShapeError, match="cov"):
+        GaussianState(mean, mean)
+
+
 def test_likelihood_is_under_the_check() -> None:
     lowpass(np.zeros(5), 1.0, 0.1)
     with pytest.raises(ShapeError, match="lowpass, x"):
         lowpass(np.zeros((3, 5)), 1.0, 0.1)
+
+
+ROOT = Path(__file__).resolve().parents[1] / "avtorch"
+ANY_SHAPE = {
+    "state.generator_of": "the bytes of a generator's state",
+    "stream.BeliefStream.feed": "time and masks of a stream, (time,) or one number; refused in its own words",
+    "arguments.tensor": "takes any shape",
+    "arguments.checked": "takes any shape",
+    "linear_loop.LinearLoop.full": "what broadcasts to its own shape",
+    "linear_loop.as_tensor": "takes any shape",
+    "nuts.PositiveNormal.log_prob": "the shapes of torch.distributions",
+    "nuts.PositiveNormal.sample": "the shapes of torch.distributions",
+}
+
+
+def bare(path: Path) -> Iterator[str]:
+    """Public functions and classes that name a tensor or an array of floats without its shape."""
+    found = {"Tensor", "torch.Tensor", "FloatArray", "Tensor | None", "FloatArray | None"}
+
+    def names(body: list[ast.stmt], place: str) -> Iterator[str]:
+        for node in body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                own = [
+                    x for x in node.body if isinstance(x, ast.AnnAssign) and not ast.unparse(x.target).startswith("_")
+                ]
+                if any(ast.unparse(x.annotation) in found for x in own):
+                    yield f"{place}.{node.name}"
+                yield from names(node.body, f"{place}.{node.name}")
+            elif isinstance(node, ast.FunctionDef) and (node.name.startswith("__") or not node.name.startswith("_")):
+                given = [x.annotation for x in (*node.args.args, *node.args.kwonlyargs)]
+                if any(x is not None and ast.unparse(x) in found for x in (*given, node.returns)):
+                    yield f"{place}.{node.name}"
+
+    return names(ast.parse(path.read_text(encoding="utf-8")).body, path.stem)
+
+
+def test_what_is_public_names_its_shapes() -> None:
+    rooms = [ROOT / name for name in ("vehicle", "inference", "gap/likelihood")]
+    files = [path for room in rooms for path in sorted(room.rglob("*.py"))]
+    assert len(files) > 60
+    assert {name for path in files for name in bare(path)} == set(ANY_SHAPE)

@@ -14,6 +14,7 @@ from avtorch.cli.blindtest import blindtest
 from avtorch.cli.compare import compare
 from avtorch.cli.diagnose import diagnose
 from avtorch.cli.estimate import estimate
+from avtorch.cli.one_thread import use_one_thread
 from avtorch.cli.out_folder import alone_in_out
 from avtorch.cli.paper import paper
 from avtorch.cli.run import run
@@ -48,13 +49,14 @@ def _missing(fault: MissingArgumentError) -> str:
 
 def main(tokens: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0, 2 for bad input (one line on stderr), 130 when interrupted."""
+    use_one_thread()
     try:
         app(tokens, exit_on_error=False, print_error=False)
     except (InputError, CycloptsError) as fault:
         # one line, however many the parser's own message has
-        said = _missing(fault) if isinstance(fault, MissingArgumentError) else str(fault)
+        message = _missing(fault) if isinstance(fault, MissingArgumentError) else str(fault)
         most = None if isinstance(fault, InputError) else 400
-        print("avtorch: " + printable(" ".join(said.split()), most), file=sys.stderr)
+        print("avtorch: " + printable(" ".join(message.split()), most), file=sys.stderr)
         return 2
     except OSError as fault:
         # a file system that fails where no command expects it to

@@ -41,9 +41,11 @@ def blindtest_table(answer: Mapping[str, Any]) -> Table:
         if _at(answer, path) is None:
             continue
         interval = _at(answer["intervals"], path)
-        spread = "" if interval is None else f"{_told(interval[0], kind, False)}-{_told(interval[1], kind, False)}"
-        others = [_told(_at(one, path), kind) for one in answer["baselines"].values()]
-        table.add_row(escape(words), _told(_at(answer, path), kind), spread, asked, *others)
+        spread = (
+            "" if interval is None else f"{_formatted(interval[0], kind, False)}-{_formatted(interval[1], kind, False)}"
+        )
+        others = [_formatted(_at(one, path), kind) for one in answer["baselines"].values()]
+        table.add_row(escape(words), _formatted(_at(answer, path), kind), spread, asked, *others)
     return table
 
 
@@ -67,7 +69,7 @@ def _at(answer: Mapping[str, Any], path: str) -> Any:
     return answer
 
 
-def _told(value: float | None, kind: str, unit: bool = True) -> str:
+def _formatted(value: float | None, kind: str, unit: bool = True) -> str:
     if value is None:
         return "-"
     if kind == "%":

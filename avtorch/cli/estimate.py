@@ -139,12 +139,12 @@ def estimates_note(answer: Mapping[str, Any]) -> str:
     last = used[-1]
     text = ", ".join(f"{name} {last[name]['mean']:.3f} ± {last[name]['sd']:.3f}" for name in ("T_L", "K_L"))
     spread = [f"{name} {x:.1f}" for name, x in answer["spread_over_sd"].items() if x is not None]
-    told = f" Spread from window to window over posterior SD: {', '.join(spread)}." if spread else ""
+    more = f" Spread from window to window over posterior SD: {', '.join(spread)}." if spread else ""
     if any((x or 0.0) > UNEXPLAINED for x in answer["spread_over_sd"].values()):
-        told += " Lag and gain alone do not explain this log, or they changed: find the cause with avtorch diagnose"
-        told += " (pass a dead time with --dead-time)."
+        more += " Lag and gain alone do not explain this log, or they changed: find the cause with avtorch diagnose"
+        more += " (pass a dead time with --dead-time)."
     elif all("accepted_change" in w["alerts"] for w in used):
-        told += (
+        more += (
             " All of them differ from the accepted values: if the car is sound, pass its own with --accepted T_L,K_L."
         )
-    return f"{count}; the last {'used' if lost else 'of them'} estimates {text}.{told}"
+    return f"{count}; the last {'used' if lost else 'of them'} estimates {text}.{more}"

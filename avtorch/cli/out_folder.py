@@ -33,8 +33,8 @@ def alone_in_out(command: Callable[..., None]) -> Callable[..., None]:
         try:
             with sole_use(out, work=f"avtorch {command.__name__}") as locked:
                 if not locked:
-                    told = "the file system has no locks; keep other runs out of this folder"
-                    print(f"avtorch: {out}: {told}", file=sys.stderr)
+                    warning = "the file system has no locks; keep other runs out of this folder"
+                    print(f"avtorch: {out}: {warning}", file=sys.stderr)
                 return command(*args, **kwargs)
         except KeyboardInterrupt as stop:
             if len(published) > before and not str(stop):

@@ -36,7 +36,7 @@ def rows_table(answer: Mapping[str, Any]) -> Table:
     for row in answer["rows"]:
         verdict = row["verdict"]
         asked = f"{escape(row['quantity'])}\n[dim]{escape(row['setting'])}[/dim]"
-        table.add_row(asked, escape(told(row["paper"])), escape(here(row)), f"[{_COLOURS[verdict]}]{verdict}[/]")
+        table.add_row(asked, escape(formatted(row["paper"])), escape(here(row)), f"[{_COLOURS[verdict]}]{verdict}[/]")
     return table
 
 
@@ -52,12 +52,12 @@ def missed(answer: Mapping[str, Any]) -> list[str]:
 def here(row: Mapping[str, Any]) -> str:
     """Our figure with its interval."""
     if row["interval"] is None:
-        return told(row["ours"])
-    low, high = (told(x) for x in row["interval"])
-    return f"{told(row['ours'])} ({low} to {high})"
+        return formatted(row["ours"])
+    low, high = (formatted(x) for x in row["interval"])
+    return f"{formatted(row['ours'])} ({low} to {high})"
 
 
-def told(value: Any) -> str:
+def formatted(value: Any) -> str:
     """A number in three digits, four around one (a peak gain of 1.077 must not read as one), or words as they are."""
     if isinstance(value, str):
         return value

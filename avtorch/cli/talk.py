@@ -67,8 +67,8 @@ class Talk:
             ]
             for name in ("T_L", "K_L"):
                 cells += [f"{w[name]['mean']:.3f}", f"{w[name]['q05']:.2f}-{w[name]['q95']:.2f}"]
-            told = ", ".join(w["alerts"]) if w["alerts"] else "" if w["used"] else unused
-            table.add_row(*cells, f"{w['p_string_stable']:.2f}", told, style="bold yellow" if w["alerts"] else style)
+            alerts = ", ".join(w["alerts"]) if w["alerts"] else "" if w["used"] else unused
+            table.add_row(*cells, f"{w['p_string_stable']:.2f}", alerts, style="bold yellow" if w["alerts"] else style)
         self.out.print(table)
         self.out.print("P: probability of string stability under the setting in force", style="dim")
         if len(windows) > most:
@@ -84,8 +84,8 @@ class Talk:
         for name, alert in first.items():
             count = sum(a["detector"] == name for a in answer["alerts"])
             again = f" (and {count - 1} more window{'s' * (count > 2)})" if count > 1 else ""
-            told = f"{alert['time_s']:.1f} s  {name}: {alert['why']}{again}"
-            self.out.print(told, style="yellow", markup=False)
+            line = f"{alert['time_s']:.1f} s  {name}: {alert['why']}{again}"
+            self.out.print(line, style="yellow", markup=False)
 
     def story(self, answer: Mapping[str, Any]) -> None:
         """The events of a run in order, and how much the action helped."""
@@ -96,13 +96,13 @@ class Talk:
             names = " and ".join(map(str, a["strategies"])) or "none"
             gain = "" if a["peak_gain_true"] is None else f"; true peak gain {a['peak_gain_true']:.4f}"
             lines.append((a["time_s"], "green", f"action, strategy {names}: {a['why']}{gain}"))
-        told = Table.grid(padding=(0, 2, 0, 0))
-        told.add_column(justify="right", no_wrap=True)
-        told.add_column()
+        table = Table.grid(padding=(0, 2, 0, 0))
+        table.add_column(justify="right", no_wrap=True)
+        table.add_column()
         # the sort is stable: an action stays behind the alert of the same time that it answers
         for time, style, text in sorted(lines, key=lambda line: line[0])[:12]:
-            told.add_row(f"{time:.1f} s", escape(text), style=style or None)
-        self.out.print(told)
+            table.add_row(f"{time:.1f} s", escape(text), style=style or None)
+        self.out.print(table)
         if len(lines) > 12:
             self.out.print(f"... and {len(lines) - 12} more in the answer", style="dim")
         table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))

@@ -111,8 +111,8 @@ def validate(
     talk.out.print(validation_table(answer))
     for note in validation_notes(answer):
         talk.out.print(note, style="dim", markup=False)
-    told = f"\n{answer['verdict']}: {answer['why']}"
-    talk.out.print(told, style="bold green" if found.verdict.agree else "bold red", markup=False)
+    verdict = f"\n{answer['verdict']}: {answer['why']}"
+    talk.out.print(verdict, style="bold green" if found.verdict.agree else "bold red", markup=False)
     talk.done(out, answer)
     talk.out.print(f"For ArviZ: {', '.join(f'{name}.nc' for name in groups)}", markup=False)
 
@@ -124,5 +124,5 @@ def export(out: Path, groups: Mapping[str, InferenceData]) -> None:
         try:
             group.to_netcdf(str(path))
         except (OSError, RuntimeError) as fault:  # what the libraries of NetCDF raise for a full disk
-            told = getattr(fault, "strerror", None) or str(fault)
-            raise InputError(f"{path}: cannot be written ({told})") from None
+            reason = getattr(fault, "strerror", None) or str(fault)
+            raise InputError(f"{path}: cannot be written ({reason})") from None

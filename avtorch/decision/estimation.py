@@ -17,7 +17,7 @@ from avtorch.decision.monitor import Monitor
 from avtorch.decision.settings import Setting
 from avtorch.decision.watch import Watch, WatchedWindow
 from avtorch.errors import InputError
-from avtorch.inference.evidence import Form, JerkForm
+from avtorch.inference.form import Form, JerkForm
 from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.stream import BeliefStream
 from avtorch.io.log import Log

@@ -193,9 +193,9 @@ class Grid:
         links = self.feedforward if 4 in self.allowed else ()
         fed = [current.feedforward[:, None], default.feedforward[:, None], _listed(links, scenarios)]
         feedforward = torch.cat(fed, dim=1)
-        heard = torch.ones_like(feedforward, dtype=torch.bool)
+        distinct = torch.ones_like(feedforward, dtype=torch.bool)
         for i in range(2):
-            heard[:, i + 1 :] &= (feedforward[:, i + 1 :] - feedforward[:, i, None]).abs() > 1e-9
+            distinct[:, i + 1 :] &= (feedforward[:, i + 1 :] - feedforward[:, i, None]).abs() > 1e-9
 
         axes = (T_d, gaps, gains, feedforward)
         lower, gap, gain, link = (
@@ -211,7 +211,7 @@ class Grid:
         priced_default = column if self.gains_of_gap is None else column.replace(gains=k)
         cost = self.intrusiveness(setting, priced_default, model_wrong[:, None] & (lower == 0))
         cost = cost + self.intrusiveness.switch * setting.differs(current[:, None])
-        on_offer = fresh[:, lower] & offered[:, gap] & other[:, gain] & heard[:, link]
+        on_offer = fresh[:, lower] & offered[:, gap] & other[:, gain] & distinct[:, link]
         return Candidates(setting, torch.where(on_offer, cost, torch.inf))
 
 

@@ -35,7 +35,7 @@ from avtorch.errors import InputError
 from avtorch.vehicle.time_gap import RAMP_RATE
 
 # Candidates evaluated, and replayed, at a time: with few scenarios a larger batch costs hardly more.
-_JUDGED = 48
+_EVALUATED = 48
 _REPLAYED = 512
 _PAIRS = 1024
 _GAIN_PRICE = 0.05  # where none is sufficient, a peak gain e times as large weighs as much as this P(string stable)
@@ -252,14 +252,14 @@ class _Search:
         order = cost.argsort(dim=1, stable=True)
         best = torch.full((cost.shape[0],), torch.inf, dtype=torch.float64)
         pick = torch.zeros(cost.shape[0], dtype=torch.long)
-        chunk = max(_JUDGED, _REPLAYED // cost.shape[0])
+        chunk = max(_EVALUATED, _REPLAYED // cost.shape[0])
         for first in range(0, cost.shape[1], chunk):
             column = order[:, first : first + chunk]
             # The margin only adds cost: a setting that costs more even without it cannot win.
             open_ = torch.nonzero(cost.gather(1, column[:, :1])[:, 0] < best)[:, 0]
             if len(open_) == 0:
                 break
-            self._judge(open_, column[open_])
+            self._evaluate(open_, column[open_])
             tries = max(4, _REPLAYED // len(open_))
             while True:
                 worth = (self.p[open_] >= self.rules.required) & ~self.replayed[open_]
@@ -291,8 +291,8 @@ class _Search:
         clipped, nearest = self.predictions.clipped_share[lost], self.predictions.min_spacing_m[lost]
         bearable = clipped <= clipped[:, :1] + self.rules.most_clipped
         no_closer = nearest >= nearest[:, :1].clamp_max(1e-9)
-        judged = self.replayed[lost] & torch.isfinite(self.p[lost])
-        eligible = in_force | (judged & bearable & no_closer)
+        evaluated = self.replayed[lost] & torch.isfinite(self.p[lost])
+        eligible = in_force | (evaluated & bearable & no_closer)
         # Among equals intrusiveness and clipping are weighed against each other.
         # An amplified demand that is clipped most of the time is bang-bang control: clipping costs by the doubling.
         doublings = self.candidates.setting[lost].amplification().log2().clamp_min(0.0)
@@ -311,7 +311,7 @@ class _Search:
         assert self.predictions is not None
         return self.predictions.map(lambda x: x[torch.arange(len(pick)), pick])
 
-    def _judge(self, rows: Tensor, columns: Tensor) -> None:
+    def _evaluate(self, rows: Tensor, columns: Tensor) -> None:
         """P(string stable) and the price of the margin for some candidates (row, chunk).
 
         Most candidates fail clearly: a few draws screen them. One that reaches the required 0.95 is string stable in

@@ -15,7 +15,7 @@ from avtorch.decision.settings import Setting
 from avtorch.decision.strategist import Strategist
 from avtorch.decision.watch import Watch, WatchedWindow
 from avtorch.errors import InputError
-from avtorch.inference.evidence import JerkForm
+from avtorch.inference.form import JerkForm
 from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.stream import BeliefStream
 from avtorch.io.log import STANDSTILL_MPS

@@ -1,10 +1,10 @@
 """Which experiment next: the manoeuvre that separates causes that a log does not distinguish."""
 
-from avtorch.experiment.foretold import ManoeuvrePrediction
 from avtorch.experiment.information import Information, information
 from avtorch.experiment.limits import Limits
 from avtorch.experiment.manoeuvres import Manoeuvre, library
 from avtorch.experiment.next_experiment import Experiment, next_experiment, write_table
+from avtorch.experiment.prediction import ManoeuvrePrediction
 
 __all__ = [
     "Experiment",

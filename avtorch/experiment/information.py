@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from avtorch.experiment.foretold import ManoeuvrePrediction
+from avtorch.experiment.prediction import ManoeuvrePrediction
 
 
 @dataclass(frozen=True)
 class Information:
     """`nats`: mutual information between the cause and the measurements to come, at most the entropy of the cause.
 
-    `told`: expected probability of the true cause afterwards. `margin`: median log odds [nats] of the true cause
-    against the likest other one, for the worst pair.
+    `truth_probability`: expected probability of the true cause afterwards. `margin`: median log odds [nats] of the true
+    cause against the likest other one, for the worst pair.
 
     Example:
         >>> from avtorch.experiment import Information
@@ -26,12 +26,12 @@ class Information:
     """
 
     nats: float
-    told: float
+    truth_probability: float
     margin: float
 
 
 def information(
-    foretold: Sequence[ManoeuvrePrediction], number: int, prior: Sequence[float], *, seed: int = 0
+    predictions: Sequence[ManoeuvrePrediction], number: int, prior: Sequence[float], *, seed: int = 0
 ) -> Information:
     """The information of manoeuvre `number`, from simulated measurements; `prior` has the causes' probabilities.
 
@@ -49,17 +49,17 @@ def information(
         0.0
     """
     rng = np.random.default_rng([seed, number])
-    laws = [f.law(number) for f in foretold]
+    laws = [f.law(number) for f in predictions]
     log_prior = np.log(np.maximum(np.asarray(prior, float) / np.sum(prior), 1e-6))
-    nats, told, margin = 0.0, 0.0, np.inf
-    for i, one in enumerate(foretold):
+    nats, truth_probability, margin = 0.0, 0.0, np.inf
+    for i, one in enumerate(predictions):
         measured = one.examples(number, rng)
         densities = np.stack([law.log_density(measured) for law in laws])
         joint = densities + log_prior[:, None]
         posterior = joint[i] - logsumexp(joint, axis=0)
         weight = float(np.exp(log_prior[i]))
         nats += weight * float((posterior - log_prior[i]).mean())
-        told += weight * float(np.exp(posterior).mean())
+        truth_probability += weight * float(np.exp(posterior).mean())
         others = np.delete(densities, i, axis=0)
         margin = min(margin, float(np.median(densities[i] - others, axis=1).min()))
-    return Information(max(nats, 0.0), told, margin)
+    return Information(max(nats, 0.0), truth_probability, margin)

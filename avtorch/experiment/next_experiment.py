@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from avtorch.errors import InputError
-from avtorch.experiment.foretold import ManoeuvrePrediction, responses
 from avtorch.experiment.information import Information, information
 from avtorch.experiment.limits import Limits
 from avtorch.experiment.manoeuvres import Manoeuvre, library
+from avtorch.experiment.prediction import ManoeuvrePrediction, responses
 from avtorch.gap.likelihood.record import grouped
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.predictive_model import PredictiveModel
@@ -33,7 +33,7 @@ class Experiment:
     """Drive `manoeuvre` next: it `separates` those causes.
 
     `information`: its expected information; `entropy` [nats]: of the cause before it. `every`: the same for all
-    manoeuvres within the `limits`. `untold`: causes that no manoeuvre distinguishes with these signals. `why`: a
+    manoeuvres within the `limits`. `unresolved`: causes that no manoeuvre distinguishes with these signals. `why`: a
     sentence.
 
     Example:
@@ -49,7 +49,7 @@ class Experiment:
     information: Information
     entropy: float
     every: Mapping[str, Information] = field(repr=False)
-    untold: tuple[str, ...] = ()
+    unresolved: tuple[str, ...] = ()
     why: str = ""
     limits: Limits = field(default_factory=Limits)
 
@@ -60,11 +60,11 @@ class Experiment:
             "separates": list(self.separates),
             "expected_information_nats": self.information.nats,
             "entropy_nats": self.entropy,
-            "expected_probability_of_truth": self.information.told,
+            "expected_probability_of_truth": self.information.truth_probability,
             "seconds": round(float(self.manoeuvre.time[-1]), 6),
             "metres": self.manoeuvre.metres,
             "start_speed_mps": float(self.manoeuvre.speed[0]),
-            "untold": list(self.untold),
+            "untold": list(self.unresolved),
             "limits": asdict(self.limits),
             "why": self.why,
         }
@@ -98,19 +98,19 @@ def next_experiment(found: Diagnosis, limits: Limits | None = None, *, seed: int
     weights = np.array([max(found.probability(r.name), 1e-3) for r in rivals])
     weights = weights / weights.sum()
     entropy = float(-(weights * np.log(weights)).sum())
-    foretold = [ManoeuvrePrediction.of(r, offers, channels, group, _DRAWS) for r in rivals]
-    judged = [information(foretold, i, weights.tolist(), seed=seed) for i in range(len(offers))]
-    best = _chosen(offers, judged)
+    predictions = [ManoeuvrePrediction.of(r, offers, channels, group, _DRAWS) for r in rivals]
+    expected = [information(predictions, i, weights.tolist(), seed=seed) for i in range(len(offers))]
+    best = _chosen(offers, expected)
     names = tuple(r.name for r in rivals)
-    untold = tuple(n for n in found.verdict.alias_set if n not in names and n != "unknown")
+    unresolved = tuple(n for n in found.verdict.alias_set if n not in names and n != "unknown")
     return Experiment(
         manoeuvre=offers[best],
         separates=names,
-        information=judged[best],
+        information=expected[best],
         entropy=entropy,
-        every={m.name: i for m, i in zip(offers, judged, strict=True)},
-        untold=untold,
-        why=_sentence(offers[best], names, judged[best], entropy, untold, channels),
+        every={m.name: i for m, i in zip(offers, expected, strict=True)},
+        unresolved=unresolved,
+        why=_sentence(offers[best], names, expected[best], entropy, unresolved, channels),
         limits=given,
     )
 
@@ -160,30 +160,30 @@ def _expected(first: PredictiveModel, manoeuvres: tuple[Manoeuvre, ...], limits:
     return [m for m in offers if m.within(limits)]
 
 
-def _chosen(offers: list[Manoeuvre], judged: list[Information]) -> int:
+def _chosen(offers: list[Manoeuvre], expected: list[Information]) -> int:
     """The gentlest manoeuvre that surely distinguishes every pair, or else the most informative one."""
-    sure = [i for i, j in enumerate(judged) if j.margin >= _SURE]
+    sure = [i for i, j in enumerate(expected) if j.margin >= _SURE]
     if sure:
         return min(sure, key=lambda i: (round(offers[i].effort, 1), offers[i].metres))
-    return max(range(len(offers)), key=lambda i: (round(judged[i].nats, 2), judged[i].margin))
+    return max(range(len(offers)), key=lambda i: (round(expected[i].nats, 2), expected[i].margin))
 
 
 def _sentence(
     m: Manoeuvre,
     names: tuple[str, ...],
-    told: Information,
+    expected: Information,
     entropy: float,
-    untold: tuple[str, ...],
+    unresolved: tuple[str, ...],
     channels: tuple[str, ...],
 ) -> str:
     causes = ["no effect" if n == "none" else n.replace("+", " with ") for n in names]
     listing = " and ".join([", ".join(causes[:-1]), causes[-1]])
-    if told.nats < _FAINT * entropy:
+    if expected.nats < _FAINT * entropy:
         text = f"no manoeuvre within the limits separates {listing}; the closest is {m.name}"
     else:
-        share = "over 0.99" if told.told > 0.99 else f"{told.told:.2f}"
+        share = "over 0.99" if expected.truth_probability > 0.99 else f"{expected.truth_probability:.2f}"
         text = f"{m.name}, to separate {listing}; expected probability of the true hypothesis afterwards: {share}"
-    if untold and len(channels) == 1:
+    if unresolved and len(channels) == 1:
         other = "speed" if channels == ("accel",) else "accel"
-        text += f"; {', '.join(untold)} can only be separated with {other} in the log as well"
+        text += f"; {', '.join(unresolved)} can only be separated with {other} in the log as well"
     return text[0].upper() + text[1:] + "."

@@ -71,7 +71,7 @@ class FollowerDiagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """The object of `diagnosis.json` with a further key `follower`; only that key where no cause was sought."""
-        told = {
+        follower = {
             "law": self.law.name,
             "parameters": {name: q.to_dict() for name, q in self.parameters.items()},
             "stability": [
@@ -87,7 +87,7 @@ class FollowerDiagnosis:
             "keeps_speed_rmse": self.keeps_speed,
             "conditional": list(self.conditional),
         }
-        return ({} if self.diagnosis is None else self.diagnosis.to_dict()) | {"follower": told}
+        return ({} if self.diagnosis is None else self.diagnosis.to_dict()) | {"follower": follower}
 
 
 def diagnose_follower(
@@ -197,13 +197,13 @@ def _cause(
 
 
 def _parameters(law: HeadwayLaw, draws: Mapping[str, FloatArray], speed: float) -> dict[str, Quantity]:
-    told = {
+    quantities = {
         k.removeprefix("law.").removeprefix(f"{delay_effect().name}."): Quantity.of_draws(x) for k, x in draws.items()
     }
     own = {k.removeprefix("law."): torch.as_tensor(x) for k, x in draws.items() if k.startswith("law.")}
     total = draws["T_L"] + draws.get(delay_key(), 0.0)
     more = {"lag_with_delay_s": total, "headway_s": law.spacing(own, speed) / speed}
-    return told | {name: Quantity.of_draws(x) for name, x in more.items()}
+    return quantities | {name: Quantity.of_draws(x) for name, x in more.items()}
 
 
 def _conditional(law: HeadwayLaw, off: float, keeps: float) -> tuple[str, ...]:

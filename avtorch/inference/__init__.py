@@ -20,8 +20,8 @@ from avtorch.inference.density import (
     SelectableDensity,
     SubsampledDensity,
 )
-from avtorch.inference.evidence import Evidence, Form, JerkForm
 from avtorch.inference.excitation import ExcitationRule
+from avtorch.inference.form import Form, JerkForm, WindowLikelihood
 from avtorch.inference.jerk import JerkDensity, JerkPoints, JerkStatistics, jerk_log_likelihood
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.posterior import Posterior, nested_rhat
@@ -49,7 +49,6 @@ __all__ = [
     "ConstrainedDensity",
     "ControlVariates",
     "Density",
-    "Evidence",
     "ExcitationRule",
     "Form",
     "JerkDensity",
@@ -70,6 +69,7 @@ __all__ = [
     "SubsampledDensity",
     "TorchDensity",
     "Window",
+    "WindowLikelihood",
     "default_position_lag_prior",
     "default_speed_lag_prior",
     "find_mode",

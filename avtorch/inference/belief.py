@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Bool, Float
+from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.posterior import sorted_quantile
 from avtorch.inference.priors import Prior
@@ -84,7 +84,13 @@ class Belief:
         i = self.names.index(name)
         return {key: float(getattr(self, key)[vehicle, i]) for key in ("mean", "sd", "q05", "q95")}
 
-    def updated(self, excited: Tensor, index: Tensor, found: Summary, converged: Tensor) -> Belief:
+    def updated(
+        self,
+        excited: Bool[Tensor, " vehicle"],
+        index: Int[Tensor, " used"],
+        found: Summary,
+        converged: Bool[Tensor, " used"],
+    ) -> Belief:
         """After a window: ``found`` of the vehicles ``index`` where it ``converged``, all others carried over."""
         used = index[converged]
         table = {key: getattr(self, key) for key in ("mean", "sd", "q05", "q95")}
@@ -96,7 +102,7 @@ class Belief:
         converged = torch.ones_like(excited).index_put((index,), converged)
         return Belief(self.names, draws=draws, excited=excited, converged=converged, **table)
 
-    def unused(self, excited: Tensor) -> Belief:
+    def unused(self, excited: Bool[Tensor, " vehicle"]) -> Belief:
         """After a window that no vehicle used: all carried over."""
         return replace(self, excited=excited, converged=torch.ones_like(excited))
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.inference.jerk import JerkDensity
 from avtorch.inference.posterior import Posterior
@@ -45,10 +46,10 @@ class Conjugate:
     """
 
     posterior: Posterior
-    ess: Tensor
-    log_evidence: Tensor
-    log_evidence_error: Tensor
-    inside: Tensor
+    ess: Float[Tensor, " window"]
+    log_evidence: Float[Tensor, " window"]
+    log_evidence_error: Float[Tensor, " window"]
+    inside: Float[Tensor, " window"]
 
 
 def sample_conjugate(
@@ -121,10 +122,10 @@ def _systematic(weight: Tensor, count: int, generator: torch.Generator | None) -
 class _NormalInverseGamma:
     """``sigma^2 ~ InverseGamma(shape, rate)``, ``beta ~ N(center, sigma^2 precision^-1)``, one a window."""
 
-    center: Tensor
-    precision: Tensor
-    shape: Tensor
-    rate: Tensor
+    center: Float[Tensor, "window 2"]
+    precision: Float[Tensor, "window 2 2"]
+    shape: Float[Tensor, " window"]
+    rate: Float[Tensor, " window"]
 
     @classmethod
     def of(cls, density: JerkDensity, generator: torch.Generator | None) -> _NormalInverseGamma:
@@ -151,7 +152,9 @@ class _NormalInverseGamma:
         rate = 0.5 * torch.maximum(squares, 1e-12 * s.jj).clamp_min(1e-12)
         return cls(center, precision, 0.5 * s.n.clamp_min(2.0), rate)
 
-    def sample(self, count: int, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+    def sample(
+        self, count: int, generator: torch.Generator | None
+    ) -> tuple[Float[Tensor, "proposal window 2"], Float[Tensor, "proposal window"]]:
         """Coefficients ``(count, window, 2)`` and variances ``(count, window)``."""
         # the public Gamma distribution takes no generator; this is the routine it calls
         gamma = torch._standard_gamma(self.shape.expand(count, -1).contiguous(), generator=generator)  # pyright: ignore[reportPrivateImportUsage]
@@ -161,7 +164,9 @@ class _NormalInverseGamma:
         spread = torch.linalg.solve_triangular(lower.mT, noise.permute(1, 2, 0), upper=True).permute(2, 0, 1)
         return self.center + variance.sqrt().unsqueeze(-1) * spread, variance
 
-    def log_prob(self, beta: Tensor, variance: Tensor) -> Tensor:
+    def log_prob(
+        self, beta: Float[Tensor, "proposal window 2"], variance: Float[Tensor, "proposal window"]
+    ) -> Float[Tensor, "proposal window"]:
         """Log density of coefficients and variance, ``(count, window)``."""
         off = beta - self.center
         distance = (torch.einsum("wij,nwj->nwi", self.precision, off) * off).sum(-1) / variance

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.func import grad, vmap
 
+from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.density import SelectableDensity, SubsampledDensity, constrained
 from avtorch.inference.map import Mode
@@ -75,21 +76,23 @@ class ControlVariates:
     def points(self) -> int:
         return self.density.points
 
-    def log_prob(self, z: Tensor) -> Tensor:
+    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
         return self.density.log_prob(z)
 
-    def log_prob_minibatch(self, z: Tensor, index: Tensor) -> Tensor:
+    def log_prob_minibatch(
+        self, z: Float[Tensor, "*draw window parameter"], index: Int[Tensor, " point"]
+    ) -> Float[Tensor, "*draw window"]:
         """Unbiased in gradient over minibatches; see the class. ``z``: ``(..., window, parameter)``."""
         linear = ((z - self.mode.z) * self._deviation[:, index].mean(1)).sum(-1)
         return self.density.log_prob_minibatch(z, index) - linear
 
-    def initial(self) -> Tensor:
+    def initial(self) -> Float[Tensor, "window parameter"]:
         return self.density.initial()
 
-    def constrain(self, z: Tensor) -> Tensor:
+    def constrain(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
         return constrained(self.density, z)
 
-    def select(self, index: Tensor) -> ControlVariates:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> ControlVariates:
         """The windows named by ``index``; the gradients at their modes are reused."""
         if not isinstance(self.density, SelectableDensity):
             raise InputError(f"density: the windows of {type(self.density).__name__} cannot be taken apart")
@@ -100,7 +103,9 @@ class ControlVariates:
         return chosen
 
 
-def gradients_by_point(density: SubsampledDensity, z: Tensor) -> Tensor:
+def gradients_by_point(
+    density: SubsampledDensity, z: Float[Tensor, "window parameter"]
+) -> Float[Tensor, "window point parameter"]:
     """Gradient at ``z`` of the estimate that each point alone would give, ``(window, point, parameter)``."""
 
     def estimate(place: Tensor, index: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
-from avtorch.arrays import Float, Int
+from avtorch.arrays import Bool, Float, Int
 
 
 @runtime_checkable
@@ -111,7 +111,7 @@ class SelectableDensity(Density, Protocol):
         2
     """
 
-    def select(self, index: Tensor) -> Density:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Density:
         """The windows named by ``index``, integers or bool."""
         ...
 

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float, Int
 from avtorch.inference.density import Density, SelectableDensity
 from avtorch.inference.other_modes import missed_mass
 from avtorch.inference.pareto import RELIABLE, pareto_k
@@ -59,24 +60,24 @@ class Exactness:
         missed: mass of another mode over that at the draws, ``(window,)``; 0 where none was found.
     """
 
-    pareto_k: Tensor
-    mean_shift: Tensor
-    sd_ratio: Tensor
-    tail_excess: Tensor
-    mean_error: Tensor
-    sd_error: Tensor
-    tail_error: Tensor
-    draws_mean_error: Tensor
-    draws_sd_error: Tensor
-    draws_tail_error: Tensor
-    missed: Tensor
+    pareto_k: Float[Tensor, " window"]
+    mean_shift: Float[Tensor, "window parameter"]
+    sd_ratio: Float[Tensor, "window parameter"]
+    tail_excess: Float[Tensor, "window parameter"]
+    mean_error: Float[Tensor, "window parameter"]
+    sd_error: Float[Tensor, "window parameter"]
+    tail_error: Float[Tensor, "window parameter"]
+    draws_mean_error: Float[Tensor, "window parameter"]
+    draws_sd_error: Float[Tensor, "window parameter"]
+    draws_tail_error: Float[Tensor, "window parameter"]
+    missed: Float[Tensor, " window"]
 
-    def known(self, resolution: float = RESOLUTION) -> Tensor:
+    def known(self, resolution: float = RESOLUTION) -> Bool[Tensor, " window"]:
         """Where the density's moments are known well enough to compare with, ``(window,)`` bool."""
         fine = (self.mean_error <= resolution) & (self.sd_error <= resolution)
         return fine.all(-1) & (self.pareto_k < RELIABLE)
 
-    def beyond(self, errors: float = 1.0) -> Tensor:
+    def beyond(self, errors: float = 1.0) -> Bool[Tensor, "3 window parameter"]:
         """Where mean, SD or tail of the draws exceeds tolerance and chance, ``(3, window, parameter)`` bool.
 
         ``errors``: standard errors of the density's side that are allowed in addition.
@@ -88,19 +89,19 @@ class Exactness:
         tolerance = off.new_tensor([MEAN_TOLERANCE, SD_TOLERANCE, TAIL_TOLERANCE])[:, None, None]
         return ~(off <= torch.maximum(tolerance, ERRORS * own) + errors * other)
 
-    def sure(self) -> Tensor:
+    def sure(self) -> Bool[Tensor, " window"]:
         """Where more points would hardly change the answer, ``(window,)`` bool."""
         return self.known() & (self.pareto_k < CERTAIN) | self.hopeless()
 
-    def hopeless(self) -> Tensor:
+    def hopeless(self) -> Bool[Tensor, " window"]:
         """Where the ratios do not even have a mean: the density is far from the draws, ``(window,)`` bool."""
         return self.pareto_k > 1.0
 
-    def clear(self) -> Tensor:
+    def clear(self) -> Bool[Tensor, " window"]:
         """Where the first test already shows that the draws follow the density, ``(window,)`` bool."""
         return self.known(2 * RESOLUTION) & (self.pareto_k < CERTAIN) & ~self.beyond().any(0).any(-1)
 
-    def holds(self) -> Tensor:
+    def holds(self) -> Bool[Tensor, " window"]:
         """Where the draws are shown to follow the density, ``(window,)`` bool."""
         return (self.clear() | self.known() & ~self.beyond().any(0).any(-1)) & (self.missed == 0)
 
@@ -127,7 +128,9 @@ class Exactness:
                 reasons.append(f"the draws do not follow the density: in unconstrained coordinates {off}")
         return reasons
 
-    def put(self, index: Tensor, other: Exactness, where: Tensor | None = None) -> Exactness:
+    def put(
+        self, index: Int[Tensor, " chosen"], other: Exactness, where: Bool[Tensor, " chosen"] | None = None
+    ) -> Exactness:
         """The same with the windows ``index`` taken from ``other``, or those of them where ``where`` is true."""
         if where is None or bool(where.all()):
             if len(index) == len(self.missed):
@@ -147,7 +150,7 @@ class Exactness:
         return cls(each[:, 0].clone(), a, b, c, d, e, f, g, h, i, each[:, 0].clone())
 
 
-def compare_with_exact(density: Density, z: Tensor) -> Exactness:
+def compare_with_exact(density: Density, z: Float[Tensor, "chain draw window parameter"]) -> Exactness:
     """Compare draws ``z`` ``(chain, draw, window, parameter)`` with their density.
 
     The first test takes few points compared with the draws; windows where it is inconclusive get about AGAIN times as
@@ -157,7 +160,7 @@ def compare_with_exact(density: Density, z: Tensor) -> Exactness:
     points = min(1024, max(256, total // 8))
     closer = min(AGAIN * points, max(4 * points, total))
     # few draws mean that the density is expensive
-    looks = (closer, AGAIN * closer) if total >= 4096 else (closer,)
+    counts = (closer, AGAIN * closer) if total >= 4096 else (closer,)
     everyone = torch.arange(z.shape[2])
 
     def chosen(where: Tensor) -> Tensor:
@@ -167,7 +170,7 @@ def compare_with_exact(density: Density, z: Tensor) -> Exactness:
 
     moments = Moments.of(z)
     found = weighed(density, moments, points)
-    for count in looks:
+    for count in counts:
         # more points do not help where the ratios' tail is clearly heavy
         index = chosen(~(found.clear() if count == closer else found.clear() | found.sure()))
         if len(index):
@@ -185,7 +188,7 @@ def _picked(density: Density, index: Tensor) -> Density:
     return density
 
 
-def exactness(density: Density, z: Tensor, points: int) -> Exactness:
+def exactness(density: Density, z: Float[Tensor, "chain draw window parameter"], points: int) -> Exactness:
     """The same with ``points`` points, once."""
     return weighed(density, Moments.of(z), points)
 
@@ -201,14 +204,14 @@ class Moments(NamedTuple):
             there are fewer than sixteen.
     """
 
-    mean: Tensor
-    lower: Tensor
-    share: Tensor
-    mean_error: Tensor
-    sd_error: Tensor
+    mean: Float[Tensor, "window parameter"]
+    lower: Float[Tensor, "window parameter parameter"]
+    share: Float[Tensor, "window parameter"]
+    mean_error: Float[Tensor, "window parameter"]
+    sd_error: Float[Tensor, "window parameter"]
 
     @classmethod
-    def of(cls, z: Tensor) -> Moments:
+    def of(cls, z: Float[Tensor, "chain draw window parameter"]) -> Moments:
         """Compute them from draws ``(chain, draw, window, parameter)``."""
         chains, draws = z.shape[:2]
         pieces = max(1, min(draws // 2, -(-16 // chains)))
@@ -229,7 +232,7 @@ class Moments(NamedTuple):
         of_sd = 0.5 * squares.flatten(2).std(-1) / variance / root
         return cls(mean.mT, lower, share.mT, of_mean.mT, of_sd.mT)
 
-    def select(self, index: Tensor) -> Moments:
+    def select(self, index: Int[Tensor, " chosen"]) -> Moments:
         """The windows named by ``index``."""
         return self if len(index) == len(self.mean) else Moments(*(x[index] for x in self))
 
@@ -272,7 +275,7 @@ def _weighed(density: Density, mean: Tensor, lower: Tensor, base: Tensor, log_pr
     return pareto_k(log_ratio), m, variance, tail, *errors.unbind(0)
 
 
-def log_density(density: Density, z: Tensor) -> Tensor:
+def log_density(density: Density, z: Float[Tensor, "point window parameter"]) -> Float[Tensor, "point window"]:
     """``log_prob`` of ``z`` ``(point, window, parameter)``, minus infinity where the density raises.
 
     Far out, a user's function may pass numbers that torch's distributions refuse by raising.
@@ -288,7 +291,7 @@ def log_density(density: Density, z: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=32)
-def proposal(points: int, d: int) -> tuple[Tensor, Tensor]:
+def proposal(points: int, d: int) -> tuple[Float[Tensor, "point d"], Float[Tensor, " point"]]:
     """Points ``(point, d)`` of a scale mixture of standard normals, mirrored, and their log density ``(point,)``.
 
     They are the same for every window and every run, independent of the sampler's random numbers.

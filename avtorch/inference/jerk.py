@@ -94,7 +94,7 @@ class JerkStatistics:
         pairs = ((jerk, jerk), (a, jerk), (u, jerk), (a, a), (a, u), (u, u))
         return cls(weight.sum(-1), *((x * y).sum(-1) for x, y in pairs))
 
-    def select(self, index: Tensor) -> JerkStatistics:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> JerkStatistics:
         """The windows named by ``index``."""
         return JerkStatistics(*(getattr(self, f.name)[index] for f in fields(self)))
 
@@ -153,7 +153,7 @@ class JerkDensity:
     def windows(self) -> int:
         return self.statistics.n.shape[0]
 
-    def select(self, index: Tensor) -> JerkDensity:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> JerkDensity:
         """The windows named by ``index``."""
         return JerkDensity(self.statistics.select(index), self.prior.select(index))
 
@@ -238,7 +238,7 @@ class JerkPoints(JerkDensity):
     def points(self) -> int:
         return self._columns.shape[1]
 
-    def select(self, index: Tensor) -> JerkPoints:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> JerkPoints:
         """The windows named by ``index``."""
         jerk, a, u = self._columns[index].unbind(-1)
         return JerkPoints(a, u, jerk, self.prior.select(index))

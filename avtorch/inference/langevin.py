@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from avtorch.arrays import Float
+
 
 class LangevinOptimizer(Optimizer):
     """A ``torch.optim`` optimizer that draws its noise from ``generator``, whose state is part of ``state_dict``."""
@@ -52,7 +54,9 @@ class LangevinOptimizer(Optimizer):
                 self.generator = torch.Generator()
             self.generator.set_state(generator)
 
-    def normal_like(self, p: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+    def normal_like(
+        self, p: Float[Tensor, "*parameter"], dtype: torch.dtype | None = None
+    ) -> Float[Tensor, "*parameter"]:
         """Standard normal noise in the shape of ``p`` and, for arithmetic in one sweep, in its order in memory."""
         order = sorted(range(p.dim()), key=p.stride, reverse=True)
         shape = [p.shape[i] for i in order]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Float, Int
+from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.latent_filter import latent_log_likelihood
 from avtorch.inference.latent_steady import EvenRows, steady_log_likelihood
@@ -101,7 +101,7 @@ class LatentDensity:
     def windows(self) -> int:
         return self.data.windows
 
-    def select(self, index: Tensor) -> LatentDensity:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> LatentDensity:
         """The windows named by ``index``."""
         return LatentDensity(self.data.select(index), self.prior.select(index), temper=self.temper)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import torch
 
-from avtorch.inference.evidence import Evidence, Rows
+from avtorch.inference.form import Rows, WindowLikelihood
 from avtorch.inference.latent import LatentDensity, default_noise_prior, latent_names
 from avtorch.inference.latent_excitation import latent_excitation
 from avtorch.inference.latent_window import LatentWindow
@@ -46,7 +46,7 @@ class LatentForm:
         self.noise_prior: Prior = default_noise_prior(self.names[2:]) if noise_prior is None else noise_prior
         self.noise, self.share = noise, share
 
-    def evidence(self, rows: Rows, full: float) -> Evidence:
+    def likelihood(self, rows: Rows, full: float) -> WindowLikelihood:
         usable = rows["usable"]
         count = usable.sum(-1)
         enough = count >= max(4.0, self.share * full)
@@ -56,4 +56,4 @@ class LatentForm:
         excited = torch.zeros_like(enough)
         if bool(enough.any()):
             excited[enough] = latent_excitation(data.select(enough), noise=self.noise)[0]
-        return Evidence(count, excited, lambda index, prior: LatentDensity(data.select(index), prior))
+        return WindowLikelihood(count, excited, lambda index, prior: LatentDensity(data.select(index), prior))

@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Float
+from avtorch.arrays import Bool, Float
 from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, discretise, initial_covariance
 
 BLOCK = 32
@@ -36,15 +36,23 @@ class EvenRows:
     ``(run,)``.
     """
 
-    lagged: Tensor
-    used: Tensor
-    count: Tensor
-    dt: Tensor
+    lagged: Float[Tensor, "run lag padded"]
+    used: Float[Tensor, "run padded"]
+    count: Float[Tensor, " run"]
+    dt: Float[Tensor, " run"]
     has_speed: bool
     has_accel: bool
 
     @classmethod
-    def build(cls, dt: Tensor, u: Tensor, used: Tensor, *, accel: Tensor | None, speed: Tensor | None) -> EvenRows:
+    def build(
+        cls,
+        dt: Float[Tensor, " run"],
+        u: Float[Tensor, "run time"],
+        used: Bool[Tensor, "run time"],
+        *,
+        accel: Float[Tensor, "run time"] | None,
+        speed: Float[Tensor, "run time"] | None,
+    ) -> EvenRows:
         """From ``dt (run,)`` and rows ``(run, time)``; ``used`` is True on a leading stretch of each run."""
         signals = [] if speed is None else [speed - speed[..., :1]]
         signals += [] if accel is None else [accel]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Bool, Float, Int
+from avtorch.arrays import Bool, Float, Int, Real
 from avtorch.errors import InputError
 
 #: A step longer than this many median steps is a gap: the filter starts afresh behind it.
@@ -52,12 +52,12 @@ class LatentWindow:
     @classmethod
     def single(
         cls,
-        time: Tensor,
-        u: Tensor,
+        time: Real[Tensor, " time"],
+        u: Real[Tensor, " time"],
         *,
-        accel: Tensor | None = None,
-        speed: Tensor | None = None,
-        mask: Tensor | None = None,
+        accel: Real[Tensor, " time"] | None = None,
+        speed: Real[Tensor, " time"] | None = None,
+        mask: Bool[Tensor, " time"] | Real[Tensor, " time"] | None = None,
     ) -> LatentWindow:
         """One window from rows ``(time,)``."""
 
@@ -86,7 +86,7 @@ class LatentWindow:
         time, u, mask = (torch.cat([pad(getattr(w, name)) for w in windows]) for name in ("time", "u", "mask"))
         return cls(time, u, measured("accel"), measured("speed"), mask)
 
-    def select(self, index: Tensor) -> LatentWindow:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> LatentWindow:
         """The windows named by ``index``."""
         accel = None if self.accel is None else self.accel[index]
         speed = None if self.speed is None else self.speed[index]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Bool, Float
+from avtorch.arrays import Bool, Float, Int
 from avtorch.inference.density import Density, ScoredDensity
 
 
@@ -40,7 +40,7 @@ class Mode:
         """Laplace covariance in ``z``, ``(window, parameter, parameter)``."""
         return self.scale @ self.scale.mT
 
-    def select(self, index: Tensor) -> Mode:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Mode:
         """The windows named by ``index``."""
         return Mode(self.z[index], self.scale[index], self.log_prob[index], self.converged[index])
 
@@ -54,7 +54,7 @@ class Mode:
         everyone = torch.arange(len(mean))
         return self.replaced(everyone, Mode(mean, factor, self.log_prob, self.converged), sound)
 
-    def replaced(self, index: Tensor, other: Mode, where: Tensor) -> Mode:
+    def replaced(self, index: Int[Tensor, " chosen"], other: Mode, where: Bool[Tensor, " chosen"]) -> Mode:
         """Centre and scale of the windows ``index`` taken from ``other`` where ``where`` is true."""
         z, scale = self.z.clone(), self.scale.clone()
         z[index[where]], scale[index[where]] = other.z[where], other.scale[where]

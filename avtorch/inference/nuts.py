@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.distributions.constraints import Constraint
 
+from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.inference.density import Density, ScoredDensity, SelectableDensity
 from avtorch.inference.jerk import JerkDensity
@@ -39,7 +40,7 @@ class _WithPrior(SelectableDensity, Protocol):
 class PositiveNormal(dist.TorchDistribution):
     """``Normal(loc, scale)`` cut off at zero and renormalised; Pyro has none."""
 
-    def __init__(self, loc: Tensor, scale: Tensor) -> None:
+    def __init__(self, loc: Float[Tensor, "*#batch"], scale: Float[Tensor, "*#batch"]) -> None:
         self.loc, self.scale = torch.broadcast_tensors(loc, scale)
         super().__init__(self.loc.shape, validate_args=False)
 
@@ -109,7 +110,11 @@ class PyroModel:
     """
 
     def __init__(
-        self, density: _WithPrior, *, window: int = 0, samples: tuple[Tensor, Tensor, Tensor] | None = None
+        self,
+        density: _WithPrior,
+        *,
+        window: int = 0,
+        samples: tuple[Float[Tensor, " time"], Float[Tensor, " time"], Float[Tensor, " time"]] | None = None,
     ) -> None:
         if not 0 <= window < density.windows:
             raise InputError(f"window: {window} is not in 0 to {density.windows - 1}")
@@ -131,16 +136,16 @@ class PyroModel:
         with pyro.plate("time", len(jerk)):
             pyro.sample("jerk", dist.Normal(glvd_jerk(a, u, T_L, K_L), sigma), obs=jerk)
 
-    def unconstrained(self, z: Tensor) -> dict[str, Tensor]:
+    def unconstrained(self, z: Float[Tensor, " parameter"]) -> dict[str, Tensor]:
         """``z`` ``(parameter,)`` as Pyro's unconstrained sites."""
         return {site.name: site.unconstrained(z) for site in self.sites}
 
-    def walked(self, found: dict[str, Tensor]) -> Tensor:
+    def walked(self, found: dict[str, Tensor]) -> Float[Tensor, "draw parameter"]:
         """The result of Pyro's MCMC as ``z`` ``(draw, parameter)``."""
         parts = [found[s.name] if s.log_space else found[s.name].log() for s in self.sites]
         return torch.cat([part.reshape(len(part), -1) for part in parts], -1)
 
-    def log_prob(self, z: Tensor) -> Tensor:
+    def log_prob(self, z: Float[Tensor, " parameter"]) -> Float[Tensor, ""]:
         """Pyro's own log density of ``z`` ``(parameter,)``, Jacobian included: minus the potential of NUTS."""
         _, potential, _, _ = initialize_model(self, initial_params=self.unconstrained(z))
         return -potential(self.unconstrained(z))
@@ -150,7 +155,7 @@ def nuts(
     density: _WithPrior,
     *,
     window: int = 0,
-    samples: tuple[Tensor, Tensor, Tensor] | None = None,
+    samples: tuple[Float[Tensor, " time"], Float[Tensor, " time"], Float[Tensor, " time"]] | None = None,
     statements: bool = False,
     chains: int = 1,
     draws: int = 1000,

@@ -8,10 +8,11 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
+from avtorch.inference.coordinates import score_of
 from avtorch.inference.density import Density, SelectableDensity
 from avtorch.inference.map import find_mode
 from avtorch.inference.planes import lower_times, lower_transposed_times
-from avtorch.inference.whitening import score_of
 
 #: Distances of the starts in SDs of the draws, evenly spaced; these are half of them, the others are mirror images.
 RADII = (4.0, 16.0)
@@ -24,7 +25,9 @@ DEPTH, FAR = 7.0, 5.0
 MASS = 0.005
 
 
-def missed_mass(density: Density, mean: Tensor, lower: Tensor) -> Tensor:
+def missed_mass(
+    density: Density, mean: Float[Tensor, "window parameter"], lower: Float[Tensor, "window parameter parameter"]
+) -> Float[Tensor, " window"]:
     """Mass of the heaviest mode found far from the draws, over that at the draws, ``(window,)``; 0 where none was.
 
     Args:
@@ -60,7 +63,7 @@ def missed_mass(density: Density, mean: Tensor, lower: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=32)
-def starts(d: int) -> Tensor:
+def starts(d: int) -> Float[Tensor, "start d"]:
     """``(start, d)``: directions at random but always the same, and their mirror images, at rising radii."""
     half = STARTS // 2
     direction = torch.randn(half, d, dtype=torch.float64, generator=torch.Generator().manual_seed(100 + d))

@@ -7,11 +7,13 @@ import math
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
+
 RELIABLE = 0.7
 """Above this shape a mean weighted by the ratios is unreliable for any number of them (Vehtari et al. 2024)."""
 
 
-def pareto_k(log_ratio: Tensor) -> Tensor:
+def pareto_k(log_ratio: Float[Tensor, "draw window"]) -> Float[Tensor, " window"]:
     """Shape ``k`` of the tail of ratios given by their logarithm ``(draw, window)``; returns ``(window,)``.
 
     Ratios have finite moments up to order ``1/k``. Of ``n`` of them the ``min(n/5, 3 sqrt n)`` largest are fitted, as

@@ -10,33 +10,37 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 
-def to_planes(x: Tensor) -> Tensor:
+
+def to_planes(x: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "parameter window *draw"]:
     """``(..., window, parameter)`` seen as ``(parameter, window, ...)``, contiguous for what this module makes."""
     return x.permute(-1, -2, *range(x.dim() - 2))
 
 
-def from_planes(planes: Tensor) -> Tensor:
+def from_planes(planes: Float[Tensor, "parameter window *draw"]) -> Float[Tensor, "*draw window parameter"]:
     """The inverse of :func:`to_planes`."""
     return planes.permute(*range(2, planes.dim()), 1, 0)
 
 
-def as_planes(*parameters: Tensor) -> Tensor:
+def as_planes(*parameters: Tensor) -> Float[Tensor, "*draw window parameter"]:
     """``(..., window, parameter)`` from one tensor ``(..., window)`` a parameter."""
     return from_planes(torch.stack([parameter.movedim(-1, 0) for parameter in parameters]))
 
 
-def join_planes(*blocks: Tensor) -> Tensor:
+def join_planes(*blocks: Tensor) -> Float[Tensor, "*draw window parameter"]:
     """Blocks ``(..., window, some parameters)`` side by side, ``(..., window, parameter)``."""
     return from_planes(torch.cat([to_planes(block) for block in blocks]))
 
 
-def empty_planes(*shape: int, dtype: torch.dtype = torch.float64) -> Tensor:
+def empty_planes(*shape: int, dtype: torch.dtype = torch.float64) -> Float[Tensor, "*draw window parameter"]:
     """An uninitialised ``(..., window, parameter)``."""
     return from_planes(torch.empty(shape[-1], shape[-2], *shape[:-2], dtype=dtype))
 
 
-def lower_times(lower: Tensor, x: Tensor) -> Tensor:
+def lower_times(
+    lower: Float[Tensor, "window d d"], x: Float[Tensor, "*draw window d"]
+) -> Float[Tensor, "*draw window d"]:
     """``lower @ x`` for triangular ``lower`` ``(window, d, d)`` and ``x`` ``(..., window, d)``."""
     if len(lower) == 1:
         return _product(lower[0], x)
@@ -50,7 +54,9 @@ def lower_times(lower: Tensor, x: Tensor) -> Tensor:
     return as_planes(*rows)
 
 
-def lower_transposed_times(lower: Tensor, x: Tensor) -> Tensor:
+def lower_transposed_times(
+    lower: Float[Tensor, "window d d"], x: Float[Tensor, "*draw window d"]
+) -> Float[Tensor, "*draw window d"]:
     """``lower.T @ x``, shapes as in :func:`lower_times`."""
     if len(lower) == 1:
         return _product(lower[0].T, x)

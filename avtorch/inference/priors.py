@@ -13,7 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Bool, Float
+from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.planes import join_planes
 
@@ -23,19 +23,21 @@ _LOG_2PI = math.log(2 * math.pi)
 class Prior(Protocol):
     """Log density over the last dimension of ``z``; ``select`` keeps the windows named by an index."""
 
-    def log_prob(self, z: Tensor) -> Tensor: ...
+    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]: ...
 
-    def score(self, z: Tensor) -> Tensor:
+    def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
         """Gradient of ``log_prob``, shape of ``z``."""
         ...
 
-    def select(self, index: Tensor) -> Prior: ...
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Prior: ...
 
-    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Tensor:
+    def sample(
+        self, count: int, windows: int, *, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "count window parameter"]:
         """Draws of ``z``, shape ``(count, window, parameter)``."""
         ...
 
-    def center(self) -> Tensor:
+    def center(self) -> Float[Tensor, "*window parameter"]:
         """A typical ``z``, shape broadcastable to ``(window, parameter)``."""
         ...
 
@@ -44,10 +46,10 @@ class Prior(Protocol):
 class LogNormalPrior:
     """Independent log-normal parameters: ``log(parameter) ~ Normal(log median, log_sd)``; shapes ``(parameter,)``."""
 
-    median: Tensor
-    log_sd: Tensor
-    _log_median: Tensor = field(init=False, repr=False)
-    _precision: Tensor = field(init=False, repr=False)
+    median: Float[Tensor, " parameter"]
+    log_sd: Float[Tensor, " parameter"]
+    _log_median: Float[Tensor, " parameter"] = field(init=False, repr=False)
+    _precision: Float[Tensor, " parameter"] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("median", "log_sd"):
@@ -58,21 +60,23 @@ class LogNormalPrior:
         object.__setattr__(self, "_log_median", self.median.log())
         object.__setattr__(self, "_precision", self.log_sd.square().reciprocal())
 
-    def log_prob(self, z: Tensor) -> Tensor:
+    def log_prob(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw"]:
         score = (z - self.median.log()) / self.log_sd
         return -0.5 * score.square().sum(-1) - self.log_sd.log().sum() - 0.5 * len(self.median) * _LOG_2PI
 
-    def score(self, z: Tensor) -> Tensor:
+    def score(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
         return (self._log_median - z).mul_(self._precision)
 
-    def select(self, index: Tensor) -> LogNormalPrior:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> LogNormalPrior:
         return self
 
-    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Tensor:
+    def sample(
+        self, count: int, windows: int, *, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "count window parameter"]:
         noise = torch.randn(count, windows, len(self.median), generator=generator, dtype=torch.float64)
         return self.median.log() + self.log_sd * noise
 
-    def center(self) -> Tensor:
+    def center(self) -> Float[Tensor, " parameter"]:
         return self.median.log()
 
 
@@ -80,8 +84,8 @@ class LogNormalPrior:
 class HalfNormalPrior:
     """Independent half-normal parameters with the given ``scale``, shape ``(parameter,)``."""
 
-    scale: Tensor
-    _minus_precision: Tensor = field(init=False, repr=False)
+    scale: Float[Tensor, " parameter"]
+    _minus_precision: Float[Tensor, " parameter"] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         value = torch.as_tensor(self.scale, dtype=torch.float64)
@@ -90,21 +94,23 @@ class HalfNormalPrior:
         object.__setattr__(self, "scale", value)
         object.__setattr__(self, "_minus_precision", -value.square().reciprocal())
 
-    def log_prob(self, z: Tensor) -> Tensor:
+    def log_prob(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw"]:
         log_density = -0.5 * (z.exp() / self.scale).square() + z
         return log_density.sum(-1) + len(self.scale) * 0.5 * math.log(2 / math.pi) - self.scale.log().sum()
 
-    def score(self, z: Tensor) -> Tensor:
+    def score(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
         return (2 * z).exp_().mul_(self._minus_precision).add_(1)
 
-    def select(self, index: Tensor) -> HalfNormalPrior:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> HalfNormalPrior:
         return self
 
-    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Tensor:
+    def sample(
+        self, count: int, windows: int, *, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "count window parameter"]:
         noise = torch.randn(count, windows, len(self.scale), generator=generator, dtype=torch.float64)
         return (self.scale * noise.abs()).log()
 
-    def center(self) -> Tensor:
+    def center(self) -> Float[Tensor, " parameter"]:
         return (0.5 * self.scale).log()
 
 
@@ -119,9 +125,9 @@ class QuadrantNormal:
         variance: ``lambda``, in the squared units of each parameter.
     """
 
-    mean: Tensor
+    mean: Float[Tensor, "window parameter"]
     variance: float
-    _log_mass: Tensor = field(init=False, repr=False)
+    _log_mass: Float[Tensor, " window"] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not self.variance > 0:
@@ -129,18 +135,20 @@ class QuadrantNormal:
         inside = torch.special.log_ndtr(self.mean / math.sqrt(self.variance)).sum(-1)
         object.__setattr__(self, "_log_mass", inside + 0.5 * self.mean.shape[-1] * (_LOG_2PI + math.log(self.variance)))
 
-    def log_prob(self, z: Tensor) -> Tensor:
+    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
         distance = (z.exp() - self.mean).square().sum(-1)
         return -0.5 / self.variance * distance + z.sum(-1) - self._log_mass
 
-    def score(self, z: Tensor) -> Tensor:
+    def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
         value = z.exp()
         return 1 - value * (value - self.mean) / self.variance
 
-    def select(self, index: Tensor) -> QuadrantNormal:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> QuadrantNormal:
         return QuadrantNormal(self.mean[index], self.variance)
 
-    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Tensor:
+    def sample(
+        self, count: int, windows: int, *, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "count window parameter"]:
         # inverse CDF of the part above zero: exact, with a fixed number of uniforms
         uniform = torch.rand(count, windows, self.mean.shape[-1], generator=generator, dtype=torch.float64)
         sd = math.sqrt(self.variance)
@@ -148,7 +156,7 @@ class QuadrantNormal:
         cut = (below + (1 - below) * uniform).clamp(1e-300, 1 - 1e-16)
         return (self.mean + sd * torch.special.ndtri(cut)).clamp_min(1e-12).log()
 
-    def center(self) -> Tensor:
+    def center(self) -> Float[Tensor, "window parameter"]:
         return self.mean.clamp_min(1e-3).log()
 
 
@@ -163,8 +171,8 @@ class LogSpaceNormal:
 
     mean_z: Float[Tensor, "window parameter"]
     cov_z: Float[Tensor, "window parameter parameter"]
-    _inverse: Tensor = field(init=False, repr=False)
-    _half_log_det: Tensor = field(init=False, repr=False)
+    _inverse: Float[Tensor, "window parameter parameter"] = field(init=False, repr=False)
+    _half_log_det: Float[Tensor, " window"] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         lower = torch.linalg.cholesky(self.cov_z)
@@ -172,21 +180,23 @@ class LogSpaceNormal:
         object.__setattr__(self, "_inverse", torch.linalg.solve_triangular(lower, eye, upper=False))
         object.__setattr__(self, "_half_log_det", lower.diagonal(dim1=-2, dim2=-1).log().sum(-1))
 
-    def log_prob(self, z: Tensor) -> Tensor:
+    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
         score = torch.einsum("wij,...wj->...wi", self._inverse, z - self.mean_z)
         return -0.5 * score.square().sum(-1) - self._half_log_det - 0.5 * self.mean_z.shape[-1] * _LOG_2PI
 
-    def score(self, z: Tensor) -> Tensor:
+    def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
         return -torch.einsum("wji,wjk,...wk->...wi", self._inverse, self._inverse, z - self.mean_z)
 
-    def select(self, index: Tensor) -> LogSpaceNormal:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> LogSpaceNormal:
         return LogSpaceNormal(self.mean_z[index], self.cov_z[index])
 
-    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Tensor:
+    def sample(
+        self, count: int, windows: int, *, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "count window parameter"]:
         noise = torch.randn(count, windows, self.mean_z.shape[-1], generator=generator, dtype=torch.float64)
         return self.mean_z + torch.einsum("wij,cwj->cwi", torch.linalg.cholesky(self.cov_z), noise)
 
-    def center(self) -> Tensor:
+    def center(self) -> Float[Tensor, "window parameter"]:
         return self.mean_z
 
 
@@ -197,20 +207,22 @@ class Joint:
     actuation: Prior
     noise: Prior
 
-    def log_prob(self, z: Tensor) -> Tensor:
+    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
         return self.actuation.log_prob(z[..., :2]) + self.noise.log_prob(z[..., 2:])
 
-    def score(self, z: Tensor) -> Tensor:
+    def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
         return join_planes(self.actuation.score(z[..., :2]), self.noise.score(z[..., 2:]))
 
-    def select(self, index: Tensor) -> Joint:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Joint:
         return Joint(self.actuation.select(index), self.noise.select(index))
 
-    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Tensor:
+    def sample(
+        self, count: int, windows: int, *, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "count window parameter"]:
         parts = [part.sample(count, windows, generator=generator) for part in (self.actuation, self.noise)]
         return torch.cat(parts, dim=-1)
 
-    def center(self) -> Tensor:
+    def center(self) -> Float[Tensor, "*window parameter"]:
         first, rest = self.actuation.center(), self.noise.center()
         shape = torch.broadcast_shapes(first.shape[:-1], rest.shape[:-1])
         return torch.cat([first.expand(*shape, -1), rest.expand(*shape, -1)], dim=-1)
@@ -224,25 +236,27 @@ class Switch:
     first: Prior
     later: Prior
 
-    def log_prob(self, z: Tensor) -> Tensor:
+    def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
         return torch.where(self.started, self.later.log_prob(z), self.first.log_prob(z))
 
-    def score(self, z: Tensor) -> Tensor:
+    def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
         return torch.where(self.started[:, None], self.later.score(z), self.first.score(z))
 
-    def select(self, index: Tensor) -> Prior:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Prior:
         started = self.started[index]
         first, later = self.first.select(index), self.later.select(index)
         if bool(started.all()):
             return later
         return Switch(started, first, later) if bool(started.any()) else first
 
-    def sample(self, count: int, windows: int, *, generator: torch.Generator | None = None) -> Tensor:
+    def sample(
+        self, count: int, windows: int, *, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "count window parameter"]:
         first = self.first.sample(count, windows, generator=generator)
         later = self.later.sample(count, windows, generator=generator)
         return torch.where(self.started[:, None], later, first)
 
-    def center(self) -> Tensor:
+    def center(self) -> Float[Tensor, "window parameter"]:
         return torch.where(self.started[:, None], self.later.center(), self.first.center())
 
 

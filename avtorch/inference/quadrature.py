@@ -183,7 +183,7 @@ class _Sums:
     marginals: Float[Tensor, "window d node"]
     coarse: Float[Tensor, "window half"]
 
-    def edge(self) -> Tensor:
+    def edge(self) -> Float[Tensor, "window d 2"]:
         """Marginal at both ends of every axis over its peak, ``(window, axis, 2)``."""
         ends = torch.stack([self.marginals[..., 0], self.marginals[..., -1]], -1)
         return ends / self.marginals.amax(-1, keepdim=True)

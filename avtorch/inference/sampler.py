@@ -13,13 +13,13 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
+from avtorch.inference.coordinates import Coordinates, Whitening, stiffness
 from avtorch.inference.density import Density, ScoredDensity, SelectableDensity, SubsampledDensity, constrained
 from avtorch.inference.exactness import Exactness, compare_with_exact
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.planes import empty_planes
 from avtorch.inference.posterior import Posterior, nested_rhat
 from avtorch.inference.sgld import SGLD, Noise
-from avtorch.inference.whitening import Coordinates, Whitening, stiffness
 
 #: Chains times windows sampled at once: enough to make the cost of a call negligible, few enough for the processor's
 #: cache.
@@ -148,32 +148,32 @@ def sample(
     """
     settings = SamplerSettings() if settings is None else settings
     mode = find_mode(density) if mode is None else mode
-    mode, pace = _adapted(density, mode, settings, generator)
+    mode, slowdown = _adapted(density, mode, settings, generator)
     # all draws of a parameter of a window behind one another, as its summaries read them
     draws = torch.empty(*mode.z.shape, settings.chains, settings.draws, dtype=mode.z.dtype).permute(2, 3, 0, 1)
-    strayed, apart, stuck = (torch.zeros_like(mode.converged) for _ in range(3))
+    diverged, unmixed, stuck = (torch.zeros_like(mode.converged) for _ in range(3))
     found = Exactness.unknown(*mode.z.shape)
     # chains that agree still differ by chance: eight groups cut into halves of this many draws each
     members = max(1, settings.chains // 8) * (settings.draws // 2)
     limit = (rhat_max**2 + 4 / members) ** 0.5
     open_ = torch.arange(density.windows)
     for attempt in range(settings.attempts):
-        for index in _batches(density, open_, pace, settings.chains):
+        for index in _batches(density, open_, slowdown, settings.chains):
             part, where = _select(density, index), mode.select(index)
-            times = float(_longer(pace[index]).amax())
-            coordinates, w = _walk(part, where, settings.slower(times), pace[index], generator)
+            times = float(_longer(slowdown[index]).amax())
+            coordinates, w = _walk(part, where, settings.slower(times), slowdown[index], generator)
             fresh = torch.isin(index, open_)
             new = index[fresh]
-            strayed[new] = _strayed(part, where, coordinates, w)[fresh]
-            apart[new] = ~(nested_rhat(w).amax(-1) <= limit)[fresh]  # NaN counts as not converged
-            stuck[new] = (pace[new] > STUCK) | _too_wide(where, settings, pace[index], times)[fresh]
+            diverged[new] = _diverged(part, where, coordinates, w)[fresh]
+            unmixed[new] = ~(nested_rhat(w).amax(-1) <= limit)[fresh]  # NaN counts as not converged
+            stuck[new] = (slowdown[new] > STUCK) | _too_wide(where, settings, slowdown[index], times)[fresh]
             z = coordinates.z(w)
             values = constrained(density, z)
             draws[:, :, new] = values if len(new) == len(index) else values[:, :, fresh]
             if settings.compare:
                 found = found.put(index, compare_with_exact(part, z), fresh)
-        pace = 2 * pace
-        again = strayed | apart
+        slowdown = 2 * slowdown
+        again = diverged | unmixed
         if settings.compare:
             # a second run may reach what the first did not; where it changed nothing, half the step will not either
             again |= ~found.holds() if attempt == 0 else ~(found.holds() | found.hopeless())
@@ -181,7 +181,7 @@ def sample(
         if not len(open_):
             break
     off = found.why(density.names) if settings.compare else [""] * density.windows
-    flags = zip(mode.converged.tolist(), strayed.tolist(), apart.tolist(), stuck.tolist(), off, strict=True)
+    flags = zip(mode.converged.tolist(), diverged.tolist(), unmixed.tolist(), stuck.tolist(), off, strict=True)
     why = tuple(_why(*flag) for flag in flags)
     converged = torch.tensor([not reason for reason in why])
     return Posterior(density.names, draws, converged, why, found if settings.compare else None)
@@ -196,34 +196,34 @@ def _adapted(
     covariance take its place if they are less stiff.
     """
     coordinates = Coordinates.of(mode, settings.whitening)
-    pace = stiffness(density, coordinates)
-    uneven = (pace > UNEVEN).nonzero().squeeze(-1)
+    slowdown = stiffness(density, coordinates)
+    uneven = (slowdown > UNEVEN).nonzero().squeeze(-1)
     if settings.whitening != "full" or not len(uneven):
-        return mode, pace
-    fitted, fitted_pace = mode, pace.clone()
-    for index in _batches(density, uneven, pace, settings.chains):
+        return mode, slowdown
+    fitted, fitted_slowdown = mode, slowdown.clone()
+    for index in _batches(density, uneven, slowdown, settings.chains):
         part, where = _select(density, index), mode.select(index)
         # a rough covariance will do
-        coordinates, w = _walk(part, where, settings.slower(PILOT), pace[index], generator)
+        coordinates, w = _walk(part, where, settings.slower(PILOT), slowdown[index], generator)
         better = where.refitted(coordinates.z(w).flatten(0, 1))
         quicker = stiffness(part, Coordinates.of(better))
-        fitted = fitted.replaced(index, better, quicker < pace[index])
-        fitted_pace[index] = torch.minimum(quicker, pace[index])
-    return fitted, fitted_pace
+        fitted = fitted.replaced(index, better, quicker < slowdown[index])
+        fitted_slowdown[index] = torch.minimum(quicker, slowdown[index])
+    return fitted, fitted_slowdown
 
 
-def _why(mode_found: bool, strayed: bool, apart: bool, stuck: bool, off: str) -> str:
+def _why(mode_found: bool, diverged: bool, unmixed: bool, stuck: bool, off: str) -> str:
     if not mode_found:
         return "the search for the posterior's mode did not end at a maximum"
     if stuck:
         return "the posterior is so uneven that the longest chain would not cross it"
-    if strayed:
+    if diverged:
         return "chains left the posterior, also with the shortest step tried"
-    return "chains disagree, also with the shortest step tried" if apart else off
+    return "chains disagree, also with the shortest step tried" if unmixed else off
 
 
 def _too_wide(
-    mode: Mode, settings: SamplerSettings, pace: Float[Tensor, " window"], times: float
+    mode: Mode, settings: SamplerSettings, slowdown: Float[Tensor, " window"], times: float
 ) -> Bool[Tensor, " window"]:
     """Where the burn-in is too short for the widest direction of a space left unwhitened, ``(window,)`` bool.
 
@@ -231,26 +231,26 @@ def _too_wide(
     an SD after two such times. They agree with each other all the while, so R-hat does not detect it.
     """
     if settings.whitening == "full":
-        return torch.zeros_like(pace, dtype=torch.bool)
+        return torch.zeros_like(slowdown, dtype=torch.bool)
     widest = Coordinates.of(mode, settings.whitening).widest(mode)
-    return settings.slower(times).burn_in < 2 * (2 / settings.step) * pace * widest.square()
+    return settings.slower(times).burn_in < 2 * (2 / settings.step) * slowdown * widest.square()
 
 
-def _longer(pace: Float[Tensor, "*window"]) -> Float[Tensor, "*window"]:
-    """Factor of steps for a window of this pace: the nearest of 1, sqrt 2, 2, ... 64."""
-    return 2.0 ** (0.5 * (2 * pace.log2()).round().clamp(0, 12))
+def _longer(slowdown: Float[Tensor, "*window"]) -> Float[Tensor, "*window"]:
+    """Factor of steps for a window of this slowdown: the nearest of 1, sqrt 2, 2, ... 64."""
+    return 2.0 ** (0.5 * (2 * slowdown.log2()).round().clamp(0, 12))
 
 
-def _batches(density: Density, index: Tensor, pace: Tensor, chains: int) -> list[Tensor]:
+def _batches(density: Density, index: Tensor, slowdown: Tensor, chains: int) -> list[Tensor]:
     """Windows to sample together: with equal numbers of steps, and not too many windows at once."""
     if not isinstance(density, SelectableDensity):
         return [torch.arange(density.windows)]
     size = max(1, BLOCK // chains)
-    times = _longer(pace[index])
+    times = _longer(slowdown[index])
     batches, few = [], index[:0]
     for each in times.unique():
         few = torch.cat([few, index[times == each]])
-        # a handful of windows costs less in the next batch, at its slower pace, than in one of their own
+        # a handful of windows costs less in the next batch, with its shorter steps, than in one of their own
         if len(few) * chains >= FEW or each == times.max():
             # in their own order: a batch of all windows needs no indexing
             batches += few.sort().values.split(size)
@@ -264,7 +264,7 @@ def _select(density: Density, index: Tensor) -> Density:
     return density.select(index)
 
 
-def _strayed(
+def _diverged(
     density: Density, mode: Mode, coordinates: Coordinates, w: Float[Tensor, "chain draw window d"], depth: float = 50.0
 ) -> Bool[Tensor, " window"]:
     """Where some chain's furthest draw lies ``depth`` nats and one a parameter off the mode, ``(window,)`` bool.
@@ -284,29 +284,30 @@ def walk(
     mode: Mode,
     settings: SamplerSettings,
     *,
-    pace: Float[Tensor, " window"] | None = None,
+    slowdown: Float[Tensor, " window"] | None = None,
     generator: torch.Generator | None = None,
 ) -> Float[Tensor, "chain draw window d"]:
-    """One run of Algorithm 1 in the whitened coordinates, with step ``settings.step / pace``.
+    """One run of Algorithm 1 in the whitened coordinates, with step ``settings.step / slowdown``.
 
-    ``pace``, ``(window,)``, is the :func:`stiffness` by default. Returns draws of ``z``, ``(chain, draw, window, d)``.
+    ``slowdown``, ``(window,)``, is the :func:`stiffness` by default. Returns draws of ``z``,
+    ``(chain, draw, window, d)``.
     """
-    pace = stiffness(density, Coordinates.of(mode, settings.whitening)) if pace is None else pace
-    coordinates, w = _walk(density, mode, settings, pace, generator)
+    slowdown = stiffness(density, Coordinates.of(mode, settings.whitening)) if slowdown is None else slowdown
+    coordinates, w = _walk(density, mode, settings, slowdown, generator)
     return coordinates.z(w)
 
 
 def _walk(
-    density: Density, mode: Mode, settings: SamplerSettings, pace: Tensor, generator: torch.Generator | None
+    density: Density, mode: Mode, settings: SamplerSettings, slowdown: Tensor, generator: torch.Generator | None
 ) -> tuple[Coordinates, Tensor]:
     """Draws ``(chain, draw, window, d)`` in the coordinates returned with them."""
     # each window's own step is folded into its scale
-    coordinates = Coordinates.of(mode, settings.whitening).slowed(pace)
+    coordinates = Coordinates.of(mode, settings.whitening).slowed(slowdown)
     shape = (settings.chains, *mode.z.shape)
     w = empty_planes(*shape, dtype=mode.z.dtype).zero_()
     if settings.spread > 0:
         start = torch.randn(shape, dtype=w.dtype, generator=generator)
-        w += settings.spread * pace.sqrt()[:, None] * start
+        w += settings.spread * slowdown.sqrt()[:, None] * start
     w.requires_grad_()
     if settings.optimizer is None:
         options = {"noise": settings.noise, "noise_dtype": torch.float32}

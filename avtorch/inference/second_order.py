@@ -12,6 +12,7 @@ import math
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool, Float, Int, Real
 from avtorch.inference.jerk import JerkDensity, JerkStatistics
 from avtorch.inference.planes import as_planes
 from avtorch.inference.priors import HalfNormalPrior, Joint, LogNormalPrior, Prior
@@ -71,11 +72,16 @@ class SpeedLagDensity(JerkDensity):
         super().__init__(statistics, default if prior is None else prior)
 
     @staticmethod
-    def sums(v: Tensor, v_cmd: Tensor, accel: Tensor, mask: Tensor | None = None) -> JerkStatistics:
+    def sums(
+        v: Real[Tensor, "window time"],
+        v_cmd: Real[Tensor, "window time"],
+        accel: Real[Tensor, "window time"],
+        mask: Real[Tensor, "window time"] | Bool[Tensor, "window time"] | None = None,
+    ) -> JerkStatistics:
         """Of speed and speed command [m/s] and acceleration [m/s²], each ``(window, time)``."""
         return JerkStatistics.from_samples(v, v_cmd, accel, mask)
 
-    def select(self, index: Tensor) -> SpeedLagDensity:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> SpeedLagDensity:
         """The windows named by ``index``."""
         return SpeedLagDensity(self.statistics.select(index), self.prior.select(index))
 
@@ -101,11 +107,16 @@ class PositionLagDensity(JerkDensity):
         super().__init__(statistics, default if prior is None else prior)
 
     @staticmethod
-    def sums(error: Tensor, v: Tensor, accel: Tensor, mask: Tensor | None = None) -> JerkStatistics:
+    def sums(
+        error: Real[Tensor, "window time"],
+        v: Real[Tensor, "window time"],
+        accel: Real[Tensor, "window time"],
+        mask: Real[Tensor, "window time"] | Bool[Tensor, "window time"] | None = None,
+    ) -> JerkStatistics:
         """Of ``x_cmd - x`` [m], speed [m/s] and acceleration [m/s²], each ``(window, time)``."""
         return JerkStatistics.from_samples(v, error, accel, mask)
 
-    def select(self, index: Tensor) -> PositionLagDensity:
+    def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> PositionLagDensity:
         """The windows named by ``index``."""
         return PositionLagDensity(self.statistics.select(index), self.prior.select(index))
 
@@ -115,7 +126,7 @@ class PositionLagDensity(JerkDensity):
         log_T, log_zeta, log_sigma = z.unbind(-1)
         return torch.stack([-log_sigma, math.log(2) + log_zeta - log_T - log_sigma, -2 * log_T - log_sigma], -1).exp()
 
-    def score(self, z: Tensor) -> Tensor:
+    def score(self, z: Float[Tensor, "*draw window 3"]) -> Float[Tensor, "*draw window 3"]:
         """Gradient of :meth:`log_prob` in ``z``, in closed form."""
         scaled = self._scaled_coefficients(z)
         # by the logarithms of the three coefficients; the form is half the chi2
@@ -123,7 +134,7 @@ class PositionLagDensity(JerkDensity):
         by_sigma = -(one + damped + pulled) - self.statistics.n
         return as_planes(-damped - 2 * pulled, damped, by_sigma).add_(self.prior.score(z))
 
-    def initial(self) -> Tensor:
+    def initial(self) -> Float[Tensor, "window 3"]:
         """Least squares where it gives positive coefficients in a plausible range, else the prior's centre."""
         damped, pulled, residual_sd = self.statistics.least_squares()
         center = self.prior.center().expand(self.windows, 3)

@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from avtorch.inference.evidence import Evidence, Rows
 from avtorch.inference.excitation import ExcitationRule
+from avtorch.inference.form import Rows, WindowLikelihood
 from avtorch.inference.jerk import JerkStatistics
 from avtorch.inference.priors import Prior
 from avtorch.inference.sampler import SamplerSettings
@@ -38,9 +38,9 @@ class SpeedLagForm:
         self.rule = ExcitationRule() if rule is None else rule
         self.noise_prior: Prior = default_accel_noise_prior() if noise_prior is None else noise_prior
 
-    def evidence(self, rows: Rows, full: float) -> Evidence:
+    def likelihood(self, rows: Rows, full: float) -> WindowLikelihood:
         sums = SpeedLagDensity.sums(rows["speed"], rows["speed_cmd"], rows["accel"], rows["usable"]).with_least_noise()
-        return Evidence(
+        return WindowLikelihood(
             n=sums.n,
             excited=self.rule(sums, full),
             density=lambda index, prior: SpeedLagDensity(sums.select(index), prior),
@@ -70,12 +70,12 @@ class PositionLagForm:
         self.resolved, self.share = resolved, share
         self.noise_prior: Prior = default_accel_noise_prior() if noise_prior is None else noise_prior
 
-    def evidence(self, rows: Rows, full: float) -> Evidence:
+    def likelihood(self, rows: Rows, full: float) -> WindowLikelihood:
         error = rows["position_cmd"] - rows["position"]
         sums = PositionLagDensity.sums(error, rows["speed"], rows["accel"], rows["usable"]).with_least_noise()
         sd_T, sd_zeta = _predicted_log_sd(sums)
         enough = sums.n >= max(4.0, self.share * full)
-        return Evidence(
+        return WindowLikelihood(
             n=sums.n,
             excited=(sd_T <= self.resolved) & (sd_zeta <= self.resolved) & enough,
             density=lambda index, prior: PositionLagDensity(sums.select(index), prior),

@@ -8,10 +8,11 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Bool
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief, Summary
 from avtorch.inference.density import Density
-from avtorch.inference.evidence import Evidence, Rows
+from avtorch.inference.form import Rows, WindowLikelihood
 from avtorch.inference.posterior import sorted_quantile
 from avtorch.inference.priors import (
     Joint,
@@ -110,7 +111,7 @@ class SequentialInference:
             later = LogSpaceNormal(self._mean_z, widening * self._cov_z)
         return Switch(self._started, self.first_prior, later)
 
-    def update(self, density: Callable[[Tensor, Prior], Density], excited: Tensor) -> Belief:
+    def update(self, density: Callable[[Tensor, Prior], Density], excited: Bool[Tensor, " vehicle"]) -> Belief:
         """Take in one window of every vehicle.
 
         Args:
@@ -129,10 +130,10 @@ class SequentialInference:
         self.belief = self.belief.updated(excited, index, found, converged)
         return self.belief
 
-    def take(self, rows: Rows, evidence: Evidence) -> Belief:
-        """:meth:`update` with the interface of an estimator of a stream; the evidence contains all that is needed of
+    def take(self, rows: Rows, likelihood: WindowLikelihood) -> Belief:
+        """:meth:`update` with the interface of an estimator of a stream; the likelihood contains all that is needed of
         the rows."""
-        return self.update(evidence.density, evidence.excited)
+        return self.update(likelihood.density, likelihood.excited)
 
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
         """Posterior of some vehicles: its summary, log moments, and where it converged ``(vehicle,)`` bool."""

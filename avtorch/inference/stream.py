@@ -12,10 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Real
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief
 from avtorch.inference.estimators.choose import make_estimator
-from avtorch.inference.evidence import Form, JerkForm
+from avtorch.inference.form import Form, JerkForm
 from avtorch.inference.stream_state import check_clock, read_state, with_checksum, without_checksum, write_state
 from avtorch.inference.stream_units import StreamUnits
 from avtorch.io.clock import ROUNDING_S, decimals
@@ -45,7 +46,7 @@ class Window:
 
     start_s: float
     end_s: float
-    n: Tensor
+    n: Real[Tensor, " vehicle"]
     belief: Belief
 
 
@@ -280,11 +281,11 @@ class BeliefStream:
             end = min(end, float(rows["time"][-1]) + (self.window / full))
         if self._units is not None:
             self._units.take(rows, self.inference.state_dict())
-        evidence = self.form.evidence(rows, full)
-        belief = self.inference.take(rows, evidence)
+        likelihood = self.form.likelihood(rows, full)
+        belief = self.inference.take(rows, likelihood)
         self._index += 1
         clock = 0.0 if self._epoch is None else self._epoch
-        return Window(start + clock, end + clock, evidence.n, belief)
+        return Window(start + clock, end + clock, likelihood.n, belief)
 
     @staticmethod
     def _since(time: Tensor, epoch: float | None) -> Tensor:
@@ -321,8 +322,8 @@ class BeliefStream:
         own = {"estimator": self.estimator, "form": type(self.form).__name__, "window": self.window}
         for name, value in {**own, "vehicles": self.vehicles}.items():
             if type(state.get(name)) is not type(value) or state[name] != value:
-                said = "by the estimator" if name == "estimator" else f"with {name}"
-                raise InputError(f"state: saved {said} {str(state.get(name))[:40]!r}, not {value!r}")
+                setting = "by the estimator" if name == "estimator" else f"with {name}"
+                raise InputError(f"state: saved {setting} {str(state.get(name))[:40]!r}, not {value!r}")
         if set(state) != {"rows", "epoch", "origin", "index", "last", "driven", "inference", "vehicles", "units", *own}:
             raise InputError(f"state: holds {', '.join(sorted(map(str, state)))[:200]}, not what a stream saves")
         check_clock(state, columns=self._rows, vehicles=self.vehicles)

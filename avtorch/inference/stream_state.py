@@ -123,5 +123,5 @@ def read_state(path: str | PathLike[str]) -> dict[str, Any]:
         return torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
     # torch.load has no documented list of errors
     except Exception as fault:
-        told = (str(fault).splitlines() or [type(fault).__name__])[0][:100]
-        raise Damaged(f"{path}: holds no tensors and plain values ({told}); {_REMEDY}") from None
+        reason = (str(fault).splitlines() or [type(fault).__name__])[0][:100]
+        raise Damaged(f"{path}: holds no tensors and plain values ({reason}); {_REMEDY}") from None

@@ -15,18 +15,18 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
-from avtorch.inference.evidence import Rows
+from avtorch.inference.form import Rows
 from avtorch.inference.jerk import JerkStatistics
 from avtorch.inference.state import tensor_as
-from avtorch.io.consistency import MIN_SPANS, SPANS_S
+from avtorch.io.consistency import LATER_S, MIN_SPANS, SPANS_S, may_be_late
 from avtorch.io.units import GRAVITY
-from avtorch.io.validity import ACCEL_FACTORS, SPEED_FACTORS, WITNESS
+from avtorch.io.validity import ACCEL_FACTORS, SAME_MOTION, SPEED_FACTORS
 
 RATES = (("position", "speed"), ("speed", "accel"), ("accel", "jerk"))
 """Pairs of a level and its rate, among the columns of the forms."""
 COMMAND = (0.02, 3.5)
 """Range of plausible gains; the limit for a log is lower, but ten seconds of a real race car gave 3.2."""
-LOOKS_S = (9.5, 19.0, 38.0)
+CHECKS_S = (9.5, 19.0, 38.0)
 """Seconds of a stretch after which it is checked; it is not kept beyond the last."""
 DELAYS_S = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 """Delays [s] of the response to a command that are tried."""
@@ -69,7 +69,7 @@ class StreamUnits:
 
     def __init__(self, columns: tuple[str, ...], vehicles: int) -> None:
         self.vehicles = vehicles
-        self.pairs = [Pair(a, b, False, WITNESS, (0.0,)) for a, b in RATES if a in columns and b in columns]
+        self.pairs = [Pair(a, b, False, SAME_MOTION, (0.0,)) for a, b in RATES if a in columns and b in columns]
         if "accel_cmd" in columns and ("speed" in columns or "accel" in columns):
             level = "speed" if "speed" in columns else "accel"
             self.pairs.append(Pair(level, "accel_cmd", level == "accel", COMMAND, DELAYS_S))
@@ -80,7 +80,7 @@ class StreamUnits:
         """Begin a stretch with the next window."""
         self.rows: dict[str, Tensor] = {}
         self.sums: Tensor | None = None
-        self.looks = 0
+        self.checks = 0
         self.before: dict[str, Any] | None = None
 
     def take(self, rows: Rows, belief: dict[str, Any]) -> None:
@@ -101,12 +101,12 @@ class StreamUnits:
             self.before = belief
         self._append(rows)
         time = self.rows["time"]
-        if float(time[-1] - time[0]) < LOOKS_S[self.looks]:
+        if float(time[-1] - time[0]) < CHECKS_S[self.checks]:
             return
-        self.looks += 1
-        sure = [self._judge(pair) for pair in self.pairs]
-        self._judge_swap()
-        if all(sure) or self.looks == len(LOOKS_S):
+        self.checks += 1
+        sure = [self._check(pair) for pair in self.pairs]
+        self._check_swap()
+        if all(sure) or self.checks == len(CHECKS_S):
             self.clear()
 
     def _append(self, rows: Rows) -> None:
@@ -140,24 +140,32 @@ class StreamUnits:
             for name, value in new.items()
         }
 
-    def _judge(self, pair: Pair) -> bool:
+    def _check(self, pair: Pair) -> bool:
         """Whether the stretch decides ``pair`` for every vehicle; raises InputError where one of them is wrong."""
-        found = [self._compare(pair, span) for span in SPANS_S]
-        slope, correlation = (torch.cat(x) for x in zip(*found, strict=True))  # (span x delay, vehicle)
-        # a periodic drive correlates as strongly, with the other sign, half a period off: the agreeing sign goes first
-        best = (correlation.abs() + (correlation > 0.5)).argmax(0, keepdim=True)
-        slope, correlation = slope.gather(0, best)[0], correlation.gather(0, best)[0]
+        slope, correlation = self._best(pair)
+        if len(pair.delays) > 1 and bool((correlation <= -SURE).any()):
+            later = self._best(pair._replace(delays=LATER_S))
+            late = (correlation <= -SURE) & may_be_late(later[1], known=later[1] != 0)
+            slope, correlation = torch.where(late, later[0], slope), torch.where(late, later[1], correlation)
         sure = correlation.abs() >= SURE
         wrong = sure & ~((slope >= pair.limits[0]) & (slope <= pair.limits[1]))
         for v in wrong.nonzero().squeeze(-1).tolist():
             moves = f"{pair.level} responds with" if pair.integrated else f"{pair.level} changes"
-            told = f"{moves} {float(slope[v]):.3g} times as much as {pair.rate} implies"
+            scale = f"{moves} {float(slope[v]):.3g} times as much as {pair.rate} implies"
             if float(slope[v]) < 0:
-                raise self._refusal(v, pair.level, pair.rate, f"{told}, so one has the wrong sign")
+                raise self._refusal(v, pair.level, pair.rate, f"{scale}, so one has the wrong sign")
             hints = _HINTS[pair.level, pair.rate]
             near = min(hints, key=lambda name: abs(math.log(float(slope[v]) / hints[name])))
-            raise self._refusal(v, pair.level, pair.rate, f"{told}, so their units differ; perhaps {near}")
+            raise self._refusal(v, pair.level, pair.rate, f"{scale}, so their units differ; perhaps {near}")
         return bool(sure.all())
+
+    def _best(self, pair: Pair) -> tuple[Tensor, Tensor]:
+        """Slope and correlation, each ``(vehicle,)``, at the delay and the span where they correlate best."""
+        found = [self._compare(pair, span) for span in SPANS_S]
+        slope, correlation = (torch.cat(x) for x in zip(*found, strict=True))  # (span x delay, vehicle)
+        # a periodic drive correlates as strongly, with the other sign, half a period off: the agreeing sign goes first
+        best = (correlation.abs() + (correlation > 0.5)).argmax(0, keepdim=True)
+        return slope.gather(0, best)[0], correlation.gather(0, best)[0]
 
     def _compare(self, pair: Pair, span: float) -> tuple[Tensor, Tensor]:
         """Slope and correlation of level on rate for every delay, ``(delay, vehicle)``; a correlation of 0: unknown."""
@@ -188,7 +196,7 @@ class StreamUnits:
         slope = torch.where(moves, correlation * (yy / xx.clamp_min(1e-300)).sqrt(), 1.0)
         return slope.mT, correlation.mT
 
-    def _judge_swap(self) -> None:
+    def _check_swap(self) -> None:
         """Least squares of the jerk on ``(-accel, accel_cmd)``: where lag and gain are both negative, the columns are
         swapped."""
         if self.sums is None:
@@ -203,17 +211,17 @@ class StreamUnits:
         for v in swapped.nonzero().squeeze(-1).tolist():
             raise self._refusal(v, "accel", "accel_cmd", "accel leads accel_cmd, so the two may be swapped")
 
-    def _refusal(self, vehicle: int, one: str, other: str, told: str) -> InputError:
+    def _refusal(self, vehicle: int, one: str, other: str, finding: str) -> InputError:
         start, end = float(self.rows["time"][0]), float(self.rows["time"][-1])
         which = f" of vehicle {vehicle}" if self.vehicles > 1 else ""
         return InputError(
-            f"stream: columns {one!r} and {other!r}{which}, {start:.10g} to {end:.10g} s: {told}; no estimate "
+            f"stream: columns {one!r} and {other!r}{which}, {start:.10g} to {end:.10g} s: {finding}; no estimate "
             f"from this time is kept"
         )
 
     def state_dict(self) -> dict[str, Any]:
         """Plain tensors and numbers."""
-        return {"rows": dict(self.rows), "sums": self.sums, "looks": self.looks, "before": self.before}
+        return {"rows": dict(self.rows), "sums": self.sums, "looks": self.checks, "before": self.before}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from :meth:`state_dict`.
@@ -223,12 +231,12 @@ class StreamUnits:
         """
         if not isinstance(state, dict) or set(state) != {"rows", "sums", "looks", "before"}:
             raise InputError("state: units: not what a stream saves")
-        rows, sums, looks, before = (state[key] for key in ("rows", "sums", "looks", "before"))
+        rows, sums, checks, before = (state[key] for key in ("rows", "sums", "looks", "before"))
         names = {"time", "usable", "lost", *self.columns, *(f"total {name}" for name in self.columns)}
         if not isinstance(rows, dict) or (rows and set(rows) != names) or bool(rows) != (before is not None):
             raise InputError(f"state: units: needs the rows {', '.join(sorted(names))}, or none")
-        if type(looks) is not int or not 0 <= looks < len(LOOKS_S):
-            raise InputError(f"state: units: looks: found {str(looks)[:40]}, needs a whole number from 0")
+        if type(checks) is not int or not 0 <= checks < len(CHECKS_S):
+            raise InputError(f"state: units: looks: found {str(checks)[:40]}, needs a whole number from 0")
         time = rows.get("time")
         if rows and (type(time) is not Tensor or time.ndim != 1 or not len(time)):
             raise InputError("state: units: rows.time: needs a tensor of shape (time,)")
@@ -238,7 +246,7 @@ class StreamUnits:
         if sums is not None:
             tensor_as(sums, torch.float64, (7, self.vehicles), "state: units: sums")
         self.rows = {name: value.clone() for name, value in rows.items()}
-        self.sums, self.looks, self.before = sums, looks, before
+        self.sums, self.checks, self.before = sums, checks, before
 
 
 def _at(time: Tensor, x: Tensor, when: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.distributions import biject_to
 from torch.distributions.constraints import Constraint
 
+from avtorch.arrays import Float
 from avtorch.errors import InputError
 
 LogDensity = Callable[[dict[str, Tensor]], Tensor]
@@ -71,11 +72,11 @@ class TorchDensity:
             z.append(value)
         self._start = torch.stack(z)[None]
 
-    def constrain(self, z: Tensor) -> Tensor:
+    def constrain(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
         """Parameters in their own units, shape of ``z``."""
         return torch.stack([t(x) for t, x in zip(self._maps, z.unbind(-1), strict=True)], -1)
 
-    def log_prob(self, z: Tensor) -> Tensor:
+    def log_prob(self, z: Float[Tensor, "*draw 1 parameter"]) -> Float[Tensor, "*draw 1"]:
         """Log density of ``z`` ``(..., 1, parameter)``, Jacobian included; returns ``(..., 1)``, NaN where ``z`` is."""
         # torch's distributions raise at the first NaN: one chain that diverges must not end the others
         lost = z.isnan().any(-1)
@@ -86,6 +87,6 @@ class TorchDensity:
             log_density = log_density + t.log_abs_det_jacobian(x, y)
         return torch.where(lost, torch.nan, log_density)
 
-    def initial(self) -> Tensor:
+    def initial(self) -> Float[Tensor, "1 parameter"]:
         """``(1, parameter)``."""
         return self._start

@@ -47,8 +47,8 @@ def since(stamps: FloatArray, origin: float, *, largest: float | None = None) ->
     if not len(stamps):
         return away
     size = max(float(np.abs(stamps).max()), abs(origin)) if largest is None else largest
-    told = np.round(away, decimals(size))
-    return away if bool(((np.diff(told) <= 0) & (np.diff(away) > 0)).any()) else told
+    rounded = np.round(away, decimals(size))
+    return away if bool(((np.diff(rounded) <= 0) & (np.diff(away) > 0)).any()) else rounded
 
 
 def since_start(stamps: FloatArray, segment: IntArray) -> FloatArray:
@@ -68,8 +68,8 @@ def since_start(stamps: FloatArray, segment: IntArray) -> FloatArray:
         if first and abs(part[0] - stamps[first - 1]) > _ANOTHER_CLOCK_S:
             origin, ahead = float(part[0]), float(out[first - 1]) + _SET_ANEW_S
         size = max(float(np.abs(part).max()), abs(origin))
-        told = since(part, origin, largest=size)
-        out[first:last] = _even(told, 10.0 ** -decimals(size)) + ahead
+        seconds = since(part, origin, largest=size)
+        out[first:last] = _even(seconds, 10.0 ** -decimals(size)) + ahead
     return out
 
 

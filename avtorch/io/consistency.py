@@ -4,13 +4,17 @@ rate."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 SPANS_S = (1.0, 4.0)  # the short one suits brisk drives, the long one averages more sensor noise
 MIN_SPANS = 8
+LATER_S = tuple(np.arange(1.1, 2.51, 0.1))
+"""Delays [s] of a response later than a command is usually followed, up to 2.5 s."""
+# a late car on a noisy manoeuvre of 30 s: 0.69 at its own delay, and -0.95 half a period earlier
+_MAY_BE = 0.5
 
 
 class Scale(NamedTuple):
@@ -38,6 +42,16 @@ def scale_between(
             totals.append((t, level[part], np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(t))])))
     found = (_compare(totals, span, delay) for span in SPANS_S for delay in delays)
     return max((x for x in found if x is not None), key=_rank, default=None)
+
+
+def may_be_late(correlation: Any, *, known: Any) -> Any:
+    """Whether a response that looks inverted may be a late one, by its best `correlation` at LATER_S, where `known`.
+
+    For a command that returns with the other sign after half a period, a late response cannot be distinguished from an
+    inverted one: an inverted response counts only where one of the right sign, with up to 2.5 s of delay and lag, is
+    known to correlate far less. Numbers, or arrays or tensors elementwise; bool.
+    """
+    return (known == 0) | (correlation >= _MAY_BE)
 
 
 def _compare(totals: list[tuple[NDArray, NDArray, NDArray]], span: float, delay: float) -> Scale | None:

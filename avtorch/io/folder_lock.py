@@ -70,8 +70,8 @@ def _make(place: Path) -> list[Path]:
             missing.append(each)
         place.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as fault:  # a name too long, or with a zero byte in it
-        told = fault.strerror if isinstance(fault, OSError) and fault.strerror else fault
-        raise InputError(f"{place}: cannot be made ({told}); needs a folder to write to") from None
+        reason = fault.strerror if isinstance(fault, OSError) and fault.strerror else fault
+        raise InputError(f"{place}: cannot be made ({reason}); needs a folder to write to") from None
     return missing
 
 
@@ -100,22 +100,22 @@ def _acquired(place: Path) -> Any:
 
 
 def _sign(path: Path, work: str) -> None:
-    told = {
+    holder = {
         "pid": os.getpid(),
         "host": socket.gethostname(),
         "work": work,
         "since": f"{datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC",
     }
     with suppress(OSError):  # only the message needs it
-        path.write_text(json.dumps(told), encoding="utf-8")
+        path.write_text(json.dumps(holder), encoding="utf-8")
 
 
 def _holder(path: Path) -> str:
     """The process that holds the lock, for a message: short and sanitised, as anyone can write the file."""
     try:
-        told = json.loads(read_regular(path, most=4096, need="a lock", links=False).decode("utf-8"))
-        words = {key: "".join(c for c in str(told[key])[:80] if c.isprintable()) for key in ("pid", "host", "work")}
-        since = "".join(c for c in str(told["since"])[:40] if c.isprintable())
+        holder = json.loads(read_regular(path, most=4096, need="a lock", links=False).decode("utf-8"))
+        words = {key: "".join(c for c in str(holder[key])[:80] if c.isprintable()) for key in ("pid", "host", "work")}
+        since = "".join(c for c in str(holder["since"])[:40] if c.isprintable())
     except (ValueError, TypeError, KeyError, RecursionError):
         return "another process"
     return f"{words['work']} (pid {words['pid']} on {words['host']}, since {since})"

@@ -76,8 +76,8 @@ def read_following(
 def _idle(source: str, **given: object) -> None:
     for option, value in given.items():
         if value is not None:
-            told = f"{option} {value}" if isinstance(value, int) else option
-            raise InputError(f"{source}: {told} has no meaning for a file of this form")
+            argument = f"{option} {value}" if isinstance(value, int) else option
+            raise InputError(f"{source}: {argument} has no meaning for a file of this form")
 
 
 def _chosen(source: str, vehicle: int | None, followers: list[int]) -> int:
@@ -86,8 +86,8 @@ def _chosen(source: str, vehicle: int | None, followers: list[int]) -> int:
     if vehicle is None:
         return followers[0]
     if vehicle not in followers:
-        told = listed(map(str, followers))
-        raise InputError(f"{source}: vehicle {vehicle} follows nobody in it; followers: {told}")
+        known = listed(map(str, followers))
+        raise InputError(f"{source}: vehicle {vehicle} follows nobody in it; followers: {known}")
     return vehicle
 
 
@@ -132,10 +132,10 @@ def _whole(name: str, time: FloatArray, speed: FloatArray, spacing: FloatArray, 
     best = int(np.argmax(edges[1::2] - edges[::2]))
     part = slice(int(edges[::2][best]), int(edges[1::2][best]) + 1)
     opened = float(spacing[part][-1] - spacing[part][0])
-    told = float(np.sum(np.diff(time[part]) * (lead - speed)[part][:-1]))
-    if abs(opened - told) > _DRIFT_M + _DRIFT_MPS * float(time[part][-1] - time[part][0]):
+    implied = float(np.sum(np.diff(time[part]) * (lead - speed)[part][:-1]))
+    if abs(opened - implied) > _DRIFT_M + _DRIFT_MPS * float(time[part][-1] - time[part][0]):
         raise InputError(
-            f"{name}: the spacing grew by {opened:.0f} m where the speeds imply {told:.0f} m; "
+            f"{name}: the spacing grew by {opened:.0f} m where the speeds imply {implied:.0f} m; "
             "needs spacing and speeds of one and the same leader"
         )
     log = Log.from_arrays(
@@ -148,5 +148,7 @@ def _whole(name: str, time: FloatArray, speed: FloatArray, spacing: FloatArray, 
     )
     if part.stop - part.start == len(time):
         return log
-    told = f"the longest stretch behind one leader with all known, rows {part.start + 1} to {part.stop} of {len(time)}"
-    return replace(log, remarks=(told,))
+    remark = (
+        f"the longest stretch behind one leader with all known, rows {part.start + 1} to {part.stop} of {len(time)}"
+    )
+    return replace(log, remarks=(remark,))

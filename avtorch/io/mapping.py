@@ -52,12 +52,12 @@ def read_mapping(
     kind of file, and for a signal, unit, table or key that is not known.
     """
     beside = _beside(Path(path))
-    told = SignalMap() if beside is None else _read_toml(beside)
+    stated = SignalMap() if beside is None else _read_toml(beside)
     return SignalMap(
-        column=_distinct({**told.column, **pairs("map", map)}),
-        unit={**told.unit, **_units(pairs("unit", unit), "")},
-        stamp={**told.stamp, **_stamps(pairs("stamp", stamp), "")},
-        elsewhere=told.elsewhere,
+        column=_distinct({**stated.column, **pairs("map", map)}),
+        unit={**stated.unit, **_units(pairs("unit", unit), "")},
+        stamp={**stated.stamp, **_stamps(pairs("stamp", stamp), "")},
+        elsewhere=stated.elsewhere,
     )
 
 
@@ -132,16 +132,16 @@ def _distinct(columns: dict[str, str]) -> dict[str, str]:
 
 
 def _read_toml(file: Path) -> SignalMap:
-    told = read_toml(file, links=False)
+    content = read_toml(file, links=False)
     here = f"{place(file)}: "
-    for name, table in told.items():
+    for name, table in content.items():
         if name not in ("map", "unit", "stamp", "signals"):
             raise InputError(f"{here}table [{printable(name, 40)}] is not known; tables: map, unit, stamp, signals")
         if not isinstance(table, dict):
             raise InputError(f"{here}{name} is no table; write [{name}] and its lines below")
     try:
-        column, unit, stamp = (pairs(name, _texts(told.get(name, {}), name)) for name in ("map", "unit", "stamp"))
-        elsewhere = {name: _elsewhere(name, table) for name, table in told.get("signals", {}).items()}
+        column, unit, stamp = (pairs(name, _texts(content.get(name, {}), name)) for name in ("map", "unit", "stamp"))
+        elsewhere = {name: _elsewhere(name, table) for name, table in content.get("signals", {}).items()}
     except InputError as fault:
         raise InputError(f"{here}{fault}") from None
     return SignalMap(column, _units(unit, here), _stamps(stamp, here), elsewhere)

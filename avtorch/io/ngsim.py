@@ -56,8 +56,8 @@ def join_events(table: Table, *, duration: float | None = None, first: int | Non
         time = np.concatenate([time, time[-1] + other.time[sample + 1 :] - other.time[sample]])
         speed = np.concatenate([speed, other.speed[sample + 1 :]])
         used.append(event)
-    told = ", ".join(map(str, used))
-    note = f"events {told} joined at equal speed ({', '.join(joints)})" if joints else f"event {told}"
+    listing = ", ".join(map(str, used))
+    note = f"events {listing} joined at equal speed ({', '.join(joints)})" if joints else f"event {listing}"
     return RawLeader(time, speed, None, None, f"NGSIM {'+'.join(map(str, used))}", note, tuple(used))
 
 

@@ -143,7 +143,7 @@ def check(log: Log) -> Quality:
     if masked == log.rows:
         notes.append("no row is left to estimate from")
     notes.extend(f"{name} is constant ({present[name][0]:.6g}): it excites nothing" for name in constant)
-    notes.extend(_says_missing(missing))
+    notes.extend(_on_missing(missing))
     notes.extend(_repeats(present, log))
     notes.extend(doubtful)
     notes.extend(_disagreements(log))
@@ -158,13 +158,13 @@ def check(log: Log) -> Quality:
     )  # fmt: skip
 
 
-def _says_missing(missing: tuple[str, ...]) -> list[str]:
-    said = {
+def _on_missing(missing: tuple[str, ...]) -> list[str]:
+    sentences = {
         "accel_cmd": "no accel_cmd: every result on the actuator is conditional on an assumed controller",
         "accel": "no accel: speed is the only channel, so the log cannot distinguish sensor faults from real forces",
         "speed": "no speed: accel is the only channel, short stops go unnoticed, and sensor faults resemble forces",
     }
-    return [said[name] for name in missing]
+    return [sentences[name] for name in missing]
 
 
 def _repeats(present: dict[str, NDArray], log: Log) -> list[str]:

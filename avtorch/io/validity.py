@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.errors import InputError
-from avtorch.io.consistency import Scale, scale_between
+from avtorch.io.consistency import LATER_S, Scale, may_be_late, scale_between
 from avtorch.io.units import GRAVITY
 
 RATE_HZ = (10.0, 200.0)
@@ -111,18 +111,15 @@ def check_rate(step: float, where: str) -> None:
 
 # how far two signals of one motion may differ in scale before their units are certainly not the same: recordings exist
 # whose acceleration is 1.8 times the derivative of their speed; an actuator that gives 2.5 times the demand does not
-WITNESS = (0.45, 2.2)
+SAME_MOTION = (0.45, 2.2)
 _COMMAND = (0.02, 2.5)
 _SURE = 0.9
-# a late car on a noisy manoeuvre of 30 s: 0.69 at its own delay, and -0.95 half a period earlier
-_MAY_BE = 0.5
 
 SPEED_FACTORS = {"km/h": 3.6, "mph": 3600 / 1609.344, "ft/s": 1 / 0.3048, "cm/s": 100.0, "mm/s": 1000.0}
 ACCEL_FACTORS = {"g": GRAVITY, "cm/s2": 0.01, "mm/s2": 0.001, "ft/s2": 0.3048, "km/h/s": 1 / 3.6}
 
 
 _DELAYS_S = tuple(np.arange(0, 1.01, 0.1))
-_LATER_S = tuple(np.arange(1.1, 2.51, 0.1))
 
 
 def command_scale(
@@ -130,9 +127,7 @@ def command_scale(
 ) -> Scale | None:
     """How the motion follows the command ``u``: from speed where it is known, else from the integrated acceleration.
 
-    For a command that returns with the other sign after half a period, a late response cannot be distinguished from an
-    inverted one: an inverted response counts only where one of the right sign, with up to 2.5 s of delay and lag, is
-    known to correlate far less.
+    An inverted response counts only where it cannot be a late one (`may_be_late`).
     """
     if speed is None:
         assert accel is not None
@@ -141,8 +136,8 @@ def command_scale(
         level = speed
     found = scale_between(time, parts, level, u, delays=_DELAYS_S)
     if found is not None and found.slope < 0 and found.correlation <= -_SURE:
-        later = scale_between(time, parts, level, u, delays=_LATER_S)
-        if later is None or (later.slope > 0 and later.correlation >= _MAY_BE):
+        later = scale_between(time, parts, level, u, delays=LATER_S)
+        if later is None or may_be_late(later.correlation, known=True):
             return later
     return found
 
@@ -164,7 +159,7 @@ def check_units(
         found = scale_between(time, parts, speed, accel)
         options = {f"speed={unit}": factor for unit, factor in SPEED_FACTORS.items()}
         options |= {f"accel={unit}": factor for unit, factor in ACCEL_FACTORS.items()}
-        _refuse_scale(source, "speed", "accel", found, WITNESS, options, "accel=-1")
+        _refuse_scale(source, "speed", "accel", found, SAME_MOTION, options, "accel=-1")
     if accel_cmd is not None:
         found = command_scale(time, parts, speed, accel, accel_cmd)
         options = {"accel_cmd=g": GRAVITY, "accel_cmd=cm/s2": 0.01}

@@ -147,27 +147,27 @@ def _coverage(sweeps: list[Sweep], seed: int) -> ClaimRow:
         value,
         interval,
         within(value, *COVERAGE),
-        sweeps[0].ahead.said(why),
+        sweeps[0].ahead.with_note(why),
     )
 
 
 def _excitation(sweep: Sweep) -> ClaimRow:
     known = sweep.known
-    poor = known < KNOWN
-    value = float((~poor).double().mean())
-    lags, gains = len(LAGS), poor.tolist()
+    too_few = known < KNOWN
+    value = float((~too_few).double().mean())
+    lags, gains = len(LAGS), too_few.tolist()
     named = [
         f"{name} {number_list([x for x, p in zip(values, flags, strict=True) if p])}{unit}"
         for name, values, flags, unit in (("T_L", LAGS, gains[:lags], " s"), ("K_L", GAINS, gains[lags:], ""))
         if any(flags)
     ]
-    told = (
+    excitation = (
         "every setting has excited windows in at least half"
         if not named
         else f"fewer than half are excited for {' and for '.join(named)}: too few to know those well"
     )
     least, most = (100 * float(x) for x in (known.min(), known.max()))
-    why = f"of the {MORE} windows after the prior {least:.0f} to {most:.0f} % are excited; {told}."
+    why = f"of the {MORE} windows after the prior {least:.0f} to {most:.0f} % are excited; {excitation}."
     return ClaimRow(
         "estimation",
         f"{len(known)} settings; {sweep.ahead.name}",
@@ -176,7 +176,7 @@ def _excitation(sweep: Sweep) -> ClaimRow:
         value,
         None,
         share(value),
-        sweep.ahead.said(why),
+        sweep.ahead.with_note(why),
     )
 
 
@@ -210,7 +210,7 @@ def _growth(sweep: Sweep, what: str, along: str, relative: bool, seed: int) -> C
         value,
         interval,
         verdict,
-        sweep.ahead.said(why),
+        sweep.ahead.with_note(why),
     )
 
 

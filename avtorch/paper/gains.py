@@ -93,7 +93,7 @@ class Gains:
             float(middle(ratio)),
             interval,
             verdicts[goes],
-            self.ahead.said(why),
+            self.ahead.with_note(why),
         )
 
     def _damps(self, index: int) -> ClaimRow:

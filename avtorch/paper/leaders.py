@@ -28,7 +28,7 @@ class Ahead:
     which: str
     note: str = ""
 
-    def said(self, why: str) -> str:
+    def with_note(self, why: str) -> str:
         """A sentence with the note appended."""
         return f"{why[:-1]}; {self.note}." if self.note else why
 
@@ -73,7 +73,7 @@ class Leaders:
         return cls((ngsim, lively), (lively, steady))
 
     @property
-    def told(self) -> dict[str, str]:
+    def descriptions(self) -> dict[str, str]:
         """By name in rows, which each is."""
         return {ahead.name: ahead.which for ahead in (*self.sweep, *self.drives)}
 

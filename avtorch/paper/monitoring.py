@@ -84,7 +84,7 @@ class Watched:
             why = "no window was excited, so the belief is still the first prior."
             return ClaimRow(
                 "monitoring", setting, f"error of {name}{unit}", theirs, "not known", None, "not reproduced",
-                self.ahead.said(why),
+                self.ahead.with_note(why),
             )  # fmt: skip
         if index is None:
             count = seen.sum(0).clamp_min(1)
@@ -101,7 +101,7 @@ class Watched:
         )
         return ClaimRow(
             "monitoring", setting, f"error of {name}{unit}", theirs, float(middle(errors)), interval, verdict,
-            self.ahead.said(why),
+            self.ahead.with_note(why),
         )  # fmt: skip
 
     def _alert(self) -> ClaimRow:
@@ -123,7 +123,7 @@ class Watched:
             ours,
             spread(self.alert[came]) if bool(came.any()) else None,
             share(timely),
-            self.ahead.said(why),
+            self.ahead.with_note(why),
         )
 
     def _early(self) -> ClaimRow:
@@ -137,7 +137,7 @@ class Watched:
             value,
             None,
             share(1.0 - value),
-            self.ahead.said(why),
+            self.ahead.with_note(why),
         )
 
 

@@ -82,7 +82,7 @@ class Platoon:
             float(middle(ratio)),
             interval,
             sign(interval, below=1.0),
-            self.ahead.said(why),
+            self.ahead.with_note(why),
         )
 
     def _attenuates(self, i: int, name: str) -> ClaimRow:
@@ -94,16 +94,16 @@ class Platoon:
             f"the exact peak gain of a vehicle is {float(self.peak[i]):.4f}, to the power of {VEHICLES - 1} "
             f"{float(self.peak[i]) ** (VEHICLES - 1):.3g}; {self._crashes(i)}."
         )
-        says = "amplifies (above 1)" if i == 0 else "stability regained (below 1)"
+        claim = "amplifies (above 1)" if i == 0 else "stability regained (below 1)"
         return ClaimRow(
             "platoon",
             f"{name}; {PASSED_S:g} to {PLATOON_S:g} s, behind {self.ahead.name}",
             "RMS of the speed about its mean, vehicle 10 over vehicle 1",
-            says,
+            claim,
             float(middle(ratio)),
             interval,
             sign(interval, above=1.0) if i == 0 else sign(interval, below=1.0),
-            self.ahead.said(why),
+            self.ahead.with_note(why),
         )
 
     def _crashes(self, i: int) -> str:

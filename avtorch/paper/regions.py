@@ -119,7 +119,7 @@ class Regions:
             value,
             interval,
             sign(interval or value, below=1.0),
-            self.ahead.said(why) if random else why,
+            self.ahead.with_note(why) if random else why,
         )
 
     def _less(self, form: str) -> ClaimRow:

@@ -78,7 +78,7 @@ class Reproduction:
             "schema": "avtorch.paper/1",
             "seed": self.seed,
             "seeds": self.seeds,
-            "leaders": self.leaders.told,
+            "leaders": self.leaders.descriptions,
             "rows": [row.as_dict() for row in self.rows],
         }
 
@@ -113,11 +113,11 @@ def reproduce(
     whole, done, found = sum(_COST[name] for name in chosen), 0.0, {}
     for name in chosen:
 
-        def told(share: float, begun: float = done, cost: float = _COST[name]) -> None:
+        def report_share(share: float, begun: float = done, cost: float = _COST[name]) -> None:
             if progress is not None:
                 progress(begun + share * cost, whole)
 
-        found[name] = EXPERIMENTS[name](ahead, seeds=seeds, seed=seed, progress=told)
+        found[name] = EXPERIMENTS[name](ahead, seeds=seeds, seed=seed, progress=report_share)
         done += _COST[name]
-        told(1.0)
+        report_share(1.0)
     return Reproduction(found, ahead, seeds, seed)

@@ -102,5 +102,5 @@ def median_interval(values: Tensor, seed: int) -> tuple[float, float]:
 
 def number_list(numbers: Sequence[float]) -> str:
     """`0.1, 0.2 and 0.3`."""
-    told = [f"{x:g}" for x in numbers]
-    return told[0] if len(told) == 1 else ", ".join(told[:-1]) + " and " + told[-1]
+    texts = [f"{x:g}" for x in numbers]
+    return texts[0] if len(texts) == 1 else ", ".join(texts[:-1]) + " and " + texts[-1]

@@ -134,7 +134,7 @@ class Strategies:
             float(middle(ratio)),
             interval,
             sign(interval, below=1.0),
-            self.ahead.said(why),
+            self.ahead.with_note(why),
         )
 
     def _string(self, name: str, one: Driven) -> ClaimRow:
@@ -178,7 +178,7 @@ class Strategies:
             value,
             interval,
             verdict,
-            self.ahead.said(why) if name in OURS else why,
+            self.ahead.with_note(why) if name in OURS else why,
         )
 
 

@@ -59,9 +59,9 @@ def to_autoware(plant: GapPlant) -> Exported:
     limits = [limit for e in plant.effects if (limit := e.accel_limit()) is not None]
     if limits:
         values["vel_rate_lim"] = min(limits)
-    half = [e for e in plant.effects if e.half_said]
-    lost = [f"{e.name}: {e.half_said}" for e in half]
-    return Exported("Autoware planning simulator", values, (*lost, *_unsaid(plant, {e.name for e in half})))
+    partly = [e for e in plant.effects if e.export_loss]
+    lost = [f"{e.name}: {e.export_loss}" for e in partly]
+    return Exported("Autoware planning simulator", values, (*lost, *_not_exported(plant, {e.name for e in partly})))
 
 
 def to_openpilot(plant: GapPlant) -> Exported:
@@ -75,7 +75,7 @@ def to_openpilot(plant: GapPlant) -> Exported:
     """
     delay = _delay(plant) + float(plant.T_L)
     lost = [f"K_L {float(plant.K_L):.3g}: a gain is learned on the way"] if abs(float(plant.K_L) - 1) > 0.01 else []
-    return Exported("openpilot CarParams", {"longitudinalActuatorDelay": delay}, (*lost, *_unsaid(plant)))
+    return Exported("openpilot CarParams", {"longitudinalActuatorDelay": delay}, (*lost, *_not_exported(plant)))
 
 
 def write_exports(plant: GapPlant | None, folder: str | PathLike[str]) -> list[Path]:
@@ -103,10 +103,10 @@ def _delay(plant: GapPlant) -> float:
     return sum((float(getattr(e, e.shift)) for e in plant.effects if e.shift is not None), 0.0)
 
 
-def _unsaid(plant: GapPlant, said: Collection[str] = ()) -> tuple[str, ...]:
+def _not_exported(plant: GapPlant, reported: Collection[str] = ()) -> tuple[str, ...]:
     lost = []
     for e in plant.effects:
-        if e.name in said or e.shift is not None:
+        if e.name in reported or e.shift is not None:
             continue
         where = "the sensor's, not the car's" if e.place == "sensor" else e.meaning
         lost.append(f"{e.name}: {where}")

@@ -78,8 +78,8 @@ class WhatToSet:
             "strategies": list(self.strategies),
             "p_string_stable": {"assumed": self.p_assumed, "in_force": self.p_now, "then": self.p_then},
             "peak_gain": {
-                name: dict(zip(("median", "q05", "q95"), map(_finite, told), strict=True))
-                for name, told in self.peaks.items()
+                name: dict(zip(("median", "q05", "q95"), map(_finite, quantiles), strict=True))
+                for name, quantiles in self.peaks.items()
             },
             "required": self.required,
             "sufficient": self.sufficient,
@@ -139,25 +139,25 @@ def what_to_set(
     used = np.zeros(0) if commands is None else np.asarray(commands, float)
     clipped = _clipped(offers.setting[0], used, accel_min, accel_max)
 
-    p, peaks = _judged(chains, now, link_delay)
-    p_now, now_at = float(p[0]), _told(peaks[0])
+    p, peaks = _string_stability(chains, now, link_delay)
+    p_now, now_at = float(p[0]), _quantiles(peaks[0])
     best, p_best, then_at = 0, p_now, now_at
     for first in range(0, len(order) if p_now < required else 0, _BLOCK):
         some = order[first : first + _BLOCK]
-        p, peaks = _judged(chains, offers.setting[0][torch.tensor(some)], link_delay)
+        p, peaks = _string_stability(chains, offers.setting[0][torch.tensor(some)], link_delay)
         good = [k for k, i in enumerate(some) if p[k] >= required and clipped[i] <= 0.05]
         if good:
-            best, p_best, then_at = some[good[0]], float(p[good[0]]), _told(peaks[good[0]])
+            best, p_best, then_at = some[good[0]], float(p[good[0]]), _quantiles(peaks[good[0]])
             break
         allowed = torch.tensor([clipped[i] <= max(0.05, clipped[0]) for i in some])
         top = int(torch.where(allowed, p, -1.0).argmax())
         if bool(allowed[top]) and float(p[top]) > p_best + 0.02:
-            best, p_best, then_at = some[top], float(p[top]), _told(peaks[top])
+            best, p_best, then_at = some[top], float(p[top]), _quantiles(peaks[top])
     chosen = offers.setting[0][torch.tensor([best])]
     bare = GapPlant((), T_L=plant.T_L, K_L=plant.K_L, sigma=0.0)
     thought = {k: torch.as_tensor(np.asarray(v), dtype=torch.float64) for k, v in (assumed or {}).items()}
-    p_thought, thought_at = _judged(_chains(bare, thought or draws, speeds[:1]), now, link_delay)
-    at = {"assumed": _told(thought_at[0]), "in_force": now_at, "then": then_at}
+    p_thought, thought_at = _string_stability(_chains(bare, thought or draws, speeds[:1]), now, link_delay)
+    at = {"assumed": _quantiles(thought_at[0]), "in_force": now_at, "then": then_at}
     sufficient = p_best >= required
     strategies = tuple(sorted(chosen.strategies(now)[0]))
     names = [e.name for e in plant.effects if not e.linear]
@@ -213,7 +213,7 @@ def _chains(plant: GapPlant, draws: Mapping[str, Tensor], speeds: Sequence[float
     return [linearised(plant, draws, speed=v, step=u) for v in at for u in steps]
 
 
-def _judged(chains: Sequence[Chain], settings: Setting, link_delay: float) -> tuple[Tensor, Tensor]:
+def _string_stability(chains: Sequence[Chain], settings: Setting, link_delay: float) -> tuple[Tensor, Tensor]:
     """P(string stable) (setting,) and the peak gain (setting, draw), each draw at its worst chain."""
     inner, forward = _lower(settings)
     stable, peak = None, None
@@ -234,7 +234,7 @@ def _judged(chains: Sequence[Chain], settings: Setting, link_delay: float) -> tu
     return stable.double().mean(-1), peak
 
 
-def _told(peak: Tensor) -> tuple[float, float, float]:
+def _quantiles(peak: Tensor) -> tuple[float, float, float]:
     """Median, 5 and 95 % quantile over draws (draw,), of which some may be inf."""
     # by rank: between a number and inf there is nothing to interpolate
     low, middle, high = torch.quantile(peak, torch.tensor([0.05, 0.5, 0.95]).to(peak), interpolation="nearest").tolist()
@@ -278,10 +278,10 @@ def _sentence(
             f"(P(string stable) {before:.2f})."
         )
     what = "; ".join(steps)
-    told = f"P(string stable) {then:.2f} instead of {before:.2f}"
+    change = f"P(string stable) {then:.2f} instead of {before:.2f}"
     if good:
-        return f"Least intrusive sufficient setting: {what} ({told})."
-    return f"No available setting reaches {required:g}; the best is: {what} ({told})."
+        return f"Least intrusive sufficient setting: {what} ({change})."
+    return f"No available setting reaches {required:g}; the best is: {what} ({change})."
 
 
 def _finite(x: float) -> float | None:

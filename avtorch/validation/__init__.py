@@ -9,9 +9,9 @@ Example:
 """
 
 from avtorch.validation.agreement import Agreement, agreement, between
+from avtorch.validation.agreement_verdict import AgreementVerdict
 from avtorch.validation.stein import Stein, stein_discrepancy
 from avtorch.validation.validate import NutsSettings, Validation, validate
-from avtorch.validation.verdict import AgreementVerdict
 from avtorch.validation.windows import Windows, synthetic_windows, windows_from_prior, windows_of_log
 
 __all__ = [

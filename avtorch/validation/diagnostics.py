@@ -86,11 +86,11 @@ def sampling_diagnostics(posterior: Posterior) -> Diagnostics:
     dims = ("chain", "draw", "window", "parameter")
     data = xarray.Dataset({"first": (dims, whitened.numpy()), "second": (dims, whitened.square().numpy())})
 
-    def told(measure: xarray.Dataset, name: str = "first") -> Tensor:
+    def values(measure: xarray.Dataset, name: str = "first") -> Tensor:
         return torch.from_numpy(measure[name].values)
 
     plain, ranked = az.ess(data, method="mean"), data[["first"]]
-    ess_mean, ess_square = told(plain), told(plain, "second")
+    ess_mean, ess_square = values(plain), values(plain, "second")
     # the delta method: var(SD)/SD^2 = (kurtosis - 1) / 4 over the draws effective for the square
     kurtosis = whitened.square().square().flatten(0, 1).mean(0)
     return Diagnostics(
@@ -99,8 +99,8 @@ def sampling_diagnostics(posterior: Posterior) -> Diagnostics:
         sd=sd,
         mean_error=sd / ess_mean.sqrt(),
         sd_error=0.5 * sd * ((kurtosis - 1).clamp_min(0) / ess_square).sqrt(),
-        rhat=told(az.rhat(ranked)),
+        rhat=values(az.rhat(ranked)),
         ess_mean=ess_mean,
-        ess_bulk=told(az.ess(ranked, method="bulk")),
-        ess_tail=told(az.ess(ranked, method="tail")),
+        ess_bulk=values(az.ess(ranked, method="bulk")),
+        ess_tail=values(az.ess(ranked, method="tail")),
     )

@@ -18,6 +18,7 @@ from avtorch.inference.quadrature import Quadrature
 from avtorch.inference.sampler import SamplerSettings, sample
 from avtorch.io.log import Log
 from avtorch.validation.agreement import Agreement, agreement, between
+from avtorch.validation.agreement_verdict import AgreementVerdict, agreement_verdict
 from avtorch.validation.exact import exact_draws
 from avtorch.validation.nuts_reference import (
     LATENT_NUTS,
@@ -29,7 +30,6 @@ from avtorch.validation.nuts_reference import (
 )
 from avtorch.validation.reference import join, reference, select
 from avtorch.validation.stein import Stein, stein_discrepancy
-from avtorch.validation.verdict import AgreementVerdict, judge
 from avtorch.validation.windows import Windows, windows_of_log
 
 if TYPE_CHECKING:
@@ -195,9 +195,9 @@ def validate(
     if nuts_windows is None:
         nuts_windows = LATENT_NUTS_WINDOWS if latent else NUTS_WINDOWS
     chosen = torch.linspace(0, len(source) - 1, min(nuts_windows, len(source))).round().long()
-    told = _ProgressCount(progress, len(source) + NUTS_SHARE * len(chosen))
+    count = _ProgressCount(progress, len(source) + NUTS_SHARE * len(chosen))
     generator = torch.Generator().manual_seed(seed)
-    blocks = [_block(source.select(i), settings, generator, told) for i in torch.arange(len(source)).split(BLOCK)]
+    blocks = [_block(source.select(i), settings, generator, count) for i in torch.arange(len(source)).split(BLOCK)]
     sgld = join_draws([b.sgld for b in blocks])
     exact = [b.quadrature for b in blocks if b.quadrature is not None]
     quadrature = join(exact) if exact else None
@@ -206,7 +206,7 @@ def validate(
         points=blocks[0].stein.points,
     )
     begun = clock.perf_counter()
-    walked = walk_nuts(source, chosen, nuts, seed=seed, done=lambda: told.add(NUTS_SHARE))
+    walked = walk_nuts(source, chosen, nuts, seed=seed, done=lambda: count.add(NUTS_SHARE))
     seconds = {
         "sgld": sum(b.sgld_seconds for b in blocks) / len(source),
         "nuts": (clock.perf_counter() - begun) / len(chosen),
@@ -221,7 +221,7 @@ def validate(
         against = agreement(walked, select(quadrature, chosen))
         converged = sgld.converged & quadrature.converged
     held_to = "nuts" if quadrature is None else "quadrature"
-    verdict = judge(found, converged, reference=held_to, numbers=compared.tolist(), nuts=against)
+    verdict = agreement_verdict(found, converged, reference=held_to, numbers=compared.tolist(), nuts=against)
     return Validation(
         windows=source,
         settings=settings,
@@ -266,18 +266,18 @@ class _Block:
     quadrature_seconds: float
 
 
-def _block(windows: Windows, settings: SamplerSettings, generator: torch.Generator, told: _ProgressCount) -> _Block:
+def _block(windows: Windows, settings: SamplerSettings, generator: torch.Generator, count: _ProgressCount) -> _Block:
     density = windows.density
     begun = clock.perf_counter()
     sgld = sample(density, settings, generator=generator)  # search for the mode included
     sgld_seconds = clock.perf_counter() - begun
-    told.add(0.3 * len(windows))
+    count.add(0.3 * len(windows))
     begun = clock.perf_counter()
     quadrature = reference(windows) if len(windows.names) <= 3 else None
     seconds = clock.perf_counter() - begun if quadrature is not None else 0.0
-    told.add(0.5 * len(windows))
+    count.add(0.5 * len(windows))
     stein = stein_discrepancy(density, sgld.draws.log(), mode=find_mode(density), generator=generator)
-    told.add(0.2 * len(windows))
+    count.add(0.2 * len(windows))
     return _Block(sgld, quadrature, stein, sgld_seconds, seconds)
 
 

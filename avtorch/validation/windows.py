@@ -10,8 +10,8 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.inference.density import Density, SelectableDensity
-from avtorch.inference.evidence import Form, JerkForm
 from avtorch.inference.excitation import ExcitationRule
+from avtorch.inference.form import Form, JerkForm
 from avtorch.inference.jerk import JerkDensity, JerkStatistics
 from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
@@ -170,7 +170,7 @@ def windows_of_log(log: Log, *, window: float = 2.0, count: int | None = None) -
         spans = [spans[i] for i in torch.linspace(0, len(spans) - 1, count).round().long().tolist()]
     measured = log.jerk is not None and log.accel is not None
     form: Form = JerkForm() if measured else LatentForm(accel=log.accel is not None, speed=log.speed is not None)
-    evidence = form.evidence(_padded(log, form, spans), window * log.rate_hz)
+    likelihood = form.likelihood(_padded(log, form, spans), window * log.rate_hz)
     prior = Joint(default_actuation_prior(), form.noise_prior)
     start = torch.tensor([s for s, _ in spans], dtype=torch.float64)
     # from the log's start to its own clock, which a segment may start anew
@@ -179,9 +179,9 @@ def windows_of_log(log: Log, *, window: float = 2.0, count: int | None = None) -
     return Windows(
         name=log.name,
         form="jerk" if measured else "latent",
-        density=evidence.density(torch.arange(len(spans)), prior),
-        n=evidence.n,
-        excited=evidence.excited,
+        density=likelihood.density(torch.arange(len(spans)), prior),
+        n=likelihood.n,
+        excited=likelihood.excited,
         truth=None,
         start_s=(start + clock).round(decimals=9),
         end_s=(torch.minimum(start + window, last + 1 / log.rate_hz) + clock).round(decimals=9),

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.vehicle.arguments import Number, checked
 from avtorch.vehicle.time_gap import RAMP_RATE, TimeGap
@@ -44,11 +45,11 @@ class FollowerState(NamedTuple):
     """
 
     time: float
-    spacing: Tensor
-    speed: Tensor
-    accel: Tensor
-    lead_speed: Tensor
-    lead_accel: Tensor
+    spacing: Float[Tensor, "*#scenario"]
+    speed: Float[Tensor, "*#scenario"]
+    accel: Float[Tensor, "*#scenario"]
+    lead_speed: Float[Tensor, "*#scenario"]
+    lead_accel: Float[Tensor, "*#scenario"]
 
 
 Controller = Callable[[FollowerState], Tensor]
@@ -105,7 +106,7 @@ class LinearController:
         object.__setattr__(self, "_final", (-(k_s * gap + k_v), -k_s * rest))
         object.__setattr__(self, "_k_f", k_f if bool((k_f != 0).any()) else None)
 
-    def __call__(self, state: FollowerState) -> Tensor:
+    def __call__(self, state: FollowerState) -> Float[Tensor, "*scenario"]:
         k_s, k_v, k_a = self._k
         on_speed, constant = self._final
         if self.ramp is not None and state.time < self.ramp.done_at:
@@ -116,7 +117,7 @@ class LinearController:
         u = torch.addcmul(u, k_a, state.accel)
         return u if self._k_f is None else torch.addcmul(u, self._k_f, state.lead_accel)
 
-    def time_gap_at(self, time: float) -> Tensor:
+    def time_gap_at(self, time: float) -> Float[Tensor, "*setting"]:
         """The time gap [s] in force at `time` [s], on its way to `time_gap`."""
         return checked("time_gap", self.time_gap) if self.ramp is None else self.ramp.at(time)
 

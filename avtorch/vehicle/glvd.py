@@ -200,19 +200,23 @@ class GLVD(torch.nn.Module):
         self.T_L = torch.nn.Parameter(lag.detach().clone())
         self.K_L = torch.nn.Parameter(gain.detach().clone())
 
-    def jerk(self, a: Number, u: Number) -> Tensor:
+    def jerk(self, a: Number, u: Number) -> Float[Tensor, "*all"]:
         """Noise-free jerk [m/s³]; `a`, `u` [m/s²] broadcast with the parameters."""
         return glvd_jerk(a, u, self.T_L, self.K_L)
 
-    def step(self, a: Number, u: Number, dt: Number, *, method: Method = "zoh") -> Tensor:
+    def step(self, a: Number, u: Number, dt: Number, *, method: Method = "zoh") -> Float[Tensor, "*all"]:
         """Acceleration after one step of `dt` [s]; see `glvd_step`."""
         return glvd_step(a, u, self.T_L, self.K_L, dt, method=method)
 
-    def rollout(self, a0: Number, u: Tensor, dt: Number, method: Method = "zoh") -> Tensor:
+    def rollout(
+        self, a0: Number, u: Real[Tensor, "*#batch time"], dt: Number, method: Method = "zoh"
+    ) -> Float[Tensor, "*all time"]:
         """Accelerations at steps 1…N along the last dimension; see `glvd_rollout`."""
         return glvd_rollout(a0, u, self.T_L, self.K_L, dt, method=method)
 
-    def forward(self, a0: Number, u: Tensor, dt: Number, method: Method = "zoh") -> Tensor:
+    def forward(
+        self, a0: Number, u: Real[Tensor, "*#batch time"], dt: Number, method: Method = "zoh"
+    ) -> Float[Tensor, "*all time"]:
         """`rollout`."""
         return self.rollout(a0, u, dt, method)
 

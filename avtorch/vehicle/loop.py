@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Float
+from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
 from avtorch.vehicle.arguments import Number, checked, tensor
 from avtorch.vehicle.block import Block, Trajectory
@@ -118,7 +118,7 @@ class ClosedLoop:
         return self._link_steps * self.dt
 
     @property
-    def collided(self) -> Tensor:
+    def collided(self) -> Bool[Tensor, "*scenario"]:
         """Whether the spacing has been zero or less so far, (scenario,) or (scenario, vehicle)."""
         return self._hit.movedim(-1, 0) if self.vehicles is not None else self._hit
 

@@ -65,13 +65,13 @@ class LowerLevel:
         object.__setattr__(self, "_inverts", bool((on_accel != 0).any() or (on_demand != 1).any()))
         object.__setattr__(self, "_limits", limits)
 
-    def raw_command(self, a: Float[Tensor, "*#batch"], u: Float[Tensor, "*#batch"]) -> Tensor:
+    def raw_command(self, a: Float[Tensor, "*#batch"], u: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
         """The command before clipping [m/s²] for measured acceleration `a` and demand `u` [m/s²], (..., scenario)."""
         if not self._inverts:
             return u
         return torch.addcmul(self._on_accel * a, self._on_demand, u)
 
-    def clip(self, raw: Float[Tensor, "*#batch"]) -> Tensor:
+    def clip(self, raw: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
         """`raw` [m/s²] within the vehicle's limits."""
         # torch takes two floats or two tensors, and its types ask for one of the two by itself
         return torch.clamp(raw, *self._limits)  # pyright: ignore[reportCallIssue, reportArgumentType, reportUnknownVariableType]
@@ -82,15 +82,15 @@ class LowerLevel:
         slack = 1e-6  # [m/s²], tolerance of a solver
         return (command <= low + slack) | (command >= high - slack)
 
-    def command(self, a: Tensor, u: Tensor) -> Tensor:
+    def command(self, a: Float[Tensor, "*#batch"], u: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
         """The command actually sent [m/s²]: `raw_command`, clipped. This is what the estimator takes as `u`."""
         return self.clip(self.raw_command(a, u))
 
-    def amplification(self) -> Tensor:
+    def amplification(self) -> Float[Tensor, "*setting"]:
         """Command effort `T_hat K_d / (K_hat T_d)` [-]: the amplification of a fast demand."""
         return self._on_demand
 
-    def effective(self, T_L: Batched, K_L: Batched) -> tuple[Tensor, Tensor]:
+    def effective(self, T_L: Batched, K_L: Batched) -> tuple[Float[Tensor, "*all"], Float[Tensor, "*all"]]:
         """Effective `(T_e [s], K_e [-])` of the unclipped loop with a plant `(T_L, K_L)`; broadcasts.
 
         `1/T_e = 1/T - r (1/T_hat - 1/T_d)`, `r = K T_hat / (T K_hat)`. Where the model overestimates the plant, `1/T_e`

@@ -117,7 +117,7 @@ class MPC:
         # the squared error falls by 1 - 1/root an iteration
         self._iterations = max(1, math.ceil(2 * math.log(_ACCURACY) / math.log1p(-1 / root))) if root > 1 else 1
 
-    def __call__(self, state: FollowerState) -> Tensor:
+    def __call__(self, state: FollowerState) -> Float[Tensor, "*scenario"]:
         gap = self.time_gap
         if self.ramp is not None and state.time < self.ramp.done_at:
             gap = self.ramp.at(state.time)
@@ -186,7 +186,7 @@ class MPC:
         """`equivalent_gains`."""
         return self.equivalent_gains()
 
-    def time_gap_at(self, time: float) -> Tensor:
+    def time_gap_at(self, time: float) -> Float[Tensor, "*setting"]:
         """The time gap [s] in force at `time` [s]."""
         return checked("time_gap", self.time_gap) if self.ramp is None else self.ramp.at(time)
 

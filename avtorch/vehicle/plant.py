@@ -37,7 +37,14 @@ class Plant(Protocol):
         (1, 1, 200)
     """
 
-    def step(self, a: Tensor, v: Tensor, u: Tensor, dt: float, eps: Tensor) -> Motion:
+    def step(
+        self,
+        a: Float[Tensor, "*#batch"],
+        v: Float[Tensor, "*#batch"],
+        u: Float[Tensor, "*#batch"],
+        dt: float,
+        eps: Float[Tensor, "*#batch"],
+    ) -> Motion:
         """Acceleration [m/s²], speed [m/s] and displacement [m] after `dt` [s], command `u` and noise `eps` held."""
         ...
 
@@ -84,18 +91,25 @@ class GLVDPlant:
             raise InputError(f"accel_min: found {self.accel_min} with accel_max {self.accel_max}, needs a lower value")
         object.__setattr__(self, "_coefficients", {})
 
-    def target(self, u: Tensor) -> Tensor:
+    def target(self, u: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
         """Steady-state acceleration under a held `u`, without noise: `K_L u` within the physical limits [m/s²]."""
         wanted = self._gain * u
         if self.accel_min is None and self.accel_max is None:
             return wanted
         return torch.clamp(wanted, self.accel_min, self.accel_max)
 
-    def jerk(self, a: Float[Tensor, "*#batch"], u: Float[Tensor, "*#batch"]) -> Tensor:
+    def jerk(self, a: Float[Tensor, "*#batch"], u: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
         """Noise-free instantaneous jerk [m/s³]."""
         return (self.target(u) - a) / self._lag
 
-    def step(self, a: Tensor, v: Tensor, u: Tensor, dt: float, eps: Tensor) -> Motion:
+    def step(
+        self,
+        a: Float[Tensor, "*#batch"],
+        v: Float[Tensor, "*#batch"],
+        u: Float[Tensor, "*#batch"],
+        dt: float,
+        eps: Float[Tensor, "*#batch"],
+    ) -> Motion:
         """See `Plant.step`."""
         if self.method == "euler":
             return a + dt * (self.jerk(a, u) + eps), v + dt * a, dt * v

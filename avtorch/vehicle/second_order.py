@@ -66,7 +66,7 @@ class SpeedLag(torch.nn.Module):
         self.T_V = torch.nn.Parameter(checked("T_V", T_V, unit="s", above=0.0).detach().clone())
         self.K_V = torch.nn.Parameter(checked("K_V", K_V, least=0.0).detach().clone())
 
-    def accel(self, v: Tensor, v_cmd: Tensor) -> Tensor:
+    def accel(self, v: Float[Tensor, "*#batch"], v_cmd: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
         """See :func:`speed_lag_accel`."""
         return speed_lag_accel(v, v_cmd, self.T_V, self.K_V)
 
@@ -77,7 +77,7 @@ class SpeedLag(torch.nn.Module):
         """
         return glvd_rollout(v0, v_cmd, self.T_V, self.K_V, dt)
 
-    def forward(self, v0: Number, v_cmd: Tensor, dt: float) -> Tensor:
+    def forward(self, v0: Number, v_cmd: Real[Tensor, "*#batch time"], dt: float) -> Float[Tensor, "*all time"]:
         """`rollout`."""
         return self.rollout(v0, v_cmd, dt)
 
@@ -102,7 +102,7 @@ class PositionLag(torch.nn.Module):
         self.T_P = torch.nn.Parameter(checked("T_P", T_P, unit="s", above=0.0).detach().clone())
         self.zeta = torch.nn.Parameter(checked("zeta", zeta, least=0.0).detach().clone())
 
-    def accel(self, error: Tensor, v: Tensor) -> Tensor:
+    def accel(self, error: Float[Tensor, "*#batch"], v: Float[Tensor, "*#batch"]) -> Float[Tensor, "*all"]:
         """See :func:`position_lag_accel`."""
         return position_lag_accel(error, v, self.T_P, self.zeta)
 
@@ -135,6 +135,12 @@ class PositionLag(torch.nn.Module):
         x, v = torch.stack(out, -2).unbind(-1)
         return x, v
 
-    def forward(self, x0: Tensor, v0: Tensor, x_cmd: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+    def forward(
+        self,
+        x0: Float[Tensor, "*#batch"],
+        v0: Float[Tensor, "*#batch"],
+        x_cmd: Float[Tensor, "*#batch time"],
+        dt: float,
+    ) -> tuple[Float[Tensor, "*all time"], Float[Tensor, "*all time"]]:
         """`rollout`."""
         return self.rollout(x0, v0, x_cmd, dt)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.vehicle.arguments import Number, checked
 
@@ -48,8 +49,8 @@ class TimeGap:
     since: float = 0.0
     rate: float = RAMP_RATE
     _done: float = field(init=False, repr=False, compare=False)
-    _start: Tensor = field(init=False, repr=False, compare=False)
-    _step: Tensor = field(init=False, repr=False, compare=False)
+    _start: Float[Tensor, "*#setting"] = field(init=False, repr=False, compare=False)
+    _step: Float[Tensor, "*#setting"] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         target = checked("time_gap", self.target, unit="s", least=0.0)
@@ -68,7 +69,7 @@ class TimeGap:
         """Time [s] from which the gap is the target in every scenario."""
         return self._done
 
-    def at(self, time: float) -> Tensor:
+    def at(self, time: float) -> Float[Tensor, "*setting"]:
         """The gap [s] in force at `time` [s]."""
         room = self.rate * max(time - self.since, 0.0)
         return self._start + torch.clamp(self._step, -room, room)

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from avtorch.inference import SGLD, SamplerSettings
 from avtorch.inference.control_variates import ControlVariates
+from avtorch.inference.coordinates import Coordinates, Whitening, stiffness
 from avtorch.inference.map import Mode
 from avtorch.inference.sampler import walk
 from avtorch.inference.schedules import harmonic, polynomial
 from avtorch.inference.sghmc import SGHMC
-from avtorch.inference.whitening import Coordinates, Whitening, stiffness
 from benchmarks.bias.law import sd_ratio
 from benchmarks.bias.windows import Problem
 
@@ -133,13 +133,13 @@ def _space(arm: Arm) -> Whitening:
 def run(arm: Arm, problem: Problem, size: Length, *, seed: int = 1) -> Tensor:
     """Draws of ``z``, ``(chain, step, window, parameter)``, one a step."""
     density, mode = problem.density, problem.mode
-    pace = stiffness(density, Coordinates.of(mode, _space(arm)))
+    slowdown = stiffness(density, Coordinates.of(mode, _space(arm)))
     target = ControlVariates(density, mode) if arm.cv else density
     if arm.start == "prior":
         # coordinates are laid out from where chains start
         mode = Mode(density.prior.center().expand_as(mode.z), mode.scale, mode.log_prob, mode.converged)
     generator = torch.Generator().manual_seed(seed)
-    return walk(target, mode, settings(arm, size), pace=pace, generator=generator)[:, size.burn_in :]
+    return walk(target, mode, settings(arm, size), slowdown=slowdown, generator=generator)[:, size.burn_in :]
 
 
 def predict(arm: Arm, problem: Problem, covariances: dict[bool, Tensor]) -> Tensor | None:

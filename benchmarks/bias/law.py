@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from avtorch.inference.control_variates import gradients_by_point
-from avtorch.inference.whitening import Coordinates
+from avtorch.inference.coordinates import Coordinates
 from benchmarks.bias.windows import Problem
 
 #: Laplace draws over which the noise that control variates leave is averaged.

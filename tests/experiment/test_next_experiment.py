@@ -11,7 +11,7 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.experiment import Limits, ManoeuvrePrediction, information, library, next_experiment, write_table
-from avtorch.experiment.foretold import responses
+from avtorch.experiment.prediction import responses
 from avtorch.gap import Effect, plant
 from avtorch.gap.effects import AerodynamicDrag, ConstantResistance, DeadBand, GainChange, RoadGrade, SensorBias
 from avtorch.gap.likelihood.noise_draws import noise_draws
@@ -79,18 +79,18 @@ def test_margin_is_half_the_square_of_the_distance(rotating_seed: int) -> None:
     law = foretold[0].law(0)
     away = law._white((foretold[1].law(0).mean - law.mean)[None])
     distance = float(np.linalg.norm(away))
-    told = information(foretold, 0, [0.5, 0.5], seed=rotating_seed)
+    expected = information(foretold, 0, [0.5, 0.5], seed=rotating_seed)
     # the log odds of 32 examples are normal with this mean and a standard deviation of `distance`; a median of them
-    assert told.margin == pytest.approx(distance**2 / 2, abs=BAR * 1.26 * distance / np.sqrt(32))
+    assert expected.margin == pytest.approx(distance**2 / 2, abs=BAR * 1.26 * distance / np.sqrt(32))
 
 
 def test_the_same_cause_twice_is_never_distinguished(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     one = contender([DeadBand(0.1)], rng=rng)
     m = library()[:1]
-    told = information([ManoeuvrePrediction.of(one, m, BOTH, 1, 32)] * 2, 0, [0.5, 0.5])
-    assert told.nats == pytest.approx(0.0, abs=1e-9)
-    assert told.told == pytest.approx(0.5)
+    expected = information([ManoeuvrePrediction.of(one, m, BOTH, 1, 32)] * 2, 0, [0.5, 0.5])
+    assert expected.nats == pytest.approx(0.0, abs=1e-9)
+    assert expected.truth_probability == pytest.approx(0.5)
 
 
 @pytest.mark.statistical
@@ -109,26 +109,26 @@ def test_a_resistance_and_a_bias_differ_in_the_speed_alone(rotating_seed: int) -
 def test_of_the_sure_manoeuvres_the_gentlest_is_chosen(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
     found = left([contender([], rng=rng), contender([DeadBand(0.1)], rng=rng)], [0.6, 0.3])
-    told = next_experiment(found)
-    assert told is not None
-    assert told.separates == ("none", "dead_band")
-    assert 0 < told.information.nats <= told.entropy + 1e-9
-    assert told.information.told > 0.99
-    sure = {name: i for name, i in told.every.items() if i.margin >= 12}
+    experiment = next_experiment(found)
+    assert experiment is not None
+    assert experiment.separates == ("none", "dead_band")
+    assert 0 < experiment.information.nats <= experiment.entropy + 1e-9
+    assert experiment.information.truth_probability > 0.99
+    sure = {name: i for name, i in experiment.every.items() if i.margin >= 12}
     efforts = {m.name: m.effort for m in library() if m.name in sure}
-    assert efforts[told.manoeuvre.name] <= min(efforts.values()) + 0.1
-    told_dict = told.to_dict()
-    assert told_dict["expected_information_nats"] == told.information.nats
-    assert told_dict["seconds"] <= 60.0
+    assert efforts[experiment.manoeuvre.name] <= min(efforts.values()) + 0.1
+    answer = experiment.to_dict()
+    assert answer["expected_information_nats"] == experiment.information.nats
+    assert answer["seconds"] <= 60.0
 
 
 def test_limits_hold_for_the_speed_that_the_car_will_drive(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     rivals = [contender([ConstantResistance(0.2)], rng=rng), contender([], rng=rng)]
     limits = Limits(speed_min=3, speed_max=18, road=700, seconds=45)
-    told = next_experiment(left(rivals, [0.6, 0.3]), limits)
-    assert told is not None
-    m = told.manoeuvre
+    experiment = next_experiment(left(rivals, [0.6, 0.3]), limits)
+    assert experiment is not None
+    m = experiment.manoeuvre
     speed = responses(rivals[0], [m], slice(None)).speed.mean((0, 1)).numpy()
     assert m.metres <= 700
     assert m.speed.min() >= 3
@@ -161,12 +161,14 @@ def test_a_gain_that_has_changed_stays_changed(fresh_seed: int) -> None:
 @pytest.mark.slow
 def test_the_table_is_written_and_an_old_one_goes(tmp_path: Path, fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
-    told = next_experiment(left([contender([], rng=rng), contender([DeadBand(0.1)], rng=rng)], [0.6, 0.3]))
-    (path,) = write_table(told, tmp_path)
+    experiment = next_experiment(left([contender([], rng=rng), contender([DeadBand(0.1)], rng=rng)], [0.6, 0.3]))
+    (path,) = write_table(experiment, tmp_path)
     rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
-    assert told is not None
+    assert experiment is not None
     assert list(rows[0]) == ["time", "accel_cmd", "speed_expected"]
-    np.testing.assert_allclose([float(r["accel_cmd"]) for r in rows], told.manoeuvre.command, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(
+        [float(r["accel_cmd"]) for r in rows], experiment.manoeuvre.command, rtol=1e-5, atol=1e-9
+    )
     assert write_table(None, tmp_path) == []
     assert not path.exists()
 
@@ -176,10 +178,10 @@ def test_a_slow_car_is_offered_what_it_can_drive(fresh_seed: int) -> None:
     rng = np.random.default_rng(fresh_seed)
     found = left([contender([], rng=rng), contender([SensorBias(0.3)], rng=rng)], [0.6, 0.3])
     slow = replace(found.log, speeds=(0.4, 3.5), commands=(-1.3, 4.9))
-    told = next_experiment(replace(found, log=slow))
-    assert told is not None
-    assert 0.2 <= told.manoeuvre.speed.min() < told.manoeuvre.speed.max() <= 3.5 * 1.05
-    answer = told.to_dict()
+    experiment = next_experiment(replace(found, log=slow))
+    assert experiment is not None
+    assert 0.2 <= experiment.manoeuvre.speed.min() < experiment.manoeuvre.speed.max() <= 3.5 * 1.05
+    answer = experiment.to_dict()
     assert answer["limits"]["source"] == "from the log"
     assert answer["limits"]["speed_max"] == pytest.approx(3.655)
     (line,) = to_drive(replace(found, next_experiment=answer))
@@ -192,10 +194,10 @@ def test_drag_on_a_fast_road_leaves_manoeuvres_that_come_back(fresh_seed: int) -
     rng = np.random.default_rng(fresh_seed)
     rivals = [contender([AerodynamicDrag(2.7e-4)], rng=rng), contender([ConstantResistance(0.2)], rng=rng)]
     limits = Limits(23, 29.6, -1.3, 1.3)
-    told = next_experiment(left(rivals, [0.6, 0.3]), limits)
-    assert told is not None
-    assert len(told.every) > 0.5 * len(library(limits))
-    speed = responses(rivals[0], [told.manoeuvre], slice(None)).speed.mean((0, 1)).numpy()
+    experiment = next_experiment(left(rivals, [0.6, 0.3]), limits)
+    assert experiment is not None
+    assert len(experiment.every) > 0.5 * len(library(limits))
+    speed = responses(rivals[0], [experiment.manoeuvre], slice(None)).speed.mean((0, 1)).numpy()
     assert abs(speed[-1] - speed[0]) < 0.3
 
 

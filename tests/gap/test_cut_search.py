@@ -14,7 +14,7 @@ from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes
 from avtorch.gap import DeadTime, Outliers, SensorBias, plant
 from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis
-from avtorch.gap.search.budget import Budget
+from avtorch.gap.search.time_budget import TimeBudget
 from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.io import Log
 from avtorch.report import report_html
@@ -39,13 +39,13 @@ def _cut(monkeypatch: pytest.MonkeyPatch, log: Log, after: int) -> Diagnosis:
     """Diagnosed with a budget that is spent at the search's question number `after`, whatever the machine's speed."""
     asked = 0
 
-    def spent(self: Budget) -> bool:
+    def spent(self: TimeBudget) -> bool:
         nonlocal asked
         asked += 1
         self.complete = self.complete and asked <= after
         return asked > after
 
-    monkeypatch.setattr(Budget, "spent", spent)
+    monkeypatch.setattr(TimeBudget, "spent", spent)
     return avtorch.diagnose(log, effects=AMONG)
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from avtorch.inference.whitening import Coordinates
+from avtorch.inference.coordinates import Coordinates
 from benchmarks.bias.arms import Arm, Length, every_arm, predict, run, settings
 from benchmarks.bias.law import point_covariance, sd_ratio
 from benchmarks.bias.measure import autocorrelation_time, measure

@@ -18,10 +18,10 @@ from avtorch.inference import (
     find_mode,
     sample,
 )
+from avtorch.inference.coordinates import Coordinates, stiffness
 from avtorch.inference.priors import Joint, QuadrantNormal, default_jerk_noise_prior
 from avtorch.inference.sampler import walk
 from avtorch.inference.schedules import harmonic, polynomial
-from avtorch.inference.whitening import Coordinates, stiffness
 from tests.bars import BAR
 
 F64 = torch.float64

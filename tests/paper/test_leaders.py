@@ -14,7 +14,9 @@ from avtorch.paper.leaders import DRIVE_S, PLATOON_S, SWEEP_S
 def test_without_recordings_us06_is_reported() -> None:
     leaders = Leaders.read()
     assert [a.name for a in (*leaders.sweep, *leaders.drives)] == ["US06", "US06"]
-    assert leaders.main.said("As it is.") == ("As it is; no recordings were given, so the embedded US06 drives ahead.")
+    assert leaders.main.with_note("As it is.") == (
+        "As it is; no recordings were given, so the embedded US06 drives ahead."
+    )
     assert leaders.main.leader.duration >= PLATOON_S
 
 
@@ -30,5 +32,5 @@ def test_recordings(data_dir: Path) -> None:
     assert all(a.leader.duration >= SWEEP_S and not a.note for a in leaders.sweep)
     assert all(a.leader.duration >= DRIVE_S for a in leaders.drives)
     assert leaders.main.leader.duration >= PLATOON_S
-    assert list(leaders.told) == ["NGSIM 156", "OpenACC ZalaZONE", "OpenACC AstaZero"]
-    assert leaders.told["NGSIM 156"].startswith("event 156, 50.2 s")
+    assert list(leaders.descriptions) == ["NGSIM 156", "OpenACC ZalaZONE", "OpenACC AstaZero"]
+    assert leaders.descriptions["NGSIM 156"].startswith("event 156, 50.2 s")

@@ -18,10 +18,10 @@ from avtorch.results import validation_answer
 pytest.importorskip("arviz")
 
 from avtorch.validation import agreement, synthetic_windows, validate
+from avtorch.validation.agreement_verdict import agreement_verdict, chi2_of_means
 from avtorch.validation.exact import exact_draws
 from avtorch.validation.reference import NODES, join, reference, select
 from avtorch.validation.validate import NutsSettings, Validation, check_installed
-from avtorch.validation.verdict import chi2_of_means, judge
 from avtorch.validation.windows import Windows
 from tests.bars import BAR, LEVEL
 
@@ -54,7 +54,7 @@ def inflated(posterior: Posterior, factor: float) -> Posterior:
 def test_exact_draws_agree(windows: Windows, exact: Quadrature, rotating_seed: int) -> None:
     assert bool(exact.converged.all())
     found = agreement(drawn(windows, exact, rotating_seed), exact)
-    verdict = judge(found, exact.converged)
+    verdict = agreement_verdict(found, exact.converged)
     assert verdict.agree
     assert verdict.share == 1.0
     assert verdict.share_if_exact > 0.99
@@ -70,7 +70,7 @@ def test_exact_draws_agree(windows: Windows, exact: Quadrature, rotating_seed: i
 @pytest.mark.statistical
 def test_ten_percent_inflation_disagrees(windows: Windows, exact: Quadrature, rotating_seed: int) -> None:
     found = agreement(inflated(drawn(windows, exact, rotating_seed), 1.1), exact)
-    verdict = judge(found, exact.converged)
+    verdict = agreement_verdict(found, exact.converged)
     assert not verdict.agree
     assert verdict.share < 0.2
     assert "95 % are needed" in verdict.why
@@ -80,14 +80,14 @@ def test_ten_percent_inflation_disagrees(windows: Windows, exact: Quadrature, ro
 def test_windows_that_did_not_settle_do_not_pass(windows: Windows, exact: Quadrature) -> None:
     converged = exact.converged.clone()
     converged[0] = False
-    verdict = judge(agreement(drawn(windows, exact, 0), exact), converged)
+    verdict = agreement_verdict(agreement(drawn(windows, exact, 0), exact), converged)
     assert not verdict.agree
     assert verdict.share <= 1 - 1 / WINDOWS
     assert "the chains or the reference of 1 did not converge" in verdict.why
 
 
 def test_too_few_draws_are_named_as_the_reason(windows: Windows, exact: Quadrature) -> None:
-    verdict = judge(agreement(drawn(windows, exact, 0, count=400), exact), exact.converged)
+    verdict = agreement_verdict(agreement(drawn(windows, exact, 0, count=400), exact), exact.converged)
     assert not verdict.agree
     assert "take more draws" in verdict.why
 
@@ -98,7 +98,7 @@ def test_references_that_contradict_each_other_settle_nothing(windows: Windows, 
     moved = replace(moved, draws=moved.draws + 0.3 * exact.sd)
     against = agreement(moved, exact)
     assert chi2_of_means(against) < 1e-6
-    verdict = judge(good, exact.converged, nuts=against)
+    verdict = agreement_verdict(good, exact.converged, nuts=against)
     assert not verdict.agree
     assert "NUTS contradicts quadrature" in verdict.why
 

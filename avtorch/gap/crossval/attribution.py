@@ -41,18 +41,18 @@ class RowAttribution:
     def of(cls, race: SearchResult, found: FittedModel) -> RowAttribution:
         """The attribution of a fitted model of a search."""
         record = race.record
-        told, bare = Refit.whole(found), Refit.whole(race.none)
-        white = told.white(record)
-        rows, flat = (r.white(record).row_likelihoods(r.errors) for r in (told, bare))
+        fitted, bare = Refit.whole(found), Refit.whole(race.none)
+        white = fitted.white(record)
+        rows, flat = (r.white(record).row_likelihoods(r.errors) for r in (fitted, bare))
         gained = rows + random_effect_density(found, race.raw, record) - flat
-        worth = found.log_evidence - race.none.log_evidence - complexity_penalties(race.found)[found.name]
+        net_gain = found.log_evidence - race.none.log_evidence - complexity_penalties(race.found)[found.name]
         return cls(
             record=record,
             gained=gained,
-            paid=float(gained.sum() - worth),
-            does=_worth(white(told.effect)),
-            felt=_worth(white(told.felt)),
-            moved=told.effect.mean(-1),
+            paid=float(gained.sum() - net_gain),
+            does=_expected_gain(white(fitted.effect)),
+            felt=_expected_gain(white(fitted.felt)),
+            moved=fitted.effect.mean(-1),
         )
 
     @property
@@ -61,6 +61,6 @@ class RowAttribution:
         return float(np.exp(-np.clip(self.gained.sum() - self.paid, 0.0, 700.0)))
 
 
-def _worth(e: FloatArray) -> FloatArray:
+def _expected_gain(e: FloatArray) -> FloatArray:
     """Half the sum of squares (counted,) of whitened images (channel, counted, group)."""
     return np.asarray(0.5 * (e**2).sum((0, 2)), np.float64)

@@ -43,7 +43,7 @@ class BlackBoxRegression:
             columns = np.concatenate([columns, faults])
         return cls(record, columns[..., None])
 
-    def foretold(self, errors: FloatArray, white: WhiteningFilter) -> FloatArray:
+    def predict(self, errors: FloatArray, white: WhiteningFilter) -> FloatArray:
         """Prediction of `errors` (channel, counted, group) over the whole record: (channel, counted, 1).
 
         Coefficients are fitted only to the rows that count in the record of `white`.

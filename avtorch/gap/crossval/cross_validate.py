@@ -39,9 +39,9 @@ class CrossValidation:
     """Scores of a `verdict` on held-out blocks; every counted row is held out once.
 
     - `sums` by name: `before` (bare baseline), `after` (hypothesis selected without the fold), `flexible` (a black box
-      on top of it), `ceiling` (a black box on the bare baseline), `verdict`, `placebo` (the wrong effect `sham` on top
-      of it); `fitted`: the verdict fitted to all blocks. `floor`: its residual noise, with the uncertainty of its
-      parameters
+      on top of it), `ceiling` (a black box on the bare baseline), `verdict`, `placebo` (the wrong effect
+      `placebo_effect` on top of it); `fitted`: the verdict fitted to all blocks. `floor`: its residual noise, with the
+      uncertainty of its parameters
     - `rows` (block,): number of single rows per block
     - `chosen`: share of the folds that selected the verdict; `by_chance`: it has only random effects, which no rollout
       predicts; `by_drives`: the folds are whole drives, not blocks of them
@@ -53,7 +53,7 @@ class CrossValidation:
     floor: NoiseFloor
     rows: FloatArray
     chosen: float
-    sham: type[Effect] | None
+    placebo_effect: type[Effect] | None
     by_chance: bool = False
     by_drives: bool = False
 
@@ -77,7 +77,7 @@ def cross_validate(
         return None
     price = complexity_penalties(race.found)
     contenders = _contenders(race, verdict, price)
-    sham = _sham(verdict, {*alike, *verdict.name.split("+")}, record.channels) if blamed else None
+    placebo_effect = _placebo_effect(verdict, {*alike, *verdict.name.split("+")}, record.channels) if blamed else None
     bare = race.none.values
     kinds = (*rollout_metrics(record.channels), *closed_loop_metrics(record.channels, bare["T_L"], bare["K_L"]))
     whole = Refit.whole(verdict)
@@ -85,40 +85,40 @@ def cross_validate(
     # random effects are penalised alike in every fold: by their row gains less their evidence, over all rows
     owed = {f.name: price[f.name] + all_in[f.name].sum() - _chance_evidence(f) for f in contenders}
     images = parameter_spread(whole)
-    told: dict[str, list[FoldScores]] = {}
+    scores: dict[str, list[FoldScores]] = {}
     chosen, rows, floors = [], [], []
     for i, part in enumerate(parts):
         if progress is not None:
             progress("held-out folds", i, len(parts))
         refits = [Refit.of(f, part.fits) for f in contenders]
         none, own = refits[0], next(r for r in refits if r.found is verdict)
-        judge = FoldScorer(record, part, kinds, none.values["T_L"])
+        scorer = FoldScorer(record, part, kinds, none.values["T_L"])
         gains = {r.name: random_effect_density(r.found, race.raw, part.fits) for r in refits}
-        best = max(refits, key=lambda r: r.log_evidence + gains[r.name][~judge.inside].sum() - owed[r.name])
+        best = max(refits, key=lambda r: r.log_evidence + gains[r.name][~scorer.inside].sum() - owed[r.name])
         chance = gains[best.name]
-        boxes = {r.name: _foretold(r, part) for r in (none, best)}
-        seen = {
-            "before": judge.judged(none),
-            "after": judge.judged(best, chance=chance),
-            "fitted": judge.judged(whole, chance=all_in[verdict.name]),
-            "flexible": judge.judged(best, less=boxes[best.name], chance=chance),
-            "ceiling": judge.judged(none, less=boxes["none"]),
+        boxes = {r.name: _black_box_prediction(r, part) for r in (none, best)}
+        results = {
+            "before": scorer.score(none),
+            "after": scorer.score(best, chance=chance),
+            "fitted": scorer.score(whole, chance=all_in[verdict.name]),
+            "flexible": scorer.score(best, less=boxes[best.name], chance=chance),
+            "ceiling": scorer.score(none, less=boxes["none"]),
         }
-        if sham is not None:
-            seen |= {"verdict": judge.judged(own), "placebo": judge.judged(_with_sham(own, sham, part))}
-        for name, values in seen.items():
-            told.setdefault(name, []).append(values)
-        floors.append(judge.floor(whole, images))
+        if placebo_effect is not None:
+            results |= {"verdict": scorer.score(own), "placebo": scorer.score(_with_placebo(own, placebo_effect, part))}
+        for name, values in results.items():
+            scores.setdefault(name, []).append(values)
+        floors.append(scorer.floor(whole, images))
         chosen.append(best is own)
-        rows.append(judge.rows)
+        rows.append(scorer.rows)
     return CrossValidation(
         record=record,
         metrics=kinds,
-        sums={name: FoldScores.joined(each) for name, each in told.items()},
+        sums={name: FoldScores.joined(each) for name, each in scores.items()},
         floor=NoiseFloor.joined(floors),
         rows=np.concatenate(rows),
         chosen=float(np.mean(chosen)),
-        sham=sham,
+        placebo_effect=placebo_effect,
         by_drives=bool(whole_drive_folds(record)),
         by_chance=verdict.name != "none" and not verdict.hypothesis.effects,
     )
@@ -126,17 +126,17 @@ def cross_validate(
 
 def _contenders(race: SearchResult, verdict: FittedModel, price: Mapping[str, float]) -> list[FittedModel]:
     """The bare baseline first, then the verdict and the hypotheses that may replace it."""
-    worth = {f.name: f.log_evidence - price[f.name] for f in race.found}
+    net_evidence = {f.name: f.log_evidence - price[f.name] for f in race.found}
     others = [f for f in race.found if f is not verdict and f.name != "none"]
-    near = [f for f in others if worth[f.name] > worth[verdict.name] - _NEAR]
-    rivals = sorted(near, key=lambda f: -worth[f.name])[:_RIVALS]
+    near = [f for f in others if net_evidence[f.name] > net_evidence[verdict.name] - _NEAR]
+    rivals = sorted(near, key=lambda f: -net_evidence[f.name])[:_RIVALS]
     return [race.none, *([] if verdict is race.none else [verdict]), *rivals]
 
 
-def _foretold(refit: Refit, part: Fold) -> FloatArray:
+def _black_box_prediction(refit: Refit, part: Fold) -> FloatArray:
     """A black box's prediction of a refit's errors."""
     record = refit.found.hypothesis.record
-    return BlackBoxRegression.of(record, record.measured - refit.errors).foretold(refit.errors, refit.white(part.fits))
+    return BlackBoxRegression.of(record, record.measured - refit.errors).predict(refit.errors, refit.white(part.fits))
 
 
 def _chance_evidence(found: FittedModel) -> float:
@@ -144,7 +144,7 @@ def _chance_evidence(found: FittedModel) -> float:
     return own + (found.tails.evidence if found.tails else 0.0) + (found.losses.evidence if found.losses else 0.0)
 
 
-def _sham(verdict: FittedModel, taken: set[str], channels: tuple[str, ...]) -> type[Effect] | None:
+def _placebo_effect(verdict: FittedModel, taken: set[str], channels: tuple[str, ...]) -> type[Effect] | None:
     """A wrong effect with about as many parameters as the verdict has; ties go to the next name after the verdict's."""
     own = verdict.hypothesis.size - 2
     some = [e for e in EFFECTS.values() if not e.random and e.name not in taken and is_observable(e, channels)]
@@ -155,10 +155,12 @@ def _sham(verdict: FittedModel, taken: set[str], channels: tuple[str, ...]) -> t
     return order[0]
 
 
-def _with_sham(refit: Refit, sham: type[Effect], part: Fold) -> Refit:
+def _with_placebo(refit: Refit, placebo_effect: type[Effect], part: Fold) -> Refit:
     """The refit with the wrong effect added, fitted to the same blocks."""
     found = refit.found
-    hypothesis = Hypothesis(found.hypothesis.record, (*found.hypothesis.effects, sham), found.hypothesis.baseline)
-    starts = effect_starts(hypothesis, sham.name)
+    hypothesis = Hypothesis(
+        found.hypothesis.record, (*found.hypothesis.effects, placebo_effect), found.hypothesis.baseline
+    )
+    starts = effect_starts(hypothesis, placebo_effect.name)
     z = hypothesis.z_of({**refit.values, **starts[len(starts) // 2]})
     return Refit.of(replace(found, name=hypothesis.name, hypothesis=hypothesis, z=z, onset=refit.onset), part.fits)

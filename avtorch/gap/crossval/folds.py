@@ -25,10 +25,12 @@ _WHOLE_S = 10.0  # a block holds one to six of these, so that rollouts of this l
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """`fits`: the record to which parameters are fitted; `blocks` (begin, end) of counted rows, held out."""
+    """`fits`: the record to which parameters are fitted; `held_out`: the record that scores them, made of
+    `blocks` (begin, end) of counted rows.
+    """
 
     fits: Record = field(repr=False)
-    judges: Record = field(repr=False)
+    held_out: Record = field(repr=False)
     blocks: tuple[slice, ...]
 
     @property
@@ -85,11 +87,11 @@ def _blocks(record: Record) -> Iterator[slice]:
 
 
 def _part(record: Record, blocks: tuple[slice, ...], apart_s: float) -> Fold:
-    judges: BoolArray = np.zeros(record.rows, bool)
+    held_out: BoolArray = np.zeros(record.rows, bool)
     fits: BoolArray = np.ones(record.rows, bool)
     apart = round(apart_s / record.dt)
     for block in blocks:
-        judges[block] = True
+        held_out[block] = True
         near = slice(max(block.start - apart, 0), block.stop + apart)
         fits[near] &= record.stretch[near] != record.stretch[block.start]
-    return Fold(record.only(fits), record.only(judges), blocks)
+    return Fold(record.only(fits), record.only(held_out), blocks)

@@ -47,8 +47,8 @@ class MetricShrinkage:
 
     def to_dict(self) -> dict[str, Any]:
         closed = None if self.closed is None else self.closed.to_dict()
-        told = {"before": self.before, "after": self.after, "floor": self.floor, "closed": closed}
-        return told | {"horizon_s": self.horizon_s}
+        levels = {"before": self.before, "after": self.after, "floor": self.floor, "closed": closed}
+        return levels | {"horizon_s": self.horizon_s}
 
 
 @dataclass(frozen=True)
@@ -96,20 +96,20 @@ def gap_closed(held: CrossValidation) -> Shrinkage:
     rng = np.random.default_rng(0)
     again = rng.multinomial(blocks, np.full(blocks, 1 / blocks), size=_DRAWS).astype(float)
     z = rng.standard_normal((_DRAWS, held.floor.axes))
-    told: dict[str, _MetricSums] = {}
+    totals: dict[str, _MetricSums] = {}
     for k, kind in enumerate(kinds):
         square = {name: s.squares[k] for name, s in sums.items()}
         form = held.floor.squares[k]
         floors = _floors(square, expected(form), drawn(form, z), rng, better=-1)
-        told[kind.name] = _MetricSums(square, floors, held.rows, again, better=-1)
+        totals[kind.name] = _MetricSums(square, floors, held.rows, again, better=-1)
     nats = {name: s.nats for name, s in sums.items()}
     form = held.floor.nats
     best = nats["fitted"] + form[:, 0, 0]
     floors = _floors(nats, best - expected(form), best - drawn(form, z), rng, better=1)
-    told[DENSITY] = _MetricSums(nats, floors, held.rows, again, better=1)
+    totals[DENSITY] = _MetricSums(nats, floors, held.rows, again, better=1)
 
     spans = {m.name: reached(m, held.record) for m in kinds}
-    by_metric = {name: replace(one.closed, horizon_s=spans.get(name)) for name, one in told.items()}
+    by_metric = {name: replace(one.closed, horizon_s=spans.get(name)) for name, one in totals.items()}
     usual = [m.name for m in kinds if m.horizon_s == HORIZON_S]
     shows = {name: by_metric[name].before / max(by_metric[name].floor, 1e-12) for name in usual}
     metric = max(shows, key=lambda name: shows[name])
@@ -118,9 +118,10 @@ def gap_closed(held: CrossValidation) -> Shrinkage:
     return Shrinkage(
         metric=metric,
         by_metric=by_metric,
-        placebo_effect=None if held.sham is None else held.sham.name,
-        placebo=told[metric].placebo,
-        ceiling={m.name: told[m.name].all_in("ceiling") for m in kinds} | {DENSITY: told[DENSITY].all_in("ceiling")},
+        placebo_effect=None if held.placebo_effect is None else held.placebo_effect.name,
+        placebo=totals[metric].placebo,
+        ceiling={m.name: totals[m.name].all_in("ceiling") for m in kinds}
+        | {DENSITY: totals[DENSITY].all_in("ceiling")},
         chosen=held.chosen,
         blocks=blocks,
         by_drives=held.by_drives,

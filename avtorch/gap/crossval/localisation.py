@@ -49,20 +49,22 @@ class Location:
         return part | {"share": self.share, "q_value": self.q_value}
 
 
-def localise(shown: RowAttribution, *, onset_s: float | None, lag: float) -> tuple[Location, ...]:
+def localise(attribution: RowAttribution, *, onset_s: float | None, lag: float) -> tuple[Location, ...]:
     """The significant parts, most significant first. `onset_s`: from the log's start; `lag` [s] of the actuator."""
-    parts: list[Part] = [*_stretches(shown, onset_s, lag), *_signals(shown), *_band(shown)]
-    q_values = _q_values([gain - shown.paid for *_, gain in parts])
-    parts = [(axis, *_stamps(shown, axis, a, b), share, gain) for axis, a, b, share, gain in parts]
+    parts: list[Part] = [*_stretches(attribution, onset_s, lag), *_signals(attribution), *_band(attribution)]
+    q_values = _q_values([gain - attribution.paid for *_, gain in parts])
+    parts = [(axis, *_stamps(attribution, axis, a, b), share, gain) for axis, a, b, share, gain in parts]
     named = [Location(axis, a, b, share, q) for (axis, a, b, share, _), q in zip(parts, q_values, strict=True)]
     return tuple(sorted((w for w in named if w.q_value <= _RATE), key=lambda w: w.q_value))
 
 
-def _stamps(shown: RowAttribution, axis: Axis, begin: float | str, end: float | str) -> tuple[float | str, float | str]:
+def _stamps(
+    attribution: RowAttribution, axis: Axis, begin: float | str, end: float | str
+) -> tuple[float | str, float | str]:
     """Both ends, with times converted from the log's start to the log's own clock."""
     if axis != "time" or isinstance(begin, str) or isinstance(end, str):
         return begin, end
-    record = shown.record
+    record = attribution.record
     time, stamp = record.time[record.source], record.stamp[record.source]
     first, last = (int(np.abs(time - t).argmin()) for t in (begin, end))
     return begin + float(stamp[first] - time[first]), end + float(stamp[last] - time[last])
@@ -72,14 +74,14 @@ Part = tuple[Axis, float | str, float | str, float, float]
 """Axis, ends, share of the cause's contribution, and gain within the part [nats]."""
 
 
-def _stretches(shown: RowAttribution, onset_s: float | None, lag: float) -> Iterator[Part]:
-    record, does = shown.record, shown.does
+def _stretches(attribution: RowAttribution, onset_s: float | None, lag: float) -> Iterator[Part]:
+    record, does = attribution.record, attribution.does
     time = record.time[record.source]
     one_clock = bool((np.diff(time) > 0).all()) and len(np.unique(record.log)) == 1
     if onset_s is not None and one_clock:
         # random effects (glitches, lost messages) have an onset but no predictable contribution
         since_then = does if does.any() else np.ones(len(time))
-        yield _part(shown, "time", time, onset_s, float(time[-1]), since_then)
+        yield _part(attribution, "time", time, onset_s, float(time[-1]), since_then)
     if not does.any():
         return
     axes: list[tuple[Axis, FloatArray]] = [("time", time)] if onset_s is None and one_clock else []
@@ -94,7 +96,7 @@ def _stretches(shown: RowAttribution, onset_s: float | None, lag: float) -> Iter
         # weighted by size, not by square, or the edges of the active region would be lost
         low, high = shortest(x, np.sqrt(does), _MOST)
         if ((x >= low) & (x <= high))[since].mean() <= _PLAINLY:
-            part = _part(shown, axis, x, low, high, does)
+            part = _part(attribution, axis, x, low, high, does)
             yield part if axis != "command" else (axis, *_own_ends(x, low, high, record.command), *part[3:])
 
 
@@ -106,9 +108,9 @@ def _own_ends(x: FloatArray, low: float, high: float, command: FloatArray) -> tu
     )
 
 
-def _part(shown: RowAttribution, axis: Axis, x: FloatArray, low: float, high: float, does: FloatArray) -> Part:
+def _part(attribution: RowAttribution, axis: Axis, x: FloatArray, low: float, high: float, does: FloatArray) -> Part:
     inside = (x >= low) & (x <= high)
-    return axis, low, high, float(does[inside].sum() / does.sum()), float(shown.gained[inside].sum())
+    return axis, low, high, float(does[inside].sum() / does.sum()), float(attribution.gained[inside].sum())
 
 
 def shortest(x: FloatArray, weight: FloatArray, share: float) -> tuple[float, float]:
@@ -122,21 +124,21 @@ def shortest(x: FloatArray, weight: FloatArray, share: float) -> tuple[float, fl
     return float(x[best]), float(x[ends[best] - 1])
 
 
-def _signals(shown: RowAttribution) -> Iterator[Part]:
-    does, felt = float(shown.does.sum()), float(shown.felt.sum())
+def _signals(attribution: RowAttribution) -> Iterator[Part]:
+    does, felt = float(attribution.does.sum()), float(attribution.felt.sum())
     if does <= 0:
         return
-    gained = float(shown.gained.sum())
+    gained = float(attribution.gained.sum())
     sensing = min(felt / does, 1.0)
     for name, share in (("actuation", 1 - sensing), ("sensing", sensing)):
         if share > 0:
             yield "signal", name, name, share, share * gained
 
 
-def _band(shown: RowAttribution) -> Iterator[Part]:
+def _band(attribution: RowAttribution) -> Iterator[Part]:
     """The frequency band of the cause's change of acceleration."""
-    record = shown.record
-    accel = shown.moved[0] if "accel" in record.channels else np.gradient(shown.moved[-1]) / record.dt
+    record = attribution.record
+    accel = attribution.moved[0] if "accel" in record.channels else np.gradient(attribution.moved[-1]) / record.dt
     power, f = np.zeros(0), np.zeros(0)
     for first, last in zip(record.starts, [*record.starts[1:], record.rows], strict=True):
         x = accel[first:last]
@@ -150,7 +152,7 @@ def _band(shown: RowAttribution) -> Iterator[Part]:
         # the lowest frequency that a drive resolves includes the steady part
         slowest = low <= np.log(f.min()) + 1e-9
         begin, end = 0.0 if slowest else float(np.exp(low)), float(np.exp(high))
-        yield "frequency", begin, end, share, share * float(shown.gained.sum())
+        yield "frequency", begin, end, share, share * float(attribution.gained.sum())
 
 
 def _q_values(gains: Sequence[float]) -> list[float]:
@@ -159,8 +161,8 @@ def _q_values(gains: Sequence[float]) -> list[float]:
         return []
     order = np.argsort(-np.asarray(gains))
     rank = np.arange(1, len(gains) + 1)
-    told = np.minimum(1.0, len(gains) / rank * np.exp(-np.clip(np.asarray(gains)[order], -50.0, 700.0)))
-    told = np.minimum.accumulate(told[::-1])[::-1]
+    q = np.minimum(1.0, len(gains) / rank * np.exp(-np.clip(np.asarray(gains)[order], -50.0, 700.0)))
+    q = np.minimum.accumulate(q[::-1])[::-1]
     out = np.empty(len(gains))
-    out[order] = told
+    out[order] = q
     return out.tolist()

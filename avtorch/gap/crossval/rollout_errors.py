@@ -57,9 +57,9 @@ class RolloutMetric:
         out = []
         for b in blocks:
             # how often each row is a start for the errors scored in this block
-            judged = np.zeros(x.shape[1])
-            judged[b] = 1.0 / starts[b]
-            often = _window(judged[::-1], length, keeps**2)[::-1]
+            scored = np.zeros(x.shape[1])
+            scored[b] = 1.0 / starts[b]
+            often = _window(scored[::-1], length, keeps**2)[::-1]
             used = slice(max(b.start - length + 1, 0), b.stop)
             mixed = x[:, b] @ mean[:, b].T
             squares = (x[:, used] * often[used]) @ x[:, used].T

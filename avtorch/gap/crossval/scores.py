@@ -45,7 +45,7 @@ class FoldScorer:
         """(measure, block, one, other) of errors (one, channel, counted, group)."""
         return np.stack([products(m, self.record, errors, self.part.blocks, self.lag) for m in self.metrics])
 
-    def judged(self, refit: Refit, *, less: FloatArray | None = None, chance: FloatArray | None = None) -> FoldScores:
+    def score(self, refit: Refit, *, less: FloatArray | None = None, chance: FloatArray | None = None) -> FoldScores:
         """Scores of a refit; `less`: prediction (channel, counted, 1) to subtract from its errors, `chance` (counted,)
         [nats]: term to add to the density of each row."""
         errors = refit.errors if less is None else refit.errors - less
@@ -58,7 +58,7 @@ class FoldScorer:
         """Log density (counted,) of each held-out row, 0 elsewhere."""
         errors = refit.errors if less is None else refit.errors - less
         out = np.zeros(self.record.rows)
-        rows = np.isin(self.record.source, self.part.judges.source)
+        rows = np.isin(self.record.source, self.part.held_out.source)
         out[rows] = self._white(refit).row_likelihoods(errors[:, rows])
         return out
 
@@ -66,7 +66,7 @@ class FoldScorer:
         """Noise floor of a refit whose parameters change its errors by `images` (axis, channel, counted, group)
         (`parameter_spread`)."""
         errors = np.concatenate([refit.errors[None], images])
-        rows = np.isin(self.record.source, self.part.judges.source)
+        rows = np.isin(self.record.source, self.part.held_out.source)
         white = self._white(refit)(errors[:, :, rows])
         nats = np.empty((len(self.part.blocks), len(errors), len(errors)))
         number = self._block_of[rows]
@@ -100,7 +100,7 @@ class FoldScorer:
         return np.array([(b.stop - b.start) * self.record.group for b in self.part.blocks], float)
 
     def _white(self, refit: Refit) -> WhiteningFilter:
-        return refit.white(self.part.judges)
+        return refit.white(self.part.held_out)
 
 
 def parameter_spread(refit: Refit) -> FloatArray:

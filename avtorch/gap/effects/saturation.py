@@ -39,7 +39,7 @@ class Saturation(Effect):
     equation = "K u within [a_min, a_max]"
     linear = False
     one_sided = True
-    half_said = "limits that differ for driving and braking; the tool's one is the wider"
+    export_loss = "limits that differ for driving and braking; the tool's one is the wider"
     starts = fixed(
         accel_max_mps2=(0.5, 0.75, 1.0, 1.25, 1.6, 2.1, 5.0),
         accel_min_mps2=(-0.8, -1.2, -1.6, -2.1, -2.8, -8.0),

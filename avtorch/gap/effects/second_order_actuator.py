@@ -51,7 +51,7 @@ class SecondOrderActuator(Effect):
     meaning = "the actuator has inertia and may overshoot"
     equation = "a'' = omega² (K u - a) - 2 zeta omega a'"
     alias = "pole"
-    half_said = "its overshoot; the time constant is that of the two poles together"
+    export_loss = "its overshoot; the time constant is that of the two poles together"
     starts = fixed(inverse_frequency_s=(0.05, 0.15, 0.4))
     parameters = (
         Parameter("inverse_frequency_s", "s", 0.0, 1 / 12, 1 / 3, reported=False),

@@ -37,7 +37,7 @@ class GaussNewtonFit:
     log_joint: float
     log_evidence: float
     grade_rms: float | None = None
-    profile: FloatArray | None = None
+    profile: Float[FloatArray, " knot"] | None = None
 
 
 def modes(
@@ -96,8 +96,8 @@ def modes(
 class _Crease(NamedTuple):
     """Where the parabolas of a step's two ends meet: `share` of the step (start,), `value` there (start,)."""
 
-    share: FloatArray
-    value: FloatArray
+    share: Float[FloatArray, " start"]
+    value: Float[FloatArray, " start"]
 
 
 def _crease(
@@ -206,7 +206,9 @@ def _sloped(
     onset: int | None,
 ) -> tuple[float, Float[FloatArray, " knot"], Float[FloatArray, "channel counted group"]]:
     """`grade_rms`, the road grade's coefficients (knot,), and its contribution to the errors."""
-    rms, profile = grade_marginal(white, hypothesis, onset, coarse=errors.shape[-1] == 1).told(white(errors).ravel())
+    rms, profile = grade_marginal(white, hypothesis, onset, coarse=errors.shape[-1] == 1).estimate(
+        white(errors).ravel()
+    )
     part = hypothesis.grade_response(profile)
     part = part.mean(-1, keepdims=True) if errors.shape[-1] == 1 else part
     return rms, profile, sensed(white.record, white.noise, acting(white.record, part, onset))

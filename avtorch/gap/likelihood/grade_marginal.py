@@ -55,7 +55,7 @@ class GradeMarginal:
         total: FloatArray = np.asarray(logsumexp(gains, axis=1))
         return total, np.exp(gains - total[:, None]) @ self.shrinkage
 
-    def told(self, errors: Float[FloatArray, " row"]) -> tuple[float, Float[FloatArray, " knot"]]:
+    def estimate(self, errors: Float[FloatArray, " row"]) -> tuple[float, Float[FloatArray, " knot"]]:
         """The best `grade_rms`, and the posterior mean of the coefficients (knot,), given whitened errors (row,)."""
         match = (errors @ self.image.T)[None]
         _, taken = self.weighed(match)

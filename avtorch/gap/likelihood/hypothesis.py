@@ -36,7 +36,7 @@ class Coordinate:
     parameter: Parameter
     wider: float
 
-    def value(self, z: FloatArray) -> torch.Tensor:
+    def value(self, z: Float[FloatArray, "*column"]) -> Float[torch.Tensor, "*column"]:
         return self.parameter.constrain(torch.as_tensor(self.wider * z))
 
     def z_of(self, value: float) -> float:

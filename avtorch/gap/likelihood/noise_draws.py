@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
-from avtorch.arrays import FloatArray
+from avtorch.arrays import Float, FloatArray
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.steady_kalman import error_dynamics
 
 
 def noise_draws(
     noise: NoiseModel, rows: int, dt: float, channels: tuple[str, ...], count: int, rng: np.random.Generator
-) -> FloatArray:
+) -> Float[FloatArray, "draw channel row"]:
     """(draw, channel, row) at rows `dt` [s] apart; the speed's error starts at 0, except for its sensor noise."""
     move, driven = error_dynamics(noise, dt)
     # stationary states start from their stationary distribution

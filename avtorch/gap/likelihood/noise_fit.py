@@ -8,7 +8,7 @@ from itertools import product
 
 import numpy as np
 
-from avtorch.arrays import FloatArray
+from avtorch.arrays import Float, FloatArray
 from avtorch.gap.likelihood.noise_model import NAMES, NoiseModel
 from avtorch.gap.likelihood.noise_segments import before_onset, whitening_filter
 from avtorch.gap.likelihood.random_law import RandomLaw
@@ -54,15 +54,15 @@ class NoiseFit:
 
     noise: NoiseModel
     log_prior: float
-    rows: FloatArray = field(repr=False)
+    rows: Float[FloatArray, " counted"] = field(repr=False)
     sds: Mapping[str, float] = field(repr=False)
-    law_z: FloatArray | None = field(default=None, repr=False)
-    law_covariance: FloatArray | None = field(default=None, repr=False)
+    law_z: Float[FloatArray, " law_coordinate"] | None = field(default=None, repr=False)
+    law_covariance: Float[FloatArray, "law_coordinate law_coordinate"] | None = field(default=None, repr=False)
 
 
 def fit_noise(
     record: Record,
-    errors: FloatArray,
+    errors: Float[FloatArray, "channel counted group"],
     start: NoiseModel,
     *,
     T_L: float,
@@ -71,7 +71,7 @@ def fit_noise(
     gust_onset: int | None = None,
     iterations: int = 6,
     law: RandomLaw | None = None,
-    law_z: FloatArray | None = None,
+    law_z: Float[FloatArray, " law_coordinate"] | None = None,
 ) -> NoiseFit:
     """Mode of the noise parameters given the errors (channel, counted, group) of a rollout; `T_L` [s].
 

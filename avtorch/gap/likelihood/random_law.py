@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.arrays import FloatArray
+from avtorch.arrays import Float, FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.likelihood.hypothesis import Coordinate, Hypothesis
 from avtorch.gap.likelihood.record import Record
@@ -67,25 +67,27 @@ class RandomLaw:
     def size(self) -> int:
         return len(self.coordinates)
 
-    def at(self, z: FloatArray) -> Effect:
+    def at(self, z: Float[FloatArray, " coordinate"]) -> Effect:
         """The effect at `z` (coordinate,)."""
         each = zip(self.coordinates, z, strict=True)
         values = {c.key.partition(".")[2]: float(c.value(np.array(x))) for c, x in each}
         return self.effect.replaced(values) if values else self.effect
 
-    def force(self, z: FloatArray) -> dict[str, float]:
+    def force(self, z: Float[FloatArray, " coordinate"]) -> dict[str, float]:
         """The noise model's `more_sd` [m/s²] and `more_time` [s]."""
         change = self._change(z, torch.zeros(1, dtype=torch.float64))
         sd, time = self._single("force_sd", change.force_sd), self._single("force_time", change.force_time, above=True)
         return {"more_sd": sd, "more_time": time}
 
-    def tails(self, z: FloatArray) -> tuple[float, float]:
+    def tails(self, z: Float[FloatArray, " coordinate"]) -> tuple[float, float]:
         """`(fraction, scale)`, at most a half and in units of the accelerometer's standard deviation."""
         change = self._change(z, torch.zeros(1, dtype=torch.float64))
         fraction = self._single("tail_fraction", change.tail_fraction)
         return min(fraction, 0.5), self._single("tail_scale", change.tail_scale)
 
-    def command_variance(self, z: FloatArray, drives: Sequence[SimulatorInput]) -> FloatArray:
+    def command_variance(
+        self, z: Float[FloatArray, " coordinate"], drives: Sequence[SimulatorInput]
+    ) -> Float[FloatArray, " row"]:
         """Variance [(m/s²)²] for every row of all drives, concatenated."""
         parts = []
         for drive in drives:

@@ -21,10 +21,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.arrays import BoolArray, Float, FloatArray, Int, IntArray
+from avtorch.arrays import Bool, BoolArray, Float, FloatArray, Int, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.simulator.simulator_input import Place, SimulatorInput
-from avtorch.io import Log
+from avtorch.io import Log, fingerprint
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import AccelKind
@@ -88,7 +88,7 @@ class Record:
         return tuple(name for name in ("accel", "speed") if getattr(self, name) is not None)
 
     @property
-    def starts(self) -> IntArray:
+    def starts(self) -> Int[IntArray, " stretch"]:
         """Index of each stretch's first counted row."""
         return np.flatnonzero(np.diff(self.stretch, prepend=-1))
 
@@ -121,8 +121,8 @@ class Record:
         specific = "specific-force" in kinds
         rates = [log.rate_hz for log in each]
         if max(rates) > 1.02 * min(rates):
-            told = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in each)
-            raise InputError(f"logs: found rates of {told}; needs one rate in all, or one diagnosis each")
+            given = ", ".join(f"{log.name} {log.rate_hz:.3g} Hz" for log in each)
+            raise InputError(f"logs: found rates of {given}; needs one rate in all, or one diagnosis each")
         group = grouped(min(rates), rate_hz)
         steps = []
         segments = 0
@@ -212,7 +212,7 @@ class Record:
         numbers = {n: i for i, n in enumerate(dict.fromkeys(cut.segment for cut in self.cuts))}
         return tuple(numbers[cut.segment] for cut in self.cuts)
 
-    def only(self, rows: BoolArray) -> Record:
+    def only(self, rows: Bool[BoolArray, " counted"]) -> Record:
         """The same drives, of which only these `rows` (counted,) still count, in stretches of 2 s or more.
 
         Rollouts cover whole drives as before; rows that no longer count are neither fitted nor scored.
@@ -253,6 +253,11 @@ class Record:
             parts.append(x.unflatten(-1, (-1, 1 if coarse else self.group)))
         whole = parts[0] if len(parts) == 1 else torch.cat(parts, -2)
         return whole.numpy()[..., self.source, :]
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Of the data, to the bit: what a stored fit belongs to."""
+        return fingerprint(self)
 
     @cached_property
     def shared_columns(self) -> dict[tuple[type, bool], FloatArray]:

@@ -39,12 +39,12 @@ def with_sensor_noise(log: Log) -> tuple[Log, str | None]:
     force, gained = _force(log, rng)
     white = {name: rng.standard_normal(log.rows) for name in FINER}
     read = {name: x + (force if name == "accel" else gained) for name, x in channels.items()}
-    told = []
+    levels = []
     for name, sd, unit in (("accel", QUIET.accel_sd, "m/s²"), ("speed", QUIET.speed_sd, "m/s")):
         if name in bare:
             read[name] = read[name] + sd * white[name]
-            told.append(f"{name} ({sd:g} {unit})")
-    added = f"the diagnosis adds noise to {' and '.join(told)}"
+            levels.append(f"{name} ({sd:g} {unit})")
+    added = f"the diagnosis adds noise to {' and '.join(levels)}"
     return replace(log, **read), f"No sensor noise in {' and '.join(bare)}, as if simulated: {added}."
 
 

@@ -86,7 +86,7 @@ class WhiteningFilter:
                 out[..., o, part, :] = rows[..., target, :]
         return out
 
-    def turned(
+    def transpose(
         self, images: Float[FloatArray, "*column channel counted group"]
     ) -> Float[FloatArray, "*column channel counted group"]:
         """Transpose of the map, for images (..., channel, counted, group): the filter run backward in time."""
@@ -181,10 +181,12 @@ class WhiteningFilter:
         """The term of the log likelihood that does not depend on the errors."""
         return float(self.constants(coarse=coarse).sum())
 
-    def log_likelihood(self, errors: Float[FloatArray, "*column channel counted group"]) -> FloatArray:
+    def log_likelihood(
+        self, errors: Float[FloatArray, "*column channel counted group"]
+    ) -> Float[FloatArray, "*column"]:
         """Log likelihood (...) of errors (..., channel, counted, group)."""
         e = self(errors)
-        return self.constant_of(coarse=errors.shape[-1] == 1) - 0.5 * (e**2).sum((-1, -2, -3))
+        return np.asarray(self.constant_of(coarse=errors.shape[-1] == 1) - 0.5 * (e**2).sum((-1, -2, -3)))
 
     def row_likelihoods(self, errors: Float[FloatArray, "channel counted group"]) -> Float[FloatArray, " counted"]:
         """Log likelihood (counted,) of each row of errors (channel, counted, group); the rows sum to the total."""

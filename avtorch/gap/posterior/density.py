@@ -94,7 +94,7 @@ class RolloutDensity:
             place = some.requires_grad_()
             with torch.enable_grad():
                 rolled = self._rolled(place)
-                value, cotangent = self._judged(rolled.detach().numpy(), slope=True)
+                value, cotangent = self._log_likelihood(rolled.detach().numpy(), slope=True)
                 (score,) = torch.autograd.grad(rolled, place, torch.as_tensor(cotangent))
             place = place.detach()  # NaN where a chain diverged, so that its sampler can detect it
             values.append(torch.as_tensor(value))
@@ -104,7 +104,7 @@ class RolloutDensity:
     def value(self, z: Tensor) -> Tensor:
         """`log_prob` without a graph."""
         with torch.no_grad():
-            values = [torch.as_tensor(self._judged(self._rolled(b).numpy())[0]) for b in self._blocks(z)]
+            values = [torch.as_tensor(self._log_likelihood(self._rolled(b).numpy())[0]) for b in self._blocks(z)]
         return torch.cat(values).reshape(z.shape[:-1]) + self._prior(z)
 
     # parts of the density --------------------------------------------------------------------------------------------
@@ -166,7 +166,7 @@ class RolloutDensity:
         """Whitened errors, every row once: (column, row)."""
         return self.white(errors).reshape(len(errors), -1)
 
-    def _judged(self, rolled: FloatArray, *, slope: bool = False) -> tuple[FloatArray, FloatArray | None]:
+    def _log_likelihood(self, rolled: FloatArray, *, slope: bool = False) -> tuple[FloatArray, FloatArray | None]:
         """Log likelihood (column,) of rollouts and, with `slope`, its derivative by the rollouts."""
         errors = self._errors(rolled)
         flat = self._image(errors)
@@ -176,7 +176,7 @@ class RolloutDensity:
             value, flat = value + gained, flat - less
         if not slope:
             return value, None
-        return value, self.white.turned(flat.reshape(errors.shape))
+        return value, self.white.transpose(flat.reshape(errors.shape))
 
 
 class _Exact(torch.autograd.Function):

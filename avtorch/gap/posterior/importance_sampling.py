@@ -81,8 +81,8 @@ def _tempered(ratios: FloatArray) -> FloatArray:
 def _density(places: FloatArray, centres: FloatArray, root: FloatArray) -> FloatArray:
     """Log density (place,) of an equal mixture of t distributions around `centres` (kernel, coordinate)."""
     dim = places.shape[1]
-    turned = np.linalg.solve(root, places.T).T[:, None] - np.linalg.solve(root, centres.T).T
-    square = (turned**2).sum(-1)
+    whitened = np.linalg.solve(root, places.T).T[:, None] - np.linalg.solve(root, centres.T).T
+    square = (whitened**2).sum(-1)
     inside = -0.5 * (_DEGREES + dim) * np.log1p(square / _DEGREES)
     norm = gammaln(0.5 * (_DEGREES + dim)) - gammaln(0.5 * _DEGREES) - 0.5 * dim * np.log(_DEGREES * np.pi)
     return logsumexp(inside, axis=1) - np.log(len(centres)) + norm - np.log(np.abs(np.diag(root))).sum()

@@ -19,9 +19,9 @@ from avtorch.gap.posterior.importance_sampling import effective_sample_size, imp
 from avtorch.gap.posterior.summary import lag_and_gain, repaired, reported, reported_draws
 from avtorch.gap.posterior.surrogate import Corrected, Surrogate, trusted_square
 from avtorch.gap.search.fitted_model import FittedModel
+from avtorch.inference.coordinates import Coordinates, stiffness
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.sampler import SamplerSettings, sample
-from avtorch.inference.whitening import Coordinates, stiffness
 
 __all__ = ["Draws", "exact_one_in", "fitted", "lag_and_gain", "posterior", "repaired", "reported", "reported_draws"]
 
@@ -79,14 +79,15 @@ def posterior(found: FittedModel, *, chains: int = 16, draws: int = 50, seed: in
 def _walked(target: Corrected, chains: int, draws: int, generator: torch.Generator) -> tuple[Tensor | None, str]:
     """SGLD draws of `z` (chain, draw, coordinate), or None and the reason; the number of gradients is bounded."""
     density, mode = target.exact, target.mode
-    pace = float(stiffness(density, Coordinates.of(mode)))
+    steepness = float(stiffness(density, Coordinates.of(mode)))
     exact = chains / target.points  # exact gradients per step
     rows = sum(len(d.time) for d in density.hypothesis.record.drives)
     steps = min(_STEPS, _ROWS / rows / exact)
     thinning = 2 if draws * 2 + 4 <= steps else 1
     longest = max([1.0, *(t for t in (1.5, 2.0, 3.0, 4.0) if (4 * t + thinning * draws) * t <= steps)])
-    if pace > 2 * longest:
-        return None, f"its shape is far from normal (in places {pace:.0f} times as steep), and SGLD would take too long"
+    if steepness > 2 * longest:
+        steep = f"in places {steepness:.0f} times as steep"
+        return None, f"its shape is far from normal ({steep}), and SGLD would take too long"
     settings = SamplerSettings(
         chains=chains,
         draws=draws,

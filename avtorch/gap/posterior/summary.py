@@ -32,9 +32,9 @@ def reported(found: FittedModel, draws: Draws | None = None) -> dict[str, Quanti
     From `draws` of the posterior, or else from Laplace's approximation at the mode. Parameters of random effects are
     normal on their link's scale, as estimated by their own fits.
     """
-    told = {name: Quantity.of_draws(x) for name, x in _deterministic(found, draws).items()}
+    deterministic = {name: Quantity.of_draws(x) for name, x in _deterministic(found, draws).items()}
     normal = {name: Quantity.of_normal(*law) for name, law in _random(found).items()}
-    return _named(found, told | normal)
+    return _named(found, deterministic | normal)
 
 
 def lag_and_gain(found: FittedModel, draws: Draws | None = None) -> dict[str, Quantity]:
@@ -77,12 +77,12 @@ def repaired(found: FittedModel, baseline: GapPlant | None = None, draws: Draws 
             rms = _deterministic(found, draws).get(f"{effect.name}.{effect.size}")
             size = float(rms.mean()) if rms is not None else float(found.grade_rms or 1.0)
             effects[i] = effect.along(torch.as_tensor(np.asarray(found.profile[: effect.count])), size)
-    told = {name: float(Quantity.of_normal(*law).mean) for name, law in _random(found).items()}
+    random_means = {name: float(Quantity.of_normal(*law).mean) for name, law in _random(found).items()}
     chance: list[Effect] = [kind() for kind in found.searched]
     if found.by_chance is not None:
         chance.append(found.by_chance.law.at(found.by_chance.z))
     for effect in chance:
-        given = {key.partition(".")[2]: x for key, x in told.items() if key.startswith(f"{effect.name}.")}
+        given = {key.partition(".")[2]: x for key, x in random_means.items() if key.startswith(f"{effect.name}.")}
         effects.append(_plain(effect.replaced(given).in_noise(float(noise.accel_sd))))
     process_sd = noise.process_sd
     if found.by_chance is not None and found.by_chance.process_sd is not None:
@@ -149,8 +149,8 @@ def _random(found: FittedModel) -> dict[str, tuple[float, float, Link]]:
     """Mean, sd and link of the random effects' parameters, by `effect.parameter`."""
     out: dict[str, tuple[float, float, Link]] = {}
     for kind in found.searched:
-        told = _searched(found, kind)
-        out |= {f"{kind.name}.{parameter}": told[own] for own, parameter in kind.noise_parameters.items()}
+        estimates = _searched(found, kind)
+        out |= {f"{kind.name}.{parameter}": estimates[own] for own, parameter in kind.noise_parameters.items()}
     if found.by_chance is not None:
         law, sds = found.by_chance.law, np.sqrt(np.diag(found.by_chance.covariance))
         for c, z, sd in zip(law.coordinates, found.by_chance.z.tolist(), sds.tolist(), strict=True):

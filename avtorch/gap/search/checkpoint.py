@@ -13,7 +13,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -24,7 +23,6 @@ from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import NoiseFit
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.noise_segments import whitening_filter
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.fitted_work import difference
 from avtorch.io import fingerprint, read_sealed, write_sealed
@@ -68,13 +66,8 @@ class FitKey:
 
     @classmethod
     def of(cls, hypothesis: Hypothesis, z: FloatArray, noise: NoiseModel, onset: int | None, rounds: int) -> FitKey:
-        record = hypothesis.record
-        if record not in _RECORDS:
-            _RECORDS[record] = fingerprint(record)
-        return cls(hypothesis, onset, fingerprint(_RECORDS[record], hypothesis.name, z, noise, onset, rounds))
-
-
-_RECORDS: WeakKeyDictionary[Record, str] = WeakKeyDictionary()
+        data = hypothesis.record.fingerprint
+        return cls(hypothesis, onset, fingerprint(data, hypothesis.name, z, noise, onset, rounds))
 
 
 class Checkpoint:

@@ -63,7 +63,7 @@ class Delays:
         return float(self.shares[self.lengths < self.row].sum()) if len(self.lengths) > 1 else 0.0
 
     @property
-    def untold(self) -> bool:
+    def may_be_zero(self) -> bool:
         """Whether zero delay fits as well: as one of the modes, or by a likelihood within `ALIKE`."""
         return self.none > 0 or (self.gain < ALIKE and float(self.lengths.max()) > self.row)
 

@@ -87,7 +87,7 @@ class OwnNoiseFits:
     def _traded(
         hypothesis: Hypothesis, z: FloatArray, white: WhiteningFilter, onset: int | None, coarse: bool
     ) -> FloatArray:
-        """`z`, or the best place from which a dead time and the lag are told apart better."""
+        """`z`, or the best place from which the fit separates a dead time and the lag better."""
         places = np.concatenate([z[None], lag_delay_starts(hypothesis, z)])
         if len(places) == 1:
             return z

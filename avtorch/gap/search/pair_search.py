@@ -10,13 +10,13 @@ from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.noise_segments import CALM
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.search.budget import Budget
 from avtorch.gap.search.checkpoint import StoredFit
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.own_noise_fit import OwnNoiseFits
 from avtorch.gap.search.pairs import PairBase, exchanged, joint_fit
 from avtorch.gap.search.random_effects import RandomEffects
 from avtorch.gap.search.screening import Screened, refine, screen
+from avtorch.gap.search.time_budget import TimeBudget
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.integrated import Integrated
 
@@ -37,7 +37,7 @@ class PairSearch:
     kinds: Sequence[type[Effect]]
     random: RandomEffects
     fits: OwnNoiseFits
-    budget: Budget
+    budget: TimeBudget
     progress: Callable[[str, int, int], None]
 
     def found(self, singles: Sequence[FittedModel], none: FittedModel) -> list[FittedModel]:

@@ -19,7 +19,6 @@ from avtorch.gap.likelihood.observability import is_observable
 from avtorch.gap.likelihood.random_law import RandomLaw
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
-from avtorch.gap.search.budget import Budget
 from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.gap.search.delays import all_delays
 from avtorch.gap.search.fitted_model import FittedModel, Scope, SearchResult, without_outliers
@@ -32,6 +31,7 @@ from avtorch.gap.search.own_noise_fit import OwnNoiseFits
 from avtorch.gap.search.pair_search import LEAST, PairSearch
 from avtorch.gap.search.random_effects import RandomEffects, commanded, glitched
 from avtorch.gap.search.screening import Screened, refine, screen
+from avtorch.gap.search.time_budget import TimeBudget
 from avtorch.gap.simulator.effect import EFFECTS, Effect
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log
@@ -59,7 +59,7 @@ class Search:
     ) -> None:
         self.logs, self.baseline, self.pairs = tuple(logs), baseline, pairs
         self.effects = list(EFFECTS.values() if effects is None else effects)
-        self.budget = Budget(budget_s)
+        self.budget = TimeBudget(budget_s)
         self.progress = progress or (lambda what, done, of: None)
         self._seen: set[str] = set()  # effects rolled out, also those whose evidence is not kept
         self._paired = False

@@ -91,9 +91,9 @@ class _Look:
         self.each = white(errors)
         self.e = _summed(self.each)
         self.rows = self.e.shape[1]
-        told = rollout.mean(-1)
+        motion = rollout.mean(-1)
         # one row late: within a group of rows, commands already respond to the noise of the first rows
-        self.a = _late(told[0] if "accel" in self.channels else np.gradient(told[-1]) / self.dt, 1)
+        self.a = _late(motion[0] if "accel" in self.channels else np.gradient(motion[-1]) / self.dt, 1)
         self.u = _late(record.command[record.source], 1)
         self.jerk = np.diff(self.a, prepend=self.a[0]) / self.dt
         self.v = np.zeros(self.rows)
@@ -124,32 +124,32 @@ class _Look:
     def flexible(self) -> float:
         e, both = self.e.ravel(), len(self.channels) == 2
         a, v, t = self.a, self.v, self.t
-        told = []
+        evidences = []
         apart = max(1, round(SCALES.response_spacing / self.dt))
         late = np.stack([_late(self.jerk, k * apart) for k in range(_DELAYS)])
         responses = [self._force(late)]
         if both:
             responses += [self._reading(late, "accel"), self._reading(late, "speed")]
         for response in responses:
-            told.append(_mean([_evidence(_decaying(keep).T @ response, e) for keep in SCALES.response_decays]))
+            evidences.append(_mean([_evidence(_decaying(keep).T @ response, e) for keep in SCALES.response_decays]))
         counts = (SCALES.accel_knots, SCALES.speed_knots, SCALES.time_knots)
         of_a, of_v, of_t = (linear_splines(x, knots) for x, knots in zip((a, v, t), counts, strict=True))
         forces = [self._force(x) for x in (of_a, of_v, of_t, a * of_v, a * of_t)]
         commands = self._force(linear_splines(self.u, SCALES.command_knots))
-        told += [_evidence(x, e) for x in (*forces, np.concatenate(forces), commands)]
+        evidences += [_evidence(x, e) for x in (*forces, np.concatenate(forces), commands)]
         if both:
-            told += [_evidence(self._reading(x, "accel"), e) for x in (of_a, of_v, of_t, a * of_v, a * of_t)]
-            told += [_evidence(self._reading(x, "speed"), e) for x in (of_a, of_v)]
+            evidences += [_evidence(self._reading(x, "accel"), e) for x in (of_a, of_v, of_t, a * of_v, a * of_t)]
+            evidences += [_evidence(self._reading(x, "speed"), e) for x in (of_a, of_v)]
         push, brake = np.maximum(a, 0), np.minimum(a, 0)
         pushes, brakes = ([lowpass(x, s, self.dt) for s in SCALES.push_lags] for x in (push, brake))
-        told.append(_evidence(self._force(np.stack([push, brake, *pushes, *brakes])), e))
+        evidences.append(_evidence(self._force(np.stack([push, brake, *pushes, *brakes])), e))
         products = [x * y for x in (push, brake) for y in (*pushes, *brakes)]
-        told.append(_evidence(self._force(np.stack(products)), e))
+        evidences.append(_evidence(self._force(np.stack(products)), e))
         turns, away = [np.tanh(self.jerk / s) for s in SCALES.jerk_turns], self.u - a
         play = [*turns, *(a * x for x in turns), np.abs(self.jerk), np.abs(away), away * np.abs(away)]
         play += [np.tanh(away / s) for s in SCALES.accel_turns]
-        told.append(_evidence(self._force(np.stack(play)), e))
-        return _mean(told)
+        evidences.append(_evidence(self._force(np.stack(play)), e))
+        return _mean(evidences)
 
     def drift(self) -> float:
         one = np.ones(self.rows)
@@ -157,7 +157,7 @@ class _Look:
         if len(self.channels) == 2:
             columns.append(self._reading(np.stack([self.jerk, self.a, one]), "accel"))
             columns.append(self._reading(np.stack([self.a, self.v]), "speed"))
-        told = []
+        evidences = []
         for x in np.concatenate(columns):
             square, cross = ((x * y).reshape(-1, self.rows).sum(0) for y in (x, self.e.ravel()))
             of_x = []
@@ -166,8 +166,8 @@ class _Look:
                 part, match = np.add.reduceat(square, starts), np.add.reduceat(cross, starts)
                 for size in SCALES.drift_sizes:
                     of_x.append(_scattered(part, match, size**2 / max(part.mean(), 1e-12)))
-            told.append(_mean(of_x))
-        return _mean(told)
+            evidences.append(_mean(of_x))
+        return _mean(evidences)
 
     def line(self) -> float:
         record = self.white.record
@@ -193,14 +193,14 @@ class _Look:
         answers = [through[0] if "accel" in self.channels else through[0] * as_speed]
         if count == 2:
             answers.append(through[0] + through[1] * as_speed)
-        told = []
+        evidences = []
         for answer in answers:
             weight = np.maximum((np.abs(answer) ** 2).sum(0), 1e-15)
             power = np.abs((answer.conj() * seen).sum(0)) ** 2 / weight / (self.rows * self.group)
             # relative to the local level of the spectrum, so that a broad hump does not count as lines
             power /= np.maximum(gaussian_filter1d(np.minimum(power, 6.0), 60), 1.0)
-            told += [_mean(power * s / (1 + s) - np.log1p(s)) for s in SCALES.line_sizes]
-        return _mean(told)
+            evidences += [_mean(power * s / (1 + s) - np.log1p(s)) for s in SCALES.line_sizes]
+        return _mean(evidences)
 
     def memory(self) -> float:
         order = SCALES.memory_order
@@ -214,11 +214,11 @@ class _Look:
         square = np.minimum(self.e**2 / self.e.var(-1, keepdims=True), 9.0)
         square = (square - square.mean(-1, keepdims=True)) / square.std(-1, keepdims=True)
         a, brisk = np.abs(self.a), lowpass(np.abs(self.jerk), SCALES.burst_lag, self.dt)
-        told = []
+        evidences = []
         for x in (a, brisk, np.abs(self.u - self.a), self.v, self.t, a * self.v):
             if x.std() > 1e-9:
                 each = [_evidence(((x - x.mean()) / x.std())[None], y) for y in square]
-                told.append(_mean([*each, sum(each)]))
+                evidences.append(_mean([*each, sum(each)]))
         local = []
         for seconds in SCALES.burst_blocks:
             starts = np.arange(0, self.rows, max(4, round(seconds / self.dt)))
@@ -226,7 +226,7 @@ class _Look:
             sizes = np.diff(np.append(starts, self.rows)).astype(np.float64)
             for size in SCALES.burst_sizes:
                 local.append(sum(_scattered(sizes, y, size**2 / sizes[0]) for y in sums))
-        return _mean([*told, _mean(local)])
+        return _mean([*evidences, _mean(local)])
 
     def tails(self) -> float:
         z = np.clip(np.abs(self.e / self.e.std(-1, keepdims=True)), 0, 8)

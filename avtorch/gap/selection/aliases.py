@@ -106,18 +106,18 @@ def note(channels: Collection[str], effects: Iterable[type[Effect]]) -> str | No
     if "accel" not in channels:
         names = ", ".join(e.name for e in hidden)
         return f"Without accel in the log these effects cannot be tested, as speed does not show them: {names}."
-    told = []
+    sentences = []
     need = [e.name for e in hidden if e.alias != "K_L"]
     if need:
-        told.append(
+        sentences.append(
             f"Without speed in the log these effects cannot be tested and appear as others: {', '.join(need)}."
         )  # fmt: skip
-    told += [
+    sentences += [
         f"Without speed in the log {e.name} is equivalent to another K_L and cannot be tested."
         for e in hidden
         if e.alias == "K_L"
     ]
-    return " ".join(told)
+    return " ".join(sentences)
 
 
 @dataclass(frozen=True)

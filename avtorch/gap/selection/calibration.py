@@ -158,9 +158,9 @@ def _same_keys(found: Any, needed: set[str], where: str) -> None:
         raise InputError(f"{where}: found {type(found).__name__}, needs an object with {', '.join(sorted(needed))}")
     missing, foreign = sorted(needed - found.keys()), sorted(found.keys() - needed)
     if missing or foreign:
-        told = [f"misses {', '.join(missing)}"] if missing else []
-        told += [f"has the unknown {', '.join(foreign)}"] if foreign else []
-        raise InputError(f"{where}: {' and '.join(told)}; needs {', '.join(sorted(needed))}")
+        faults = [f"misses {', '.join(missing)}"] if missing else []
+        faults += [f"has the unknown {', '.join(foreign)}"] if foreign else []
+        raise InputError(f"{where}: {' and '.join(faults)}; needs {', '.join(sorted(needed))}")
 
 
 CALIBRATION = Calibration.read()

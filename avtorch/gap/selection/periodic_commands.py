@@ -12,13 +12,13 @@ _NAMED = 4  # delays named in a sentence
 
 def untold(found: Iterable[FittedModel]) -> dict[str, FittedModel]:
     """Fitted models, by name, whose delay may be zero."""
-    return {f.name: f for f in found if f.delays is not None and f.delays.untold}
+    return {f.name: f for f in found if f.delays is not None and f.delays.may_be_zero}
 
 
-def shared(chances: Mapping[str, float], untold: Mapping[str, FittedModel]) -> dict[str, float]:
+def shared(chances: Mapping[str, float], undetermined: Mapping[str, FittedModel]) -> dict[str, float]:
     """Probabilities after the share of near-zero delays is moved to the same model without a delay."""
     out = dict(chances)
-    for name, f in untold.items():
+    for name, f in undetermined.items():
         assert f.delays is not None
         if not out.get(f.delays.without):
             continue  # excluded by the prior
@@ -28,10 +28,10 @@ def shared(chances: Mapping[str, float], untold: Mapping[str, FittedModel]) -> d
     return out
 
 
-def add_delay_aliases(aliases: Sequence[str], untold: Mapping[str, FittedModel]) -> list[str]:
+def add_delay_aliases(aliases: Sequence[str], undetermined: Mapping[str, FittedModel]) -> list[str]:
     """The alias set, verdict first, with the model that differs from the verdict only by an undetermined delay."""
     more = []
-    for name, f in untold.items():
+    for name, f in undetermined.items():
         assert f.delays is not None
         pair = (name, f.delays.without)
         if aliases[0] in pair:
@@ -39,14 +39,14 @@ def add_delay_aliases(aliases: Sequence[str], untold: Mapping[str, FittedModel])
     return list(dict.fromkeys([*aliases, *more]))
 
 
-def why(chances: Mapping[str, float], untold: Mapping[str, FittedModel]) -> str | None:
+def why(chances: Mapping[str, float], undetermined: Mapping[str, FittedModel]) -> str | None:
     """The verdict's sentence, where an alias differs from it only by a delay; None elsewhere."""
     first = max(chances, key=lambda name: chances[name])
-    for name, f in untold.items():
+    for name, f in undetermined.items():
         assert f.delays is not None
         if first in (name, f.delays.without):
-            apart = f"this log cannot distinguish {f.delays.without} from {name}"
-            return f"{_repeats(f)}, so {apart}; {first} has probability {chances[first]:.3g}."
+            ambiguity = f"this log cannot distinguish {f.delays.without} from {name}"
+            return f"{_repeats(f)}, so {ambiguity}; {first} has probability {chances[first]:.3g}."
     return None
 
 
@@ -55,7 +55,7 @@ def notes(found: Iterable[FittedModel], verdict: Verdict) -> list[str]:
     for f in found:
         if f.delays is None or f.name not in verdict.alias_set:
             continue
-        if len(f.delays.lengths) > 1 or f.delays.untold:
+        if len(f.delays.lengths) > 1 or f.delays.may_be_zero:
             return [f"{_repeats(f)}: to estimate the delay, drive with a command that does not repeat."]
     return []
 

@@ -23,16 +23,18 @@ def implausible(
 
     `parameters` of a candidate's `effects`, by their own names or as `effect.parameter`; `moved`: T_L [s] and K_L.
     """
-    told = []
+    sentences = []
     for effect in effects:
         for p in (*effect.parameters, *effect.derived):
             q = parameters.get(f"{effect.name}.{p.name}", parameters.get(p.name))
             if q is not None and (p.reported or p in effect.derived) and outside(p, q):
-                told.append(f"{_sentence(f'{effect.name}.{p.name}', p, q)}; the effect stands in for something else.")
-    told += [
+                sentences.append(
+                    f"{_sentence(f'{effect.name}.{p.name}', p, q)}; the effect stands in for something else."
+                )
+    sentences += [
         f"{_sentence(p.name, p, moved[p.name])}." for p in BASELINE if p.name in moved and outside(p, moved[p.name])
     ]
-    return tuple(told)
+    return tuple(sentences)
 
 
 def outside(parameter: Parameter, q: Quantity) -> bool:

@@ -29,7 +29,7 @@ The defaults suit an ordinary effect:
 | cross-validation        | `of_the_drive`                                         | parameters are the car's        |
 | linearisation           | `linear`, `one_sided`                                  | proportional to the command     |
 | delay                   | `shift`, `role`                                        | none                            |
-| exports, plots          | `accel_limit`, `half_said`, `pictured`                 | not exported; plotted at 12 m/s |
+| exports, plots          | `accel_limit`, `export_loss`, `pictured`                 | not exported; plotted at 12 m/s |
 """
 
 from __future__ import annotations
@@ -129,8 +129,8 @@ class Effect:
 
     Elsewhere. `linear` False: the step response is not proportional to the step. `one_sided`: it differs between
     driving and braking. `role`: `"delay"` for the effect that serves as a bare delay wherever one is needed.
-    `half_said`: what an export to other tools cannot express about this effect. `pictured`: speed [m/s] at which it is
-    visible.
+    `export_loss`: what an export to other tools cannot express about this effect. `pictured`: speed [m/s] at which it
+    is visible.
 
     Example:
         >>> from dataclasses import dataclass
@@ -173,7 +173,7 @@ class Effect:
     linear: ClassVar[bool] = True
     one_sided: ClassVar[bool] = False
     role: ClassVar[Literal["delay"] | None] = None
-    half_said: ClassVar[str] = ""
+    export_loss: ClassVar[str] = ""
     pictured: ClassVar[float] = 12.0
 
     # the hook ------------------------------------------------------------------------------------------------------

@@ -237,6 +237,6 @@ def _joined(parts: Sequence[Tensor | None]) -> Tensor | None:
     return torch.cat(flat) if flat else None
 
 
-def _from(told: PlantDescription) -> GapPlant:
-    given = told.baseline
-    return plant(told.effects, T_L=given.get("T_L"), K_L=given.get("K_L"), sigma=given.get("sigma"))
+def _from(description: PlantDescription) -> GapPlant:
+    given = description.baseline
+    return plant(description.effects, T_L=given.get("T_L"), K_L=given.get("K_L"), sigma=given.get("sigma"))

@@ -119,11 +119,11 @@ class _Scan(torch.autograd.Function):
         (alpha, _, start), x = _split(n, saved[:-n]), saved[-n:]
         constant = alpha[0].shape[-1] == 1
         # co-state c[k] = grad[k] + A[k+1]ᵀ c[k+1]: the same recursion, transposed and run backward
-        turned = [alpha[j * n + i] for i in range(n) for j in range(n)]
+        transposed = [alpha[j * n + i] for i in range(n) for j in range(n)]
         if not constant:
-            turned = [torch.cat([a[..., :1], a[..., 1:].flip(-1)], -1) for a in turned]
+            transposed = [torch.cat([a[..., :1], a[..., 1:].flip(-1)], -1) for a in transposed]
         zero = [torch.zeros_like(s) for s in start]
-        costate = [c.flip(-1) for c in _Scan.apply(n, *turned, *(g.flip(-1) for g in grads), *zero)]
+        costate = [c.flip(-1) for c in _Scan.apply(n, *transposed, *(g.flip(-1) for g in grads), *zero)]
         before = [torch.cat([s, xi[..., :-1]], -1) for s, xi in zip(start, x, strict=True)]
         need = ctx.needs_input_grad[1:]
         on_alpha: list[Tensor | None] = []

@@ -12,7 +12,7 @@ from avtorch.inference.estimators.map import MaximumAPosteriori
 from avtorch.inference.estimators.rls import RecursiveLeastSquares
 from avtorch.inference.estimators.ukf import JointUKF
 from avtorch.inference.estimators.windowed import WindowedEstimator
-from avtorch.inference.evidence import Form
+from avtorch.inference.form import Form
 from avtorch.inference.sequential import SequentialInference
 
 ESTIMATORS: dict[str, type[SequentialInference] | type[WindowedEstimator]] = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from avtorch.inference.belief import Belief
-from avtorch.inference.evidence import Evidence, Rows
+from avtorch.inference.form import Rows, WindowLikelihood
 
 
 class Estimator(Protocol):
@@ -26,8 +26,8 @@ class Estimator(Protocol):
         """The belief after the last window; before the first, the first prior."""
         ...
 
-    def take(self, rows: Rows, evidence: Evidence) -> Belief:
-        """Take in one window: its rows, each column ``(vehicle, time)``, and the form's evidence from them."""
+    def take(self, rows: Rows, likelihood: WindowLikelihood) -> Belief:
+        """Take in one window: its rows, each column ``(vehicle, time)``, and what the form makes of them."""
         ...
 
     def state_dict(self) -> dict[str, Any]:

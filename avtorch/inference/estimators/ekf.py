@@ -12,6 +12,7 @@ import math
 
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.inference.estimators.kalman import JointKalman
 from avtorch.inference.estimators.state_model import GaussianState, Observation, StateModel
 
@@ -35,7 +36,7 @@ class JointEKF(JointKalman):
 
     def correct(
         self, model: StateModel, state: GaussianState, row: Observation, channel: int
-    ) -> tuple[GaussianState, Tensor]:
+    ) -> tuple[GaussianState, Float[Tensor, " vehicle"]]:
         slope = model.observed_slope(state.mean, row, channel)
         pointing = (state.cov @ slope.unsqueeze(-1)).squeeze(-1)
         spread = (pointing * slope).sum(-1) + model.variance[:, channel]
@@ -43,7 +44,12 @@ class JointEKF(JointKalman):
         return gained(state, innovation, pointing, spread)
 
 
-def gained(state: GaussianState, innovation: Tensor, pointing: Tensor, spread: Tensor) -> tuple[GaussianState, Tensor]:
+def gained(
+    state: GaussianState,
+    innovation: Float[Tensor, " vehicle"],
+    pointing: Float[Tensor, "vehicle d"],
+    spread: Float[Tensor, " vehicle"],
+) -> tuple[GaussianState, Float[Tensor, " vehicle"]]:
     """The linear update: ``pointing`` ``(vehicle, d)`` is the covariance of state and reading, ``spread`` its variance.
 
     Returns the state and the log likelihood of the reading, ``(vehicle,)``.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.inference.estimators.state_model import GaussianState, Observation
 
 
@@ -16,7 +17,7 @@ class JerkState:
         drift: SD of the walk per square root of a second, of both logarithms.
     """
 
-    def __init__(self, sigma: Tensor, drift: float) -> None:
+    def __init__(self, sigma: Float[Tensor, " vehicle"], drift: float) -> None:
         self.variance = sigma.square().unsqueeze(-1)
         self._walk = drift**2 * torch.eye(2, dtype=sigma.dtype)
         self._still = torch.eye(2, dtype=sigma.dtype)
@@ -24,19 +25,23 @@ class JerkState:
     def start(self, actuation: GaussianState, row: Observation) -> GaussianState:
         return actuation
 
-    def advance(self, x: Tensor, row: Observation) -> Tensor:
+    def advance(self, x: Float[Tensor, "*point vehicle 2"], row: Observation) -> Float[Tensor, "*point vehicle 2"]:
         return x
 
-    def slope(self, x: Tensor, row: Observation) -> Tensor:
+    def slope(self, x: Float[Tensor, "*point vehicle 2"], row: Observation) -> Float[Tensor, "*point vehicle 2 2"]:
         return self._still.expand(*x.shape, 2)
 
-    def noise(self, x: Tensor, row: Observation) -> Tensor:
+    def noise(self, x: Float[Tensor, "vehicle 2"], row: Observation) -> Float[Tensor, "2 2"]:
         return row.dt * self._walk
 
-    def observe(self, x: Tensor, row: Observation, channel: int) -> Tensor:
+    def observe(
+        self, x: Float[Tensor, "*point vehicle 2"], row: Observation, channel: int
+    ) -> Float[Tensor, "*point vehicle"]:
         log_T, log_K = x.unbind(-1)
         return (log_K.exp() * row.u - row.a) * (-log_T).exp()
 
-    def observed_slope(self, x: Tensor, row: Observation, channel: int) -> Tensor:
+    def observed_slope(
+        self, x: Float[Tensor, "*point vehicle 2"], row: Observation, channel: int
+    ) -> Float[Tensor, "*point vehicle 2"]:
         by_gain = (x[..., 1] - x[..., 0]).exp() * row.u
         return torch.stack([(-x[..., 0]).exp() * row.a - by_gain, by_gain], -1)

@@ -10,13 +10,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.errors import InputError
 from avtorch.inference.belief import Summary
 from avtorch.inference.estimators.jerk_state import JerkState
 from avtorch.inference.estimators.latent_state import LatentState
 from avtorch.inference.estimators.state_model import GaussianState, Observation, StateModel
 from avtorch.inference.estimators.windowed import WindowedEstimator
-from avtorch.inference.evidence import Form, JerkForm, Rows
+from avtorch.inference.form import Form, JerkForm, Rows
 from avtorch.inference.jerk import JerkStatistics
 from avtorch.inference.latent import NOISE_PRIOR
 from avtorch.inference.latent_form import LatentForm
@@ -69,12 +70,12 @@ class JointKalman(WindowedEstimator):
     @abstractmethod
     def correct(
         self, model: StateModel, state: GaussianState, row: Observation, channel: int
-    ) -> tuple[GaussianState, Tensor]:
+    ) -> tuple[GaussianState, Float[Tensor, " vehicle"]]:
         """The state after one channel's reading, and the log likelihood of the reading, ``(vehicle,)``."""
 
     def filter(
         self, model: StateModel, actuation: GaussianState, rows: Rows, columns: tuple[str, ...]
-    ) -> tuple[GaussianState, Tensor]:
+    ) -> tuple[GaussianState, Float[Tensor, " vehicle"]]:
         """Filter all usable rows of a window; after a gap or an unused row all but the parameters restarts.
 
         Args:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.inference.estimators.state_model import GaussianState, Observation
 from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, Step, discretise, initial_covariance
 
@@ -47,12 +48,12 @@ class LatentState:
         parameters = (n["process_noise"], road, n["coloured_sd"], n["coloured_time"])
         return discretise(x[..., 4].exp(), x[..., 5].exp(), *parameters, row.dt)
 
-    def advance(self, x: Tensor, row: Observation) -> Tensor:
+    def advance(self, x: Float[Tensor, "*point vehicle 6"], row: Observation) -> Float[Tensor, "*point vehicle 6"]:
         step = self._step(x, row)
         moved = (step.transition @ x[..., :4, None])[..., 0] + step.gain * row.u[:, None]
         return torch.cat([moved, x[..., 4:]], -1)
 
-    def slope(self, x: Tensor, row: Observation) -> Tensor:
+    def slope(self, x: Float[Tensor, "*point vehicle 6"], row: Observation) -> Float[Tensor, "*point vehicle 6 6"]:
         step = self._step(x, row)
         a, K, u = x[..., 1], x[..., 5].exp(), row.u
         decay, reach = step.transition[..., 1, 1], step.transition[..., 0, 1]
@@ -63,14 +64,18 @@ class LatentState:
         out[..., :2, 5] = step.gain[..., :2] * u[:, None]
         return out
 
-    def noise(self, x: Tensor, row: Observation) -> Tensor:
+    def noise(self, x: Float[Tensor, "vehicle 6"], row: Observation) -> Float[Tensor, "vehicle 6 6"]:
         out = torch.zeros(*x.shape, 6, dtype=x.dtype)
         out[..., :4, :4] = self._step(x, row).noise
         out[..., 4, 4] = out[..., 5, 5] = self.drift**2 * row.dt
         return out
 
-    def observe(self, x: Tensor, row: Observation, channel: int) -> Tensor:
+    def observe(
+        self, x: Float[Tensor, "*point vehicle 6"], row: Observation, channel: int
+    ) -> Float[Tensor, "*point vehicle"]:
         return x @ self._rows[channel]
 
-    def observed_slope(self, x: Tensor, row: Observation, channel: int) -> Tensor:
+    def observed_slope(
+        self, x: Float[Tensor, "*point vehicle 6"], row: Observation, channel: int
+    ) -> Float[Tensor, "*point vehicle 6"]:
         return self._rows[channel].expand_as(x)

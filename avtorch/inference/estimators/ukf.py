@@ -12,6 +12,7 @@ import math
 import torch
 from torch import Tensor
 
+from avtorch.arrays import Float
 from avtorch.inference.estimators.ekf import gained
 from avtorch.inference.estimators.kalman import JointKalman
 from avtorch.inference.estimators.state_model import GaussianState, Observation, StateModel
@@ -38,7 +39,7 @@ class JointUKF(JointKalman):
 
     def correct(
         self, model: StateModel, state: GaussianState, row: Observation, channel: int
-    ) -> tuple[GaussianState, Tensor]:
+    ) -> tuple[GaussianState, Float[Tensor, " vehicle"]]:
         points = sigma_points(state)
         seen = model.observe(points, row, channel)
         expected = seen.mean(0)
@@ -48,7 +49,7 @@ class JointUKF(JointKalman):
         return gained(state, row.measured[:, channel] - expected, pointing, spread)
 
 
-def sigma_points(state: GaussianState) -> Tensor:
+def sigma_points(state: GaussianState) -> Float[Tensor, "point vehicle d"]:
     """``(2d, vehicle, d)``; not a number where the covariance has no Cholesky factor: the filter has diverged."""
     root, failed = torch.linalg.cholesky_ex(state.cov)
     root = torch.where((failed == 0)[:, None, None], root, torch.nan)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief, Summary
-from avtorch.inference.evidence import Evidence, Form, Rows
+from avtorch.inference.form import Form, Rows, WindowLikelihood
 from avtorch.inference.priors import Joint, LogNormalPrior, default_actuation_prior
 from avtorch.inference.state import about, generator_of, shaped_as
 
@@ -45,15 +45,15 @@ class WindowedEstimator(ABC):
         self.belief = Belief.of_prior(form.names, prior, kept, vehicles, self.generator)
         self._memory: dict[str, Tensor] = {}
 
-    def take(self, rows: Rows, evidence: Evidence) -> Belief:
+    def take(self, rows: Rows, likelihood: WindowLikelihood) -> Belief:
         """Take in one window of every vehicle; those that are not excited keep their belief."""
-        index = evidence.excited.nonzero().squeeze(-1)
+        index = likelihood.excited.nonzero().squeeze(-1)
         if len(index):
             excited = {name: rows[name][index] for name in ("usable", *self.form.columns)}
             found, converged = self._learn({"time": rows["time"], **excited}, index)
-            self.belief = self.belief.updated(evidence.excited, index, found, converged)
+            self.belief = self.belief.updated(likelihood.excited, index, found, converged)
         else:
-            self.belief = self.belief.unused(evidence.excited)
+            self.belief = self.belief.unused(likelihood.excited)
         return self.belief
 
     @abstractmethod

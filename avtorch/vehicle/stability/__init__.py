@@ -24,15 +24,15 @@ from avtorch.vehicle.stability.conditions import (
     string_sufficient,
 )
 from avtorch.vehicle.stability.exact import string_margin, string_margins
-from avtorch.vehicle.stability.region import Region, region
-from avtorch.vehicle.stability.transfer import gain, transfer_function
-from avtorch.vehicle.stability.verdict import (
+from avtorch.vehicle.stability.local_and_string import (
     dead_time_margin,
     local_stable,
     peak_frequency,
     peak_gain,
     string_stable,
 )
+from avtorch.vehicle.stability.region import Region, region
+from avtorch.vehicle.stability.transfer import gain, transfer_function
 
 __all__ = [
     "Chain",

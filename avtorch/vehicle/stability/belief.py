@@ -13,8 +13,8 @@ from avtorch.arrays import Float, Real
 from avtorch.errors import InputError
 from avtorch.vehicle.stability.exact import coefficients
 from avtorch.vehicle.stability.linear_loop import Gains, LinearLoop, Value, as_tensor, linear_loop
+from avtorch.vehicle.stability.local_and_string import locally_stable, peak_gain_of, string_stable_of
 from avtorch.vehicle.stability.nyquist import lost_at
-from avtorch.vehicle.stability.verdict import locally_stable, peak_gain_of, string_stable_of
 
 Drawn = float | Real[Tensor, ""] | Real[Tensor, "*#setting #draw"]
 
@@ -33,9 +33,9 @@ class Interval(NamedTuple):
         [1.42, 1.82, 2.43]
     """
 
-    q05: Tensor
-    q50: Tensor
-    q95: Tensor
+    q05: Float[Tensor, "*setting"]
+    q50: Float[Tensor, "*setting"]
+    q95: Float[Tensor, "*setting"]
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from avtorch.arrays import Float
+from avtorch.arrays import Bool, Float
 from avtorch.vehicle.broadcasting import broadcast
 from avtorch.vehicle.stability.linear_loop import Gains, LinearLoop, Value, linear_loop
 
@@ -58,14 +58,14 @@ def string_margin(
     return s.full(torch.where(s.valid, least, torch.full_like(least, -torch.inf)))
 
 
-def coefficients(s: LinearLoop) -> tuple[Tensor, Tensor]:
+def coefficients(s: LinearLoop) -> tuple[Float[Tensor, "*setting"], Float[Tensor, "*setting"]]:
     """(B, C), the dead time and the feed-forward's delay ignored."""
     B = s.b**2 - 2 * s.T * s.K * s.g - (s.K * s.kf) ** 2
     C = s.K**2 * (s.g**2 - s.kv**2 + 2 * s.ks * s.kf) - 2 * s.K * s.ks * s.b
     return B, C
 
 
-def gain_condition(s: LinearLoop) -> Tensor:
+def gain_condition(s: LinearLoop) -> Bool[Tensor, "*setting"]:
     """`|G| <= 1` at every omega, without dead time: C >= 0 and (B >= 0 or B^2 <= 4 T^2 C), to rounding."""
     B, C = coefficients(s)
     eps = ROUNDINGS * torch.finfo(C.dtype).eps
@@ -77,7 +77,7 @@ def gain_condition(s: LinearLoop) -> Tensor:
     return (C + slack >= 0) & ((B + B_slack >= 0) | (room >= 0))
 
 
-def peak_omega(s: LinearLoop) -> Tensor:
+def peak_omega(s: LinearLoop) -> Float[Tensor, "*setting"]:
     """Frequency [rad/s] at which |G| is largest, 0 where |G| nowhere exceeds one; no dead time, no feed-forward.
 
     With x = omega^2, |G|^2 = N / (N + P), N = K^2 (k_v^2 x + k_s^2), P = T^2 x^3 + B x^2 + C x. P / N is stationary at

@@ -39,12 +39,12 @@ class LinearLoop:
     valid: Bool[Tensor, "*#setting"]
 
     @property
-    def g(self) -> Tensor:
+    def g(self) -> Float[Tensor, "*setting"]:
         """Total speed gain g = k_s tau + k_v [1/s]."""
         return self.ks * self.tau + self.kv
 
     @property
-    def b(self) -> Tensor:
+    def b(self) -> Float[Tensor, "*setting"]:
         """Coefficient of s^2 without dead time, 1 - K k_a [-]."""
         return 1 - self.K * self.ka
 
@@ -60,7 +60,7 @@ class LinearLoop:
         """The setting with `change` applied to every field."""
         return LinearLoop(*(change(getattr(self, f.name)) for f in fields(self)))
 
-    def pick(self, mask: Tensor) -> LinearLoop:
+    def pick(self, mask: Bool[Tensor, "*setting"]) -> LinearLoop:
         """The entries where `mask` (of the full shape) holds, as a flat (setting,) batch."""
         mask = mask.reshape(1) if mask.ndim == 0 else mask
         return self.map(lambda x: x.expand(mask.shape)[mask])

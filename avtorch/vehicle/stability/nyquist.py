@@ -54,15 +54,15 @@ def nyquist(s: LinearLoop) -> Bool[Tensor, "..."]:
     minus two in the good one. k_s <= 0 leaves a real root at or above zero in every case.
     """
     omega, phase, sign = crossings(s)
-    turned = omega * s.theta.unsqueeze(-1)
-    passed = torch.floor((turned - phase) / (2 * math.pi)) + 1
+    rotation = omega * s.theta.unsqueeze(-1)
+    passed = torch.floor((rotation - phase) / (2 * math.pi)) + 1
     right = torch.where(hurwitz(s), 0, 2) + 2 * (sign * passed.clamp_min(0)).sum(-1)
     # Without lag the loop is of neutral type: |K k_a| >= 1 then feeds the delay back undamped.
     neutral = (s.T > 0) | (s.theta == 0) | ((s.K * s.ka).abs() < 1)
     return s.valid & (s.ks > 0) & neutral & (right == 0)
 
 
-def lost_at(s: LinearLoop) -> Tensor:
+def lost_at(s: LinearLoop) -> Float[Tensor, "*setting"]:
     """Smallest dead time [s] at which a loop loses its local stability; 0 where it is unstable without dead time."""
     omega, phase, sign = crossings(s)
     first = torch.where(sign > 0, phase / omega, torch.full_like(phase, torch.inf)).amin(-1)

@@ -13,7 +13,7 @@ from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
 from avtorch.vehicle.stability.conditions import PointOrBox, local_conditions, string_sufficient
 from avtorch.vehicle.stability.linear_loop import Gains, Value
-from avtorch.vehicle.stability.verdict import local_stable, peak_gain, string_stable
+from avtorch.vehicle.stability.local_and_string import local_stable, peak_gain, string_stable
 
 AXES = ("k_s", "k_v", "k_a", "tau", "T", "K")
 Axis = tuple[str, Sequence[float] | Tensor]

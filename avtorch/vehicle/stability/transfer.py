@@ -69,12 +69,14 @@ def gain(
     return torch.where(s.valid, size, torch.zeros_like(size))
 
 
-def magnitude(s: LinearLoop, omega: Tensor) -> Tensor:
+def magnitude(s: LinearLoop, omega: Float[Tensor, "*#setting"]) -> Float[Tensor, "*setting"]:
     """`|G(j omega)|` of a setting."""
     return torch.hypot(*_numerator(s, omega)) / torch.hypot(*_denominator(s, omega))
 
 
-def excess(s: LinearLoop, omega: Tensor) -> tuple[Tensor, Tensor]:
+def excess(
+    s: LinearLoop, omega: Float[Tensor, "*#setting"]
+) -> tuple[Float[Tensor, "*setting"], Float[Tensor, "*setting"]]:
     """(h, N) with |G|^2 = N / (N + omega^2 h): the gain is at most one exactly where h >= 0.
 
     Without dead time and feed-forward h = T^2 omega^4 + B omega^2 + C. Dividing by omega^2 analytically, not

@@ -22,8 +22,8 @@ def test_noise_stays_noise(rotating_seed: int) -> None:
     worse = []
     for _ in range(20):
         errors = errors_of(QUIET, record, rng)
-        left = errors - box.foretold(errors, WhiteningFilter(part.fits, QUIET))
-        white = WhiteningFilter(part.judges, QUIET)
+        left = errors - box.predict(errors, WhiteningFilter(part.fits, QUIET))
+        white = WhiteningFilter(part.held_out, QUIET)
         before, after = (white.log_likelihood(e[:, part.rows]) for e in (errors, left))
         worse.append(float(before - after))
     # a size that the evidence chooses is now and then too large by chance; 20 draws of some nats each
@@ -41,7 +41,7 @@ def test_an_unnamed_force_is_predicted(rotating_seed: int) -> None:
     errors = errors_of(QUIET, record, rng) + moved
     box = BlackBoxRegression.of(record, rollout)
     for part in folds(record):
-        left = errors - box.foretold(errors, WhiteningFilter(part.fits, QUIET))
+        left = errors - box.predict(errors, WhiteningFilter(part.fits, QUIET))
         before, after = (float((e[0, part.rows] ** 2).mean()) for e in (errors, left))
         noise = QUIET.process_sd**2 + QUIET.accel_sd**2
         # most of what is above the noise goes, on rows that it never saw

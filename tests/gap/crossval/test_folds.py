@@ -19,17 +19,17 @@ def test_every_row_is_scored_once(seconds: float, rate_hz: int) -> None:
     judging = np.concatenate([p.rows for p in parts])
     np.testing.assert_array_equal(np.sort(judging), np.arange(record.rows))
     for part in parts:
-        fits, judges = record.time[part.fits.source], record.time[part.judges.source]
-        assert np.abs(fits[:, None] - judges[None]).min() > 3.0
+        fits, held_out = record.time[part.fits.source], record.time[part.held_out.source]
+        assert np.abs(fits[:, None] - held_out[None]).min() > 3.0
         assert all((b.stop - b.start) * record.dt > 9.9 for b in part.blocks)
-        assert np.isin(part.judges.source, record.source[part.rows]).all()
+        assert np.isin(part.held_out.source, record.source[part.rows]).all()
 
 
 def test_drives_apart_need_no_distance() -> None:
     record = Record.of([log_of(seconds=14.0), log_of(seconds=14.0)])
     parts = folds(record)
     assert len(parts) == 2
-    assert all(len(p.fits.source) == len(p.judges.source) for p in parts)
+    assert all(len(p.fits.source) == len(p.held_out.source) for p in parts)
 
 
 @pytest.mark.parametrize("rate_hz", [20, 100])
@@ -43,8 +43,8 @@ def test_of_three_drives_each_scores_the_fit_to_the_others(rate_hz: int) -> None
     ends = np.flatnonzero(np.diff(record.time) < 0) + 1
     drive = np.searchsorted(ends, np.arange(len(record.time)), side="right")
     for part in parts:
-        assert not set(drive[part.judges.source]) & set(drive[part.fits.source])
-        assert set(drive[part.judges.source]) | set(drive[part.fits.source]) == set(range(6))
+        assert not set(drive[part.held_out.source]) & set(drive[part.fits.source])
+        assert set(drive[part.held_out.source]) | set(drive[part.fits.source]) == set(range(6))
 
 
 def test_one_long_drive_beside_short_ones_is_cut_into_blocks() -> None:

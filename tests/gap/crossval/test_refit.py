@@ -22,7 +22,7 @@ def test_a_part_agrees_within_its_uncertainty(effects: list, rotating_seed: int)
         # chi-squared of some three coordinates, of which the two fits share three quarters of the data
         assert away < 30
         assert refit.errors.shape == found.errors.shape
-        white = refit.white(part.judges)
+        white = refit.white(part.held_out)
         assert 0.5 < (white(refit.errors[:, part.rows]) ** 2).mean() < 2.0
 
 

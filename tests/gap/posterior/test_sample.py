@@ -93,7 +93,9 @@ def test_the_adjoint_is_the_transpose(rate_hz: int) -> None:
     errors = rng.standard_normal((2, *found.errors.shape))
     images = white(errors)
     back = rng.standard_normal(images.shape)
-    np.testing.assert_allclose((images * back).sum((1, 2, 3)), (errors * white.turned(back)).sum((1, 2, 3)), rtol=1e-9)
+    np.testing.assert_allclose(
+        (images * back).sum((1, 2, 3)), (errors * white.transpose(back)).sum((1, 2, 3)), rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize(

@@ -21,10 +21,10 @@ from avtorch.blindtest import Car, simulate
 from avtorch.blindtest.drives import Recorded
 from avtorch.errors import InputError
 from avtorch.gap import DeadTime, SensorBias, plant
-from avtorch.gap.search.budget import Budget
 from avtorch.gap.search.checkpoint import SCHEMA, read_fits
 from avtorch.gap.search.fitted_work import difference, fitted_work
 from avtorch.gap.search.search import Search
+from avtorch.gap.search.time_budget import TimeBudget
 from avtorch.io import Log, read_sealed, write_sealed
 from tests.damage import KINDS, damaged
 from tests.gap.records import command_over
@@ -107,7 +107,7 @@ def test_a_spent_budget_is_gone_on_from_to_the_same_answer(
     whole = avtorch.diagnose(log, **given).to_dict()
     left = [0]
 
-    def spent(self: Budget) -> bool:
+    def spent(self: TimeBudget) -> bool:
         left[0] -= 1
         self.complete = self.complete and left[0] >= 0
         return left[0] < 0
@@ -116,7 +116,7 @@ def test_a_spent_budget_is_gone_on_from_to_the_same_answer(
         path = tmp_path / f"{chances}.json"
         left[0] = chances
         with monkeypatch.context() as patch:
-            patch.setattr(Budget, "spent", spent)
+            patch.setattr(TimeBudget, "spent", spent)
             assert not avtorch.diagnose(log, checkpoint=path, **given).complete
         assert avtorch.diagnose(log, checkpoint=path, **given).to_dict() == whole
 

@@ -164,8 +164,8 @@ def test_nearly_linear_is_nearly_quadrature(kind, rotating_seed):
     loop = kind(JerkForm(), vehicles=4, drift=0.0, actuation_prior=TIGHT)
     found, converged = loop._learn(rows, torch.arange(4))
     assert converged.all()
-    evidence = JerkForm().evidence(rows, 200)
-    density = evidence.density(torch.arange(4), Joint(TIGHT, default_jerk_noise_prior()))
+    likelihood = JerkForm().likelihood(rows, 200)
+    density = likelihood.density(torch.arange(4), Joint(TIGHT, default_jerk_noise_prior()))
     assert isinstance(density, JerkDensity)
     exact = integrate(density)
     assert ((found.mean - exact.mean)[:, :2].abs() / exact.sd[:, :2]).max() < 0.25

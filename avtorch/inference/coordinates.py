@@ -40,11 +40,11 @@ class Coordinates:
         narrowest = torch.linalg.eigvalsh(mode.covariance)[:, :1].clamp_min(0.0).sqrt()
         return cls(mode.z, torch.diag_embed(narrowest.expand_as(mode.z)))
 
-    def z(self, w: Tensor) -> Tensor:
+    def z(self, w: Float[Tensor, "*draw window d"]) -> Float[Tensor, "*draw window d"]:
         """``w`` ``(..., window, d)`` as log parameters (or whatever the density's unconstrained space is)."""
         return lower_times(self.lower, w).add_(self.mode)
 
-    def pull_back(self, score: Tensor) -> Tensor:
+    def pull_back(self, score: Float[Tensor, "*draw window d"]) -> Float[Tensor, "*draw window d"]:
         """A gradient in ``z`` as one in ``w``."""
         return lower_transposed_times(self.lower, score)
 
@@ -53,9 +53,9 @@ class Coordinates:
         seen = torch.linalg.solve_triangular(self.lower, mode.scale, upper=False)
         return torch.linalg.matrix_norm(seen, ord=2)
 
-    def slowed(self, pace: Float[Tensor, " window"]) -> Coordinates:
-        """A step ``h/pace`` in ``w`` is a step ``h`` in these; ``pace`` ``(window,)``."""
-        return Coordinates(self.mode, self.lower / pace.sqrt()[:, None, None])
+    def slowed(self, slowdown: Float[Tensor, " window"]) -> Coordinates:
+        """A step ``h/slowdown`` in ``w`` is a step ``h`` in these; ``slowdown`` ``(window,)``."""
+        return Coordinates(self.mode, self.lower / slowdown.sqrt()[:, None, None])
 
 
 def stiffness(density: Density, coordinates: Coordinates, *, radius: float = 3.0) -> Float[Tensor, " window"]:

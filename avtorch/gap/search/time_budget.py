@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 
-class Budget:
+class TimeBudget:
     """`seconds` from now on; None: no limit. `complete` turns False with the first `spent()` after they are over."""
 
     def __init__(self, seconds: float | None) -> None:

@@ -1,4 +1,4 @@
-"""The evidence of a window of rows: its density for a given prior, and whether it is excited."""
+"""A form of the log density, and the likelihood that it gives of a window of rows."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Protocol
 
 from torch import Tensor
 
+from avtorch.arrays import Bool, Real
 from avtorch.inference.density import Density
 from avtorch.inference.excitation import ExcitationRule
 from avtorch.inference.jerk import JerkDensity, JerkStatistics
@@ -19,8 +20,8 @@ Rows = Mapping[str, Tensor]
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """One window of every vehicle.
+class WindowLikelihood:
+    """The likelihood of one window of every vehicle: with a prior it gives a posterior density.
 
     Attributes:
         n: usable rows, ``(vehicle,)``.
@@ -33,18 +34,18 @@ class Evidence:
         >>> from avtorch.inference import JerkForm
         >>> run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
         >>> rows = {"accel": run.accel[:, 0], "accel_cmd": run.accel_cmd[:, 0], "jerk": run.jerk[:, 0]}
-        >>> evidence = JerkForm().evidence({**rows, "usable": torch.ones(1, 200, dtype=torch.bool)}, full=200)
-        >>> evidence.n.tolist(), evidence.excited.tolist()
+        >>> likelihood = JerkForm().likelihood({**rows, "usable": torch.ones(1, 200, dtype=torch.bool)}, full=200)
+        >>> likelihood.n.tolist(), likelihood.excited.tolist()
         ([200.0], [True])
     """
 
-    n: Tensor
-    excited: Tensor
+    n: Real[Tensor, " vehicle"]
+    excited: Bool[Tensor, " vehicle"]
     density: Callable[[Tensor, Prior], Density]
 
 
 class Form(Protocol):
-    """A form of the log density: its columns, its parameters, and its evidence from a window of rows.
+    """A form of the log density: its columns, its parameters, and the likelihood of a window of rows.
 
     Example:
         >>> from avtorch.inference import Form, JerkForm, SpeedLagForm
@@ -67,8 +68,8 @@ class Form(Protocol):
         """Default settings of the sampler for its posteriors."""
         ...
 
-    def evidence(self, rows: Rows, full: float) -> Evidence:
-        """Evidence of a window; ``full`` is the number of rows of a complete one."""
+    def likelihood(self, rows: Rows, full: float) -> WindowLikelihood:
+        """The likelihood of a window; ``full`` is the number of rows of a complete one."""
         ...
 
 
@@ -91,10 +92,10 @@ class JerkForm:
         self.rule = ExcitationRule() if rule is None else rule
         self.noise_prior = default_jerk_noise_prior() if noise_prior is None else noise_prior
 
-    def evidence(self, rows: Rows, full: float) -> Evidence:
+    def likelihood(self, rows: Rows, full: float) -> WindowLikelihood:
         statistics = JerkStatistics.from_samples(rows["accel"], rows["accel_cmd"], rows["jerk"], rows["usable"])
         statistics = statistics.with_least_noise()
-        return Evidence(
+        return WindowLikelihood(
             n=statistics.n,
             excited=self.rule(statistics, full),
             density=lambda index, prior: JerkDensity(statistics.select(index), prior),

@@ -153,7 +153,7 @@ def string_stable_of(s: LinearLoop) -> Bool[Tensor, "..."]:
         return verdict
 
 
-def peak_gain_of(s: LinearLoop) -> Tensor:
+def peak_gain_of(s: LinearLoop) -> Float[Tensor, "*setting"]:
     """`peak_gain` of a setting, in its full shape."""
     with torch.no_grad():
         stable = s.full(locally_stable(s))

@@ -59,7 +59,7 @@ def chi2_of_means(agreement: Agreement) -> float:
     return min(1.0, z.shape[1] * smallest)
 
 
-def judge(
+def agreement_verdict(
     agreement: Agreement,
     converged: Tensor,
     *,
@@ -98,8 +98,8 @@ def judge(
     else:
         parts.append(f"exact draws of the same effective number would reach {_percent(exact)}")
     if p is not None and nuts is not None:
-        told = "contradicts" if contradicted else "agrees with"
-        parts.append(f"NUTS {told} quadrature on {len(nuts.z_mean)} of them (chi² p {p:.2g})")
+        finding = "contradicts" if contradicted else "agrees with"
+        parts.append(f"NUTS {finding} quadrature on {len(nuts.z_mean)} of them (chi² p {p:.2g})")
     return AgreementVerdict(
         agree=enough and not contradicted,
         share=good / count,
@@ -132,7 +132,7 @@ def _furthest(agreement: Agreement, converged: Tensor, numbers: Sequence[int]) -
     window, parameter, kind = torch.unravel_index(off.argmax(), off.shape)
     name = agreement.names[int(parameter)]
     if int(kind) == 0:
-        told = f"mean of {name} {float(agreement.mean_difference[window, parameter]):+.2f} SD"
+        finding = f"mean of {name} {float(agreement.mean_difference[window, parameter]):+.2f} SD"
     else:
-        told = f"SD of {name} {float(agreement.sd_ratio[window, parameter]):.3f} times the reference's"
-    return f"furthest: window {numbers[int(window)]}, {told}"
+        finding = f"SD of {name} {float(agreement.sd_ratio[window, parameter]):.3f} times the reference's"
+    return f"furthest: window {numbers[int(window)]}, {finding}"
