@@ -175,8 +175,8 @@ def _rate_needed(logs: Sequence[Log], rate_hz: float) -> float:
     Six rows a period keep a sine's response to 5 %; the power that counts is what a usual lag lets through.
     """
     for log in logs:
-        for part in log.segments() if log.accel_cmd is not None else ():
-            command = log.accel_cmd[part]
+        commands = () if log.accel_cmd is None else [log.accel_cmd[part] for part in log.segments()]
+        for command in commands:
             if len(command) < 2:
                 continue
             frequency = np.fft.rfftfreq(len(command), 1.0 / log.rate_hz)
