@@ -83,7 +83,6 @@ class Answered:
         missed = 0.0 if self.truth in self.probabilities else 1.0
         return missed + sum((p - (name == self.truth)) ** 2 for name, p in self.probabilities.items())
 
-
     @property
     def blamed_alone(self) -> bool:
         """Whether the verdict names effects and does not say that something material is left besides."""

@@ -109,22 +109,23 @@ class Case:
         return parts
 
     def log(self, *, signals: Sequence[str] = ("accel", "speed")) -> Log:
-        """The log given to a diagnosis, as the recorder wrote it: `time`, `accel_cmd`, the channels in `signals`."""
-        columns = {"accel": self.run.accel, "speed": self.run.speed}
+        """The log given to a diagnosis, as the recorder wrote it: `time`, `accel_cmd`, `engaged`, the channels in
+        `signals`."""
+        columns: dict[str, np.ndarray] = {"accel": self.run.accel, "speed": self.run.speed}
         if not signals or set(signals) - columns.keys():
             raise InputError(f"signals: found {tuple(signals)}, needs accel, speed or both")
-        columns |= {"time": self.run.time, "accel_cmd": self.run.command}
+        columns |= {"time": self.run.time, "accel_cmd": self.run.command, "engaged": np.ones(len(self.run.time), int)}
         if self.recorder != Recorder.ideal():
             seed = int(np.random.default_rng([self.seed, self.index, 5]).integers(2**63))
             written = self.recorder.record(self._from(columns), seed)
             columns = {name: getattr(written, name) for name in columns}
-        return self._from({name: x for name, x in columns.items() if name in ("time", "accel_cmd", *signals)})
+        always = ("time", "accel_cmd", "engaged")
+        return self._from({name: x for name, x in columns.items() if name in (*always, *signals)})
 
-    def _from(self, columns: Mapping[str, FloatArray]) -> Log:
-        accel, speed = columns.get("accel"), columns.get("speed")
-        return Log.from_arrays(
-            name=self.name, time=columns["time"], accel_cmd=columns["accel_cmd"], accel=accel, speed=speed
-        )
+    def _from(self, columns: Mapping[str, np.ndarray]) -> Log:
+        """Checked, and bit for bit what a log read from a file is."""
+        driven = {"engaged": columns["engaged"].astype(int)}
+        return Log.from_arrays(name=self.name, **columns | driven)
 
     def truth(self) -> dict[str, Any]:
         """The hidden truth as plain numbers and strings: the input of `avtorch.blindtest.score`.
@@ -151,7 +152,8 @@ class Case:
             "baseline": {"T_L": self.car.T_L, "K_L": self.car.K_L},
             "refit": {"T_L": self.refit.T_L, "K_L": self.refit.K_L},
             "noise": {k: v for k, v in asdict(self.car).items() if k not in ("T_L", "K_L")},
-            "drive": asdict(self.drive),
+            # truths kept before there were stops stay as they are
+            "drive": {key: value for key, value in asdict(self.drive).items() if key != "stops" or value},
             "oracle": {metric: {**asdict(o), "closed": o.closed} for metric, o in self.oracles.items()},
         }
         if self.replay is not None:

@@ -18,7 +18,7 @@ from avtorch.blindtest.case import Case
 from avtorch.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, Family
 from avtorch.blindtest.command import Parameters
 from avtorch.blindtest.deck import MIX, card, kind_of
-from avtorch.blindtest.drives import draw_drive
+from avtorch.blindtest.drives import draw_drive, with_stops
 from avtorch.blindtest.oracle_budget import gap_over_floor
 from avtorch.blindtest.recorder import draw_recorder
 from avtorch.blindtest.replay import Replay
@@ -61,7 +61,8 @@ def draw_cases(
     instead of drawn. `signals`: the channels of the logs, in which a cause must be visible. Where a cause cannot reach
     the visibility asked for on a drive, another drive is drawn; after ten drives another cause takes its place, or else
     the case keeps the drive where it is most visible, in the tier that it has there. `recorder`: `ordinary` passes each
-    log, whatever its kind, through a recorder drawn for it (`draw_recorder`); the drives are those of `ideal`.
+    log, whatever its kind, through a recorder drawn for it (`draw_recorder`), and lets every other drive of cruise and
+    steps come to a standstill; the other drives are those of `ideal`.
 
     Raises `InputError` for unknown kinds, tiers, effects, signals or recorders.
 
@@ -116,7 +117,8 @@ def draw_case(
         raise InputError(f"signals: found {tuple(signals)}, needs accel, speed or both")
     if recorder not in get_args(Recording):
         raise InputError(f"recorder: found {recorder!r}, needs ideal or ordinary")
-    case = _drawn(index, seed, MIX if mix is None else mix, tiers, effects, outside, seconds, manoeuvre, signals)
+    mix, stops = MIX if mix is None else mix, recorder == "ordinary"
+    case = _drawn(index, seed, mix, tiers, effects, outside, seconds, manoeuvre, signals, stops)
     if recorder == "ideal":
         return case
     # draws of its own: the drive is the same behind either recorder
@@ -134,6 +136,7 @@ def _drawn(
     seconds: float | None,
     manoeuvre: str | None,
     signals: Sequence[str],
+    stops: bool,
 ) -> Case:
     """A case before its recorder is drawn."""
     kind, count = kind_of(index, seed, mix)
@@ -147,7 +150,7 @@ def _drawn(
             # first the cause that is due; after ten drives in which it is not visible, any other
             due = count if attempt == 0 else int(rng.integers(2**31))
             families, tier, count_of = _causes(kind, due, seed, rng, effects, tiers, group)
-        case = _attempt(index, seed, kind, families, count_of, tier, rng, seconds, manoeuvre, signals)
+        case = _attempt(index, seed, kind, families, count_of, tier, rng, seconds, manoeuvre, signals, stops)
         if case is None:
             continue
         if kind in ("none", "pair", "several") or case.tier == tier:
@@ -198,10 +201,13 @@ def _attempt(
     seconds: float | None,
     manoeuvre: str | None,
     signals: Sequence[str],
+    stops: bool,
 ) -> Case | None:
     """A case of `count` causes on a newly drawn drive; None where the drive is unusable, or where one of a pair or too
     many of several cannot be visible on it."""
     car, drive = draw_car(rng), draw_drive(rng, seconds=seconds, manoeuvre=manoeuvre)
+    if stops:
+        drive = with_stops(drive)
     noise, late, when = int(rng.integers(2**31)), rng.random() < 0.5, float(rng.uniform(0.2, 0.7))
     if kind == "several" and late:
         # its moment may be before that of the others

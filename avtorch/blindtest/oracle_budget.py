@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -89,7 +90,7 @@ def oracle_budget(replay: Replay, log: Log) -> OracleBudget:
     while len(entered) < len(known):
         entered.append(min((n for n in known if n not in entered), key=lambda n: after([*entered, n])))
     levels = [after(entered[:k]) for k in range(len(entered) + 1)]
-    taken = [max(b - a, 0.0) for b, a in zip(levels, levels[1:], strict=False)]
+    taken = [max(b - a, 0.0) for b, a in pairwise(levels)]
     rest = max(levels[-1] - 1.0, 0.0) if len(known) < len(foretold) else 0.0
     whole = max(sum(taken) + rest, 1e-12)
     before = rollouts.squares(rollouts.errors([], *rollouts.fit([], floor)))
@@ -176,7 +177,7 @@ class _Rollouts:
 
         low = np.array([np.log(_LAGS_S[0]), _GAINS[0]])
         high = np.array([np.log(_LAGS_S[1]), _GAINS[1]])
-        at = np.array([np.log(start[0]), start[1]])
+        at: FloatArray = np.array([np.log(start[0]), start[1]])
         now, small = residuals(at, names), 1e-3
         bare = residuals(at, [])
         slopes = np.stack([(residuals(at + small * unit, []) - bare) / small for unit in np.eye(2)], 1)
@@ -191,7 +192,7 @@ class _Rollouts:
             tried = residuals(at + step, names)
             slopes = slopes + np.outer(tried - expected, step) / (step @ step)
             if tried @ tried < now @ now:
-                at, now, damping = at + step, tried, damping * 0.1
+                at, now, damping = np.asarray(at + step, np.float64), tried, damping * 0.1
             else:
                 damping = max(damping, 1e-3) * 30
         return float(np.exp(at[0])), float(at[1])

@@ -57,7 +57,8 @@ def ordinary(
     to divide.
     """
     least, _ = excess_range(_LEAST)
-    strengths = np.exp(rng.uniform(*np.log(STRENGTHS), len(families)))
+    low, high = STRENGTHS
+    strengths = np.exp(rng.uniform(np.log(low), np.log(high), len(families)))
     found: list[T] = []
     foretold = 0
     for f, strength in zip(families, strengths.tolist(), strict=True):

@@ -53,7 +53,8 @@ def run_background(
     raises has not answered: where that is a control, no effect is put in front of its log.
 
     Args:
-        answerer: `Log` to a dict of `avtorch.diagnosis/1`, whose `baseline` holds the lag and gain that fit the log.
+        answerer: `Log` to a dict of `avtorch.diagnosis/1` or `/2`, whose `baseline` holds the lag and gain that fit the
+            log.
         seed: of the times, roads and gusts of effects; the same for all sizes of an effect in front of a log.
         sizes: relative to the spread of the log's signals, see `put_in_front`.
         effects: of `IN_FRONT`; default: all.
