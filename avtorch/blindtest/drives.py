@@ -48,7 +48,8 @@ ACCEL_MAX_MPS2, ACCEL_MIN_MPS2 = 2.0, -3.5
 class DrivePlan:
     """A drive to simulate: `manoeuvre`, `seconds`, `rate_hz` of the log, `seed` of its random events.
 
-    `stops`: whether a cruise, or steps, come to a standstill once in four minutes, at least once. Raises `InputError` for an unknown manoeuvre.
+    `stops`: whether a cruise, or steps, come to a standstill once in four minutes, at least once. Raises `InputError`
+    for an unknown manoeuvre.
 
     Example:
         >>> from avtorch.blindtest import Car, DrivePlan, simulate
