@@ -124,8 +124,8 @@ class Case:
 
     def _from(self, columns: Mapping[str, np.ndarray]) -> Log:
         """Checked, and bit for bit what a log read from a file is."""
-        driven = {"engaged": columns["engaged"].astype(int)}
-        return Log.from_arrays(name=self.name, **columns | driven)
+        engaged = columns["engaged"].astype(int)
+        return Log.from_arrays(name=self.name, **{**columns, "engaged": engaged})
 
     def truth(self) -> dict[str, Any]:
         """The hidden truth as plain numbers and strings: the input of `avtorch.blindtest.score`.

@@ -14,7 +14,7 @@ from typing import Any
 
 from avtorch.blindtest.answered_budget import read_budget
 from avtorch.blindtest.answers import canonical_name
-from avtorch.blindtest.intervals import wilson
+from avtorch.blindtest.intervals import cases_for, wilson
 
 SIZE_WITHIN = 0.25
 """A size is right within this share of what was put in."""
@@ -159,15 +159,16 @@ class Injected:
 
 
 def score_in_front(trials: Sequence[Injected]) -> dict[str, Any]:
-    """Counts by effect and size in the order of their first trial (`table`), by size (`sizes`), and over all trials
+    """Counts by effect and size in the order of their first trial (`table`), by size (`by_size`), and over all trials
     (`totals`).
 
     Of the `trials`, `held` counts those whose verdict names the effect, `in_control` those whose control names it too,
     `sized` those held whose size is told, and `size_right` those of them within a quarter of what was put in; `extra`
     those with a name that neither control nor injection has, `nothing_named` those answered `unknown`, `none` or
     nothing, `failed` those without an answer. Of the `bounded`, whose size has an interval and is not in the control,
-    `covered` counts those whose interval holds it. `sizes` and `totals` also have shares with Wilson's 90 % intervals:
-    of the trials, but `size_right` of the `sized` and `covered` of the `bounded`.
+    `covered` counts those whose interval holds it. `by_size` and `totals` also have shares with Wilson's 90 %
+    intervals: of the trials, but `size_right` of the `sized` and `covered` of the `bounded`; and in `needed` how many
+    of these make an interval of ± 5 points.
 
     Example:
         >>> from avtorch.blindtest import Injected, score_in_front
@@ -186,7 +187,7 @@ def score_in_front(trials: Sequence[Injected]) -> dict[str, Any]:
     table = [{"effect": effect, "size": size, **_counts(some)} for (effect, size), some in cells.items()]
     sizes = sorted({one.size for one in trials})
     by_size = [{"size": size, **_with_shares([one for one in trials if one.size == size])} for size in sizes]
-    return {"table": table, "sizes": by_size, "totals": _with_shares(trials)}
+    return {"table": table, "by_size": by_size, "totals": _with_shares(trials)}
 
 
 SHARES_OF: Mapping[str, str] = {
@@ -204,7 +205,8 @@ def _with_shares(trials: Sequence[Injected]) -> dict[str, Any]:
     shares = {key: totals[key] / totals[n] if totals[n] else None for key, n in SHARES_OF.items()}
     intervals = {key: wilson(totals[key], totals[n]) for key, n in SHARES_OF.items()}
     known = {key: None if interval is None else list(interval) for key, interval in intervals.items()}
-    return {**totals, "shares": shares, "intervals": known}
+    needed = {key: cases_for(totals[key], totals[n]) for key, n in SHARES_OF.items()}
+    return {**totals, "shares": shares, "intervals": known, "needed": needed}
 
 
 def _counts(trials: Sequence[Injected]) -> dict[str, int]:

@@ -13,7 +13,7 @@ from avtorch.arrays import FloatArray
 from avtorch.blindtest import budget_score as of_budget
 from avtorch.blindtest.answers import Answered, read_answer
 from avtorch.blindtest.deck import KINDS
-from avtorch.blindtest.intervals import Interval, bootstrap, wilson
+from avtorch.blindtest.intervals import Interval, bootstrap, cases_for, cases_for_mean, wilson
 from avtorch.blindtest.visibility import TIERS
 from avtorch.errors import InputError
 
@@ -31,8 +31,8 @@ def score(
     """Measures of the answers (`avtorch.diagnosis/1` or `/2`, None where there is none) to the cases of `truths`.
 
     The keys are those of `blindtest.json`, and also `confident_errors`, `alias_set.by_tier`, `counts` (the number of
-    cases behind each measure) and `intervals` (the same keys, `[low, high]` of 90 %). A measure to which no case
-    applies is None.
+    cases behind each measure), `intervals` (the same keys, `[low, high]` of 90 %) and `needed` (how many cases make an
+    interval of ± 5 points, of shares and of measures of several causes). A measure to which no case applies is None.
 
     - `top1` by tier, `alias_set`: single effects only. `false_alarm`: share of the cases without a cause for which the
       verdict is not `none`. `pairs_exact`, `pairs_jaccard`: pairs.
@@ -111,6 +111,7 @@ def score(
         "confusion": {truth: dict(sorted(c.items())) for truth, c in sorted(confusion.items())},
         "counts": sheet.counts,
         "intervals": sheet.intervals,
+        "needed": sheet.needed,
     }
 
 
@@ -120,11 +121,11 @@ def _several(sheet: _Sheet, rows: Rows) -> None:
     def known(of: Callable[[Answered], float | None]) -> list[float]:
         return [value for value in map(of, rows) if value is not None]
 
-    sheet.mean("several.recall", known(of_budget.recall))
-    sheet.mean("several.precision", known(of_budget.precision))
-    sheet.mean("several.sum_error", known(of_budget.sum_error))
-    sheet.mean("several.share_error", known(of_budget.share_error))
-    sheet.mean("several.unexplained_error", known(of_budget.unexplained_error))
+    sheet.mean("several.recall", known(of_budget.recall), planned=True)
+    sheet.mean("several.precision", known(of_budget.precision), planned=True)
+    sheet.mean("several.sum_error", known(of_budget.sum_error), planned=True)
+    sheet.mean("several.share_error", known(of_budget.share_error), planned=True)
+    sheet.mean("several.unexplained_error", known(of_budget.unexplained_error), planned=True)
     sheet.share("several.leading", [of_budget.leading_right(r) for r in rows if r.budget is not None])
     sheet.share("several.exact", [r.right for r in rows])
     sheet.share("several.extra", [of_budget.extra_names(r) for r in rows])
@@ -199,30 +200,31 @@ class _Sheet:
         self.values: dict[str, Any] = {}
         self.counts: dict[str, Any] = {}
         self.intervals: dict[str, Any] = {}
+        self.needed: dict[str, Any] = {}
         self._resamples, self._seed = resamples, seed
 
     def _put(self, key: str, value: float | None, count: int, interval: Interval | None) -> None:
-        *path, last = key.split(".")
         for sheet, entry in (
             (self.values, value),
             (self.counts, count),
             (self.intervals, None if interval is None else list(interval)),
         ):
-            for part in path:
-                sheet = sheet.setdefault(part, {})
-            sheet[last] = entry
+            _set(sheet, key, entry)
 
     def share(self, key: str, hits: Sequence[bool]) -> None:
         """A share, with Wilson's interval."""
         self._put(key, float(np.mean(hits)) if hits else None, len(hits), wilson(sum(hits), len(hits)))
+        _set(self.needed, key, cases_for(sum(hits), len(hits)) if hits else None)
 
-    def mean(self, key: str, values: Sequence[float]) -> None:
-        """A mean, bootstrapped."""
+    def mean(self, key: str, values: Sequence[float], *, planned: bool = False) -> None:
+        """A mean, bootstrapped; `planned`: also how many cases it needs."""
         known = np.asarray(values, float)
         interval = bootstrap(
             lambda index: float(known[index].mean()), len(known), resamples=self._resamples, seed=self._seed
         )
         self._put(key, float(known.mean()) if len(known) else None, len(known), interval)
+        if planned:
+            _set(self.needed, key, cases_for_mean(interval, len(known)))
 
     def measure(self, key: str, rows: Rows, of: Callable[[Rows], float | None]) -> None:
         """Any measure of rows, with a bootstrap interval."""
@@ -230,3 +232,11 @@ class _Sheet:
             lambda index: of([rows[i] for i in index.tolist()]), len(rows), resamples=self._resamples, seed=self._seed
         )
         self._put(key, of(rows) if rows else None, len(rows), interval)
+
+
+def _set(sheet: dict[str, Any], key: str, entry: Any) -> None:
+    """Put an entry in a sheet; dots in its key make nested dicts."""
+    *path, last = key.split(".")
+    for part in path:
+        sheet = sheet.setdefault(part, {})
+    sheet[last] = entry
