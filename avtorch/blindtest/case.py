@@ -124,8 +124,14 @@ class Case:
 
     def _from(self, columns: Mapping[str, np.ndarray]) -> Log:
         """Checked, and bit for bit what a log read from a file is."""
-        engaged = columns["engaged"].astype(int)
-        return Log.from_arrays(name=self.name, **{**columns, "engaged": engaged})
+        return Log.from_arrays(
+            name=self.name,
+            time=columns["time"],
+            accel_cmd=columns["accel_cmd"],
+            accel=columns.get("accel"),
+            speed=columns.get("speed"),
+            engaged=columns["engaged"].astype(int),
+        )
 
     def truth(self) -> dict[str, Any]:
         """The hidden truth as plain numbers and strings: the input of `avtorch.blindtest.score`.

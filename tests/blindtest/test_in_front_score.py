@@ -164,8 +164,8 @@ def test_counts_and_shares() -> None:
     assert [totals[key] for key in keys] == [5, 3, 1, 2, 1, 1, 1, 1]
     shares = {"held": 0.6, "size_right": 0.5, "covered": None, "extra": 0.2, "nothing_named": 0.2}
     assert totals["shares"] == shares
-    assert [(one["size"], one["trials"], one["held"]) for one in found["sizes"]] == [(0.5, 4, 3), (1.25, 1, 0)]
-    assert found["sizes"][0]["intervals"]["held"] == list(wilson(3, 4) or ())
+    assert [(one["size"], one["trials"], one["held"]) for one in found["by_size"]] == [(0.5, 4, 3), (1.25, 1, 0)]
+    assert found["by_size"][0]["intervals"]["held"] == list(wilson(3, 4) or ())
     assert totals["intervals"]["held"] == list(wilson(3, 5) or ())
     assert totals["intervals"]["size_right"] == list(wilson(1, 2) or ())
     json.dumps([one.to_dict() for one in trials], allow_nan=False)
