@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from avtorch.blindtest.answers import Answered
 
@@ -17,23 +17,30 @@ def true_unexplained(row: Answered) -> float:
     return float((row.true_budget or {})["unexplained"]["share"])
 
 
-def recall(row: Answered) -> float | None:
-    """Share of what the table's causes take off the gap that is due to named ones; None where they take nothing."""
-    shares = true_shares(row)
-    whole = sum(shares.values())
-    return sum(share for name, share in shares.items() if name in row.named) / whole if whole > 0 else None
+def recall(rows: Sequence[Answered]) -> float | None:
+    """Of all that the table's causes take off the gaps of these cases, the part that is due to named ones.
 
-
-def precision(row: Answered) -> float | None:
-    """Of the shares that the answer gives to what it names, the part given to true causes; None where it names nothing.
-
-    Names without a share count alike where no name has one: a cause of chance, or an answer without a budget.
+    Where a cause outside the table takes nearly all of a gap, the rest weighs little. None where they take nothing.
     """
-    given = {name: max(row.budget.shares.get(name, 0.0), 0.0) for name in row.named} if row.budget else {}
-    if sum(given.values()) <= 0:
-        given = dict.fromkeys(row.named, 1.0)
-    true = row.truth.split("+")
-    return sum(share for name, share in given.items() if name in true) / sum(given.values()) if given else None
+    found = [(share, name in row.named) for row in rows for name, share in true_shares(row).items()]
+    whole = sum(share for share, _ in found)
+    return sum(share for share, named in found if named) / whole if whole > 0 else None
+
+
+def precision(rows: Sequence[Answered]) -> float | None:
+    """Of the shares that answers give to what they name, the part given to true causes; None where nothing is named.
+
+    Names without a share count alike, 1 for each answer, where no name of it has one: causes of chance, or an answer
+    without a budget.
+    """
+    right = whole = 0.0
+    for row in rows:
+        given = {name: max(row.budget.shares.get(name, 0.0), 0.0) for name in row.named} if row.budget else {}
+        if sum(given.values()) <= 0:
+            given = dict.fromkeys(row.named, 1 / max(len(row.named), 1))
+        right += sum(share for name, share in given.items() if name in row.truth.split("+"))
+        whole += sum(given.values())
+    return right / whole if whole > 0 else None
 
 
 def extra_names(row: Answered) -> bool:

@@ -30,8 +30,9 @@ _SHORTEST_S = 2.0
 _SETTLED_S = 2.0  # start of a drive, in which no log identifies the actuator's initial state
 _LAGS_S = (0.02, 3.0)
 _GAINS = (0.1, 3.0)
-_TRIALS = 6  # of lag and gain
-_WORTH = 0.003  # share of the energy that a further trial must promise
+# of lag and gain, and the share of the energy that a further one must promise. Against 25 trials of 1e-5, shares of 20
+# cases of a minute differ by 0.0003 in the median and 0.012 at most, and causes enter in the same order
+_TRIALS, _WORTH = 6, 0.003
 
 
 @dataclass(frozen=True)

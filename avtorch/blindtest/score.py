@@ -121,8 +121,8 @@ def _several(sheet: _Sheet, rows: Rows) -> None:
     def known(of: Callable[[Answered], float | None]) -> list[float]:
         return [value for value in map(of, rows) if value is not None]
 
-    sheet.mean("several.recall", known(of_budget.recall), planned=True)
-    sheet.mean("several.precision", known(of_budget.precision), planned=True)
+    sheet.measure("several.recall", rows, of_budget.recall, planned=True)
+    sheet.measure("several.precision", [r for r in rows if r.named], of_budget.precision, planned=True)
     sheet.mean("several.sum_error", known(of_budget.sum_error), planned=True)
     sheet.mean("several.share_error", known(of_budget.share_error), planned=True)
     sheet.mean("several.unexplained_error", known(of_budget.unexplained_error), planned=True)
@@ -226,12 +226,14 @@ class _Sheet:
         if planned:
             _set(self.needed, key, cases_for_mean(interval, len(known)))
 
-    def measure(self, key: str, rows: Rows, of: Callable[[Rows], float | None]) -> None:
-        """Any measure of rows, with a bootstrap interval."""
+    def measure(self, key: str, rows: Rows, of: Callable[[Rows], float | None], *, planned: bool = False) -> None:
+        """Any measure of rows, with a bootstrap interval; `planned` as of a mean."""
         interval = bootstrap(
             lambda index: of([rows[i] for i in index.tolist()]), len(rows), resamples=self._resamples, seed=self._seed
         )
         self._put(key, of(rows) if rows else None, len(rows), interval)
+        if planned:
+            _set(self.needed, key, cases_for_mean(interval, len(rows)))
 
 
 def _set(sheet: dict[str, Any], key: str, entry: Any) -> None:

@@ -107,8 +107,8 @@ def test_names_weigh_by_their_shares() -> None:
     one = read_answer(several(), divided({"dead_time": 0.4, "backlash": 0.1}, unexplained=0.5, material=True))
     assert one.named == ("backlash", "dead_time")
     assert one.partial
-    assert of.recall(one) == pytest.approx(0.3)  # the oracle's share of the one that is right
-    assert of.precision(one) == pytest.approx(0.8)  # the answer's
+    assert of.recall([one]) == pytest.approx(0.3)  # the oracle's share of the one that is right
+    assert of.precision([one]) == pytest.approx(0.8)  # the answer's
     assert of.sum_error(one) == pytest.approx(0.5)
     assert of.unexplained_error(one) == pytest.approx(0.5)
     assert of.share_error(one) == pytest.approx((0.6 + 0.1 + 0.1) / 3)
@@ -122,7 +122,7 @@ def test_parts_that_are_not_named_do_not_count_as_names() -> None:
     sure = divided({"road_grade": 0.6}, unsure={"dead_time": 0.3}, unexplained=0.1)
     one = read_answer(case, sure)
     assert one.named == ("road_grade",)
-    assert of.recall(one) == pytest.approx(0.6)
+    assert of.recall([one]) == pytest.approx(0.6)
     assert of.sum_error(one) == pytest.approx(0.4)
     assert of.leading_right(one)
     assert of.part_probabilities(one) == [(0.9, True), (0.3, True)]
@@ -132,18 +132,28 @@ def test_answers_without_a_budget_have_names_alone() -> None:
     case = several()
     old = read_answer(case, answer({"dead_time+road_grade": 1.0}, "dead_time+road_grade"))
     assert (old.budget, old.partial) == (None, False)
-    assert of.recall(old) == pytest.approx(0.9)
-    assert of.precision(old) == 1.0
+    assert of.recall([old]) == pytest.approx(0.9)
+    assert of.precision([old]) == 1.0
     wrong = read_answer(case, answer({"backlash+road_grade": 1.0}, "backlash+road_grade"))
-    assert of.precision(wrong) == 0.5
+    assert of.precision([wrong]) == 0.5
     assert (of.sum_error(old), of.unexplained_error(old), of.part_probabilities(old)) == (None, None, [])
     nothing = read_answer(case, divided(None))
-    assert (of.recall(nothing), of.precision(nothing), of.extra_names(nothing)) == (0.0, None, False)
+    assert (of.recall([nothing]), of.precision([nothing]), of.extra_names(nothing)) == (0.0, None, False)
     failed = read_answer(case, None)
-    assert (of.recall(failed), of.precision(failed), failed.utility()) == (0.0, None, 0.0)
+    assert (of.recall([failed]), of.precision([failed]), failed.utility()) == (0.0, None, 0.0)
     s = score([case, case], [None, divided(SHARES, chance=("gust",))], resamples=10)
     assert s["several"]["recall"] == pytest.approx(0.5)
     assert s["counts"]["several"] | {"precision": 2, "leading": 2} != s["counts"]["several"]  # of one alone
+
+
+def test_a_small_rest_beside_a_cause_outside_the_table_weighs_little() -> None:
+    whole, rest = several(), several(outside=True, unexplained=0.9)
+    rows = [read_answer(whole, divided(SHARES)), read_answer(rest, divided({}, unexplained=1.0, material=True))]
+    # of 1 + 0.1 of the two gaps
+    assert of.recall(rows) == pytest.approx(1 / 1.1)
+    assert of.precision(rows) == 1.0
+    wrong = read_answer(rest, divided({"backlash": 0.25}, unexplained=0.75, material=True))
+    assert of.precision([rows[0], wrong]) == pytest.approx(1 / 1.25)
 
 
 def outside_case() -> dict[str, Any]:
