@@ -11,7 +11,7 @@ from avtorch.blindtest.car import Car, draw_car
 from avtorch.blindtest.case import Case, write
 from avtorch.blindtest.cases import draw_case, draw_cases
 from avtorch.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, Family, family
-from avtorch.blindtest.deck import MIX
+from avtorch.blindtest.deck import KINDS, MIX
 from avtorch.blindtest.drives import DURATIONS_S, MANOEUVRES, RATES_HZ, DrivePlan, Recorded, draw_drive
 from avtorch.blindtest.in_front import IN_FRONT, put_in_front
 from avtorch.blindtest.in_front_score import Injected, score_in_front
@@ -25,6 +25,7 @@ __all__ = [
     "DURATIONS_S",
     "EFFECTS",
     "IN_FRONT",
+    "KINDS",
     "MANOEUVRES",
     "MIX",
     "RATES_HZ",

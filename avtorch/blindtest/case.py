@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,10 +13,12 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.blindtest.car import Car
-from avtorch.blindtest.catalogue import family
+from avtorch.blindtest.catalogue import EFFECTS, family
 from avtorch.blindtest.command import Parameters
 from avtorch.blindtest.drives import DrivePlan
+from avtorch.blindtest.oracle_budget import oracle_budget
 from avtorch.blindtest.recorder import Recorder
+from avtorch.blindtest.replay import Replay
 from avtorch.blindtest.vehicle import Run
 from avtorch.blindtest.visibility import Oracle, Sight, exact_gain
 from avtorch.errors import InputError
@@ -23,7 +26,7 @@ from avtorch.io import Log, write_json
 
 _MOVING_MPS = 0.3  # slower rows are masked
 
-Kind = Literal["none", "single", "pair", "outside"]
+Kind = Literal["none", "single", "pair", "outside", "several"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +38,8 @@ class Case:
     `avtorch.blindtest.visibility`; `visibility_each`: visibility of each effect of a pair, alone on the same drive.
     `oracles`: rollout errors, by metric, of GLVD and of a model that knows the cause. `without`, `with_cause` (row,)
     [m/s²]: noise-free measured acceleration under the logged command, without the cause and with its predictable part.
-    `recorder`: what the log is written by; visibility, tier and oracles are those of the drive before it.
+    `recorder`: what the log is written by; visibility, tier and oracles are those of the drive before it. `replay`: of
+    a case of several causes, the drive again with only some of them; `signals`: the channels that its budget is of.
 
     Example:
         >>> from avtorch.blindtest import draw_case
@@ -60,6 +64,8 @@ class Case:
     refit: Sight
     oracles: Mapping[str, Oracle]
     recorder: Recorder = field(default_factory=Recorder.ideal)
+    replay: Replay | None = None
+    signals: tuple[str, ...] = ("accel", "speed")
 
     @property
     def name(self) -> str:
@@ -68,8 +74,15 @@ class Case:
 
     @property
     def truth_name(self) -> str:
-        """The correct verdict: `none`, `unknown`, an effect, or two joined by `+`."""
-        return {"none": "none", "outside": "unknown"}.get(self.kind, "+".join(self.names))
+        """The correct verdict: `none`, `unknown`, or the case's effects joined by `+`."""
+        known = "+".join(name for name in self.names if name in EFFECTS)
+        return {"none": "none", "outside": "unknown"}.get(self.kind, known)
+
+    @cached_property
+    def budget(self) -> dict[str, Any] | None:
+        """What each of several causes contributes to the gap (`avtorch.blindtest.oracle_budget`); None for other
+        kinds."""
+        return None if self.replay is None else oracle_budget(self.replay, self.log(signals=self.signals)).to_dict()
 
     @property
     def without(self) -> FloatArray:
@@ -96,28 +109,36 @@ class Case:
         return parts
 
     def log(self, *, signals: Sequence[str] = ("accel", "speed")) -> Log:
-        """The log given to a diagnosis, as the recorder wrote it: `time`, `accel_cmd`, the channels in `signals`."""
-        columns = {"accel": self.run.accel, "speed": self.run.speed}
+        """The log given to a diagnosis, as the recorder wrote it: `time`, `accel_cmd`, `engaged`, the channels in
+        `signals`."""
+        columns: dict[str, np.ndarray] = {"accel": self.run.accel, "speed": self.run.speed}
         if not signals or set(signals) - columns.keys():
             raise InputError(f"signals: found {tuple(signals)}, needs accel, speed or both")
-        columns |= {"time": self.run.time, "accel_cmd": self.run.command}
+        columns |= {"time": self.run.time, "accel_cmd": self.run.command, "engaged": np.ones(len(self.run.time), int)}
         if self.recorder != Recorder.ideal():
             seed = int(np.random.default_rng([self.seed, self.index, 5]).integers(2**63))
             written = self.recorder.record(self._from(columns), seed)
             columns = {name: getattr(written, name) for name in columns}
-        return self._from({name: x for name, x in columns.items() if name in ("time", "accel_cmd", *signals)})
+        always = ("time", "accel_cmd", "engaged")
+        return self._from({name: x for name, x in columns.items() if name in (*always, *signals)})
 
-    def _from(self, columns: Mapping[str, FloatArray]) -> Log:
-        accel, speed = columns.get("accel"), columns.get("speed")
+    def _from(self, columns: Mapping[str, np.ndarray]) -> Log:
+        """Checked, and bit for bit what a log read from a file is."""
         return Log.from_arrays(
-            name=self.name, time=columns["time"], accel_cmd=columns["accel_cmd"], accel=accel, speed=speed
+            name=self.name,
+            time=columns["time"],
+            accel_cmd=columns["accel_cmd"],
+            accel=columns.get("accel"),
+            speed=columns.get("speed"),
+            engaged=columns["engaged"].astype(int),
         )
 
     def truth(self) -> dict[str, Any]:
         """The hidden truth as plain numbers and strings: the input of `avtorch.blindtest.score`.
 
         Where the recorder is not the ideal one, its numbers are in `recorder`, and `oracle` is empty: the floors of the
-        oracles lack its noise.
+        oracles lack its noise. A case of several causes has its `budget`, and under `outside` those of its causes that
+        are not in the table.
         """
         told = {
             "schema": "avtorch.blindtest.truth/1",
@@ -137,9 +158,12 @@ class Case:
             "baseline": {"T_L": self.car.T_L, "K_L": self.car.K_L},
             "refit": {"T_L": self.refit.T_L, "K_L": self.refit.K_L},
             "noise": {k: v for k, v in asdict(self.car).items() if k not in ("T_L", "K_L")},
-            "drive": asdict(self.drive),
+            # truths kept before there were stops stay as they are
+            "drive": {key: value for key, value in asdict(self.drive).items() if key != "stops" or value},
             "oracle": {metric: {**asdict(o), "closed": o.closed} for metric, o in self.oracles.items()},
         }
+        if self.replay is not None:
+            told |= {"budget": self.budget, "outside": [name for name in self.names if name not in EFFECTS]}
         # truths kept by trials without recorders stay as they are
         if self.recorder == Recorder.ideal():
             return told

@@ -7,7 +7,7 @@ in any order.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal, get_args
 
@@ -18,14 +18,19 @@ from avtorch.blindtest.case import Case
 from avtorch.blindtest.catalogue import CALIBRATION, EFFECTS, SEALED, Family
 from avtorch.blindtest.command import Parameters
 from avtorch.blindtest.deck import MIX, card, kind_of
-from avtorch.blindtest.drives import draw_drive
+from avtorch.blindtest.drives import draw_drive, with_stops
+from avtorch.blindtest.oracle_budget import gap_over_floor
 from avtorch.blindtest.recorder import draw_recorder
+from avtorch.blindtest.replay import Replay
+from avtorch.blindtest.several import LEAST_GAP, draw_several, ordinary
 from avtorch.blindtest.strength import excess_range, solve_strength
 from avtorch.blindtest.vehicle import Pilot, Run, simulate
 from avtorch.blindtest.visibility import TIERS, Sight, oracles, sight, tier_of
 from avtorch.errors import InputError
 
 Recording = Literal["ideal", "ordinary"]
+Trial = tuple[Parameters, Run, Sight]
+"""A cause alone on a drive: its parameters, the drive, how visible it is there."""
 _ATTEMPTS = 10
 SIGNALS = ("accel", "speed")
 _PAIR_EXCESS = (1.25, 8.0)
@@ -49,13 +54,15 @@ def draw_cases(
 ) -> Iterator[Case]:
     """Cases `start` to `start + n - 1` of the set `seed`, one after another.
 
-    Args: `mix`: shares of the kinds (default 25 % none, 40 % single, 20 % pair, 15 % outside), kept in every 20 cases.
+    Args: `mix`: shares of the kinds (default 25 % none, 40 % single, 20 % pair, 15 % outside), kept in every 20 cases;
+    `several`: three to five causes of ordinary size (`avtorch.blindtest.several`), with the oracle's budget of the gap.
     `tiers`, `effects`: single cases cover all their combinations in random order; causes outside the table are drawn
     from all `tiers`. `outside`: which of the two groups of families outside the table. `seconds`, `manoeuvre`: fixed
     instead of drawn. `signals`: the channels of the logs, in which a cause must be visible. Where a cause cannot reach
     the visibility asked for on a drive, another drive is drawn; after ten drives another cause takes its place, or else
     the case keeps the drive where it is most visible, in the tier that it has there. `recorder`: `ordinary` passes each
-    log, whatever its kind, through a recorder drawn for it (`draw_recorder`); the drives are those of `ideal`.
+    log, whatever its kind, through a recorder drawn for it (`draw_recorder`), and lets every other drive of cruise and
+    steps come to a standstill; the other drives are those of `ideal`.
 
     Raises `InputError` for unknown kinds, tiers, effects, signals or recorders.
 
@@ -110,7 +117,8 @@ def draw_case(
         raise InputError(f"signals: found {tuple(signals)}, needs accel, speed or both")
     if recorder not in get_args(Recording):
         raise InputError(f"recorder: found {recorder!r}, needs ideal or ordinary")
-    case = _drawn(index, seed, MIX if mix is None else mix, tiers, effects, outside, seconds, manoeuvre, signals)
+    mix, stops = MIX if mix is None else mix, recorder == "ordinary"
+    case = _drawn(index, seed, mix, tiers, effects, outside, seconds, manoeuvre, signals, stops)
     if recorder == "ideal":
         return case
     # draws of its own: the drive is the same behind either recorder
@@ -128,6 +136,7 @@ def _drawn(
     seconds: float | None,
     manoeuvre: str | None,
     signals: Sequence[str],
+    stops: bool,
 ) -> Case:
     """A case before its recorder is drawn."""
     kind, count = kind_of(index, seed, mix)
@@ -140,11 +149,11 @@ def _drawn(
                 return best
             # first the cause that is due; after ten drives in which it is not visible, any other
             due = count if attempt == 0 else int(rng.integers(2**31))
-            families, tier = _causes(kind, due, seed, rng, effects, tiers, group)
-        case = _attempt(index, seed, kind, families, tier, rng, seconds, manoeuvre, signals)
+            families, tier, count_of = _causes(kind, due, seed, rng, effects, tiers, group)
+        case = _attempt(index, seed, kind, families, count_of, tier, rng, seconds, manoeuvre, signals, stops)
         if case is None:
             continue
-        if kind in ("none", "pair") or case.tier == tier:
+        if kind in ("none", "pair", "several") or case.tier == tier:
             return case
         if best is None or case.visibility > best.visibility:
             best = case
@@ -161,21 +170,24 @@ def _causes(
     effects: Sequence[str],
     tiers: Sequence[str],
     group: Mapping[str, Family],
-) -> tuple[list[Family], str]:
-    """The causes of the `count`-th case of its kind, and the tier of their visibility."""
+) -> tuple[list[Family], str, int]:
+    """The causes of the `count`-th case of its kind, the tier of their visibility, and how many there will be."""
     if kind == "single":
         tier, effect = divmod(card(count, seed, len(effects) * len(tiers)), len(effects))
-        return [EFFECTS[effects[effect]]], tiers[tier]
+        return [EFFECTS[effects[effect]]], tiers[tier], 1
     if kind == "outside":
         tier, which = divmod(card(count, seed, len(group) * len(tiers)), len(group))
-        return [list(group.values())[which]], tiers[tier]
+        return [list(group.values())[which]], tiers[tier], 1
     if kind == "pair":
         # lost messages are too faint for one half of a pair
         able = sorted(set(effects) - {"command_hold"})
         if len(able) < 2:
             raise InputError(f"effects: found {tuple(effects)}, pairs need two that are not command_hold")
-        return [EFFECTS[str(name)] for name in sorted(rng.choice(able, 2, replace=False))], "pair"
-    return [], "none"
+        return [EFFECTS[str(name)] for name in sorted(rng.choice(able, 2, replace=False))], "pair", 2
+    if kind == "several":
+        families, wanted = draw_several(rng, effects, group)
+        return families, "several", wanted
+    return [], "none", 0
 
 
 def _attempt(
@@ -183,20 +195,28 @@ def _attempt(
     seed: int,
     kind: str,
     families: Sequence[Family],
+    count: int,
     tier: str,
     rng: np.random.Generator,
     seconds: float | None,
     manoeuvre: str | None,
     signals: Sequence[str],
+    stops: bool,
 ) -> Case | None:
-    """A case on a newly drawn drive; None where the drive is unusable or one of a pair cannot be visible on it."""
+    """A case of `count` causes on a newly drawn drive; None where the drive is unusable, or where one of a pair or too
+    many of several cannot be visible on it."""
     car, drive = draw_car(rng), draw_drive(rng, seconds=seconds, manoeuvre=manoeuvre)
+    if stops:
+        drive = with_stops(drive)
     noise, late, when = int(rng.integers(2**31)), rng.random() < 0.5, float(rng.uniform(0.2, 0.7))
+    if kind == "several" and late:
+        # its moment may be before that of the others
+        families = [f for f in families if f.name != "gain_change"]
     draws = {f.name: f.draw(rng, car, drive) for f in families}
     aims = {f.name: float(rng.random()) for f in families}
     # a random first strength: otherwise the first trial to fit would be the same in many cases
     begins = {f.name: float(np.exp(rng.uniform(-1, 1))) for f in families}
-    if any(f.suits and drive.manoeuvre not in f.suits for f in families):
+    if kind != "several" and any(f.suits and drive.manoeuvre not in f.suits for f in families):
         return None
     changes = "gain_change" in draws
     onset = round(when * drive.seconds * drive.rate_hz) / drive.rate_hz if late and families and not changes else 0.0
@@ -210,53 +230,72 @@ def _attempt(
         )
         return run, sight(run, signals)
 
-    def alone(f: Family) -> tuple[Parameters, Run, Sight] | None:
+    def at_strength(f: Family, strength: float) -> Trial:
+        parameters = {f.name: draws[f.name](strength)}
+        return parameters, *made(parameters)
+
+    def alone(f: Family) -> Trial | None:
         """The effect by itself, at the strength that the tier requires."""
         low, high = excess_range(tier) if kind != "pair" else _PAIR_EXCESS
         aim = low * (high / low) ** (0.1 + 0.8 * aims[f.name])
 
-        def trial(strength: float) -> tuple[float, tuple[Parameters, Run, Sight]]:
-            parameters = {f.name: draws[f.name](strength)}
-            run, seen = made(parameters)
-            return seen.excess, (parameters, run, seen)
+        def trial(strength: float) -> tuple[float, Trial]:
+            made_so = at_strength(f, strength)
+            return made_so[2].excess, made_so
 
         # where it cannot reach the tier, keep its strongest form
         found = solve_strength(trial, aim, low, high, begin=begins[f.name], strongest=f.strongest)
         return found or (trial(f.strongest)[1] if kind != "pair" else None)
 
-    parameters: dict[str, Mapping[str, float]] = {}
-    each: dict[str, float] = {}
-    run: Run | None = None
-    seen: Sight | None = None
-    for f in families:
-        found = alone(f)
-        if found is None:
-            return None
-        part, run, seen = found
-        parameters |= part
-        each[f.name] = seen.most
-    if run is None or seen is None or len(families) > 1:
-        run, seen = made(parameters)
+    if kind == "several":
+        found = ordinary(rng, families, count, drive, at_strength, lambda trial: trial[2].excess)
+    else:
+        found = _all_of(families, alone)
+    if found is None:
+        return None
+    parameters = {name: values for trial in found for name, values in trial[0].items()}
+    # a case of one cause is the drive on which its strength was found
+    run, seen = found[0][1:] if len(found) == 1 else made(parameters)
     if not _sound(run, pilots[-1]):
         return None
-    moment = parameters["gain_change"]["change_s"] if changes else (onset or None)
-    return Case(
+    moment = parameters["gain_change"]["change_s"] if "gain_change" in parameters else (onset or None)
+    case = Case(
         index=index,
         seed=seed,
         kind=kind,  # type: ignore[arg-type]
         names=tuple(sorted(parameters)),
         parameters=parameters,
         onset_s=moment,
-        onset_scored=not (changes and len(families) > 1),
+        onset_scored=not ("gain_change" in parameters and len(parameters) > 1),
         visibility=seen.most,
-        visibility_each=each,
-        tier=tier_of(seen.most) if families else None,
+        visibility_each={name: trial[2].most for trial in found for name in trial[0]},
+        tier=tier_of(seen.most) if parameters else None,
         car=car,
         drive=drive,
         run=run,
         refit=seen,
         oracles=oracles(run, seen, foretold="command_hold" not in parameters),
+        replay=Replay(run, car, parameters, onset, noise) if kind == "several" else None,
+        signals=tuple(name for name in SIGNALS if name in signals),
     )
+    return None if case.replay is not None and not _divisible(case, case.replay) else case
+
+
+def _divisible(case: Case, replay: Replay) -> bool:
+    """Whether several causes leave a gap to divide; gusts and glitches may drown the others."""
+    gap = gap_over_floor(replay, case.log(signals=case.signals), case.refit.T_L, case.refit.K_L)
+    return gap >= LEAST_GAP
+
+
+def _all_of(families: Sequence[Family], alone: Callable[[Family], Trial | None]) -> list[Trial] | None:
+    """The trial of each cause alone; None where one cannot be visible."""
+    found: list[Trial] = []
+    for f in families:
+        trial = alone(f)
+        if trial is None:
+            return None
+        found.append(trial)
+    return found
 
 
 def _sound(run: Run, pilot: Pilot) -> bool:

@@ -16,6 +16,14 @@ Example:
     >>> round(sum(MIX.values()), 6), max(MIX, key=MIX.get)
     (1.0, 'single')
 """
+KINDS = (*MIX, "several")
+"""All kinds of case; `several` is drawn only where a mix asks for it.
+
+Example:
+    >>> from avtorch.blindtest import KINDS, MIX
+    >>> [kind for kind in KINDS if kind not in MIX]
+    ['several']
+"""
 _ROUND = 20
 
 
@@ -24,8 +32,8 @@ def kind_of(index: int, seed: int, mix: Mapping[str, float] = MIX) -> tuple[str,
 
     `mix`: shares that sum to 1, kept in every 20 cases (largest remainders). Raises `InputError` for other shares.
     """
-    if set(mix) - MIX.keys() or min(mix.values()) < 0 or abs(sum(mix.values()) - 1) > 1e-9:
-        raise InputError(f"mix: found {dict(mix)}, needs shares of {', '.join(MIX)} that sum to 1")
+    if not mix or set(mix) - set(KINDS) or min(mix.values()) < 0 or abs(sum(mix.values()) - 1) > 1e-9:
+        raise InputError(f"mix: found {dict(mix)}, needs shares of {', '.join(KINDS)} that sum to 1")
     counts = {kind: int(_ROUND * share + 1e-9) for kind, share in mix.items()}
     left = sorted(mix, key=lambda kind: counts[kind] - _ROUND * mix[kind])
     for kind in left[: _ROUND - sum(counts.values())]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -48,7 +48,8 @@ ACCEL_MAX_MPS2, ACCEL_MIN_MPS2 = 2.0, -3.5
 class DrivePlan:
     """A drive to simulate: `manoeuvre`, `seconds`, `rate_hz` of the log, `seed` of its random events.
 
-    Raises `InputError` for an unknown manoeuvre.
+    `stops`: whether a cruise, or steps, come to a standstill once in four minutes, at least once. Raises `InputError`
+    for an unknown manoeuvre.
 
     Example:
         >>> from avtorch.blindtest import Car, DrivePlan, simulate
@@ -62,6 +63,7 @@ class DrivePlan:
     seconds: float
     rate_hz: int
     seed: int
+    stops: bool = False
 
     def __post_init__(self) -> None:
         if self.manoeuvre not in MANOEUVRES:
@@ -71,10 +73,9 @@ class DrivePlan:
         """A fresh pilot; two pilots of the same drive act identically as long as the car does."""
         rng = np.random.default_rng([self.seed, MANOEUVRES.index(self.manoeuvre)])
         dt = 1 / self.rate_hz
-        if self.manoeuvre == "cruise":
-            return _Cruise(rng, self.seconds, dt)
-        if self.manoeuvre == "steps":
-            return _Steps(rng, self.seconds)
+        if self.manoeuvre in ("cruise", "steps"):
+            driver = _Cruise(rng, self.seconds, dt) if self.manoeuvre == "cruise" else _Steps(rng, self.seconds)
+            return _Stopping(driver, rng, self.seconds) if self.stops else driver
         if self.manoeuvre == "stop_and_go":
             return _Follow(rng, queue(rng, self.seconds, dt), dt)
         return _Follow(rng, (us06 if rng.random() < 0.4 else trip)(rng, self.seconds, dt), dt)
@@ -96,6 +97,15 @@ def draw_drive(rng: np.random.Generator, *, seconds: float | None = None, manoeu
         rate_hz=int(rng.choice(RATES_HZ)),
         seed=int(rng.integers(2**31)),
     )
+
+
+def with_stops(drive: DrivePlan) -> DrivePlan:
+    """Every other drive that would not come to a standstill comes to one; its seed decides, so no draw is needed.
+
+    Drives below 40 s have no time for it; following and stop-and-go have stops of their own.
+    """
+    can = drive.manoeuvre in ("cruise", "steps") and drive.seconds >= 40
+    return replace(drive, stops=can and drive.seed % 2 == 0)
 
 
 def _clip(u: float) -> float:
@@ -179,6 +189,34 @@ class _Steps:
             self._value = 0.0 if self._rest[i] and 6.0 <= speed <= self._top - 2.0 else sign * size
             self._at, self._until = time, time + self._holds[i]
         return self._value
+
+
+class _Stopping:
+    """Another pilot, who brakes to a standstill now and then, stands for some seconds, and pulls away again."""
+
+    def __init__(self, pilot: Pilot, rng: np.random.Generator, seconds: float) -> None:
+        self.start_speed = pilot.start_speed
+        self._pilot = pilot
+        count = max(1, round(seconds / 240))
+        # in the middle of as many equal parts, so that a drive neither begins nor ends with one
+        self._times = (seconds * (np.arange(count) + rng.uniform(0.3, 0.5, count)) / count).tolist()
+        self._brake, self._pull = float(rng.uniform(1.5, 2.8)), float(rng.uniform(1.0, 1.8))
+        self._stand = rng.uniform(2, 6, count).tolist()
+        self._back, self._until = 0.0, float("inf")
+        self._phase = "drive"
+
+    def command(self, row: int, time: float, speed: float, accel: float, position: float) -> float:
+        own = self._pilot.command(row, time, speed, accel, position)
+        if self._phase == "drive" and self._times and time >= self._times[0]:
+            self._times.pop(0)
+            self._phase, self._back = "brake", 0.5 * speed
+        if self._phase == "brake" and speed < 0.2:
+            self._phase, self._until = "stand", time + self._stand.pop(0)
+        if self._phase == "stand" and time >= self._until:
+            self._phase = "pull"
+        if self._phase == "pull" and speed > self._back:
+            self._phase = "drive"
+        return {"drive": own, "brake": -self._brake, "stand": -0.8, "pull": self._pull}[self._phase]
 
 
 class Recorded:

@@ -5,7 +5,8 @@ where `E(u') = u`. This gives a known effect together with a real response, its 
 is the control. Where the diagnosis of the changed log differs from that of the unchanged one, the difference is due to
 the added effect, whatever else the car lacks.
 
-Effects of the command are inverted exactly. A force `f` on the body is replaced by the equivalent command `u' = u - (f
+Effects of the command are inverted exactly; a limit, beyond which nothing can be inverted, by dropping the rows that a
+limited car would not have driven. A force `f` on the body is replaced by the equivalent command `u' = u - (f
 + T_L df/dt) / K_L`, with the car's lag and gain, which must be given. Effects of the accelerometer are applied to its
 reading. Sizes are relative to the spread of the logged signals, so that size 1 is equally visible in any car.
 """
@@ -28,6 +29,10 @@ Truth = dict[str, float]
 _MOVING_MPS = 0.3
 _SMOOTH_S = 0.3  # smooths the measured speed before a force is computed from it and differentiated
 _GRAVITY = 9.81
+_KNEE = 0.3  # of a limit, over which it sets in
+_CREEPS_TO_MPS = 3.0
+_LONGEST_MEMORY_S = 0.5
+_SHORTEST_S = 1.0  # what is left between dropped rows
 
 
 @dataclass(frozen=True)
@@ -166,6 +171,27 @@ def _speed_dependent_gain(x: _Bench) -> tuple[Log, Truth]:
     return replace(x.log, accel_cmd=x.command / gain), {"gain_slope": slope}
 
 
+def _saturation(x: _Bench) -> tuple[Log, Truth]:
+    """The drive's limit `L`, with a soft knee over its last 30 %, exceeded by a fifth of the positive commands.
+
+    `E(u') = L - 0.3 L exp(-(u' - 0.7 L) / (0.3 L))` above `0.7 L`, which has an inverse below `L`. Rows beyond 0.99 L
+    are dropped, and those that their acceleration still reaches: one lag, up to half a second.
+    """
+    push = x.command[x.log.usable & (x.command > 0)]
+    if len(push) == 0:
+        raise InputError(f"{x.log.name}: has no positive command, which this effect limits")
+    limit = float(np.quantile(push, max(1 - 0.2 * x.size, 0.5)))
+    knee = _KNEE * limit
+    into = np.clip((x.command - (limit - knee)) / knee, 0.0, None)
+    beyond = x.command > 0.99 * limit
+    command = np.where(into > 0, limit - knee - knee * np.log1p(-np.minimum(into, 1 - 0.01 / _KNEE)), x.command)
+    kept, memory = ~beyond, round(min(x.T_L, _LONGEST_MEMORY_S) / x.step)
+    for part in x.log.segments():
+        since = np.convolve(beyond[part], np.ones(memory + 1))[: part.stop - part.start]
+        kept[part] &= since < 0.5
+    return _stretches(replace(x.log, accel_cmd=command), kept, x.step), {"accel_max_mps2": x.K_L * limit}
+
+
 # --- forces on the body -----------------------------------------------------------------------------------------------
 def _resistance(x: _Bench) -> tuple[Log, Truth]:
     """Resistance of a quarter of the command's SD while the car moves."""
@@ -190,6 +216,12 @@ def _grade(x: _Bench) -> tuple[Log, Truth]:
     pull = 0.35 * x.size * x.spread
     force = -pull * np.sin(2 * np.pi * (way / wave + float(x.rng.random())))
     return x.pushed(force), {"grade_rms": float(np.sqrt(np.mean(force[x.log.usable] ** 2))) / _GRAVITY}
+
+
+def _creep(x: _Bench) -> tuple[Log, Truth]:
+    """A push of 0.35 of the command's SD at standstill, which falls with the square of speed to 0 at 3 m/s."""
+    push = 0.35 * x.size * x.spread
+    return x.pushed(push * np.clip(1 - (x.speed / _CREEPS_TO_MPS) ** 2, 0.0, None)), {"creep_mps2": push}
 
 
 def _gust(x: _Bench) -> tuple[Log, Truth]:
@@ -252,8 +284,11 @@ IN_FRONT: Mapping[str, Callable[[_Bench], tuple[Log, Truth]]] = {
     "sensor_scale": _sensor_scale,
     "sensor_lag": _sensor_lag,
     "outliers": _outliers,
+    # behind the others: their places are part of the seeds of trials that were kept before
+    "low_speed_creep": _creep,
+    "saturation": _saturation,
 }
-"""Effects that can be added to a recording, by name; the last four need `accel`.
+"""Effects that can be added to a recording, by name; those of the accelerometer need `accel`.
 
 Example:
     >>> from avtorch.blindtest import EFFECTS, IN_FRONT
@@ -267,3 +302,19 @@ def _rows(log: Log, kept: BoolArray) -> Log:
     columns = {name: value[kept] for name, value in vars(log).items() if isinstance(value, np.ndarray)}
     columns = {name: value for name, value in columns.items() if name in log.__dataclass_fields__}
     return replace(log, **columns)
+
+
+def _stretches(log: Log, kept: BoolArray, step: float) -> Log:
+    """The log with only the rows `kept` (row,), each stretch between dropped rows a segment, if it lasts a second."""
+    kept, cuts = kept.copy(), np.zeros(log.rows, int)
+    for part in log.segments():
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], kept[part].astype(int), [0]]))) + part.start
+        for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            kept[begin:end] = end - begin >= _SHORTEST_S / step
+            cuts[begin] = 1
+        cuts[part.start] = 1
+    if not kept.any():
+        raise InputError(f"{log.name}: no stretch of {_SHORTEST_S:g} s is left below the limit")
+    segment = np.cumsum(cuts)[kept]
+    number = np.unique(segment, return_inverse=True)[1]
+    return replace(_rows(log, kept), segment=number.astype(log.segment.dtype))

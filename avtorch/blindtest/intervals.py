@@ -12,6 +12,8 @@ from avtorch.arrays import IntArray
 Interval = tuple[float, float]
 LEVEL = 0.90
 
+_FEWEST = 30
+
 
 def wilson(hits: int, trials: int, level: float = LEVEL) -> Interval | None:
     """Wilson's score interval of a share; None without trials. Wilson, J. Am. Stat. Assoc. 22 (1927) 209."""
@@ -23,6 +25,45 @@ def wilson(hits: int, trials: int, level: float = LEVEL) -> Interval | None:
     half = z / (1 + weight) * np.sqrt(share * (1 - share) / trials + weight / (4 * trials))
     low = 0.0 if hits == 0 else float(middle - half)
     return low, 1.0 if hits == trials else float(middle + half)
+
+
+HALF_WIDTH = 0.05
+"""Half width of an interval that is narrow enough to quote a figure with: 5 points."""
+
+
+def cases_for(hits: int, trials: int, half: float = HALF_WIDTH, level: float = LEVEL) -> int:
+    """Trials after which Wilson's interval of a share is `half` wide on either side; 268 for a share of a half.
+
+    The share is planned with the middle of the interval at hand: two hits of two do not promise a share of 1. Without
+    trials it is a half, the worst case. Where that many trials have been made it is enough.
+    """
+    interval = wilson(hits, trials, level) if trials else (0.0, 1.0)
+    assert interval is not None
+    z, share = NormalDist().inv_cdf(0.5 + level / 2), sum(interval) / 2
+    if trials and (interval[1] - interval[0]) / 2 <= half:
+        return trials
+
+    def width(n: float) -> float:
+        return z / (1 + z * z / n) * float(np.sqrt(share * (1 - share) / n + z * z / (4 * n * n)))
+
+    low, high = 1, 2
+    while width(high) > half:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if width(middle) > half else (low, middle)
+    return high
+
+
+def cases_for_mean(interval: Interval | None, cases: int, half: float = HALF_WIDTH) -> int | None:
+    """Cases after which a bootstrapped interval is `half` wide on either side; None without an interval.
+
+    Its width falls with the root of their number. At least 30: of a few like values the bootstrap promises too much.
+    """
+    if interval is None:
+        return None
+    now = (interval[1] - interval[0]) / 2
+    return max(cases if now <= half else int(np.ceil(cases * (now / half) ** 2)), _FEWEST)
 
 
 def bootstrap(

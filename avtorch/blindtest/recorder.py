@@ -2,11 +2,12 @@
 
 A bus rounds a signal and sends it less often than the log has rows; a wheel-speed sensor averages; an accelerometer
 vibrates with the body it is fixed to; each channel has its own clock; rows are lost, or written with the readings of
-the row before. None of it is a cause that a simulator lacks: it moves no car. A recorder changes `accel`, `speed` and
-which rows there are; the command and the times of the rows that remain are kept to the bit.
+the row before. Now and then a driver overrides the controller, which goes on asking for the contrary. None of it is a
+cause that a simulator lacks: it moves no car. A recorder changes `accel`, `speed`, `engaged`, the command under an
+override, and which rows there are; other commands and the times of the rows that remain are kept to the bit.
 
 The order is that of the signal path: clock offset, low-pass (speed), vibration and noise (accel), quantum, hold
-(speed), then dropped and repeated rows.
+(speed), overrides, then dropped and repeated rows.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ class Recorder:
     proportion to speed, shared equally among resonances at `vibration_hz`. `accel_noise_mps2`, `accel_noise_dof`: scale
     and degrees of freedom of t-distributed noise. `accel_offset_s`, `speed_offset_s`: age of a channel's readings by
     the clock of the command (negative: stamped too early). `dropped`, `repeated`: shares of rows that are lost, and
-    that hold the readings of the row before.
+    that hold the readings of the row before. `overrides_per_min`, `override_s`: how often a driver takes over on
+    average, and for how long [s]: the car does as before, by the driver's will, while `engaged` is 0 and the logged
+    command is the opposite of what the car obeys.
 
     Raises `InputError` for values out of range.
 
@@ -60,6 +63,8 @@ class Recorder:
     speed_offset_s: float = 0.0
     dropped: float = 0.0
     repeated: float = 0.0
+    overrides_per_min: float = 0.0
+    override_s: float = 4.0
 
     def __post_init__(self) -> None:
         for name in (
@@ -69,6 +74,8 @@ class Recorder:
             "vibration_mps2",
             "accel_quantum",
             "accel_noise_mps2",
+            "overrides_per_min",
+            "override_s",
         ):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name}: found {getattr(self, name)!r}, needs a finite number of 0 or more")
@@ -110,7 +117,7 @@ class Recorder:
             return log
         accel = None if log.accel is None else self._accel(log, log.accel, seed)
         speed = None if log.speed is None else self._speed(log, log.speed)
-        return self._rows(replace(log, accel=accel, speed=speed), seed)
+        return self._rows(self._driven(replace(log, accel=accel, speed=speed), seed), seed)
 
     def _accel(self, log: Log, accel: FloatArray, seed: int) -> FloatArray:
         out = _shifted(log, accel, self.accel_offset_s)
@@ -146,6 +153,22 @@ class Recorder:
                 out[part] = out[part][_latest(new)]
         return out
 
+    def _driven(self, log: Log, seed: int) -> Log:
+        """A driver in charge from moments that chance decides: the motion stays, the logged command turns round."""
+        if not self.overrides_per_min or log.accel_cmd is None:
+            return log
+        rng = np.random.default_rng([seed, 5])
+        driver = np.zeros(log.rows, bool)
+        for part in log.segments():
+            time = log.elapsed[part]
+            seconds = float(time[-1] - time[0])
+            count = int(rng.poisson(self.overrides_per_min * seconds / 60))
+            for begin in (time[0] + rng.uniform(0, seconds, count)).tolist():
+                driver[part] |= (time >= begin) & (time < begin + self.override_s)
+        return replace(
+            log, accel_cmd=np.where(driver, -log.accel_cmd, log.accel_cmd), engaged=log.engaged & ~driver
+        )  # fmt: skip
+
     def _rows(self, log: Log, seed: int) -> Log:
         """Rows are lost first, so a repeated row repeats the one that precedes it in the log."""
         starts = np.array([part.start for part in log.segments()])
@@ -171,7 +194,8 @@ def draw_recorder(rng: np.random.Generator, rate_hz: float) -> Recorder:
     one is held at 20 Hz. Accelerometer: one to three resonances of 3 to 20 Hz, below the log's Nyquist frequency, with
     0.02 to 0.15 m/s² together; quantum 0.01 to 0.05 m/s²; t-distributed noise of scale 0.01 to 0.05 m/s² with 3 to 10
     degrees of freedom. The clocks of command, accel and speed differ by up to 20 ms; up to 2 % of the rows are lost and
-    up to 2 % repeated. Raises `InputError` for a rate of 8 Hz or less, which shows no such vibration.
+    up to 2 % repeated. In every other log a driver takes over 0.5 to 1.5 times a minute for 2 to 6 s. Raises
+    `InputError` for a rate of 8 Hz or less, which shows no such vibration.
 
     Example:
         >>> import numpy as np
@@ -205,6 +229,8 @@ def draw_recorder(rng: np.random.Generator, rate_hz: float) -> Recorder:
         speed_offset_s=speed - command,
         dropped=float(rng.uniform(0.0, 0.02)),
         repeated=float(rng.uniform(0.0, 0.02)),
+        overrides_per_min=float(rng.uniform(0.5, 1.5)) if rng.random() < 0.5 else 0.0,
+        override_s=float(rng.uniform(2.0, 6.0)),
     )
 
 

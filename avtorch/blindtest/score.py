@@ -10,8 +10,10 @@ import numpy as np
 from scipy.stats import rankdata
 
 from avtorch.arrays import FloatArray
+from avtorch.blindtest import budget_score as of_budget
 from avtorch.blindtest.answers import Answered, read_answer
-from avtorch.blindtest.intervals import Interval, bootstrap, wilson
+from avtorch.blindtest.deck import KINDS
+from avtorch.blindtest.intervals import Interval, bootstrap, cases_for, cases_for_mean, wilson
 from avtorch.blindtest.visibility import TIERS
 from avtorch.errors import InputError
 
@@ -26,16 +28,22 @@ def score(
     resamples: int = 1000,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Measures of the answers (dicts of `avtorch.diagnosis/1`, None where there is none) to the cases of `truths`.
+    """Measures of the answers (`avtorch.diagnosis/1` or `/2`, None where there is none) to the cases of `truths`.
 
     The keys are those of `blindtest.json`, and also `confident_errors`, `alias_set.by_tier`, `counts` (the number of
-    cases behind each measure) and `intervals` (the same keys, `[low, high]` of 90 %). A measure to which no case
-    applies is None.
+    cases behind each measure), `intervals` (the same keys, `[low, high]` of 90 %) and `needed` (how many cases make an
+    interval of ± 5 points, of shares and of measures of several causes). A measure to which no case applies is None.
 
     - `top1` by tier, `alias_set`: single effects only. `false_alarm`: share of the cases without a cause for which the
       verdict is not `none`. `pairs_exact`, `pairs_jaccard`: pairs.
     - `unknown_auroc`, `unknown_fpr95`: the probability of `unknown`, causes outside the table against all other cases.
-      `unknown_confidently_blamed`: share of the former in which a named effect or pair has probability 0.5 or more.
+      `unknown_confidently_blamed`: share of the former in which a named effect or pair has probability 0.5 or more;
+      `blamed_alone`: in which the verdict names effects, and does not say that something material is left.
+    - `partial_wrong`: share of the cases without a cause outside the table that are answered with `partial`.
+    - `several.recall`, `.precision` (weighted by shares), `.sum_error`, `.share_error`, `.unexplained_error`,
+      `.leading`, `.exact`, `.extra`: cases of several causes against the oracle's budget
+      (`avtorch.blindtest.budget_score`). `part_ece`: calibration error of the budgets' parts, all cases.
+    - `utility.group`, `.weighted`, `.by_kind`: of the alias set as an ambiguity group (`avtorch.blindtest.ambiguity`).
     - `confident_errors`, `ece` (ten bins of the highest probability), `brier`: all cases.
     - `macro_f1`: over the labels that occur; an effect found within a pair counts for that effect.
     - `closed_error`, `closed_covered` (by the 90 % interval), `onset_error_s` (median): where the verdict is right.
@@ -58,7 +66,9 @@ def score(
         raise InputError(f"answers: found {len(answers)} for {len(truths)} cases, needs one each")
     rows = [read_answer(truth, answer) for truth, answer in zip(truths, answers, strict=True)]
     sheet = _Sheet(resamples, seed)
-    by_kind = {kind: [r for r in rows if r.kind == kind] for kind in ("none", "single", "pair", "outside")}
+    by_kind = {kind: [r for r in rows if r.kind == kind] for kind in KINDS}
+    # with a cause outside the table beside others, either answer to "unknown?" is right
+    clear = [r for r in rows if r.kind == "outside" or not r.outside]
     for tier in TIERS:
         of_tier = [r for r in by_kind["single"] if r.tier == tier]
         sheet.share(f"top1.{tier}", [r.right for r in of_tier])
@@ -66,15 +76,21 @@ def score(
     sheet.share("alias_set.accuracy", [r.truth in r.alias_set for r in by_kind["single"]])
     sheet.mean("alias_set.mean_size", [len(r.alias_set) for r in by_kind["single"]])
     sheet.share("false_alarm", [not r.right for r in by_kind["none"]])
-    sheet.measure("unknown_auroc", rows, auroc)
-    sheet.measure("unknown_fpr95", rows, fpr95)
+    sheet.measure("unknown_auroc", clear, auroc)
+    sheet.measure("unknown_fpr95", clear, fpr95)
     sheet.share("unknown_confidently_blamed", [r.blamed >= 0.5 for r in by_kind["outside"]])
+    sheet.share("blamed_alone", [r.blamed_alone for r in by_kind["outside"]])
+    sheet.share("partial_wrong", [r.partial for r in rows if not r.outside])
     sheet.share("confident_errors", [r.confidence > 0.9 and r.favourite != r.truth for r in rows])
     sheet.measure("ece", rows, ece)
     sheet.mean("brier", [r.brier for r in rows])
     sheet.measure("macro_f1", rows, macro_f1)
     sheet.share("pairs_exact", [r.right for r in by_kind["pair"]])
     sheet.mean("pairs_jaccard", [_jaccard(r) for r in by_kind["pair"]])
+    _several(sheet, by_kind["several"])
+    sheet.measure("part_ece", [r for r in rows if of_budget.part_probabilities(r)], part_ece)
+    for kind, some in {"group": rows, "weighted": rows, **{f"by_kind.{k}": by_kind[k] for k in KINDS}}.items():
+        sheet.mean(f"utility.{kind}", [r.utility(weighted=kind == "weighted") for r in some])
     sheet.mean("closed_error", [r.closed_error for r in rows if r.closed_error is not None])
     sheet.share("closed_covered", [r.closed_covered for r in rows if r.closed_covered is not None])
     placebos = [r.placebo for r in rows if r.placebo is not None]
@@ -95,7 +111,24 @@ def score(
         "confusion": {truth: dict(sorted(c.items())) for truth, c in sorted(confusion.items())},
         "counts": sheet.counts,
         "intervals": sheet.intervals,
+        "needed": sheet.needed,
     }
+
+
+def _several(sheet: _Sheet, rows: Rows) -> None:
+    """Cases of several causes: which are named, and how the gap is divided among them."""
+
+    def known(of: Callable[[Answered], float | None]) -> list[float]:
+        return [value for value in map(of, rows) if value is not None]
+
+    sheet.measure("several.recall", rows, of_budget.recall, planned=True)
+    sheet.measure("several.precision", [r for r in rows if r.named], of_budget.precision, planned=True)
+    sheet.mean("several.sum_error", known(of_budget.sum_error), planned=True)
+    sheet.mean("several.share_error", known(of_budget.share_error), planned=True)
+    sheet.mean("several.unexplained_error", known(of_budget.unexplained_error), planned=True)
+    sheet.share("several.leading", [of_budget.leading_right(r) for r in rows if r.budget is not None])
+    sheet.share("several.exact", [r.right for r in rows])
+    sheet.share("several.extra", [of_budget.extra_names(r) for r in rows])
 
 
 def auroc(rows: Rows) -> float | None:
@@ -127,11 +160,20 @@ def ece(rows: Rows, bins: int = 10) -> float | None:
     """Expected calibration error: mean difference between confidence and the share of right answers, in equal bins."""
     if not rows:
         return None
-    confidence = np.array([r.confidence for r in rows])
-    right = np.array([r.favourite == r.truth for r in rows], float)
+    return _calibration_error([r.confidence for r in rows], [r.favourite == r.truth for r in rows], bins)
+
+
+def part_ece(rows: Rows, bins: int = 10) -> float | None:
+    """Expected calibration error of the probabilities that budgets give to their parts, each part for itself."""
+    parts = [part for r in rows for part in of_budget.part_probabilities(r)]
+    return _calibration_error([p for p, _ in parts], [true for _, true in parts], bins) if parts else None
+
+
+def _calibration_error(probabilities: Sequence[float], true: Sequence[bool], bins: int) -> float:
+    confidence, right = np.array(probabilities), np.array(true, float)
     which = np.minimum((confidence * bins).astype(int), bins - 1)
     gaps = np.bincount(which, weights=confidence - right, minlength=bins)
-    return float(np.abs(gaps).sum() / len(rows))
+    return float(np.abs(gaps).sum() / len(confidence))
 
 
 def macro_f1(rows: Rows) -> float | None:
@@ -158,34 +200,45 @@ class _Sheet:
         self.values: dict[str, Any] = {}
         self.counts: dict[str, Any] = {}
         self.intervals: dict[str, Any] = {}
+        self.needed: dict[str, Any] = {}
         self._resamples, self._seed = resamples, seed
 
     def _put(self, key: str, value: float | None, count: int, interval: Interval | None) -> None:
-        *path, last = key.split(".")
         for sheet, entry in (
             (self.values, value),
             (self.counts, count),
             (self.intervals, None if interval is None else list(interval)),
         ):
-            for part in path:
-                sheet = sheet.setdefault(part, {})
-            sheet[last] = entry
+            _set(sheet, key, entry)
 
     def share(self, key: str, hits: Sequence[bool]) -> None:
         """A share, with Wilson's interval."""
         self._put(key, float(np.mean(hits)) if hits else None, len(hits), wilson(sum(hits), len(hits)))
+        _set(self.needed, key, cases_for(sum(hits), len(hits)) if hits else None)
 
-    def mean(self, key: str, values: Sequence[float]) -> None:
-        """A mean, bootstrapped."""
+    def mean(self, key: str, values: Sequence[float], *, planned: bool = False) -> None:
+        """A mean, bootstrapped; `planned`: also how many cases it needs."""
         known = np.asarray(values, float)
         interval = bootstrap(
             lambda index: float(known[index].mean()), len(known), resamples=self._resamples, seed=self._seed
         )
         self._put(key, float(known.mean()) if len(known) else None, len(known), interval)
+        if planned:
+            _set(self.needed, key, cases_for_mean(interval, len(known)))
 
-    def measure(self, key: str, rows: Rows, of: Callable[[Rows], float | None]) -> None:
-        """Any measure of rows, with a bootstrap interval."""
+    def measure(self, key: str, rows: Rows, of: Callable[[Rows], float | None], *, planned: bool = False) -> None:
+        """Any measure of rows, with a bootstrap interval; `planned` as of a mean."""
         interval = bootstrap(
             lambda index: of([rows[i] for i in index.tolist()]), len(rows), resamples=self._resamples, seed=self._seed
         )
         self._put(key, of(rows) if rows else None, len(rows), interval)
+        if planned:
+            _set(self.needed, key, cases_for_mean(interval, len(rows)))
+
+
+def _set(sheet: dict[str, Any], key: str, entry: Any) -> None:
+    """Put an entry in a sheet; dots in its key make nested dicts."""
+    *path, last = key.split(".")
+    for part in path:
+        sheet = sheet.setdefault(part, {})
+    sheet[last] = entry

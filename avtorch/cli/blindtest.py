@@ -33,6 +33,13 @@ def blindtest(
         Literal["ideal", "ordinary"],
         Parameter(help="ordinary: filters, quanta, vibration and lost rows as in real logs, drawn for each case."),
     ] = "ideal",
+    mix: Annotated[
+        str | None,
+        Parameter(
+            help="Kinds of case and their shares, none=0.5,several=0.5, or one kind; default: none=0.25,single=0.4,"
+            "pair=0.2,outside=0.15. several: three to five causes at once."
+        ),
+    ] = None,
     rivals: Annotated[
         str | None,
         Parameter(
@@ -55,6 +62,14 @@ def blindtest(
     effects: Annotated[
         str | None, Parameter(group=RECORDED, help="Only these effects, NAME,NAME,...; default: all that can be.")
     ] = None,
+    draws: Annotated[
+        int | None,
+        Parameter(
+            group=RECORDED,
+            converter=whole_number,
+            help="How often effects with random times, roads or gusts are put in front; default: once.",
+        ),
+    ] = None,
     workers: Annotated[int, Parameter(converter=whole_number, help="Processes, one thread each.")] = 1,
     resume: Annotated[bool, Parameter(negative=(), help="Resume the trial in --out.")] = False,
     json: Json = False,
@@ -73,21 +88,24 @@ def blindtest(
             ("--n", n),
             ("--rivals", rivals),
             ("--recorder", None if recorder == "ideal" else recorder),
+            ("--mix", mix),
         ):
             if given is not None:
                 raise InputError(f"{name}: found {given} with --background, which draws no cases; needs one of the two")
     else:
-        for name, given in (("--sizes", sizes), ("--effects", effects)):
+        for name, given in (("--sizes", sizes), ("--effects", effects), ("--draws", draws)):
             if given is not None:
-                raise InputError(f"{name}: found {quoted(given)} without --background; needs the recordings")
+                raise InputError(f"{name}: found {quoted(str(given))} without --background; needs the recordings")
         if n is None:
             raise InputError("--n: missing; see avtorch blindtest --help")
         if n < 1:
             raise InputError(f"--n: found {n}, needs 1 case or more")
     if seed is None:
         raise InputError("--seed: missing; see avtorch blindtest --help")
-    if workers < 1:
-        raise InputError(f"--workers: found {workers}, needs 1 or more")
+    for name, count in (("--workers", workers), ("--draws", draws)):
+        if count is not None and count < 1:
+            raise InputError(f"{name}: found {count}, needs 1 or more")
+    shares = None if mix is None else _shares(mix)
     seed_number(seed)
     free_folder(out)
     if (out / "trial.json").exists() and not resume:
@@ -96,10 +114,10 @@ def blindtest(
     talk = Talk(json=json, quiet=quiet)
     try:
         if background is not None:
-            answer = _recorded(background, seed, out, talk, signals, sizes, effects, workers)
+            answer = _recorded(background, seed, out, talk, signals, sizes, effects, draws or 1, workers)
         else:
             assert n is not None
-            answer = _cases(n, seed, out, talk, signals, recorder, "all" if rivals is None else rivals, workers)
+            answer = _cases(n, seed, out, talk, signals, recorder, shares, "all" if rivals is None else rivals, workers)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"answers so far are kept in {out}, --resume goes on") from None
     talk.done(out, answer)
@@ -112,6 +130,7 @@ def _cases(
     talk: Talk,
     signals: Channels,
     recorder: Literal["ideal", "ordinary"],
+    mix: Mapping[str, float] | None,
     rivals: str,
     workers: int,
 ) -> Mapping[str, Any]:
@@ -127,6 +146,7 @@ def _cases(
             workers=workers,
             signals=("accel", "speed") if signals == "both" else (signals,),
             recorder=recorder,
+            mix=mix,
             progress=step,
             publish=False,  # together with the picture
         )
@@ -145,6 +165,7 @@ def _recorded(
     signals: Channels,
     sizes: str | None,
     effects: str | None,
+    draws: int,
     workers: int,
 ) -> Mapping[str, Any]:
     from dataclasses import replace
@@ -168,6 +189,7 @@ def _recorded(
             answerer=trial.avtorch,
             sizes=wanted,
             effects=None if effects is None else [name.strip() for name in effects.split(",")],
+            draws=draws,
             workers=workers,
             progress=step,
             publish=False,
@@ -184,3 +206,25 @@ def _numbers(text: str) -> list[float]:
         return [numeral(part.strip()) for part in text.split(",")]
     except ValueError:
         raise InputError(f"--sizes: found {quoted(text)}, needs numbers such as 0.5,0.8,1.25") from None
+
+
+def _shares(text: str) -> dict[str, float]:
+    """Shares by kind: `none=0.5,several=0.5`, or one kind alone."""
+    from avtorch.blindtest import KINDS
+
+    if text.strip() in KINDS:
+        return {text.strip(): 1.0}
+    shares: dict[str, float] = {}
+    for part in text.split(","):
+        kind, _, share = (x.strip() for x in part.partition("="))
+        try:
+            number = numeral(share)
+        except ValueError:
+            number = -1.0
+        if kind not in KINDS or kind in shares or not 0 <= number <= 1:
+            break
+        shares[kind] = number
+    else:
+        if abs(sum(shares.values()) - 1) <= 1e-9:
+            return shares
+    raise InputError(f"--mix: found {quoted(text)}, needs one of {', '.join(KINDS)}, or shares of them that sum to 1")

@@ -42,6 +42,7 @@ def run_background(
     name: str = "avtorch",
     sizes: Sequence[float] = SIZES,
     effects: Sequence[str] | None = None,
+    draws: int = 1,
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
     publish: bool = True,
@@ -53,10 +54,12 @@ def run_background(
     raises has not answered: where that is a control, no effect is put in front of its log.
 
     Args:
-        answerer: `Log` to a dict of `avtorch.diagnosis/1`, whose `baseline` holds the lag and gain that fit the log.
+        answerer: `Log` to a dict of `avtorch.diagnosis/1` or `/2`, whose `baseline` holds the lag and gain that fit the
+            log.
         seed: of the times, roads and gusts of effects; the same for all sizes of an effect in front of a log.
         sizes: relative to the spread of the log's signals, see `put_in_front`.
         effects: of `IN_FRONT`; default: all.
+        draws: how often each effect is put in front with new times, roads and gusts; once where it has none.
         workers: processes, as in `run_trial`.
         progress: is told (logs answered, of).
         publish: False returns the answer and leaves `out/background.json` to the caller.
@@ -77,9 +80,10 @@ def run_background(
         (6, 0, 6)
     """
     wanted = list(IN_FRONT) if effects is None else list(effects)
-    _check(logs, seed, wanted, sizes, workers)
+    _check(logs, seed, wanted, sizes, draws, workers)
+    sizes = [float(size) for size in sizes]
     with sole_use(out, work="a blind test"):
-        found = _run(logs, seed, Path(out), answerer, name, [float(size) for size in sizes], wanted, workers, progress)
+        found = _run(logs, seed, Path(out), answerer, name, sizes, wanted, draws, workers, progress)
         if publish:
             with answer_set(out, BACKGROUND_FILES) as staged:
                 write_json(staged / "background.json", found)
@@ -88,12 +92,14 @@ def run_background(
 
 @dataclass(frozen=True)
 class _Place:
-    """Number `index` of the trial: recording number `background` as it is, or with an `effect` in front of it."""
+    """Number `index` of the trial: recording number `background` as it is, or with an `effect` in front of it; `draw`:
+    which one of its random draws."""
 
     index: int
     background: int
     effect: str | None
     size: float | None
+    draw: int = 0
 
 
 @dataclass(frozen=True)
@@ -137,14 +143,17 @@ def _run(
     name: str,
     sizes: Sequence[float],
     effects: Sequence[str],
+    draws: int,
     workers: int,
     progress: Callable[[int, int], None] | None,
 ) -> dict[str, Any]:
     folder = TrialFolder(out)
     # by content: a recording may move between two runs
     prints = [fingerprint(replace(log, name=""))[:16] for log in logs]
-    settings = folder.settle({"background": prints, "seed": seed, "sizes": list(sizes), "effects": list(effects)})
-    places, skipped = _places(logs, seed, effects, sizes)
+    settings = {"background": prints, "seed": seed, "sizes": list(sizes), "effects": list(effects)}
+    # without the key where it is 1: trials that were kept before can be resumed
+    settings = folder.settle(settings | ({"draws": draws} if draws > 1 else {}))
+    places, skipped = _places(logs, effects, sizes, draws)
     of, done, notes = len(places), 0, []
 
     def answer(some: Sequence[_Place], cars: Sequence[tuple[float, float] | None]) -> None:
@@ -192,6 +201,7 @@ def _run(
         "seed": seed,
         "sizes": list(sizes),
         "effects": list(effects),
+        "draws": draws,
         "backgrounds": [
             {
                 "name": log.name,
@@ -216,26 +226,27 @@ def _run(
 
 
 def _places(
-    logs: Sequence[Log], seed: int, effects: Sequence[str], sizes: Sequence[float]
+    logs: Sequence[Log], effects: Sequence[str], sizes: Sequence[float], draws: int
 ) -> tuple[list[_Place], list[tuple[int, str, str]]]:
     """All controls, then all that can be put in front of them; and (recording, effect, why) of what cannot."""
     places, skipped = [_Place(b, b, None, None) for b in range(len(logs))], []
     for b, log in enumerate(logs):
         for effect in effects:
-            why = _cannot(log, effect)
+            why = _cannot(log, effect, max(sizes))
             if why is not None:
                 skipped.append((b, effect, why))
                 continue
-            for size in sizes:
-                places.append(_Place(len(places), b, effect, size))
+            for draw in range(draws if draws > 1 and _has_draws(log, effect) else 1):
+                for size in sizes:
+                    places.append(_Place(len(places), b, effect, size, draw))
     return places, skipped
 
 
-def _cannot(log: Log, effect: str) -> str | None:
+def _cannot(log: Log, effect: str, size: float) -> str | None:
     """Why an effect cannot be put in front of a log, whatever the car's lag and gain; None where it can."""
     try:
         with np.errstate(all="ignore"):
-            changed, put_in = put_in_front(log, effect, T_L=1.0, K_L=1.0)
+            changed, put_in = put_in_front(log, effect, T_L=1.0, K_L=1.0, size=size)
     except InputError as error:
         return str(error)
     columns = [(changed.accel_cmd, log.accel_cmd), (changed.accel, log.accel)]
@@ -248,6 +259,12 @@ def _cannot(log: Log, effect: str) -> str | None:
     return None
 
 
+def _has_draws(log: Log, effect: str) -> bool:
+    """Whether an effect in front of a log depends on chance: else all its draws are one."""
+    logs = [put_in_front(log, effect, T_L=1.0, K_L=1.0, seed=seed)[0] for seed in (0, 1)]
+    return fingerprint(logs[0]) != fingerprint(logs[1])
+
+
 def _drawn(place: _Place, log: Log, seed: int, car: tuple[float, float] | None) -> tuple[Log, dict[str, Any]]:
     """The log to answer, under a name that tells nothing, and its truth; `verdict`, `kind` as the folder reads them."""
     truth: dict[str, Any] = {"index": place.index, "background": place.background, "tier": None, "onset_s": None}
@@ -255,7 +272,8 @@ def _drawn(place: _Place, log: Log, seed: int, car: tuple[float, float] | None) 
     if place.effect is None or place.size is None or car is None:
         return replace(log, name=case_name(place.index)), truth | {"kind": "control", "verdict": "control"}
     which = list(IN_FRONT).index(place.effect)
-    draws = int(np.random.default_rng([seed, place.background, which]).integers(2**31))
+    begin = [seed, place.background, which, *([place.draw] if place.draw else [])]
+    draws = int(np.random.default_rng(begin).integers(2**31))
     T_L, K_L = car
     changed, put_in = put_in_front(log, place.effect, T_L=T_L, K_L=K_L, size=place.size, seed=draws)
     truth |= {"kind": "in_front", "verdict": place.effect, "put_in": put_in, "baseline": {"T_L": T_L, "K_L": K_L}}
@@ -270,7 +288,9 @@ def _car(control: Mapping[str, Any] | None) -> tuple[float, float] | None:
     return (T_L, K_L) if T_L > 0 and K_L > 0 else None
 
 
-def _check(logs: Sequence[Log], seed: int, effects: Sequence[str], sizes: Sequence[float], workers: int) -> None:
+def _check(
+    logs: Sequence[Log], seed: int, effects: Sequence[str], sizes: Sequence[float], draws: int, workers: int
+) -> None:
     if not logs:
         raise InputError("logs: found none, needs a recording")
     for log in logs:
@@ -284,8 +304,9 @@ def _check(logs: Sequence[Log], seed: int, effects: Sequence[str], sizes: Sequen
         seen[mark] = log.name
     if not 0 <= seed < 2**63:
         raise InputError(f"seed: found {seed}, needs a whole number from 0 to 2^63 - 1")
-    if workers < 1:
-        raise InputError(f"workers: found {workers}, needs 1 or more")
+    for name, count in (("workers", workers), ("draws", draws)):
+        if count < 1:
+            raise InputError(f"{name}: found {count}, needs 1 or more")
     if not effects or len(set(effects)) < len(effects) or set(effects) - IN_FRONT.keys():
         raise InputError(
             f"effects: found {', '.join(effects) or 'none'}, needs some of {', '.join(IN_FRONT)}, each once"

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from avtorch.blindtest.answers import read_answer
+from avtorch.blindtest.answers import SCHEMAS, read_answer
 from avtorch.errors import InputError
 from avtorch.io import Damaged, Log, Sealed, fingerprint, read_sealed, write_sealed
 
@@ -140,8 +140,13 @@ class TrialFolder:
         accel, speed = (getattr(log, name) if name in signals else None for name in ("accel", "speed"))
         # bit for bit as `Case.log` makes it
         return Log.from_arrays(
-            name=case_name(index), time=log.time, accel_cmd=log.accel_cmd, accel=accel, speed=speed
-        )  # fmt: skip
+            name=case_name(index),
+            time=log.time,
+            accel_cmd=log.accel_cmd,
+            accel=accel,
+            speed=speed,
+            engaged=log.engaged.astype(int),
+        )
 
     def _of(self, index: int, answerer: str | None = None) -> dict[str, Any]:
         assert self._trial is not None, "the trial's settings come first"
@@ -188,5 +193,5 @@ def _fault(kept: Any, truth: Mapping[str, Any]) -> str | None:
     try:
         read_answer(truth, kept["answer"])
     except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
-        return f"the answer is not of avtorch.diagnosis/1 ({type(error).__name__})"
+        return f"the answer is not of {' or '.join(SCHEMAS)} ({type(error).__name__})"
     return None

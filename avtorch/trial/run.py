@@ -48,7 +48,7 @@ def run_trial(
     run it again.
 
     Args:
-        answerers: by name (letters, digits, `_`, `-`): `Log` to a dict of `avtorch.diagnosis/1`.
+        answerers: by name (letters, digits, `_`, `-`): `Log` to a dict of `avtorch.diagnosis/1` or `/2`.
         workers: processes, each with one thread; more than one needs answerers that can be pickled, and a script that
             begins work under `if __name__ == "__main__"`.
         mix, outside, recorder, draw_options: as `avtorch.blindtest.draw_cases`.

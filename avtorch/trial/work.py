@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from avtorch.blindtest import draw_case
-from avtorch.blindtest.answers import read_answer
+from avtorch.blindtest.answers import SCHEMAS, read_answer
 from avtorch.errors import InputError
 from avtorch.io import Log
 from avtorch.io.answers import json_text
 from avtorch.trial.folder import TrialFolder
 
 Answerer = Callable[[Log], dict[str, Any]]
-"""Takes a log, returns an answer of `avtorch.diagnosis/1`.
+"""Takes a log, returns an answer of `avtorch.diagnosis/1` or `/2`.
 
 Example:
     >>> from avtorch.trial import Answerer, reply
@@ -80,6 +80,6 @@ def ask(folder: TrialFolder, name: str, index: int, answerer: Answerer, log: Log
             read_answer(truth, answer)  # the scorer must be able to read it
             json_text(answer)
         except (InputError, KeyError, TypeError, ValueError) as error:
-            answer, fault = None, f"the answer is not of avtorch.diagnosis/1: {type(error).__name__}: {error}"
+            answer, fault = None, f"the answer is not of {' or '.join(SCHEMAS)}: {type(error).__name__}: {error}"
     # a disk that is full is no fault of the answer's
     folder.keep_answer(name, index, answer, error=fault if answer is None else None, **spent)

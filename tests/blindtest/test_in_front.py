@@ -62,19 +62,53 @@ def _neutral(effect: str) -> float:
 
 @pytest.mark.parametrize("effect", IN_FRONT)
 def test_the_response_stays_real(effect: str) -> None:
-    log = recorded(30.0)
+    log = recorded(30.0, 1.5)  # slow enough that a car creeps
     changed, truth = put_in_front(log, effect, T_L=T_L, K_L=K_L, seed=1)
     assert truth
     assert all(np.isfinite(list(truth.values())))
-    rows = changed.rows
-    np.testing.assert_array_equal(changed.time, log.time[:rows])
-    np.testing.assert_array_equal(changed.speed, log.speed[:rows])
+    kept = np.searchsorted(log.time, changed.time)
+    np.testing.assert_array_equal(changed.time, log.time[kept])
+    np.testing.assert_array_equal(changed.speed, log.speed[kept])
     sensor = effect.startswith("sensor") or effect == "outliers"
-    same = np.array_equal(changed.accel, log.accel[:rows]), np.array_equal(changed.accel_cmd, log.accel_cmd[:rows])
+    same = np.array_equal(changed.accel, log.accel[kept]), np.array_equal(changed.accel_cmd, log.accel_cmd[kept])
     assert same == (not sensor, sensor)
     again, _ = put_in_front(log, effect, T_L=T_L, K_L=K_L, seed=1)
     np.testing.assert_array_equal(again.accel_cmd, changed.accel_cmd)
     np.testing.assert_array_equal(again.accel, changed.accel)
+
+
+@pytest.mark.parametrize("size", [0.5, 1.25])
+def test_a_limit_gives_back_the_commands_that_the_car_obeyed(size: float) -> None:
+    """Forwards, the knee makes of every new command the old one; no stretch holds a row beyond the limit."""
+    log = recorded()
+    changed, truth = put_in_front(log, "saturation", T_L=T_L, K_L=K_L, size=size)
+    limit, kept = truth["accel_max_mps2"] / K_L, np.searchsorted(log.time, changed.time)
+    u, old = changed.accel_cmd, log.accel_cmd[kept]  # type: ignore[index]
+    forwards = np.where(u > 0.7 * limit, limit - 0.3 * limit * np.exp(-(u - 0.7 * limit) / (0.3 * limit)), u)
+    np.testing.assert_allclose(forwards, old, atol=1e-12)
+    assert old.max() <= 0.99 * limit
+    assert u.max() > 1.2 * limit
+    share = np.mean(log.accel_cmd[log.accel_cmd > 0] > limit)  # type: ignore[index,operator]
+    assert share == pytest.approx(0.2 * size, abs=0.01)  # a quantile between rows of a smooth command
+    # where rows were dropped a segment ends, and none is shorter than a second
+    assert [part.stop for part in changed.segments()][:-1] == (np.flatnonzero(np.diff(kept) > 1) + 1).tolist()
+    assert min(part.stop - part.start for part in changed.segments()) >= RATE
+    # behind a dropped row the acceleration of the limit has died away
+    begins = [part.start for part in changed.segments()][1:]
+    assert all(kept[b] - 1 - np.flatnonzero(log.accel_cmd[: kept[b]] > 0.99 * limit)[-1] >= T_L * RATE for b in begins)  # type: ignore[index,operator]
+
+
+def test_creep_is_a_push_at_walking_speed() -> None:
+    log = recorded(30.0, 1.5)
+    changed, truth = put_in_front(log, "low_speed_creep", T_L=T_L, K_L=K_L)
+    speed, less = np.asarray(log.speed), log.accel_cmd - changed.accel_cmd  # type: ignore[operator]
+    assert (less[speed > 3.5] == 0).all()
+    assert 0 < speed.min() < 2.5
+    slow = speed < 2.0
+    force = truth["creep_mps2"] * (1 - (speed / 3) ** 2)
+    # K_L times the command that is saved, through the lag, is the force; its slope adds T_L f'
+    slope = np.gradient(force, log.time)
+    np.testing.assert_allclose(K_L * less[slow], (force + T_L * slope)[slow], rtol=0.1, atol=0.02)
 
 
 @pytest.mark.parametrize(
@@ -92,6 +126,9 @@ def test_a_log_without_the_signal_is_refused() -> None:
     bare = Log.from_arrays(time=log.time, accel_cmd=log.accel_cmd, accel=log.accel)
     with pytest.raises(InputError, match="has no speed"):
         put_in_front(bare, "aerodynamic_drag", T_L=T_L, K_L=K_L)
+    never_pulls = Log.from_arrays(time=log.time, accel_cmd=-np.abs(log.accel_cmd), speed=log.speed)
+    with pytest.raises(InputError, match="no positive command"):
+        put_in_front(never_pulls, "saturation", T_L=T_L, K_L=K_L)
     blind = Log.from_arrays(time=log.time, accel_cmd=log.accel_cmd, speed=log.speed)
     with pytest.raises(InputError, match="has no accel,"):
         put_in_front(blind, "sensor_bias", T_L=T_L, K_L=K_L)
@@ -104,4 +141,4 @@ def test_on_a_recording(data_dir: Path) -> None:
             continue
         changed, _ = put_in_front(log, effect, T_L=0.3, K_L=0.95, size=0.8)
         assert np.isfinite(changed.accel_cmd).all()
-        np.testing.assert_array_equal(changed.speed, log.speed[: changed.rows])
+        np.testing.assert_array_equal(changed.speed, log.speed[np.isin(log.time, changed.time)])

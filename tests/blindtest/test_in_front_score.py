@@ -28,6 +28,23 @@ def one(
     return Injected("lap", effect, size, put_in, said("unknown") if control is None else control, answer)
 
 
+def budgeted(*names: str, interval: float = 0.1, **parameters: float) -> dict[str, Any]:
+    """An answer of `avtorch.diagnosis/2`, whose budget tells the parameters; `effects` tells none of them."""
+    parts = []
+    for name in names:
+        own = {key.partition("__")[2]: value for key, value in parameters.items() if key.startswith(f"{name}__")}
+        told = {key: {"mean": x, "q05": x - interval, "q95": x + interval} for key, x in own.items()}
+        share = {"mean": 1 / len(names), "q05": 0.0, "q95": 1.0}
+        parts.append({"names": [name], "alias_set": [name], "probability": 0.9, "share": share, "parameters": told})
+    unexplained = {"share": {"mean": 0.0, "q05": 0.0, "q95": 0.0}, "material": False}
+    bare = said(*names)
+    return bare | {
+        "schema": "avtorch.diagnosis/2",
+        "verdict": {"names": list(names), "partial": False},
+        "budget": {"parts": parts, "chance": [], "unexplained": unexplained},
+    }
+
+
 LATE = {"delay_s": 0.4}
 
 
@@ -100,6 +117,34 @@ def test_sizes_of_a_set_of_effects_and_of_those_untold() -> None:
     assert wrong.size_ratio is None
 
 
+def test_of_two_limits_the_stricter_one_is_seen() -> None:
+    put_in = {"accel_max_mps2": 1.2}
+    alone = one("saturation", put_in, said("saturation", accel_max_mps2=1.5))
+    assert alone.size_ratio == pytest.approx(1.25)
+    assert alone.size_right is True
+    weaker = one("saturation", put_in, said("saturation", accel_max_mps2=0.9), said("saturation", accel_max_mps2=0.9))
+    assert weaker.size_ratio == pytest.approx(1.0)
+    untold = one("saturation", put_in, said("saturation", accel_max_mps2=math.inf))
+    assert (untold.size_ratio, untold.covered) == (None, None)
+
+
+def test_a_budget_tells_sizes_and_their_intervals() -> None:
+    three = budgeted("dead_time", "gust", "road_grade", dead_time__delay_s=0.44, gust__sd_mps2=0.1)
+    trial = one("dead_time", LATE, three, budgeted("road_grade"))
+    assert (trial.held, trial.size_ratio, trial.size_right) == (True, pytest.approx(1.1), True)
+    assert trial.extra == ("gust",)
+    assert trial.covered is True
+    assert one("dead_time", LATE, budgeted("dead_time", dead_time__delay_s=0.44, interval=0.03)).covered is False
+    assert one("dead_time", LATE, said("dead_time", delay_s=0.4)).covered is None  # no interval
+    had = budgeted("dead_time", dead_time__delay_s=0.2)
+    again = one("dead_time", LATE, budgeted("dead_time", dead_time__delay_s=0.6), had)
+    assert again.size_ratio == pytest.approx(1.0)
+    assert again.covered is None  # the interval is of both together
+    found = score_in_front([trial, one("dead_time", LATE, budgeted("dead_time", dead_time__delay_s=0.9)), again])
+    assert (found["totals"]["bounded"], found["totals"]["covered"]) == (2, 1)
+    assert found["totals"]["shares"]["covered"] == 0.5
+
+
 def test_counts_and_shares() -> None:
     trials = [
         one("dead_time", LATE, said("dead_time", delay_s=0.41), size=0.5),
@@ -117,7 +162,10 @@ def test_counts_and_shares() -> None:
     ]
     totals = found["totals"]
     assert [totals[key] for key in keys] == [5, 3, 1, 2, 1, 1, 1, 1]
-    assert totals["shares"] == {"held": 0.6, "size_right": 0.5, "extra": 0.2, "nothing_named": 0.2}
+    shares = {"held": 0.6, "size_right": 0.5, "covered": None, "extra": 0.2, "nothing_named": 0.2}
+    assert totals["shares"] == shares
+    assert [(one["size"], one["trials"], one["held"]) for one in found["by_size"]] == [(0.5, 4, 3), (1.25, 1, 0)]
+    assert found["by_size"][0]["intervals"]["held"] == list(wilson(3, 4) or ())
     assert totals["intervals"]["held"] == list(wilson(3, 5) or ())
     assert totals["intervals"]["size_right"] == list(wilson(1, 2) or ())
     json.dumps([one.to_dict() for one in trials], allow_nan=False)

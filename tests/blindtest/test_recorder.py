@@ -14,6 +14,7 @@ from avtorch.blindtest import Recorder, draw_case, draw_recorder
 from avtorch.blindtest.drives import RATES_HZ
 from avtorch.errors import InputError
 from avtorch.io import Log
+from tests.bars import BAR
 
 RATE = 100
 SHORT = {"seconds": 20.0, "manoeuvre": "steps"}
@@ -124,6 +125,47 @@ def test_rows_are_lost_and_repeated_and_time_stays_in_order(fresh_seed: int) -> 
     np.testing.assert_array_equal(seen.accel[~repeats], log.accel[at][~repeats])  # type: ignore[index]
 
 
+def test_a_driver_acts_against_the_logged_command(fresh_seed: int) -> None:
+    """The motion is the driver's, and the controller that is not obeyed asks for the contrary."""
+    log = drive(600.0, 20)
+    seen = Recorder(overrides_per_min=3.0, override_s=4.0).record(log, fresh_seed)
+    driver = ~seen.engaged
+    np.testing.assert_array_equal(seen.accel, log.accel)
+    np.testing.assert_array_equal(seen.speed, log.speed)
+    np.testing.assert_array_equal(seen.accel_cmd[driver], -log.accel_cmd[driver])  # type: ignore[index]
+    np.testing.assert_array_equal(seen.accel_cmd[~driver], log.accel_cmd[~driver])  # type: ignore[index]
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], driver.astype(int), [0]])))
+    lasts = (edges[1::2] - edges[::2]) / 20
+    assert len(lasts) > 1
+    # all but one at the end of the log last 4 s, or longer where two overlap
+    assert (lasts[:-1] >= 4.0 - 0.051).all()
+    again = Recorder(overrides_per_min=3.0, override_s=4.0, dropped=0.1).record(log, fresh_seed)
+    np.testing.assert_array_equal(again.engaged, seen.engaged[np.searchsorted(log.time, again.time)])
+
+
+@pytest.mark.statistical
+def test_overrides_come_as_often_as_asked(rotating_seed: int) -> None:
+    log = drive(3600.0, 10)
+    seen = Recorder(overrides_per_min=0.5, override_s=0.2).record(log, rotating_seed)
+    begins = int((np.diff(seen.engaged.astype(int)) == -1).sum())
+    # 30 in an hour, by Poisson's law; so short that hardly two overlap
+    assert abs(begins - 30) < BAR * math.sqrt(30) + 1
+
+
+def test_a_case_is_overridden_and_keeps_its_motion() -> None:
+    """Found by trying: which of the first cases have an override depends on their seed alone."""
+    cases = [draw_case(i, 5, mix={"none": 1.0}, recorder="ordinary", seconds=60.0, manoeuvre="steps") for i in range(8)]
+    logs = [case.log() for case in cases]
+    overridden = [not log.engaged.all() for log in logs]
+    assert any(overridden)
+    assert not all(overridden)
+    for case, log in zip(cases, logs, strict=True):
+        at = np.searchsorted(case.run.time, log.time)
+        sign = np.where(log.engaged, 1.0, -1.0)
+        np.testing.assert_array_equal(log.accel_cmd, sign * case.run.command[at])
+        assert log.usable.mean() > 0.2
+
+
 def test_segments_are_recorded_apart(fresh_seed: int) -> None:
     time = np.concatenate([np.arange(300) / RATE, 100 + np.arange(300) / RATE])
     speed = np.repeat([10.0, 20.0], 300)
@@ -169,6 +211,9 @@ def test_drawn_recorders_are_ordinary(rate: int, fresh_seed: int) -> None:
         assert max(abs(x) for x in (r.accel_offset_s, r.speed_offset_s, r.accel_offset_s - r.speed_offset_s)) <= 0.02
         assert 0 <= r.dropped <= 0.02
         assert 0 <= r.repeated <= 0.02
+        assert r.overrides_per_min == 0 or 0.5 <= r.overrides_per_min <= 1.5
+        assert 2 <= r.override_s <= 6
+    assert len({r.overrides_per_min == 0 for r in some}) == 2
 
 
 @pytest.mark.parametrize(
@@ -179,6 +224,7 @@ def test_drawn_recorders_are_ordinary(rate: int, fresh_seed: int) -> None:
         ({"accel_offset_s": math.nan}, "accel_offset_s: found nan"),
         ({"dropped": 1.0}, "dropped: found 1.0"),
         ({"accel_noise_dof": 0.0}, "accel_noise_dof: found 0.0"),
+        ({"overrides_per_min": -1.0}, "overrides_per_min: found -1.0"),
         ({"vibration_mps2": 0.1}, "vibration_hz: found none"),
         ({"vibration_hz": (0.0,)}, r"vibration_hz: found \(0.0,\)"),
     ],

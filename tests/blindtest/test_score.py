@@ -7,7 +7,7 @@ import pytest
 
 from avtorch.blindtest.answers import canonical_name, read_answer
 from avtorch.blindtest.catalogue import EFFECTS
-from avtorch.blindtest.intervals import bootstrap, wilson
+from avtorch.blindtest.intervals import bootstrap, cases_for, cases_for_mean, wilson
 from avtorch.blindtest.score import score
 from avtorch.errors import InputError
 from tests.bars import BAR
@@ -177,6 +177,30 @@ def test_bad_answers_are_named() -> None:
         read_answer(case, broken)
     with pytest.raises(InputError, match="answers"):
         score([case], [])
+
+
+def test_how_many_cases_an_interval_of_five_points_takes() -> None:
+    assert cases_for(0, 0) == 268  # the worst case, a share of a half
+    for hits, trials in ((5, 10), (9, 10), (60, 100), (2, 2)):
+        needed = cases_for(hits, trials)
+        middle = sum(wilson(hits, trials) or ()) / 2
+        low, high = wilson(round(middle * needed), needed) or (0, 0)
+        assert (high - low) / 2 == pytest.approx(0.05, rel=0.02)
+    assert cases_for(500, 1000) == 1000  # enough
+    assert cases_for(2, 2) > cases_for(20, 20) > cases_for(60, 60)
+    assert cases_for_mean((0.4, 0.6), 50) == 200
+    assert cases_for_mean((0.46, 0.54), 50) == 50
+    assert cases_for_mean((0.5, 0.5), 3) == 30
+    assert cases_for_mean(None, 0) is None
+
+
+def test_needed_cases_stand_beside_the_shares() -> None:
+    cases = truths()
+    s = score(cases, [perfect(t) for t in cases], resamples=10)
+    count = s["counts"]["false_alarm"]
+    assert s["needed"]["false_alarm"] == cases_for(0, count)
+    assert s["needed"]["top1"].keys() == s["top1"].keys()
+    assert s["needed"]["several"]["recall"] is None  # no such case
 
 
 @pytest.mark.statistical

@@ -77,6 +77,20 @@ def test_an_ordinary_recorder_is_a_setting_of_the_trial(
     assert "trial with draw {'recorder': 'ordinary'}; found {}" in capsys.readouterr().err
 
 
+def test_a_mix_is_a_setting_and_few_cases_are_reported(
+    quick: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["blindtest", "--n", "2", "--seed", "4", "--rivals", "none", "--out", str(tmp_path / "x")]
+    assert main([*line, "--mix", "none"]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    answer = json.loads((tmp_path / "x" / "blindtest.json").read_text(encoding="utf-8"))
+    assert answer["mix"] == {"none": 1.0}
+    needed = answer["needed"]["false_alarm"]
+    assert f"Too few cases for intervals of ± 5 points, which take {needed} none (of 2)" in told
+    assert main([*line, "--resume"]) == 2
+    assert "mix" in capsys.readouterr().err
+
+
 @pytest.fixture
 def laps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     # short names: the terminal wraps long ones
@@ -103,6 +117,9 @@ def test_effects_in_front_of_recordings(
     assert {"background.json", "trial.json", "truth", "answers"} == {p.name for p in out.glob("[!.]*")}
     answer = json.loads((out / "background.json").read_text(encoding="utf-8"))
     assert answer["sizes"] == [0.5, 0.8, 1.25]
+    assert [(one["size"], one["trials"]) for one in answer["by_size"]] == [(0.5, 4), (0.8, 4), (1.25, 4)]
+    needed = answer["totals"]["needed"]["held"]
+    assert f"± 5 points: 12, which take some {needed}" in " ".join(told.split())
     assert answer["totals"]["nothing_named"] == answer["totals"]["trials"] == len(quick) - 2 == 12
     assert main(line) == 2
     assert "--resume" in capsys.readouterr().err
@@ -123,11 +140,18 @@ def test_effects_in_front_of_recordings(
         (["--background", "LAP", "--n", "3"], "--n: found 3 with --background"),
         (["--background", "LAP", "--rivals", "none"], "--rivals: found none with --background"),
         (["--background", "LAP", "--recorder", "ordinary"], "--recorder: found ordinary with --background"),
+        (["--background", "LAP", "--mix", "several"], "--mix: found several with --background"),
+        (["--background", "LAP", "--draws", "0"], "--draws: found 0"),
         (["--background", "LAP", "--sizes", "big"], "--sizes: found 'big'"),
         (["--background", "LAP", "--sizes", "-1"], "sizes: found -1"),
         (["--background", "LAP", "--effects", "wings"], "effects: found wings"),
         (["--n", "1", "--sizes", "1"], "--sizes: found '1' without --background"),
         (["--n", "1", "--effects", "gust"], "--effects: found 'gust' without --background"),
+        (["--n", "1", "--draws", "2"], "--draws: found '2' without --background"),
+        (["--n", "1", "--mix", "many"], "--mix: found 'many'"),
+        (["--n", "1", "--mix", "none=0.5,several=0.4"], "--mix: found 'none=0.5,several=0.4'"),
+        (["--n", "1", "--mix", "none=0.5,none=0.5"], "--mix: found 'none=0.5,none=0.5'"),
+        (["--n", "1", "--mix", "none=x"], "--mix: found 'none=x'"),
         ([], "--n: missing"),
         (["--n", "1", "--recorder", "poor"], "--recorder"),
     ],

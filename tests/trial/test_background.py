@@ -14,7 +14,7 @@ from avtorch.blindtest import IN_FRONT, put_in_front
 from avtorch.errors import InputError
 from avtorch.io import Log, read_sealed
 from avtorch.trial import SIZES, reply, run_background
-from avtorch.trial.folder import TRUTH
+from avtorch.trial.folder import TRIAL, TRUTH
 from avtorch.trial.rivals import random_guess
 
 T_L, K_L = 0.4, 0.9
@@ -107,11 +107,29 @@ def test_what_a_log_cannot_show_is_left_out(tmp_path: Path) -> None:
 
     found = run(tmp_path, [never_brakes], answerer=knows_nothing, effects=None, sizes=(1.0,))
     left_out = {one["effect"]: one["why"] for one in found["skipped"]}
-    assert set(left_out) == {"sensor_bias", "sensor_scale", "sensor_lag", "outliers", "brake_throttle_asymmetry"}
+    sensors = {"sensor_bias", "sensor_scale", "sensor_lag", "outliers"}
+    assert set(left_out) == sensors | {"brake_throttle_asymmetry", "low_speed_creep"}
     assert "has no accel" in left_out["sensor_bias"]
     assert "nothing changes" in left_out["brake_throttle_asymmetry"]
+    assert "nothing changes" in left_out["low_speed_creep"]  # never below 3 m/s
     assert [cell["effect"] for cell in found["table"]] == [effect for effect in IN_FRONT if effect not in left_out]
     assert found["totals"]["shares"]["nothing_named"] == 1.0
+
+
+def test_effects_with_chance_are_drawn_as_often_as_asked(tmp_path: Path) -> None:
+    ears = Ears()
+    found = run(tmp_path, [recording(1)], answerer=ears, effects=["dead_time", "gain_change"], sizes=(1.0,), draws=3)
+    counts = {cell["effect"]: cell["trials"] for cell in found["table"]}
+    assert counts == {"dead_time": 1, "gain_change": 3}  # a dead time is the same whenever it is drawn
+    moments = [one["put_in"]["change_s"] for one in found["trials"] if one["effect"] == "gain_change"]
+    assert len(set(moments)) == 3
+    assert len(ears.logs) == 5
+    with pytest.raises(InputError, match="draws"):
+        run(tmp_path, [recording(1)], effects=["dead_time", "gain_change"], sizes=(1.0,), draws=2)
+    # one draw is the first of three, and its folder is that of a trial without draws
+    alone = run(tmp_path / "one", [recording(1)], effects=["gain_change"], sizes=(1.0,))
+    assert alone["trials"][0]["put_in"]["change_s"] == moments[0]
+    assert "draws" not in read_sealed(tmp_path / "one" / "trial.json", schema=TRIAL).content
 
 
 @pytest.mark.parametrize("fails", ["control", "injected"])
@@ -141,6 +159,7 @@ def test_who_fails_has_not_answered(fails: str, tmp_path: Path) -> None:
         ({"logs": [recording(1), recording(1, name="copy")]}, "copy: holds the same drive as lap"),
         ({"seed": -1}, "seed: found -1"),
         ({"workers": 0}, "workers: found 0"),
+        ({"draws": 0}, "draws: found 0"),
         ({"effects": ["wings"]}, "effects: found wings"),
         ({"effects": ["gust", "gust"]}, "effects: found gust, gust"),
         ({"sizes": (0.0,)}, "sizes: found 0"),

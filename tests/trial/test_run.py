@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from avtorch.errors import InputError
@@ -54,6 +55,29 @@ def test_answers_are_kept_and_only_missing_ones_are_asked_for(tmp_path: Path) ->
     assert sum(sum(row.values()) for row in more["confusion"].values()) == 7
     # truths are stored apart from the input of an answerer
     assert not {"truth", "logs"} & {p.name for p in (tmp_path / "answers").rglob("*")}
+
+
+def test_kept_logs_keep_who_drove(tmp_path: Path) -> None:
+    first, again = Asked(), Asked()
+    options: dict[str, Any] = {"mix": {"none": 1.0}, "seconds": 60.0, "recorder": "ordinary", "keep_logs": True}
+    run_trial(6, 5, tmp_path, answerers={"first": first}, **options)
+    run_trial(6, 5, tmp_path, answerers={"again": again}, **options)
+    assert not all(log.engaged.all() for log in first.logs)
+    for one, other in zip(first.logs, again.logs, strict=True):
+        np.testing.assert_array_equal(one.engaged, other.engaged)
+        np.testing.assert_array_equal(one.accel_cmd, other.accel_cmd)
+
+
+@pytest.mark.slow
+def test_several_causes_are_divided_alike_when_drawn_again(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"mix": {"several": 1.0}, "seconds": 30.0, "signals": ("speed",)}
+    found = run_trial(1, 5, tmp_path, answerers={"says_none": Asked()}, **options)
+    assert found["several"]["recall"] == 0.0
+    assert found["counts"]["several"]["exact"] == 1
+    truth = read_sealed(tmp_path / "truth" / "case_00000.json", schema=TRUTH).content["truth"]
+    assert list(truth["budget"]["by_channel"]) == ["speed"]
+    # the truth is compared with the kept one
+    assert run_trial(1, 5, tmp_path, answerers={"other": Asked()}, **options)["failed"] == 0
 
 
 def test_other_settings_need_another_folder(tmp_path: Path) -> None:
