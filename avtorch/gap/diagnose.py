@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from avtorch.errors import InputError
-from avtorch.gap.budget.account import account
+from avtorch.gap.budget.account import account, restated
 from avtorch.gap.budget.forward_selection import MOST_PARTS
 from avtorch.gap.budget.parts import MATERIAL
 from avtorch.gap.budget.repaired_model import parameter_draws, repaired_plant
@@ -106,7 +106,7 @@ def diagnose(
     chances = apart.shared(model_probabilities(race.found, left_over(top, race), prior))
     untold = delays.untold(race.found)
     chances = delays.shared(chances, untold)
-    candidates = [_told(f, race, chances[f.name], kinds) for f in race.found]
+    candidates = [_candidate(f, race, chances[f.name], kinds) for f in race.found]
     # for an unknown cause the only model is the bare baseline
     bare = implausible({}, lag_and_gain(race.none))
     candidates.append(Candidate("unknown", chances["unknown"], None, {}, {}, None, bare))
@@ -133,14 +133,16 @@ def diagnose(
     )
     if accounted is not None:
         candidates, verdict = list(accounted.candidates), accounted.verdict
+    budget = None if accounted is None else accounted.budget
     selected = accounted.selection if accounted is not None and accounted.held_out else None
     winner = None if selected is not None else next((f for f in race.found if f.name == verdict.name), None)
     draws = None
     one_mode = winner is not None and (winner.delays is None or len(winner.delays.lengths) == 1)
     if winner is not None and winner.hypothesis.size and winner.name != "none" and posterior == "sgld" and one_mode:
         draws = _draws(winner, seed)
-        told = _told(winner, race, chances[winner.name], kinds, draws)
-        candidates = [told if c.name == winner.name else c for c in candidates]
+        anew = _candidate(winner, race, chances[winner.name], kinds, draws)
+        candidates = [anew if c.name == winner.name else c for c in candidates]
+        budget = None if budget is None else restated(budget, anew)
     noted = tuple(noise_added)
     if not race.complete:
         noted += ("The budget ended the search before all hypotheses were tried: the verdict is provisional.",)
@@ -164,7 +166,7 @@ def diagnose(
     car, beliefs = None, belief(race.none)
     if named and winner is not None:
         car, beliefs = repaired(winner, base, draws), belief(winner, draws)
-    elif selected is not None and accounted is not None and accounted.budget.parts:
+    elif selected is not None and budget is not None and budget.parts:
         car = repaired_plant(selected, base, float(simulator.sigma))
         beliefs = parameter_draws(selected, seed=seed)
     shrinkage = gap_closed(held) if held is not None and named else None
@@ -194,7 +196,7 @@ def diagnose(
         complete=race.complete,
         scope=race.scope,
         notes=noted,
-        budget=None if accounted is None else accounted.budget,
+        budget=budget,
     )
 
 
@@ -228,7 +230,7 @@ def _draws(found: FittedModel, seed: int) -> Draws:
     return posteriors.posterior(found, seed=seed)
 
 
-def _told(
+def _candidate(
     found: FittedModel,
     race: SearchResult,
     probability: float,

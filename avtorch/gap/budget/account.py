@@ -117,6 +117,17 @@ def _by_likelihood(
     return replace(budget, parts=parts, chance=_chance(candidates, verdict, winner))
 
 
+def restated(budget: Budget, candidate: Candidate) -> Budget:
+    """The budget with the parameters of the likelihood's winner as estimated anew, such as from draws."""
+
+    def parameters(name: str, before: Mapping[str, Quantity] | None) -> Mapping[str, Quantity]:
+        return _own_parameters(name, candidate) or before or {}
+
+    parts = tuple(replace(p, parameters=parameters(p.name, p.parameters)) for p in budget.parts)
+    chance = tuple(replace(p, parameters=parameters(p.name, p.parameters)) for p in budget.chance)
+    return replace(budget, parts=parts, chance=chance)
+
+
 def _part(
     part: Part,
     kind: type[Effect],

@@ -97,12 +97,13 @@ def budget(found: Findings) -> list[str]:
     """The sentence on the budget of the gap, and what it divides."""
     if found.budget is None or not found.budget.parts:
         return []
+    these = "this effect" if len(found.budget.names) == 1 else "these effects"
     line = [] if headline(found).endswith(str(found.budget)) else [str(found.budget)]
     errors = [
         f"{name} {error.before:.2g} to {error.left:.2g} {_UNIT[name]} (noise floor {error.floor:.2g})"
         for name, error in found.budget.by_channel.items()
     ]
-    return [*line, f"Error of held-out 10 s rollouts, without and with these effects: {', '.join(errors)}."]
+    return [*line, f"Error of held-out 10 s rollouts, without and with {these}: {', '.join(errors)}."]
 
 
 def onset(found: Findings) -> list[str]:
