@@ -72,14 +72,13 @@ def account(
     epoch, options = logs[0].epoch_s, {"material": material, "seed": seed}
     if winner is not None and not winner.blown:
         selection = largest_first(begun, 0.0)
-        budget = budget_of(selection, epoch_s=epoch, given=True, **options)
-        if named or not budget.unexplained.material:
-            budget = _by_likelihood(budget, candidates, verdict, named, winner)
-            return Account(budget, selection, tuple(candidates), _verdict(budget, verdict), held_out=False)
+        budget = _as_adequate(budget_of(selection, epoch_s=epoch, given=True, **options), candidates)
+        budget = _by_likelihood(budget, candidates, verdict, named, winner)
+        return Account(budget, selection, tuple(candidates), _verdict(budget, verdict), held_out=False)
     selection = select(record, base, kinds, begun=begun, most=most, progress=progress)
     selection = largest_first(selection, material)
     budget = budget_of(selection, epoch_s=epoch, **options)
-    budget = replace(budget, chance=_chance(candidates, verdict, winner))
+    budget = replace(budget, chance=_chance(candidates, verdict, winner, budget.unexplained.probability))
     held_out = tuple(_spread(candidates, budget, kinds))
     return Account(budget, selection, held_out, _verdict(budget, verdict), held_out=True)
 
@@ -102,6 +101,13 @@ def _onsets(winner: FittedModel | None, logs: Sequence[Log]) -> dict[str, float]
     return {e.name: time for e in winner.hypothesis.effects if e.own_onset is None}
 
 
+def _as_adequate(budget: Budget, candidates: Sequence[Candidate]) -> Budget:
+    """The budget of a likelihood that holds: its test of adequacy sees any structure, so what it misses is not there."""
+    doubt = next(c.probability for c in candidates if c.name == "unknown")
+    rest = budget.unexplained
+    return replace(budget, unexplained=replace(rest, material=False, probability=min(rest.probability, doubt)))
+
+
 # by the likelihood -------------------------------------------------------------------------------------------------
 def _by_likelihood(
     budget: Budget,
@@ -113,8 +119,9 @@ def _by_likelihood(
     """The budget whose parts have the likelihood's probabilities, aliases, parameters and onset."""
     by_name = {kind.name: kind for kind in named}
     own = next(c for c in candidates if c.name == verdict.name)
-    parts = tuple(_part(part, by_name[part.name], own, candidates, verdict, winner) for part in budget.parts)
-    return replace(budget, parts=parts, chance=_chance(candidates, verdict, winner))
+    left = budget.unexplained.probability
+    parts = tuple(_part(part, by_name[part.name], own, candidates, verdict, winner, left) for part in budget.parts)
+    return replace(budget, parts=parts, chance=_chance(candidates, verdict, winner, left))
 
 
 def restated(budget: Budget, candidate: Candidate) -> Budget:
@@ -135,6 +142,7 @@ def _part(
     candidates: Sequence[Candidate],
     verdict: Verdict,
     winner: FittedModel,
+    left: float,
 ) -> Part:
     aliases = _aliases(part.name, verdict)
     parameters = _own_parameters(part.name, own)
@@ -142,14 +150,16 @@ def _part(
     return replace(
         part,
         alias_set=aliases,
-        probability=_probability(aliases, candidates),
+        probability=_probability(aliases, candidates, left),
         parameters=parameters or part.parameters,
         onset_s=own.onset_s if late else None,
         plausible=not implausible(parameters, {}, [kind]),
     )
 
 
-def _chance(candidates: Sequence[Candidate], verdict: Verdict, winner: FittedModel | None) -> tuple[ChancePart, ...]:
+def _chance(
+    candidates: Sequence[Candidate], verdict: Verdict, winner: FittedModel | None, left: float
+) -> tuple[ChancePart, ...]:
     """The verdict's effects that chance decides."""
     if winner is None:
         return ()
@@ -158,7 +168,7 @@ def _chance(candidates: Sequence[Candidate], verdict: Verdict, winner: FittedMod
     out = []
     for kind in random:
         parameters = _own_parameters(kind.name, own)
-        probability = _probability(_aliases(kind.name, verdict), candidates)
+        probability = _probability(_aliases(kind.name, verdict), candidates, left)
         out.append(ChancePart(kind.name, probability, None, parameters, not implausible(parameters, {}, [kind])))
     return tuple(sorted(out, key=lambda part: -part.probability))
 
@@ -175,11 +185,14 @@ def _aliases(name: str, verdict: Verdict) -> tuple[str, ...]:
     return (name, *swapped)
 
 
-def _probability(aliases: Sequence[str], candidates: Sequence[Candidate]) -> float:
-    """That one of them is there: of all hypotheses that hold one."""
-    total = math.fsum(c.probability for c in candidates)
-    held = math.fsum(c.probability for c in candidates if set(aliases) & set(c.effects))
-    return min(held / total, 1.0)
+def _probability(aliases: Sequence[str], candidates: Sequence[Candidate], left: float) -> float:
+    """That one of them is there: of all hypotheses that hold one.
+
+    `left`: the probability that something reproducible is left; as far as nothing is, the cause is not an unknown one.
+    """
+    weights = {c.name: c.probability * (left if c.name == "unknown" else 1.0) for c in candidates}
+    held = math.fsum(weights[c.name] for c in candidates if set(aliases) & set(c.effects))
+    return min(held / math.fsum(weights.values()), 1.0)
 
 
 def _own_parameters(name: str, candidate: Candidate) -> Mapping[str, Quantity]:

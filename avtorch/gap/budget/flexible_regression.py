@@ -10,6 +10,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.held_out_evidence import Evidence, agreement
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.likelihood.basis import lowpass
 
@@ -75,7 +76,7 @@ def left_over(fitting: RobustFit, fit: Fit) -> FloatArray:
 def foretold(fitting: RobustFit, fit: Fit, residuals: FloatArray) -> FloatArray:
     """What the regression makes of `residuals` (channel, row), each block by a fit to the other folds.
 
-    The ridge is what foretells held-out blocks best; where none does better than nothing, nothing.
+    The ridge is what foretells held-out blocks best; where these do not agree on it more surely than chance, nothing.
     """
     whitening, record = fitting.whitening, fit.model.record
     shapes = columns(fit)
@@ -83,7 +84,8 @@ def foretold(fitting: RobustFit, fit: Fit, residuals: FloatArray) -> FloatArray:
     fold = whitening.spread(fitting.fold.astype(float))
     fold = np.tile(fold, len(record.channels))
     row_fold = np.where(record.block >= 0, fitting.fold[np.minimum(record.block, len(fitting.fold) - 1)], -1)
-    best, least = np.zeros_like(residuals), float((fitting.nats(whitening(residuals))).sum())
+    before = fitting.nats(whitening(residuals))
+    best, after = np.zeros_like(residuals), before
     for ridge in _RIDGES:
         out = np.zeros_like(residuals)
         for k in range(int(fitting.fold.max()) + 1):
@@ -92,10 +94,13 @@ def foretold(fitting: RobustFit, fit: Fit, residuals: FloatArray) -> FloatArray:
             coefficients = np.linalg.solve(gram + ridge * kept.sum() * np.eye(len(X)), X[:, kept] @ y[kept]) / scale
             rows = row_fold == k
             out[:, rows] = np.tensordot(coefficients, shapes[..., rows], 1)
-        cost = float(fitting.nats(whitening(residuals - out)).sum())
-        if cost < least:
-            best, least = out, cost
-    return best
+        cost = fitting.nats(whitening(residuals - out))
+        if cost.sum() < after.sum():
+            best, after = out, cost
+    white, found = whitening(residuals), whitening(best)
+    errors, freedom = agreement(whitening.by_block(white * found), whitening.by_block(found**2))
+    evidence = Evidence(float((before - after).sum()), errors, freedom)
+    return best if evidence.strength(len(_RIDGES)) > 0 else np.zeros_like(residuals)
 
 
 def _white(fitting: RobustFit, shapes: FloatArray, residuals: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
