@@ -37,8 +37,8 @@ def printable(text: str, most: int | None = None) -> str:
     if most is not None and len(text) > most:
         text = _shortened(text, most)
     if not text.isprintable():
-        shown = (c if c.isprintable() or unicodedata.category(c) == "Zs" else _escape(c) for c in text)
-        text = "".join(shown)
+        characters = (c if c.isprintable() or unicodedata.category(c) == "Zs" else _escape(c) for c in text)
+        text = "".join(characters)
         if most is not None and len(text) > most:
             text = _shortened(text, most)
     return text
@@ -54,9 +54,9 @@ def quoted(text: str, most: int = 40) -> str:
 def listed(names: Iterable[str]) -> str:
     """The first dozen of `names`, escaped and shortened, and the number of the rest."""
     all_ = list(names)
-    shown = ", ".join(printable(name, _NAME) for name in all_[:_NAMES])
+    listing = ", ".join(printable(name, _NAME) for name in all_[:_NAMES])
     rest = len(all_) - _NAMES
-    return f"{shown} and {rest} more" if rest > 0 else shown
+    return f"{listing} and {rest} more" if rest > 0 else listing
 
 
 def _shortened(text: str, most: int) -> str:

@@ -102,7 +102,7 @@ def _onsets(winner: FittedModel | None, logs: Sequence[Log]) -> dict[str, float]
 
 
 def _as_adequate(budget: Budget, candidates: Sequence[Candidate]) -> Budget:
-    """The budget of a likelihood that holds: its test of adequacy sees any structure, so what it misses is not there."""
+    """The budget where the likelihood holds: its test of adequacy sees any structure; what it misses is not there."""
     doubt = next(c.probability for c in candidates if c.name == "unknown")
     rest = budget.unexplained
     return replace(budget, unexplained=replace(rest, material=False, probability=min(rest.probability, doubt)))

@@ -50,11 +50,11 @@ class SensorLag(Effect):
         return x, x, None
 
     def advance(self, x: Tensor, row: EffectContext, state: Any) -> tuple[Tensor, Any]:
-        shown, before, dt = state
+        measured, before, dt = state
         if dt is not None:
             keep, old, new = self._weights(dt)
-            shown = keep * shown + old * before + new * x
-        return shown, (shown, x, row.dt)
+            measured = keep * measured + old * before + new * x
+        return measured, (measured, x, row.dt)
 
     def over(self, x: Tensor, row: EffectContext) -> Tensor:
         dt = row.dt[..., :-1] if bool(row.dt.dim() and row.dt.min() != row.dt.max()) else row.dt.reshape(-1)[:1]

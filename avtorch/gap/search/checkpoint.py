@@ -45,7 +45,7 @@ class StoredFit:
     noise: NoiseModel
     log_prior: float
 
-    def found(self, hypothesis: Hypothesis, onset: int | None) -> FittedModel:
+    def fitted_model(self, hypothesis: Hypothesis, onset: int | None) -> FittedModel:
         """The fitted model that results from this fit."""
         record = hypothesis.record
         white = whitening_filter(record, self.noise, onset=onset)

@@ -85,8 +85,8 @@ def _in_words(baseline: GapPlant) -> str:
     values = [f"{name}={x:g}" for name in ("T_L", "K_L") if isinstance(x := getattr(baseline, name), (int, float))]
     for effect in baseline.effects:
         given = [(f.name, getattr(effect, f.name)) for f in fields(effect)]
-        shown = [f"{name}={x:g}" for name, x in given if isinstance(x, (int, float)) and not isinstance(x, bool)]
-        values.append(f"{effect.name}({', '.join(shown)})")
+        arguments = [f"{name}={x:g}" for name, x in given if isinstance(x, (int, float)) and not isinstance(x, bool)]
+        values.append(f"{effect.name}({', '.join(arguments)})")
     return ", ".join(values)
 
 

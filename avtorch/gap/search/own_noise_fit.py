@@ -57,7 +57,7 @@ class OwnNoiseFits:
         start = self.checkpoint.start(hypothesis, z, noise, onset, rounds)
         known = self.checkpoint.next(start)
         if known is not None:
-            return known.found(hypothesis, onset)
+            return known.fitted_model(hypothesis, onset)
         # on averaged commands first, which is several times as fast and ends close by
         for coarse in (True, False) if record.group > 1 else (False,):
             value, best = -np.inf, (z, noise)
@@ -81,7 +81,7 @@ class OwnNoiseFits:
                 value = new
             z, noise = best
         self.checkpoint.keep(start, StoredFit(z, noise, log_prior))
-        return StoredFit(z, noise, log_prior).found(hypothesis, onset)
+        return StoredFit(z, noise, log_prior).fitted_model(hypothesis, onset)
 
     @staticmethod
     def _traded(

@@ -40,7 +40,7 @@ class PairSearch:
     budget: TimeBudget
     progress: Callable[[str, int, int], None]
 
-    def found(self, singles: Sequence[FittedModel], none: FittedModel) -> list[FittedModel]:
+    def fitted(self, singles: Sequence[FittedModel], none: FittedModel) -> list[FittedModel]:
         """Pairs with noise of their own, built on the best of `singles`; empty where none of those gains on `none`."""
         single = sorted((f for f in singles if f.name != "none"), key=lambda f: -f.log_evidence)
         if not single or single[0].log_evidence < none.log_evidence + LEAST:
@@ -97,7 +97,7 @@ class PairSearch:
                 break
             forms = screen(hypothesis, blown.white, z[None], onsets=hypothesis.effects[-1].own_onset is None)
             look = max((refine(form, blown.white) for form in forms), key=lambda form: form.value)
-            under = StoredFit(look.z, blown.noise.noise, 0.0).found(look.hypothesis, look.onset)
+            under = StoredFit(look.z, blown.noise.noise, 0.0).fitted_model(look.hypothesis, look.onset)
             both = self.random.forced_as(blown, under)
             if both.name not in made or made[both.name].log_evidence < both.log_evidence:
                 made[both.name] = both

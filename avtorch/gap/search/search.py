@@ -148,7 +148,7 @@ class Search:
         if self.pairs and not self.budget.spent():
             self._paired = True
             pairs = PairSearch(kinds, self._random, self.fits, self.budget, self.progress)
-            found += pairs.found(found, none)
+            found += pairs.fitted(found, none)
         return found
 
     def _left_behind(self, rest: Sequence[Screened], white: WhiteningFilter, none: FittedModel) -> list[FittedModel]:

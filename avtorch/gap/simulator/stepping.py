@@ -85,10 +85,10 @@ def begin(
     for e in bodies:
         at = _draw(past, e, row, past.row)
         memory[e.name] = e.advance(own, at, e.start(own, at))[1]
-    shown = a
+    measured = a
     for e in at_place(effects, "sensor"):
         at = _draw(past, e, row, past.row)
-        shown, memory[e.name] = e.advance(shown, at, e.start(shown, at))
+        measured, memory[e.name] = e.advance(measured, at, e.start(measured, at))
     return replace(past, actuator=actuator_of(effects).steady_state(own), force=force, memory=memory)
 
 

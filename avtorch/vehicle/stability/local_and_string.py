@@ -1,4 +1,4 @@
-"""The verdicts on a setting: locally stable, string stable, peak gain; with and without dead time."""
+"""Is a setting locally stable and string stable, and what is its peak gain? With and without dead time."""
 
 from __future__ import annotations
 
