@@ -11,8 +11,8 @@ is work on sound parts, the second the search among parts held to be sound. A gr
 mean of `m` over all pairs of `D` and the true group `T`, divided by that of `T` against itself.
 
 Here a component is an effect of the table, and one more stands for all causes outside it; no cause is the empty set.
-The true group of a case is its cause alone, so a group that lists what the log cannot distinguish is below 1, where
-the benchmark, which knows the ambiguity, would give 1. Divided or not, the two are then the same.
+The benchmark's true group lists all that its circuits cannot distinguish. A case's true group is its causes alone,
+whose utility against itself is 1, so an alias set that lists what no log can tell apart is below 1.
 """
 
 from __future__ import annotations

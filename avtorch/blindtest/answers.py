@@ -154,9 +154,15 @@ def read_answer(truth: Mapping[str, Any], answer: Mapping[str, Any] | None) -> A
 
 
 def _of_case(truth: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of `Answered` that do not depend on the answer."""
     outside = truth["kind"] == "outside" or bool(truth.get("outside"))
-    told = {key: truth[key] for key in ("kind", "tier")} | {"truth": truth["verdict"], "outside": outside}
-    return told | {"true_budget": truth.get("budget")}
+    return {
+        "truth": truth["verdict"],
+        "kind": truth["kind"],
+        "tier": truth["tier"],
+        "outside": outside,
+        "true_budget": truth.get("budget"),
+    }
 
 
 def _alias_set(answer: Mapping[str, Any], verdict: str, budget: AnsweredBudget | None) -> frozenset[str]:

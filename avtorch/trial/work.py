@@ -79,7 +79,7 @@ def ask(folder: TrialFolder, name: str, index: int, answerer: Answerer, log: Log
         try:
             read_answer(truth, answer)  # the scorer must be able to read it
             json_text(answer)
-        except (InputError, KeyError, TypeError, ValueError) as error:
+        except (InputError, KeyError, TypeError, ValueError, AttributeError) as error:
             answer, fault = None, f"the answer is not of {' or '.join(SCHEMAS)}: {type(error).__name__}: {error}"
     # a disk that is full is no fault of the answer's
     folder.keep_answer(name, index, answer, error=fault if answer is None else None, **spent)

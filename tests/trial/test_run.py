@@ -107,13 +107,19 @@ def test_who_fails_or_breaks_the_schema_has_not_answered(tmp_path: Path) -> None
     def not_finite(log: Log) -> dict[str, Any]:
         return reply(log, {"none": 1.0}, why="nan") | {"onset_s": float("nan")}
 
-    every = {"fails": fails, "breaks": breaks, "not_finite": not_finite}
+    def no_budget(log: Log) -> dict[str, Any]:
+        odd = {"parts": ["dead_time"], "chance": [], "unexplained": {"share": {"mean": 0.0}}}
+        return reply(log, {"none": 1.0}, why="odd") | {"schema": "avtorch.diagnosis/2", "budget": odd}
+
+    every = {"fails": fails, "breaks": breaks, "not_finite": not_finite, "no_budget": no_budget}
     found = run_trial(2, 4, tmp_path, answerers=every, **SHORT)
     assert found["failed"] == 2
     assert found["failures"] == ["ValueError: out of ideas"]
     assert {v for row in found["confusion"].values() for v in row} == {"failed"}
     assert "probabilities sum to 0.5" in found["baselines"]["breaks"]["failures"][0]
     assert found["baselines"]["not_finite"]["failed"] == 2
+    assert found["baselines"]["no_budget"]["failed"] == 2
+    assert "not of avtorch.diagnosis/1 or avtorch.diagnosis/2" in found["baselines"]["no_budget"]["failures"][0]
 
 
 @pytest.mark.slow
