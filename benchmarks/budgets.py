@@ -39,7 +39,7 @@ SETS: dict[str, tuple[str, ...]] = {
 """Recordings with commands, by name: the logs of one car."""
 
 
-def said(budget: Budget) -> str:
+def causes(budget: Budget) -> str:
     """Causes with shares and parameters, in one cell of a table."""
     if not budget.names:
         return budget.verdict[0]
@@ -80,7 +80,7 @@ def in_front(logs: Sequence[Log], size: float) -> tuple[int, int]:
         alike = any(effect in part.alias_set for part in budget.parts if part.name in budget.names)
         held, total = held + named, total + 1
         print(
-            f"| {effect} ({truth}) | {'named' if named else 'alias' if alike else 'missed'} | {said(budget)} |",
+            f"| {effect} ({truth}) | {'named' if named else 'alias' if alike else 'missed'} | {causes(budget)} |",
             flush=True,
         )
     return held, total
@@ -111,7 +111,7 @@ def main() -> None:
         unexplained = f"{budget.unexplained.share.mean:.0%}"
         seconds = np.sum([log.seconds for log in logs])
         print(
-            f"| {name} | {seconds:.0f} | {share} | {said(budget)} | {unexplained} | {halves} | {spent:.0f} |",
+            f"| {name} | {seconds:.0f} | {share} | {causes(budget)} | {unexplained} | {halves} | {spent:.0f} |",
             flush=True,
         )
 

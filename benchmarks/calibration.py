@@ -79,8 +79,8 @@ def loop(replications: int, seed: int, windows: int) -> None:
         p = [c.p_value for c in found]
         all_in_all = min(1.0, min(p) * len(p))
         which = "excited windows" if rule else "all windows"
-        shown = "/".join(f"{x:g}" for x in (amplitude if isinstance(amplitude, tuple) else (amplitude,)))
-        print(f"  {mode}, truth {truth}, amplitude {shown}, {which}: {verdict(all_in_all)}")
+        amplitudes = "/".join(f"{x:g}" for x in (amplitude if isinstance(amplitude, tuple) else (amplitude,)))
+        print(f"  {mode}, truth {truth}, amplitude {amplitudes}, {which}: {verdict(all_in_all)}")
         print("    p by window  " + " ".join(f"{x:8.3g}" for x in p))
         print("    used         " + " ".join(f"{c.replications:8d}" for c in found))
         print("    not converged" + " ".join(f"{c.dropped:8d}" for c in found))

@@ -40,12 +40,12 @@ def tried(index: int, *, seed: int, seconds: float, baseline: str | None) -> dic
     case = draw_case(index, seed, mix=NONE, seconds=2 * seconds, manoeuvre=manoeuvre)
     log = case.log()
     half = slice(0, log.rows // 2), slice(log.rows // 2, log.rows)
-    told: dict[str, Any] = {"case": case.name, "manoeuvre": manoeuvre, "T_L": case.car.T_L}
+    row: dict[str, Any] = {"case": case.name, "manoeuvre": manoeuvre, "T_L": case.car.T_L}
     for name, second in (("same", log), ("slower", slower(case, seed=seed + 1 + index))):
         found = compare(log[half[0]], second[half[1]], baseline=baseline)
         ratio = found.car["T_L"].ratio
-        told[name] = {"changed": found.changed, "p_value": found.p_value, "T_L ratio": ratio.to_dict()}
-    return told
+        row[name] = {"changed": found.changed, "p_value": found.p_value, "T_L ratio": ratio.to_dict()}
+    return row
 
 
 def share(hits: Sequence[bool]) -> str:

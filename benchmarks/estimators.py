@@ -69,9 +69,9 @@ def jerk_arms() -> dict[str, dict[str, object]]:
 
 def latent_arms(noise: float, accel_noise: float) -> dict[str, dict[str, object]]:
     """Filters with the default noise levels, and with the simulator's own: noise held over a step, no unknown force."""
-    told = {"process_noise": noise * math.sqrt(DT), "accel_noise": accel_noise, "coloured_sd": 0.01}
+    levels = {"process_noise": noise * math.sqrt(DT), "accel_noise": accel_noise, "coloured_sd": 0.01}
     arms: dict[str, dict[str, object]] = {name: {"estimator": name} for name in ("sgld", "map", "ekf", "ukf")}
-    return arms | {f"{name}, given the noise": {"estimator": name, "noise": told} for name in ("ekf", "ukf")}
+    return arms | {f"{name}, given the noise": {"estimator": name, "noise": levels} for name in ("ekf", "ukf")}
 
 
 def run(
@@ -154,8 +154,8 @@ def score(arm: Arm) -> Score:
 
 
 def _error_over_seeds(by_seed: Tensor) -> Tensor:
-    told = by_seed[~by_seed.isnan().any(-1)]
-    return told.std(0) / math.sqrt(len(told)) if len(told) > 1 else torch.full((2,), torch.nan)
+    finite = by_seed[~by_seed.isnan().any(-1)]
+    return finite.std(0) / math.sqrt(len(finite)) if len(finite) > 1 else torch.full((2,), torch.nan)
 
 
 def pair(values: Tensor, form: str) -> str:

@@ -72,7 +72,7 @@ def score(
             reached.append(belief.excited)
     informed = torch.stack(reached).int().argmax(0) if reached else torch.zeros(len(first))
     due = [change_at + window * (1 + int(k)) for k in informed]
-    seen, moved = torch.stack(excited), torch.stack(moving)
+    informative, moved = torch.stack(excited), torch.stack(moving)
     coverage = torch.cat(inside).double().mean(0)
     pooled = {after: torch.cat(e) for after, e in errors.items() if e}
     median = {after: e.median(0).values for after, e in pooled.items() if len(e)}
@@ -83,7 +83,7 @@ def score(
         "alert_before": sum(early) / len(early),
         "alert_by_one_window": sum(t <= change_at + window + 1e-6 for t in first) / len(first),
         "alert_by_first_excited_window": sum(t <= d + 1e-6 for t, d in zip(first, due, strict=True)) / len(first),
-        "excited_of_moving": float((seen & moved).sum() / moved.sum().clamp_min(1)),
+        "excited_of_moving": float((informative & moved).sum() / moved.sum().clamp_min(1)),
         "coverage_T_L": float(coverage[0]),
         "coverage_K_L": float(coverage[1]),
         "error_before": [float(x) for x in median.get(False, torch.full((2,), torch.nan))],
@@ -125,8 +125,8 @@ def main() -> None:
     )
     print(f"{leader.name}, start {options.start:g} s, noise {options.noise:g} m/s^3, strategy {options.strategy}")
     for name, value in score(run, vehicle=changed).items():
-        shown = f"{value:.4f}" if isinstance(value, float) else value
-        print(f"  {name:32} {shown}")
+        text = f"{value:.4f}" if isinstance(value, float) else value
+        print(f"  {name:32} {text}")
 
 
 if __name__ == "__main__":

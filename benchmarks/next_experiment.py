@@ -56,7 +56,7 @@ def tried(case: Case, limits: Limits, *, seed: int) -> dict[str, Any]:
     log = case.log()
     before = diagnose(log)
     named = [n for n in before.verdict.alias_set if n != "unknown"]
-    told: dict[str, Any] = {
+    row: dict[str, Any] = {
         "case": case.name,
         "truth": case.truth_name,
         "tier": case.tier,
@@ -64,12 +64,12 @@ def tried(case: Case, limits: Limits, *, seed: int) -> dict[str, Any]:
         "confused": len(named) > 1,
     }
     if len(before.verdict.alias_set) < 2:
-        return told
+        return row
     experiment = next_experiment(before, limits)
     if experiment is None:
-        return told
+        return row
     after = diagnose([log, driven(case, experiment, seed=seed)])
-    return told | {
+    return row | {
         "manoeuvre": experiment.manoeuvre.name,
         "nats": experiment.information.nats,
         "margin": experiment.information.margin,
@@ -101,8 +101,8 @@ def main() -> None:
         for key, of in (("right before", "before"), ("right", "after"), ("separated", ""), ("kept", "")):
             hits = sum(r[of][0] == r["truth"] if of else r[key] for r in some)
             interval = wilson(hits, len(some))
-            told = "" if interval is None else f" ({interval[0]:.2f} to {interval[1]:.2f})"
-            print(f"{what}: {key} {hits} of {len(some)}{told}")
+            between = "" if interval is None else f" ({interval[0]:.2f} to {interval[1]:.2f})"
+            print(f"{what}: {key} {hits} of {len(some)}{between}")
     if given.json:
         given.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
 

@@ -61,22 +61,22 @@ def stays(count: int, windows: int, seed: int) -> None:
     for amplitude in AMPLITUDES:
         g = torch.Generator().manual_seed(seed)
         path = constant(vehicles_of(count, g), windows)
-        seen = windows_of(path, amplitude=amplitude, generator=g)
-        pooled = truth_given_all(seen)
+        observed = windows_of(path, amplitude=amplitude, generator=g)
+        pooled = truth_given_all(observed)
         shares = 100 * ((pooled.cdf(path[-1].exp()) - 0.5).abs() <= 0.45).double().mean(0)
         worst = float(pooled.error.max())
         print(f"  amplitude {amplitude:g} m/s^2; pooled: 90 % coverage {three(shares, '.1f')}, grid error {worst:.1g}")
         for mode in MODES:
-            track = track_loop(path, seen, mode=mode, seed=seed)
+            track = track_loop(path, observed, mode=mode, seed=seed)
             row(mode, PooledComparison.of(track, pooled))
             if not bool(track.converged.all()):
                 print(f"    {int((~track.converged).sum())} windows not converged")
-        free = truth_given_all(seen, shared_noise=False)
+        free = truth_given_all(observed, shared_noise=False)
         shift = ((free.mean - pooled.mean[:, :2]) / pooled.sd[:, :2]).square().mean(0).sqrt()
         ratio = (free.sd / pooled.sd[:, :2]).median(0).values
         print(f"  {'pooled, sigma a window':24}{three(shift)}          {'':25}{three(ratio)}")
-        last = torch.tensor([len(seen) - 1])
-        alone = truth_given_all([seen[int(last)]])
+        last = torch.tensor([len(observed) - 1])
+        alone = truth_given_all([observed[int(last)]])
         ratio = (alone.sd / pooled.sd).median(0).values
         shift = ((alone.mean - pooled.mean) / pooled.sd).square().mean(0).sqrt()
         print(f"  {'last window alone':24}{three(shift)}  {'':25}{three(ratio)}", flush=True)
@@ -87,15 +87,15 @@ def carried(count: int, windows: int, seed: int) -> None:
     for amplitude in AMPLITUDES:
         g = torch.Generator().manual_seed(seed)
         path = constant(vehicles_of(count, g), windows)
-        seen = windows_of(path, amplitude=amplitude, generator=g)
-        pooled = truth_given_all(seen)
+        observed = windows_of(path, amplitude=amplitude, generator=g)
+        pooled = truth_given_all(observed)
         print(f"  amplitude {amplitude:g} m/s^2")
         default = SamplerSettings()
         for factor in (1, 16):
             settings = SamplerSettings(chains=factor * default.chains)
             row(
                 f"{settings.chains} chains",
-                PooledComparison.of(track_loop(path, seen, mode="posterior", settings=settings), pooled),
+                PooledComparison.of(track_loop(path, observed, mode="posterior", settings=settings), pooled),
             )
 
 
@@ -113,10 +113,10 @@ def change(count: int, windows: int, seed: int) -> None:
             "drift of 3 % a window": drift(z, rate, windows),
         }
         for name, path in paths.items():
-            seen = windows_of(path, amplitude=amplitude, generator=g)
+            observed = windows_of(path, amplitude=amplitude, generator=g)
             print(f"  amplitude {amplitude:g} m/s^2, {name}")
             for mode in MODES:
-                show(mode, track_loop(path, seen, mode=mode, seed=seed))
+                show(mode, track_loop(path, observed, mode=mode, seed=seed))
 
 
 def show(mode: str, track: Track) -> None:

@@ -100,15 +100,15 @@ def slope_recovered(found: FollowerDiagnosis, grade: np.ndarray) -> dict[str, fl
     z, _ = modes(candidate, white, found.identified.z[None])
     profile = finish(candidate, white, z[0]).profile
     assert profile is not None
-    told, true, first = [], [], 0
+    estimated, true, first = [], [], 0
     for drive, begin in zip(own.record.drives, own.begins, strict=True):
         assert drive.position is not None
         road = RoadGrade().prepared(drive.time, drive.speed, drive.position)
         force = road.force(drive.position, torch.as_tensor(profile[first : first + road.knots]))
-        told.append(-force.numpy() / GRAVITY)
+        estimated.append(-force.numpy() / GRAVITY)
         true.append(grade[begin : begin + len(drive.time)])
         first += road.knots
-    a, b = (x - x.mean() for x in (np.concatenate(told), np.concatenate(true)))
+    a, b = (x - x.mean() for x in (np.concatenate(estimated), np.concatenate(true)))
     return {
         "correlation": float(np.corrcoef(a, b)[0, 1]),
         "rmse": float(np.sqrt(np.mean((a - b) ** 2))),

@@ -86,9 +86,11 @@ def main() -> None:
         for level in LEVELS:
             low, high = found.quantile(0.5 - level / 2), found.quantile(0.5 + level / 2)
             shares = ((low <= truth) & (truth <= high))[used].double().mean(0)
-            told = ", ".join(f"{name} {100 * x:.1f}" for name, x in zip(density.names, shares.tolist(), strict=True))
+            coverage = ", ".join(
+                f"{name} {100 * x:.1f}" for name, x in zip(density.names, shares.tolist(), strict=True)
+            )
             error = 100 * math.sqrt(level * (1 - level) / int(used.sum()))
-            print(f"  {level:.0%} interval covers [%]: {told}; binomial error {error:.1f}", flush=True)
+            print(f"  {level:.0%} interval covers [%]: {coverage}; binomial error {error:.1f}", flush=True)
         some = torch.arange(options.exact)
         exact = integrate(density.select(some))
         good = used[some] & exact.converged

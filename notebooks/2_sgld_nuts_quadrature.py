@@ -128,8 +128,8 @@ off = {}
 for i, name in enumerate(density.names):
     mean, sd = exact.mean[0, i], exact.sd[0, i]
     off[name] = {s: (float((x[:, i].mean() - mean) / sd), float(x[:, i].std() / sd)) for s, x in samplers.items()}
-    told = "".join(f"{m:>+10.3f}, {r:.3f} " for m, r in off[name].values())
-    print(f"{name:8}{float(mean):>10.4f}{float(sd):>10.4f}{'':35}{told}")
+    errors = "".join(f"{m:>+10.3f}, {r:.3f} " for m, r in off[name].values())
+    print(f"{name:8}{float(mean):>10.4f}{float(sd):>10.4f}{'':35}{errors}")
 
 # %% [markdown]
 # Grey is exact, blue is SGLD, the dashed line NUTS, the dotted one the truth. The three lie on top of each other, and

@@ -44,9 +44,9 @@ def change(loop: avtorch.ClosedLoop) -> None:
 supervisor = avtorch.Supervisor(fresh(), window=2.0, strategist=Strategist())
 saved = supervisor.run(SECONDS, events=[(CHANGE_S, change)])
 
-said = [(a.time_s, f"alert, {a.detector}: {a.why}") for a in saved.alerts[0]]
-said += [(a.time_s, f"action, strategies {a.strategies}: {a.why}") for a in saved.actions[0]]
-for time, text in sorted(said, key=lambda entry: entry[0]):
+events = [(a.time_s, f"alert, {a.detector}: {a.why}") for a in saved.alerts[0]]
+events += [(a.time_s, f"action, strategies {a.strategies}: {a.why}") for a in saved.actions[0]]
+for time, text in sorted(events, key=lambda entry: entry[0]):
     print(f"{time:4.0f} s  {text}")
 
 # %% [markdown]
@@ -89,9 +89,9 @@ measures = {
     "jerk_rms_mps3": "jerk, RMS [m/s³]",
     "throughput_vph": "cars an hour at equilibrium",
 }
-told = answer["performance"]
+performance = answer["performance"]
 for key, name in measures.items():
-    print(f"{name:34}{told['without_action'][key]:>16.4g}{told['with_action'][key]:>16.4g}")
+    print(f"{name:34}{performance['without_action'][key]:>16.4g}{performance['with_action'][key]:>16.4g}")
 
 # %% [markdown]
 # Above one in the first two rows, the car amplifies its leader's motion; below one, it damps it. The last row is the
@@ -152,8 +152,8 @@ print(f"{'':24}{'peak gain':>10}{'acceleration':>14}{'jerk [m/s³]':>13}{'clippe
 drove = {}
 for name, run in runs.items():
     m = drove[name] = avtorch.performance(run).row()
-    told_of_it = f"{m['jerk_rms_mps3']:>13.2f}{m['clipped_share']:>9.0%}{m['min_spacing_m']:>19.2f}"
-    print(f"{name:24}{peaks[name]:>10.3f}{m['accel_rms_ratio']:>14.3f}{told_of_it}")
+    columns = f"{m['jerk_rms_mps3']:>13.2f}{m['clipped_share']:>9.0%}{m['min_spacing_m']:>19.2f}"
+    print(f"{name:24}{peaks[name]:>10.3f}{m['accel_rms_ratio']:>14.3f}{columns}")
 
 # %% [markdown]
 # With its lower level both decisions, time gap and gains, are string stable at the true car; without it neither is. On

@@ -77,10 +77,10 @@ plots.show(over_diagnosis.where_figure(found), OUT / "where.png")
 # the effect in far fewer rows.
 
 # %%
-told = found.shrinkage
-if told is not None:
-    top = told.top
-    print(f"{told.metric}: {top.before:.3g} baseline, {top.after:.3g} with the effect, {top.floor:.3g} noise floor")
+scores = found.shrinkage
+if scores is not None:
+    top = scores.top
+    print(f"{scores.metric}: {top.before:.3g} baseline, {top.after:.3g} with the effect, {top.floor:.3g} noise floor")
     if top.closed is not None:
         closed = f"{top.closed.mean:.0%} ({top.closed.q05:.0%} to {top.closed.q95:.0%})"
         print(f"closed {closed} of the reducible gap, on held-out rows")

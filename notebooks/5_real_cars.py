@@ -106,24 +106,24 @@ if there(*LAPS):
     with TemporaryDirectory() as folder:
         kept = Path(folder) / "fits.json"
         as_it_is = avtorch.diagnose(laps, effects=among, pairs=False, checkpoint=kept)
-        told = avtorch.diagnose(laps, effects=among, pairs=False, checkpoint=kept, prior={"unknown": 0})
+        named = avtorch.diagnose(laps, effects=among, pairs=False, checkpoint=kept, prior={"unknown": 0})
     print(f"as usual: {as_it_is.verdict.name}, probability {as_it_is.winner.probability:.2f}")
-    print(f"without unknown: {told.verdict.name}, probability {told.winner.probability:.2f}", end="; ")
-    print(", ".join(f"{name} {q.mean:.2f} ({q.q05:.2f} to {q.q95:.2f})" for name, q in told.winner.parameters.items()))
+    print(f"without unknown: {named.verdict.name}, probability {named.winner.probability:.2f}", end="; ")
+    print(", ".join(f"{name} {q.mean:.2f} ({q.q05:.2f} to {q.q95:.2f})" for name, q in named.winner.parameters.items()))
 
 # %% [markdown]
 # The measured speed fluctuates at 8 to 20 Hz as under no effect of the table, so the right verdict is `unknown`. With
 # that excluded, the verdict is brakes that are stronger than the engine.
 
 # %%
-if there(*LAPS) and told.shrinkage is not None:
-    plots.show(over_diagnosis.shrinkage_figure(told), OUT / "laps.png")
+if there(*LAPS) and named.shrinkage is not None:
+    plots.show(over_diagnosis.shrinkage_figure(named), OUT / "laps.png")
     for metric, words in (
         ("rollout_rmse_speed", "ten seconds"),
         ("rollout_rmse_speed_whole", "a whole lap"),
         ("closed_loop_rmse_speed", "a drive behind a leader"),
     ):
-        moved = told.shrinkage.by_metric[metric]
+        moved = named.shrinkage.by_metric[metric]
         print(f"speed over {words}: error {moved.before:.2g} m/s, with the effect {moved.after:.2g}", end="")
         closed = moved.closed
         print("" if closed is None else f"; closed {closed.mean:.0%} ({closed.q05:.0%} to {closed.q95:.0%})")

@@ -184,9 +184,9 @@ traces = {
 }
 truth = {"T_L": [(0.0, 0.3), (26.0, 1.5)], "K_L": [(0.0, 1.0), (26.0, 0.5)]}
 plots.show(plots.overview_figure(answer, saved.rows.time, traces, truth=truth), OUT / "watched.png")
-told = answer["performance"]
+performance = answer["performance"]
 for key in ("accel_rms_ratio", "jerk_rms_mps3", "min_spacing_m"):
-    print(f"{key}: {told['without_action'][key]:.3g} without action, {told['with_action'][key]:.3g} with")
+    print(f"{key}: {performance['without_action'][key]:.3g} without action, {performance['with_action'][key]:.3g} with")
 
 # %% [markdown]
 # The belief follows lag and gain as it does under the paper's controller: it uses the commands and the response, not

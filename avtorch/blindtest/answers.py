@@ -180,14 +180,14 @@ def _alias_set(answer: Mapping[str, Any], verdict: str, budget: AnsweredBudget |
 
 def _closed_error(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> float | None:
     """Absolute difference between the answer's `closed` and the oracle's."""
-    oracle, said = _oracle_closed(truth, answer), _closed(answer)
-    return None if oracle is None or said is None else abs(float(said["mean"]) - oracle)
+    oracle, closed = _oracle_closed(truth, answer), _closed(answer)
+    return None if oracle is None or closed is None else abs(float(closed["mean"]) - oracle)
 
 
 def _closed_covered(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> bool | None:
     """Whether the 90 % interval of the answer's `closed` covers the oracle's."""
-    oracle, said = _oracle_closed(truth, answer), _closed(answer)
-    return None if oracle is None or said is None else bool(said["q05"] <= oracle <= said["q95"])
+    oracle, closed = _oracle_closed(truth, answer), _closed(answer)
+    return None if oracle is None or closed is None else bool(closed["q05"] <= oracle <= closed["q95"])
 
 
 def _oracle_closed(truth: Mapping[str, Any], answer: Mapping[str, Any]) -> float | None:
@@ -214,11 +214,11 @@ def _onset_error(truth: Mapping[str, Any], answer: Mapping[str, Any], budget: An
     """
     if truth["onset_s"] is None or not truth["onset_scored"]:
         return None
-    said = answer.get("onset_s")
-    if said is None and budget is not None:
+    onset = answer.get("onset_s")
+    if onset is None and budget is not None:
         parts = [part for part in (*budget.parts, *budget.chance) if part.named]
-        said = min((part.onset_s for part in parts if part.onset_s is not None), default=None)
-    return float(truth["drive"]["seconds"]) if said is None else abs(float(said) - float(truth["onset_s"]))
+        onset = min((part.onset_s for part in parts if part.onset_s is not None), default=None)
+    return float(truth["drive"]["seconds"]) if onset is None else abs(float(onset) - float(truth["onset_s"]))
 
 
 def _placebo(answer: Mapping[str, Any]) -> Mapping[str, float] | None:

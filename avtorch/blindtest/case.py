@@ -140,7 +140,7 @@ class Case:
         oracles lack its noise. A case of several causes has its `budget`, and under `outside` those of its causes that
         are not in the table.
         """
-        told = {
+        truth = {
             "schema": "avtorch.blindtest.truth/1",
             "case": self.name,
             "index": self.index,
@@ -163,11 +163,11 @@ class Case:
             "oracle": {metric: {**asdict(o), "closed": o.closed} for metric, o in self.oracles.items()},
         }
         if self.replay is not None:
-            told |= {"budget": self.budget, "outside": [name for name in self.names if name not in EFFECTS]}
+            truth |= {"budget": self.budget, "outside": [name for name in self.names if name not in EFFECTS]}
         # truths kept by trials without recorders stay as they are
         if self.recorder == Recorder.ideal():
-            return told
-        return told | {"recorder": asdict(self.recorder), "oracle": {}}
+            return truth
+        return truth | {"recorder": asdict(self.recorder), "oracle": {}}
 
 
 def write(case: Case, folder: str | os.PathLike[str]) -> Path:

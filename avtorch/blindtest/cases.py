@@ -255,7 +255,7 @@ def _attempt(
         return None
     parameters = {name: values for trial in found for name, values in trial[0].items()}
     # a case of one cause is the drive on which its strength was found
-    run, seen = found[0][1:] if len(found) == 1 else made(parameters)
+    run, fitted = found[0][1:] if len(found) == 1 else made(parameters)
     if not _sound(run, pilots[-1]):
         return None
     moment = parameters["gain_change"]["change_s"] if "gain_change" in parameters else (onset or None)
@@ -267,14 +267,14 @@ def _attempt(
         parameters=parameters,
         onset_s=moment,
         onset_scored=not ("gain_change" in parameters and len(parameters) > 1),
-        visibility=seen.most,
+        visibility=fitted.most,
         visibility_each={name: trial[2].most for trial in found for name in trial[0]},
-        tier=tier_of(seen.most) if parameters else None,
+        tier=tier_of(fitted.most) if parameters else None,
         car=car,
         drive=drive,
         run=run,
-        refit=seen,
-        oracles=oracles(run, seen, foretold="command_hold" not in parameters),
+        refit=fitted,
+        oracles=oracles(run, fitted, predictable="command_hold" not in parameters),
         replay=Replay(run, car, parameters, onset, noise) if kind == "several" else None,
         signals=tuple(name for name in SIGNALS if name in signals),
     )

@@ -153,15 +153,15 @@ class _Follow:
     def command(self, row: int, time: float, speed: float, accel: float, position: float) -> float:
         spacing = self._place[row] - position
         self.nearest = min(self.nearest, spacing)
-        seen, lead = spacing + self._radar[row], self._lead[row]
-        if lead < 0.2 and speed < 0.5 and seen < self._still + 2.0:
+        measured, lead = spacing + self._radar[row], self._lead[row]
+        if lead < 0.2 and speed < 0.5 and measured < self._still + 2.0:
             return -0.8  # stands with the brake on
-        pull = self._spring * (seen - self._still - self._gap * speed) + self._match * (lead - speed)
+        pull = self._spring * (measured - self._still - self._gap * speed) + self._match * (lead - speed)
         wish = min(pull, 1.6) - self._damping * accel
         closing = speed - lead
         if closing > 0:
             # deceleration that matches the leader's speed with 2 m to spare; a driver brakes no later than this
-            needed = closing * closing / (2 * max(seen - 2.0, 0.3))
+            needed = closing * closing / (2 * max(measured - 2.0, 0.3))
             if needed > 0.7:
                 wish = min(wish, -1.3 * needed)
         return _clip(wish)

@@ -1,6 +1,6 @@
 """Scores of answers to recordings with a known effect in front of them, each beside the answer to the untouched log.
 
-What else a recorded car lacks is not known, so an answer is judged by its difference from that of its control: is the
+What else a recorded car lacks is not known, so an answer is scored by its difference from that of its control: is the
 effect named, is its size what was added to the size that the control already had, and is any name new that was not put
 in.
 """
@@ -60,7 +60,7 @@ SIZE_OF: Mapping[str, tuple[str, float, Callable[[float, float, float], float | 
 }
 """By effect: the parameter that is its size, its value without the effect, and how a second one adds to a first.
 
-A diagnosis tells the size of outliers in units of a noise that nobody knows, so their share is compared instead.
+A diagnosis gives the size of outliers in units of a noise that nobody knows, so their share is compared instead.
 """
 
 
@@ -76,7 +76,7 @@ class Injected:
         >>> said = (["gust"], ["gust", "dead_time"])
         >>> control, answer = ({"verdict": {"names": names}, "effects": []} for names in said)
         >>> trial = Injected("lap", "dead_time", 1.0, {"delay_s": 0.3}, control, answer)
-        >>> trial.held, trial.extra, trial.size_ratio  # no size is told
+        >>> trial.held, trial.extra, trial.size_ratio  # the answer gives no size
         (True, (), None)
     """
 
@@ -104,7 +104,7 @@ class Injected:
 
     @property
     def size_ratio(self) -> float | None:
-        """The size found on top of the control's, over the size put in; None where the verdict tells none."""
+        """The size found on top of the control's, over the size put in; None where the answer gives none."""
         parameter, without, relative = SIZE_OF[self.effect]
         found = _quantity(self.answer, self.effect, parameter)
         before = {"mean": without} if not self.in_control else _quantity(self.control, self.effect, parameter)
@@ -159,14 +159,13 @@ class Injected:
 
 
 def score_in_front(trials: Sequence[Injected]) -> dict[str, Any]:
-    """Counts by effect and size in the order of their first trial (`table`), by size (`by_size`), and over all trials
-    (`totals`).
+    """Counts by effect and size (`table`), by size (`by_size`), and over all trials (`totals`).
 
-    Of the `trials`, `held` counts those whose verdict names the effect, `in_control` those whose control names it too,
-    `sized` those held whose size is told, and `size_right` those of them within a quarter of what was put in; `extra`
-    those with a name that neither control nor injection has, `nothing_named` those answered `unknown`, `none` or
-    nothing, `failed` those without an answer. Of the `bounded`, whose size has an interval and is not in the control,
-    `covered` counts those whose interval holds it. `by_size` and `totals` also have shares with Wilson's 90 %
+    Rows are in the order of their first trial. Of the `trials`, `held` counts those whose verdict names the effect, `in_control` those whose control names it too,
+    `sized` those held with a size in the answer, and `size_right` those of them within a quarter of what was put in;
+    `extra` those with a name that neither control nor injection has, `nothing_named` those answered `unknown`, `none`
+    or nothing, `failed` those without an answer. Of the `bounded`, whose size has an interval and is not in the
+    control, `covered` counts those whose interval holds it. `by_size` and `totals` also have shares with Wilson's 90 %
     intervals: of the trials, but `size_right` of the `sized` and `covered` of the `bounded`; and in `needed` how many
     of these make an interval of ± 5 points.
 

@@ -73,13 +73,13 @@ def oracle_budget(replay: Replay, log: Log) -> OracleBudget:
         >>> abs(sum(part["share"] for part in budget["parts"]) + budget["unexplained"]["share"] - 1) < 1e-9
         True
     """
-    foretold = [name for name in replay.effects if not family(name).by_chance]
-    known = [name for name in foretold if name in EFFECTS]
+    predictable = [name for name in replay.effects if not family(name).by_chance]
+    known = [name for name in predictable if name in EFFECTS]
     rollouts = _Rollouts(replay, log)
-    floor = rollouts.floor(foretold)
+    floor = rollouts.floor(predictable)
     # like the others fitted to the log, noise and gusts included: else it would not be the lowest
-    floor = np.maximum(rollouts.squares(rollouts.errors(foretold, *rollouts.fit(foretold, floor))), 1e-12)
-    energy = {frozenset(): rollouts.energy([], floor), frozenset(foretold): 1.0}
+    floor = np.maximum(rollouts.squares(rollouts.errors(predictable, *rollouts.fit(predictable, floor))), 1e-12)
+    energy = {frozenset(): rollouts.energy([], floor), frozenset(predictable): 1.0}
 
     def after(names: Sequence[str]) -> float:
         key = frozenset(names)
@@ -92,14 +92,14 @@ def oracle_budget(replay: Replay, log: Log) -> OracleBudget:
         entered.append(min((n for n in known if n not in entered), key=lambda n: after([*entered, n])))
     levels = [after(entered[:k]) for k in range(len(entered) + 1)]
     taken = [max(b - a, 0.0) for b, a in pairwise(levels)]
-    rest = max(levels[-1] - 1.0, 0.0) if len(known) < len(foretold) else 0.0
+    rest = max(levels[-1] - 1.0, 0.0) if len(known) < len(predictable) else 0.0
     whole = max(sum(taken) + rest, 1e-12)
     before = rollouts.squares(rollouts.errors([], *rollouts.fit([], floor)))
     return OracleBudget(
         before=float(np.sqrt(levels[0])),
         shares={name: share / whole for name, share in zip(entered, taken, strict=True)},
         after={name: float(np.sqrt(level)) for name, level in zip(entered, levels[1:], strict=True)},
-        chance=tuple(name for name in replay.effects if name not in foretold),
+        chance=tuple(name for name in replay.effects if name not in predictable),
         unexplained=rest / whole,
         by_channel={
             name: (float(np.sqrt(b)), float(np.sqrt(f)))
@@ -148,7 +148,7 @@ class _Rollouts:
         return np.array([np.mean(e**2) if len(e) else 0.0 for e in errors])
 
     def floor(self, names: Sequence[str]) -> FloatArray:
-        """Mean squares (channel,) that the car's true lag and gain leave with all causes that can be foretold."""
+        """Mean squares (channel,) that the car's true lag and gain leave with all causes that can be predicted."""
         return np.maximum(self.squares(self.errors(names, self._replay.car.T_L, self._replay.car.K_L)), 1e-12)
 
     def energy(self, names: Sequence[str], floor: FloatArray, *, begin: Sequence[str] | None = None) -> float:

@@ -1,8 +1,8 @@
-"""The reference vehicle driven along a drive that is known: what a model with exact equations foretells of a log.
+"""The reference vehicle driven along a drive that is known: what a model with exact equations predicts of a log.
 
 A model of a car with only some of its causes would drive elsewhere, and a force that depends on speed or place would
 then act elsewhere too. So commands, speed and position are taken from the drive, and only the response to them is
-simulated: what can be foretold from commands, speed and place. No noise, no gusts, no outliers, no lost messages.
+simulated: what can be predicted from commands, speed and place. No noise, no gusts, no outliers, no lost messages.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Replay:
         phase = float(self._stream("delay_jitter").uniform(0, 2 * np.pi))
         bus, actuate = Command({}, lost=None), actuator(car, {}, 0.0)
         push, mode, stages = [], None, []
-        a_out, twist, shown = 0.0, 0.0, 0.0
+        a_out, twist, accel = 0.0, 0.0, 0.0
         accels, filtered = [0.0], [0.0]
         for row in range(rows - 1):
             if row == first:
@@ -102,15 +102,15 @@ class Replay:
                 a_out = actuate(bus.over(time), v[step], time)
                 if mode is not None:
                     twist = mode(a_out - before)
-                shown = a_out + twist
+                accel = a_out + twist
                 for force in push:
-                    shown += force(v[step + 1], x[step + 1], time + STEP_S)
+                    accel += force(v[step + 1], x[step + 1], time + STEP_S)
                 if v[step + 1] <= 0.0:
-                    shown = 0.0
-                accels.append(shown)
+                    accel = 0.0
+                accels.append(accel)
                 for stage in stages:
-                    shown = stage(shown)
-                filtered.append(shown)
+                    accel = stage(accel)
+                filtered.append(accel)
         return self._read(effects, np.array(accels), np.array(filtered), speeds, at, per_row, first, reach)
 
     def _read(

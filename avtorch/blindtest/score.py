@@ -182,15 +182,15 @@ def macro_f1(rows: Rows) -> float | None:
     labels = sorted(set().union(*(truth for truth, _ in pairs))) if pairs else []
     scores = []
     for label in labels:
-        hit = sum(label in truth and label in said for truth, said in pairs)
-        wrong = sum((label in truth) != (label in said) for truth, said in pairs)
+        hit = sum(label in truth and label in named for truth, named in pairs)
+        wrong = sum((label in truth) != (label in named) for truth, named in pairs)
         scores.append(2 * hit / (2 * hit + wrong))
     return float(np.mean(scores)) if scores else None
 
 
 def _jaccard(r: Answered) -> float:
-    truth, said = set(r.truth.split("+")), set(r.verdict.split("+"))
-    return len(truth & said) / len(truth | said)
+    truth, named = set(r.truth.split("+")), set(r.verdict.split("+"))
+    return len(truth & named) / len(truth | named)
 
 
 class _Sheet:

@@ -53,23 +53,23 @@ def ordinary(
     """Trials of the first `count` of the `families` that can be seen on the drive; None where fewer can.
 
     `at_strength(family, strength)` simulates the drive with one of them alone, `excess` is that trial's visibility. A
-    cause outside the table is among them, or there is no case. At least two can be foretold: else no rollout has a gap
+    cause outside the table is among them, or there is no case. At least two can be predicted: else no rollout has a gap
     to divide.
     """
     least, _ = excess_range(_LEAST)
     low, high = STRENGTHS
     strengths = np.exp(rng.uniform(np.log(low), np.log(high), len(families)))
     found: list[T] = []
-    foretold = 0
+    predictable = 0
     for f, strength in zip(families, strengths.tolist(), strict=True):
         trial = None
         if not f.suits or drive.manoeuvre in f.suits:
             trial = at_strength(f, min(strength, f.strongest))
         if trial is not None and excess(trial) >= least:
             found.append(trial)
-            foretold += not f.by_chance
+            predictable += not f.by_chance
         elif f.name not in EFFECTS:
             return None
         if len(found) == count:
-            return found if foretold >= 2 else None
+            return found if predictable >= 2 else None
     return None

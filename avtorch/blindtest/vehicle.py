@@ -139,7 +139,7 @@ class _Drive:
         white_a, white_v = self.white_accel.tolist(), self.white_speed.tolist()
         quantum = self.car.speed_quantum
         accels, speeds, places, filtered = [total], [speed], [position], [total]
-        commands, seen_a, seen_v = [], [], []
+        commands, readings_a, readings_v = [], [], []
         per_row, half = self.per_row, 0.5 * STEP_S
         for row in range(self.rows):
             time = row * per_row * STEP_S
@@ -156,8 +156,8 @@ class _Drive:
             command = self.pilot.command(row, time, read_v, read_a, position)
             bus.send(row, time, command)
             commands.append(command)
-            seen_a.append(read_a)
-            seen_v.append(read_v)
+            readings_a.append(read_a)
+            readings_v.append(read_v)
             for step in range(row * per_row, (row + 1) * per_row):
                 time = step * STEP_S
                 before = a_out
@@ -172,19 +172,19 @@ class _Drive:
                 new = speed + half * (total + ahead)
                 if new <= 0.0:
                     # at rest the brake balances any backward force; it is released when the sum pulls forward
-                    new, shown = 0.0, 0.0
+                    new, accel = 0.0, 0.0
                 else:
-                    shown = ahead
+                    accel = ahead
                 position += half * (speed + new)
                 speed, total = new, ahead
-                accels.append(shown)
+                accels.append(accel)
                 speeds.append(new)
                 places.append(position)
                 if filter_:
                     for stage in filter_:
-                        shown = stage(shown)
-                filtered.append(shown)
-        return self._logged(commands, seen_a, seen_v, accels, speeds, places)
+                        accel = stage(accel)
+                filtered.append(accel)
+        return self._logged(commands, readings_a, readings_v, accels, speeds, places)
 
     def _draw(self) -> None:
         """Draw all random signals that do not depend on the car's motion."""
@@ -210,7 +210,7 @@ class _Drive:
             self.white_accel[hit] += size[hit]
 
     def _chain(
-        self, effects: Mapping[str, Mapping[str, float]], earlier: Command | None, a_out: float, shown: float
+        self, effects: Mapping[str, Mapping[str, float]], earlier: Command | None, a_out: float, accel: float
     ) -> None:
         """Build the chain with these effects, starting from the state of the earlier chain."""
         lost = None
@@ -223,7 +223,7 @@ class _Drive:
         self.actuate = actuator(self.car, effects, a_out)
         self.push = forces(effects, self.stream, reach=self.reach)
         self.mode = driveline(effects["driveline_oscillation"]) if "driveline_oscillation" in effects else None
-        self.filters = filters(effects, shown)
+        self.filters = filters(effects, accel)
         self.sensors = Readings(effects, self.stream, reach=self.reach, seconds=self.seconds, onset=self.onset)
 
     def _read(
@@ -250,25 +250,25 @@ class _Drive:
         """(row,): accelerometer reading of process noise and gusts, with lag and scale, minus these themselves."""
         begin, rows = self.first * self.per_row, np.arange(self.rows) * self.per_row
         motion = self.process + self.gust
-        shown = motion.copy()
+        reading = motion.copy()
         if "sensor_lag" in self.effects:
             (late,) = filters({"sensor_lag": self.effects["sensor_lag"]}, float(motion[begin]))
-            shown[begin:] = [late(x) for x in motion[begin:].tolist()]
+            reading[begin:] = [late(x) for x in motion[begin:].tolist()]
         if "sensor_scale" in self.effects:
-            shown[begin:] *= self.effects["sensor_scale"]["scale"]
-        return (shown - motion)[rows]
+            reading[begin:] *= self.effects["sensor_scale"]["scale"]
+        return (reading - motion)[rows]
 
     def _logged(
         self,
         commands: list[float],
-        seen_a: list[float],
-        seen_v: list[float],
+        readings_a: list[float],
+        readings_v: list[float],
         accels: list[float],
         speeds: list[float],
         places: list[float],
     ) -> Run:
         rows = np.arange(self.rows) * self.per_row
-        accel, speed = np.array(seen_a), np.array(seen_v)
+        accel, speed = np.array(readings_a), np.array(readings_v)
         true_v = np.array(speeds)[rows]
 
         def summed(x: FloatArray) -> FloatArray:

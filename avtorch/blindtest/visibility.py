@@ -195,27 +195,27 @@ class Oracle:
         return (self.before - self.after) / (self.before - self.floor)
 
 
-def oracles(run: Run, fitted: Sight, *, foretold: bool) -> dict[str, Oracle]:
+def oracles(run: Run, fitted: Sight, *, predictable: bool) -> dict[str, Oracle]:
     """`rollout_rmse_accel` [m/s²] and `rollout_rmse_speed` [m/s], over 10 s from a measured value, by metric.
 
-    Over moving rows, from 2 s on. `foretold`: False where the response to the command is random (lost messages), so
+    Over moving rows, from 2 s on. `predictable`: False where the response to the command is random (lost messages), so
     that knowing the cause improves no rollout. Gusts and outliers count towards the floor, as their contribution to the
     log is known.
     """
     dt = float(run.time[1] - run.time[0])
-    judged = (run.true_speed >= _MOVING_MPS) & (run.time >= run.time[0] + _SETTLED_S)
+    rows = (run.true_speed >= _MOVING_MPS) & (run.time >= run.time[0] + _SETTLED_S)
     unit_a, unit_v = exact_gain(run.command, dt, fitted.T_L)
     # the error of an initial acceleration decays with the lag
     keeps = float(np.exp(-dt / fitted.T_L))
-    before_a = _from_all_starts(run.accel - fitted.K_L * unit_a, judged, dt, keeps)
-    before_v = _from_all_starts(run.speed - fitted.K_L * unit_v, judged, dt)
-    if not foretold:
+    before_a = _from_all_starts(run.accel - fitted.K_L * unit_a, rows, dt, keeps)
+    before_v = _from_all_starts(run.speed - fitted.K_L * unit_v, rows, dt)
+    if not predictable:
         return {
             "rollout_rmse_accel": Oracle(before_a, before_a, before_a),
             "rollout_rmse_speed": Oracle(before_v, before_v, before_v),
         }
-    floor_a = _from_all_starts(run.noise_accel + run.chance_accel + run.felt_accel, judged, dt, keeps)
-    floor_v = _from_all_starts(run.noise_speed + run.drift_speed + run.chance_speed, judged, dt)
+    floor_a = _from_all_starts(run.noise_accel + run.chance_accel + run.felt_accel, rows, dt, keeps)
+    floor_v = _from_all_starts(run.noise_speed + run.drift_speed + run.chance_speed, rows, dt)
     return {
         "rollout_rmse_accel": Oracle(before_a, floor_a, floor_a),
         "rollout_rmse_speed": Oracle(before_v, floor_v, floor_v),

@@ -38,7 +38,7 @@ def background_table(answer: Mapping[str, Any]) -> Table:
 def background_notes(answer: Mapping[str, Any]) -> list[str]:
     """What the columns count, what was said of the untouched logs, and what could not be put in or gave no answer."""
     notes = [
-        "size right: within 25 % of what was put in, of those whose size is told. covered: its 90 % interval holds "
+        "size right: within 25 % of what was put in, of answers that give a size. covered: its 90 % interval holds "
         "that. extra: a name that neither the effect nor the untouched log has. nothing: unknown or none."
     ]
     for one in answer["backgrounds"]:

@@ -147,7 +147,7 @@ def diagnose(
     drives = [Log.read(path, map=map, unit=unit, stamp=stamp) for path in logs]
     for path, drive in zip(logs, drives, strict=True):
         _usable(path, drive, accel_kind)
-        _judged(chosen or (), path, drive)
+        _check_effects(chosen or (), path, drive)
     limits = _limits(drives, track)
     if not resume:
         begin_anew(out)
@@ -177,12 +177,12 @@ def diagnose(
             )
     except KeyboardInterrupt:
         if (out / FITS).exists():
-            told = f"no answer was written; finished fits are kept in {out / FITS}: the same command resumes there"
-            raise KeyboardInterrupt(told) from None
+            message = f"no answer was written; finished fits are kept in {out / FITS}: the same command resumes there"
+            raise KeyboardInterrupt(message) from None
         raise
     from avtorch.remedy import setting_for, write_exports
 
-    told = setting_for(found, [x for drive in drives if drive.accel_cmd is not None for x in drive.accel_cmd])
+    setting = setting_for(found, [x for drive in drives if drive.accel_cmd is not None for x in drive.accel_cmd])
     from avtorch.experiment import next_experiment, write_table
     from avtorch.gap.result.diagnosis import DIAGNOSIS_FILES
     from avtorch.io import answer_set
@@ -196,7 +196,7 @@ def diagnose(
     found = replace(
         found,
         notes=notes,
-        setting=None if told is None else told.to_dict(),
+        setting=None if setting is None else setting.to_dict(),
         next_experiment=None if ahead is None else ahead.to_dict(),
     )
     with answer_set(out, DIAGNOSIS_FILES) as staged:
@@ -287,7 +287,7 @@ def _usable(path: Path, drive: Log, accel_kind: str) -> None:
         raise InputError(f"--accel-kind: found specific-force, but {path} has no accel")
 
 
-def _judged(names: Sequence[str], path: Path, drive: Log) -> None:
+def _check_effects(names: Sequence[str], path: Path, drive: Log) -> None:
     """Report a requested effect that the log's channels cannot show."""
     from avtorch.gap import EFFECTS
 

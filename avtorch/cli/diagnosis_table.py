@@ -69,8 +69,8 @@ def diagnosis_table(found: Diagnosis) -> Table:
     table.add_column("probability", no_wrap=True)
     table.add_column("nats", justify="right", no_wrap=True)
     table.add_column("parameters (90 %)")
-    shown, left = _shown(found.candidates)
-    for c in shown:
+    printed, left = _printed(found.candidates)
+    for c in printed:
         first = c.name == found.verdict.name
         style = "bold" if first else None if c.name in found.verdict.alias_set else "dim"
         gain = round(c.log_evidence or 0.0)
@@ -92,20 +92,20 @@ def diagnosis_notes(found: Diagnosis) -> list[str]:
     """Further lines with markup: alias set, onset, size of the gap, what remains, budget."""
     from avtorch.gap.result import sentences
 
-    told = [
+    plain = [
         sentences.aliases(found),
         *sentences.onset(found),
         *sentences.where(found),
         *sentences.moved(found),
         *sentences.gap(found),
     ]
-    told += [
+    plain += [
         *sentences.shrinkage(found),
         *sentences.to_set(found),
         *sentences.to_drive(found),
         *sentences.remains(found),
     ]
-    lines = [escape(line) for line in told]
+    lines = [escape(line) for line in plain]
     if not found.complete:
         text = (
             "The budget ended the search: the answer is provisional; the same command with a larger one resumes here."
@@ -121,14 +121,14 @@ def bar(share: float) -> str:
     return ("█" * full + (_EIGHTHS[part] if part else "")).ljust(BAR)
 
 
-def _shown(candidates: Iterable[Candidate]) -> tuple[list[Candidate], list[Candidate]]:
+def _printed(candidates: Iterable[Candidate]) -> tuple[list[Candidate], list[Candidate]]:
     """Rows to print, and rows left out. The rows of the verdict, `none` and `unknown` are always printed."""
     ranked = list(candidates)
     always = [c for c in ranked if c.name in ("none", "unknown")]
     best = [c for c in ranked if c not in always and (c is ranked[0] or c.probability >= _FAINT)]
     best = best[: ROWS - len(always)]
-    shown = [c for c in ranked if c in best or c in always]
-    return shown, [c for c in ranked if c not in shown]
+    printed = [c for c in ranked if c in best or c in always]
+    return printed, [c for c in ranked if c not in printed]
 
 
 def _parameter(key: str, parameters: Mapping[str, Quantity], q: Quantity) -> str:

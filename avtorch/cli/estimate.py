@@ -112,9 +112,9 @@ def estimate(
         "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
     }
     write_answer(out, "estimates.json", answer, pictures)
-    shown = answer | {key: from_start(answer[key], answer["epoch_s"]) for key in ("windows", "alerts")}
-    talk.windows(shown["windows"])
-    talk.summary(shown, estimates_note(answer))
+    printed = answer | {key: from_start(answer[key], answer["epoch_s"]) for key in ("windows", "alerts")}
+    talk.windows(printed["windows"])
+    talk.summary(printed, estimates_note(answer))
     talk.done(out, answer)
 
 

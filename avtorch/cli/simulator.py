@@ -20,16 +20,16 @@ def read_simulator(option: str, text: str) -> GapPlant | None:
 
     if text.strip().lower() == "glvd":
         return None
-    shown = f"{option} {quoted(text, 80)}"
+    given = f"{option} {quoted(text, 80)}"
     if text.endswith(".toml") and not os.path.lexists(text):
-        raise InputError(f"{shown}: no such file; needs a TOML file, or effects such as dead_time=0.2")
+        raise InputError(f"{given}: no such file; needs a TOML file, or effects such as dead_time=0.2")
     try:
         simulator = plant(baseline=text)
     except InputError as fault:
-        raise InputError(f"{shown}: {fault}") from None
+        raise InputError(f"{given}: {fault}") from None
     known = simulator.parameters()
     for name, value in simulator.values().items():
         # the ends of an interval are a drive's, which is not known yet
         if known[name].constraint != "interval" and known[name].unconstrain(value).isnan().any():
-            raise InputError(f"{shown}: {name} is {value.tolist():g}, needs a {known[name].constraint} number")
+            raise InputError(f"{given}: {name} is {value.tolist():g}, needs a {known[name].constraint} number")
     return simulator

@@ -114,7 +114,7 @@ class Talk:
             table.add_row(escape(words), *(_number(both[side][key]) for side in ("without_action", "with_action")))
         self.out.print()
         self.out.print(table)
-        hit = [side.replace("_", " ") for side, seen in both.items() if (seen["min_spacing_m"] or 0.0) < 0]
+        hit = [side.replace("_", " ") for side, run in both.items() if (run["min_spacing_m"] or 0.0) < 0]
         if hit:
             text = f"Collision {' and '.join(hit)}: everything after it, figures included, is not physical."
             self.out.print(text, style="bold red")

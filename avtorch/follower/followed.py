@@ -51,7 +51,7 @@ class Followed(Hypothesis):
             for drive, seen in zip(self.record.drives, self.seen, strict=True):
                 sent = SimulatorInput(drive.time, self.law.command(law, seen), seen.speed)
                 out.append(self.plant.response(sent, car).speed)
-        return self._seen(cast(list, [_Speed(x) for x in out]), len(z), coarse)
+        return self._by_channel(cast(list, [_Speed(x) for x in out]), len(z), coarse)
 
     def row(self, counted: int) -> int:
         """The row of the log at which each `counted` row of the record begins."""

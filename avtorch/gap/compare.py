@@ -198,7 +198,7 @@ def _rolled(record: Record, simulator: GapPlant) -> FloatArray:
         own = simulator.prepared(*drives)
         responses += [own.response(drive) for drive in drives]
     seen = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
-    return np.stack([record.seen(seen[name]) for name in record.channels])
+    return np.stack([record.at_counted_rows(seen[name]) for name in record.channels])
 
 
 def _squares(

@@ -104,8 +104,8 @@ def diagnose(
     top = favourite(race.found)
     apart = Identifiability.of(race, kinds, prior)
     chances = apart.shared(model_probabilities(race.found, left_over(top, race), prior))
-    untold = delays.untold(race.found)
-    chances = delays.shared(chances, untold)
+    undetermined = delays.undetermined_delays(race.found)
+    chances = delays.shared(chances, undetermined)
     candidates = [_candidate(f, race, chances[f.name], kinds) for f in race.found]
     # for an unknown cause the only model is the bare baseline
     bare = implausible({}, lag_and_gain(race.none))
@@ -114,8 +114,8 @@ def diagnose(
     known = "known effect" if race.complete and race.scope.whole else "effect tried"
     verdict = verdict_of(
         candidates,
-        aliases=lambda c: delays.add_delay_aliases(apart.alias_set(c), untold),
-        why=delays.why(chances, untold),
+        aliases=lambda c: delays.add_delay_aliases(apart.alias_set(c), undetermined),
+        why=delays.why(chances, undetermined),
         known=known,
     )
     won = next((f for f in race.found if f.name == verdict.name), None)
@@ -161,7 +161,7 @@ def diagnose(
     onset = None if verdict.name == "none" or selected is not None else _onset(winner or top, race)
     alike = {part for name in verdict.alias_set for part in name.split("+")}
     held = cross_validate(race, winner or top, blamed=named, alike=sorted(alike), progress=progress)
-    shown = RowAttribution.of(race, winner or top)
+    attribution = RowAttribution.of(race, winner or top)
     simulator = repaired(race.none, base)
     car, beliefs = None, belief(race.none)
     if named and winner is not None:
@@ -175,7 +175,7 @@ def diagnose(
     return Diagnosis(
         log=LogFacts.of(each),
         baseline=lag_and_gain(race.none),
-        gap=gap_size(race, top, detected=chances["none"] < 0.5, p_value=shown.p_value),
+        gap=gap_size(race, top, detected=chances["none"] < 0.5, p_value=attribution.p_value),
         candidates=tuple(candidates),
         verdict=verdict,
         onset_s=None if onset is None else onset.stamp_s,
@@ -188,10 +188,10 @@ def diagnose(
         draws=reported_draws(winner, draws) if draws is not None and winner is not None else None,
         where=()
         if verdict.name == "none"
-        else localise(shown, onset_s=None if onset is None else onset.from_start_s, lag=race.none.values["T_L"]),
+        else localise(attribution, onset_s=None if onset is None else onset.from_start_s, lag=race.none.values["T_L"]),
         shrinkage=shrinkage,
         contenders=predictive_models(race, verdict),
-        traces=_traces(race, winner, shown, car if selected is not None else None),
+        traces=_traces(race, winner, attribution, car if selected is not None else None),
         remaining=given_dead_time(candidates, verdict, base),
         complete=race.complete,
         scope=race.scope,
@@ -207,7 +207,9 @@ def left_over(top: FittedModel, race: SearchResult) -> Adequacy:
     return adequacy(top.white, top.errors, measured - top.errors, explained=explained)
 
 
-def _traces(race: SearchResult, winner: FittedModel | None, shown: RowAttribution, car: GapPlant | None) -> Traces:
+def _traces(
+    race: SearchResult, winner: FittedModel | None, attribution: RowAttribution, car: GapPlant | None
+) -> Traces:
     """`car`: the simulator with the effects that held-out blocks selected."""
     record = race.record
     measured = record.measured.mean(-1)
@@ -221,7 +223,7 @@ def _traces(race: SearchResult, winner: FittedModel | None, shown: RowAttributio
         measured=measured,
         before=measured - race.none.errors.mean(-1),
         after=measured - errors.mean(-1),
-        does=shown.does,
+        does=attribution.does,
         stretch=record.stretch,
     )
 

@@ -38,8 +38,8 @@ def calibration_figure(calibration: RankCalibration, *, title: str = "") -> Figu
         rank_plot(left, {"": counts[i].numpy()})
         left.set_title(short(name))
         ecdf_difference(centre, {"": ecdf[i].numpy()}, band)
-        told = f"ECDF: p = {float(p_values['ecdf'][i]):.2g}, spread: p = {float(p_values['dispersion'][i]):.2g}"
-        centre.set_title(told, fontsize=9, fontweight="normal")
+        subtitle = f"ECDF: p = {float(p_values['ecdf'][i]):.2g}, spread: p = {float(p_values['dispersion'][i]):.2g}"
+        centre.set_title(subtitle, fontsize=9, fontweight="normal")
         ecdf_difference(right, {"": ecdf_of(central[:, i].numpy(), POINTS)}, central_band)
         held = [(level, 100 * float(share[i])) for level, share in calibration.coverage.items()]
         right.set_title(

@@ -35,10 +35,10 @@ def operating_curve(ax: Axes, curves: Mapping[str, Sequence[Point]]) -> Axes:
     if not curves:
         raise InputError("curves: found none, needs one or more")
     for k, (name, points) in enumerate(curves.items()):
-        told = [(share, delay) for _, share, delay in points if math.isfinite(delay)]
-        if not told:
+        finite = [(share, delay) for _, share, delay in points if math.isfinite(delay)]
+        if not finite:
             continue
-        x, y = zip(*told, strict=True)
+        x, y = zip(*finite, strict=True)
         ax.plot(
             x, y, color=_COLOURS[k % 8], marker=_MARKS[k % 8], markersize=4, linewidth=1, label=name.replace("_", " ")
         )

@@ -146,15 +146,15 @@ def shrinkage(ax: Axes, found: Diagnosis, channel: str) -> Axes:
 
     Raises `InputError` where nothing was held out, or not this channel.
     """
-    told = found.shrinkage
+    scores = found.shrinkage
     names = [_metric(channel, h) for h in _HORIZONS]
-    if told is None or names[0] not in told.by_metric:
+    if scores is None or names[0] not in scores.by_metric:
         raise InputError(f"shrinkage: found none of {channel}, needs a diagnosis that names an effect")
     at = np.arange(len(names))
-    each = [told.by_metric[name] for name in names]
+    each = [scores.by_metric[name] for name in names]
     lines: Sequence[tuple[str, list[float], str, str]] = (
         ("baseline simulator", [c.before for c in each], VERMILLION, "o"),
-        ("baseline with black box", [told.ceiling[name] for name in names], GREY, "x"),
+        ("baseline with black box", [scores.ceiling[name] for name in names], GREY, "x"),
         ("with the effect", [c.after for c in each], BLUE, "o"),
         ("noise floor", [c.floor for c in each], SKY, "_"),
     )
@@ -237,8 +237,8 @@ def which_figure(found: Diagnosis) -> Figure:
 @styled
 def shrinkage_figure(found: Diagnosis) -> Figure:
     """How far the gap shrinks, a panel per channel."""
-    told = found.shrinkage
-    names = [] if told is None else [w for w in ("accel", "speed") if f"rollout_rmse_{w}" in told.by_metric]
+    scores = found.shrinkage
+    names = [] if scores is None else [w for w in ("accel", "speed") if f"rollout_rmse_{w}" in scores.by_metric]
     figure = Figure(figsize=(8.6, 3.0), layout="constrained")
     for i, channel in enumerate(names):
         ax = shrinkage(figure.add_subplot(1, len(names), i + 1), found, channel)

@@ -20,9 +20,9 @@ def parameter_of_each(ax: Axes, cars: Sequence[FollowerDiagnosis], name: str) ->
     if not all(name in car.parameters for car in cars):
         raise InputError(f"name: found {name!r}, needs one of {', '.join(cars[0].parameters)}")
     rows = np.arange(len(cars))[::-1]
-    told = [car.parameters[name] for car in cars]
-    ax.hlines(rows, [q.q05 for q in told], [q.q95 for q in told], color=BLUE)
-    ax.plot([q.mean for q in told], rows, "o", color=BLUE, ms=4)
+    estimates = [car.parameters[name] for car in cars]
+    ax.hlines(rows, [q.q05 for q in estimates], [q.q95 for q in estimates], color=BLUE)
+    ax.plot([q.mean for q in estimates], rows, "o", color=BLUE, ms=4)
     ax.set_yticks(rows, [car.name for car in cars])
     ax.set(xlabel=_WORDS.get(name, name.replace("_", " ")), ylim=(-0.6, len(cars) - 0.4))
     ax.set_xlim(left=0)
@@ -50,8 +50,8 @@ def peak_gain_of_each(ax: Axes, cars: Sequence[FollowerDiagnosis], *, most: floa
 
 def amplification(ax: Axes, cars: Sequence[FollowerDiagnosis]) -> Axes:
     """Spread of each car's speed over its leader's: in the simulated loop, over as measured."""
-    told = [car.loops[car.law.name] for car in cars]
-    x, y = [e.amplified for e in told], [e.amplified_simulated for e in told]
+    loops = [car.loops[car.law.name] for car in cars]
+    x, y = [e.amplified for e in loops], [e.amplified_simulated for e in loops]
     low, high = min(*x, *y), max(*x, *y)
     pad = 0.05 * (high - low) + 0.01
     ends = (low - pad, high + pad)

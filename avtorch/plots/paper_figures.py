@@ -77,8 +77,8 @@ def paper_pictures(found: Mapping[str, Any]) -> dict[str, Callable[[], Figure]]:
     pictures: dict[str, Callable[[], Figure]] = {}
     for name, one in found.items():
         if name == "strategies":
-            for shown, draw in _STRATEGIES.items():
-                pictures[f"strategies_{shown}.png"] = lambda one=one, draw=draw: draw(one)
+            for part, draw in _STRATEGIES.items():
+                pictures[f"strategies_{part}.png"] = lambda one=one, draw=draw: draw(one)
         else:
             pictures[f"{name}.png"] = lambda one=one, draw=_DRAWN[name]: draw(one)
     return pictures
@@ -212,13 +212,13 @@ def gains_figure(found: Gains) -> Figure:
 @styled
 def platoon_figure(found: Platoon) -> Figure:
     """Speeds of the first run's platoons, and RMS speed and acceleration from vehicle to vehicle."""
-    shown = [i for i, name in enumerate(found.names) if not name.endswith("with the lower level")]
-    figure = Figure(figsize=(11, 2.2 * len(shown) + 3.8), layout="constrained")
-    grid = figure.add_gridspec(len(shown) + 1, 2, height_ratios=[1.0] * len(shown) + [1.5])
+    platoons = [i for i, name in enumerate(found.names) if not name.endswith("with the lower level")]
+    figure = Figure(figsize=(11, 2.2 * len(platoons) + 3.8), layout="constrained")
+    grid = figure.add_gridspec(len(platoons) + 1, 2, height_ratios=[1.0] * len(platoons) + [1.5])
     first: Axes | None = None
     panels: list[Axes] = []
     run = found.run
-    for row, i in enumerate(shown):
+    for row, i in enumerate(platoons):
         ax = figure.add_subplot(grid[row, :], sharex=first)
         first = ax if first is None else first
         hit = torch.nonzero((run.spacing[i, 0] <= 0).any(0))
@@ -227,10 +227,10 @@ def platoon_figure(found: Platoon) -> Figure:
         platoon_speeds(ax, run.time, run.lead_speed[i, 0, 0], run.speed[i, 0], hit_s=hit_s)
         ax.set_title(f"{found.names[i]}: peak gain {float(found.peak[i]):.3f}", fontsize=10)
         panels.append(ax)
-        ax.tick_params(labelbottom=i == shown[-1])
+        ax.tick_params(labelbottom=i == platoons[-1])
     panels[-1].set_xlabel("time [s]")
     for column, what in enumerate(("speed", "accel")):
-        ax = figure.add_subplot(grid[len(shown), column])
+        ax = figure.add_subplot(grid[len(platoons), column])
         ratios = middle(found.against_leader(what, PASSED_S), 1)
         amplitude_by_position(ax, {name: ratios[i] for i, name in enumerate(found.names)})
         word = "speed about its mean" if what == "speed" else "acceleration"

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from avtorch.inference import Posterior, Quadrature
+from avtorch.plots.chosen_windows import ChosenWindows, converged, place, relative_width
 from avtorch.plots.posteriors import agreement_reach, agreement_scatter, joint_cloud, marginals
 from avtorch.plots.ranks import METHODS, ecdf_difference, pooled_rank_counts, rank_plot
-from avtorch.plots.shown import ChosenWindows, converged, place, relative_width
 from avtorch.plots.style import BLACK, short, styled
 from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE
 from avtorch.validation.diagnostics import sampling_diagnostics
@@ -51,11 +51,11 @@ def validation_figures(validation: Validation) -> dict[str, Callable[[], Figure]
         >>> sorted(figures)
         ['agreement.png', 'ecdf.png', 'joint.png', 'marginals.png', 'ranks.png']
     """
-    shown = ChosenWindows(validation)
+    chosen = ChosenWindows(validation)
     figures: dict[str, Callable[[], Figure]] = {
-        "marginals.png": lambda: marginals_figure(shown),
-        "joint.png": lambda: joint_figure(shown),
-        "ranks.png": lambda: ranks_figure(shown),
+        "marginals.png": lambda: marginals_figure(chosen),
+        "joint.png": lambda: joint_figure(chosen),
+        "ranks.png": lambda: ranks_figure(chosen),
         "agreement.png": lambda: agreement_figure(validation),
     }
     if validation.quadrature is not None:
@@ -64,16 +64,16 @@ def validation_figures(validation: Validation) -> dict[str, Callable[[], Figure]
 
 
 @styled
-def marginals_figure(shown: ChosenWindows) -> Figure:
+def marginals_figure(chosen: ChosenWindows) -> Figure:
     """Exact marginals with the histograms of SGLD and NUTS; a row a window, a column a parameter."""
-    found, names = shown.validation, shown.validation.names
-    figure = Figure(figsize=(_wide(names) * len(names) + 0.3, 2.3 * len(shown.windows) + 0.9), layout="constrained")
-    axes = figure.subplots(len(shown.windows), len(names), squeeze=False)
-    for row, (window, line) in enumerate(zip(shown.windows, axes, strict=True)):
+    found, names = chosen.validation, chosen.validation.names
+    figure = Figure(figsize=(_wide(names) * len(names) + 0.3, 2.3 * len(chosen.windows) + 0.9), layout="constrained")
+    axes = figure.subplots(len(chosen.windows), len(names), squeeze=False)
+    for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
         for name, ax in zip(names, line, strict=True):
             other = None if window.nuts is None else found.nuts[name][..., window.nuts].numpy()
             own = found.sgld[name][..., window.number].numpy()
-            marginals(ax, name, own, other, found.quadrature, window.number, truth=shown.truth(window, name))
+            marginals(ax, name, own, other, found.quadrature, window.number, truth=chosen.truth(window, name))
             if row < len(axes) - 1:
                 ax.set_xlabel("")
         line[0].set_title(window.title)
@@ -83,16 +83,16 @@ def marginals_figure(shown: ChosenWindows) -> Figure:
 
 
 @styled
-def joint_figure(shown: ChosenWindows) -> Figure:
+def joint_figure(chosen: ChosenWindows) -> Figure:
     """Clouds of lag and gain within the 50 and 90 % regions of exact draws and of NUTS; a panel a window."""
-    found = shown.validation
-    figure = Figure(figsize=(3.9 * len(shown.windows) + 0.3, 4.6), layout="constrained")
-    axes = figure.subplots(1, len(shown.windows), squeeze=False)
-    for i, (window, ax) in enumerate(zip(shown.windows, axes[0], strict=True)):
-        references = {} if shown.exact is None else {"exact": (shown.exact, i)}
+    found = chosen.validation
+    figure = Figure(figsize=(3.9 * len(chosen.windows) + 0.3, 4.6), layout="constrained")
+    axes = figure.subplots(1, len(chosen.windows), squeeze=False)
+    for i, (window, ax) in enumerate(zip(chosen.windows, axes[0], strict=True)):
+        references = {} if chosen.exact is None else {"exact": (chosen.exact, i)}
         if window.nuts is not None:
             references["NUTS"] = (found.nuts, window.nuts)
-        lag, gain = shown.truth(window, "T_L"), shown.truth(window, "K_L")
+        lag, gain = chosen.truth(window, "T_L"), chosen.truth(window, "K_L")
         truth = None if lag is None or gain is None else (lag, gain)
         joint_cloud(ax, found.sgld, window.number, references=references, truth=truth)
         ax.set_title("\n".join(t for t in (window.title, ax.get_title("left")) if t))
@@ -103,17 +103,17 @@ def joint_figure(shown: ChosenWindows) -> Figure:
 
 
 @styled
-def ranks_figure(shown: ChosenWindows) -> Figure:
+def ranks_figure(chosen: ChosenWindows) -> Figure:
     """Ranks of groups of SGLD's chains, of NUTS and of exact draws in their common pool; a row a window."""
-    found, names = shown.validation, shown.validation.names
+    found, names = chosen.validation, chosen.validation.names
     groups = min(GROUPS, found.sgld.draws.shape[0])
     rows = groups + 2
     figure = Figure(
-        figsize=(_wide(names) * len(names) + 1.4, (0.33 * rows + 0.6) * len(shown.windows) + 0.9), layout="constrained"
+        figsize=(_wide(names) * len(names) + 1.4, (0.33 * rows + 0.6) * len(chosen.windows) + 0.9), layout="constrained"
     )
-    axes = figure.subplots(len(shown.windows), len(names), squeeze=False)
+    axes = figure.subplots(len(chosen.windows), len(names), squeeze=False)
     reference = sampling_diagnostics(found.nuts) if len(found.nuts_index) else None
-    for row, (window, line) in enumerate(zip(shown.windows, axes, strict=True)):
+    for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
         for i, (name, ax) in enumerate(zip(names, line, strict=True)):
             drawn = _grouped(found.sgld[name][..., window.number], groups)
             compared = place(found.compared, window.number)
@@ -122,8 +122,8 @@ def ranks_figure(shown: ChosenWindows) -> Figure:
             if window.nuts is not None and reference is not None:
                 drawn["NUTS"] = found.nuts[name][..., window.nuts].numpy()
                 worth["NUTS"] = _ess(reference.ess_bulk[window.nuts, i])
-            if shown.exact is not None:
-                drawn["exact"] = shown.exact[name][..., row].numpy()
+            if chosen.exact is not None:
+                drawn["exact"] = chosen.exact[name][..., row].numpy()
             rank_plot(ax, pooled_rank_counts(drawn, bins=BINS), effective=worth)
             if row == len(axes) - 1:
                 ax.set_xlabel(f"rank of {short(name)} [-]")

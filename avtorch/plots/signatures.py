@@ -72,9 +72,9 @@ def effect_signature(ax: Axes, effect: Effect, *, seed: int = _SEED) -> Axes:
     ax.plot(time, without, color=BLACK, linewidth=1.0, linestyle="--", label="simulator (GLVD)")
     ax.plot(time, with_it, color=BLUE, linewidth=1.3, label="with the effect")
     ax.axhline(_GAP_AT, color=GREY, linewidth=0.6)
-    shown = (factor * gap).clamp(-1.1, 1.1) + _GAP_AT
-    ax.fill_between(time, shown, _GAP_AT, color=VERMILLION, alpha=0.6, linewidth=0, label="gap, magnified")
-    ax.plot(time, shown, color=VERMILLION, linewidth=0.8)
+    magnified = (factor * gap).clamp(-1.1, 1.1) + _GAP_AT
+    ax.fill_between(time, magnified, _GAP_AT, color=VERMILLION, alpha=0.6, linewidth=0, label="gap, magnified")
+    ax.plot(time, magnified, color=VERMILLION, linewidth=0.8)
     ax.text(0.995, 0.02, f"gap × {factor}", transform=ax.transAxes, color=VERMILLION, fontsize=7, ha="right")
     ax.set_title(effect.name.replace("_", " "), fontsize=9)
     ax.set_xlim(0.0, float(time[-1]))

@@ -16,7 +16,7 @@ from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, PLACES
 from avtorch.plots.style import BLACK, BLUE, GREY, VERMILLION, styled
 
-PAIR, OTHER_PAIR = "a pair", "another pair"
+SEVERAL, OTHERS = "several causes", "other causes"
 _SHADES = LinearSegmentedColormap.from_list("right", ["#FFFFFF", BLUE])
 _WRONG = LinearSegmentedColormap.from_list("wrong", ["#FFFFFF", VERMILLION])
 
@@ -27,8 +27,9 @@ def confusion(ax: Axes, counts: Counts) -> Axes:
     """The confusion matrix, a row a truth and a column a verdict, effects in the order of the chain.
 
     Colour is the share of the row, blue where the verdict is right, vermillion where it is not; the number is the count
-    of cases. All pairs make one row: a verdict counts as `a pair` where it is the very pair, as `another pair` else.
-    Labels that occur nowhere are left out.
+    of cases. Truths of two or more causes make one row, `several causes`. A verdict of two or more names counts as
+    `several causes` where it names exactly the true ones, as `other causes` elsewhere. Labels that occur nowhere are
+    left out.
 
     Args:
         counts: `{truth: {verdict: count}}`, as `confusion` of `blindtest.json`.
@@ -48,8 +49,8 @@ def confusion(ax: Axes, counts: Counts) -> Axes:
     rows = [name for name in _order() if sum(gathered.get(name, {}).values())]
     if not rows:
         raise InputError("counts: found no case, needs one")
-    said = {verdict for told in gathered.values() for verdict in told}
-    columns = [name for name in _order() if name in said or name in rows]
+    verdicts = {verdict for row in gathered.values() for verdict in row}
+    columns = [name for name in _order() if name in verdicts or name in rows]
     table = np.array([[gathered[row][column] for column in columns] for row in rows], float)
     share = table / table.sum(1, keepdims=True)
     for i, row in enumerate(rows):
@@ -62,8 +63,8 @@ def confusion(ax: Axes, counts: Counts) -> Axes:
             colour = (_SHADES if right else _WRONG)(share[i, j])
             ax.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, facecolor=colour, linewidth=0, zorder=1))
             dark = share[i, j] > 0.55
-            told = f"{table[i, j]:.0f}"
-            ax.text(j, i, told, ha="center", va="center", fontsize=7, color="white" if dark else BLACK, zorder=4)
+            count = f"{table[i, j]:.0f}"
+            ax.text(j, i, count, ha="center", va="center", fontsize=7, color="white" if dark else BLACK, zorder=4)
     places = [_place(name) for name in rows], [_place(name) for name in columns]
     for k in range(1, len(rows)):
         if places[0][k] != places[0][k - 1]:
@@ -99,8 +100,8 @@ def confusion_figure(answer: Mapping[str, Any]) -> Figure:
         True
     """
     gathered = _gathered(answer["confusion"])
-    told = {verdict for one in gathered.values() for verdict in one} | gathered.keys()
-    size = 0.31 * len(told)
+    labels = {verdict for row in gathered.values() for verdict in row} | gathered.keys()
+    size = 0.31 * len(labels)
     figure = Figure(figsize=(max(size + 2.6, 5.0), max(size + 2.0, 3.6)), layout="constrained")
     ax = confusion(figure.subplots(), answer["confusion"])
     right = sum(count.get(truth, 0) for truth, count in answer["confusion"].items())
@@ -112,23 +113,23 @@ def confusion_figure(answer: Mapping[str, Any]) -> Figure:
 
 
 def _gathered(counts: Counts) -> dict[str, Counter[str]]:
-    """With pairs put together."""
+    """With sets of two or more put together."""
     out: dict[str, Counter[str]] = {}
-    for truth, told in counts.items():
-        row = out.setdefault(PAIR if "+" in truth else truth, Counter())
-        for verdict, count in told.items():
-            named = verdict if "+" not in verdict else PAIR if verdict == truth else OTHER_PAIR
+    for truth, verdicts in counts.items():
+        row = out.setdefault(SEVERAL if "+" in truth else truth, Counter())
+        for verdict, count in verdicts.items():
+            named = verdict if "+" not in verdict else SEVERAL if verdict == truth else OTHERS
             row[named] += count
     return out
 
 
 def _order() -> list[str]:
     effects = sorted(EFFECTS, key=lambda name: (PLACES.index(EFFECTS[name].place), name))
-    return ["none", *effects, PAIR, OTHER_PAIR, "unknown", "failed"]
+    return ["none", *effects, SEVERAL, OTHERS, "unknown", "failed"]
 
 
 def _place(name: str) -> str:
-    return EFFECTS[name].place if name in EFFECTS else name if name in ("none", "unknown", "failed") else "pairs"
+    return EFFECTS[name].place if name in EFFECTS else name if name in ("none", "unknown", "failed") else "several"
 
 
 def _words(name: str) -> str:

@@ -60,7 +60,7 @@ def linearised(
     middle = _DT * (torch.arange(len(time) - begin, dtype=torch.float64) + 0.5) - _DT
     half = 0.5 * omega * _DT
     turn = torch.exp(-1j * middle[:, None] * omega) * (torch.sin(half) / half)
-    motion, shown = (
+    motion, reading = (
         ((m - r).diff(dim=-1)[..., begin - 1 :] / step).to(torch.complex128) @ turn
         for m, r in zip(moves, rests, strict=True)
     )
@@ -68,7 +68,7 @@ def linearised(
     drag = (slower - faster) / (2 * _ASIDE)
     count = max(len(v) for v in values.values())
     shape = (count, len(omega))
-    motion, shown = motion.expand(shape), shown.expand(shape)
+    motion, reading = motion.expand(shape), reading.expand(shape)
     small = motion.abs() < 1e-9
-    sensed = torch.where(small, 0.0, shown / torch.where(small, 1.0, motion))
+    sensed = torch.where(small, 0.0, reading / torch.where(small, 1.0, motion))
     return Chain(omega, motion, sensed, drag.expand(count))

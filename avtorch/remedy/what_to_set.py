@@ -218,7 +218,7 @@ def _string_stability(chains: Sequence[Chain], settings: Setting, link_delay: fl
     inner, forward = _lower(settings)
     stable, peak = None, None
     for chain in chains:
-        seen = chain_verdict(
+        verdict = chain_verdict(
             chain,
             settings.time_gap[:, None],
             settings.gains[:, None],
@@ -227,8 +227,8 @@ def _string_stability(chains: Sequence[Chain], settings: Setting, link_delay: fl
             feedforward=settings.feedforward[:, None],
             feedforward_delay=link_delay,
         )
-        stable = seen.string_stable if stable is None else stable & seen.string_stable
-        peak = seen.peak_gain if peak is None else torch.maximum(peak, seen.peak_gain)
+        stable = verdict.string_stable if stable is None else stable & verdict.string_stable
+        peak = verdict.peak_gain if peak is None else torch.maximum(peak, verdict.peak_gain)
     assert stable is not None
     assert peak is not None
     return stable.double().mean(-1), peak

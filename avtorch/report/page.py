@@ -212,12 +212,12 @@ def _part(found: Diagnosis, part: Any) -> Mapping[str, str]:
     if part.axis == "time":
         begin, end = (t - found.log.epochs_s[0] for t in (part.begin, part.end))
         ends = f"{begin:.1f} to {end:.1f} s from the log's start"
-        return _told(part, ends)
+        return _row(part, ends)
     ends = part.begin if part.axis == "signal" else f"{part.begin:.3g} to {part.end:.3g} {unit}"
-    return _told(part, ends)
+    return _row(part, ends)
 
 
-def _told(part: Any, ends: str) -> Mapping[str, str]:
+def _row(part: Any, ends: str) -> Mapping[str, str]:
     return {"axis": part.axis, "ends": ends, "share": f"{100 * part.share:.0f} %", "q": _small(part.q_value)}
 
 
@@ -226,8 +226,8 @@ def _small(p: float) -> str:
 
 
 def _measures(found: Diagnosis) -> Sequence[Mapping[str, Any]]:
-    told = found.shrinkage
-    if told is None:
+    shrinkage = found.shrinkage
+    if shrinkage is None:
         return []
     return [
         {
@@ -235,11 +235,11 @@ def _measures(found: Diagnosis) -> Sequence[Mapping[str, Any]]:
             "before": f"{c.before:.3g}",
             "after": f"{c.after:.3g}",
             "floor": f"{c.floor:.3g}",
-            "ceiling": f"{told.ceiling[name]:.3g}",
+            "ceiling": f"{shrinkage.ceiling[name]:.3g}",
             "closed": "" if c.closed is None else _percent(c.closed),
-            "top": name == told.metric,
+            "top": name == shrinkage.metric,
         }
-        for name, c in told.by_metric.items()
+        for name, c in shrinkage.by_metric.items()
     ]
 
 
@@ -249,25 +249,26 @@ def _percent(q: Quantity) -> str:
 
 
 def _placebo(found: Diagnosis) -> str | None:
-    told = found.shrinkage
-    if told is None or told.placebo is None or told.placebo_effect is None:
+    shrinkage = found.shrinkage
+    if shrinkage is None or shrinkage.placebo is None or shrinkage.placebo_effect is None:
         return None
-    return f"A placebo ({told.placebo_effect}, a wrong effect added to the verdict) closes {_percent(told.placebo)}."
+    closed = _percent(shrinkage.placebo)
+    return f"A placebo ({shrinkage.placebo_effect}, a wrong effect added to the verdict) closes {closed}."
 
 
-def _peak(told: Mapping[str, float | None]) -> str:
+def _peak(peak: Mapping[str, float | None]) -> str:
     """A peak gain with its 90 % interval."""
-    middle, low, high = (f"{x:.2f}" if x is not None else "no end" for x in (told[k] for k in ("median", "q05", "q95")))
+    middle, low, high = (f"{x:.2f}" if x is not None else "no end" for x in (peak[k] for k in ("median", "q05", "q95")))
     return f"{middle} ({low} to {high})"
 
 
 def _setting(found: Diagnosis) -> Mapping[str, Any] | None:
     if found.setting is None:
         return None
-    told, p = found.setting, found.setting["p_string_stable"]
-    peaks = {k: _peak(x) for k, x in told["peak_gain"].items()}
+    setting, p = found.setting, found.setting["p_string_stable"]
+    peaks = {k: _peak(x) for k, x in setting["peak_gain"].items()}
     return {
-        "why": told["why"],
+        "why": setting["why"],
         "rows": [
             ("P(string stable), baseline simulator", f"{p['assumed']:.2f}"),
             ("P(string stable), repaired simulator", f"{p['in_force']:.2f}"),
@@ -276,5 +277,5 @@ def _setting(found: Diagnosis) -> Mapping[str, Any] | None:
             ("peak gain, repaired simulator", peaks["in_force"]),
             ("peak gain, with this setting", peaks["then"]),
         ],
-        "notes": told["notes"],
+        "notes": setting["notes"],
     }

@@ -61,7 +61,7 @@ def run_background(
         effects: of `IN_FRONT`; default: all.
         draws: how often each effect is put in front with new times, roads and gusts; once where it has none.
         workers: processes, as in `run_trial`.
-        progress: is told (logs answered, of).
+        progress: called with (logs answered, of).
         publish: False returns the answer and leaves `out/background.json` to the caller.
 
     Returns `table` and `totals` (`avtorch.blindtest.score_in_front`), `trials` one by one, `backgrounds`
@@ -266,7 +266,7 @@ def _has_draws(log: Log, effect: str) -> bool:
 
 
 def _drawn(place: _Place, log: Log, seed: int, car: tuple[float, float] | None) -> tuple[Log, dict[str, Any]]:
-    """The log to answer, under a name that tells nothing, and its truth; `verdict`, `kind` as the folder reads them."""
+    """The log to answer, under a neutral name, and its truth; `verdict`, `kind` as the folder reads them."""
     truth: dict[str, Any] = {"index": place.index, "background": place.background, "tier": None, "onset_s": None}
     truth |= {"case": case_name(place.index), "onset_scored": False, "effect": place.effect, "size": place.size}
     if place.effect is None or place.size is None or car is None:

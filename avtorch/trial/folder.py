@@ -111,13 +111,13 @@ class TrialFolder:
 
         Raises `InputError` where this case differed when it was answered before.
         """
-        path, told = self.truth_path(case.index), case.truth()
-        if os.path.lexists(path) and self.truth(case.index) != json.loads(json.dumps(told)):
+        path, truth = self.truth_path(case.index), case.truth()
+        if os.path.lexists(path) and self.truth(case.index) != json.loads(json.dumps(truth)):
             raise InputError(
                 f"{path}: the case comes out otherwise than when it was drawn before; the reference vehicle has "
                 "changed since, needs another folder"
             )
-        kept = {"truth": told, "log_sha256": None if log is None else hashlib.sha256(log).hexdigest()}
+        kept = {"truth": truth, "log_sha256": None if log is None else hashlib.sha256(log).hexdigest()}
         write_sealed(path, kept, schema=TRUTH, of=self._of(case.index))
 
     def keep_answer(

@@ -40,7 +40,7 @@ def worked(work: Callable[[T], int], tasks: Sequence[T], workers: int) -> Iterat
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Children begun within use one thread each; it must be told before their libraries are loaded."""
+    """Children begun within use one thread each; this must be set before their libraries are loaded."""
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     before = {name: os.environ.get(name) for name in names}
     os.environ.update(dict.fromkeys(names, "1"))

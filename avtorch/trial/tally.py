@@ -16,7 +16,7 @@ def tally(folder: TrialFolder, n: int, names: Sequence[str], settings: Mapping[s
     test."""
     truths = [folder.truth(i) for i in range(n)]
     measures = {name: _measures(folder, name, truths) for name in names}
-    judged = measures.pop(names[0])
+    tested = measures.pop(names[0])
     return {
         "schema": "avtorch.blindtest/1",
         "cases": n,
@@ -26,7 +26,7 @@ def tally(folder: TrialFolder, n: int, names: Sequence[str], settings: Mapping[s
         "outside": settings["outside"],
         "mix": settings["mix"],
         "draw": settings["draw"],
-        **judged,
+        **tested,
         "baselines": measures,
     }
 

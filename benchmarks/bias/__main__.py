@@ -61,14 +61,14 @@ def cells(arm: Arm, found: Measured, predicted: Tensor | None) -> tuple[str, ...
     """Its results on the windows of one length."""
     if bool(found.lost.all()):
         return ("-", "-", "-", "-", "100%")
-    told = number(found.one_chain.nanmedian()) if arm.section == LONG else "-"
+    third = number(found.one_chain.nanmedian()) if arm.section == LONG else "-"
     if predicted is not None:
         each = predicted.gather(-1, furthest(predicted)).squeeze(-1)
-        told = both(each, worst_ratio(each))
+        third = both(each, worst_ratio(each))
     return (
         both(found.mean_difference),
         both(found.sd_ratio, worst_ratio(found.sd_ratio)),
-        told,
+        third,
         number(found.ess_per_step.nanmedian()),
         f"{found.lost.double().mean():.0%}",
     )
@@ -77,8 +77,8 @@ def cells(arm: Arm, found: Measured, predicted: Tensor | None) -> tuple[str, ...
 def check(problem: Problem, found: Measured, predicted: Tensor) -> Tensor:
     """Relative difference of the SD ratio from the closed form, and its Monte Carlo error: ``(2, strong window)``."""
     strong = (problem.strength == 2) & ~found.lost
-    told = predicted.gather(-1, found.parameter[:, None]).squeeze(-1)
-    return torch.stack([(found.sd_ratio / told - 1).abs(), found.sd_error / found.sd_ratio])[:, strong]
+    expected = predicted.gather(-1, found.parameter[:, None]).squeeze(-1)
+    return torch.stack([(found.sd_ratio / expected - 1).abs(), found.sd_error / found.sd_ratio])[:, strong]
 
 
 class Printer:
@@ -122,15 +122,17 @@ def main() -> None:
         errors: list[Tensor] = []
         for arm in arms:
             found = [measure(p, run(arm, p, length(arm, quick=options.quick))) for p in problems]
-            told = [predict(arm, p, c) for p, c in zip(problems, covariances, strict=True)]
-            each = (cells(arm, f, t) for f, t in zip(found, told, strict=True))
+            predictions = [predict(arm, p, c) for p, c in zip(problems, covariances, strict=True)]
+            each = (cells(arm, f, t) for f, t in zip(found, predictions, strict=True))
             printer.row(sum(each, arm_cells(arm)))
             errors += [f.sd_error for f in found]
             if arm.whitening == "full":
-                checks += [check(p, f, t) for p, f, t in zip(problems, found, told, strict=True) if t is not None]
+                checks += [
+                    check(p, f, t) for p, f, t in zip(problems, found, predictions, strict=True) if t is not None
+                ]
         error = torch.cat(errors)
-        shown = f"median {number(error.nanmedian())}, largest {number(error.nan_to_num(0.0).amax())}"
-        print(f"\nMonte Carlo error of an SD ratio here: {shown}")
+        summary = f"median {number(error.nanmedian())}, largest {number(error.nan_to_num(0.0).amax())}"
+        print(f"\nMonte Carlo error of an SD ratio here: {summary}")
     if checks:
         gap, error = torch.cat(checks, -1)
         print(f"\nClosed form against measurement, whitened, strong excitation, {len(gap)} windows and arms:")

@@ -98,11 +98,11 @@ def main() -> None:
     beliefs = kept["drift"][0]
     for title, (runs, values) in parts.items():
         first = times(runs["drift"][1], beliefs, values)
-        told = []
+        shares = []
         for name, t in first.items():
             early = (t > beliefs.change_s) & (t - beliefs.change_s <= turn)
-            told.append(f"{name} {100 * float(early.double().mean()):.0f} %")
-        print(f"  {title}: " + ", ".join(told))
+            shares.append(f"{name} {100 * float(early.double().mean()):.0f} %")
+        print(f"  {title}: " + ", ".join(shares))
     if options.out is not None:
         curves = {
             "healthy runs": (kept, "healthy"),

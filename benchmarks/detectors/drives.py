@@ -120,8 +120,8 @@ def drive(
             report = watch.update(T, K, used, setting)
             log = Gaussian.of_draws(T, K)
             ends.append(window.end_s)
-            seen = report.statistics
-            rows.append((used, seen["stability"], seen["accepted_change"], log.mean, log.cov))
+            statistics = report.statistics
+            rows.append((used, statistics["stability"], statistics["accepted_change"], log.mean, log.cov))
         if progress is not None:
             progress(loop.time)
     used, p, sure, mean, cov = (torch.stack(column) for column in zip(*rows, strict=True))

@@ -72,15 +72,15 @@ def scores(beliefs: Beliefs, unevenness: tuple[float, float] = (0.0, 0.0)) -> di
     for i in range(windows):
         window, used = Gaussian(beliefs.belief.mean[i], spread[i]), beliefs.used[i]
         compared, against = used & known, _where(known, baseline, window)
-        out["stability"].append(_seen(1.0 - beliefs.p_stable[i], used))
-        out["accepted_change"].append(_seen(beliefs.sure[i], used))
+        out["stability"].append(_used(1.0 - beliefs.p_stable[i], used))
+        out["accepted_change"].append(_used(beliefs.sure[i], used))
         for kind in DIVERGENCES:
             p = divergence_p_value(kind, window, against).clamp_min(1e-300)
-            out[kind].append(_seen(-p.log10(), compared))
+            out[kind].append(_used(-p.log10(), compared))
         z = innovation(window, against)
         for kind, chart in charts.items():
             chart.step(z, compared)
-            out[kind].append(_seen(chart.last_statistic.amax(-1), compared))
+            out[kind].append(_used(chart.last_statistic.amax(-1), compared))
         baseline = _where(used, _where(known, baseline.combine(window), window), baseline)
         known = known | used
     return {name: torch.stack(rows) for name, rows in out.items()}
@@ -91,7 +91,7 @@ def first_alarm(score: Tensor, end_s: Tensor, limit: float) -> Tensor:
     return torch.where(score > limit - 1e-12, end_s[:, None], torch.inf).amin(0)
 
 
-def _seen(score: Tensor, where: Tensor) -> Tensor:
+def _used(score: Tensor, where: Tensor) -> Tensor:
     return torch.where(where, score, -torch.inf)
 
 

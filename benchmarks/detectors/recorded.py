@@ -36,8 +36,8 @@ def judge(paths: Sequence[Path], unevenness: tuple[float, float], *, window: flo
     for path in paths:
         found = [w.window.belief for w in estimate(Log.read(path), window=window).windows]
         used = [b for b in found if bool(b.excited[0] & b.converged[0])]
-        told = ", ".join(f"{b.stat('T_L')['mean']:.2f} s / {b.stat('K_L')['mean']:.2f}" for b in used)
-        print(f"{path.name}: {len(used)} of {len(found)} windows of {window:g} s used: {told}")
+        estimates = ", ".join(f"{b.stat('T_L')['mean']:.2f} s / {b.stat('K_L')['mean']:.2f}" for b in used)
+        print(f"{path.name}: {len(used)} of {len(found)} windows of {window:g} s used: {estimates}")
         beliefs += used
     for granted in ((0.0, 0.0), unevenness):
         counts = alarmed(beliefs, granted)

@@ -127,34 +127,34 @@ def rows(
 def alarms(table: list[dict[str, object]], kinds: list[str]) -> str:
     """A markdown table of false alarms: share of unchanged runs with one (95 % Wilson), and how many an hour."""
 
-    def told(q: dict) -> str:
+    def cell(q: dict) -> str:
         low, high = (100.0 * x for x in q["interval"])
         rate = f", {q['per_hour']:.2g}/h" if q["alarmed"] else ""
         return f"{100.0 * q['alarmed'] / q['runs']:.3g} % ({low:.1f} to {high:.1f}){rate}"
 
-    return _table(table, kinds, told)
+    return _table(table, kinds, cell)
 
 
 def delays(table: list[dict[str, object]], kinds: list[str]) -> str:
     """A markdown table of changes: median delay; found within 30 s, and by the end; runs with an alarm before."""
 
-    def told(f: dict) -> str:
-        judged = f["runs"] - f["early"]
-        if judged == 0:
+    def cell(f: dict) -> str:
+        runs = f["runs"] - f["early"]
+        if runs == 0:
             return "no run without an early alarm"
         seconds = f"{f['median_s']:.1f} s" if math.isfinite(f["median_s"]) else "-"
         early = f"; {f['early']} early" if f["early"] else ""
-        return f"{seconds}; {100 * f['soon'] / judged:.0f} %, {100 * f['at_all'] / judged:.0f} %{early}"
+        return f"{seconds}; {100 * f['soon'] / runs:.0f} %, {100 * f['at_all'] / runs:.0f} %{early}"
 
-    return _table(table, kinds, told)
+    return _table(table, kinds, cell)
 
 
-def _table(table: list[dict[str, object]], kinds: list[str], told: Callable[[dict], str]) -> str:
+def _table(table: list[dict[str, object]], kinds: list[str], cell: Callable[[dict], str]) -> str:
     """One row per detector, one column per kind of run."""
     head = ["detector", "set to", *kinds]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for row in table:
-        cells = [*_named(row), *(told(cast(dict, row[kind])) for kind in kinds)]
+        cells = [*_named(row), *(cell(cast(dict, row[kind])) for kind in kinds)]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 

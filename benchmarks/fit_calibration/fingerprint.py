@@ -104,9 +104,11 @@ def searched(log: Log, names: Sequence[str], *, left: str, pairs: bool = True) -
 
 def differences(part: str, stored: Mapping[str, float], now: Mapping[str, float]) -> list[str]:
     """Each number of a part that differs, in words."""
-    told = [f"{part}: {name}: only {'stored' if name in stored else 'computed'}" for name in stored.keys() ^ now.keys()]
+    lines = [
+        f"{part}: {name}: only {'stored' if name in stored else 'computed'}" for name in stored.keys() ^ now.keys()
+    ]
     for name in stored.keys() & now.keys():
         allowed = RELATIVE * abs(stored[name]) if part == FIXED_PLACE else NATS
         if abs(stored[name] - now[name]) > allowed:
-            told.append(f"{part}: {name}: stored {stored[name]:.9g}, computed {now[name]:.9g}")
-    return sorted(told)
+            lines.append(f"{part}: {name}: stored {stored[name]:.9g}, computed {now[name]:.9g}")
+    return sorted(lines)

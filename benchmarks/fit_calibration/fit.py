@@ -65,8 +65,8 @@ def fit(cases: Sequence[KeptCase], weights: Mapping[str, float]) -> Fitted:
     best = _lowest(loss, len(means))
     of_odds = np.linalg.inv(_curvature(loss, best)) * np.outer(sds, sds)
     constants = odds_at(means + sds * best)
-    seen = np.array([regressors(case, constants) for case in cases])
-    learnt, of_weights = logistic(seen, outside, weigh)
+    columns = np.array([regressors(case, constants) for case in cases])
+    learnt, of_weights = logistic(columns, outside, weigh)
     covariance = np.zeros((len(best) + len(learnt),) * 2)
     covariance[: len(best), : len(best)], covariance[len(best) :, len(best) :] = of_odds, of_weights
     return Fitted(constants, UnknownWeights(*learnt.tolist()), np.concatenate([means + sds * best, learnt]), covariance)
@@ -82,8 +82,8 @@ def loss_of(cases: Sequence[KeptCase], weights: Mapping[str, float]) -> Callable
 
     def loss(x: FloatArray) -> float:
         found = odds_at(means + sds * x)
-        told = sum(w * np.log((1 - MISSED) * _share(case, found) + MISSED) for case, w in named)
-        return 0.5 * float(x @ x) - float(told)
+        log_likelihood = sum(w * np.log((1 - MISSED) * _share(case, found) + MISSED) for case, w in named)
+        return 0.5 * float(x @ x) - float(log_likelihood)
 
     return loss
 
@@ -99,13 +99,13 @@ def regressors(case: KeptCase, constants: Odds) -> tuple[float, ...]:
     return odds.signs(top, case.none, case.left[top.name])
 
 
-def logistic(seen: FloatArray, outside: BoolArray, weigh: FloatArray) -> tuple[FloatArray, FloatArray]:
+def logistic(columns: FloatArray, outside: BoolArray, weigh: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Weights (column,) and their covariance for regressors (case, column), by Newton's steps."""
-    learnt = np.zeros(seen.shape[1])
+    learnt = np.zeros(columns.shape[1])
     for _ in range(100):
-        chance = 1 / (1 + np.exp(-seen @ learnt))
-        slope = seen.T @ (weigh * (outside - chance)) - learnt / WEIGHT_SD**2
-        curvature = (seen.T * (weigh * chance * (1 - chance))) @ seen + np.eye(len(learnt)) / WEIGHT_SD**2
+        chance = 1 / (1 + np.exp(-columns @ learnt))
+        slope = columns.T @ (weigh * (outside - chance)) - learnt / WEIGHT_SD**2
+        curvature = (columns.T * (weigh * chance * (1 - chance))) @ columns + np.eye(len(learnt)) / WEIGHT_SD**2
         step = np.linalg.solve(curvature, slope)
         # far from the maximum a full step can overshoot into a flat region
         learnt = learnt + step / max(1.0, float(np.abs(step).max()))

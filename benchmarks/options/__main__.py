@@ -28,7 +28,7 @@ def main() -> None:
         "driver": ("a driver who complies later", lambda: gap.driver(options.runs)),
         "link": ("feed-forward with communication delay: exact verdict and simulation", link.verdict),
         "strategy": ("feed-forward as a strategy", link.strategy),
-        "controllers": ("controllers of any structure under the same monitor", black_box.judged),
+        "controllers": ("controllers of any structure under the same monitor", black_box.verdicts),
         "bounds": ("the posterior as design bounds", bounds.rechecked),
         "measures": ("comfort, energy, safe spacing", lambda: bounds.measures(options.runs)),
     }

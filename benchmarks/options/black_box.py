@@ -59,8 +59,8 @@ class Network:
 
     def _asked(self, s: FollowerState) -> Tensor:
         error = s.spacing - 1.1 * s.speed - 5.0
-        shown = torch.stack([error / 8.0, (s.lead_speed - s.speed) / 4.0, s.accel / 3.0, s.speed / 20.0 - 1.0], -1)
-        return self.net(shown)[..., 0].clamp(-3.0, 3.0)
+        inputs = torch.stack([error / 8.0, (s.lead_speed - s.speed) / 4.0, s.accel / 3.0, s.speed / 20.0 - 1.0], -1)
+        return self.net(inputs)[..., 0].clamp(-3.0, 3.0)
 
     @staticmethod
     def _state(rows: Tensor) -> FollowerState:
@@ -76,7 +76,7 @@ def table(state: FollowerState) -> Tensor:
     return 1.5 * rounded[0] + 1.5 * rounded[1] - 0.8 * rounded[2]
 
 
-def judged() -> None:
+def verdicts() -> None:
     """Slopes, their exact verdict, the measured gain, and the monitor's report on a change."""
     network = Network()
     print(f"network: RMS error against the law it imitates {network.error:.3f} m/s²")

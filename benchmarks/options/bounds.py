@@ -8,7 +8,7 @@ import torch
 
 from avtorch.decision import DesignBounds, Setting, Strategist
 from avtorch.vehicle import performance
-from benchmarks.options.watched import CHANGE_S, belief, told, watched
+from benchmarks.options.watched import CHANGE_S, belief, median_and_range, watched
 
 SETTINGS = (
     ("as designed", 1.0, (1.5, 1.5, -0.8)),
@@ -65,4 +65,4 @@ def measures(runs: int) -> None:
         gap = torch.tensor([a[-1].setting.time_gap[0] if a else 1.0 for a in run.actions], dtype=torch.float64)
         columns.append(performance(run.rows[round(CHANGE_S * 100) :], time_gap=gap))
     for name in names:
-        print(f"| {name} | " + " | ".join(told(getattr(c, name)) for c in columns) + " |")
+        print(f"| {name} | " + " | ".join(median_and_range(getattr(c, name)) for c in columns) + " |")

@@ -11,7 +11,7 @@ import torch
 from avtorch.decision import Grid, Setting, Strategist, gap_trade_off
 from avtorch.decision.settings import DRIVER_TIME_GAPS
 from avtorch.vehicle import ClosedLoop, Leader, LowerLevel, performance
-from benchmarks.options.watched import CHANGE_S, WORN, belief, told, watched
+from benchmarks.options.watched import CHANGE_S, WORN, belief, median_and_range, watched
 
 MILD = (1.0, 0.8)
 
@@ -78,7 +78,7 @@ def driver(runs: int) -> None:
         rules = None if delay is None else Strategist(Grid(allowed=frozenset({2})), driver_delay=delay)
         run = watched(runs=runs, strategist=rules)
         late = run.rows[round(CHANGE_S * 100) :]
-        seen = performance(late)
+        measures = performance(late)
         reached = []
         for actions in run.actions:
             for a in actions[:1]:
@@ -87,7 +87,8 @@ def driver(runs: int) -> None:
         when = f"{sum(reached) / len(reached):.1f}" if reached else "-"
         name = "no request" if delay is None else f"{delay:g}"
         collided = f"{int(run.rows.collided.sum())} of {runs}"
-        print(f"| {name} | {when} | {told(seen.accel_rms_ratio)} | {told(seen.min_spacing_m)} | {collided} |")
+        ratio, spacing = median_and_range(measures.accel_rms_ratio), median_and_range(measures.min_spacing_m)
+        print(f"| {name} | {when} | {ratio} | {spacing} | {collided} |")
 
 
 def _peak(vehicle: tuple[float, float], gap: float) -> str:

@@ -29,12 +29,12 @@ def verdict() -> None:
         how = {"feedforward": 0.75, "feedforward_delay": delay}
         at = stability.peak_frequency(*MILD, 1.0, GAINS, **how).clamp_min(0.0)
         omega = float(at) if float(at) > 0 else 1.0
-        seen = measured_gain(
+        simulated = measured_gain(
             LinearController(GAINS, 1.0, feedforward=0.75), [omega], plant=GLVDPlant(*MILD, 0.0), link_delay=delay
         )
         # a command held for a step of 0.01 s acts half a step late
-        said = stability.gain(omega, *MILD, 1.0, GAINS, dead_time=0.005, **how)
-        print(f"  delay {delay:g} s, {omega:.2f} rad/s: {float(seen[0]):.4f}, {float(said):.4f}")
+        exact = stability.gain(omega, *MILD, 1.0, GAINS, dead_time=0.005, **how)
+        print(f"  delay {delay:g} s, {omega:.2f} rad/s: {float(simulated[0]):.4f}, {float(exact):.4f}")
 
 
 def strategy() -> None:

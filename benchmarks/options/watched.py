@@ -49,7 +49,7 @@ def last_used(run: SupervisedRun) -> Belief:
     return [b for b in beliefs if bool(b.excited[0] & b.converged[0])][-1]
 
 
-def told(values: Tensor) -> str:
+def median_and_range(values: Tensor) -> str:
     """Median of the runs with the range of the middle 90 %."""
     low, middle, high = torch.quantile(values.double(), torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)).tolist()
     return f"{middle:.2f} ({low:.2f} to {high:.2f})"

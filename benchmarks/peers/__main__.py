@@ -82,8 +82,8 @@ def main(given: list[str] | None = None) -> int:
         if part:
             print("\nSettings\n" + "\n".join(details(part)))
     if o.json is not None:
-        told = {"one": [r.as_dict() for r in one], "many": [r.as_dict() for r in many], "growth": grown}
-        o.json.write_text(json.dumps({**told, "aims": verdicts}, indent=1) + "\n", encoding="utf-8")
+        results = {"one": [r.as_dict() for r in one], "many": [r.as_dict() for r in many], "growth": grown}
+        o.json.write_text(json.dumps({**results, "aims": verdicts}, indent=1) + "\n", encoding="utf-8")
     return 0
 
 

@@ -89,10 +89,10 @@ class Worker:
         """Time it on ``count`` windows of a file, up to ``repeats`` times but no new one after ``patience_s``."""
         out = f"{self.method.name}.npz"
         fields = {"windows": windows, "first": first, "count": count, "seed": seed, "out": out, "keep": keep}
-        told = self._order(do="run", repeats=repeats, patience_s=patience_s, **fields)
+        reply = self._order(do="run", repeats=repeats, patience_s=patience_s, **fields)
         with np.load(self.folder / out) as file:
             answer = Answer(**{key: file[key] for key in file.files})
-        return Timed(told[self.clock], answer, float(told["peak_mb"]))
+        return Timed(reply[self.clock], answer, float(reply["peak_mb"]))
 
     def close(self) -> None:
         """End the process and close its pipes."""

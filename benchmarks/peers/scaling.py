@@ -58,15 +58,15 @@ def grow(*, quick: bool = False) -> dict[str, Any]:
 
     windows, chains, points = (WINDOWS[:2], CHAINS[:2], POINTS[:2]) if quick else (WINDOWS, CHAINS, POINTS)
 
-    def told(name: str, value: int, row: dict[str, float]) -> dict[str, float]:
+    def timed(name: str, value: int, row: dict[str, float]) -> dict[str, float]:
         print(f"{name} {value}: {1e3 * row['total_s']:.1f} ms", file=sys.stderr, flush=True)
         return {name: value, **row}
 
     update(make_windows(2), 4)  # the loading time of the first call is not part of the growth
     return {
-        "windows": [told("windows", n, update(make_windows(n, seed=3))) for n in windows],
-        "chains": [told("chains", n, update(make_windows(1, seed=4), n)) for n in chains],
-        "points": [told("points", n, update(make_windows(1, points=n, seed=5))) for n in points],
+        "windows": [timed("windows", n, update(make_windows(n, seed=3))) for n in windows],
+        "chains": [timed("chains", n, update(make_windows(1, seed=4), n)) for n in chains],
+        "points": [timed("points", n, update(make_windows(1, points=n, seed=5))) for n in points],
         "minibatch": [row for n in points for row in minibatch(n, quick=quick)],
     }
 

@@ -169,8 +169,8 @@ def choose(method: Method, plan: Plan, folder: Path, exact: Exact) -> tuple[Sett
         ratio = score.ratio.mean(0)
         accurate = bool(np.abs(score.shift).max() <= allowed and (np.abs(ratio - 1) <= 0.05).all())
         cost = median([t * MARGIN * WANTED / e for t, e in zip(seconds, score.bulk, strict=True)])
-        told = {"settings": settings, "seconds": median(seconds), "least_ess": least, "seconds_wanted": cost}
-        trials.append({**told, "accurate": accurate, "scaled": scaled})
+        trial = {"settings": settings, "seconds": median(seconds), "least_ess": least, "seconds_wanted": cost}
+        trials.append({**trial, "accurate": accurate, "scaled": scaled})
         say(f"  {json.dumps(settings)}: {1e3 * cost:.1f} ms to {WANTED}, {'accurate' if accurate else 'not accurate'}")
     best = min(trials, key=lambda t: (not t["accurate"], t["seconds_wanted"]))
     chosen = {**best["settings"], method.scales: best["scaled"]}

@@ -53,10 +53,10 @@ def test_exact_gain_integrates_glvd() -> None:
 
 def test_oracle_closes_the_gap_and_needs_one() -> None:
     made = run({"sensor_bias": {"bias_mps2": 0.3}})
-    assert oracles(made, sight(made), foretold=True)["rollout_rmse_accel"].closed == pytest.approx(1.0)
-    assert oracles(made, sight(made), foretold=False)["rollout_rmse_accel"].closed is None
+    assert oracles(made, sight(made), predictable=True)["rollout_rmse_accel"].closed == pytest.approx(1.0)
+    assert oracles(made, sight(made), predictable=False)["rollout_rmse_accel"].closed is None
     plain = run()
-    assert oracles(plain, sight(plain), foretold=True)["rollout_rmse_speed"].closed is None
+    assert oracles(plain, sight(plain), predictable=True)["rollout_rmse_speed"].closed is None
 
 
 def test_tiers() -> None:

@@ -32,12 +32,12 @@ class BlackBoxRegression:
     def of(cls, record: Record, rollout: FloatArray) -> BlackBoxRegression:
         """Regressors from a rollout (channel, counted, group) over the record."""
         forces = _shapes(record, rollout.mean(-1))
-        seen = []
+        channels = []
         if "accel" in record.channels:
-            seen.append(forces)
+            channels.append(forces)
         if "speed" in record.channels:
-            seen.append(np.cumsum(forces, -1) * record.dt)
-        columns = np.stack(seen, 1)
+            channels.append(np.cumsum(forces, -1) * record.dt)
+        columns = np.stack(channels, 1)
         if len(record.channels) == 2:
             faults = np.stack([forces, np.zeros_like(forces)], 1)
             columns = np.concatenate([columns, faults])

@@ -24,9 +24,9 @@ from avtorch.gap.quantity import Quantity
 
 DENSITY = "log_predictive_density"
 _DRAWS = 2000
-_TELLS = 1.1  # ratio of before to floor below which there is no gap to close
+_LEAST_RATIO = 1.1  # ratio of before to floor below which there is no gap to close
 _MATERIAL = 0.1  # share of the gap (in squares) that a flexible regression must close to replace the floor
-_TELLS_NATS = 5.0  # the same threshold for densities [nats], over all blocks
+_LEAST_NATS = 5.0  # the same threshold for densities [nats], over all blocks
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def gap_closed(held: CrossValidation) -> Shrinkage:
     usual = [m.name for m in kinds if m.horizon_s == HORIZON_S]
     shows = {name: by_metric[name].before / max(by_metric[name].floor, 1e-12) for name in usual}
     metric = max(shows, key=lambda name: shows[name])
-    if held.by_chance or shows[metric] < _TELLS:
+    if held.by_chance or shows[metric] < _LEAST_RATIO:
         metric = DENSITY
     return Shrinkage(
         metric=metric,
@@ -166,19 +166,19 @@ class _MetricSums:
     def closed(self) -> MetricShrinkage:
         before, after = self.all_in("before"), self.all_in("after")
         floor = float(self._mean(self.floors[0], np.ones(len(self.rows))))
-        return MetricShrinkage(before, after, floor, self._share("before", "after") if self._tells else None)
+        return MetricShrinkage(before, after, floor, self._share("before", "after") if self._has_gap else None)
 
     @property
     def placebo(self) -> Quantity | None:
-        return self._share("verdict", "placebo") if self._tells and "placebo" in self.sums else None
+        return self._share("verdict", "placebo") if self._has_gap and "placebo" in self.sums else None
 
     @property
-    def _tells(self) -> bool:
+    def _has_gap(self) -> bool:
         """Whether there is a gap to close."""
         before, floor = self.all_in("before"), float(self._mean(self.floors[0], np.ones(len(self.rows))))
         if self.better < 0:
-            return before > _TELLS * floor
-        return (floor - before) * self.rows.sum() > _TELLS_NATS
+            return before > _LEAST_RATIO * floor
+        return (floor - before) * self.rows.sum() > _LEAST_NATS
 
     def _mean(self, sums: FloatArray, weights: FloatArray) -> FloatArray:
         """Mean per row, over blocks (..., block) with weights (..., block)."""

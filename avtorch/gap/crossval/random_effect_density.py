@@ -25,17 +25,19 @@ def random_effect_density(found: FittedModel, raw: Record, fits: Record) -> Floa
     if found.tails is None and found.losses is None and (own is None or own.process_sd is None):
         return np.zeros(record.rows)
     row = raw.source // record.group
-    seen = np.isin(row, fits.source)
+    fitted = np.isin(row, fits.source)
     errors = full_rate_errors(raw, found)
     gained = np.zeros(raw.rows)
     began = None
     if found.tails is not None:
         law = {} if own is None or own.law.form != "tails" else {"law": own.law.tails, "size": own.law.size}
-        gained += heavy_tails(errors[0, :, 0], raw.dt, fits=seen, **law).ratios
+        gained += heavy_tails(errors[0, :, 0], raw.dt, fits=fitted, **law).ratios
         began = found.tails.onset
     if found.losses is not None:
         values, command = found.values, raw.command[raw.source]
-        gained += lost_message_gains(full_rate_filter(raw, found), errors, command, values["T_L"], values["K_L"], seen)
+        gained += lost_message_gains(
+            full_rate_filter(raw, found), errors, command, values["T_L"], values["K_L"], fitted
+        )
         began = found.losses.onset
     if own is not None and own.process_sd is not None:
         plain = full_rate_filter(raw, found)

@@ -115,7 +115,7 @@ class Hypothesis:
         with torch.inference_mode():
             place = self.record.place(onset, coarse=coarse)
             responses = rollout_from_onset(self.plant, self._without, drives, values, place)
-        return self._seen(responses, len(z), coarse)
+        return self._by_channel(responses, len(z), coarse)
 
     def baseline_rollouts(
         self, z: Float[FloatArray, "column coordinate"], *, coarse: bool = False
@@ -130,14 +130,14 @@ class Hypothesis:
         record = self.record
         with torch.inference_mode():  # no derivatives: faster recursions
             responses = [of.response(drive, values) for drive in (record.coarse if coarse else record.drives)]
-        return self._seen(responses, max(len(v) for v in values.values()), coarse)
+        return self._by_channel(responses, max(len(v) for v in values.values()), coarse)
 
-    def _seen(self, responses: Sequence[Response], columns: int, coarse: bool) -> FloatArray:
+    def _by_channel(self, responses: Sequence[Response], columns: int, coarse: bool) -> FloatArray:
         record, parts = self.record, []
         if record.accel is not None:
-            parts.append(record.seen([r.accel_measured for r in responses], coarse=coarse))
+            parts.append(record.at_counted_rows([r.accel_measured for r in responses], coarse=coarse))
         if record.speed is not None:
-            parts.append(record.seen([r.speed for r in responses], coarse=coarse))
+            parts.append(record.at_counted_rows([r.speed for r in responses], coarse=coarse))
         return np.stack([np.broadcast_to(p, (columns, *p.shape[-2:])) for p in parts], 1)
 
     def errors(
@@ -182,13 +182,13 @@ class Hypothesis:
         for drive, road, own in zip(drives, *self._places, strict=True):
             force = road.columns(_position(drive)).T
             forces.append(torch.nn.functional.pad(force, (0, 0, own.start, knots - own.stop)))
-        return self._seen_forces(drives, forces, coarse=coarse)
+        return self._response_to_forces(drives, forces, coarse=coarse)
 
     def grade_response(self, coefficients: Float[FloatArray, " knot"]) -> Float[FloatArray, "channel counted group"]:
         """Response to a road grade of `coefficients` (knot,), (channel, counted, group)."""
         drives = self.record.drives
         forces = [road.force(_position(d), own)[None] for road, d, own in self._each_road(drives, coefficients)]
-        return self._seen_forces(drives, forces, coarse=False)[0]
+        return self._response_to_forces(drives, forces, coarse=False)[0]
 
     def _each_road(
         self, drives: Sequence[SimulatorInput], coefficients: FloatArray
@@ -205,7 +205,7 @@ class Hypothesis:
         numbers = self.record.segment
         return [self._roads[n] for n in numbers], [own[n] for n in numbers]
 
-    def _seen_forces(
+    def _response_to_forces(
         self, drives: Sequence[SimulatorInput], forces: Sequence[torch.Tensor], *, coarse: bool
     ) -> FloatArray:
         """Response of both channels to forces (column, time) of each drive, (column, channel, counted, group)."""
@@ -215,8 +215,10 @@ class Hypothesis:
             hidden = drive.specific_force and self.integrated is not None and self.integrated.gravity
             accel.append(torch.zeros_like(force) if hidden else force)  # an accelerometer does not measure gravity
             speed.append(torch.cat([torch.zeros_like(force[:, :1]), gained], -1))
-        seen = {"accel": accel, "speed": speed}
-        return np.stack([self.record.seen(seen[name], coarse=coarse) for name in self.record.channels], 1)
+        channels = {"accel": accel, "speed": speed}
+        return np.stack(
+            [self.record.at_counted_rows(channels[name], coarse=coarse) for name in self.record.channels], 1
+        )
 
     @cached_property
     def _roads(self) -> list[Integrated]:

@@ -240,7 +240,9 @@ class Record:
         out[..., self.target, :] = values
         return out.reshape(*values.shape[:-2], -1)
 
-    def seen(self, responses: Sequence[Tensor], *, coarse: bool = False) -> Float[FloatArray, "*column counted group"]:
+    def at_counted_rows(
+        self, responses: Sequence[Tensor], *, coarse: bool = False
+    ) -> Float[FloatArray, "*column counted group"]:
         """Responses by drive, (..., time) each, at counted rows: (..., counted, group), `coarse` with group 1."""
         parts = []
         for x in responses:

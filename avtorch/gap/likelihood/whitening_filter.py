@@ -79,9 +79,9 @@ class WhiteningFilter:
         out = np.empty(errors.shape)
         for (tops, bottom, _), part in self._parts(group == 1):
             target = record.target[part]
-            seen = padded[..., : (target[-1] + 1) * group]
+            history = padded[..., : (target[-1] + 1) * group]
             for o in range(count):
-                total = sum(np.asarray(lfilter(tops[o][i], bottom, seen[..., i, :], axis=-1)) for i in range(count))
+                total = sum(np.asarray(lfilter(tops[o][i], bottom, history[..., i, :], axis=-1)) for i in range(count))
                 rows = np.asarray(total).reshape(*total.shape[:-1], -1, group)  # type: ignore[union-attr]
                 out[..., o, part, :] = rows[..., target, :]
         return out

@@ -150,11 +150,11 @@ class RolloutDensity:
             responses = [whole.response(drive, values) for drive in record.drives]
         else:
             responses = rollout_from_onset(whole, self._without, record.drives, values, record.place(self.onset))
-        seen = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
+        channels = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
         source, columns = torch.as_tensor(record.source), len(values["T_L"])
         parts = []
         for name in record.channels:
-            whole = torch.cat([x.unflatten(-1, (-1, record.group)) for x in seen[name]], -2)
+            whole = torch.cat([x.unflatten(-1, (-1, record.group)) for x in channels[name]], -2)
             part = whole if len(source) == whole.shape[-2] else whole.index_select(-2, source)
             parts.append(part.expand(columns, *part.shape[-2:]))
         return torch.stack(parts, 1)

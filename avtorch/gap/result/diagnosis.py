@@ -133,17 +133,17 @@ class Diagnosis:
         if self.onset_s is not None and self.onset_from_start_s is None:
             object.__setattr__(self, "onset_from_start_s", self.onset_s - self.log.epochs_s[self.onset_log])
         object.__setattr__(self, "candidates", listed_candidates(self.candidates))
-        said = self.verdict.name
-        if self.budget is None and self.probability(said) < self.candidates[0].probability - 1e-12:
-            raise InputError(f"verdict: found {said}, needs the most probable, {self.candidates[0].name}")
-        if self.budget is not None and candidate_name(self.budget.verdict) != said:
-            raise InputError(f"verdict: found {said}, needs that of the budget, {candidate_name(self.budget.verdict)}")
-        if said not in self.verdict.alias_set or self.verdict.abstained != (said == "unknown"):
+        named = self.verdict.name
+        if self.budget is None and self.probability(named) < self.candidates[0].probability - 1e-12:
+            raise InputError(f"verdict: found {named}, needs the most probable, {self.candidates[0].name}")
+        if self.budget is not None and candidate_name(self.budget.verdict) != named:
+            raise InputError(f"verdict: found {named}, needs that of the budget, {candidate_name(self.budget.verdict)}")
+        if named not in self.verdict.alias_set or self.verdict.abstained != (named == "unknown"):
             raise InputError(f"verdict: found {self.verdict}, needs itself in its alias set, and to abstain on unknown")
 
     def __str__(self) -> str:
         """The sentences of the terminal, one per line."""
-        told = [
+        lines = [
             sentences.headline(self),
             *sentences.budget(self),
             *self.winner.implausible,
@@ -152,8 +152,8 @@ class Diagnosis:
             *sentences.onset(self),
             *sentences.where(self),
         ]
-        told += [*sentences.moved(self), *sentences.gap(self), *sentences.shrinkage(self), *sentences.to_set(self)]
-        return "\n".join([*told, *sentences.to_drive(self), *sentences.remains(self), *self.notes])
+        lines += [*sentences.moved(self), *sentences.gap(self), *sentences.shrinkage(self), *sentences.to_set(self)]
+        return "\n".join([*lines, *sentences.to_drive(self), *sentences.remains(self), *self.notes])
 
     def __repr__(self) -> str:
         return f"<Diagnosis of {self.log.name}: {sentences.headline(self)}>"

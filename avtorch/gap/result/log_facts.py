@@ -54,8 +54,8 @@ class LogFacts:
     def to_dict(self) -> dict[str, Any]:
         given = {"rows": self.rows, "segments": self.segments, "seconds": self.seconds, "rate_hz": self.rate_hz}
         driven = {"speeds_mps": self.speeds, "commands_mps2": self.commands}
-        told = {name: None if ends is None else list(ends) for name, ends in driven.items()}
-        return given | {"signals": list(self.signals), "name": self.name, "epochs_s": list(self.epochs_s)} | told
+        ranges = {name: None if ends is None else list(ends) for name, ends in driven.items()}
+        return given | {"signals": list(self.signals), "name": self.name, "epochs_s": list(self.epochs_s)} | ranges
 
 
 def _driven(logs: Sequence[Log], signal: str, apart: float) -> tuple[float, float] | None:

@@ -54,10 +54,10 @@ def repeatability(record: Record) -> Repeatability | None:
     if not found:
         return None
     floors: dict[str, float] = {}
-    for name, seen in zip(record.channels, record.measured, strict=True):
+    for name, measured in zip(record.channels, record.measured, strict=True):
         each = []
         for first, second in found:
-            one, other = (seen[k + settled : k + rows].ravel() for k in (first, second))
+            one, other = (measured[k + settled : k + rows].ravel() for k in (first, second))
             if name == "speed":
                 one, other = one - one[0], other - other[0]
             each.append(one - other)

@@ -85,12 +85,12 @@ def _verdict(found: Findings) -> str:
         return f"{first} simulator lacks nothing that this log shows ({p}){but}."
     if found.budget is not None and (len(verdict.names) > 1 or verdict.partial):
         return str(found.budget)
-    told = meanings(verdict.name)
+    meaning = meanings(verdict.name)
     # an implausible fit is not described by the effect's usual meaning
-    told = ", but as fitted that is physically implausible." if odd else f": {told}." if told else "."
+    rest = ", but as fitted that is physically implausible." if odd else f": {meaning}." if meaning else "."
     share = found.winner.probability
     who = "The" if share >= SURE else "Probably the" if share >= 0.5 else "Perhaps the"
-    return f"{who} simulator lacks {' and '.join(verdict.names)} ({p}){told}"
+    return f"{who} simulator lacks {' and '.join(verdict.names)} ({p}){rest}"
 
 
 def budget(found: Findings) -> list[str]:
@@ -129,35 +129,38 @@ def moment(found: Findings) -> str:
 
 def where(found: Findings) -> list[str]:
     """Where the gap lies, apart from an onset."""
-    told = []
+    places = []
     for part in found.where:
         if part.axis == "time" and found.onset_s is not None:
             continue  # stated by the sentence on the onset
         if part.axis == "signal":
             if part.share >= 0.5:
-                told.append("in the car's motion" if part.begin == "actuation" else "in the accelerometer's reading")
+                places.append("in the car's motion" if part.begin == "actuation" else "in the accelerometer's reading")
         elif not isinstance(part.begin, str) and not isinstance(part.end, str):
             begin, end = part.begin, part.end
             if part.axis == "time":
                 begin, end = (t - found.log.epochs_s[0] for t in (begin, end))
-                told.append(f"from {begin:.1f} to {end:.1f} s after the log's start")
+                places.append(f"from {begin:.1f} to {end:.1f} s after the log's start")
                 continue
             at, unit = "frequencies" if part.axis == "frequency" else f"{part.axis}s", UNITS[part.axis]
             ends = f"from {part.begin:.2g} to {part.end:.2g}" if part.begin else f"below {part.end:.2g}"
-            told.append(f"at {at} {ends} {unit}")
-    return [f"The gap lies {', '.join(told)}."] if told else []
+            places.append(f"at {at} {ends} {unit}")
+    return [f"The gap lies {', '.join(places)}."] if places else []
 
 
 def shrinkage(found: Findings) -> list[str]:
     """How far the gap shrinks on held-out data."""
-    told = found.shrinkage
-    if told is None:
+    scores = found.shrinkage
+    if scores is None:
         return []
-    top, few = told.top, "" if told.chosen in (1, None) else f"; {100 * told.chosen:.0f} % of the folds selected it"
-    parts = "drives" if told.by_drives else "blocks"
+    top, few = (
+        scores.top,
+        "" if scores.chosen in (1, None) else f"; {100 * scores.chosen:.0f} % of the folds selected it",
+    )
+    parts = "drives" if scores.by_drives else "blocks"
     effect, it, closes = ("effects", "them", "close") if len(found.verdict.names) > 1 else ("effect", "it", "closes")
-    if told.metric in _MEASURES:
-        words, unit = _MEASURES[told.metric]
+    if scores.metric in _MEASURES:
+        words, unit = _MEASURES[scores.metric]
         over = _over(top.horizon_s)
         errors = f"{words} error {top.before:.2g} {unit} without the {effect}, {top.after:.2g} {unit} with {it}"
         line = f"On held-out {parts}{over}: {errors}"
@@ -174,13 +177,13 @@ def shrinkage(found: Findings) -> list[str]:
 
 def moved(found: Findings) -> list[str]:
     """The change of the baseline's fit by the effect."""
-    baseline, with_it, told = found.baseline, found.winner.moved, []
+    baseline, with_it, changes = found.baseline, found.winner.moved, []
     for name in ("T_L", "K_L"):
         if name in with_it and name in baseline:
             unit = " s" if name == "T_L" else ""
-            told.append(f"{name} {baseline[name].mean:.2f} → {with_it[name].mean:.2f}{unit}")
+            changes.append(f"{name} {baseline[name].mean:.2f} → {with_it[name].mean:.2f}{unit}")
     effects = "effects" if len(found.verdict.names) > 1 else "effect"
-    return [f"Baseline fitted without and with the {effects}: {', '.join(told)}."] if told else []
+    return [f"Baseline fitted without and with the {effects}: {', '.join(changes)}."] if changes else []
 
 
 def aliases(found: Findings) -> str:
@@ -188,8 +191,8 @@ def aliases(found: Findings) -> str:
     from_words = {"none": "no effect at all", "unknown": "a cause outside the table"}
     if found.budget is not None and len(found.verdict.names) > 2:
         alike = [(p.name, [n for n in p.alias_set if n != p.name]) for p in found.budget.parts]
-        told = [f"{name} from {' or '.join(others)}" for name, others in alike if others]
-        return f"This log cannot distinguish {', nor '.join(told)}." if told else "This log distinguishes them."
+        confused = [f"{name} from {' or '.join(others)}" for name, others in alike if others]
+        return f"This log cannot distinguish {', nor '.join(confused)}." if confused else "This log distinguishes them."
     if _cut(found):
         from_words["unknown"] = "a cause that was not tried"
     others = [from_words.get(n, n.replace("+", " with ")) for n in found.verdict.alias_set if n != found.verdict.name]
@@ -249,8 +252,8 @@ def gap(found: Findings) -> list[str]:
     lines = [f"Gap of the baseline simulator{_over(gap.horizon_s)}: {', '.join(parts)}."]
     if gap.repeats is not None:
         alike = [("accelerations", gap.repeats.accel, "m/s²"), ("speeds", gap.repeats.speed, "m/s")]
-        told = " and ".join(f"{name} to {x:.2g} {unit}" for name, x, unit in alike if x is not None)
-        again = f"Under repeated commands ({gap.repeats.seconds:.0f} s) the car repeats {told}"
+        spreads = " and ".join(f"{name} to {x:.2g} {unit}" for name, x, unit in alike if x is not None)
+        again = f"Under repeated commands ({gap.repeats.seconds:.0f} s) the car repeats {spreads}"
         lines.append(f"{again}; this spread is noise, or does not depend on the commands.")
     return lines
 
@@ -265,8 +268,8 @@ def remains(found: Findings) -> list[str]:
     if not found.remaining:
         return []
     best = sorted(found.remaining, key=lambda c: -c.probability)[:3]
-    told = ", ".join(f"{c.name} {number(c.probability)}" for c in best if c.probability >= 0.005)
-    return [f"Hypotheses once the simulator has dead_time: {told}."]
+    listing = ", ".join(f"{c.name} {number(c.probability)}" for c in best if c.probability >= 0.005)
+    return [f"Hypotheses once the simulator has dead_time: {listing}."]
 
 
 def to_set(found: Findings) -> list[str]:
@@ -279,12 +282,12 @@ def to_set(found: Findings) -> list[str]:
 
 def to_drive(found: Findings) -> list[str]:
     """The recommended next experiment."""
-    told = found.next_experiment
-    if told is None:
+    experiment = found.next_experiment
+    if experiment is None:
         return []
-    begin, seconds, metres = (told[key] for key in ("start_speed_mps", "seconds", "metres"))
-    line = f"Next experiment: {told['why']} It starts at {begin:.3g} m/s and takes {seconds:.0f} s and {metres:.0f} m."
-    kept = told.get("limits")
+    why, begin, seconds, metres = (experiment[key] for key in ("why", "start_speed_mps", "seconds", "metres"))
+    line = f"Next experiment: {why} It starts at {begin:.3g} m/s and takes {seconds:.0f} s and {metres:.0f} m."
+    kept = experiment.get("limits")
     if kept is None:
         return [line]
     speeds, commands = (f"{kept[f'{k}_min']:.2g} to {kept[f'{k}_max']:.3g}" for k in ("speed", "accel"))

@@ -43,4 +43,4 @@ def rolled_out(record: Record, simulator: GapPlant) -> FloatArray:
         own = simulator.prepared(*drives)
         responses += [own.response(drive) for drive in drives]
     channels = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
-    return np.stack([record.seen(channels[name]) for name in record.channels])
+    return np.stack([record.at_counted_rows(channels[name]) for name in record.channels])

@@ -181,8 +181,8 @@ class LossHistories:
         drift[:order, :order] = self.move.T
         drift[order, order] = 1.0
         for t in range(steps):
-            seen = path[..., :order] @ self.see.T
-            gain = (seen @ e[:, :, t].T[..., None])[..., 0] - 0.5 * (seen**2).sum(-1)
+            predicted = path[..., :order] @ self.see.T
+            gain = (predicted @ e[:, :, t].T[..., None])[..., 0] - 0.5 * (predicted**2).sum(-1)
             with np.errstate(divide="ignore"):
                 gain += np.log(weight)
             top = gain.max(1, keepdims=True)

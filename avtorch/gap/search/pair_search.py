@@ -63,16 +63,16 @@ class PairSearch:
             self._under(single[0], none, made)
         white = WhiteningFilter(none.hypothesis.record, noise)
         alone = {f.name: f.values for f in single if not f.blown}
-        seen: dict[str, Screened] = {}
+        screened: dict[str, Screened] = {}
         for i, base in enumerate(bases):
             self.progress("pairs", i, len(bases))
             if self.budget.spent():
                 break
             for look in self._joined(base, white, alone, _SECONDS if i == 0 else _SECONDS // 2):
-                known = seen.get(look.hypothesis.name)
+                known = screened.get(look.hypothesis.name)
                 if known is None or look.value > known.value:
-                    seen[look.hypothesis.name] = look
-        done = self._settle_pairs(list(seen.values()), _PAIRS, noise, made)
+                    screened[look.hypothesis.name] = look
+        done = self._settle_pairs(list(screened.values()), _PAIRS, noise, made)
         for _ in range(_SWAPS):
             if done is None or done.log_evidence < single[0].log_evidence + _SECOND or self.budget.spent():
                 break

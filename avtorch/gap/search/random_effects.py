@@ -133,12 +133,12 @@ def glitched(
         names = [] if f.name == "none" else f.name.split("+")
         if len(names) > 1 or (names and not pairs):
             continue
-        for of, seen in glitches:
+        for of, tails in glitches:
             if not isinstance(of, RandomLaw):
-                own = {"name": f.name_with(of.name), "searched": (*f.searched, of), "tails": seen}
-                out.append(replace(f, log_evidence=f.log_evidence + seen.evidence, **own))
+                own = {"name": f.name_with(of.name), "searched": (*f.searched, of), "tails": tails}
+                out.append(replace(f, log_evidence=f.log_evidence + tails.evidence, **own))
             elif f.by_chance is None:
-                out.append(tailed(f, of, seen))
+                out.append(tailed(f, of, tails))
     return out
 
 

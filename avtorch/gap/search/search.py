@@ -61,7 +61,7 @@ class Search:
         self.effects = list(EFFECTS.values() if effects is None else effects)
         self.budget = TimeBudget(budget_s)
         self.progress = progress or (lambda what, done, of: None)
-        self._seen: set[str] = set()  # effects rolled out, also those whose evidence is not kept
+        self._rolled_out: set[str] = set()  # effects rolled out, also those whose evidence is not kept
         self._paired = False
         self._random = RandomEffects({}, {})  # until their laws are drawn up for the drives
         self._glitches: list[tuple[RandomLaw | type[Effect], HeavyTails]] = []
@@ -106,14 +106,14 @@ class Search:
             best.setdefault(f.name, f)
         best = all_delays(record, best)
         pairs = "none" if not self._paired else "all" if self.budget.complete else "some"
-        scope = Scope.of(self.effects, {*best, *self._seen}, record.channels, pairs)
+        scope = Scope.of(self.effects, {*best, *self._rolled_out}, record.channels, pairs)
         return SearchResult(record, raw, tuple(logs), tuple(best.values()), self.budget.complete, scope)
 
     # deterministic causes and gusts --------------------------------------------------------------------------------
     def _deterministic(self, record: Record, none: FittedModel) -> list[FittedModel]:
         kinds = [e for e in self.effects if not e.random and is_observable(e, record.channels)]
         white = WhiteningFilter(record, none.noise.noise)
-        seen: list[Screened] = []
+        screened: list[Screened] = []
         floor, coarse_floor = (
             float(white.log_likelihood(e[None])[0]) for e in (none.errors, none.errors.mean(-1, keepdims=True))
         )
@@ -124,10 +124,10 @@ class Search:
             hypothesis = Hypothesis(record, (kind,), self.baseline)
             begin = start_points(hypothesis, none.values)
             found = screen(hypothesis, white, begin, onsets=kind.own_onset is None, floor=coarse_floor)
-            seen += [refine(look, white) for look in found]
+            screened += [refine(look, white) for look in found]
         best: dict[str, float] = {}
-        self._seen |= {look.hypothesis.name for look in seen}
-        for look in seen:
+        self._rolled_out |= {look.hypothesis.name for look in screened}
+        for look in screened:
             best[look.hypothesis.name] = max(best.get(look.hypothesis.name, -np.inf), look.value)
         order = sorted(best, key=lambda n: -best[n])
         top = best[order[0]] - floor if order else 0.0
@@ -143,8 +143,8 @@ class Search:
             fitted.add(name)
             # a gust's model leaves too little noise for models that explain less
             noise = max((f for f in found if not f.blown), key=lambda f: f.log_evidence).noise.noise
-            found.append(self.fits.best_form([look for look in seen if look.hypothesis.name == name], noise))
-        found += self._left_behind([look for look in seen if look.hypothesis.name not in fitted], white, none)
+            found.append(self.fits.best_form([look for look in screened if look.hypothesis.name == name], noise))
+        found += self._left_behind([look for look in screened if look.hypothesis.name not in fitted], white, none)
         if self.pairs and not self.budget.spent():
             self._paired = True
             pairs = PairSearch(kinds, self._random, self.fits, self.budget, self.progress)

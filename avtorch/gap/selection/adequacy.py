@@ -109,12 +109,12 @@ class _Look:
         """The same for a change in the reading of one channel only."""
         return self._image(x, False, (channel,))
 
-    def _image(self, x: FloatArray, moves: bool, seen: Sequence[str]) -> FloatArray:
+    def _image(self, x: FloatArray, moves: bool, channels: Sequence[str]) -> FloatArray:
         out = np.empty((len(x), len(self.channels), self.rows))
         for i, column in enumerate(x):
             rows = np.zeros((len(self.channels), self.rows, self.group))
             for k, channel in enumerate(self.channels):
-                if channel in seen:
+                if channel in channels:
                     rows[k] = column[:, None]
                     if moves and channel == "speed":
                         rows[k] = (np.cumsum(rows[k]) * self.dt / self.group).reshape(self.rows, self.group)
@@ -180,7 +180,7 @@ class _Look:
         span = grid.shape[1]
         f = np.fft.rfftfreq(2 * span, dt)
         use = (f > SCALES.line_from) & (f < SCALES.line_to / self.dt)
-        seen, f = np.fft.rfft(grid, n=2 * span, axis=-1)[:, use], f[use]
+        spectrum, f = np.fft.rfft(grid, n=2 * span, axis=-1)[:, use], f[use]
         length = min(span, 2048 * self.group)
         through = []
         for i in range(count):
@@ -196,7 +196,7 @@ class _Look:
         evidences = []
         for answer in answers:
             weight = np.maximum((np.abs(answer) ** 2).sum(0), 1e-15)
-            power = np.abs((answer.conj() * seen).sum(0)) ** 2 / weight / (self.rows * self.group)
+            power = np.abs((answer.conj() * spectrum).sum(0)) ** 2 / weight / (self.rows * self.group)
             # relative to the local level of the spectrum, so that a broad hump does not count as lines
             power /= np.maximum(gaussian_filter1d(np.minimum(power, 6.0), 60), 1.0)
             evidences += [_mean(power * s / (1 + s) - np.log1p(s)) for s in SCALES.line_sizes]

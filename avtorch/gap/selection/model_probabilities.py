@@ -79,9 +79,9 @@ def model_probabilities(
         if len(parts) > 1:
             shares[f.name] *= weigh.get("pair", 1.0)
     total = sum(shares.values())
-    seen = signs(favourite(found, calibration.odds), _none(found), left)
+    regressors = signs(favourite(found, calibration.odds), _none(found), left)
     weights = [getattr(calibration.unknown, f.name) for f in fields(UnknownWeights)]
-    odds = float(np.exp(sum(w * x for w, x in zip(weights, seen, strict=True)))) * weigh.get("unknown", 1.0)
+    odds = float(np.exp(sum(w * x for w, x in zip(weights, regressors, strict=True)))) * weigh.get("unknown", 1.0)
     unknown = odds / (1 + odds)
     if not total > 0:
         if not unknown > 0:

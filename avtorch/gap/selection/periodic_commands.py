@@ -10,7 +10,7 @@ from avtorch.gap.selection.verdict import Verdict
 _NAMED = 4  # delays named in a sentence
 
 
-def untold(found: Iterable[FittedModel]) -> dict[str, FittedModel]:
+def undetermined_delays(found: Iterable[FittedModel]) -> dict[str, FittedModel]:
     """Fitted models, by name, whose delay may be zero."""
     return {f.name: f for f in found if f.delays is not None and f.delays.may_be_zero}
 

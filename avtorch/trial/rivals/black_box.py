@@ -78,13 +78,19 @@ def _features(drive: Residuals, residual: FloatArray, rows: NDArray[np.intp]) ->
     speed = np.concatenate(
         [np.zeros(len(one.time)) if one.speed is None else one.speed.numpy() for one in drive.drives]
     )
-    moved = (command, drive.seen[0] - residual[:, 0])
+    moved = (command, drive.measured[0] - residual[:, 0])
     v = speed[rows - 1]
     columns = [np.ones(len(rows)), v, v**2, np.exp(-v / 2)]
     for x in moved:
         for lag in _LAGS_S:
-            seen = x[rows - 1 - round(lag / drive.step)]
-            columns += [seen, np.maximum(seen, 0.0), np.tanh(seen / 0.1), seen * v, np.abs(seen) * seen]
+            delayed = x[rows - 1 - round(lag / drive.step)]
+            columns += [
+                delayed,
+                np.maximum(delayed, 0.0),
+                np.tanh(delayed / 0.1),
+                delayed * v,
+                np.abs(delayed) * delayed,
+            ]
     late = rows / rows[-1]
     columns += [command[rows - 1] * late, late, command[rows - 1] * (late > 0.5)]
     return np.stack(columns, 1)

@@ -15,8 +15,8 @@ _ROAD_HZ = 3.0  # the effect of a road on a car is slower
 
 def outliers(fitter: Fitter, fit: MaximumLikelihoodFit) -> float:
     """A few samples of the acceleration have a wider normal error: two more parameters, by expectation maximisation."""
-    told = _innovations(fitter, fit)[0]
-    square = (told / told.std()) ** 2
+    innovations = _innovations(fitter, fit)[0]
+    square = (innovations / innovations.std()) ** 2
     share, wide, narrow = 0.01, 25.0, 0.9
     mixed = plain = -0.5 * float(square.sum())
     for _ in range(60):
@@ -33,7 +33,7 @@ def outliers(fitter: Fitter, fit: MaximumLikelihoodFit) -> float:
 
 def command_hold(fitter: Fitter, fit: MaximumLikelihoodFit) -> float:
     """Innovations are larger where the command has just stepped: one more parameter."""
-    told, rows = _innovations(fitter, fit)
+    innovations, rows = _innovations(fitter, fit)
     # the step before the row: the row's own command already depends on the row's noise
     push = fitter.drive.push[rows - 1]
     if push.max() <= 0:
@@ -41,8 +41,8 @@ def command_hold(fitter: Fitter, fit: MaximumLikelihoodFit) -> float:
     gains = [0.0]
     for more in np.geomspace(1e-3, 30.0, 25):
         spread = 1 + more * push / push.mean()
-        size = np.mean(told**2 / spread) / np.mean(told**2)
-        gains.append(-0.5 * float(np.log(size) * len(told) + np.log(spread).sum()))
+        size = np.mean(innovations**2 / spread) / np.mean(innovations**2)
+        gains.append(-0.5 * float(np.log(size) * len(innovations) + np.log(spread).sum()))
     return fit.loss - max(gains)
 
 

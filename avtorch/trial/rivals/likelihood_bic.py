@@ -139,15 +139,15 @@ def _reported(one: Scored) -> dict[str, tuple[float, float]]:
     values = one.fit.values()
     means = {name: torch.tensor(mean, dtype=torch.float64) for name, (mean, _) in values.items()}
 
-    def told(at: dict[str, torch.Tensor]) -> dict[str, float]:
+    def report_at(at: dict[str, torch.Tensor]) -> dict[str, float]:
         own = one.fit.plant.with_values(at).report()
         pair = len(one.names) > 1
         return {f"{e}.{key}" if pair else key: float(x) for e, keys in own.items() for key, x in keys.items()}
 
-    middle = told(means)
+    middle = report_at(means)
     variance = dict.fromkeys(middle, 0.0)
     for name, (mean, sd) in values.items():
-        moved = told({**means, name: torch.tensor(mean + 0.1 * sd, dtype=torch.float64)})
+        moved = report_at({**means, name: torch.tensor(mean + 0.1 * sd, dtype=torch.float64)})
         for key in middle:
             variance[key] += ((moved[key] - middle[key]) / 0.1) ** 2
     return {key: (middle[key], math.sqrt(variance[key])) for key in middle}

@@ -25,14 +25,14 @@ _SETTLE_S = 1.0
 class Residuals:
     """Every n-th row of a log; the command is the mean over the rows between, which the actuator integrates.
 
-    `seen` (channel, row): acceleration [m/s²] and gain in speed until the next row [m/s], as far as the log has them,
-    named by `channels`. `valid` (row,): moving, engaged, not the last of a stretch, and past the first second of it.
-    `push` (row,) [(m/s²)²]: squared steps of the command within the row. `step` [s].
+    `measured` (channel, row): acceleration [m/s²] and gain in speed until the next row [m/s], as far as the log has
+    them, named by `channels`. `valid` (row,): moving, engaged, not the last of a stretch, and past the first second of
+    it. `push` (row,) [(m/s²)²]: squared steps of the command within the row. `step` [s].
     """
 
     drives: tuple[SimulatorInput, ...]
     channels: tuple[str, ...]
-    seen: FloatArray
+    measured: FloatArray
     valid: BoolArray
     push: FloatArray
     step: float
@@ -44,7 +44,7 @@ class Residuals:
             raise InputError(f"{log.name}: has no accel_cmd, needed to simulate a plant")
         every = max(1, round(log.rate_hz / rate_hz))
         channels = tuple(name for name in ("accel", "speed") if getattr(log, name) is not None)
-        drives, seen, valid, push = [], [], [], []
+        drives, measured, valid, push = [], [], [], []
         for part in log.engaged_segments():
             count = (part.stop - part.start) // every
             if count < 3:
@@ -57,7 +57,7 @@ class Residuals:
             valid.append(fit & np.append(fit[1:], False) & _after(fit, round(_SETTLE_S * log.rate_hz / every)))
             push.append((np.diff(command.ravel(), prepend=command[0, 0]) ** 2).reshape(count, every).sum(1))
             gained = None if speed is None else np.append(np.diff(speed), 0.0)
-            seen.append(np.stack([x for x in (accel, gained) if x is not None]))
+            measured.append(np.stack([x for x in (accel, gained) if x is not None]))
             drives.append(
                 SimulatorInput(
                     torch.as_tensor(time),
@@ -69,7 +69,9 @@ class Residuals:
         if not valid or np.concatenate(valid).sum() < 100:
             raise InputError(f"{log.name}: fewer than 100 rows in motion, needs more to diagnose")
         step = every / log.rate_hz
-        return cls(tuple(drives), channels, np.concatenate(seen, 1), np.concatenate(valid), np.concatenate(push), step)
+        return cls(
+            tuple(drives), channels, np.concatenate(measured, 1), np.concatenate(valid), np.concatenate(push), step
+        )
 
     @torch.no_grad()
     def misses(self, plant: GapPlant, values: Mapping[str, Tensor]) -> FloatArray:
@@ -78,18 +80,18 @@ class Residuals:
         for drive in self.drives:
             answer = plant.response(drive, values)
             gained = answer.speed.diff(dim=-1, append=answer.speed[..., -1:])
-            told = {"accel": answer.accel_measured, "speed": gained}
-            batch = np.broadcast_shapes(*(told[name].shape for name in self.channels))
-            parts.append(torch.stack([told[name].expand(batch) for name in self.channels], -2).numpy())
-        missed = self.seen - np.concatenate(parts, -1)
+            response = {"accel": answer.accel_measured, "speed": gained}
+            batch = np.broadcast_shapes(*(response[name].shape for name in self.channels))
+            parts.append(torch.stack([response[name].expand(batch) for name in self.channels], -2).numpy())
+        missed = self.measured - np.concatenate(parts, -1)
         return np.where(self.valid, missed, 0.0)
 
     def forced(self, columns: FloatArray) -> FloatArray:
         """The channels' response (column, channel, row) to accelerations (column, row) [m/s²] of the body."""
         gained = np.zeros_like(columns)
         gained[:, :-1] = 0.5 * self.step * (columns[:, 1:] + columns[:, :-1])
-        told = {"accel": columns, "speed": gained}
-        return np.where(self.valid, np.stack([told[name] for name in self.channels], 1), 0.0)
+        response = {"accel": columns, "speed": gained}
+        return np.where(self.valid, np.stack([response[name] for name in self.channels], 1), 0.0)
 
 
 def _after(fit: BoolArray, wait: int) -> BoolArray:

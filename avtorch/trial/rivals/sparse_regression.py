@@ -91,11 +91,11 @@ def _thin(x: FloatArray, every: int) -> FloatArray:
 def _best_lag(u: FloatArray, a: FloatArray | None, v: FloatArray | None, moving: BoolArray, step: float) -> float:
     """The lag [s] whose response to the command is nearest to the acceleration, up to a gain."""
     assert a is not None or v is not None
-    seen = gaussian_filter1d(v, _SMOOTH_S / step, order=1) / step if a is None and v is not None else a
+    slope = gaussian_filter1d(v, _SMOOTH_S / step, order=1) / step if a is None and v is not None else a
 
     def miss(lag: float) -> float:
         x = lagged(u, lag, step)[moving]
-        y = np.asarray(seen)[moving]
+        y = np.asarray(slope)[moving]
         return float(y @ y - (x @ y) ** 2 / max(x @ x, 1e-12))
 
     return min(np.geomspace(0.05, 2.0, 30).tolist(), key=miss)
@@ -119,8 +119,8 @@ def _held_out(
     errors = []
     for half in range(2):
         held = moving & (block % 2 == half)
-        seen = moving & ~held
-        if held.sum() < 20 or seen.sum() < 20:
+        kept = moving & ~held
+        if held.sum() < 20 or kept.sum() < 20:
             continue
         model = package.SINDy(
             optimizer=package.STLSQ(threshold=0.005 * size, alpha=1e-6),
@@ -129,9 +129,9 @@ def _held_out(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             # all columns but the first are inputs: only the equation of the slope is identified
-            model.fit(x[seen, :1], t=step, x_dot=slope[seen, None], u=x[seen, 1:] if x.shape[1] > 1 else None)
-            told = model.predict(x[held, :1], u=x[held, 1:] if x.shape[1] > 1 else None)
-        errors.append(slope[held] - np.asarray(told)[:, 0])
+            model.fit(x[kept, :1], t=step, x_dot=slope[kept, None], u=x[kept, 1:] if x.shape[1] > 1 else None)
+            predicted = model.predict(x[held, :1], u=x[held, 1:] if x.shape[1] > 1 else None)
+        errors.append(slope[held] - np.asarray(predicted)[:, 0])
     if not errors:
         raise InputError("sparse_regression: too little motion in the log, needs 40 rows at 20 Hz")
     return np.concatenate(errors)

@@ -267,7 +267,7 @@ def test_the_reported_slope_is_the_roads(rotating_seed: int) -> None:
     values = {k: float(v) for k, v in hypothesis.values(z).items()}
     found = plant([RoadGrade(fit.grade_rms, profile=torch.as_tensor(fit.profile / fit.grade_rms))], **values)
     response = found.response(record.drives[0])
-    shown = np.stack([record.seen([response.accel_measured]), record.seen([response.speed])])
+    shown = np.stack([record.at_counted_rows([response.accel_measured]), record.at_counted_rows([response.speed])])
     # after the start, at which the actuator makes up for the slope; what that adds to the speed is its offset
     apart = (record.measured - shown - fit.errors)[:, 80:]
     assert np.abs(apart[0]).max() < 1e-3
@@ -289,8 +289,8 @@ def test_slope_columns_are_the_rollouts_derivatives(fresh_seed: int) -> None:
         response = plant([RoadGrade(1.0, profile=unit)]).response(drive)
         # at the start the actuator makes up for the slope, so that the first acceleration is the measured one
         late = record.time[record.source] > 8
-        accel = record.seen([response.accel_measured - flat.accel_measured])[late, 0]
-        speed = record.seen([response.speed - flat.speed])[late, 0]
+        accel = record.at_counted_rows([response.accel_measured - flat.accel_measured])[late, 0]
+        speed = record.at_counted_rows([response.speed - flat.speed])[late, 0]
         own = 1e-4 * columns[k][:, late, 0]
         np.testing.assert_allclose(accel, own[0], atol=1e-9)
         np.testing.assert_allclose(speed - speed[0], own[1] - own[1, 0], atol=1e-9)

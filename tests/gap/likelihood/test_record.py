@@ -162,9 +162,9 @@ def test_segments_are_drives_of_their_own(monkeypatch: pytest.MonkeyPatch) -> No
     assert [len(d.time) for d in record.coarse] == [300, 480, 310]
     np.testing.assert_allclose(_stretches(record), [(2, 14.95), (18, 39.95), (46, 59.45)], atol=1e-6)
     # measured and rolled out stand at the same rows
-    seen = record.seen([d.command for d in record.drives])
+    seen = record.at_counted_rows([d.command for d in record.drives])
     np.testing.assert_allclose(seen.mean(-1), record.command[record.source])
-    at = record.seen([d.time for d in record.drives])
+    at = record.at_counted_rows([d.time for d in record.drives])
     np.testing.assert_allclose(at[:, 0], record.time[record.source], atol=1e-6)
 
 

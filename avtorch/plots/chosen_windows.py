@@ -16,7 +16,7 @@ EXACT = 4000
 
 
 @dataclass(frozen=True)
-class ShownWindow:
+class ChosenWindow:
     """A window drawn individually: its number, its place among those NUTS was run on, what it represents."""
 
     number: int
@@ -40,7 +40,7 @@ class ChosenWindows:
         places = sorted({0, len(order) // 2, len(order) - 1})
         words = {1: [""], 2: ["wide: ", "narrow: "], 3: ["wide: ", "middle: ", "narrow: "]}[len(places)]
         self.windows = [
-            ShownWindow(
+            ChosenWindow(
                 number := int(index[order[p]]),
                 place(validation.nuts_index, number),
                 f"{word}window {number}, SD of $T_L$ {100 * float(width[order[p]]):.2g} %",
@@ -54,7 +54,7 @@ class ChosenWindows:
         index = torch.tensor([w.number for w in self.windows])
         return self.validation.quadrature_draws(index, chains=1, draws=EXACT)
 
-    def truth(self, window: ShownWindow, name: str) -> float | None:
+    def truth(self, window: ChosenWindow, name: str) -> float | None:
         known = self.validation.windows.truth
         return None if known is None else float(known[window.number, self.validation.names.index(name)])
 
