@@ -70,13 +70,16 @@ class AnalysisRecord:
         return "speed" in self.channels
 
     @classmethod
-    def of(cls, logs: Sequence[Log], *, rate_hz: float = RATE_HZ) -> AnalysisRecord:
-        """Raises `InputError` where what counts is less than six blocks of four seconds."""
+    def of(cls, logs: Sequence[Log], *, rate_hz: float = RATE_HZ, block_s: float | None = None) -> AnalysisRecord:
+        """`block_s`: length of a block [s]; default: so that there are some 24, of four to ten seconds.
+
+        Raises `InputError` where what counts is less than six blocks.
+        """
         channels = tuple(c for c in ("speed", "accel") if all(getattr(log, c) is not None for log in logs))
         if not channels:
             raise InputError("logs: found no channel that all of them have, needs speed or accel in each")
         usable = sum(float(log.usable.sum()) / log.rate_hz for log in logs)
-        length = float(np.clip(usable / _BLOCKS, _SHORTEST_BLOCK_S, _LONGEST_BLOCK_S))
+        length = float(np.clip(usable / _BLOCKS, _SHORTEST_BLOCK_S, _LONGEST_BLOCK_S)) if block_s is None else block_s
         step = 1.0 / min(rate_hz, min(log.rate_hz for log in logs))
         pieces = [piece for number, log in enumerate(logs) for piece in _pieces(log, number, step, channels, length)]
         if not pieces:
