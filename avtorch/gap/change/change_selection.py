@@ -18,7 +18,7 @@ from avtorch.gap.budget.noise_whitening import NoiseWhitening
 from avtorch.gap.change.change_model import Change, ChangeModel
 from avtorch.gap.change.joint_fit import Fit, HeldOut, JointFit
 from avtorch.gap.change.joint_whitening import JointWhitening
-from avtorch.gap.change.shared_remainder import columns
+from avtorch.gap.change.shared_remainder import BASIC, columns
 from avtorch.gap.change.two_sides import TwoSides
 from avtorch.gap.simulator.plant import GapPlant
 
@@ -31,7 +31,7 @@ DRIFT_ERRORS = 2.0
 _SCREENING = 2  # iterations of the fits that decide which changes are held out
 _SCREENED = 6  # besides lag, gain and dead time
 _STAYS = -1.0  # strength down to which a change holds its place
-_RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+_RIDGES = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 _NOISE_RIDGE = 1e-4  # of the regression whose left-over is the noise
 
 
@@ -124,18 +124,17 @@ def _noise(sides: TwoSides, base: GapPlant, progress: Progress | None) -> tuple[
     record, model = sides.whole, ChangeModel(sides, base)
     mean = record.measured - record.measured[:, record.counts].mean(-1, keepdims=True)
     whitening = NoiseWhitening.band(record, mean)
-    starts = model.starts({})
-    fitting = JointFit(whitening, columns(record, model.simulate(starts[0])[0]))
-    fit = fitting.fit(model, starts)
+    starts, basic = model.starts({}), BASIC if len(record.channels) == 2 else BASIC - 1
+    fit = JointFit(whitening, columns(record, model.simulate(starts[0])[0])[:basic]).fit(model, starts)
     for number in range(2):
         if progress is not None:
             progress("noise of both drives", number, 2)
         shapes = columns(record, model.simulate(fit.p)[0])
-        both = np.concatenate([shapes, shapes * sides.is_after])
-        of_both = JointFit(whitening if number == 0 else fitting.whitening, both, ridge=_NOISE_RIDGE)
-        left = of_both.left(of_both.fit(model, np.array([fit.p]), iterations=3))
-        fitting = JointFit(JointWhitening.vector_autoregressive(record, left), shapes, ridge=fitting.ridge)
-        fit = fitting.fit(model, np.concatenate([fit.p[None], starts]), iterations=10)
+        both = JointFit(whitening, np.concatenate([shapes, shapes * sides.is_after]), ridge=_NOISE_RIDGE)
+        whitening = JointWhitening.vector_autoregressive(record, both.left(both.fit(model, fit.p[None], iterations=3)))
+        fit = JointFit(whitening, shapes[:basic]).fit(model, np.concatenate([fit.p[None], starts]), iterations=10)
+    shapes = columns(record, model.simulate(fit.p)[0])
+    fitting = JointFit(whitening, shapes).beyond(model, fit.p, basic)
     costs = []
     for ridge in _RIDGES:
         stiff = replace(fitting, ridge=ridge)
@@ -185,11 +184,15 @@ def _with_drift(sides: TwoSides, fitting: JointFit, step: Step) -> Step:
     changed = _last_difference(model, p)
     halves = [sides.second_half(after) for after in (False, True)]
     added = np.array([changed * sides.is_after, *(changed * half for half in halves)])
-    values, errors = fitting.sizes(step.fit, added)
-    weights = 1 / np.maximum(errors[1:], 1e-9) ** 2
-    excess = np.maximum(values[1:] ** 2 - errors[1:] ** 2, 0.0)
-    alone = fitting.sizes(step.fit, added[:1])[1][0]
-    return replace(step, relative_sd=float(alone), drift=float(np.sqrt(weights @ excess / weights.sum())))
+    others = model.without(model.changes[-1]).size  # the change's own coordinates would do the same
+    values, errors = fitting.sizes(step.fit, added, others)
+    alone = fitting.sizes(step.fit, added[:1], others)[1][0]
+    known = np.isfinite(errors[1:])
+    drift = 0.0
+    if known.any():
+        square, variance = values[1:][known] ** 2, np.maximum(errors[1:][known], 1e-9) ** 2
+        drift = float(np.sqrt((np.maximum(square - variance, 0.0) / variance).sum() / (1 / variance).sum()))
+    return replace(step, relative_sd=float(alone), drift=drift)
 
 
 def _last_difference(model: ChangeModel, p: FloatArray) -> FloatArray:

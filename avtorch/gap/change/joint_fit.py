@@ -20,6 +20,7 @@ _STEP = 1e-3  # of the differences
 _DAMPING = (1e-3, 0.3, 10.0)
 _LONGEST = 1.5  # step of a coordinate [prior SD]
 _STOP_NATS = 0.05
+_SHOWN = 1e-6  # of the largest column's square, that a column counts
 _REWEIGHTED = 3  # times that the weights of blocks follow the residuals, in linear fits
 
 
@@ -67,8 +68,19 @@ class JointFit:
     def folds(self) -> int:
         return int(self.robust.fold.max()) + 1
 
-    def with_shapes(self, shapes: FloatArray) -> JointFit:
-        return replace(self, shapes=shapes)
+    def beyond(self, model: ChangeModel, p: FloatArray, basic: int) -> JointFit:
+        """With columns after the first `basic` that do nothing which those or the parameters could do near `p`.
+
+        So the parameters keep their meaning, however many columns stand beside them.
+        """
+        around = model.simulate(np.concatenate([p[None], p + _STEP * np.eye(model.size)]))
+        known = np.concatenate([(around[1:] - around[0]) / _STEP, self.shapes[:basic]])
+        J = self.whitening(known).reshape(len(known), -1)
+        matrix = J @ J.T
+        matrix += 1e-6 * np.diag(np.diag(matrix)) + 1e-9 * np.eye(len(J))
+        more = self.shapes[basic:]
+        shares = np.linalg.solve(matrix, J @ self.whitening(more).reshape(len(more), -1).T).T
+        return replace(self, shapes=np.concatenate([self.shapes[:basic], more - np.tensordot(shares, known, 1)]))
 
     def white(self, model: ChangeModel, p: FloatArray) -> FloatArray:
         """White residuals (..., channel, counted) of the model alone at `p` (..., size)."""
@@ -184,21 +196,27 @@ class JointFit:
         return np.array(out)
 
     # a column in addition ------------------------------------------------------------------------------------------
-    def sizes(self, fit: Fit, added: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def sizes(self, fit: Fit, added: FloatArray, free: int | None = None) -> tuple[FloatArray, FloatArray]:
         """Coefficients and their standard errors (column,) of `added` columns (column, channel, row) beside a fit.
 
-        By a jackknife over blocks: what blocks disagree on is in the error.
+        Only the first `free` coordinates of its model move with them (default: all).
+
+        By a jackknife over blocks: what blocks disagree on is in the error, which is infinite for a column that the
+        drives do not show.
         """
         model, count = fit.model, len(added)
+        free = model.size if free is None else free
         w = self.white(model, fit.p)
-        slopes = (w - self.white(model, fit.p + _STEP * np.eye(model.size))) / _STEP
+        slopes = (w - self.white(model, fit.p + _STEP * np.eye(model.size)[:free])) / _STEP
         extra = self.whitening(added)
         grams = self._grams(np.concatenate([extra, slopes, self.X, w[None]]))
         last = grams.shape[-1] - 1
-        x = np.concatenate([np.zeros(count + model.size), fit.c])
+        x = np.concatenate([np.zeros(count + free), fit.c])
         # the added columns are free
-        prior = np.concatenate([np.zeros(count), np.ones(model.size), np.full(len(fit.c), self.penalty)])
-        begun = np.concatenate([np.zeros(count), fit.p, np.zeros(len(fit.c))])
+        own = np.einsum("bii->i", grams)[:count]
+        shown = own > _SHOWN * own.max(initial=0.0)
+        prior = np.concatenate([np.where(shown, 0.0, 1.0), np.ones(free), np.full(len(fit.c), self.penalty)])
+        begun = np.concatenate([np.zeros(count), fit.p[:free], np.zeros(len(fit.c))])
         scale = np.ones(self.whitening.blocks)
         for _ in range(_REWEIGHTED):
             left = np.append(-x, 1.0)
@@ -211,7 +229,8 @@ class JointFit:
             weights = scale.copy()
             weights[b] = 0.0
             each[b] = _solved(np.tensordot(weights, grams, 1), prior, begun, last)[:count]
-        return x[:count], np.sqrt((blocks - 1) / blocks * ((each - each.mean(0)) ** 2).sum(0))
+        errors = np.sqrt((blocks - 1) / blocks * ((each - each.mean(0)) ** 2).sum(0))
+        return np.where(shown, x[:count], 0.0), np.where(shown, errors, np.inf)
 
 
 def _solved(total: FloatArray, prior: FloatArray, begun: FloatArray, last: int) -> FloatArray:

@@ -12,13 +12,18 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.likelihood.basis import lowpass
 
-_FAULTS = 7  # of the first columns, which a fault of the accelerometer may follow alone
+BASIC = 4
+"""Columns that come first: a constant force, and how it follows speed; a bias of the accelerometer.
+
+GLVD is fitted with these alone, as no car rolls without resistance; the others stand for what it then leaves."""
+_FAULTS = 7  # shapes that a fault of the accelerometer may follow alone
 
 
 def columns(record: AnalysisRecord, rollout: FloatArray) -> FloatArray:
     """Columns (column, channel, row) along the acceleration `rollout` (row,) [m/s²] of the present model.
 
-    A force shows in both channels, a fault of the accelerometer in its own alone.
+    A force shows in both channels, a fault of the accelerometer in its own alone. With one channel, the basic ones are
+    the first three.
     """
     moving = record.speed[record.counts]
     speed = (record.speed - moving.mean()) / max(float(moving.std()), 0.1)
@@ -27,8 +32,8 @@ def columns(record: AnalysisRecord, rollout: FloatArray) -> FloatArray:
     )
     if len(record.channels) == 1:
         return forces[:, None]
-    faults = np.stack([np.zeros_like(forces), forces], 1)[:_FAULTS]
-    return np.concatenate([np.stack([forces, forces], 1), faults])
+    both, faults = np.stack([forces, forces], 1), np.stack([np.zeros_like(forces), forces], 1)[:_FAULTS]
+    return np.concatenate([both[: BASIC - 1], faults[:1], both[BASIC - 1 :], faults[1:]])
 
 
 def _forces(a: FloatArray, speed: FloatArray, u: FloatArray, dt: float) -> FloatArray:
@@ -38,10 +43,10 @@ def _forces(a: FloatArray, speed: FloatArray, u: FloatArray, dt: float) -> Float
     return np.array(
         [
             np.ones_like(a),
-            a,
-            jerk,
             v,
             v**2,
+            a,
+            jerk,
             a * v,
             braking,
             a * v**2,
