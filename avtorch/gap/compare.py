@@ -26,6 +26,7 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.change.change_cause import ChangeCause, cause_of_change
+from avtorch.gap.change.two_sides import FEWEST_BLOCKS, TwoSides
 from avtorch.gap.crossval.folds import blocks_of
 from avtorch.gap.crossval.rollout_errors import HORIZON_S, RolloutMetric, products, reached
 from avtorch.gap.dead_time_or_lag import DeadTimeFit, compare_explanations
@@ -36,6 +37,7 @@ from avtorch.gap.result.comparison import Change, Comparison, DeadTimeTest, Simu
 from avtorch.gap.result.diagnosis import LogFacts
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
+from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.simulator.simulator_input import Response
 from avtorch.io import Log
@@ -55,29 +57,38 @@ def compare(
     baseline: Simulator = None,
     baseline_after: Simulator = None,
     level: float = LEVEL,
+    effects: Sequence[str | type[Effect]] | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> Comparison:
     """What changed from the drives `before` to those `after`.
 
     `baseline`: the simulator with which both are compared (`baseline_after`: another one for the second set), with its
     own `T_L` and `K_L`; default: bare GLVD fitted to the drives before. Its effects keep their values in the fits of
-    the car. `level`: significance level of a difference between the drives.
+    the car. `level`: significance level of a difference between the drives. `effects`: candidates, by name or class,
+    for the cause of a change, beside T_L, K_L and dead time (default: all registered; none: `[]`).
+    `progress(what, done, of)` is called at every hypothesis.
 
-    Raises `InputError` for logs that cannot be diagnosed or hold less than 50 s, channels that differ, or a level out
-    of range.
+    Raises `InputError` for logs that cannot be diagnosed or hold less than five blocks of 4 s of usable driving,
+    channels that differ, an unknown effect, or a level out of range.
 
     Example:
         >>> from avtorch import GLVDPlant, Leader, compare, simulate
         >>> leader = Leader.default(start=50.0, duration=54.0, dt=0.1)
         >>> before, after = (simulate(leader, plant=GLVDPlant(*car)).log() for car in ((0.3, 1.0), (1.0, 0.7)))
-        >>> found = compare(before, after)
+        >>> found = compare(before, after, effects=["sensor_bias"])  # leave effects out to try all
         >>> found.changed, round(found.car["T_L"].after.mean, 1), found.simulator
         (True, 1.0, 'farther')
+        >>> sorted(found.cause.names)
+        ['K_L', 'T_L']
     """
     if not 0 < level < 1:
         raise InputError(f"level: found {level}, needs a number between 0 and 1")
     sides = [[x] if isinstance(x, Log) else list(x) for x in (before, after)]
+    kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
     given = [baseline, baseline if baseline_after is None else baseline_after]
     plants = [b if isinstance(b, GapPlant) else plant([], baseline=b) for b in given]
+    if progress is not None:
+        progress("lag and gain of both drives", 0, 2)
     fitted = [_Side.of(logs, plants[0], name) for logs, name in zip(sides, ("before", "after"), strict=True)]
     one, two = fitted
     if one.found.hypothesis.record.channels != two.found.hypothesis.record.channels:
@@ -103,10 +114,13 @@ def compare(
     same = all(x is y or _alike(x, y) for x, y in zip(*sides, strict=False)) and len(sides[0]) == len(sides[1])
     horizon = _horizon(fitted)
     gap = _gaps(fitted, simulators, horizon, same=same)
-    simulator_change = _simulator_change(gap)
+    simulator = _simulator_change(gap)
     changed = p_value < level
+    cause = None if same else _cause(sides, plants[0], kinds, progress)
     dead_time_test = (
-        compare_explanations(*(DeadTimeFit.of(x.search.fits, x.found) for x in fitted), level=level) if changed else None
+        compare_explanations(*(DeadTimeFit.of(x.search.fits, x.found) for x in fitted), level=level)
+        if changed
+        else None
     )
     return Comparison(
         before=LogFacts.of(sides[0]),
@@ -115,11 +129,26 @@ def compare(
         gap=gap,
         p_value=p_value,
         changed=changed,
-        simulator=simulator_change,
-        why=_sentence(car, p_value, simulator_change, dead_time_test, same=same),
+        simulator=simulator,
+        why=_sentence(car, p_value, simulator, dead_time_test, cause, same=same),
         dead_time_test=dead_time_test,
+        cause=cause,
         horizon_s=horizon,
     )
+
+
+def _cause(
+    sides: Sequence[Sequence[Log]],
+    base: GapPlant,
+    kinds: Sequence[type[Effect]],
+    progress: Callable[[str, int, int], None] | None,
+) -> ChangeCause | None:
+    """None where the drives, long enough for lag and gain, are too short for it: stretches below 8 s do not count."""
+    try:
+        both = TwoSides.of(*sides)
+    except InputError:
+        return None
+    return cause_of_change(both, base, kinds, progress=progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,8 +168,9 @@ class _Side:
         record = found.hypothesis.record
         blocks = blocks_of(record, fewest=FEWEST_BLOCKS)
         if len(blocks) < FEWEST_BLOCKS:
-            found_ = f"{len(blocks)} blocks of 4 s"
-            raise InputError(f"{which}: found {found_} of usable driving, needs {FEWEST_BLOCKS} or more")
+            raise InputError(
+                f"{which}: found {len(blocks)} blocks of 4 s of usable driving, needs {FEWEST_BLOCKS} or more"
+            )
         columns = whitened_jacobian(found.hypothesis, found.white, found.z).reshape(len(found.z), -1)
         # derivative of the errors: minus that of the rollout
         pulls = -columns * found.white(found.errors).ravel()
@@ -237,28 +267,40 @@ def _simulator_change(gap: Mapping[str, Change]) -> SimulatorChange:
 
 
 def _sentence(
-    car: Mapping[str, Change], p_value: float, simulator: SimulatorChange, dead_time_test: DeadTimeTest | None, *, same: bool
+    car: Mapping[str, Change],
+    p_value: float,
+    simulator: SimulatorChange,
+    dead_time_test: DeadTimeTest | None,
+    cause: ChangeCause | None,
+    *,
+    same: bool,
 ) -> str:
     if same:
         of_two = {"closer": "The second simulator is closer", "farther": "The second simulator is farther from it"}
         return f"One drive, two simulators. {of_two.get(simulator, 'Neither simulator is measurably closer to it')}."
-    parts: list[str] = []
-    for name, unit in (("T_L", " s"), ("K_L", "")):
-        m = car[name]
-        parts.append(f"{name} {m.before.mean:.2f} to {m.after.mean:.2f}{unit}")
-    first = _explanation(", ".join(parts), f"p = {p_value:.2g}", dead_time_test)
+    numbers = ", ".join(
+        f"{name} {car[name].before.mean:.2f} to {car[name].after.mean:.2f}{unit}"
+        for name, unit in (("T_L", " s"), ("K_L", ""))
+    )
+    # what all effects were tried for is not said again of two of them
+    named = cause is not None and bool(cause.parts)
+    first = _explanation(numbers, f"p = {p_value:.2g}", dead_time_test, named=named)
     words = {
         "closer": "the drives after are closer to the simulator",
         "farther": "the drives after are farther from the simulator",
         "inconclusive": "the simulator's error has not changed measurably",
     }
-    return f"{first}; {words[simulator]}."
+    last = "The drives are too short to name a cause." if cause is None else cause.why
+    return f"{first}; {words[simulator]}. {last}"
 
 
-def _explanation(numbers: str, chance: str, dead_time_test: DeadTimeTest | None) -> str:
-    """The sentence on the car: lag and gain are stated as the explanation only where dead time is none."""
+def _explanation(numbers: str, chance: str, dead_time_test: DeadTimeTest | None, *, named: bool) -> str:
+    """The sentence on lag and gain: they are stated as the explanation only where dead time is none."""
     if dead_time_test is None:
-        return f"No change of the car is detected: {numbers} ({chance})"
+        first = "T_L and K_L alone show no change" if named else "No change of the car is detected"
+        return f"{first}: {numbers} ({chance})"
+    if named:
+        return f"The car has changed: as GLVD without any effect, {numbers} ({chance})"
     delays = " to ".join(f"{max(q.mean, 0.0):.2f}" for q in (dead_time_test.before, dead_time_test.after))
     if dead_time_test.explanation == "lag and gain":
         more = f"a change of dead time alone does not explain it (p = {dead_time_test.p_dead_time:.2g})"

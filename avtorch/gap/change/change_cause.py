@@ -19,7 +19,6 @@ from avtorch.gap.change.two_sides import TwoSides
 from avtorch.gap.quantity import Quantity, unit_of, words_of
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant
-from avtorch.io import Log
 
 Answer = Literal["named", "ambiguous", "unknown", "drift", "none"]
 _EXCITED = 0.5
@@ -104,21 +103,17 @@ class ChangeCause:
 
 
 def cause_of_change(
-    before: Sequence[Log],
-    after: Sequence[Log],
+    sides: TwoSides,
     base: GapPlant,
     kinds: Sequence[type[Effect]],
     *,
     progress: Progress | None = None,
 ) -> ChangeCause:
-    """What of `kinds`, of T_L, K_L and dead time, explains how the drives `after` differ from those `before`.
+    """What of `kinds`, of T_L, K_L and dead time, explains how the drives after differ from those before.
 
     Random effects, and those of one drive alone (a grade, a moment), are left out. `progress(what, done, of)` is called
     at each hypothesis.
-
-    Raises `InputError` where either side has less than five blocks of four seconds, or no channel is common.
     """
-    sides = TwoSides.of(before, after)
     selection = select_changes(sides, base, changes(kinds, base, sides), progress=progress)
     parts = tuple(_part(selection, step) for step in selection.steps[1:])
     detectable = detectable_changes(selection)
@@ -145,7 +140,7 @@ def _part(selection: ChangeSelection, step: Step) -> ChangePart:
 
 
 def _parameters(last: Step, step: Step) -> dict[str, Quantity]:
-    """By jackknife over the folds, and by what comes and goes between the halves of one side."""
+    """By jackknives over folds and over blocks, and by what comes and goes between the halves of one side."""
     assert step.change is not None
     count = len(last.held.p)
     values = _values(last.fit.model, step.change, np.concatenate([last.fit.p[None], last.held.p]))
@@ -153,7 +148,9 @@ def _parameters(last: Step, step: Step) -> dict[str, Quantity]:
     out = {}
     for key, x in values.items():
         spread = float(np.sqrt((count - 1) / count * ((x[1:] - x[1:].mean()) ** 2).sum()))
-        sd = float(np.hypot(spread, step.drift * abs(x[0]))) if _is_change(key) else spread
+        sd = spread
+        if _is_change(key):
+            sd = float(np.hypot(max(spread, step.relative_sd * abs(x[0])), step.drift * abs(x[0])))
         out[key] = Quantity(float(x[0]), sd, float(x[0] - sure * sd), float(x[0] + sure * sd))
     return out
 
@@ -193,7 +190,7 @@ def _text(key: str, q: Quantity) -> str:
 def _why(
     selection: ChangeSelection, parts: Sequence[ChangePart], answer: Answer, detectable: Mapping[str, float]
 ) -> str:
-    shown = ", ".join(_least(name, value) for name, value in detectable.items())
+    shown = ", ".join(f"{name} {detectable_text(name, value)}" for name, value in detectable.items())
     if parts:
         said = [f"What explains it: {' and '.join(map(str, parts))}"]
         for part in parts:
@@ -216,8 +213,12 @@ def _why(
         first = "Something reproducible has changed, and no known effect explains it"
     weak = [name for name, value in detectable.items() if value > _EXCITED]
     reason = f"; the commands excite too little for {', '.join(weak)}" if weak else ""
-    return "; ".join([f"{first}{reason}. A change would show from here on: {shown}", *unlike_drives(selection.sides)]) + "."
+    return (
+        "; ".join([f"{first}{reason}. A change would show from here on: {shown}", *unlike_drives(selection.sides)])
+        + "."
+    )
 
 
-def _least(name: str, value: float) -> str:
-    return f"{name} {value:.0%}" if name in ("T_L", "K_L") else f"{name} {value:.2g} s"
+def detectable_text(name: str, value: float) -> str:
+    """A least change with its unit: a share of T_L and K_L, seconds of dead time."""
+    return f"{value:.0%}" if name in ("T_L", "K_L") else f"{value:.2g} s"

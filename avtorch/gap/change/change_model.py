@@ -19,7 +19,8 @@ from avtorch.gap.simulator.effect import Effect, delay_effect, delay_key
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.plant import GapPlant
 
-_AFTER = "after."
+AFTER = "after."
+"""Begins the name of a coordinate that the side after has of its own."""
 _LAGS = (-2.0, -1.0, 0.0, 1.0)  # prior standard deviations, to begin with
 _DELAYS_S = (0.03, 0.15)
 _TRADED_S = (-0.12, -0.05, -0.02, 0.02, 0.05, 0.12)
@@ -83,7 +84,7 @@ class ChangeModel:
             add(key, key, models[0])
         for change in self.changes:
             if change.parameter is not None:
-                add(_AFTER + change.parameter, change.parameter, models[1])
+                add(AFTER + change.parameter, change.parameter, models[1])
             else:
                 model = models[0] if change.less else models[1]
                 for key in _own(model, change):
@@ -127,7 +128,7 @@ class ChangeModel:
         """A vector (size,) with the coordinates `known` by name; a side's own parameter begins at the shared one."""
         p = np.zeros(self.size)
         for key, at in self.index.items():
-            value = known.get(key, known.get(key.removeprefix(_AFTER)))
+            value = known.get(key, known.get(key.removeprefix(AFTER)))
             if value is not None:
                 p[at] = value
         return np.clip(p, self.low, self.high)
@@ -137,7 +138,7 @@ class ChangeModel:
         model = (self.after if after else self.before) if model is None else model
         z = np.zeros((*p.shape[:-1], model.size))
         for key, at in model.index.items():
-            own = self.index.get(_AFTER + key) if after else None
+            own = self.index.get(AFTER + key) if after else None
             own = self.index.get(key) if own is None else own
             if own is not None:
                 z[..., at] = p[..., own]
@@ -151,7 +152,7 @@ class ChangeModel:
             return np.array([self.coordinates({**known, **point}) for point in grid])
         change = self.changes[-1]
         if change.parameter is not None:
-            at = self.index[_AFTER + change.parameter]
+            at = self.index[AFTER + change.parameter]
             out = [begun]
             for moved in (-1.0, -0.4, 0.4, 1.0):
                 out.append(begun.copy())
@@ -172,16 +173,16 @@ class ChangeModel:
     def traded(self, p: FloatArray) -> FloatArray:
         """Places (place, size) where lag and delay of both sides, or of the side after, have traded some time."""
         out: list[FloatArray] = []
-        for prefix in ("", _AFTER):
+        for prefix in ("", AFTER):
             pair = [prefix + key if prefix + key in self.index else key for key in (delay_key(), "T_L")]
-            if prefix and not any(key.startswith(_AFTER) for key in pair):
+            if prefix and not any(key.startswith(AFTER) for key in pair):
                 continue
             for seconds in _TRADED_S:
                 place = p.copy()
                 for key, moved in zip(pair, (seconds, -seconds), strict=True):
-                    if prefix and not key.startswith(_AFTER):
+                    if prefix and not key.startswith(AFTER):
                         continue
-                    parameter = self.before.plant.parameters()[key.removeprefix(_AFTER)]
+                    parameter = self.before.plant.parameters()[key.removeprefix(AFTER)]
                     value = parameter.constrain(torch.as_tensor(p[self.index[key]])) + moved
                     place[self.index[key]] = parameter.unconstrain(value.clamp_min(0.01)).numpy()
                 out.append(np.clip(place, self.low, self.high))
@@ -230,7 +231,9 @@ def _first(whole: ChangeModel, begun: FloatArray, change: Change, model: EffectM
         for place in out:
             for value in values:
                 grown.append(place.copy())
-                grown[-1][whole.index[key]] = float(parameters[key].unconstrain(torch.tensor(value, dtype=torch.float64)))
+                grown[-1][whole.index[key]] = float(
+                    parameters[key].unconstrain(torch.tensor(value, dtype=torch.float64))
+                )
         out = grown
     starts = np.clip(np.array(out), whole.low, whole.high)
     if len(starts) > _MOST_STARTS:

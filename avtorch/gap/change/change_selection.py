@@ -134,7 +134,7 @@ def _noise(sides: TwoSides, base: GapPlant, progress: Progress | None) -> tuple[
         whitening = JointWhitening.vector_autoregressive(record, both.left(both.fit(model, fit.p[None], iterations=3)))
         fit = JointFit(whitening, shapes[:basic]).fit(model, np.concatenate([fit.p[None], starts]), iterations=10)
     shapes = columns(record, model.simulate(fit.p)[0])
-    fitting = JointFit(whitening, shapes).beyond(model, fit.p, basic)
+    fitting = replace(JointFit(whitening, shapes).beyond(model, fit.p, basic), anchor=model.named(fit.p))
     costs = []
     for ridge in _RIDGES:
         stiff = replace(fitting, ridge=ridge)
@@ -208,7 +208,9 @@ def _simplest(sides: TwoSides, entering: Sequence[Step]) -> Step:
     """Of the changes that held-out blocks cannot tell from the best the one with the fewest parameters."""
     best = max(entering, key=_total)
     assert best.gains is not None
-    alike = [s for s in entering if s is best or (s.gains is not None and strength_of(best.gains - s.gains, sides) <= 0)]
+    alike = [
+        s for s in entering if s is best or (s.gains is not None and strength_of(best.gains - s.gains, sides) <= 0)
+    ]
     simplest = min(alike, key=lambda s: (s.fit.model.size, -_total(s)))
     names = dict.fromkeys(s.change.name for s in sorted(alike, key=_total, reverse=True) if s.change is not None)
     return replace(simplest, aliases=tuple(names))

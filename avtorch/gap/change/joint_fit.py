@@ -7,18 +7,21 @@ for a block, `budget.robust_fit`), so none decides alone.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 from avtorch.gap.budget.robust_fit import RobustFit
-from avtorch.gap.change.change_model import ChangeModel
+from avtorch.gap.change.change_model import AFTER, ChangeModel
 
 _STEP = 1e-3  # of the differences
 _DAMPING = (1e-3, 0.3, 10.0)
 _LONGEST = 1.5  # step of a coordinate [prior SD]
+_NEAR = 0.3  # standard deviations of the plant's priors, around an anchor
 _STOP_NATS = 0.05
 _SHOWN = 1e-6  # of the largest column's square, that a column counts
 _REWEIGHTED = 3  # times that the weights of blocks follow the residuals, in linear fits
@@ -44,11 +47,16 @@ class HeldOut:
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """Fits under one noise with the columns of one remainder; `ridge`: of their coefficients, a share of all rows."""
+    """Fits under one noise with the columns of one remainder; `ridge`: of their coefficients, a share of all rows.
+
+    `anchor`: coordinates of GLVD without the remainder, by name, near which what both sides share stays: a remainder of
+    many columns could else trade a gain of 1 for one of 1.5. Without it, and for effects, the priors are the plant's.
+    """
 
     whitening: NoiseWhitening
     shapes: FloatArray = field(repr=False)
     ridge: float = 1e-3
+    anchor: Mapping[str, FloatArray] = field(default_factory=dict)
     robust: RobustFit = field(init=False)
     X: FloatArray = field(init=False, repr=False)
     scale: FloatArray = field(init=False, repr=False)
@@ -115,7 +123,7 @@ class JointFit:
         nats, p = np.empty(self.whitening.blocks), np.empty((self.folds, model.size))
         for k in range(self.folds):
             kept = (self.robust.fold != k).astype(float)
-            moved, _ = self._linear(grams, kept, fit.p, fit.c)
+            moved, _ = self._linear(model, grams, kept, fit.p, fit.c)
             near = np.clip(fit.p + np.array([0.0, 0.5, 1.0])[:, None] * np.clip(moved, -_LONGEST, _LONGEST),
                            model.low, model.high)  # fmt: skip
             p[k], white, c, _ = self._best(model, near, kept)
@@ -130,14 +138,25 @@ class JointFit:
         white = self.white(model, places)
         best: tuple[FloatArray, FloatArray, FloatArray, float] | None = None
         inner = self._inner
+        centre, precision = self._prior(model)
         for p, w in zip(places, white, strict=True):
             c = self._coefficients(w, weights, inner)
             left = self.robust.nats(w - np.tensordot(c, self.X, 1)) @ weights
-            cost = float(left + 0.5 * p @ p + 0.5 * self.penalty * c @ c)
+            cost = float(left + 0.5 * precision @ (p - centre) ** 2 + 0.5 * self.penalty * c @ c)
             if best is None or cost < best[3]:
                 best = p, w, c, cost
         assert best is not None
         return best
+
+    def _prior(self, model: ChangeModel) -> tuple[FloatArray, FloatArray]:
+        """Centre and precision (size,) of a normal prior of the coordinates."""
+        centre, precision = np.zeros(model.size), np.ones(model.size)
+        for key, at in model.index.items():
+            value = self.anchor.get(key, self.anchor.get(key.removeprefix(AFTER)))
+            if value is not None:
+                centre[at] = value
+                precision[at] = 1.0 if key.startswith(AFTER) else 1 / _NEAR**2
+        return centre, precision
 
     def _coefficients(self, w: FloatArray, weights: FloatArray, inner: FloatArray) -> FloatArray:
         """The remainder's coefficients (column,) for white residuals `w` (channel, counted) of the model alone."""
@@ -164,16 +183,24 @@ class JointFit:
     def _grams(self, stacked: FloatArray) -> FloatArray:
         """Sums (block, i, j) of products of `stacked` (i, channel, counted)."""
         ends = np.append(self.whitening.first, stacked.shape[-1])
-        parts = [stacked[..., a:b].reshape(len(stacked), -1) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        parts = [stacked[..., a:b].reshape(len(stacked), -1) for a, b in pairwise(ends)]
         return np.stack([x @ x.T for x in parts])
 
     def _linear(
-        self, grams: FloatArray, weights: FloatArray, p: FloatArray, c: FloatArray, damping: float = 0.0
+        self,
+        model: ChangeModel,
+        grams: FloatArray,
+        weights: FloatArray,
+        p: FloatArray,
+        c: FloatArray,
+        damping: float = 0.0,
     ) -> tuple[FloatArray, FloatArray]:
         """Step (size,) from `p` and coefficients (column,), from sums of slopes, columns and residuals."""
         size, last = len(p), grams.shape[-1] - 1
         x = np.concatenate([np.zeros(size), c])
-        prior = np.concatenate([np.ones(size), np.full(last - size, self.penalty)])
+        centre, precision = self._prior(model)
+        prior = np.concatenate([precision, np.full(last - size, self.penalty)])
+        pull = np.concatenate([precision * (p - centre), np.zeros(last - size)])
         for _ in range(_REWEIGHTED if damping == 0 else 1):
             left = np.append(-x, 1.0)
             squares = np.einsum("bij,i,j->b", grams, left, left)
@@ -181,16 +208,18 @@ class JointFit:
             total = np.tensordot(scale, grams, 1)
             matrix = total[:last, :last] + np.diag(prior)
             matrix[:size, :size] += damping * np.diag(np.diag(matrix[:size, :size]))
-            x = np.linalg.solve(matrix, total[:last, last] - np.concatenate([p, np.zeros(last - size)]))
+            x = np.linalg.solve(matrix, total[:last, last] - pull)
         return x[:size], x[size:]
 
-    def _steps(self, model: ChangeModel, p: FloatArray, w: FloatArray, c: FloatArray, weights: FloatArray) -> FloatArray:
+    def _steps(
+        self, model: ChangeModel, p: FloatArray, w: FloatArray, c: FloatArray, weights: FloatArray
+    ) -> FloatArray:
         """Places (step, size) to try from `p`, more and less damped."""
         slopes = (w - self.white(model, p + _STEP * np.eye(model.size))) / _STEP
         grams = self._grams(np.concatenate([slopes, self.X, w[None]]))
         out = []
         for damping in _DAMPING:
-            step, _ = self._linear(grams, weights, p, c, damping)
+            step, _ = self._linear(model, grams, weights, p, c, damping)
             step = step * min(1.0, _LONGEST / max(float(np.abs(step).max()), 1e-12))
             out += [np.clip(p + share * step, model.low, model.high) for share in (1.0, 0.4)]
         return np.array(out)
@@ -215,8 +244,9 @@ class JointFit:
         # the added columns are free
         own = np.einsum("bii->i", grams)[:count]
         shown = own > _SHOWN * own.max(initial=0.0)
-        prior = np.concatenate([np.where(shown, 0.0, 1.0), np.ones(free), np.full(len(fit.c), self.penalty)])
-        begun = np.concatenate([np.zeros(count), fit.p[:free], np.zeros(len(fit.c))])
+        centre, precision = self._prior(model)
+        prior = np.concatenate([np.where(shown, 0.0, 1.0), precision[:free], np.full(len(fit.c), self.penalty)])
+        begun = np.concatenate([np.zeros(count), (fit.p - centre)[:free], np.zeros(len(fit.c))])
         scale = np.ones(self.whitening.blocks)
         for _ in range(_REWEIGHTED):
             left = np.append(-x, 1.0)

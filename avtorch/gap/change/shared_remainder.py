@@ -12,8 +12,8 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.likelihood.basis import lowpass
 
-BASIC = 4
-"""Columns that come first: a constant force, and how it follows speed; a bias of the accelerometer.
+BASIC = 2
+"""Columns that come first: a constant force, and a bias of the accelerometer.
 
 GLVD is fitted with these alone, as no car rolls without resistance; the others stand for what it then leaves."""
 _FAULTS = 7  # shapes that a fault of the accelerometer may follow alone
@@ -22,8 +22,8 @@ _FAULTS = 7  # shapes that a fault of the accelerometer may follow alone
 def columns(record: AnalysisRecord, rollout: FloatArray) -> FloatArray:
     """Columns (column, channel, row) along the acceleration `rollout` (row,) [m/s²] of the present model.
 
-    A force shows in both channels, a fault of the accelerometer in its own alone. With one channel, the basic ones are
-    the first three.
+    A force shows in both channels, a fault of the accelerometer in its own alone. With one channel, the basic
+    one is the first.
     """
     moving = record.speed[record.counts]
     speed = (record.speed - moving.mean()) / max(float(moving.std()), 0.1)
