@@ -74,8 +74,8 @@ def compare(
                 f"{path}: has no row to use; all are driven by hand (engaged 0), within 2 s after, or at standstill"
             )
         talk.notes(log.name, check(log).notes)
-    with talk.waiting("fitting both drives"):
-        told = work(*logs, baseline=simulator, baseline_after=other)
+    with talk.steps("Comparing") as step:
+        told = work(*logs, baseline=simulator, baseline_after=other, progress=step)
     if out is not None:
         with answer_set(out, ("comparison.json",)) as staged:
             write_json(staged / "comparison.json", told.to_dict())
@@ -99,7 +99,32 @@ def _table(told: Comparison) -> Table:
     for name, moved in {**told.car, **told.gap}.items():
         row = _ROWS.get(name, name).format(horizon=f"{told.horizon_s:.3g}")
         table.add_row(escape(row), *_cells(moved))
+    for label, value in _of_cause(told):
+        table.add_row(escape(label), "", "", escape(value))
     return table
+
+
+def _of_cause(told: Comparison) -> list[tuple[str, str]]:
+    """Rows of the cause: what has changed, by how much, with which probability; or the least change that would show."""
+    from avtorch.gap.change.change_cause import detectable_text
+    from avtorch.gap.quantity import unit_of, words_of
+
+    cause = told.cause
+    if cause is None:
+        return []
+    if not cause.parts:
+        least = cause.detectable.items()
+        return [(f"least change of {name} that would show", detectable_text(name, value)) for name, value in least]
+    rows: list[tuple[str, str]] = []
+    for part in cause.parts:
+        others = [name for name in part.alias_set if name != part.name]
+        alike = f" (or {', '.join(others)})" if others else ""
+        rows.append((f"cause: {part.name}{alike}", f"probability {part.probability:.2f}"))
+        for key, q in part.parameters.items():
+            unit = unit_of(key)
+            name = f"  {words_of(key)}" + ("" if unit == "-" else f" [{unit}]")
+            rows.append((name, f"{q.mean:.3g} ({q.q05:.3g} to {q.q95:.3g})"))
+    return rows
 
 
 def _cells(moved: Change) -> list[str]:

@@ -4,15 +4,18 @@ The car: `T_L` and `K_L` are fitted to each set. Their spread between drives of 
 the drives, each of which contributes its own score (the sandwich estimator of White 1982), and is never less than the
 posterior's. Differences that a missing effect causes between manoeuvres therefore count as spread, not as a change.
 
-Where `T_L` or `K_L` differ, a change of dead time is tested as a rival explanation (`dead_time_test`), because it
+Where `T_L` or `K_L` differ, a change of dead time is tested as a rival explanation (`dead_time_or_lag`), because it
 resembles a longer lag.
+
+The cause: T_L alone, K_L alone, dead time, or an effect of the table, whichever explains the drives after best on top
+of what both sides share (`change.change_cause`).
 
 The simulator: rollout errors over both sets, and their ratio over bootstrapped blocks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 
@@ -22,16 +25,19 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
+from avtorch.gap.change.change_cause import ChangeCause, cause_of_change
+from avtorch.gap.change.two_sides import FEWEST_BLOCKS, TwoSides
 from avtorch.gap.crossval.folds import blocks_of
 from avtorch.gap.crossval.rollout_errors import HORIZON_S, RolloutMetric, products, reached
-from avtorch.gap.dead_time_test import DeadTimeFit, compare_accounts
+from avtorch.gap.dead_time_or_lag import DeadTimeFit, compare_explanations
 from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.result.comparison import Change, Comparison, DeadTimeTest, Telling
+from avtorch.gap.result.comparison import Change, Comparison, DeadTimeTest, SimulatorChange
 from avtorch.gap.result.diagnosis import LogFacts
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
+from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.simulator.simulator_input import Response
 from avtorch.io import Log
@@ -42,7 +48,6 @@ LEVEL = 0.04
 """Significance level: with one car, "no change" is the right answer in more than 95 % of comparisons."""
 _DRAWS = 2000
 _CAR = ("T_L", "K_L")
-_LEAST = 5  # fewest blocks of 10 s
 
 
 def compare(
@@ -52,29 +57,38 @@ def compare(
     baseline: Simulator = None,
     baseline_after: Simulator = None,
     level: float = LEVEL,
+    effects: Sequence[str | type[Effect]] | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> Comparison:
     """What changed from the drives `before` to those `after`.
 
     `baseline`: the simulator with which both are compared (`baseline_after`: another one for the second set), with its
     own `T_L` and `K_L`; default: bare GLVD fitted to the drives before. Its effects keep their values in the fits of
-    the car. `level`: significance level of a difference between the drives.
+    the car. `level`: significance level of a difference between the drives. `effects`: candidates, by name or class,
+    for the cause of a change, beside T_L, K_L and dead time (default: all registered; none: `[]`).
+    `progress(what, done, of)` is called at every hypothesis.
 
-    Raises `InputError` for logs that cannot be diagnosed or hold less than 50 s, channels that differ, or a level out
-    of range.
+    Raises `InputError` for logs that cannot be diagnosed or hold less than five blocks of 4 s of usable driving,
+    channels that differ, an unknown effect, or a level out of range.
 
     Example:
         >>> from avtorch import GLVDPlant, Leader, compare, simulate
         >>> leader = Leader.default(start=50.0, duration=54.0, dt=0.1)
         >>> before, after = (simulate(leader, plant=GLVDPlant(*car)).log() for car in ((0.3, 1.0), (1.0, 0.7)))
-        >>> found = compare(before, after)
+        >>> found = compare(before, after, effects=["sensor_bias"])  # leave effects out to try all
         >>> found.changed, round(found.car["T_L"].after.mean, 1), found.simulator
         (True, 1.0, 'farther')
+        >>> sorted(found.cause.names)
+        ['K_L', 'T_L']
     """
     if not 0 < level < 1:
         raise InputError(f"level: found {level}, needs a number between 0 and 1")
     sides = [[x] if isinstance(x, Log) else list(x) for x in (before, after)]
+    kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
     given = [baseline, baseline if baseline_after is None else baseline_after]
     plants = [b if isinstance(b, GapPlant) else plant([], baseline=b) for b in given]
+    if progress is not None:
+        progress("lag and gain of both drives", 0, 2)
     fitted = [_Side.of(logs, plants[0], name) for logs, name in zip(sides, ("before", "after"), strict=True)]
     one, two = fitted
     if one.found.hypothesis.record.channels != two.found.hypothesis.record.channels:
@@ -100,10 +114,13 @@ def compare(
     same = all(x is y or _alike(x, y) for x, y in zip(*sides, strict=False)) and len(sides[0]) == len(sides[1])
     horizon = _horizon(fitted)
     gap = _gaps(fitted, simulators, horizon, same=same)
-    telling = _telling(gap)
+    simulator = _simulator_change(gap)
     changed = p_value < level
+    cause = None if same else _cause(sides, plants[0], kinds, progress)
     dead_time_test = (
-        compare_accounts(*(DeadTimeFit.of(x.search.fits, x.found) for x in fitted), level=level) if changed else None
+        compare_explanations(*(DeadTimeFit.of(x.search.fits, x.found) for x in fitted), level=level)
+        if changed
+        else None
     )
     return Comparison(
         before=LogFacts.of(sides[0]),
@@ -112,11 +129,26 @@ def compare(
         gap=gap,
         p_value=p_value,
         changed=changed,
-        simulator=telling,
-        why=_sentence(car, p_value, telling, dead_time_test, same=same),
+        simulator=simulator,
+        why=_sentence(car, p_value, simulator, dead_time_test, cause, same=same),
         dead_time_test=dead_time_test,
+        cause=cause,
         horizon_s=horizon,
     )
+
+
+def _cause(
+    sides: Sequence[Sequence[Log]],
+    base: GapPlant,
+    kinds: Sequence[type[Effect]],
+    progress: Callable[[str, int, int], None] | None,
+) -> ChangeCause | None:
+    """None where the drives, long enough for lag and gain, are too short for it: stretches below 8 s do not count."""
+    try:
+        both = TwoSides.of(*sides)
+    except InputError:
+        return None
+    return cause_of_change(both, base, kinds, progress=progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,9 +166,11 @@ class _Side:
         search = Search(logs, base, effects=[], pairs=False)
         found = search.run().none
         record = found.hypothesis.record
-        blocks = blocks_of(record)
-        if len(blocks) < _LEAST:
-            raise InputError(f"{which}: found {len(blocks)} blocks of 10 s of usable driving, needs {_LEAST} or more")
+        blocks = blocks_of(record, fewest=FEWEST_BLOCKS)
+        if len(blocks) < FEWEST_BLOCKS:
+            raise InputError(
+                f"{which}: found {len(blocks)} blocks of 4 s of usable driving, needs {FEWEST_BLOCKS} or more"
+            )
         columns = whitened_jacobian(found.hypothesis, found.white, found.z).reshape(len(found.z), -1)
         # derivative of the errors: minus that of the rollout
         pulls = -columns * found.white(found.errors).ravel()
@@ -180,7 +214,7 @@ def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float
         rng = np.random.default_rng(0 if same else i)
         record = side.found.hypothesis.record
         errors = record.measured - _rolled(record, simulator)
-        blocks = blocks_of(record)
+        blocks = blocks_of(record, fewest=FEWEST_BLOCKS)
         squares = _squares(record, errors, blocks, float(simulator.T_L), horizon)
         rows = np.array([(b.stop - b.start) * record.group for b in blocks], float)
         weights = rng.multinomial(len(blocks), np.full(len(blocks), 1 / len(blocks)), size=_DRAWS)
@@ -224,42 +258,54 @@ def _log_quantity(mean: float, variance: float, sure: float) -> Quantity:
     return Quantity(middle, middle * sd, float(np.exp(mean - sure * sd)), float(np.exp(mean + sure * sd)))
 
 
-def _telling(gap: Mapping[str, Change]) -> Telling:
+def _simulator_change(gap: Mapping[str, Change]) -> SimulatorChange:
     ratios = [moved.ratio for moved in gap.values()]
     closer, farther = (any(r.q95 < 1 for r in ratios), any(r.q05 > 1 for r in ratios))
     if closer == farther:
-        return "no telling"
+        return "inconclusive"
     return "closer" if closer else "farther"
 
 
 def _sentence(
-    car: Mapping[str, Change], p_value: float, telling: Telling, dead_time_test: DeadTimeTest | None, *, same: bool
+    car: Mapping[str, Change],
+    p_value: float,
+    simulator: SimulatorChange,
+    dead_time_test: DeadTimeTest | None,
+    cause: ChangeCause | None,
+    *,
+    same: bool,
 ) -> str:
     if same:
         of_two = {"closer": "The second simulator is closer", "farther": "The second simulator is farther from it"}
-        return f"One drive, two simulators. {of_two.get(telling, 'Neither simulator is measurably closer to it')}."
-    parts: list[str] = []
-    for name, unit in (("T_L", " s"), ("K_L", "")):
-        m = car[name]
-        parts.append(f"{name} {m.before.mean:.2f} to {m.after.mean:.2f}{unit}")
-    first = _account(", ".join(parts), f"p = {p_value:.2g}", dead_time_test)
+        return f"One drive, two simulators. {of_two.get(simulator, 'Neither simulator is measurably closer to it')}."
+    numbers = ", ".join(
+        f"{name} {car[name].before.mean:.2f} to {car[name].after.mean:.2f}{unit}"
+        for name, unit in (("T_L", " s"), ("K_L", ""))
+    )
+    # what all effects were tried for is not said again of two of them
+    named = cause is not None and bool(cause.parts)
+    first = _explanation(numbers, f"p = {p_value:.2g}", dead_time_test, named=named)
     words = {
         "closer": "the drives after are closer to the simulator",
         "farther": "the drives after are farther from the simulator",
-        "no telling": "the simulator's error has not changed measurably",
+        "inconclusive": "the simulator's error has not changed measurably",
     }
-    return f"{first}; {words[telling]}."
+    last = "The drives are too short to name a cause." if cause is None else cause.why
+    return f"{first}; {words[simulator]}. {last}"
 
 
-def _account(numbers: str, chance: str, dead_time_test: DeadTimeTest | None) -> str:
-    """The sentence on the car: lag and gain are stated as the explanation only where dead time is none."""
+def _explanation(numbers: str, chance: str, dead_time_test: DeadTimeTest | None, *, named: bool) -> str:
+    """The sentence on lag and gain: they are stated as the explanation only where dead time is none."""
     if dead_time_test is None:
-        return f"No change of the car is detected: {numbers} ({chance})"
+        first = "T_L and K_L alone show no change" if named else "No change of the car is detected"
+        return f"{first}: {numbers} ({chance})"
+    if named:
+        return f"The car has changed: as GLVD without any effect, {numbers} ({chance})"
     delays = " to ".join(f"{max(q.mean, 0.0):.2f}" for q in (dead_time_test.before, dead_time_test.after))
-    if dead_time_test.account == "lag and gain":
+    if dead_time_test.explanation == "lag and gain":
         more = f"a change of dead time alone does not explain it (p = {dead_time_test.p_dead_time:.2g})"
         return f"The car has changed: {numbers} ({chance}); {more}"
-    if dead_time_test.account == "cannot be told":
+    if dead_time_test.explanation == "not distinguishable":
         return (
             f"The car has changed ({chance}), but these drives cannot distinguish a change of lag and gain ({numbers}) "
             f"from one of dead time ({delays} s, p = {dead_time_test.p_dead_time:.2g})"

@@ -12,7 +12,7 @@ import avtorch
 from avtorch.cli.compare import _table
 from avtorch.errors import InputError
 from avtorch.gap import DeadTime, GapPlant, plant
-from avtorch.gap.dead_time_test import DeadTimeFit, compare_accounts
+from avtorch.gap.dead_time_or_lag import DeadTimeFit, compare_explanations
 from avtorch.io import Log
 from tests.bars import LEVEL, student
 from tests.gap.records import QUIET, log_of
@@ -52,7 +52,7 @@ CHANGES = {
 def test_a_later_answer_is_not_taken_for_lag_and_gain(what: str, delay: float, rotating_seed: int) -> None:
     """Only the delay, the lag or the gain has changed, of a car that had a delay before or had none.
 
-    Both accounts are rejected at the chance of a bar. So the true one is never rejected, and these drives are long
+    Both explanations are rejected at the chance of a bar. So the true one is never rejected, and these drives are long
     enough for the other: it comes out a thousand times below that chance and more.
     """
     rng = np.random.default_rng(rotating_seed)
@@ -61,7 +61,7 @@ def test_a_later_answer_is_not_taken_for_lag_and_gain(what: str, delay: float, r
         late = delay + more.get("delay", 0.0)
         return plant([DeadTime(late)] if late else [], T_L=T_L, K_L=K_L)
 
-    change, account = CHANGES[what]
+    change, explanation = CHANGES[what]
     drives = (log_of(x, seconds=LONG_S, rng=rng, noise=QUIET) for x in (car(), car(**change)))
     told = avtorch.compare(*drives, level=LEVEL)
     assert told.changed
@@ -69,30 +69,30 @@ def test_a_later_answer_is_not_taken_for_lag_and_gain(what: str, delay: float, r
     dead_time_test = told.dead_time_test
     true, other = (dead_time_test.p_dead_time, dead_time_test.p_lag_gain)[:: 1 if what == "delay" else -1]
     assert other < LEVEL < true
-    assert dead_time_test.account == account
+    assert dead_time_test.explanation == explanation
     gone = dead_time_test.difference
     assert abs(gone.mean - change.get("delay", 0.0)) < student(LONG_BLOCKS - 1) * gone.sd
-    if account == "not lag and gain":
+    if explanation == "not lag and gain":
         assert "lag and gain do not explain it" in told.why
     else:
         assert told.why.startswith("The car has changed: T_L ")
     answer = told.to_dict()["explained"]
-    assert answer["account"] == account
+    assert answer["explanation"] == explanation
     json.dumps(answer, allow_nan=False)
 
 
-def test_ambiguous_changes_get_no_account(fresh_seed: int) -> None:
-    """Where either account would do, neither is given."""
+def test_ambiguous_changes_get_no_explanation(fresh_seed: int) -> None:
+    """Where either explanation would do, neither is given."""
     numbers = np.random.default_rng(fresh_seed).normal(scale=0.01, size=(2, 3))
     spread = np.diag([0.1, 0.1, 0.05]) ** 2
     one, two = (DeadTimeFit(x, spread, 9) for x in numbers)
-    told = compare_accounts(one, two, level=0.04)
-    assert told.account == "cannot be told"
-    far = compare_accounts(one, DeadTimeFit(two.mean + np.array([1.0, 0.0, 0.0]), spread, 9), level=0.04)
-    assert far.account == "lag and gain"
+    told = compare_explanations(one, two, level=0.04)
+    assert told.explanation == "not distinguishable"
+    far = compare_explanations(one, DeadTimeFit(two.mean + np.array([1.0, 0.0, 0.0]), spread, 9), level=0.04)
+    assert far.explanation == "lag and gain"
     # both have changed: lag and gain alone do not explain it either
-    both = compare_accounts(one, DeadTimeFit(two.mean + np.array([1.0, 0.0, 0.5]), spread, 9), level=0.04)
-    assert both.account == "not lag and gain"
+    both = compare_explanations(one, DeadTimeFit(two.mean + np.array([1.0, 0.0, 0.5]), spread, 9), level=0.04)
+    assert both.explanation == "not lag and gain"
 
 
 @pytest.mark.statistical

@@ -84,9 +84,9 @@ def account(
 
 
 def _record(logs: Sequence[Log]) -> AnalysisRecord | None:
-    for shortest in (None, _SHORT_S):
+    for block_s in (None, _SHORT_S):
         try:
-            return AnalysisRecord.of(logs) if shortest is None else AnalysisRecord.of(logs, shortest_block_s=shortest)
+            return AnalysisRecord.of(logs, block_s=block_s)
         except InputError:
             continue
     return None

@@ -72,21 +72,24 @@ class AnalysisRecord:
         return "speed" in self.channels
 
     @classmethod
-    def of(
-        cls, logs: Sequence[Log], *, rate_hz: float = RATE_HZ, shortest_block_s: float = _SHORTEST_BLOCK_S
-    ) -> AnalysisRecord:
-        """Raises `InputError` where what counts is less than six blocks of four seconds."""
+    def of(cls, logs: Sequence[Log], *, rate_hz: float = RATE_HZ, block_s: float | None = None) -> AnalysisRecord:
+        """`block_s`: length of a block [s]; default: so that there are some 24, of four to ten seconds.
+
+        Raises `InputError` where what counts is less than six blocks.
+        """
         channels = tuple(c for c in ("speed", "accel") if all(getattr(log, c) is not None for log in logs))
         if not channels:
             raise InputError("logs: found no channel that all of them have, needs speed or accel in each")
         usable = sum(float(log.usable.sum()) / log.rate_hz for log in logs)
-        length = float(np.clip(usable / _BLOCKS, shortest_block_s, _LONGEST_BLOCK_S))
+        length = float(np.clip(usable / _BLOCKS, _SHORTEST_BLOCK_S, _LONGEST_BLOCK_S)) if block_s is None else block_s
         slowest = min(log.rate_hz for log in logs)
         # whole rows of the slowest log, so that nothing is interpolated there
         step = max(1, int(slowest / _rate_needed(logs, rate_hz) + 1e-6)) / slowest
         pieces = [piece for number, log in enumerate(logs) for piece in _pieces(log, number, step, channels, length)]
         if not pieces:
-            raise InputError(f"logs: found no stretch of {shortest_block_s + _SETTLE_S + 1.0:g} s, needs some")
+            raise InputError(
+                f"logs: found no stretch of {min(length, _SHORTEST_BLOCK_S) + _SETTLE_S + 1.0:g} s, needs some"
+            )
         starts = np.cumsum([0, *(len(p.time) for p in pieces)])
         stretches = tuple(
             Stretch(p.drive, slice(a, b)) for p, a, b in zip(pieces, starts[:-1], starts[1:], strict=True)

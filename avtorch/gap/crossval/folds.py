@@ -21,6 +21,7 @@ FOLDS = 5
 _BLOCKS = 20  # of a long drive
 _DRIVES = 3  # fewest drives for which whole ones are held out
 _WHOLE_S = 10.0  # a block holds one to six of these, so that rollouts of this length fit in
+_SHORTER_S = (8.0, 7.0, 6.0, 5.0, 4.0)  # tried in turn where a drive is too short for that
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +74,21 @@ def _drive_of(record: Record) -> IntArray:
     return np.asarray(record.segment)[np.searchsorted(ends, record.source, side="right")]
 
 
-def blocks_of(record: Record) -> list[slice]:
-    """A partition of the counted rows into blocks of 10 to 60 s; short stretches are blocks of their own."""
-    return list(_blocks(record))
+def blocks_of(record: Record, *, fewest: int = 0) -> list[slice]:
+    """A partition of the counted rows into blocks of 10 to 60 s; short stretches are blocks of their own.
+
+    Where these are not `fewest`, blocks as short as 4 s.
+    """
+    blocks: list[slice] = []
+    for whole_s in (_WHOLE_S, *_SHORTER_S):
+        blocks = list(_blocks(record, whole_s))
+        if len(blocks) >= fewest:
+            break
+    return blocks
 
 
-def _blocks(record: Record) -> Iterator[slice]:
-    seconds = _WHOLE_S * float(np.clip(round(record.rows * record.dt / _BLOCKS / _WHOLE_S), 1, 6))
+def _blocks(record: Record, whole_s: float) -> Iterator[slice]:
+    seconds = whole_s * float(np.clip(round(record.rows * record.dt / _BLOCKS / whole_s), 1, 6))
     for begin, end in pairwise([*record.starts.tolist(), record.rows]):
         count = max(1, int((end - begin) * record.dt / seconds + 1e-9))
         edges = np.linspace(begin, end, count + 1).round().astype(int).tolist()

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from avtorch.gap.change.change_cause import ChangeCause
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import LogFacts
 
-Telling = Literal["closer", "farther", "no telling"]
-Account = Literal["lag and gain", "not lag and gain", "cannot be told"]
+SimulatorChange = Literal["closer", "farther", "inconclusive"]
+Explanation = Literal["lag and gain", "not lag and gain", "not distinguishable"]
 
 
 @dataclass(frozen=True)
@@ -43,17 +44,17 @@ class DeadTimeTest:
     level: float
 
     @property
-    def account(self) -> Account:
+    def explanation(self) -> Explanation:
         """`"lag and gain"` where they explain the change and a dead time does not, `"not lag and gain"` where they do
-        not explain it, `"cannot be told"` where both explain it."""
+        not explain it, `"not distinguishable"` where both explain it."""
         if self.p_lag_gain < 0.25 * self.level:
             return "not lag and gain"
-        return "lag and gain" if self.p_dead_time < self.level else "cannot be told"
+        return "lag and gain" if self.p_dead_time < self.level else "not distinguishable"
 
     def to_dict(self) -> dict[str, Any]:
         delays = {"before": self.before, "after": self.after, "difference": self.difference}
         return {
-            "account": self.account,
+            "explanation": self.explanation,
             "p_lag_gain": self.p_lag_gain,
             "p_dead_time": self.p_dead_time,
             "dead_time_s": {name: q.to_dict() for name, q in delays.items()},
@@ -67,7 +68,9 @@ class Comparison:
 
     `changed`: the car's parameters differ, with p-value `p_value` for drives of one car. `simulator`: whether the
     simulator's errors on the drives after are smaller than those on the drives before (each with its own simulator,
-    where two are given). `dead_time_test`: where the car has changed, whether lag and gain explain it; else None.
+    where two are given); `"inconclusive"`: neither. `dead_time_test`: where the car has changed, whether lag and gain
+    explain it; else None. `cause`: what of T_L, K_L, dead time and all effects differs; None where both sides are one
+    drive, or too short for it.
     """
 
     before: LogFacts
@@ -76,9 +79,10 @@ class Comparison:
     gap: Mapping[str, Change]
     p_value: float
     changed: bool
-    simulator: Telling
+    simulator: SimulatorChange
     why: str
     dead_time_test: DeadTimeTest | None = None
+    cause: ChangeCause | None = None
     horizon_s: float = 10.0
 
     def to_dict(self) -> dict[str, Any]:
@@ -93,6 +97,7 @@ class Comparison:
             "p_value": self.p_value,
             "changed": self.changed,
             "explained": None if self.dead_time_test is None else self.dead_time_test.to_dict(),
+            "cause": None if self.cause is None else self.cause.to_dict(),
             "simulator": self.simulator,
             "why": self.why,
         }

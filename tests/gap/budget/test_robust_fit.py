@@ -88,7 +88,7 @@ def test_an_effect_that_sets_in_is_absent_before() -> None:
 
 def test_every_row_is_predicted_by_a_model_that_did_not_see_it() -> None:
     """Blocks so short that the filter's past takes the first: numbers of blocks once differed by one after it."""
-    record = AnalysisRecord.of([log_of(seconds=20.0)], shortest_block_s=1.0)
+    record = AnalysisRecord.of([log_of(seconds=20.0)], block_s=1.0)
     fitting = RobustFit(NoiseWhitening.autoregressive(record, record.measured))
     whitening = fitting.whitening
     assert whitening.blocks < record.blocks

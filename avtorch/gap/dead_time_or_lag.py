@@ -1,4 +1,4 @@
-"""Test whether a change of lag and gain, or a change of dead time, explains the difference between two sets of drives.
+"""Whether a change of lag and gain, or one of dead time, explains the difference between two sets of drives.
 
 To GLVD, a car that responds 0.15 s later resembles one with a longer lag. Both sides are therefore fitted with a dead
 time as well, and two explanations are compared: only lag and gain differ (equal dead times), or only the dead time
@@ -16,6 +16,7 @@ from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.change.two_sides import FEWEST_BLOCKS
 from avtorch.gap.crossval.folds import blocks_of
 from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
 from avtorch.gap.quantity import Quantity
@@ -51,7 +52,7 @@ class DeadTimeFit:
         inverse = np.linalg.inv(columns @ columns.T)
         pulls = columns * white
         by_row = pulls.reshape(len(own), len(record.channels), record.rows, record.group).sum((1, 3))
-        blocks = blocks_of(record)
+        blocks = blocks_of(record, fewest=FEWEST_BLOCKS)
         scores = np.stack([by_row[:, b].sum(1) for b in blocks], 1)
         values = [found.values[key] for key in own]
         # undo the prior's shrinkage and the constraint at zero delay: the estimate may be below 0
@@ -63,7 +64,7 @@ class DeadTimeFit:
         return cls(mean, root @ axes @ np.diag(np.maximum(sizes, 1.0)) @ axes.T @ root.T, len(blocks))
 
 
-def compare_accounts(before: DeadTimeFit, after: DeadTimeFit, *, level: float) -> DeadTimeTest:
+def compare_explanations(before: DeadTimeFit, after: DeadTimeFit, *, level: float) -> DeadTimeTest:
     """Test both explanations at `level` (see `DeadTimeTest`)."""
     away, covariance = after.mean - before.mean, after.covariance + before.covariance
     blocks = min(before.blocks, after.blocks)

@@ -1,0 +1,1 @@
+"""What has changed between two sets of drives: the cause of a change, learnt on what both sets share."""
