@@ -161,13 +161,13 @@ class Injected:
 def score_in_front(trials: Sequence[Injected]) -> dict[str, Any]:
     """Counts by effect and size (`table`), by size (`by_size`), and over all trials (`totals`).
 
-    Rows are in the order of their first trial. Of the `trials`, `held` counts those whose verdict names the effect, `in_control` those whose control names it too,
-    `sized` those held with a size in the answer, and `size_right` those of them within a quarter of what was put in;
-    `extra` those with a name that neither control nor injection has, `nothing_named` those answered `unknown`, `none`
-    or nothing, `failed` those without an answer. Of the `bounded`, whose size has an interval and is not in the
-    control, `covered` counts those whose interval holds it. `by_size` and `totals` also have shares with Wilson's 90 %
-    intervals: of the trials, but `size_right` of the `sized` and `covered` of the `bounded`; and in `needed` how many
-    of these make an interval of ± 5 points.
+    Rows are in the order of their first trial. Of the `trials`, `held` counts those whose verdict names the effect,
+    `in_control` those whose control names it too, `sized` those held with a size in the answer, and `size_right` those
+    of them within a quarter of what was put in; `extra` those with a name that neither control nor injection has,
+    `nothing_named` those answered `unknown`, `none` or nothing, `failed` those without an answer. Of the `bounded`,
+    whose size has an interval and is not in the control, `covered` counts those whose interval holds it. `by_size` and
+    `totals` also have shares with Wilson's 90 % intervals: of the trials, but `size_right` of the `sized` and `covered`
+    of the `bounded`; and in `needed` how many of these make an interval of ± 5 points.
 
     Example:
         >>> from avtorch.blindtest import Injected, score_in_front

@@ -1,4 +1,4 @@
-"""Who accounts for the gap: the likelihood's verdict where it holds, selection on held-out blocks where it does not.
+"""Which analysis supplies the verdict: the likelihood where it holds, selection on held-out blocks where it does not.
 
 The likelihood is the sharper of the two where its equations hold: it names a cause that no rollout shows yet. Where it
 answers `unknown`, or calls for a random force that swallows whatever is reproducible, its noise model does not hold.
@@ -102,7 +102,7 @@ def _onsets(winner: FittedModel | None, logs: Sequence[Log]) -> dict[str, float]
 
 
 def _as_adequate(budget: Budget, candidates: Sequence[Candidate]) -> Budget:
-    """The budget where the likelihood holds: its test of adequacy sees any structure; what it misses is not there."""
+    """The budget where the likelihood holds: what its test of adequacy does not see is taken as noise."""
     doubt = next(c.probability for c in candidates if c.name == "unknown")
     rest = budget.unexplained
     return replace(budget, unexplained=replace(rest, material=False, probability=min(rest.probability, doubt)))

@@ -83,7 +83,7 @@ def foretold(fitting: RobustFit, fit: Fit, residuals: FloatArray) -> FloatArray:
     X, y, scale = _white(fitting, shapes, residuals)
     fold = whitening.spread(fitting.fold.astype(float))
     fold = np.tile(fold, len(record.channels))
-    row_fold = np.where(record.block >= 0, fitting.fold[np.minimum(record.block, len(fitting.fold) - 1)], -1)
+    row_fold = fitting.fold_of_row
     before = fitting.nats(whitening(residuals))
     best, after = np.zeros_like(residuals), before
     for ridge in _RIDGES:

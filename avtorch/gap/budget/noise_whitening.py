@@ -80,6 +80,11 @@ class NoiseWhitening:
         return len(self.first)
 
     @property
+    def numbers(self) -> IntArray:
+        """The record's numbers (block,) of these blocks; one whose rows are all the filter's past has none here."""
+        return self.record.block[self.order[self.first]]
+
+    @property
     def lengths(self) -> IntArray:
         """Rows (block,) that count."""
         return np.diff(np.append(self.first, len(self.order)))

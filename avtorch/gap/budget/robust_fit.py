@@ -66,6 +66,14 @@ class RobustFit:
         object.__setattr__(self, "prior", _PRIOR_SHARE * n)
         object.__setattr__(self, "half", 0.5 * (1 + _PRIOR_SHARE) * n)
 
+    @property
+    def fold_of_row(self) -> IntArray:
+        """Fold (row,) whose model did not see the row; -1 where the row is of no block that is scored."""
+        record = self.whitening.record
+        by_block = np.full(record.blocks, -1)
+        by_block[self.whitening.numbers] = self.fold
+        return np.where(record.block >= 0, by_block[np.maximum(record.block, 0)], -1)
+
     def nats(self, white: FloatArray) -> FloatArray:
         """Cost (..., block) of white residuals (..., channel, counted)."""
         return self.half * np.log1p(self.whitening.by_block(white**2) / self.prior)

@@ -17,9 +17,9 @@ _BEGIN_S = 0.5  # over which the measured start of a rollout is averaged
 
 def held_out_residuals(selection: Selection, step: Step) -> FloatArray:
     """(channel, row): each block's by the fit that was made without it."""
-    fold, record = selection.fitting.fold, selection.fitting.whitening.record
+    record = selection.fitting.whitening.record
     response = step.fit.model.simulate(step.held.z)  # (fold, channel, row)
-    which = np.where(record.block >= 0, fold[np.clip(record.block, 0, len(fold) - 1)], 0)
+    which = np.maximum(selection.fitting.fold_of_row, 0)
     return record.measured - response[which, :, np.arange(record.rows)].T
 
 
@@ -44,10 +44,11 @@ def rollout_squares(selection: Selection, residuals: FloatArray) -> FloatArray:
 
 
 def calm_blocks(selection: Selection) -> IntArray:
-    """Blocks but the tenth that the selected model foretells worst: a kerb is not to decide what a budget is."""
+    """Blocks that are scored, but the tenth that the selected model predicts worst: a kerb does not decide a budget."""
     squares = rollout_squares(selection, held_out_residuals(selection, selection.last))
-    worst = (squares / (np.median(squares, -1, keepdims=True) + 1e-12)).max(0)
-    return np.sort(np.argsort(worst)[: max(1, round(0.9 * len(worst)))])
+    scored = selection.fitting.whitening.numbers
+    worst = (squares / (np.median(squares[:, scored], -1, keepdims=True) + 1e-12)).max(0)[scored]
+    return np.sort(scored[np.argsort(worst)[: max(1, round(0.9 * len(worst)))]])
 
 
 def counted_rows(selection: Selection) -> FloatArray:

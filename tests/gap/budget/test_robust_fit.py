@@ -84,3 +84,15 @@ def test_an_effect_that_sets_in_is_absent_before() -> None:
     before = record.time < 60.0
     np.testing.assert_array_equal(late.simulate(z)[..., before], without[..., before])
     np.testing.assert_array_equal(late.simulate(z)[..., ~before], with_it[..., ~before])
+
+
+def test_every_row_is_predicted_by_a_model_that_did_not_see_it() -> None:
+    """Blocks so short that the filter's past takes the first: numbers of blocks once differed by one after it."""
+    record = AnalysisRecord.of([log_of(seconds=20.0)], shortest_block_s=1.0)
+    fitting = RobustFit(NoiseWhitening.autoregressive(record, record.measured))
+    whitening = fitting.whitening
+    assert whitening.blocks < record.blocks
+    row_fold = fitting.fold_of_row
+    scored = whitening.spread(fitting.fold.astype(float))
+    assert np.array_equal(row_fold[whitening.order], scored)
+    assert set(row_fold[~np.isin(record.block, whitening.numbers)]) == {-1}
