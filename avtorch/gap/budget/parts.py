@@ -25,7 +25,8 @@ class Part:
     physically possible.
 
     Example:
-        >>> from avtorch.gap import Part, Quantity
+        >>> from avtorch.gap import Part
+        >>> from avtorch.gap.quantity import Quantity
         >>> share, size = Quantity(0.6, 0.05, 0.5, 0.7), Quantity(0.31, 0.02, 0.28, 0.34)
         >>> part = Part("sensor_bias", ("sensor_bias",), 0.97, share, 1.2, {"bias_mps2": size})
         >>> part.to_dict()["names"], part.to_dict()["share"]["mean"]
@@ -89,7 +90,8 @@ class Unexplained:
     `material`: surely more than a user cares for; `probability`: that it is more.
 
     Example:
-        >>> from avtorch.gap import Quantity, Unexplained
+        >>> from avtorch.gap import Unexplained
+        >>> from avtorch.gap.quantity import Quantity
         >>> Unexplained(Quantity(0.2, 0.04, 0.12, 0.27), material=True, probability=0.99).to_dict()["material"]
         True
     """
@@ -144,7 +146,7 @@ class Budget:
         >>> part.name, round(part.parameters["resistance_mps2"].mean, 1), budget.verdict
         ('constant_resistance', 0.2, ('constant_resistance',))
         >>> print(budget)
-        Chiefly constant_resistance (100 % of the gap); the rest is noise.
+        Chiefly constant_resistance (100 % of the gap); the rest of the error is noise.
         >>> speed = budget.by_channel["speed"]
         >>> speed.before > 3 * speed.left
         True
@@ -193,7 +195,7 @@ class Budget:
             lines.append(f"{percent(self.unexplained.share.mean)} is reproducible and no known effect explains it")
         by_chance = [c.name for c in self.chance if c.probability >= LIKELY]
         noise = "noise" if not by_chance else f"noise, in part by {' and '.join(by_chance)}"
-        lines.append(f"the rest is {noise}")
+        lines.append(f"the rest of the error is {noise}")
         text = "; ".join(lines) + "."
         return text[0].upper() + text[1:]
 
