@@ -184,7 +184,7 @@ class JointFit:
         """Sums (block, i, j) of products of `stacked` (i, channel, counted)."""
         ends = np.append(self.whitening.first, stacked.shape[-1])
         parts = [stacked[..., a:b].reshape(len(stacked), -1) for a, b in pairwise(ends)]
-        return np.stack([x @ x.T for x in parts])
+        return np.asarray(np.stack([x @ x.T for x in parts]))
 
     def _linear(
         self,
@@ -266,4 +266,4 @@ class JointFit:
 def _solved(total: FloatArray, prior: FloatArray, begun: FloatArray, last: int) -> FloatArray:
     matrix = total[:last, :last] + np.diag(prior)
     matrix += 1e-9 * np.diag(np.diag(matrix))
-    return np.linalg.solve(matrix, total[:last, last] - begun * prior)
+    return np.asarray(np.linalg.solve(matrix, total[:last, last] - begun * prior))
