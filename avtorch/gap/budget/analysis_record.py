@@ -20,7 +20,7 @@ from avtorch.gap.simulator.simulator_input import SimulatorInput
 from avtorch.io import Log
 
 RATE_HZ = 20.0
-"""Rows a second at most: the noise above half of this is not modelled, and no effect but a ring shows there."""
+"""Rows a second, about: the noise above half of this is not modelled, and only a driveline's ring shows there."""
 _USUAL_LAG_S = 0.3
 _ROWS_A_PERIOD = 6
 _SETTLE_S = 3.0  # at the beginning of a stretch, and after rows that are masked, until the start no longer matters
@@ -33,10 +33,14 @@ _COUNTED_SHARE = 0.4  # of a block that must count
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Rows without a gap, `rows` of the record, and the `drive` (row,) that a plant responds to."""
+    """Rows without a gap, `rows` of the record, and the `drive` (row,) that a plant responds to.
+
+    `averaging` [s²]: half the variance of the window over which the readings around each row are averaged.
+    """
 
     drive: SimulatorInput
     rows: slice
+    averaging: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +96,7 @@ class AnalysisRecord:
             )
         starts = np.cumsum([0, *(len(p.time) for p in pieces)])
         stretches = tuple(
-            Stretch(p.drive, slice(a, b)) for p, a, b in zip(pieces, starts[:-1], starts[1:], strict=True)
+            Stretch(p.drive, slice(a, b), p.averaging) for p, a, b in zip(pieces, starts[:-1], starts[1:], strict=True)
         )
         counts = np.concatenate([p.counts for p in pieces])
         offsets = np.cumsum([0, *(int(p.block.max()) + 1 for p in pieces)])
@@ -135,6 +139,7 @@ class _Piece:
     time: FloatArray
     speed: FloatArray
     log: int
+    averaging: float
 
 
 def _pieces(log: Log, number: int, step: float, channels: Sequence[str], length: float) -> list[_Piece]:
@@ -151,8 +156,11 @@ def _pieces(log: Log, number: int, step: float, channels: Sequence[str], length:
         # a command is held until the next row: what it sums to is linear between rows
         summed = np.concatenate([[0.0], np.cumsum(log.accel_cmd[part][:-1] * np.diff(time))])
         command = np.diff(np.interp(edges, time, summed)) / step
-        near = max(1, round(step / float(np.median(np.diff(time)))))
-        at = {c: np.interp(edges, time, _mean_around(getattr(log, c)[part], near)) for c in channels}
+        row = float(np.median(np.diff(time)))
+        window = _window(max(1, round(step / row)))
+        at = {c: np.interp(edges, time, _averaged(getattr(log, c)[part], window)) for c in channels}
+        places = row * (np.arange(len(window)) - len(window) // 2)
+        averaging = 0.5 * float(window @ places**2)
         speed = at.get("speed")
         measured = [np.diff(at["speed"]) / step if c == "speed" else at[c][:-1] for c in channels]
         usable = np.interp(grid, time, log.usable[part].astype(float)) > 0.999
@@ -168,7 +176,7 @@ def _pieces(log: Log, number: int, step: float, channels: Sequence[str], length:
         block = np.arange(rows) * max(1, round(rows * step / length)) // rows
         settled = _settled(usable, round(_SETTLE_S / step))
         plain = np.zeros(rows) if speed is None else speed[:-1]
-        pieces.append(_Piece(drive, np.stack(measured), settled, block, grid, plain, number))
+        pieces.append(_Piece(drive, np.stack(measured), settled, block, grid, plain, number, averaging))
     return pieces
 
 
@@ -191,12 +199,17 @@ def _rate_needed(logs: Sequence[Log], rate_hz: float) -> float:
     return rate_hz
 
 
-def _mean_around(x: FloatArray, rows: int) -> FloatArray:
-    """Mean over `rows` rows around each; of an even number the outermost two count half, so that nothing shifts."""
-    weights = np.full(rows, 1.0 / rows)
-    if rows % 2 == 0:
-        weights = np.convolve(weights, [0.5, 0.5])
-    return np.convolve(np.pad(x, len(weights) // 2, mode="edge"), weights, "valid")
+def _window(rows: int) -> FloatArray:
+    """Weights of a mean over `rows` rows, symmetric: of an even number the first and the last count half."""
+    if rows % 2:
+        return np.full(rows, 1.0 / rows)
+    return np.concatenate([[0.5], np.ones(rows - 1), [0.5]]) / rows
+
+
+def _averaged(x: FloatArray, window: FloatArray) -> FloatArray:
+    """The weighted mean around each row."""
+    reach = len(window) // 2
+    return np.convolve(np.pad(x, reach, mode="edge"), window, "valid")
 
 
 def _settled(usable: BoolArray, rows: int) -> BoolArray:

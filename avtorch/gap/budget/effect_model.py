@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.budget.analysis_record import AnalysisRecord, stacked
+from avtorch.gap.budget.analysis_record import AnalysisRecord, Stretch, stacked
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.parameter import Parameter
@@ -24,8 +24,8 @@ from avtorch.gap.simulator.plant import GapPlant, plant
 LATENESS = "recorder.lateness"
 """The coordinate that is no parameter of an effect: how late speed is read against acceleration."""
 _LATENESS_S = 0.04  # its standard deviation [s]
+_BEYOND = 3.0  # times as far as physics allows
 _WIDEST = 6.0  # prior standard deviations, where physics sets no limit
-_BEYOND = 3.0
 _AT_LIMIT = 0.02  # prior standard deviations from a limit
 
 
@@ -56,13 +56,12 @@ class EffectModel:
             effect = key.partition(".")[0]
             if effect not in {"T_L", "K_L", *own} or key in _sizes(self.effects):
                 continue
+            if parameter.of_onset and effect not in self.onsets:  # the same as a change of T_L or K_L
+                continue
             index[key] = slice(len(low), len(low) + parameter.size)
-            ends = sorted(
-                float(parameter.unconstrain(torch.tensor(x, dtype=torch.float64))) for x in parameter.physical
-            )
-            interval = parameter.constraint == "interval"
-            low += [-_WIDEST if interval else max(ends[0], -_WIDEST)] * parameter.size
-            high += [_WIDEST if interval else min(ends[1], _WIDEST)] * parameter.size
+            ends = _box(parameter)
+            low += [ends[0]] * parameter.size
+            high += [ends[1]] * parameter.size
         if len(self.record.channels) == 2:
             index[LATENESS] = slice(len(low), len(low) + 1)
             low.append(-_WIDEST)
@@ -130,7 +129,7 @@ class EffectModel:
         return np.array(out)
 
     def at_limit(self, z: FloatArray, effect: str) -> bool:
-        """Whether a parameter of `effect` rests where physics ends."""
+        """Whether a parameter of `effect` rests where fits end, far beyond what is physically possible."""
         own = [at for key, at in self.index.items() if key.startswith(f"{effect}.")]
         return any(
             bool(((z[at] < self.low[at] + _AT_LIMIT) & (self.low[at] > -_WIDEST)).any())
@@ -138,8 +137,16 @@ class EffectModel:
             for at in own
         )
 
+    def plausible(self, z: FloatArray, effect: str) -> bool:
+        """Whether all parameters of `effect` are physically possible."""
+        parameters, values = self.plant.parameters(), self.values(z)
+        own = {key: parameters[key] for key in values if key.startswith(f"{effect}.")}
+        return all(
+            bool(((values[key] >= p.physical[0]) & (values[key] <= p.physical[1])).all()) for key, p in own.items()
+        )
+
     # response ------------------------------------------------------------------------------------------------------
-    @torch.no_grad()
+    @torch.inference_mode()
     def simulate(self, z: FloatArray) -> FloatArray:
         """Noise-free channels (..., channel, row) [m/s²] of coordinates `z` (..., size)."""
         values = self.values(z)
@@ -158,15 +165,20 @@ class EffectModel:
         return self._late(out, z)
 
     def _late(self, channels: FloatArray, z: FloatArray) -> FloatArray:
-        """`channels` with speed as late as it is read, to first order."""
+        """`channels` (..., channel, row) with the one that is read late as late as it is.
+
+        It is delayed, the other is not advanced: a command that follows what is measured knows the noise of the rows
+        before it, and would foretell the noise of a row from the commands after it.
+        """
         if LATENESS not in self.index:
             return channels
-        speed = self.record.channels.index("speed")
-        slope = np.empty_like(channels[..., speed, :])
-        for stretch in self.record.stretches:
-            slope[..., stretch.rows] = np.gradient(channels[..., speed, stretch.rows], self.record.dt, axis=-1)
+        seconds = _LATENESS_S * np.clip(z, self.low, self.high)[..., self.index[LATENESS]]
         out = np.array(np.broadcast_to(channels, (*z.shape[:-1], *channels.shape[-2:])))
-        out[..., speed, :] -= _LATENESS_S * z[..., self.index[LATENESS]] * slope
+        for name, late in (("speed", seconds), ("accel", -seconds)):
+            channel = self.record.channels.index(name)
+            for stretch in self.record.stretches:
+                at = (..., channel, stretch.rows)
+                out[at] = _delayed(out[at], np.maximum(late, 0.0) / self.record.dt)
         return out
 
     def _simulate(self, car: GapPlant, values: Mapping[str, Tensor]) -> FloatArray:
@@ -175,8 +187,27 @@ class EffectModel:
             response = car.response(stretch.drive, values)
             gained = response.speed.diff(dim=-1) / self.record.dt
             by_channel = {"speed": torch.cat([gained, gained[..., -1:]], -1), "accel": response.accel_measured}
-            channels.append(stacked([by_channel[c] for c in self.record.channels]))
+            channels.append(_averaged(stacked([by_channel[c] for c in self.record.channels]), stretch, self.record.dt))
         return np.concatenate(channels, -1)
+
+
+def _delayed(x: FloatArray, rows: FloatArray) -> FloatArray:
+    """`x` (..., row) so many `rows` (..., 1) later, linear between rows."""
+    if not rows.any():
+        return x
+    whole = np.floor(rows).astype(int)
+    place = np.arange(x.shape[-1]) - whole
+    now, before = (np.take_along_axis(x, np.maximum(place - k, 0), -1) for k in (0, 1))
+    return now + (rows - whole) * (before - now)
+
+
+def _averaged(x: FloatArray, stretch: Stretch, dt: float) -> FloatArray:
+    """`x` (..., row) averaged as the readings were, to second order: `x + s²/2 x''`."""
+    if stretch.averaging == 0:
+        return x
+    out = x.copy()
+    out[..., 1:-1] += stretch.averaging / dt**2 * (x[..., 2:] - 2 * x[..., 1:-1] + x[..., :-2])
+    return out
 
 
 def _box(parameter: Parameter) -> tuple[float, float]:

@@ -1,50 +1,49 @@
 """Which effects, and how many: forward, with removal, by the blocks that were held out.
 
-An effect enters while the blocks that were held out gain from it by more than their scatter explains. Of the effects
-that gain alike the simplest is taken, and the others are its aliases. Once one has entered, each of those before it has
-to hold its place without it.
+An effect enters if the blocks that were held out agree on it, more surely than the best of as many wrong effects would
+(`held_out_evidence`). Of the effects that explain the same, as far as they can tell, the simplest is added, and the
+others are its aliases; so is one that explains most of the same with far fewer parameters. Once one has entered, each
+of those before it has to hold its place without it; at the end each has to pass as if it were the last one tried.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
-import torch
 
-from avtorch.arrays import FloatArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.effect_model import LATENESS, EffectModel
 from avtorch.gap.budget.flexible_regression import left_over
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 from avtorch.gap.budget.robust_fit import Fit, HeldOut, RobustFit
+from avtorch.gap.budget.score_test import Candidate, ScoreTest
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.plant import GapPlant
 
-_ERRORS = 2.5  # standard errors of the gain over held-out blocks that are enough
-_NATS, _FEWER_ERRORS = 20.0, 1.2  # or so many nats, with so many standard errors
-_LEAST_NATS = 4.0
-_STAYS = -1.0  # strength down to which an effect holds its place
 MOST_PARTS = 5
 """Effects that a selection may hold."""
-_SCREENING = 2  # iterations of the fits that decide which effects are held out
-_SCREENED = 6  # effects that are held out, of those fitted
+_ROUNDS = 8  # of entering, as effects may leave again
+_LEAST_NATS = 3.0  # in the blocks that fitted it, below which no effect is held out
+_FAR_FEWER, _MOST_OF_IT = 3, 0.6  # parameters, and share of the gain, with which a simpler effect takes precedence
+_OF_ITS_OWN = 0.5  # share of an effect's gain, on top of another, from which it is no alias of that
+_FITTED = 9  # effects that are fitted, those of which a score test promises most
+_SCREENING = 3  # iterations of these fits
+_SCREENED = 5  # effects that are held out, of those fitted
+_REFITTING = 5  # iterations after a model has lost an effect
 _ONSET_NATS = 6.0  # that an onset must gain
-_FAINT = -2.0  # prior SD, for effects that name no first values
-_MOST_STARTS = 40
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A model and what held-out blocks gain by it: `gains` (block,) nats over the model before, `aliases` by name."""
+    """A model, the effect that `entered` last, its `strength` (`Evidence.strength`) and its `aliases` by name."""
 
     fit: Fit
     held: HeldOut
     entered: str | None = None
-    gains: FloatArray | None = None
+    strength: float = 0.0
     aliases: tuple[str, ...] = ()
 
 
@@ -58,19 +57,6 @@ class Selection:
     @property
     def last(self) -> Step:
         return self.steps[-1]
-
-
-def strength(gains: FloatArray) -> float:
-    """By how many standard errors held-out gains (block,) [nats] exceed what an effect needs to enter.
-
-    Either nearly all blocks gain, or all together gain so much that noise would not: gains are skewed, because an
-    effect of braking shows where the car brakes, and of a few large ones the scatter is large too.
-    """
-    total, blocks = float(gains.sum()), len(gains)
-    error = max(float(gains.std(ddof=1)) * np.sqrt(blocks), 1e-12)
-    errors = total / error
-    many = min(errors - _FEWER_ERRORS, (total - _NATS) / error)
-    return min(max(errors - _ERRORS, many), (total - _LEAST_NATS) / error)
 
 
 def select(
@@ -91,14 +77,29 @@ def select(
     if begun is None:
         fitting, start = baseline_noise(record, base)
         begun = Selection(fitting, (Step(start, fitting.hold_out(start)),))
-    fitting, steps = begun.fitting, list(begun.steps)
-    while len(steps) <= most:
-        entered = _enter(fitting, steps[-1], kinds, progress, len(steps))
-        if entered is None:
+    fitting, bare, now = begun.fitting, begun.steps[0], begun.last
+    entered = {s.entered: s for s in begun.steps if s.entered is not None}
+    for number in range(_ROUNDS):
+        step = None if len(now.fit.model.names) >= most else _enter(fitting, now, kinds, progress, number + 1)
+        if step is None:
             break
-        steps.append(entered)
-        steps = _without_the_redundant(fitting, steps)
-    return Selection(fitting, tuple(in_order(fitting, steps)))
+        entered[step.fit.model.names[-1]] = step
+        now, _ = _without_the_redundant(fitting, step, tried=1, spared=step.entered)
+    now, strengths = _without_the_redundant(fitting, now, tried=len(kinds))
+    aliases = {name: entered[name].aliases for name in now.fit.model.names}
+    return Selection(fitting, (bare, *one_by_one(fitting, now, strengths, aliases)))
+
+
+def one_by_one(
+    fitting: RobustFit, last: Step, strengths: Mapping[str, float], aliases: Mapping[str, tuple[str, ...]]
+) -> tuple[Step, ...]:
+    """Steps up to `last` whose models grow by one effect each."""
+    steps, names = [], last.fit.model.names
+    for count, name in enumerate(names, start=1):
+        fit = without_effects(fitting, last.fit, names[count:])
+        held = last.held if fit is last.fit else fitting.hold_out(fit)
+        steps.append(Step(fit, held, name, strengths.get(name, 0.0), aliases.get(name, (name,))))
+    return tuple(steps)
 
 
 def _observable(kind: type[Effect], record: AnalysisRecord) -> bool:
@@ -134,14 +135,17 @@ def _enter(
     progress: Callable[[str, int, int], None] | None,
     number: int,
 ) -> Step | None:
-    names = now.fit.model.names
-    fits = []
+    test, names = ScoreTest.at(fitting, now.fit), now.fit.model.names
+    candidates = []
     for kind in kinds:
         if kind.name in names:
             continue
         if progress is not None:
-            progress(f"budget, effect {number}: {kind.name}", len(fits), len(kinds) - len(names))
-        fits.append(_added(fitting, now.fit, kind, iterations=_SCREENING))
+            progress(f"budget, effect {number}: {kind.name}", len(candidates), len(kinds) - len(names))
+        candidates.append(test.candidate(kind))
+    candidates.sort(key=lambda c: -c.promise)
+    fits = [_fitted(fitting, test, c) for c in candidates[:_FITTED]]
+    fits = [fit for fit in fits if now.fit.nats - fit.nats > _LEAST_NATS]
     fits.sort(key=lambda fit: fit.nats + _complexity(fit))
     tried = []
     for rough in fits[:_SCREENED]:
@@ -150,114 +154,78 @@ def _enter(
         if fit.model.at_limit(fit.z, name):
             continue
         held = fitting.hold_out(fit)
-        tried.append(Step(fit, held, name, now.held.nats - held.nats))
-    tried = [step for step in tried if step.gains is not None and strength(step.gains) > 0]
+        tried.append(Step(fit, held, name, fitting.evidence(now.held, held).strength(len(candidates))))
+    tried = [step for step in tried if step.strength > 0]
     if not tried:
         return None
-    best = max(tried, key=_total)
-    alike = [s for s in tried if s is best or _alike(best, s)]
-    simplest = min(alike, key=lambda s: (_complexity(s.fit), -_total(s)))
-    return replace(simplest, aliases=tuple(sorted(s.entered for s in alike if s.entered is not None)))
+    best = min(tried, key=_cost)
+    same = [s for s in tried if s is best or _explains_the_same(fitting, now, best, s)]
+    alike = [s for s in same if s is best or fitting.preference(s.held, best.held).strength() <= 0]
+    chosen = min([s for s in same if s in alike or _much_simpler(now, best, s)], key=lambda s: _complexity(s.fit))
+    aliases = {s.entered for s in alike} | {chosen.entered}
+    return replace(chosen, aliases=tuple(sorted(name for name in aliases if name is not None)))
 
 
-def _total(step: Step) -> float:
-    return 0.0 if step.gains is None else float(step.gains.sum())
+def _explains_the_same(fitting: RobustFit, now: Step, best: Step, other: Step) -> bool:
+    """Whether little is left of what the other explains once the best is in."""
+    return fitting.on_top(now.held, best.held, other.held) < _OF_ITS_OWN * (_cost(now) - _cost(other))
 
 
-def _alike(best: Step, other: Step) -> bool:
-    """Whether held-out blocks cannot tell the other from the best."""
-    assert best.gains is not None
-    assert other.gains is not None
-    return strength(best.gains - other.gains) <= 0
+def _much_simpler(now: Step, best: Step, other: Step) -> bool:
+    """Whether the other explains most of the same with far fewer parameters.
+
+    A free course of the road follows a constant force too, and whatever else comes back at the same place; what a
+    simpler effect leaves of that, the flexible one may explain afterwards.
+    """
+    fewer = _complexity(best.fit) - _complexity(other.fit)
+    return fewer >= _FAR_FEWER and _cost(now) - _cost(other) > _MOST_OF_IT * (_cost(now) - _cost(best))
+
+
+def _fitted(fitting: RobustFit, test: ScoreTest, candidate: Candidate) -> Fit:
+    """The candidate fitted, from the start on or from the onset that promises most."""
+    fit = fitting.fit(candidate.model, candidate.starts, iterations=_SCREENING)
+    kind, logs = candidate.model.effects[-1], set(candidate.model.record.log)
+    if kind.own_onset is not None or issubclass(kind, Integrated) or len(logs) > 1:
+        return fit
+    late = test.late(candidate)
+    if late is None or late.promise < candidate.promise + _ONSET_NATS:
+        return fit
+    starts = np.concatenate([late.starts, late.model.coordinates(fit.known)[None]])
+    later = fitting.fit(late.model, starts, iterations=_SCREENING)
+    return later if later.nats + _ONSET_NATS < fit.nats else fit
+
+
+def _cost(step: Step) -> float:
+    """Nats of the blocks that were held out."""
+    return float(step.held.nats.sum())
 
 
 def _complexity(fit: Fit) -> int:
-    """Parameters, as many as the data can see: a force along the road has a coefficient for every knot."""
-    return fit.model.size + len(fit.model.onsets) + 4 * sum(issubclass(e, Integrated) for e in fit.model.effects)
+    """Parameters, those of a force along the road among them."""
+    return fit.model.size + len(fit.model.onsets)
 
 
-def _added(fitting: RobustFit, fit: Fit, kind: type[Effect], *, iterations: int) -> Fit:
-    """The model with one effect more, from the start on or from an onset."""
-    model = fit.model.with_effect(kind)
-    starts = _starts(model, fit, kind)
-    rough = fitting.fit(model, starts, iterations=iterations)
-    if kind.own_onset is not None or issubclass(kind, Integrated) or len(set(fit.model.record.log)) > 1:
-        return rough
-    onset = _onset(fit, rough)
-    if onset is None:
-        return rough
-    late_model, late_starts = model.setting_in(kind.name, onset), np.concatenate([rough.z[None], starts])
-    late = fitting.fit(late_model, late_starts, iterations=iterations)
-    return late if late.nats + _ONSET_NATS < rough.nats else rough
+def _without_the_redundant(
+    fitting: RobustFit, step: Step, *, tried: int, spared: str | None = None
+) -> tuple[Step, dict[str, float]]:
+    """The model without effects that do not hold their place, weakest first, and the strength of each that does."""
+    while True:
+        without: dict[str, Step] = {}
+        for name in step.fit.model.names:
+            if name != spared:
+                fit = without_effects(fitting, step.fit, [name])
+                held = fitting.hold_out(fit)
+                without[name] = Step(fit, held, strength=fitting.evidence(held, step.held).strength(tried))
+        if not without or min(s.strength for s in without.values()) > 0:
+            return step, {name: s.strength for name, s in without.items()}
+        step = min(without.values(), key=lambda s: s.strength)
 
 
-def _onset(before: Fit, after: Fit) -> float | None:
-    """When the model `after` begins to be the better one [s], to a block; None where it is from the start."""
-    record = after.model.record
-    gains = before.block_nats - after.block_nats
-    later = np.concatenate([np.cumsum(gains[::-1])[::-1], [0.0]])
-    best = int(np.argmax(later))
-    if best in (0, len(gains)) or later[best] < later[0] + _ONSET_NATS / 2:
-        return None
-    return float(record.time[record.block == best].min())
-
-
-def _starts(model: EffectModel, fit: Fit, kind: type[Effect]) -> FloatArray:
-    """First vectors (start, size): the parameters so far, with the effect's own first values."""
-    time = model.record.time
-    known, parameters = dict(fit.known), model.plant.parameters()
-    grids, keys = [], []
-    for name, values in kind.starts_in(float(time.min()), float(time.max())).items():
-        key = f"{kind.name}.{name}"
-        if key in model.index:
-            keys.append(key)
-            points = torch.tensor(values, dtype=torch.float64)
-            grids.append([float(z) for z in parameters[key].unconstrain(points)])
-    starts = [model.coordinates({**known, **dict(zip(keys, z, strict=True))}) for z in product(*grids)]
-    own = [key for key in model.index if key.startswith(f"{kind.name}.")]
-    if not grids and own and not issubclass(kind, Integrated):
-        starts += [model.coordinates({**known, own[0]: np.array([z])}) for z in (_FAINT, -_FAINT)]
-    out = np.clip(np.array(starts), model.low, model.high)
-    if len(out) > _MOST_STARTS:
-        out = out[np.linspace(0, len(out) - 1, _MOST_STARTS).astype(int)]
-    # a lag and a delay trade places, so from a shorter lag too
-    shorter = out.copy()
-    shorter[:, model.index["T_L"]] -= 1.0
-    return np.concatenate([out, shorter]) if kind.memory or kind.role == "delay" else out
-
-
-def _without_the_redundant(fitting: RobustFit, steps: list[Step]) -> list[Step]:
-    """Without effects that the last one has made superfluous."""
-    last = steps[-1]
-    for name in last.fit.model.names[:-1]:
-        fit = without_effect(fitting, last.fit, name)
-        held = fitting.hold_out(fit)
-        if strength(held.nats - last.held.nats) > _STAYS:
-            continue
-        kept = [s for s in steps[:-1] if name not in s.fit.model.names]
-        return [*kept, replace(last, fit=fit, held=held)]
-    return steps
-
-
-def without_effect(fitting: RobustFit, fit: Fit, name: str) -> Fit:
-    """The model without one of its effects, fitted anew."""
-    model = fit.model.without(name)
-    return fitting.fit(model, model.coordinates(fit.known)[None])
-
-
-def in_order(fitting: RobustFit, steps: list[Step]) -> list[Step]:
-    """Steps whose models grow by one effect each, as removal may have left gaps between them."""
-    aliases = {s.entered: s.aliases for s in steps if s.entered is not None}
-    last, out = steps[-1], [steps[0]]
-    for count in range(1, len(last.fit.model.names) + 1):
-        names = last.fit.model.names[:count]
-        step = next((s for s in steps if s.fit.model.names == names and s.entered == names[-1]), None)
-        if step is None or count == len(last.fit.model.names):
-            fit = last.fit
-            for name in last.fit.model.names[count:]:
-                fit = without_effect(fitting, fit, name)
-            held = last.held if fit is last.fit else fitting.hold_out(fit)
-            step = Step(fit, held, names[-1])
-        gains = out[-1].held.nats - step.held.nats
-        out.append(replace(step, entered=names[-1], gains=gains, aliases=aliases.get(names[-1], (names[-1],))))
-    return out
+def without_effects(fitting: RobustFit, fit: Fit, names: Collection[str]) -> Fit:
+    """The model without some of its effects, fitted anew."""
+    if not names:
+        return fit
+    model = fit.model
+    for name in names:
+        model = model.without(name)
+    return fitting.fit(model, model.coordinates(fit.known)[None], iterations=_REFITTING)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from avtorch.gap.budget.effect_model import EffectModel
-from avtorch.gap.budget.forward_selection import Selection, Step, in_order
+from avtorch.gap.budget.forward_selection import Selection, Step, one_by_one
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.simulator.effect import Effect
 
@@ -40,4 +40,4 @@ def given_effects(
     starts = np.stack([model.coordinates(with_lag), model.coordinates({**with_lag, **bare.known})])
     fit = fitting.fit(model, np.clip(starts, model.low, model.high), iterations=12)
     last = Step(fit, fitting.hold_out(fit), fit.model.names[-1])
-    return Selection(fitting, tuple(in_order(fitting, [first, last])))
+    return Selection(fitting, (first, *one_by_one(fitting, last, {}, {})))

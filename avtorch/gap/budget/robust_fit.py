@@ -7,20 +7,22 @@ goes on for a while (another driver, a kerb), the block says less instead of eve
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.budget.effect_model import EffectModel
+from avtorch.gap.budget.held_out_evidence import Evidence, agreement
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 
 _PRIOR_SHARE = 0.2  # of a block's rows, that the prior of its noise's size counts as
 _STEP = 1e-3  # of the differences
 _DAMPING = (1e-3, 0.3, 10.0, 300.0)
+_CLOSE = (1e-3, 1.0)  # where the place is known nearly
 _LONGEST = 1.0  # step of a coordinate [prior SD], then two and a half of it
-_STOP_NATS = 0.02
+_STOP_NATS = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +46,14 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """A model fitted without each fold in turn: `nats` (block,) of the blocks held out, `z` (fold, size)."""
+    """A model fitted without each fold in turn: `nats` (block,) of the blocks held out, `z` (fold, size).
+
+    `white` (channel, counted): white residuals of the blocks held out.
+    """
 
     nats: FloatArray
     z: FloatArray
+    white: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +92,14 @@ class RobustFit:
 
     def fit(self, model: EffectModel, starts: FloatArray, *, iterations: int = 8) -> Fit:
         """Gauss and Newton's, from the best of `starts` (start, size)."""
-        everything = np.ones((1, self.whitening.blocks))
+        everything = np.ones(self.whitening.blocks)
         white = self.white(model, starts)
         cost = self._cost(white, starts, everything)
         best = int(np.argmin(cost))
         z, now, at = starts[best], float(cost[best]), white[best]
         for _ in range(iterations):
-            steps = np.concatenate([self._steps(model, z, at, everything[0]), model.traded(z)])
+            slope = self.slope(model, z, at)
+            steps = np.concatenate([self._steps(model, z, at, slope, everything), model.traded(z)])
             white = self.white(model, steps)
             cost = self._cost(white, steps, everything)
             best = int(np.argmin(cost))
@@ -103,29 +110,69 @@ class RobustFit:
                 break
         return Fit(model, z, now, self.nats(at))
 
+    def slope(self, model: EffectModel, z: FloatArray, white: FloatArray) -> FloatArray:
+        """Derivatives (size, channel, counted) of the white response at `z`, where the white residuals are `white`."""
+        return (white - self.white(model, z + _STEP * np.eye(model.size))) / _STEP
+
     def hold_out(self, fit: Fit, *, iterations: int = 2) -> HeldOut:
-        """Each fold held out, all folds at once."""
+        """Each fold held out, all folds at once.
+
+        The folds' best places lie close to the fit, so its slopes serve all of them; what a step gains is the cost
+        itself.
+        """
         model, count = fit.model, int(self.fold.max()) + 1
         kept = (self.fold != np.arange(count)[:, None]).astype(float)
         z = np.tile(fit.z, (count, 1))
+        here = self.white(model, fit.z)
+        slope = self.slope(model, fit.z, here)
+        white = np.tile(here, (count, 1, 1))
         for _ in range(iterations):
-            around = z[:, None] + np.concatenate([np.zeros((1, model.size)), _STEP * np.eye(model.size)])
-            white = self.white(model, around.reshape(-1, model.size)).reshape(
-                *around.shape[:2], len(self.whitening.sd), -1
-            )
-            steps = np.stack(
-                [
-                    self._steps(model, z[k], white[k, 0], kept[k], (white[k, 0] - white[k, 1:]) / _STEP)
-                    for k in range(count)
-                ]
-            )
-            steps = np.concatenate([z[:, None], steps], 1)
-            shape = steps.shape[:2]
-            tried = self.white(model, steps.reshape(-1, model.size)).reshape(*shape, len(self.whitening.sd), -1)
-            cost = self._cost(tried, steps, kept[:, None])
-            z = np.take_along_axis(steps, cost.argmin(1)[:, None, None], 1)[:, 0]
-        nats = self.nats(self.white(model, z))
-        return HeldOut(nats[self.fold, np.arange(self.whitening.blocks)], z)
+            each = [self._steps(model, z[k], white[k], slope, kept[k], _CLOSE) for k in range(count)]
+            most = max(len(x) for x in each)
+            steps = np.stack([np.concatenate([z[k, None], x, *[x[:1]] * (most - len(x))]) for k, x in enumerate(each)])
+            tried = self.white(model, steps.reshape(-1, model.size)).reshape(count, most + 1, *here.shape)
+            best = self._cost(tried, steps, kept[:, None]).argmin(1)
+            z, white = steps[np.arange(count), best], tried[np.arange(count), best]
+        fold = self.whitening.spread(self.fold.astype(float)).astype(int)
+        own = white[fold, :, np.arange(white.shape[-1])].T
+        return HeldOut(self.nats(own), z, own)
+
+    def evidence(self, before: HeldOut, after: HeldOut) -> Evidence:
+        """What held-out blocks say for `after`, a model with more in it than `before`: is its change there at all?"""
+        change = before.white - after.white
+        return self._evidence(before, after, self._by_block(before, change * before.white), change)
+
+    def preference(self, one: HeldOut, other: HeldOut) -> Evidence:
+        """What held-out blocks say for `other` against `one`, neither of which is part of the other."""
+        change = one.white - other.white
+        return self._evidence(one, other, self._by_block(one, 0.5 * (one.white**2 - other.white**2)), change)
+
+    def on_top(self, before: HeldOut, best: HeldOut, other: HeldOut) -> float:
+        """Nats that `other`, another model than `best` after `before`, would add to it by what the two do not share."""
+        one, two = before.white - best.white, before.white - other.white
+        weight = self.whitening.spread(self._weight(best))
+
+        def product(x: FloatArray, y: FloatArray) -> float:
+            return float((weight * x * y).sum())
+
+        apart = two - product(one, two) / max(product(one, one), 1e-12) * one
+        return 0.5 * max(product(apart, best.white), 0.0) ** 2 / max(product(apart, apart), 1e-12)
+
+    def _evidence(self, before: HeldOut, after: HeldOut, score: FloatArray, change: FloatArray) -> Evidence:
+        errors, freedom = agreement(score, self._by_block(before, change**2))
+        return Evidence(float((before.nats - after.nats).sum()), errors, freedom)
+
+    def _by_block(self, held: HeldOut, products: FloatArray) -> FloatArray:
+        """Sums (block,) of `products` (channel, counted), weighed by Student's law."""
+        return self._weight(held) * self.whitening.by_block(products)
+
+    def _weight(self, held: HeldOut) -> FloatArray:
+        return 2 * self.half / (self.prior + self.whitening.by_block(held.white**2))
+
+    def weights(self, white: FloatArray, of_blocks: FloatArray) -> FloatArray:
+        """Of rows (counted,) in a step of least squares: blocks that fit badly weigh less, by Student's law."""
+        sums = self.whitening.by_block(white**2)
+        return self.whitening.spread(of_blocks * 2 * self.half / (self.prior + sums))
 
     def _cost(self, white: FloatArray, z: FloatArray, weights: FloatArray) -> FloatArray:
         return (self.nats(white) * weights).sum(-1) + 0.5 * (z**2).sum(-1)
@@ -135,24 +182,18 @@ class RobustFit:
         model: EffectModel,
         z: FloatArray,
         white: FloatArray,
-        weights: FloatArray,
-        slope: FloatArray | None = None,
+        slope: FloatArray,
+        of_blocks: FloatArray,
+        dampings: Sequence[float] = _DAMPING,
     ) -> FloatArray:
         """Places (step, size) to try from `z`, more and less damped."""
-        if slope is None:
-            slope = (white - self.white(model, z + _STEP * np.eye(model.size))) / _STEP
-        sums = self.whitening.by_block(white**2)
-        # of the log of Student's law: blocks that fit badly weigh less
-        by_row = self.whitening.spread(weights * 2 * self.half / (self.prior + sums))
-        weighed = (slope * by_row).reshape(model.size, -1)
+        weighed = (slope * self.weights(white, of_blocks)).reshape(model.size, -1)
         curvature = weighed @ slope.reshape(model.size, -1).T + np.eye(model.size)
         downhill = weighed @ white.ravel() - z
         out = []
-        for damping in _DAMPING:
+        for damping in dampings:
             step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), downhill)
             longest = float(np.abs(step).max(initial=1e-12))
             for cap in (_LONGEST, 2.5 * _LONGEST) if longest > _LONGEST else (_LONGEST,):
                 out.append(np.clip(z + step * min(1.0, cap / longest), model.low, model.high))
-        while len(out) < 2 * len(_DAMPING):  # as many for each fold
-            out.append(out[0])
         return np.array(out)

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.budget.forward_selection import strength
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 from avtorch.gap.change.change_model import Change, ChangeModel
 from avtorch.gap.change.joint_fit import Fit, HeldOut, JointFit
@@ -28,11 +27,27 @@ MOST = 3
 """Changes at once."""
 DRIFT_ERRORS = 2.0
 """Standard errors, halves of one side among them, by which a change must differ from none."""
+_ERRORS = 2.5  # standard errors of the gain over held-out blocks that are enough
+_NATS, _FEWER_ERRORS = 20.0, 1.2  # or so many nats, with so many standard errors
+_LEAST_NATS = 4.0
 _SCREENING = 2  # iterations of the fits that decide which changes are held out
 _SCREENED = 6  # besides lag, gain and dead time
 _STAYS = -1.0  # strength down to which a change holds its place
 _RIDGES = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 _NOISE_RIDGE = 1e-4  # of the regression whose left-over is the noise
+
+
+def strength(gains: FloatArray) -> float:
+    """By how many standard errors held-out gains (block,) [nats] exceed what an effect needs to enter.
+
+    Either nearly all blocks gain, or all together gain so much that noise would not: gains are skewed, because an
+    effect of braking shows where the car brakes, and of a few large ones the scatter is large too.
+    """
+    total, blocks = float(gains.sum()), len(gains)
+    error = max(float(gains.std(ddof=1)) * np.sqrt(blocks), 1e-12)
+    errors = total / error
+    many = min(errors - _FEWER_ERRORS, (total - _NATS) / error)
+    return min(max(errors - _ERRORS, many), (total - _LEAST_NATS) / error)
 
 
 @dataclass(frozen=True, eq=False)

@@ -169,7 +169,7 @@ class JointFit:
             c = np.linalg.solve(matrix, outer @ scale)
             squares = total - 2 * c @ outer + np.einsum("bij,i,j->b", inner, c, c)
             scale = weights * 2 * self.robust.half / (self.robust.prior + np.maximum(squares, 0.0))
-        return c
+        return np.asarray(c, float)
 
     @property
     def _inner(self) -> FloatArray:
@@ -209,6 +209,7 @@ class JointFit:
             matrix = total[:last, :last] + np.diag(prior)
             matrix[:size, :size] += damping * np.diag(np.diag(matrix[:size, :size]))
             x = np.linalg.solve(matrix, total[:last, last] - pull)
+        x = np.asarray(x, float)
         return x[:size], x[size:]
 
     def _steps(
@@ -252,7 +253,7 @@ class JointFit:
             left = np.append(-x, 1.0)
             squares = np.einsum("bij,i,j->b", grams, left, left)
             scale = 2 * self.robust.half / (self.robust.prior + np.maximum(squares, 0.0))
-            x = _solved(np.tensordot(scale, grams, 1), prior, begun, last)
+            x = _solved(np.asarray(np.tensordot(scale, grams, 1), float), prior, begun, last)
         blocks = len(scale)
         each = np.empty((blocks, count))
         for b in range(blocks):
@@ -266,4 +267,4 @@ class JointFit:
 def _solved(total: FloatArray, prior: FloatArray, begun: FloatArray, last: int) -> FloatArray:
     matrix = total[:last, :last] + np.diag(prior)
     matrix += 1e-9 * np.diag(np.diag(matrix))
-    return np.asarray(np.linalg.solve(matrix, total[:last, last] - begun * prior))
+    return np.asarray(np.linalg.solve(matrix, total[:last, last] - begun * prior), float)

@@ -4,24 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from avtorch.errors import InputError
 from avtorch.gap import ConstantResistance, DeadBand, DeadTime, Effect, SensorBias, gap_budget
-from avtorch.gap.budget.forward_selection import strength
 from avtorch.io import Log
 from tests.gap.budget.cars import log_of
 
 FEW = ["dead_time", "dead_band", "constant_resistance", "sensor_bias", "sensor_scale"]
-
-
-def test_gains_must_be_large_or_alike() -> None:
-    even, one = np.full(12, 3.0), np.append(np.zeros(11), 60.0)
-    assert strength(even + 0.1 * np.arange(12)) > 0
-    assert strength(one) < 0  # one block is one event
-    assert strength(np.tile([8.0, 1.0, -2.0], 8)) > 0
-    assert strength(np.tile([0.2, 0.1], 6)) < 0  # consistent, and nothing
 
 
 @pytest.mark.parametrize(
@@ -50,7 +40,7 @@ def test_coloured_noise_is_no_cause(seed: int) -> None:
 
 
 def test_parts_are_in_order_and_sum_to_one() -> None:
-    log = log_of([ConstantResistance(0.3), SensorBias(0.1), DeadBand(0.1)], seed=2)
+    log = log_of([ConstantResistance(0.2), SensorBias(0.1), DeadBand(0.25)], seed=2)  # each over 3 % of the gap
     budget = gap_budget(log, effects=FEW)
     assert set(budget.names) == {"constant_resistance", "sensor_bias", "dead_band"}
     shares = [part.share.mean for part in budget.parts]
