@@ -16,7 +16,7 @@ from scipy import special
 
 from avtorch.arrays import FloatArray
 
-FALSE_ALARMS = 0.05
+FALSE_ALARMS = 0.02
 """Share of models without anything left to find in which a wrong effect may enter, whatever the number tried."""
 _LEAST_FREEDOM = 1.0
 

@@ -81,12 +81,19 @@ def test_the_answer_has_the_form_of_the_contract(coloured: Diagnosis, faults: Ca
     assert faults(answer) == []
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_coloured_noise_alone_is_no_cause(fresh_seed: int) -> None:
-    """Once `unknown`: a likelihood with white sensors takes any colour for something that it does not know."""
-    found = diagnose(log_of(seconds=100.0, seed=fresh_seed), effects=KINDS, posterior="laplace")
-    assert found.verdict.names == ("none",)
-    assert found.probability("none") > 0.5
+    """Once `unknown` each time: a likelihood with white sensors takes any colour for something that it does not know.
+
+    Eight drives: more than two alarms have a probability of 0.003 where each has `FALSE_ALARMS` twice, for an effect
+    and for something unexplained.
+    """
+    alarms = 0
+    for k in range(8):
+        found = diagnose(log_of(seconds=60.0, seed=fresh_seed + k), effects=KINDS, posterior="laplace")
+        alarms += found.verdict.names != ("none",)
+    assert alarms <= 2
 
 
 def test_the_likelihood_decides_where_it_holds(faults: Callable[[dict], list[str]]) -> None:
