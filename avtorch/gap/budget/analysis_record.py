@@ -1,6 +1,6 @@
 """The drives as the budget takes them: every channel as an acceleration, at one modest rate, in blocks.
 
-Sensors' noise lies mostly above a few hertz and no rollout foretells it. So commands are averaged over rows of some
+Sensors' noise lies mostly above a few hertz and no rollout predicts it. So commands are averaged over rows of some
 50 ms (exact for what a command does to a slower actuator), speed is differenced over the same rows, and the residuals
 of both channels are accelerations. Blocks of a few seconds are what is held out and what a standard error counts.
 """
@@ -49,7 +49,7 @@ class AnalysisRecord:
 
     `measured` (channel, row) [m/s²]: the derivative of `speed`, and `accel`. `counts` (row,): whether a row counts.
     `block` (row,): the number of its block, -1 where it belongs to none. `time` (row,) [s] from its log's start, `log`
-    (row,) the number of its log, `command` [m/s²] and `speed` [m/s] (row,), the latter nought where not measured.
+    (row,) the number of its log, `command` [m/s²] and `speed` [m/s] (row,), the latter zero where not measured.
     """
 
     stretches: tuple[Stretch, ...]

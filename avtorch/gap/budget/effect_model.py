@@ -168,7 +168,7 @@ class EffectModel:
         """`channels` (..., channel, row) with the one that is read late as late as it is.
 
         It is delayed, the other is not advanced: a command that follows what is measured knows the noise of the rows
-        before it, and would foretell the noise of a row from the commands after it.
+        before it, and would predict the noise of a row from the commands after it.
         """
         if LATENESS not in self.index:
             return channels
@@ -227,7 +227,7 @@ def _box(parameter: Parameter) -> tuple[float, float]:
 
 
 def _coarse(effect: Effect, record: AnalysisRecord) -> Effect:
-    """A force along the road with knots far enough apart that neighbours of a held-out block foretell it."""
+    """A force along the road with knots far enough apart that neighbours of a held-out block predict it."""
     if not isinstance(effect, Integrated):
         return effect
     ends = [float(s.drive.position[-1]) for s in record.stretches if s.drive.position is not None]

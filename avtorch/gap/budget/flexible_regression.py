@@ -1,6 +1,6 @@
-"""What commands, speed and time foretell of the residuals, by a regression without physics.
+"""What commands, speed and time predict of the residuals, by a regression without physics.
 
-It has two uses: what it leaves over is the noise that `noise_whitening` fits, and what it foretells of blocks that were
+It has two uses: what it leaves over is the noise that `noise_whitening` fits, and what it predicts of blocks that were
 held out is reproducible and not explained.
 """
 
@@ -73,10 +73,10 @@ def left_over(fitting: RobustFit, fit: Fit) -> FloatArray:
     return residuals - (coefficients @ shapes.reshape(len(shapes), -1)).reshape(residuals.shape)
 
 
-def foretold(fitting: RobustFit, fit: Fit, residuals: FloatArray) -> FloatArray:
+def predicted_residuals(fitting: RobustFit, fit: Fit, residuals: FloatArray) -> FloatArray:
     """What the regression makes of `residuals` (channel, row), each block by a fit to the other folds.
 
-    The ridge is what foretells held-out blocks best; where these do not agree on it more surely than chance, nothing.
+    The ridge is what predicts held-out blocks best; where these do not agree on it more surely than chance, nothing.
     """
     whitening, record = fitting.whitening, fit.model.record
     shapes = columns(fit)

@@ -2,7 +2,7 @@
 
 An energy is the mean squared error of rollouts over 10 s, each channel over its own floor, the mean of the channels.
 Every block's error is that of a model fitted without it. The floor is what no model that knows commands, speed and
-time could foretell: what a regression on these leaves of held-out blocks, once the causes are in.
+time could predict: what a regression on these leaves of held-out blocks, once the causes are in.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.special import ndtr
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.flexible_regression import foretold
+from avtorch.gap.budget.flexible_regression import predicted_residuals
 from avtorch.gap.budget.forward_selection import (
     Selection,
     Step,
@@ -55,7 +55,7 @@ def gap_budget(
 ) -> Budget:
     """The budget of the gap between `baseline` (default: bare GLVD) and the car of these drives.
 
-    Args: `effects`: candidates by name or class (default: all registered); random ones foretell nothing and are left
+    Args: `effects`: candidates by name or class (default: all registered); random ones predict nothing and are left
     out. `material`: share of the gap, or of the response, below which a cause is not a part. `seed`: of the drawing of
     blocks for the intervals. `progress(what, done, of)` is called at each effect tried.
 
@@ -132,7 +132,7 @@ def budget_of(
     """
     fitting, record = selection.fitting, selection.fitting.whitening.record
     held = [held_out_residuals(selection, step) for step in selection.steps]
-    floor = held[-1] - foretold(fitting, selection.last.fit, held[-1])
+    floor = held[-1] - predicted_residuals(fitting, selection.last.fit, held[-1])
     errors = np.stack([rollout_squares(selection, x) for x in [*held, floor]])  # (model, channel, block)
     calm = calm_blocks(selection)
     blocks = len(calm)

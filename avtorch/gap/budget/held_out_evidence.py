@@ -1,8 +1,8 @@
-"""Whether blocks that were held out agree that a model foretells them better than another.
+"""Whether blocks that were held out agree that a model predicts them better than another.
 
 A model's gain differs from block to block for two reasons: blocks that excite an effect can show more of it, and the
 noise is what it is. So each block is asked for the size of the change that it sees, in proportion to what the model
-foretells. The standard error is that of a jackknife over blocks, which holds whatever the noise within a block is
+predicts. The standard error is that of a jackknife over blocks, which holds whatever the noise within a block is
 (Liang and Zeger's sandwich); Student's law has as many degrees of freedom as blocks that excite the change. An effect
 that shows in a single block is one event, however large.
 """
@@ -43,7 +43,7 @@ class Evidence:
 
 
 def agreement(score: FloatArray, size: FloatArray) -> tuple[float, float]:
-    """Standard errors by which the sum of `score` (block,) exceeds nought, and degrees of freedom.
+    """Standard errors by which the sum of `score` (block,) exceeds zero, and degrees of freedom.
 
     `size` (block,) is what `score` is in proportion to where all blocks agree.
     """

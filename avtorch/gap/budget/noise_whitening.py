@@ -57,7 +57,7 @@ class NoiseWhitening:
 
     @classmethod
     def autoregressive(cls, record: AnalysisRecord, residuals: FloatArray) -> NoiseWhitening:
-        """Yule and Walker's, from `residuals` (channel, row)."""
+        """By Yule and Walker, from `residuals` (channel, row)."""
         lags = max(4, round(_MEMORY_S / record.dt))
         taps, sds = [], []
         for channel in residuals:

@@ -1,4 +1,4 @@
-"""The result of a budget: its parts, what chance decides, what is unexplained, and the sentence a person reads."""
+"""The result of a budget: its parts, random causes, what is unexplained, and the sentence a person reads."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Part:
 
 @dataclass(frozen=True)
 class ChancePart:
-    """A cause that chance decides, such as a gust: no rollout foretells it, so it is a part of the noise.
+    """A random cause, such as a gust: no rollout predicts it, so it is a part of the noise.
 
     `share_of_noise`: of the variance that is left with all parts; None where it was not estimated.
 
@@ -134,7 +134,7 @@ class Budget:
     """The gap's budget: roots of energies `before`, `left` and `floor` (1 by definition), and where they come from.
 
     `parts` in the order of their shares; these and `unexplained` sum to 1. `baseline`, `repaired`: `T_L` [s] and `K_L`
-    [-] without any cause, and with all parts. Where rollouts show no gap, `unexplained` is the whole of nothing.
+    [-] without any cause, and with all parts. Where rollouts show no gap, shares mean nothing.
 
     Example:
         >>> from avtorch import Leader, simulate

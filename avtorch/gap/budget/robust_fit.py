@@ -91,7 +91,7 @@ class RobustFit:
         return self.whitening(record.measured - np.broadcast_to(response, (*z.shape[:-1], *response.shape[-2:])))
 
     def fit(self, model: EffectModel, starts: FloatArray, *, iterations: int = 8) -> Fit:
-        """Gauss and Newton's, from the best of `starts` (start, size)."""
+        """Gauss-Newton, from the best of `starts` (start, size)."""
         everything = np.ones(self.whitening.blocks)
         white = self.white(model, starts)
         cost = self._cost(white, starts, everything)

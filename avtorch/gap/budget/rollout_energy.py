@@ -1,7 +1,7 @@
 """Errors of rollouts over 10 s, every block's by a model that was fitted without it.
 
 Speed is rolled out from its measured value at the beginning of each 10 s. The tenth of the blocks that the selected
-model foretells worst is left out: a kerb is not to decide what a budget is.
+model predicts worst is left out: a local disturbance such as a kerb does not decide a budget.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.budget.flexible_regression import foretold
+from avtorch.gap.budget.flexible_regression import predicted_residuals
 from avtorch.gap.budget.forward_selection import Selection
 from avtorch.gap.budget.parts import HORIZON_S
 from avtorch.gap.budget.rollout_energy import calm_blocks, counted_rows, held_out_residuals, rollout_squares
@@ -24,8 +24,8 @@ def shrinkage_of(selection: Selection, *, seed: int = 0) -> Shrinkage:
     first, last = selection.steps[0], selection.last
     before, after = (held_out_residuals(selection, step) for step in (first, last))
     fitting = selection.fitting
-    floor = after - foretold(fitting, last.fit, after)
-    ceiling = before - foretold(fitting, first.fit, before)
+    floor = after - predicted_residuals(fitting, last.fit, after)
+    ceiling = before - predicted_residuals(fitting, first.fit, before)
     squares = np.stack([rollout_squares(selection, x) for x in (before, after, floor, ceiling)])
     calm = calm_blocks(selection)
     rows, blocks = counted_rows(selection)[calm], len(calm)
