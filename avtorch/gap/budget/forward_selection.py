@@ -27,7 +27,7 @@ MOST_PARTS = 5
 """Effects that a selection may hold."""
 _ROUNDS = 8  # of entering, as effects may leave again
 _LEAST_NATS = 3.0  # in the blocks that fitted it, below which no effect is held out
-_FAR_FEWER, _MOST_OF_IT = 3, 0.6  # parameters, and share of the gain, with which a simpler effect takes precedence
+_FAR_FEWER, _MOST_OF_IT = 3, 0.4  # parameters, and share of the gain, with which a simpler effect takes precedence
 _OF_ITS_OWN = 0.5  # share of an effect's gain, on top of another, from which it is no alias of that
 _FITTED = 9  # effects that are fitted, those of which a score test promises most
 _SCREENING = 3  # iterations of these fits
