@@ -68,9 +68,10 @@ class ChangeCause:
     """What has changed: `parts`, the first found first.
 
     `answer`: `"named"`; `"ambiguous"` where a part has aliases; `"unknown"` where something reproducible has changed
-    that no effect explains; `"drift"` where a change is supported, but halves of one side differ by as much, or blocks
-    disagree on its size; `"none"`. `detectable`: the least change of T_L and K_L (as a share) and of dead time [s] that
-    these drives show, infinite (in JSON null) where they show none. `why`: one or two sentences.
+    that no effect explains; `"drift"` where a change is supported, but halves of one side differ by as much; `"none"`,
+    also where a change is supported whose size is too uncertain. `detectable`: the least change of T_L and K_L (as a
+    share) and of dead time [s] that these drives show, infinite (in JSON null) where they show none. `why`: one or two
+    sentences.
 
     Example:
         >>> from avtorch.gap.change.change_cause import ChangeCause
@@ -124,7 +125,9 @@ def cause_of_change(
     detectable = detectable_changes(selection)
     answer: Answer = "named"
     if not parts:
-        answer = "drift" if selection.drifting is not None else "unknown" if selection.other > 0 else "none"
+        best = selection.rejected
+        drifts = best is not None and best.drift > best.relative_sd
+        answer = "drift" if drifts else "unknown" if selection.other > 0 else "none"
     elif any(len(part.alias_set) > 1 for part in parts):
         answer = "ambiguous"
     return ChangeCause(parts, answer, detectable, _why(selection, parts, answer, detectable))
@@ -207,14 +210,12 @@ def _why(
         if selection.other > 0:
             clauses.append("something else has changed too, and no known effect explains it")
         return "; ".join([*clauses, *unlike_drives(selection.sides)]) + "."
-    if answer == "drift":
-        assert selection.drifting is not None
-        assert selection.drifting.change is not None
-        name, drift, error = selection.drifting.change.name, selection.drifting.drift, selection.drifting.relative_sd
-        doubt = f"the standard error of its size is {error:.0%} of it"
-        if drift > error:
-            doubt = f"halves of one side differ by {drift:.0%} of it, so one car may have driven both"
-        first = f"No cause is named: {name} explains the difference best, but {doubt}"
+    best = selection.rejected
+    if best is not None and best.change is not None and answer != "unknown":
+        doubt = f"the standard error of its size is {best.relative_sd:.0%} of it"
+        if answer == "drift":
+            doubt = f"halves of one side differ by {best.drift:.0%} of it, so one car may have driven both"
+        first = f"No cause is named: {best.change.name} explains the difference best, but {doubt}"
         return "; ".join([first, *unlike_drives(selection.sides)]) + "."
     first = "No change is named"
     if answer == "unknown":

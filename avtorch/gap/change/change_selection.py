@@ -77,7 +77,7 @@ class Step:
 class ChangeSelection:
     """`steps` from one car on, each with one change more; `tried`: changes that were held out at the first step.
 
-    `drifting`: the strongest change that held-out blocks support and that did not enter, because halves of one side
+    `rejected`: the strongest change that held-out blocks support and that did not enter, because halves of one side
     differ by as much or because blocks disagree on its size; `other`: strength of a remainder of the drives after
     alone, on top of the last step.
     """
@@ -86,7 +86,7 @@ class ChangeSelection:
     fitting: JointFit
     steps: tuple[Step, ...]
     tried: tuple[Step, ...]
-    drifting: Step | None
+    rejected: Step | None
     other: float
 
     @property
@@ -110,7 +110,7 @@ def select_changes(
     fitting, start = _noise(sides, base, progress)
     steps = [Step(start, fitting.hold_out(start))]
     first: tuple[Step, ...] = ()
-    drifting = None
+    rejected = None
     for number in range(1, _ROUNDS + 1):
         if len(steps) > MOST:
             break
@@ -119,11 +119,11 @@ def select_changes(
         supported = [_with_drift(sides, fitting, s) for s in tried if _strength(s, sides) > 0]
         entering = [s for s in supported if s.surplus > 0]
         if not entering:
-            drifting = max(supported, key=_total, default=None)
+            rejected = max(supported, key=_total, default=None)
             break
         steps.append(_simplest(sides, entering))
         steps = _without_the_redundant(sides, fitting, steps)
-    return ChangeSelection(sides, fitting, tuple(steps), first, drifting, _other(sides, fitting, steps[-1]))
+    return ChangeSelection(sides, fitting, tuple(steps), first, rejected, _other(sides, fitting, steps[-1]))
 
 
 def _strength(step: Step, sides: TwoSides) -> float:
