@@ -153,14 +153,17 @@ def _parameters(last: Step, step: Step) -> dict[str, Quantity]:
     count = len(last.held.p)
     values = _values(last.fit.model, step.change, np.concatenate([last.fit.p[None], last.held.p]))
     sure = float(student.ppf(0.95, count - 1))
-    out = {}
+    out: dict[str, Quantity] = {}
     for key, x in values.items():
-        spread = float(np.sqrt((count - 1) / count * ((x[1:] - x[1:].mean()) ** 2).sum()))
-        sd = spread
+        sd = float(np.sqrt((count - 1) / count * ((x[1:] - x[1:].mean()) ** 2).sum()))
         if _is_change(key):
-            sd = float(np.hypot(max(spread, step.relative_sd * abs(x[0])), step.drift * abs(x[0])))
+            sd = float(np.hypot(max(sd, step.relative_sd * abs(x[0])), step.drift * abs(x[0])))
         out[key] = Quantity(float(x[0]), sd, float(x[0] - sure * sd), float(x[0] + sure * sd))
-    return out
+    if step.change.parameter is None:
+        return out
+    # what both sides share is held near its anchor, so folds alone understate the error of either side's value
+    least = max(q.sd for q in out.values())
+    return {key: Quantity(q.mean, least, q.mean - sure * least, q.mean + sure * least) for key, q in out.items()}
 
 
 def _values(model: ChangeModel, change: Change, p: FloatArray) -> dict[str, FloatArray]:

@@ -79,6 +79,10 @@ def test_a_change_is_named_with_its_size(which: str, rotating_seed: int) -> None
     size = found.parts[0].parameters[case.key]
     assert abs(size.mean - case.size) < student(BLOCKS - 1) * size.sd
     assert size.q05 < size.mean < size.q95
+    if case.name == "K_L":
+        for key, truth in (("before", K_L), ("after", case.gain)):
+            side = found.parts[0].parameters[key]
+            assert abs(side.mean - truth) < student(BLOCKS - 1) * side.sd
     assert found.probability is not None
     assert found.probability > 0.5
     assert case.name in found.why
