@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,7 +75,7 @@ LACKS: Sequence[dict[str, dict[str, float]]] = (
 """What the reference vehicle lacks before and after alike."""
 
 
-def said(cause: ChangeCause | None) -> str:
+def cell(cause: ChangeCause | None) -> str:
     """What is named, with its parameters, in one cell of a table."""
     if cause is None:
         return "too short"
@@ -90,26 +90,26 @@ def said(cause: ChangeCause | None) -> str:
     return "; ".join(cells)
 
 
-def line(name: str, told: Comparison) -> str:
-    cause = told.cause
+def line(name: str, comparison: Comparison) -> str:
+    cause = comparison.cause
     least = "" if cause is None else ", ".join(f"{key} {value:.2g}" for key, value in cause.detectable.items())
     lag, gain = (
-        f"{told.car[key].ratio.mean:.2f} ({told.car[key].ratio.q05:.2f} to {told.car[key].ratio.q95:.2f})"
-        for key in ("T_L", "K_L")
+        f"{ratio.mean:.2f} ({ratio.q05:.2f} to {ratio.q95:.2f})"
+        for ratio in (comparison.car[key].ratio for key in ("T_L", "K_L"))
     )
-    return f"| {name} | {lag} | {gain} | {said(cause)} | {least} |"
+    return f"| {name} | {lag} | {gain} | {cell(cause)} | {least} |"
 
 
 def recordings(folder: Path, only: str) -> None:
     for name, pair in PAIRS.items():
         if only in name:
             try:
-                told = compare(*([Log.read(folder / file) for file in side] for side in pair))
+                comparison = compare(*([Log.read(folder / file) for file in side] for side in pair))
             except InputError as refusal:
                 print(f"| {name} | refused: {refusal} |", flush=True)
                 continue
-            print(line(name, told), flush=True)
-            print(f"    {told.why}", flush=True)
+            print(line(name, comparison), flush=True)
+            print(f"    {comparison.why}", flush=True)
 
 
 def in_front(folder: Path, size: float, only: str) -> None:
@@ -119,7 +119,7 @@ def in_front(folder: Path, size: float, only: str) -> None:
             continue
         before, after = ([Log.read(folder / file) for file in side] for side in pair)
         fitted = gap_budget(before, effects=[]).baseline
-        print(f"| {name}, untouched | {said(compare(before, after).cause)} |", flush=True)
+        print(f"| {name}, untouched | {cell(compare(before, after).cause)} |", flush=True)
         named = alike = total = 0
         for number, effect in enumerate((GAIN, *IN_FRONT)):
             try:
@@ -131,12 +131,14 @@ def in_front(folder: Path, size: float, only: str) -> None:
             alias = cause is not None and any(effect in part.alias_set for part in cause.parts)
             named, alike, total = named + hit, alike + alias, total + 1
             print(
-                f"| {name}, {effect} {truth} | {'named' if hit else 'alias' if alias else 'missed'} | {said(cause)} |"
+                f"| {name}, {effect} {truth} | {'named' if hit else 'alias' if alias else 'missed'} | {cell(cause)} |"
             )
         print(f"{name}, size {size:g}: {named} of {total} named, {alike} with aliases", flush=True)
 
 
-def _changed(logs: Sequence[Log], effect: str, car: dict[str, float], size: float, seed: int) -> tuple[list[Log], str]:
+def _changed(
+    logs: Sequence[Log], effect: str, car: Mapping[str, float], size: float, seed: int
+) -> tuple[list[Log], str]:
     if effect == GAIN:
         ratio = 1 - 0.25 * size
         return [
@@ -170,7 +172,7 @@ def simulated(count: int, *, seed: int, seconds: float, recorder: str, only: str
             names = () if cause is None else cause.names
             alike = cause is not None and any(change in part.alias_set for part in cause.parts)
             answers.setdefault(change, []).append((change in names, alike, not names))
-            print(f"| {index} {manoeuvre} {car.T_L:.2f} {list(lacks)} | {change} | {said(cause)} |", flush=True)
+            print(f"| {index} {manoeuvre} {car.T_L:.2f} {list(lacks)} | {change} | {cell(cause)} |", flush=True)
     for change, rows in answers.items():
         shares = [
             f"{label} {_share([row[k] for row in rows])}" for k, label in enumerate(("named", "in aliases", "none"))

@@ -75,41 +75,41 @@ def compare(
             )
         talk.notes(log.name, check(log).notes)
     with talk.steps("Comparing") as step:
-        told = work(*logs, baseline=simulator, baseline_after=other, progress=step)
+        comparison = work(*logs, baseline=simulator, baseline_after=other, progress=step)
     if out is not None:
         with answer_set(out, ("comparison.json",)) as staged:
-            write_json(staged / "comparison.json", told.to_dict())
+            write_json(staged / "comparison.json", comparison.to_dict())
     if talk.json:
         import json as text
 
-        print(text.dumps(told.to_dict()))
+        print(text.dumps(comparison.to_dict()))
         return
-    talk.out.print(f"[bold]{escape(told.why)}[/bold]")
+    talk.out.print(f"[bold]{escape(comparison.why)}[/bold]")
     talk.out.print()
-    talk.out.print(_table(told))
+    talk.out.print(_table(comparison))
     if out is not None:
         talk.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: comparison.json", soft_wrap=True)
 
 
-def _table(told: Comparison) -> Table:
+def _table(comparison: Comparison) -> Table:
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("")
     for name in ("before", "after", "after / before (90 %)"):
         table.add_column(name, justify="right", no_wrap=True)
-    for name, moved in {**told.car, **told.gap}.items():
-        row = _ROWS.get(name, name).format(horizon=f"{told.horizon_s:.3g}")
+    for name, moved in {**comparison.car, **comparison.gap}.items():
+        row = _ROWS.get(name, name).format(horizon=f"{comparison.horizon_s:.3g}")
         table.add_row(escape(row), *_cells(moved))
-    for label, value in _of_cause(told):
+    for label, value in _of_cause(comparison):
         table.add_row(escape(label), "", "", escape(value))
     return table
 
 
-def _of_cause(told: Comparison) -> list[tuple[str, str]]:
+def _of_cause(comparison: Comparison) -> list[tuple[str, str]]:
     """Rows of the cause: what has changed, by how much, with which probability; or the least change that would show."""
     from avtorch.gap.change.change_cause import detectable_text
     from avtorch.gap.quantity import unit_of, words_of
 
-    cause = told.cause
+    cause = comparison.cause
     if cause is None:
         return []
     if not cause.parts:

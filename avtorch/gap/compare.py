@@ -24,7 +24,7 @@ from scipy.stats import f as fisher  # pyright: ignore[reportMissingTypeStubs]
 from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
-from avtorch.errors import InputError
+from avtorch.errors import InputError, quoted
 from avtorch.gap.change.change_cause import ChangeCause, cause_of_change
 from avtorch.gap.change.two_sides import FEWEST_BLOCKS, TwoSides
 from avtorch.gap.crossval.folds import blocks_of
@@ -84,7 +84,7 @@ def compare(
     if not 0 < level < 1:
         raise InputError(f"level: found {level}, needs a number between 0 and 1")
     sides = [[x] if isinstance(x, Log) else list(x) for x in (before, after)]
-    kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
+    kinds = _kinds(effects)
     given = [baseline, baseline if baseline_after is None else baseline_after]
     plants = [b if isinstance(b, GapPlant) else plant([], baseline=b) for b in given]
     if progress is not None:
@@ -135,6 +135,21 @@ def compare(
         cause=cause,
         horizon_s=horizon,
     )
+
+
+def _kinds(effects: Sequence[str | type[Effect]] | None) -> list[type[Effect]]:
+    if effects is None:
+        return list(EFFECTS.values())
+    if isinstance(effects, str):
+        raise InputError(f"effects: found {quoted(effects)}, needs a list of names or classes")
+    kinds: list[type[Effect]] = []
+    given: list[object] = list(effects)
+    for effect in given:
+        kind = effect_class(effect) if isinstance(effect, str) else effect
+        if not (isinstance(kind, type) and issubclass(kind, Effect)):
+            raise InputError(f"effects: found {quoted(repr(effect))}, needs names or classes of effects")
+        kinds.append(kind)
+    return kinds
 
 
 def _cause(

@@ -12,6 +12,7 @@ import avtorch
 from avtorch.cli.compare import _table
 from avtorch.errors import InputError
 from avtorch.gap import DeadTime, GapPlant, plant
+from avtorch.gap.compare import _explanation
 from avtorch.gap.dead_time_or_lag import DeadTimeFit, compare_explanations
 from avtorch.io import Log
 from tests.bars import LEVEL, student
@@ -63,7 +64,7 @@ def test_a_later_answer_is_not_taken_for_lag_and_gain(what: str, delay: float, r
 
     change, explanation = CHANGES[what]
     drives = (log_of(x, seconds=LONG_S, rng=rng, noise=QUIET) for x in (car(), car(**change)))
-    told = avtorch.compare(*drives, level=LEVEL)
+    told = avtorch.compare(*drives, level=LEVEL, effects=[])
     assert told.changed
     assert told.dead_time_test is not None
     dead_time_test = told.dead_time_test
@@ -72,10 +73,13 @@ def test_a_later_answer_is_not_taken_for_lag_and_gain(what: str, delay: float, r
     assert dead_time_test.explanation == explanation
     gone = dead_time_test.difference
     assert abs(gone.mean - change.get("delay", 0.0)) < student(LONG_BLOCKS - 1) * gone.sd
-    if explanation == "not lag and gain":
-        assert "lag and gain do not explain it" in told.why
-    else:
-        assert told.why.startswith("The car has changed: T_L ")
+    assert told.cause is not None
+    assert told.cause.names == ({"delay": "dead_time", "lag": "T_L", "gain": "K_L"}[what],)
+    assert told.why.startswith("The car has changed: as GLVD without any effect, T_L ")
+    # without a cause the sentence says what of the two explains it
+    sentence = _explanation("T_L 0.40 to 0.56 s", "p = 0.001", dead_time_test, named=False)
+    unexplained = "but lag and gain do not explain it" in sentence
+    assert unexplained == (explanation == "not lag and gain")
     answer = told.to_dict()["explained"]
     assert answer["explanation"] == explanation
     json.dumps(answer, allow_nan=False)
@@ -103,7 +107,8 @@ def test_one_car_stays_one_car(rotating_seed: int) -> None:
     changed = 0
     for _ in range(20):
         car = plant([DeadTime(float(rng.uniform(0, 0.3)))], T_L=float(rng.uniform(0.2, 0.6)), K_L=0.9)
-        changed += avtorch.compare(*(log_of(car, seconds=70.0, rng=rng) for _ in range(2))).changed
+        two = [log_of(car, seconds=70.0, rng=rng) for _ in range(2)]
+        changed += avtorch.compare(*two, effects=[]).changed
     # 4 in 100: five or more of twenty come in 1 of 1000 runs
     assert changed < 5
 
@@ -147,8 +152,8 @@ def test_rollouts_of_both_sides_last_as_long_as_they_are_said_to(rotating_seed: 
 def test_wrong_input_is_refused() -> None:
     rng = np.random.default_rng(0)
     long = _drive(rng, seconds=60.0)
-    with pytest.raises(InputError, match="after: found 3 blocks"):
-        avtorch.compare(long, _drive(rng, seconds=36.0))
+    with pytest.raises(InputError, match="after: found 4 blocks of 4 s of usable driving, needs 5 or more"):
+        avtorch.compare(long, _drive(rng, seconds=18.0))
     with pytest.raises(InputError, match="level"):
         avtorch.compare(long, long, level=0.0)
     with pytest.raises(InputError, match="channels"):

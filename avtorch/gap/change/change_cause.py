@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any, Literal
 
 import numpy as np
@@ -17,12 +18,13 @@ from avtorch.gap.change.change_selection import ChangeSelection, Progress, Step,
 from avtorch.gap.change.detectable import detectable_changes, unlike_drives
 from avtorch.gap.change.two_sides import TwoSides
 from avtorch.gap.quantity import Quantity, unit_of, words_of
-from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.effect import Effect, delay_effect
 from avtorch.gap.simulator.plant import GapPlant
 
 Answer = Literal["named", "ambiguous", "unknown", "drift", "none"]
 _EXCITED = 0.5
 """Share of T_L or K_L, or seconds of dead time, above which drives that show no smaller change excite too little."""
+_CLOCK_S = 0.02  # offsets between the clocks of two channels, as ordinary recorders have them
 
 
 @dataclass(frozen=True)
@@ -52,11 +54,13 @@ class ChangePart:
             "alias_set": list(self.alias_set),
             "probability": self.probability,
             "parameters": {key: value.to_dict() for key, value in self.parameters.items()},
+            "less": self.less,
         }
 
     def __str__(self) -> str:
-        told = ", ".join(_text(key, q) for key, q in self.parameters.items() if _is_change(key))
-        return f"{self.name} ({told})" if told else self.name
+        name = f"less {self.name}" if self.less else self.name
+        sizes = ", ".join(_text(key, q) for key, q in self.parameters.items() if _is_change(key))
+        return f"{name} ({sizes})" if sizes else name
 
 
 @dataclass(frozen=True)
@@ -64,8 +68,10 @@ class ChangeCause:
     """What has changed: `parts`, the first found first.
 
     `answer`: `"named"`; `"ambiguous"` where a part has aliases; `"unknown"` where something reproducible has changed
-    that no effect explains; `"drift"` where halves of one side differ by as much; `"none"`. `detectable`: the least
-    change of T_L and K_L (as a share) and of dead time [s] that these drives show. `why`: one or two sentences.
+    that no effect explains; `"drift"` where a change is supported, but halves of one side differ by as much; `"none"`,
+    also where a change is supported whose size is too uncertain. `detectable`: the least change of T_L and K_L (as a
+    share) and of dead time [s] that these drives show, infinite (in JSON null) where they show none. `why`: one or two
+    sentences.
 
     Example:
         >>> from avtorch.gap.change.change_cause import ChangeCause
@@ -84,7 +90,7 @@ class ChangeCause:
 
     @property
     def probability(self) -> float | None:
-        """That all parts are really there; None without any."""
+        """That other drives of the two cars would name the least certain part again; None without parts."""
         return min((part.probability for part in self.parts), default=None)
 
     def to_dict(self) -> dict[str, Any]:
@@ -97,7 +103,7 @@ class ChangeCause:
                 f"{part.name}.{key}": value.to_dict() for part in self.parts for key, value in part.parameters.items()
             },
             "parts": [part.to_dict() for part in self.parts],
-            "detectable": dict(self.detectable),
+            "detectable": {name: value if isfinite(value) else None for name, value in self.detectable.items()},
             "why": self.why,
         }
 
@@ -119,7 +125,9 @@ def cause_of_change(
     detectable = detectable_changes(selection)
     answer: Answer = "named"
     if not parts:
-        answer = "drift" if selection.drifting is not None else "unknown" if selection.other > 0 else "none"
+        best = selection.rejected
+        drifts = best is not None and best.drift > best.relative_sd
+        answer = "drift" if drifts else "unknown" if selection.other > 0 else "none"
     elif any(len(part.alias_set) > 1 for part in parts):
         answer = "ambiguous"
     return ChangeCause(parts, answer, detectable, _why(selection, parts, answer, detectable))
@@ -145,14 +153,17 @@ def _parameters(last: Step, step: Step) -> dict[str, Quantity]:
     count = len(last.held.p)
     values = _values(last.fit.model, step.change, np.concatenate([last.fit.p[None], last.held.p]))
     sure = float(student.ppf(0.95, count - 1))
-    out = {}
+    out: dict[str, Quantity] = {}
     for key, x in values.items():
-        spread = float(np.sqrt((count - 1) / count * ((x[1:] - x[1:].mean()) ** 2).sum()))
-        sd = spread
+        sd = float(np.sqrt((count - 1) / count * ((x[1:] - x[1:].mean()) ** 2).sum()))
         if _is_change(key):
-            sd = float(np.hypot(max(spread, step.relative_sd * abs(x[0])), step.drift * abs(x[0])))
+            sd = float(np.hypot(max(sd, step.relative_sd * abs(x[0])), step.drift * abs(x[0])))
         out[key] = Quantity(float(x[0]), sd, float(x[0] - sure * sd), float(x[0] + sure * sd))
-    return out
+    if step.change.parameter is None:
+        return out
+    # what both sides share is held near its anchor, so folds alone understate the error of either side's value
+    least = max(q.sd for q in out.values())
+    return {key: Quantity(q.mean, least, q.mean - sure * least, q.mean + sure * least) for key, q in out.items()}
 
 
 def _values(model: ChangeModel, change: Change, p: FloatArray) -> dict[str, FloatArray]:
@@ -192,33 +203,36 @@ def _why(
 ) -> str:
     shown = ", ".join(f"{name} {detectable_text(name, value)}" for name, value in detectable.items())
     if parts:
-        said = [f"What explains it: {' and '.join(map(str, parts))}"]
+        clauses = [f"What explains it: {' and '.join(map(str, parts))}"]
         for part in parts:
             others = [name for name in part.alias_set if name != part.name]
             if others:
-                said.append(f"these drives cannot distinguish {part.name} from {' or '.join(others)}")
+                clauses.append(f"these drives cannot distinguish {part.name} from {' or '.join(others)}")
+        if any(part.name == delay_effect().name and abs(part.parameters["change_s"].mean) < _CLOCK_S for part in parts):
+            clauses.append("so small a change of dead time may be the recorder's clock")
         if selection.other > 0:
-            said.append("something else has changed too, and no known effect explains it")
-        return "; ".join([*said, *unlike_drives(selection.sides)]) + "."
-    if answer == "drift":
-        assert selection.drifting is not None
-        assert selection.drifting.change is not None
-        name, drift = selection.drifting.change.name, selection.drifting.drift
-        return (
-            f"No cause is named: {name} explains the difference best, but halves of one side differ by "
-            f"{drift:.0%} of it, so one car may have driven both."
-        )
+            clauses.append("something else has changed too, and no known effect explains it")
+        return "; ".join([*clauses, *unlike_drives(selection.sides)]) + "."
+    best = selection.rejected
+    if best is not None and best.change is not None and answer != "unknown":
+        doubt = f"the standard error of its size is {best.relative_sd:.0%} of it"
+        if answer == "drift":
+            doubt = f"halves of one side differ by {best.drift:.0%} of it, so one car may have driven both"
+        first = f"No cause is named: {best.change.name} explains the difference best, but {doubt}"
+        return "; ".join([first, *unlike_drives(selection.sides)]) + "."
     first = "No change is named"
     if answer == "unknown":
         first = "Something reproducible has changed, and no known effect explains it"
     weak = [name for name, value in detectable.items() if value > _EXCITED]
     reason = f"; the commands excite too little for {', '.join(weak)}" if weak else ""
     return (
-        "; ".join([f"{first}{reason}. A change would show from here on: {shown}", *unlike_drives(selection.sides)])
+        "; ".join([f"{first}{reason}. The least change that would show: {shown}", *unlike_drives(selection.sides)])
         + "."
     )
 
 
 def detectable_text(name: str, value: float) -> str:
     """A least change with its unit: a share of T_L and K_L, seconds of dead time."""
+    if not isfinite(value):
+        return "none"
     return f"{value:.0%}" if name in ("T_L", "K_L") else f"{value:.2g} s"

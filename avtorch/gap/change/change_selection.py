@@ -1,8 +1,8 @@
 """Which changes explain the difference between two sets of drives: forward, with removal, by blocks held out.
 
 The null hypothesis is one car: the same lag, gain and dead time on both sides, and the same remainder. A change enters
-while held-out blocks gain from it by more than their scatter explains (`budget.forward_selection.strength`), and while
-it is larger than what halves of one side differ by.
+while held-out blocks gain from it by more than their scatter explains (`strength`), and while it is larger than what
+halves of one side differ by.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ Progress = Callable[[str, int, int], None]
 
 MOST = 3
 """Changes at once."""
+_ROUNDS = 2 * MOST  # that one change enters in; one that has left may enter again
 DRIFT_ERRORS = 2.0
 """Standard errors, halves of one side among them, by which a change must differ from none."""
 _ERRORS = 2.5  # standard errors of the gain over held-out blocks that are enough
@@ -76,15 +77,16 @@ class Step:
 class ChangeSelection:
     """`steps` from one car on, each with one change more; `tried`: changes that were held out at the first step.
 
-    `drifting`: the strongest change that held-out blocks support, where halves of one side differ by as much; `other`:
-    strength of a remainder of the drives after alone, on top of the last step.
+    `rejected`: the strongest change that held-out blocks support and that did not enter, because halves of one side
+    differ by as much or because blocks disagree on its size; `other`: strength of a remainder of the drives after
+    alone, on top of the last step.
     """
 
     sides: TwoSides
     fitting: JointFit
     steps: tuple[Step, ...]
     tried: tuple[Step, ...]
-    drifting: Step | None
+    rejected: Step | None
     other: float
 
     @property
@@ -108,18 +110,20 @@ def select_changes(
     fitting, start = _noise(sides, base, progress)
     steps = [Step(start, fitting.hold_out(start))]
     first: tuple[Step, ...] = ()
-    drifting = None
-    while len(steps) <= MOST:
-        tried = _tried(sides, fitting, steps[-1], candidates, progress, len(steps))
+    rejected = None
+    for number in range(1, _ROUNDS + 1):
+        if len(steps) > MOST:
+            break
+        tried = _tried(sides, fitting, steps[-1], candidates, progress, number)
         first = first or tuple(tried)
         supported = [_with_drift(sides, fitting, s) for s in tried if _strength(s, sides) > 0]
         entering = [s for s in supported if s.surplus > 0]
         if not entering:
-            drifting = max(supported, key=_total, default=None)
+            rejected = max(supported, key=_total, default=None)
             break
         steps.append(_simplest(sides, entering))
         steps = _without_the_redundant(sides, fitting, steps)
-    return ChangeSelection(sides, fitting, tuple(steps), first, drifting, _other(sides, fitting, steps[-1]))
+    return ChangeSelection(sides, fitting, tuple(steps), first, rejected, _other(sides, fitting, steps[-1]))
 
 
 def _strength(step: Step, sides: TwoSides) -> float:
@@ -220,7 +224,7 @@ def _last_difference(model: ChangeModel, p: FloatArray) -> FloatArray:
 
 
 def _simplest(sides: TwoSides, entering: Sequence[Step]) -> Step:
-    """Of the changes that held-out blocks cannot tell from the best the one with the fewest parameters."""
+    """Of the changes that held-out blocks cannot distinguish from the best, the one with the fewest parameters."""
     best = max(entering, key=_total)
     assert best.gains is not None
     alike = [
@@ -232,18 +236,28 @@ def _simplest(sides: TwoSides, entering: Sequence[Step]) -> Step:
 
 
 def _without_the_redundant(sides: TwoSides, fitting: JointFit, steps: list[Step]) -> list[Step]:
-    """Without changes that the last one has made superfluous."""
+    """Without a change that the later ones have made superfluous; those between are fitted again without it."""
     last = steps[-1]
-    for change in last.fit.model.changes[:-1]:
-        model = last.fit.model.without(change)
-        fit = fitting.fit(model, model.coordinates(last.fit.model.named(last.fit.p))[None])
-        held = fitting.hold_out(fit)
-        if strength_of(held.nats - last.held.nats, sides) > _STAYS:
+    for at, change in enumerate(last.fit.model.changes[:-1], start=1):
+        fit = _without(fitting, last, change)
+        if strength_of(fitting.hold_out(fit).nats - last.held.nats, sides) > _STAYS:
             continue
-        kept = [s for s in steps[:-1] if change not in s.fit.model.changes]
-        gains = kept[-1].held.nats - held.nats
-        return [*kept, _with_drift(sides, fitting, replace(last, fit=fit, held=held, gains=gains))]
+        kept = steps[:at]
+        for step in steps[at + 1 : -1]:
+            kept.append(_again(sides, fitting, kept[-1], step, _without(fitting, step, change)))
+        return [*kept, _again(sides, fitting, kept[-1], last, fit)]
     return steps
+
+
+def _without(fitting: JointFit, step: Step, change: Change) -> Fit:
+    model = step.fit.model.without(change)
+    return fitting.fit(model, model.coordinates(step.fit.model.named(step.fit.p))[None])
+
+
+def _again(sides: TwoSides, fitting: JointFit, before: Step, step: Step, fit: Fit) -> Step:
+    """A step with another fit, on top of another one `before` it."""
+    held = fitting.hold_out(fit)
+    return _with_drift(sides, fitting, replace(step, fit=fit, held=held, gains=before.held.nats - held.nats))
 
 
 def _other(sides: TwoSides, fitting: JointFit, now: Step) -> float:
