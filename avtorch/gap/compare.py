@@ -74,12 +74,12 @@ def compare(
     Example:
         >>> from avtorch import GLVDPlant, Leader, compare, simulate
         >>> leader = Leader.default(start=50.0, duration=54.0, dt=0.1)
-        >>> before, after = (simulate(leader, plant=GLVDPlant(*car)).log() for car in ((0.3, 1.0), (1.0, 0.7)))
+        >>> before, after = (simulate(leader, plant=GLVDPlant(*car)).log() for car in ((0.3, 1.0), (0.3, 0.7)))
         >>> found = compare(before, after, effects=["sensor_bias"])  # leave effects out to try all
-        >>> found.changed, round(found.car["T_L"].after.mean, 1), found.simulator
-        (True, 1.0, 'farther')
-        >>> sorted(found.cause.names)
-        ['K_L', 'T_L']
+        >>> found.changed, round(found.car["K_L"].after.mean, 1), found.simulator
+        (True, 0.7, 'farther')
+        >>> found.cause.names
+        ('K_L',)
     """
     if not 0 < level < 1:
         raise InputError(f"level: found {level}, needs a number between 0 and 1")

@@ -71,7 +71,7 @@ def _pair(case: Case, seed: int, both: Sequence[Effect] = ()) -> tuple[Log, Log]
     "which", ["bias", "gain", *(pytest.param(x, marks=pytest.mark.slow) for x in ("resistance", "delay"))]
 )
 def test_a_change_is_named_with_its_size(which: str, rotating_seed: int) -> None:
-    """Each is some twice as large as the least change that such drives show in nine of ten cases."""
+    """Each is larger than one that was named in ten of ten pairs of such drives (docs/compare.md)."""
     case = CASES[which]
     found = _cause(*_pair(case, rotating_seed))
     assert found.answer in ("named", "ambiguous")
