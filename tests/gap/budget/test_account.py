@@ -83,7 +83,7 @@ def test_the_answer_has_the_form_of_the_contract(coloured: Diagnosis, faults: Ca
 
 @pytest.mark.slow
 @pytest.mark.statistical
-def test_coloured_noise_alone_is_no_cause(fresh_seed: int) -> None:
+def test_coloured_noise_alone_is_no_cause(rotating_seed: int) -> None:
     """Once `unknown` each time: a likelihood with white sensors takes any colour for something that it does not know.
 
     Eight drives: more than two alarms have a probability of 0.003 where each has `FALSE_ALARMS` twice, for an effect
@@ -91,7 +91,7 @@ def test_coloured_noise_alone_is_no_cause(fresh_seed: int) -> None:
     """
     alarms = 0
     for k in range(8):
-        found = diagnose(log_of(seconds=60.0, seed=fresh_seed + k), effects=KINDS, posterior="laplace")
+        found = diagnose(log_of(seconds=60.0, seed=rotating_seed + k), effects=KINDS, posterior="laplace")
         alarms += found.verdict.names != ("none",)
     assert alarms <= 2
 
