@@ -134,7 +134,7 @@ def follower(c: Command) -> None:
 def comparison(c: Command) -> None:
     log = write(c.tmp_path / "drive.csv", **columns())
     c.lines = {of: ["compare", log, log] for of in ("old", "new")}
-    told = lambda *_, **__: SimpleNamespace(why=c.of, car={}, gap={}, to_dict=lambda: {"why": c.of})  # noqa: E731
+    told = lambda *_, **__: SimpleNamespace(why=c.of, car={}, gap={}, cause=None, to_dict=lambda: {"why": c.of})  # noqa: E731
     c.stand_in(avtorch.gap.compare, "compare", told)
 
 
