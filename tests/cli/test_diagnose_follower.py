@@ -26,7 +26,7 @@ def test_answer_and_page(log: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     (out / "manoeuvre.csv").write_text("of an earlier diagnosis\n", encoding="utf-8")
     assert main(["diagnose", str(log), "--follower", "--effects", "aerodynamic_drag", "--out", str(out)]) == 0
     answer = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
-    assert answer["schema"] == "avtorch.diagnosis/1"
+    assert answer["schema"] == "avtorch.diagnosis/2"
     assert answer["follower"]["parameters"]["headway_s"]["mean"] == pytest.approx(1.65, abs=0.1)
     said = capsys.readouterr().out
     assert "headway" in said

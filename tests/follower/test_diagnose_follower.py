@@ -137,7 +137,7 @@ def test_cause_is_conditional_on_the_law(rotating_seed: int) -> None:
     assert found.diagnosis is not None
     assert not (found.diagnosis.winner.effects and found.diagnosis.winner.probability > 0.9)
     answer = found.to_dict()
-    assert answer["schema"] == "avtorch.diagnosis/1"
+    assert answer["schema"] == "avtorch.diagnosis/2"
     assert answer["follower"]["law"] == "constant_time_gap"
     assert any("conditional" in line for line in answer["follower"]["conditional"])
 

@@ -30,6 +30,7 @@ from avtorch.gap.budget.rollout_energy import (
     calm_blocks,
     counted_rows,
     held_out_residuals,
+    horizon,
     relative_energy,
     rollout_squares,
 )
@@ -167,6 +168,7 @@ def budget_of(
         baseline={key: float(value) for key, value in bare.model.values(bare.z).items() if key in ("T_L", "K_L")},
         repaired=lag_and_gain(selection),
         material=material,
+        horizon_s=horizon(record),
     )
 
 

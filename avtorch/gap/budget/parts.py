@@ -135,6 +135,7 @@ class Budget:
 
     `parts` in the order of their shares; these and `unexplained` sum to 1. `baseline`, `repaired`: `T_L` [s] and `K_L`
     [-] without any cause, and with all parts. Where rollouts show no gap, shares mean nothing.
+    `horizon_s` [s] of the rollouts: 10 s, or the longest stretch.
 
     Example:
         >>> from avtorch import Leader, simulate
@@ -162,6 +163,7 @@ class Budget:
     chance: tuple[ChancePart, ...] = ()
     material: float = MATERIAL
     floor: float = 1.0
+    horizon_s: float = HORIZON_S
     by_drives: bool = False
 
     @property
@@ -203,7 +205,7 @@ class Budget:
         """The object `budget` of `diagnosis.json`."""
         return {
             "metric": "rollout_10s_over_floor",
-            "horizon_s": HORIZON_S,
+            "horizon_s": self.horizon_s,
             "heldout_by": "drives" if self.by_drives else "blocks",
             "before": self.before,
             "floor": self.floor,

@@ -9,10 +9,17 @@ from __future__ import annotations
 import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
+from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.forward_selection import Selection, Step
 from avtorch.gap.budget.parts import HORIZON_S
 
 _BEGIN_S = 0.5  # over which the measured start of a rollout is averaged
+
+
+def horizon(record: AnalysisRecord) -> float:
+    """Length of the rollouts [s]: `HORIZON_S`, or the longest stretch where that is shorter."""
+    longest = max(s.rows.stop - s.rows.start for s in record.stretches) * record.dt
+    return min(HORIZON_S, longest)
 
 
 def held_out_residuals(selection: Selection, step: Step) -> FloatArray:

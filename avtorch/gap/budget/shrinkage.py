@@ -7,8 +7,7 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.gap.budget.flexible_regression import predicted_residuals
 from avtorch.gap.budget.forward_selection import Selection
-from avtorch.gap.budget.parts import HORIZON_S
-from avtorch.gap.budget.rollout_energy import calm_blocks, counted_rows, held_out_residuals, rollout_squares
+from avtorch.gap.budget.rollout_energy import calm_blocks, counted_rows, held_out_residuals, horizon, rollout_squares
 from avtorch.gap.crossval.gap_closed import MetricShrinkage, Shrinkage
 from avtorch.gap.quantity import Quantity
 
@@ -34,7 +33,8 @@ def shrinkage_of(selection: Selection, *, seed: int = 0) -> Shrinkage:
     means = np.einsum("db,mcb->mcd", weights, squares[..., calm]) / weights.sum(-1)
     roots = np.sqrt(means)  # (model, channel, draw)
     names = [f"rollout_rmse_{c}" for c in fitting.whitening.record.channels]
-    by_metric = {name: _closed(*roots[:3, c]) for c, name in enumerate(names)}
+    span = horizon(fitting.whitening.record)
+    by_metric = {name: _closed(roots[0, c], roots[1, c], roots[2, c], horizon_s=span) for c, name in enumerate(names)}
     return Shrinkage(
         metric=max(names, key=lambda name: by_metric[name].before / max(by_metric[name].floor, 1e-12)),
         by_metric=by_metric,
@@ -46,7 +46,7 @@ def shrinkage_of(selection: Selection, *, seed: int = 0) -> Shrinkage:
     )
 
 
-def _closed(before: FloatArray, after: FloatArray, floor: FloatArray) -> MetricShrinkage:
+def _closed(before: FloatArray, after: FloatArray, floor: FloatArray, *, horizon_s: float) -> MetricShrinkage:
     """Of errors (draw,), the first of them over all blocks."""
     floor = np.minimum(floor, after)
     closed = None
@@ -55,4 +55,4 @@ def _closed(before: FloatArray, after: FloatArray, floor: FloatArray) -> MetricS
         q05, q95 = np.quantile(share[1:], (0.05, 0.95))
         mean = float(share[0])
         closed = Quantity(mean, float(share[1:].std()), min(float(q05), mean), max(float(q95), mean))
-    return MetricShrinkage(float(before[0]), float(after[0]), float(floor[0]), closed, HORIZON_S)
+    return MetricShrinkage(float(before[0]), float(after[0]), float(floor[0]), closed, horizon_s)

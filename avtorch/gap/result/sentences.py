@@ -103,7 +103,10 @@ def budget(found: Findings) -> list[str]:
         f"{name} {error.before:.2g} to {error.left:.2g} {_UNIT[name]} (noise floor {error.floor:.2g})"
         for name, error in found.budget.by_channel.items()
     ]
-    return [*line, f"Error of held-out 10 s rollouts, without and with {these}: {', '.join(errors)}."]
+    return [
+        *line,
+        f"Error of held-out {found.budget.horizon_s:.3g} s rollouts, without and with {these}: {', '.join(errors)}.",
+    ]
 
 
 def onset(found: Findings) -> list[str]:
