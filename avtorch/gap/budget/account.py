@@ -76,7 +76,7 @@ def account(
         budget = _by_likelihood(budget, candidates, verdict, named, winner)
         return Account(budget, selection, tuple(candidates), _verdict(budget, verdict), held_out=False)
     selection = select(record, base, kinds, begun=begun, most=most, progress=progress)
-    selection = largest_first(selection, material)
+    selection = largest_first(selection, material, seed=seed)
     budget = budget_of(selection, epoch_s=epoch, **options)
     budget = replace(budget, chance=_chance(candidates, verdict, winner, budget.unexplained.probability))
     held_out = tuple(_spread(candidates, budget, kinds))

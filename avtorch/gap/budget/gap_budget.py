@@ -77,19 +77,20 @@ def gap_budget(
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
     selection = select(AnalysisRecord.of(each), base, kinds, progress=progress)
-    return budget_of(largest_first(selection, material), material=material, seed=seed, epoch_s=each[0].epoch_s)
+    return budget_of(largest_first(selection, material, seed=seed), material=material, seed=seed, epoch_s=each[0].epoch_s)
 
 
-def largest_first(selection: Selection, material: float = MATERIAL) -> Selection:
+def largest_first(selection: Selection, material: float = MATERIAL, *, seed: int = 0) -> Selection:
     """The selection's effects in the order of what each takes off the energy on top of those before it.
 
     One that takes less than `material` off is left out: a delay of ten milliseconds may be certain, and is no part of a
-    gap. Unless it makes no rollout worse and changes the response by three times as much: beside a large force, errors
-    of rollouts show little else. With `material` 0 none is left out.
+    gap. Unless it changes the response by three times as much: slow noise, and beside it a large force, may leave
+    little else to see in errors of rollouts. With `material` 0 none is left out.
     """
     fitting, bare, last = selection.fitting, selection.steps[0], selection.last
     entered = {s.entered: s for s in selection.steps[1:]}
     steps, rest = [bare], list(last.fit.model.names)
+    gap = not material or _gap_is_there(_energies(selection, seed)[-1])
     while rest:
         tried = []
         for name in rest:
@@ -100,8 +101,8 @@ def largest_first(selection: Selection, material: float = MATERIAL) -> Selection
         best = tried[int(np.argmin(energies))]
         before, after = relative_energy(selection, steps[-1]), float(np.min(energies))
         name = str(best.entered)
-        worth = before - after >= material * relative_energy(selection, bare) or not material
-        if not worth and (after > before or _change(steps[-1], best) < _OF_THE_RESPONSE * material):
+        worth = gap and (before - after >= material * relative_energy(selection, bare) or not material)
+        if not worth and _change(steps[-1], best) < _OF_THE_RESPONSE * material:
             last = Step(without_effects(fitting, last.fit, [name]), last.held)
             last = replace(last, held=fitting.hold_out(last.fit))
         else:
@@ -131,21 +132,11 @@ def budget_of(
     `epoch_s`: the first log's start on its own clock. `given`: the effects are known by other means, and are parts
     even where rollouts show no gap.
     """
-    fitting, record = selection.fitting, selection.fitting.whitening.record
-    held = [held_out_residuals(selection, step) for step in selection.steps]
-    floor = held[-1] - predicted_residuals(fitting, selection.last.fit, held[-1])
-    errors = np.stack([rollout_squares(selection, x) for x in [*held, floor]])  # (model, channel, block)
-    calm = calm_blocks(selection)
-    blocks = len(calm)
-    draws = np.random.default_rng(seed).multinomial(blocks, np.ones(blocks) / blocks, _DRAWS)
-    weights = np.concatenate([np.ones((1, blocks)), draws]) * counted_rows(selection)[calm]
-    means = np.einsum("db,mcb->mdc", weights, errors[..., calm]) / weights.sum(-1)[:, None]  # (model, draw, channel)
-    floors = np.minimum(means[-1, 0], means[-2, 0])
-    energy = (means / floors).mean(-1)  # (model, draw)
-    whole = energy[0] - np.minimum(energy[-1], energy[-2])
-    # a gap that drives drawn anew would not have, or that is a small part of the noise, is none
-    there = bool(whole[0] > _LEAST_GAP and np.quantile(whole[1:], 0.05) > 0)
-    taken = np.maximum(energy[:-2] - energy[1:-1], 0.0) if there or given else np.zeros((0, _DRAWS + 1))
+    record = selection.fitting.whitening.record
+    means, floors, energy = _energies(selection, seed)
+    there = _gap_is_there(energy)
+    # a part may be sure and change the response, and drown in what slow noise does to rollouts: its share is small then
+    taken = np.maximum(energy[:-2] - energy[1:-1], 0.0)
     rest = np.maximum(energy[-2] - energy[-1], 0.0)
     total = np.maximum(taken.sum(0) + rest, 1e-12)
     shares = taken / total
@@ -170,6 +161,31 @@ def budget_of(
         material=material,
         horizon_s=horizon(record),
     )
+
+
+def _energies(selection: Selection, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean squared errors of rollouts (model, draw, channel), their floors (channel,), and energies (model, draw).
+
+    Models are the selection's steps, and last the floor's; draws of blocks, the first of which is all of them once.
+    """
+    fitting = selection.fitting
+    held = [held_out_residuals(selection, step) for step in selection.steps]
+    floor = held[-1] - predicted_residuals(fitting, selection.last.fit, held[-1])
+    errors = np.stack([rollout_squares(selection, x) for x in [*held, floor]])  # (model, channel, block)
+    calm = calm_blocks(selection)
+    blocks = len(calm)
+    draws = np.random.default_rng(seed).multinomial(blocks, np.ones(blocks) / blocks, _DRAWS)
+    weights = np.concatenate([np.ones((1, blocks)), draws]) * counted_rows(selection)[calm]
+    means = np.einsum("db,mcb->mdc", weights, errors[..., calm]) / weights.sum(-1)[:, None]
+    floors = np.minimum(means[-1, 0], means[-2, 0])
+    return means, floors, (means / floors).mean(-1)
+
+
+def _gap_is_there(energy: FloatArray) -> bool:
+    """Whether there is one in `energy` (model, draw): drives drawn anew have it too, and it is no small part of the
+    noise."""
+    whole = energy[0] - np.minimum(energy[-1], energy[-2])
+    return bool(whole[0] > _LEAST_GAP and np.quantile(whole[1:], 0.05) > 0)
 
 
 def _part(selection: Selection, step: Step, share: Quantity, after: float, epoch_s: float) -> Part:

@@ -4,6 +4,9 @@ Plant and noise share no parameters (Box and Jenkins): whatever colour vibration
 the noise, a long autoregression takes it. It is fitted once, to what a flexible regression on commands, speed and time
 leaves over, and is the same for all models. Fitted to the residuals of a model that lacks an effect it would take the
 effect for slow noise: of 214 nats for a resistance on a real car that left one.
+
+Above `BAND_HZ` nothing is compared. Most of what a sensor says there is noise, and what a real car does there (tyres,
+pitch, a driveline) is in no equation of an actuator; its many rows would outvote the slow errors that a rollout shows.
 """
 
 from __future__ import annotations
@@ -17,8 +20,11 @@ from scipy.signal import firwin
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 
+BAND_HZ = 2.5
+"""What is above this frequency is not compared: a lag of 0.3 s leaves a fifth of it."""
 _MEMORY_S = 1.0  # of the autoregression
-_BAND_HZ = 1.0  # of the first guess: noise is flat below and without bound above
+_GUESSED_HZ = 1.0  # band of the first guess, in which noise is flat
+_LOWPASS_PERIODS = 1.0  # of the band's edge, that its filter lasts
 _RIDGE = 1e-6
 
 
@@ -27,7 +33,7 @@ class NoiseWhitening:
     """Filters `taps` (channel, lag) and the SD of what they leave `sd` (channel,) [m/s²], for one record.
 
     `order` (counted,) are the rows that count once the filter has its past, sorted by block; `first` (block,) is where
-    each block begins in it.
+    each block begins in it. `share`: of a row, that it counts as: rows of a narrow band repeat each other.
     """
 
     record: AnalysisRecord
@@ -35,9 +41,10 @@ class NoiseWhitening:
     sd: FloatArray
     order: IntArray
     first: IntArray
+    share: float = 1.0
 
     @classmethod
-    def of(cls, record: AnalysisRecord, taps: FloatArray, sd: FloatArray) -> NoiseWhitening:
+    def of(cls, record: AnalysisRecord, taps: FloatArray, sd: FloatArray, share: float = 1.0) -> NoiseWhitening:
         counts = record.counts.copy()
         for stretch in record.stretches:
             lost = np.concatenate([np.ones(taps.shape[1] - 1), ~record.counts[stretch.rows]])
@@ -45,21 +52,21 @@ class NoiseWhitening:
         rows = np.nonzero(counts)[0]
         order = rows[np.argsort(record.block[rows], kind="stable")]
         first = np.unique(record.block[order], return_index=True)[1]
-        return cls(record, taps, sd, order, first)
+        return cls(record, taps, sd, order, first, share)
 
     @classmethod
     def band(cls, record: AnalysisRecord, residuals: FloatArray) -> NoiseWhitening:
         """The first guess: only what lies below 1 Hz counts; its size from `residuals` (channel, row)."""
-        lags = 2 * round(0.4 / record.dt) + 1
-        taps = np.tile(firwin(lags, min(_BAND_HZ, 0.45 / record.dt), fs=1 / record.dt), (len(record.channels), 1))
-        guess = cls.of(record, taps, np.ones(len(taps)))
-        return cls.of(record, taps, guess(residuals).std(-1) + 1e-9)
+        lowpass = _lowpass(_GUESSED_HZ, record.dt)
+        return cls._sized(record, np.tile(lowpass, (len(record.channels), 1)), residuals, _GUESSED_HZ)
 
     @classmethod
-    def autoregressive(cls, record: AnalysisRecord, residuals: FloatArray) -> NoiseWhitening:
-        """By Yule and Walker, from `residuals` (channel, row)."""
+    def autoregressive(
+        cls, record: AnalysisRecord, residuals: FloatArray, *, band_hz: float = BAND_HZ
+    ) -> NoiseWhitening:
+        """By Yule and Walker, from `residuals` (channel, row), for what lies below `band_hz`."""
         lags = max(4, round(_MEMORY_S / record.dt))
-        taps, sds = [], []
+        taps = []
         for channel in residuals:
             covariance, rows = np.zeros(lags + 1), 0
             for stretch in record.stretches:
@@ -71,9 +78,16 @@ class NoiseWhitening:
             covariance /= rows
             covariance[0] = covariance[0] * (1 + _RIDGE) + 1e-12
             a = solve_toeplitz(covariance[:lags], covariance[1:])
-            taps.append(np.concatenate([[1.0], -a]))
-            sds.append(np.sqrt(max(covariance[0] - a @ covariance[1:], 1e-12)))
-        return cls.of(record, np.array(taps), np.array(sds))
+            taps.append(np.convolve(np.concatenate([[1.0], -a]), _lowpass(band_hz, record.dt)))
+        return cls._sized(record, np.array(taps), residuals, band_hz)
+
+    @classmethod
+    def _sized(
+        cls, record: AnalysisRecord, taps: FloatArray, residuals: FloatArray, band_hz: float
+    ) -> NoiseWhitening:
+        """With the SD that `taps` leave of `residuals`."""
+        plain = cls.of(record, taps, np.ones(len(taps)))
+        return cls.of(record, taps, plain(residuals).std(-1) + 1e-9, min(1.0, 2 * band_hz * record.dt))
 
     @property
     def blocks(self) -> int:
@@ -90,9 +104,12 @@ class NoiseWhitening:
         return np.diff(np.append(self.first, len(self.order)))
 
     def __call__(self, x: FloatArray) -> FloatArray:
-        """White residuals (..., channel, counted) of `x` (..., channel, row), in units of their SD, sorted by block."""
+        """White residuals (..., channel, counted) of `x` (..., channel, row), sorted by block.
+
+        In units of their SD, as far as a row counts: the sum of squares is the number of values that say something new.
+        """
         out = np.empty((*x.shape[:-1], len(self.order)))
-        for c, (taps, sd) in enumerate(zip(self.taps, self.sd, strict=True)):
+        for c, (taps, sd) in enumerate(zip(self.taps, self.sd / np.sqrt(self.share), strict=True)):
             out[..., c, :] = self.record.filtered(x[..., c, :], taps)[..., self.order] / sd
         return out
 
@@ -103,3 +120,11 @@ class NoiseWhitening:
     def spread(self, weights: FloatArray) -> FloatArray:
         """Weights (block,) as (counted,)."""
         return np.repeat(weights, self.lengths)
+
+
+def _lowpass(band_hz: float, dt: float) -> FloatArray:
+    """Taps (lag,) of a filter that passes what is below `band_hz`, all of it where rows hold no more."""
+    if band_hz >= 0.45 / dt:
+        return np.ones(1)
+    lags = 2 * round(0.5 * _LOWPASS_PERIODS / band_hz / dt) + 1
+    return np.asarray(firwin(lags, band_hz, fs=1 / dt), dtype=float)

@@ -17,7 +17,7 @@ from avtorch.gap.budget.effect_model import EffectModel
 from avtorch.gap.budget.held_out_evidence import Evidence, agreement
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 
-_PRIOR_SHARE = 0.2  # of a block's rows, that the prior of its noise's size counts as
+_PRIOR_SHARE = 0.2  # of a block's values, that the prior of its noise's size counts as
 _STEP = 1e-3  # of the differences
 _DAMPING = (1e-3, 0.3, 10.0, 300.0)
 _CLOSE = (1e-3, 1.0)  # where the place is known nearly
@@ -67,7 +67,7 @@ class RobustFit:
     half: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
-        n = self.whitening.lengths * len(self.whitening.taps)
+        n = self.whitening.lengths * len(self.whitening.taps) * self.whitening.share
         object.__setattr__(self, "fold", np.arange(self.whitening.blocks) % min(self.folds, self.whitening.blocks))
         object.__setattr__(self, "prior", _PRIOR_SHARE * n)
         object.__setattr__(self, "half", 0.5 * (1 + _PRIOR_SHARE) * n)
