@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from avtorch.errors import InputError
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.forward_selection import MOST_PARTS, Selection, baseline_noise, select
-from avtorch.gap.budget.gap_budget import budget_of, largest_first
+from avtorch.gap.budget.gap_budget import budget_of, by_chance, largest_first
 from avtorch.gap.budget.given_effects import given_effects
 from avtorch.gap.budget.parts import LIKELY, MATERIAL, Budget, ChancePart, Part
 from avtorch.gap.quantity import Quantity
@@ -78,7 +78,7 @@ def account(
     selection = select(record, base, kinds, begun=begun, most=most, progress=progress)
     selection = largest_first(selection, material, seed=seed)
     budget = budget_of(selection, epoch_s=epoch, **options)
-    budget = replace(budget, chance=_chance(candidates, verdict, winner, budget.unexplained.probability))
+    budget = replace(budget, chance=_all_chance(selection, base, kinds, candidates, verdict, winner, budget))
     held_out = tuple(_spread(candidates, budget, kinds))
     return Account(budget, selection, held_out, _verdict(budget, verdict), held_out=True)
 
@@ -171,6 +171,21 @@ def _chance(
         probability = _probability(_aliases(kind.name, verdict), candidates, left)
         out.append(ChancePart(kind.name, probability, None, parameters, not implausible(parameters, {}, [kind])))
     return tuple(sorted(out, key=lambda part: -part.probability))
+
+
+def _all_chance(
+    selection: Selection,
+    base: GapPlant,
+    kinds: Sequence[type[Effect]],
+    candidates: Sequence[Candidate],
+    verdict: Verdict,
+    winner: FittedModel | None,
+    budget: Budget,
+) -> tuple[ChancePart, ...]:
+    """The likelihood's, but for forces: there these swallowed what is reproducible, so the residuals are asked."""
+    forces = {k.name for k in kinds if k.own_search() == "force"}
+    others = [x for x in _chance(candidates, verdict, winner, budget.unexplained.probability) if x.name not in forces]
+    return tuple(sorted([*others, *by_chance(selection, base, kinds)], key=lambda part: -part.probability))
 
 
 def _aliases(name: str, verdict: Verdict) -> tuple[str, ...]:

@@ -120,6 +120,15 @@ class AnalysisRecord:
             )
         return record
 
+    def runs(self) -> list[slice]:
+        """Rows that count without one between them that does not: through another driver's rows there is no rollout."""
+        found = []
+        for stretch in self.stretches:
+            counts = np.concatenate([[0], self.counts[stretch.rows].astype(int), [0]])
+            edges = np.flatnonzero(np.diff(counts)) + stretch.rows.start
+            found += [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+        return found
+
     def filtered(self, x: FloatArray, taps: FloatArray) -> FloatArray:
         """`x` (..., row) through a causal filter, each stretch by itself."""
         from scipy.signal import lfilter

@@ -1,9 +1,10 @@
 """Which effects, and how many: forward, with removal, by the blocks that were held out.
 
-An effect enters if the blocks that were held out agree on it, more surely than the best of as many wrong effects would
-(`held_out_evidence`). Of the effects that explain the same, as far as they can tell, the simplest is added, and the
-others are its aliases; so is one that explains most of the same with far fewer parameters. Once one has entered, each
-of those before it has to hold its place without it; at the end each has to pass as if it were the last one tried.
+An effect enters if the blocks that were held out agree on it as surely as one effect by itself would have to
+(`held_out_evidence`): while several are missing, each hides the others, and none would pass a stricter test. Of the
+effects that explain the same, as far as the blocks can tell, the simplest is added, and the others are its aliases; so
+is one that explains most of the same with far fewer parameters. Once one has entered, each of those before it has to
+hold its place without it; at the end each has to pass as the best of all that were tried.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _LEAST_NATS = 3.0  # in the blocks that fitted it, below which no effect is held
 _FAR_FEWER, _MOST_OF_IT = 3, 0.4  # parameters, and share of the gain, with which a simpler effect takes precedence
 _OF_ITS_OWN = 0.5  # share of an effect's gain, on top of another, from which it is no alias of that
 _FITTED = 9  # effects that are fitted, those of which a score test promises most
-_AT_ENTRY = 1
+_AT_ENTRY = 1  # effects tried, as far as entering is concerned
 _SCREENING = 3  # iterations of these fits
 _SCREENED = 5  # effects that are held out, of those fitted
 _REFITTING = 5  # iterations after a model has lost an effect

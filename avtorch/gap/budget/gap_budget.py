@@ -17,14 +17,14 @@ from scipy.special import ndtr
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.flexible_regression import predicted_residuals
+from avtorch.gap.budget.flexible_regression import left_over, predicted_residuals
 from avtorch.gap.budget.forward_selection import (
     Selection,
     Step,
     select,
     without_effects,
 )
-from avtorch.gap.budget.parts import MATERIAL, Budget, ChannelError, Part, Unexplained
+from avtorch.gap.budget.parts import MATERIAL, Budget, ChancePart, ChannelError, Part, Unexplained
 from avtorch.gap.budget.repaired_model import lag_and_gain, parameters_of
 from avtorch.gap.budget.rollout_energy import (
     calm_blocks,
@@ -34,6 +34,7 @@ from avtorch.gap.budget.rollout_energy import (
     relative_energy,
     rollout_squares,
 )
+from avtorch.gap.budget.slow_disturbance import slow_disturbance
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.simulator.plant import GapPlant, plant
@@ -56,9 +57,9 @@ def gap_budget(
 ) -> Budget:
     """The budget of the gap between `baseline` (default: bare GLVD) and the car of these drives.
 
-    Args: `effects`: candidates by name or class (default: all registered); random ones predict nothing and are left
-    out. `material`: share of the gap, or of the response, below which a cause is not a part. `seed`: of the drawing of
-    blocks for the intervals. `progress(what, done, of)` is called at each effect tried.
+    Args: `effects`: candidates by name or class (default: all registered); of the random ones, which predict nothing,
+    only a slow force is looked for. `material`: share of the gap, or of the response, below which a cause is not a
+    part. `seed`: of the drawing of blocks for the intervals. `progress(what, done, of)` is called at each effect tried.
 
     Raises `InputError` for a log without `accel_cmd`, for logs with less than six blocks of four seconds that count,
     or for wrong arguments.
@@ -77,7 +78,21 @@ def gap_budget(
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
     selection = select(AnalysisRecord.of(each), base, kinds, progress=progress)
-    return budget_of(largest_first(selection, material, seed=seed), material=material, seed=seed, epoch_s=each[0].epoch_s)
+    selection = largest_first(selection, material, seed=seed)
+    budget = budget_of(selection, material=material, seed=seed, epoch_s=each[0].epoch_s)
+    return replace(budget, chance=by_chance(selection, base, kinds))
+
+
+def by_chance(selection: Selection, base: GapPlant, kinds: Sequence[type[Effect]]) -> tuple[ChancePart, ...]:
+    """Those of `kinds` that are random forces `base` lacks, as far as the residuals hold one."""
+    present = {e.name for e in base.effects}
+    random = [k for k in kinds if k.own_search() == "force" and k.name not in present]
+    if not random:
+        return ()
+    fitting, fit = selection.fitting, selection.last.fit
+    noise, T_L = left_over(fitting, fit), float(fit.model.values(fit.z)["T_L"])
+    found = [slow_disturbance(fitting.whitening.record, noise, T_L, kind) for kind in random]
+    return tuple(part for part in found if part is not None)
 
 
 def largest_first(selection: Selection, material: float = MATERIAL, *, seed: int = 0) -> Selection:

@@ -82,9 +82,7 @@ class NoiseWhitening:
         return cls._sized(record, np.array(taps), residuals, band_hz)
 
     @classmethod
-    def _sized(
-        cls, record: AnalysisRecord, taps: FloatArray, residuals: FloatArray, band_hz: float
-    ) -> NoiseWhitening:
+    def _sized(cls, record: AnalysisRecord, taps: FloatArray, residuals: FloatArray, band_hz: float) -> NoiseWhitening:
         """With the SD that `taps` leave of `residuals`."""
         plain = cls.of(record, taps, np.ones(len(taps)))
         return cls.of(record, taps, plain(residuals).std(-1) + 1e-9, min(1.0, 2 * band_hz * record.dt))

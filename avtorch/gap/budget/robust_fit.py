@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
-from avtorch.gap.budget.effect_model import EffectModel
+from avtorch.gap.budget.effect_model import LATENESS, EffectModel
 from avtorch.gap.budget.held_out_evidence import Evidence, agreement
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 
@@ -186,13 +186,24 @@ class RobustFit:
         of_blocks: FloatArray,
         dampings: Sequence[float] = _DAMPING,
     ) -> FloatArray:
-        """Places (step, size) to try from `z`, more and less damped."""
+        """Places (step, size) to try from `z`, more and less damped.
+
+        And one that leaves the lateness alone: where neither channel is late the likelihood has a crease, and slopes on
+        one side of it say nothing of the other.
+        """
         weighed = (slope * self.weights(white, of_blocks)).reshape(model.size, -1)
         curvature = weighed @ slope.reshape(model.size, -1).T + np.eye(model.size)
         downhill = weighed @ white.ravel() - z
+        every = np.ones(model.size, bool)
+        tries = [(damping, every) for damping in dampings]
+        if LATENESS in model.index:
+            others = every.copy()
+            others[model.index[LATENESS]] = False
+            tries.append((dampings[0], others))
         out = []
-        for damping in dampings:
-            step = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), downhill)
+        for damping, free in tries:
+            step, inner = np.zeros(model.size), curvature[np.ix_(free, free)]
+            step[free] = np.linalg.solve(inner + damping * np.diag(np.diag(inner)), downhill[free])
             longest = float(np.abs(step).max(initial=1e-12))
             for cap in (_LONGEST, 2.5 * _LONGEST) if longest > _LONGEST else (_LONGEST,):
                 out.append(np.clip(z + step * min(1.0, cap / longest), model.low, model.high))

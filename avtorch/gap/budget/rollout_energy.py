@@ -1,7 +1,7 @@
 """Errors of rollouts over 10 s, every block's by a model that was fitted without it.
 
-Speed is rolled out from its measured value at the beginning of each 10 s. The tenth of the blocks that the selected
-model predicts worst is left out: a local disturbance such as a kerb does not decide a budget.
+Speed is rolled out from its measured value at the beginning of each 10 s of rows that count. The tenth of the blocks
+that the selected model predicts worst is left out: a local disturbance such as a kerb does not decide a budget.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ _BEGIN_S = 0.5  # over which the measured start of a rollout is averaged
 
 
 def horizon(record: AnalysisRecord) -> float:
-    """Length of the rollouts [s]: `HORIZON_S`, or the longest stretch where that is shorter."""
-    longest = max(s.rows.stop - s.rows.start for s in record.stretches) * record.dt
+    """Length of the rollouts [s]: `HORIZON_S`, or the longest run of rows that count where that is shorter."""
+    longest = max(run.stop - run.start for run in record.runs()) * record.dt
     return min(HORIZON_S, longest)
 
 
@@ -38,9 +38,9 @@ def rollout_squares(selection: Selection, residuals: FloatArray) -> FloatArray:
     errors = residuals.copy()
     if record.has_speed:
         drift = np.zeros(record.rows)
-        for stretch in record.stretches:
-            for start in range(stretch.rows.start, stretch.rows.stop, window):
-                rows = slice(start, min(start + window, stretch.rows.stop))
+        for run in record.runs():
+            for start in range(run.start, run.stop, window):
+                rows = slice(start, min(start + window, run.stop))
                 gained = np.cumsum(residuals[0, rows]) * record.dt
                 drift[rows] = gained - gained[:begin].mean()
         errors[0] = drift

@@ -39,7 +39,7 @@ class JointWhitening(NoiseWhitening):
         mixed = np.concatenate([np.eye(channels)[..., None], -each], -1)
         mixed = np.einsum("ij,jkl->ikl", root, mixed)
         plain = NoiseWhitening.of(record, mixed[:, 0], np.ones(channels))
-        return cls(record, plain.taps, plain.sd, plain.order, plain.first, mixed)
+        return cls(record, plain.taps, plain.sd, plain.order, plain.first, mixed=mixed)
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """White residuals (..., channel, counted) of `x` (..., channel, row), of unit variance, sorted by block."""

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.noise_whitening import NoiseWhitening
+from avtorch.gap.budget.noise_whitening import BAND_HZ, NoiseWhitening
 from tests.bars import BAR
 from tests.gap.budget.cars import log_of
 
@@ -19,7 +19,7 @@ def test_what_an_autoregression_leaves_is_white_and_of_size_one(rotating_seed: i
     record = AnalysisRecord.of([log_of(seconds=400.0)])
     rng = np.random.default_rng(rotating_seed)
     noise = np.asarray(lfilter([1.0], [1.0, -1.4, 0.7], rng.normal(0.0, 0.3, (2, record.rows)), axis=-1))
-    whitening = NoiseWhitening.autoregressive(record, noise)
+    whitening = NoiseWhitening.autoregressive(record, noise, band_hz=0.5 / record.dt)
     white = whitening(noise)
     n = white.shape[-1]
     # the SD's own error, and that of twenty more coefficients than there are
@@ -27,6 +27,24 @@ def test_what_an_autoregression_leaves_is_white_and_of_size_one(rotating_seed: i
     # sorted by block, and blocks follow each other: neighbours are neighbours
     correlation = [(x[1:] * x[:-1]).mean() for x in white]
     assert np.abs(correlation).max() < BAR / np.sqrt(n)
+
+
+@pytest.mark.statistical
+def test_what_is_above_the_band_is_not_compared_and_rows_count_as_what_they_say(rotating_seed: int) -> None:
+    record = AnalysisRecord.of([log_of(seconds=400.0)])
+    rng = np.random.default_rng(rotating_seed)
+    noise = np.asarray(lfilter([1.0], [1.0, -1.4, 0.7], rng.normal(0.0, 0.3, (2, record.rows)), axis=-1))
+    whitening = NoiseWhitening.autoregressive(record, noise)
+    n = len(whitening.order)
+    assert whitening.share == pytest.approx(2 * BAND_HZ * record.dt)
+    tone = np.sin(2 * np.pi * 2 * BAND_HZ * record.dt * np.arange(record.rows))
+    # at twice the band's edge a filter of one period leaves about a tenth
+    whole = NoiseWhitening.autoregressive(record, noise, band_hz=0.5 / record.dt)
+    kept, passed = (filtered(np.stack([tone, tone])).std(-1) for filtered in (whitening, whole))
+    assert (kept / np.sqrt(whitening.share) * whitening.sd < 0.2 * passed * whole.sd).all()
+    # values that say something new: as many as the sum of squares, to its own error
+    independent = whitening.share * n
+    assert (whitening(noise) ** 2).sum(-1) == pytest.approx(independent, rel=BAR * np.sqrt(2 / independent))
 
 
 def test_a_stretch_knows_nothing_of_the_one_before() -> None:
