@@ -3,8 +3,9 @@
 ``AVTORCH_DATA=DIR python -m benchmarks.budgets [--only TEXT] [--in-front SIZE ...]``
 
 Prints a line a recording: the causes with their shares and parameters, and what each half says alone. With
-``--in-front`` a line a known effect of that size, put in front of the recording: what is named, and what the untouched
-recording is said to lack.
+``--in-front`` a line a known effect of that size, put in front of the recording as one car's, several logs as segments
+of one: what is named, the size found on top of the untouched recording's over the size put in, names that neither the
+effect nor the untouched recording accounts for, and what the simplest selection names (`reference_selection`).
 """
 
 from __future__ import annotations
@@ -12,15 +13,18 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from avtorch.blindtest import IN_FRONT, put_in_front
+from avtorch.blindtest.in_front_score import SIZE_OF, SIZE_WITHIN
 from avtorch.errors import InputError
-from avtorch.gap import Budget, gap_budget
+from avtorch.gap import EFFECTS, Budget, gap_budget
 from avtorch.io import Log
+from benchmarks.reference_selection import selected
 
 SETS: dict[str, tuple[str, ...]] = {
     "genesis, three laps": ("genesis/lap1.csv", "genesis/lap2.csv", "genesis/lap3.csv"),
@@ -37,6 +41,7 @@ SETS: dict[str, tuple[str, ...]] = {
     "volvo_truck": ("volvo_truck/052311_grade.csv",),
 }
 """Recordings with commands, by name: the logs of one car."""
+_BETWEEN_S = 5.0
 
 
 def causes(budget: Budget) -> str:
@@ -48,6 +53,7 @@ def causes(budget: Budget) -> str:
         if part.name in budget.names:
             values = [f"{q.mean:.3g} ({q.q05:.3g} to {q.q95:.3g})" for q in part.parameters.values()]
             cells.append(f"{part.name} {part.share.mean:.0%}: {', '.join(values)}")
+    cells += [f"{part.name}, by chance" for part in budget.chance if part.name in budget.names]
     return "; ".join(cells)
 
 
@@ -64,26 +70,66 @@ def tried(logs: Sequence[Log]) -> str:
     return ", ".join(budget.names) or budget.verdict[0]
 
 
-def in_front(logs: Sequence[Log], size: float) -> tuple[int, int]:
-    """How many effects are named, of how many; prints a line each."""
-    control = gap_budget(logs)
+def joined(logs: Sequence[Log]) -> Log:
+    """One log of several, each a segment, with some seconds between them."""
+    if len(logs) == 1:
+        return logs[0]
+    ends = np.cumsum([0.0, *(log.seconds + _BETWEEN_S for log in logs)])
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(log, name) for log in logs])
+        for name in ("accel_cmd", "speed", "accel", "engaged")
+        if all(getattr(log, name, None) is not None for log in logs)
+    }
+    time = np.concatenate([log.elapsed - log.elapsed[0] + end for log, end in zip(logs, ends[:-1], strict=True)])
+    segment = np.concatenate([np.full(log.rows, number) for number, log in enumerate(logs)])
+    return Log.from_arrays(name=logs[0].name, time=time, segment=segment, **columns)
+
+
+def in_front(log: Log, size: float) -> None:
+    """Prints a line per effect, and a last one with the counts."""
+    control = gap_budget(log)
+    simple_control = selected([log])
+    print(f"| untouched | | | | {causes(control)} | {', '.join(simple_control) or 'none'} |", flush=True)
     T_L, K_L = control.baseline["T_L"], control.baseline["K_L"]
-    held = total = 0
+    tried = named = sized = extra = simple = simple_extra = 0
     for number, effect in enumerate(IN_FRONT):
+        if EFFECTS[effect].random:
+            continue
         try:
-            changed = [put_in_front(log, effect, T_L=T_L, K_L=K_L, size=size, seed=number) for log in logs]
+            changed, put_in = put_in_front(log, effect, T_L=T_L, K_L=K_L, size=size, seed=number)
+            budget = gap_budget(changed)
         except InputError:
             continue
-        budget = gap_budget([log for log, _ in changed])
-        truth = ", ".join(f"{value:.3g}" for value in changed[0][1].values())
-        named = effect in budget.names
+        others = [name for name in budget.names if name != effect and name not in control.names]
+        reference = list(selected([changed]))
+        ratio = _ratio(budget, control, effect, put_in)
+        held = effect in budget.names
         alike = any(effect in part.alias_set for part in budget.parts if part.name in budget.names)
-        held, total = held + named, total + 1
+        tried, named, extra = tried + 1, named + held, extra + bool(others)
+        sized += ratio is not None and abs(ratio - 1) <= SIZE_WITHIN
+        simple += effect in reference
+        simple_extra += any(name != effect and name not in simple_control for name in reference)
+        truth = ", ".join(f"{value:.3g}" for value in put_in.values())
         print(
-            f"| {effect} ({truth}) | {'named' if named else 'alias' if alike else 'missed'} | {causes(budget)} |",
+            f"| {effect} ({truth}) | {'named' if held else 'alias' if alike else 'missed'} | "
+            f"{'' if ratio is None else f'{ratio:.2f}'} | {', '.join(others)} | {causes(budget)} | "
+            f"{', '.join(reference) or 'none'} |",
             flush=True,
         )
-    return held, total
+    print(f"named {named} of {tried}, of these {sized} within 25 % in size; with others {extra}")
+    print(f"the simplest selection: named {simple} of {tried}, with others {simple_extra}", flush=True)
+
+
+def _ratio(budget: Budget, control: Budget, effect: str, put_in: Mapping[str, float]) -> float | None:
+    """The size found on top of the control's, over what was put in."""
+    key, without, relative = SIZE_OF[effect]
+    found, before = _size(budget, effect, key), _size(control, effect, key)
+    return None if found is None else relative(found, without if before is None else before, put_in[key])
+
+
+def _size(budget: Budget, effect: str, key: str) -> float | None:
+    part = next((part for part in budget.parts if part.name == effect and effect in budget.names), None)
+    return None if part is None or key not in part.parameters else part.parameters[key].mean
 
 
 def main() -> None:
@@ -100,8 +146,8 @@ def main() -> None:
         logs = [Log.read(Path(folder) / file) for file in files]
         if arguments.in_front:
             for size in arguments.in_front:
-                held, total = in_front(logs, size)
-                print(f"{name}, size {size:g}: {held} of {total} named", flush=True)
+                print(f"{name}, size {size:g}", flush=True)
+                in_front(joined(logs), size)
             continue
         begun = time.process_time()
         budget = gap_budget(logs)

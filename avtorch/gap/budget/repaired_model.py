@@ -11,11 +11,13 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
+from torch import Tensor
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.budget.forward_selection import Selection
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.plant import GapPlant, plant
 
 
@@ -23,13 +25,22 @@ def parameters_of(selection: Selection, name: str) -> dict[str, Quantity]:
     """The parameters of one effect under the answer's names."""
     model, every = selection.last.fit.model, _folds(selection)
     plants = model.plant.with_values(model.values(every))
-    reported = next(e for e in plants.effects if e.name == name).report(torch.as_tensor(plants.T_L))
+    effect = next(e for e in plants.effects if e.name == name)
+    reported = effect.report(torch.as_tensor(plants.T_L))
+    if isinstance(effect, Integrated):  # whose fit leaves the size at its default, and has it in the coefficients
+        reported = {**reported, effect.size: effect.size_along(_places(selection))}
     out = {}
     for key, value in reported.items():
         x = np.broadcast_to(value.numpy(), (len(every),) if value.dim() < 2 else value.shape)
         if x.ndim == 1:
             out[key] = _jackknife(x)
     return out
+
+
+def _places(selection: Selection) -> Tensor:
+    """Positions (row,) [m] of all rows."""
+    stretches = selection.fitting.whitening.record.stretches
+    return torch.cat([s.drive.position for s in stretches if s.drive.position is not None])
 
 
 def lag_and_gain(selection: Selection) -> dict[str, Quantity]:

@@ -104,6 +104,11 @@ class RoadGrade(Integrated):
         """The grade [-]."""
         return self.force(position, coefficients) / GRAVITY
 
+    def size_along(self, position: Tensor) -> Tensor:
+        """The root mean square grade [-] over `position` (time,) [m]; its constant part is a force and no grade."""
+        grade = tensor(self.grade_rms)[..., None] * _spline(position, self._coefficients(), self.knot_m, True)
+        return grade.std(-1, correction=0)
+
     def spaced(self, knot_m: float) -> Self:
         return replace(self, knot_m=max(self.knot_m, knot_m))
 

@@ -40,6 +40,10 @@ class Integrated(Effect):
         """The quantity whose root mean square is the size, (..., time), with the same arguments."""
         raise NotImplementedError(f"{type(self).__name__} has no magnitude")
 
+    def size_along(self, position: Tensor) -> Tensor:
+        """The size that the coefficients have over these places: a root mean square, (...); `position` (time,) [m]."""
+        raise NotImplementedError(f"{type(self).__name__} has no size_along")
+
     def spaced(self, knot_m: float) -> Self:
         """The effect with knots at least `knot_m` [m] apart."""
         return self
