@@ -24,6 +24,7 @@ from avtorch.io import Log
 BLOCK_S = 10.0
 FOLDS = 5
 ERRORS, LEAST, MOST = 2.0, 0.03, 4
+_FEWEST = 7  # blocks, in short drives
 _GAUSSIAN = 1e6  # values that the prior of a block's noise counts as: its size is then the same in all
 
 
@@ -39,7 +40,8 @@ class LeastSquares(RobustFit):
 
 def selected(logs: Sequence[Log]) -> dict[str, dict[str, float]]:
     """Parameters by effect, in the order in which they entered."""
-    record, base = AnalysisRecord.of(logs, block_s=BLOCK_S), plant()
+    block_s = min(BLOCK_S, sum(log.seconds for log in logs) / _FEWEST)
+    record, base = AnalysisRecord.of(logs, block_s=block_s), plant()
     bare = EffectModel(record, base)
     starts = [bare.coordinates({"T_L": np.array(lag), LATENESS: np.array(0.0)}) for lag in (-2.0, -1.0, 0.0, 1.0)]
     fitting = LeastSquares(NoiseWhitening.band(record, record.measured), FOLDS)

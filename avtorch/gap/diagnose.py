@@ -133,6 +133,8 @@ def diagnose(
     )
     if accounted is not None:
         candidates, verdict = list(accounted.candidates), accounted.verdict
+        if not race.complete and "unknown" not in verdict.alias_set:  # which stands for what was not tried
+            verdict = replace(verdict, alias_set=(*verdict.alias_set, "unknown"))
     budget = None if accounted is None else accounted.budget
     selected = accounted.selection if accounted is not None and accounted.held_out else None
     winner = None if selected is not None else next((f for f in race.found if f.name == verdict.name), None)

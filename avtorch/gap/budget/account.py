@@ -182,10 +182,11 @@ def _all_chance(
     winner: FittedModel | None,
     budget: Budget,
 ) -> tuple[ChancePart, ...]:
-    """The likelihood's, but for forces: there these swallowed what is reproducible, so the residuals are asked."""
-    forces = {k.name for k in kinds if k.own_search() == "force"}
-    others = [x for x in _chance(candidates, verdict, winner, budget.unexplained.probability) if x.name not in forces]
-    return tuple(sorted([*others, *by_chance(selection, base, kinds)], key=lambda part: -part.probability))
+    """The residuals', which no part explains any more, and the likelihood's besides."""
+    seen = by_chance(selection, base, kinds)
+    own = {part.name for part in seen}
+    others = [x for x in _chance(candidates, verdict, winner, budget.unexplained.probability) if x.name not in own]
+    return tuple(sorted([*others, *seen], key=lambda part: -part.probability))
 
 
 def _aliases(name: str, verdict: Verdict) -> tuple[str, ...]:
@@ -233,8 +234,10 @@ def _spread(candidates: Sequence[Candidate], budget: Budget, kinds: Sequence[typ
         shares = {"unknown": free * ((1 - sure) + sure * left), "none": 0.0, name: free * sure * (1 - left)}
     out = [replace(c, probability=shares.get(c.name, c.probability)) for c in candidates if c.name != name]
     if budget.names:
-        before = next((c.probability for c in candidates if c.name == name), 0.0)
-        out.append(_selected(budget, name, min(before + shares[name], 1.0), kinds))
+        before = next((c for c in candidates if c.name == name), None)
+        known = 0.0 if before is None else before.probability
+        chosen = _selected(budget, name, min(known + shares[name], 1.0), kinds)
+        out.append(replace(chosen, log_evidence=None if before is None else before.log_evidence))
     elif name:
         out += [replace(c, probability=shares[name]) for c in candidates if c.name == name]
     return out

@@ -19,6 +19,7 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.parts import ChancePart
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.selection.calibration import CALIBRATION
 from avtorch.gap.simulator.effect import Effect
 
 _BELOW_HZ = 1.0
@@ -80,8 +81,8 @@ def slow_disturbance(
 ) -> ChancePart | None:
     """The random force `kind` in `residuals` (channel, row) [m/s²] of a car with lag `T_L` [s].
 
-    Its probability weighs the likelihood's gain against two more parameters (BIC). None where it is less likely than
-    not, or where no stretch is long enough to see.
+    Its probability weighs the likelihood's gain against two more parameters (BIC) and against what any effect has to
+    gain over none (`calibration.json`). None where it is less likely than not, or where no run is long enough to see.
     """
     seen = Periodogram.of(record, residuals.mean(0))
     ordinates = len(seen.power) / _REPEATED
@@ -95,7 +96,7 @@ def slow_disturbance(
     forces = [4 * time / (1 + (omega * time) ** 2) for time in _TIMES_S]  # of unit variance
     fits = [seen.fitted(np.concatenate([own, force[None]])) for force in forces]
     best = int(np.argmin([nats for nats, _ in fits]))
-    probability = float(expit(bare - fits[best][0] - np.log(ordinates)))
+    probability = float(expit(bare - fits[best][0] - np.log(ordinates) - CALIBRATION.odds.effect))
     if probability < 0.5:
         return None
     # the two parameters over a grid, the other sizes as they give way

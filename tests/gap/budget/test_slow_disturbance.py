@@ -51,7 +51,7 @@ def test_a_slow_force_is_found_with_its_size(rotating_seed: int) -> None:
 
 @pytest.mark.statistical
 def test_a_cars_own_noise_is_no_slow_force(rotating_seed: int) -> None:
-    """Twenty cars: by BIC some 1 in 100 has one named, and four of twenty then less than once in 40,000 times."""
+    """Twenty cars: if 1 in 100 had one named, four of twenty would less than once in 20,000 times."""
     record = AnalysisRecord.of([log_of(seconds=120.0)])
     found = [slow_disturbance(record, residuals(record, rotating_seed + k), T_L, Gust) for k in range(20)]
     assert sum(part is not None for part in found) < 4
