@@ -5,7 +5,8 @@
 Draws cases of the blind test's reference vehicle, with the calibration families of causes outside the table, searches
 each once (hours: a minute or more of processor time per case) and keeps what the fit needs in `--kept`. Then it fits
 the constants, holds out a quarter for the figures, and writes `--out`; constants that were chosen by hand are kept.
-With `--resume` an interrupted run continues, and a finished one is only fitted again.
+With `--resume` an interrupted run continues, and a finished one is only fitted again. `--compare` writes nothing: it
+prints how the constants in use do on these cases beside those of a fit to other ones.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from avtorch.errors import InputError
 from avtorch.gap.selection.calibration import PATH, SCHEMA, Calibration, document
 from avtorch.io import write_json
 from benchmarks.fit_calibration.cases import CASE_MIX, KeptCase, collect, families, weights
-from benchmarks.fit_calibration.figures import held_out
+from benchmarks.fit_calibration.figures import compared, held_out
 from benchmarks.fit_calibration.fingerprint import Numbers, fingerprint
 from benchmarks.fit_calibration.fit import Fitted, fit
 
@@ -89,6 +90,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=PATH)
     parser.add_argument("--kept", type=Path, default=Path("out/calibration_cases.json"))
     parser.add_argument("--resume", action="store_true", help="go on with the cases in --kept")
+    parser.add_argument("--compare", action="store_true", help="with the constants in use, instead of writing new ones")
     options = parser.parse_args(argv)
     try:
         commit = commit_of(Path(__file__).parent)
@@ -103,6 +105,10 @@ def main(argv: Sequence[str] | None = None) -> None:
             progress=lambda done, of: print(f"\rcase {done} of {of}", end="", file=sys.stderr, flush=True),
         )
         print(file=sys.stderr)
+        if options.compare:
+            for key, value in compared(cases, options.seed).items():
+                print(f"{key:25s} {value:g}")
+            return
         found = fit(cases, weights(cases))
         provenance = origin(cases, options.seed, commit=commit, today=date.today().isoformat())
         write_json(options.out, made(document(), found, provenance, numbers))

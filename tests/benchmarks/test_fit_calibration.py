@@ -26,7 +26,9 @@ from benchmarks.fit_calibration.cases import (
     searched,
     weights,
 )
+from benchmarks.fit_calibration.figures import compared
 from benchmarks.fit_calibration.fit import PRIORS, WEIGHT_SD, fit, loss_of, odds_at
+from tests.bars import BAR
 
 NUMBERS = {"late": {"none": 1000.0}}
 NAMES = ("none", "dead_time", "gust", "backlash", "backlash+dead_time", "dead_time+gust")
@@ -161,6 +163,19 @@ def test_the_file_is_made_and_read(fresh_seed: int) -> None:
     assert (read.alias_sets, read.remainder) == (CALIBRATION.alias_sets, CALIBRATION.remainder)
     assert 0 <= provenance["held_out"]["calibration_error"] <= 1
     assert 0 <= provenance["held_out"]["unknown_auroc"] <= 1
+
+
+@pytest.mark.statistical
+@pytest.mark.slow
+def test_on_cases_of_its_own_probabilities_nothing_beats_the_constants_in_use(rotating_seed: int) -> None:
+    figures = compared(drawn(140, shipped(), np.random.default_rng(rotating_seed)), 7)
+    assert figures["nats"] < BAR * figures["error"]
+    assert {
+        "calibration_error_used",
+        "unknown_auroc_used",
+        "calibration_error_new",
+        "unknown_auroc_new",
+    } < figures.keys()
 
 
 @pytest.mark.slow
