@@ -5,8 +5,8 @@
 Draws cases of the blind test's reference vehicle, with the calibration families of causes outside the table, searches
 each once (hours: a minute or more of processor time per case) and keeps what the fit needs in `--kept`. Then it fits
 the constants, holds out a quarter for the figures, and writes `--out`; constants that were chosen by hand are kept.
-With `--resume` an interrupted run continues, and a finished one is only fitted again. `--compare` writes nothing: it
-prints how the constants in use do on these cases beside those of a fit to other ones.
+With `--resume` an interrupted run continues, and a finished one is only fitted again. `--compare` keeps the
+constants: it adds to their provenance how they do on these cases beside those of a fit to other ones.
 """
 
 from __future__ import annotations
@@ -66,6 +66,15 @@ def origin(cases: Sequence[KeptCase], seed: int, *, commit: str, today: str) -> 
     }
 
 
+def checked(
+    old: Mapping[str, Any], figures: Mapping[str, float], cases: int, seed: int, *, commit: str, today: str
+) -> dict[str, Any]:
+    """The file with `figures` (`compared`) of new cases in its provenance."""
+    made_by = f"{COMMAND} --seed {seed} --cases {cases} --compare"
+    own = {"made_by": made_by, "date": today, "commit": commit, **figures}
+    return {**old, "provenance": {**old["provenance"], "checked": own}}
+
+
 def commit_of(tree: Path) -> str:
     """The commit of the likelihood. Raises `InputError` where the running code differs from the committed one."""
 
@@ -93,7 +102,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--compare", action="store_true", help="with the constants in use, instead of writing new ones")
     options = parser.parse_args(argv)
     try:
-        commit = commit_of(Path(__file__).parent)
+        commit, today = commit_of(Path(__file__).parent), date.today().isoformat()
         numbers = fingerprint()
         options.kept.parent.mkdir(parents=True, exist_ok=True)
         cases = collect(
@@ -106,11 +115,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         )
         print(file=sys.stderr)
         if options.compare:
-            for key, value in compared(cases, options.seed).items():
+            figures = compared(cases, options.seed)
+            for key, value in figures.items():
                 print(f"{key:25s} {value:g}")
+            write_json(options.out, checked(document(), figures, len(cases), options.seed, commit=commit, today=today))
             return
         found = fit(cases, weights(cases))
-        provenance = origin(cases, options.seed, commit=commit, today=date.today().isoformat())
+        provenance = origin(cases, options.seed, commit=commit, today=today)
         write_json(options.out, made(document(), found, provenance, numbers))
     except InputError as fault:
         sys.exit(f"fit_calibration: {fault}")

@@ -17,7 +17,7 @@ from avtorch.errors import InputError
 from avtorch.gap.selection import model_probabilities as odds
 from avtorch.gap.selection.adequacy import Adequacy
 from avtorch.gap.selection.calibration import CALIBRATION, Calibration, document
-from benchmarks.fit_calibration.__main__ import made, origin
+from benchmarks.fit_calibration.__main__ import checked, made, origin
 from benchmarks.fit_calibration.cases import (
     KeptCandidate,
     KeptCase,
@@ -170,6 +170,9 @@ def test_the_file_is_made_and_read(fresh_seed: int) -> None:
 def test_on_cases_of_its_own_probabilities_nothing_beats_the_constants_in_use(rotating_seed: int) -> None:
     figures = compared(drawn(140, shipped(), np.random.default_rng(rotating_seed)), 7)
     assert figures["nats"] < BAR * figures["error"]
+    new = checked(document(), figures, 140, 7, commit="0" * 40, today="2026-01-01")
+    assert new["constants"] == document()["constants"]
+    assert new["provenance"]["checked"]["nats"] == figures["nats"]
     assert {
         "calibration_error_used",
         "unknown_auroc_used",

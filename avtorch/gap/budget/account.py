@@ -72,7 +72,7 @@ def account(
     epoch, options = logs[0].epoch_s, {"material": material, "seed": seed}
     if winner is not None and not winner.blown:
         selection = largest_first(begun, 0.0)
-        budget = _as_adequate(budget_of(selection, epoch_s=epoch, given=True, **options), candidates)
+        budget = _as_adequate(budget_of(selection, epoch_s=epoch, **options), candidates)
         budget = _by_likelihood(budget, candidates, verdict, named, winner)
         return Account(budget, selection, tuple(candidates), _verdict(budget, verdict), held_out=False)
     selection = select(record, base, kinds, begun=begun, most=most, progress=progress)

@@ -31,7 +31,6 @@ _LEAST_NATS = 3.0  # in the blocks that fitted it, below which no effect is held
 _FAR_FEWER, _MOST_OF_IT = 3, 0.4  # parameters, and share of the gain, with which a simpler effect takes precedence
 _OF_ITS_OWN = 0.5  # share of an effect's gain, on top of another, from which it is no alias of that
 _FITTED = 9  # effects that are fitted, those of which a score test promises most
-_AT_ENTRY = 1  # effects tried, as far as entering is concerned
 _SCREENING = 3  # iterations of these fits
 _SCREENED = 5  # effects that are held out, of those fitted
 _REFITTING = 5  # iterations after a model has lost an effect
@@ -156,7 +155,7 @@ def _enter(
         if fit.model.at_limit(fit.z, name):
             continue
         held = fitting.hold_out(fit)
-        tried.append(Step(fit, held, name, fitting.evidence(now.held, held).strength(_AT_ENTRY)))
+        tried.append(Step(fit, held, name, fitting.evidence(now.held, held).strength()))
     tried = [step for step in tried if step.strength > 0]
     if not tried:
         return None

@@ -140,12 +140,10 @@ def budget_of(
     material: float = MATERIAL,
     seed: int = 0,
     epoch_s: float = 0.0,
-    given: bool = False,
 ) -> Budget:
     """The budget of a selection, as it is ordered; intervals of shares by drawing blocks anew.
 
-    `epoch_s`: the first log's start on its own clock. `given`: the effects are known by other means, and are parts
-    even where rollouts show no gap.
+    `epoch_s`: the first log's start on its own clock.
     """
     record = selection.fitting.whitening.record
     means, floors, energy = _energies(selection, seed)

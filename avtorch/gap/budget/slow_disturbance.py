@@ -29,6 +29,7 @@ _TIMES_S = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0)
 _LAGS = (0.5, 1.0, 2.0)  # times T_L, that the lag of GLVD's own noise may be: other equations of the actuator change it
 _RATIOS = np.exp(np.linspace(-1.6, 1.2, 15))  # of the force's SD to its most likely one
 _NEGLIGIBLE = 1e-9
+_FEWEST = 16  # independent ordinates, some four for each size
 _SMALL = 0.05  # of its equal share, where a size starts that may be absent
 
 
@@ -62,12 +63,12 @@ class Periodogram:
         spectrum = spectrum + _NEGLIGIBLE * self.power.mean()
         return float((np.log(spectrum) + self.power / spectrum).sum()) / _REPEATED
 
-    def fitted(self, shapes: FloatArray, also: FloatArray | float = 0.0) -> tuple[float, FloatArray]:
-        """Least cost of a sum of `shapes` (shape, ordinate) and `also`, and the sizes (shape,) in it."""
+    def fitted(self, shapes: FloatArray) -> tuple[float, FloatArray]:
+        """Least cost of a sum of `shapes` (shape, ordinate), and the sizes (shape,) in it."""
         equal = np.log(self.power.mean() / len(shapes) / shapes.mean(-1))
 
         def cost(z: FloatArray) -> float:
-            return self.nats(np.exp(z) @ shapes + also)
+            return self.nats(np.exp(z) @ shapes)
 
         absent = np.eye(len(shapes)) * np.log(_SMALL)
         starts = equal + np.concatenate([np.zeros((1, len(shapes))), absent])
@@ -86,7 +87,7 @@ def slow_disturbance(
     """
     seen = Periodogram.of(record, residuals.mean(0))
     ordinates = len(seen.power) / _REPEATED
-    if ordinates < 2 * len(_TIMES_S):
+    if ordinates < _FEWEST:
         return None
     omega = 2 * np.pi * seen.frequency
     sensors = [omega**2 if channel == "speed" else np.ones_like(omega) for channel in record.channels]

@@ -29,22 +29,19 @@ def test_what_an_autoregression_leaves_is_white_and_of_size_one(rotating_seed: i
     assert np.abs(correlation).max() < BAR / np.sqrt(n)
 
 
-@pytest.mark.statistical
-def test_what_is_above_the_band_is_not_compared_and_rows_count_as_what_they_say(rotating_seed: int) -> None:
-    record = AnalysisRecord.of([log_of(seconds=400.0)])
-    rng = np.random.default_rng(rotating_seed)
-    noise = np.asarray(lfilter([1.0], [1.0, -1.4, 0.7], rng.normal(0.0, 0.3, (2, record.rows)), axis=-1))
-    whitening = NoiseWhitening.autoregressive(record, noise)
-    n = len(whitening.order)
-    assert whitening.share == pytest.approx(2 * BAND_HZ * record.dt)
-    tone = np.sin(2 * np.pi * 2 * BAND_HZ * record.dt * np.arange(record.rows))
-    # at twice the band's edge a filter of one period leaves about a tenth
-    whole = NoiseWhitening.autoregressive(record, noise, band_hz=0.5 / record.dt)
-    kept, passed = (filtered(np.stack([tone, tone])).std(-1) for filtered in (whitening, whole))
-    assert (kept / np.sqrt(whitening.share) * whitening.sd < 0.2 * passed * whole.sd).all()
-    # values that say something new: as many as the sum of squares, to its own error
-    independent = whitening.share * n
-    assert (whitening(noise) ** 2).sum(-1) == pytest.approx(independent, rel=BAR * np.sqrt(2 / independent))
+def test_what_is_above_the_band_is_not_compared_and_rows_count_as_what_they_say() -> None:
+    record = AnalysisRecord.of([log_of(seconds=200.0)])
+    noise = np.random.default_rng(0).normal(0.0, 0.3, (2, record.rows))
+    in_band, whole = (NoiseWhitening.autoregressive(record, noise, band_hz=hz) for hz in (BAND_HZ, 0.5 / record.dt))
+    frequency = np.fft.rfftfreq(4096, record.dt)
+    passed = np.abs(np.fft.rfft(in_band.taps, 4096) / np.fft.rfft(whole.taps, 4096)) ** 2
+    # a filter of one period of the band's edge: half the amplitude there, a tenth at twice the edge
+    assert (passed[:, frequency < 0.5 * BAND_HZ] > 0.6).all()
+    assert (passed[:, frequency > 2 * BAND_HZ] < 0.02).all()
+    # flat noise through it has as many independent values as this; no row may count for more
+    independent = passed.mean(-1) ** 2 / (passed**2).mean(-1)
+    assert (in_band.share <= independent).all()
+    assert (in_band.share > 0.7 * independent).all()
 
 
 def test_a_stretch_knows_nothing_of_the_one_before() -> None:
