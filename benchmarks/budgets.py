@@ -33,11 +33,14 @@ SETS: dict[str, tuple[str, ...]] = {
     "genesis, lap 3": ("genesis/lap3.csv",),
     "indy_av21": ("indy_av21/Putnam_park2023_run4_2.csv",),
     "roboracer, one mass": ("roboracer/Normal_1weight.csv",),
+    "roboracer, other mass": ("roboracer/single_mass.csv",),
     "roboracer, tyres": ("roboracer/tire_set_1.csv",),
     "roboracer, training": ("roboracer/ftg_stanley_total_training.csv",),
     "roboracer, validation": ("roboracer/ftg_stanley_total_validation.csv",),
     "dart, 10:02": ("dart/09_16_2024_10_02_28_onboard10Hz.csv",),
     "dart, 10:27": ("dart/09_16_2024_10_27_02_onboard10Hz.csv",),
+    "dart, 10:02, motion capture": ("dart/09_16_2024_10_02_28_vicon50Hz.csv",),
+    "dart, 10:27, motion capture": ("dart/09_16_2024_10_27_02_vicon50Hz.csv",),
     "volvo_truck": ("volvo_truck/052311_grade.csv",),
 }
 """Recordings with commands, by name: the logs of one car."""

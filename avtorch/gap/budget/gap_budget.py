@@ -17,32 +17,18 @@ from scipy.special import ndtr
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.flexible_regression import left_over, predicted_residuals
-from avtorch.gap.budget.forward_selection import (
-    Selection,
-    Step,
-    select,
-    without_effects,
-)
+from avtorch.gap.budget.flexible_regression import left_over
+from avtorch.gap.budget.forward_selection import Selection, Step, select
 from avtorch.gap.budget.parts import MATERIAL, Budget, ChancePart, ChannelError, Part, Unexplained
 from avtorch.gap.budget.repaired_model import lag_and_gain, parameters_of
-from avtorch.gap.budget.rollout_energy import (
-    calm_blocks,
-    counted_rows,
-    held_out_residuals,
-    horizon,
-    relative_energy,
-    rollout_squares,
-)
+from avtorch.gap.budget.rollout_energy import horizon
+from avtorch.gap.budget.share_order import energies, gap_is_there, largest_first, taken_off
 from avtorch.gap.budget.slow_disturbance import slow_disturbance
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log
 
-_OF_THE_RESPONSE = 3.0  # times as large a share of the response, which counts beside the gap
-_LEAST_GAP = 0.1  # of the floor's energy, that there is a gap
-_DRAWS = 2000
 _SURELY = 0.95  # share of the draws that find more unexplained than is material
 
 
@@ -95,45 +81,6 @@ def by_chance(selection: Selection, base: GapPlant, kinds: Sequence[type[Effect]
     return tuple(part for part in found if part is not None)
 
 
-def largest_first(selection: Selection, material: float = MATERIAL, *, seed: int = 0) -> Selection:
-    """The selection's effects in the order of what each takes off the energy on top of those before it.
-
-    One that takes less than `material` off is left out: a delay of ten milliseconds may be certain, and is no part of a
-    gap. Unless it changes the response by three times as much: slow noise, and beside it a large force, may leave
-    little else to see in errors of rollouts. With `material` 0 none is left out.
-    """
-    fitting, bare, last = selection.fitting, selection.steps[0], selection.last
-    entered = {s.entered: s for s in selection.steps[1:]}
-    steps, rest = [bare], list(last.fit.model.names)
-    gap = not material or _gap_is_there(_energies(selection, seed)[-1])
-    while rest:
-        tried = []
-        for name in rest:
-            fit = without_effects(fitting, last.fit, [other for other in rest if other != name])
-            held = last.held if fit is last.fit else fitting.hold_out(fit, iterations=1)
-            tried.append(replace(entered[name], fit=fit, held=held))
-        energies = [relative_energy(selection, step) for step in tried]
-        best = tried[int(np.argmin(energies))]
-        before, after = relative_energy(selection, steps[-1]), float(np.min(energies))
-        name = str(best.entered)
-        worth = gap and (before - after >= material * relative_energy(selection, bare) or not material)
-        if not worth and _change(steps[-1], best) < _OF_THE_RESPONSE * material:
-            last = Step(without_effects(fitting, last.fit, [name]), last.held)
-            last = replace(last, held=fitting.hold_out(last.fit))
-        else:
-            steps.append(best)
-        rest.remove(name)
-    return Selection(fitting, tuple(steps))
-
-
-def _change(before: Step, after: Step) -> float:
-    """Share of the response (root mean square) that one more effect changes; of the channel that it changes most."""
-    one, other = before.fit.model.simulate(before.fit.z), after.fit.model.simulate(after.fit.z)
-    rows = after.fit.model.record.counts
-    size = np.sqrt((other[:, rows] ** 2).mean(-1)) + 1e-12
-    return float((np.sqrt(((other - one)[:, rows] ** 2).mean(-1)) / size).max())
-
-
 def budget_of(
     selection: Selection,
     *,
@@ -146,10 +93,9 @@ def budget_of(
     `epoch_s`: the first log's start on its own clock.
     """
     record = selection.fitting.whitening.record
-    means, floors, energy = _energies(selection, seed)
-    there = _gap_is_there(energy)
-    # a part may be sure and change the response, and drown in what slow noise does to rollouts: its share is small then
-    taken = np.maximum(energy[:-2] - energy[1:-1], 0.0)
+    means, floors, energy = energies(selection, seed)
+    there = gap_is_there(energy)
+    taken = taken_off(energy[:-1])
     rest = np.maximum(energy[-2] - energy[-1], 0.0)
     total = np.maximum(taken.sum(0) + rest, 1e-12)
     shares = taken / total
@@ -174,31 +120,6 @@ def budget_of(
         material=material,
         horizon_s=horizon(record),
     )
-
-
-def _energies(selection: Selection, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean squared errors of rollouts (model, draw, channel), their floors (channel,), and energies (model, draw).
-
-    Models are the selection's steps, and last the floor's; draws of blocks, the first of which is all of them once.
-    """
-    fitting = selection.fitting
-    held = [held_out_residuals(selection, step) for step in selection.steps]
-    floor = held[-1] - predicted_residuals(fitting, selection.last.fit, held[-1])
-    errors = np.stack([rollout_squares(selection, x) for x in [*held, floor]])  # (model, channel, block)
-    calm = calm_blocks(selection)
-    blocks = len(calm)
-    draws = np.random.default_rng(seed).multinomial(blocks, np.ones(blocks) / blocks, _DRAWS)
-    weights = np.concatenate([np.ones((1, blocks)), draws]) * counted_rows(selection)[calm]
-    means = np.einsum("db,mcb->mdc", weights, errors[..., calm]) / weights.sum(-1)[:, None]
-    floors = np.minimum(means[-1, 0], means[-2, 0])
-    return means, floors, (means / floors).mean(-1)
-
-
-def _gap_is_there(energy: FloatArray) -> bool:
-    """Whether there is one in `energy` (model, draw): drives drawn anew have it too, and it is no small part of the
-    noise."""
-    whole = energy[0] - np.minimum(energy[-1], energy[-2])
-    return bool(whole[0] > _LEAST_GAP and np.quantile(whole[1:], 0.05) > 0)
 
 
 def _part(selection: Selection, step: Step, share: Quantity, after: float, epoch_s: float) -> Part:
