@@ -26,7 +26,6 @@ from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log
 
-_SHORT_S = 1.0  # blocks of drives too short for blocks of the usual length
 Progress = Callable[[str, int, int], None]
 
 
@@ -85,12 +84,10 @@ def account(
 
 
 def _record(logs: Sequence[Log]) -> AnalysisRecord | None:
-    for block_s in (None, _SHORT_S):
-        try:
-            return AnalysisRecord.of(logs, block_s=block_s)
-        except InputError:
-            continue
-    return None
+    try:
+        return AnalysisRecord.for_budget(logs)
+    except InputError:
+        return None
 
 
 def _onsets(winner: FittedModel | None, logs: Sequence[Log]) -> dict[str, float]:

@@ -26,6 +26,7 @@ _ROWS_A_PERIOD = 6
 _SETTLE_S = 3.0  # at the beginning of a stretch, and after rows that are masked, until the start no longer matters
 _LONGEST_BLOCK_S = 10.0
 _SHORTEST_BLOCK_S = 4.0
+_SHORT_DRIVES_BLOCK_S = 1.0  # where drives are too short for six of the usual ones
 _BLOCKS = 24  # aimed at, within those lengths
 _FEWEST_BLOCKS = 6
 _COUNTED_SHARE = 0.4  # of a block that must count
@@ -74,6 +75,17 @@ class AnalysisRecord:
     @property
     def has_speed(self) -> bool:
         return "speed" in self.channels
+
+    @classmethod
+    def for_budget(cls, logs: Sequence[Log]) -> AnalysisRecord:
+        """With blocks of the usual length, or of a second in drives too short for these.
+
+        Raises `InputError` where what counts is less than six seconds.
+        """
+        try:
+            return cls.of(logs)
+        except InputError:
+            return cls.of(logs, block_s=_SHORT_DRIVES_BLOCK_S)
 
     @classmethod
     def of(cls, logs: Sequence[Log], *, rate_hz: float = RATE_HZ, block_s: float | None = None) -> AnalysisRecord:

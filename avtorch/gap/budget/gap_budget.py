@@ -47,8 +47,8 @@ def gap_budget(
     only a slow force is looked for. `material`: share of the gap, or of the response, below which a cause is not a
     part. `seed`: of the drawing of blocks for the intervals. `progress(what, done, of)` is called at each effect tried.
 
-    Raises `InputError` for a log without `accel_cmd`, for logs with less than six blocks of four seconds that count,
-    or for wrong arguments.
+    Raises `InputError` for a log without `accel_cmd`, for logs with less than six seconds that count (blocks
+    are then of one second; six of four seconds or more are better), or for wrong arguments.
 
     Example:
         >>> from avtorch import Leader, simulate
@@ -63,7 +63,7 @@ def gap_budget(
         raise InputError(f"material: found {material}, needs a share between 0 and 1")
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
-    selection = select(AnalysisRecord.of(each), base, kinds, progress=progress)
+    selection = select(AnalysisRecord.for_budget(each), base, kinds, progress=progress)
     selection = largest_first(selection, material, seed=seed)
     budget = budget_of(selection, material=material, seed=seed, epoch_s=each[0].epoch_s)
     return replace(budget, chance=by_chance(selection, base, kinds))

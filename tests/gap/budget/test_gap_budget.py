@@ -85,7 +85,9 @@ def test_wrong_arguments_are_refused() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("file", "bias"), [("Normal_1weight", -0.235), ("tire_set_1", -0.174)])
+@pytest.mark.parametrize(
+    ("file", "bias"), [("single_mass", -0.235), ("Normal_1weight", -0.228), ("tire_set_1", -0.174)]
+)
 def test_the_bias_of_a_real_accelerometer_is_in_its_interval(data_dir: Path, file: str, bias: float) -> None:
     """Mean of accel - dv/dt while moving, by the columns themselves."""
     budget = gap_budget(Log.read(data_dir / "roboracer" / f"{file}.csv"))
@@ -101,3 +103,11 @@ def test_a_model_cars_resistance_is_what_its_authors_say(data_dir: Path) -> None
     budget = gap_budget(Log.read(data_dir / "dart" / "09_16_2024_10_27_02_onboard10Hz.csv"))
     assert budget.parts[0].name == "constant_resistance"
     assert budget.parts[0].parameters["resistance_mps2"].mean == pytest.approx(2.9, rel=0.25)
+
+
+def test_a_short_drive_is_divided_into_short_blocks() -> None:
+    """Twenty seconds hold four blocks of four; `diagnose` answers them, and so does the budget by itself."""
+    log = log_of([SensorBias(0.4)], seed=11, seconds=20.0)
+    assert gap_budget(log, effects=FEW).names == ("sensor_bias",)
+    with pytest.raises(InputError, match="needs"):
+        gap_budget(log_of(seconds=7.0), effects=FEW)
