@@ -44,7 +44,10 @@ _TURNS, _ENOUGH = 5, 1e-3  # maximum rounds of the search, and the gain [nats] b
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """The constants; `z` (13,): their coordinates, logarithms but for `effect` and the weights; `covariance` of `z`."""
+    """The constants; `z` (13,): their coordinates, logarithms but for `effect` and the weights; `covariance` of `z`.
+
+    By the curvature at the best place: too small for prices that trade places along a curved ridge.
+    """
 
     odds: Odds
     unknown: UnknownWeights

@@ -62,14 +62,23 @@ def drawn(count: int, z: np.ndarray, rng: np.random.Generator) -> list[KeptCase]
 @pytest.mark.statistical
 @pytest.mark.slow
 def test_constants_are_found_again(rotating_seed: int) -> None:
-    """Each within five standard errors, of which 400 cases leave no more than two thirds of the prior's in most."""
+    """Prices as probable as the best, weights within five standard errors; 400 cases leave no more than two thirds of
+    the prior's in most.
+
+    Prices that trade places lie on a curved ridge with kinks: in one of thirty draws one is five standard errors off,
+    by seed 1921668905 ten, where the truth is 6 nats from the best. So they are held to the likelihood ratio.
+    """
     truth = shipped()
-    found = fit(drawn(400, truth, np.random.default_rng(rotating_seed)), dict.fromkeys(MIX, 1.0))
+    means, sds = (np.array([p[k] for p in PRIORS.values()]) for k in (0, 1))
+    cases = drawn(400, truth, np.random.default_rng(rotating_seed))
+    found = fit(cases, dict.fromkeys(MIX, 1.0))
+    loss = loss_of(cases, dict.fromkeys(MIX, 1.0))
+    assert loss((truth[:8] - means) / sds) - loss((found.z[:8] - means) / sds) < 0.5 * chi2.isf(1e-6, 8)
     errors = np.sqrt(np.diag(found.covariance))
-    off = (found.z - truth) / errors
-    assert np.abs(off).max() < 5, dict(zip([*PRIORS, *asdict(found.unknown)], off.round(1).tolist(), strict=True))
-    sds = np.array([*(sd for _, sd in PRIORS.values()), *([WEIGHT_SD] * 5)])
-    assert np.median(errors / sds) < 2 / 3
+    off = ((found.z - truth) / errors)[8:]
+    assert np.abs(off).max() < 5, dict(zip(asdict(found.unknown), off.round(1).tolist(), strict=True))
+    widths = np.array([*(sd for _, sd in PRIORS.values()), *([WEIGHT_SD] * 5)])
+    assert np.median(errors / widths) < 2 / 3
 
 
 @pytest.mark.statistical
