@@ -7,10 +7,12 @@ reduce the error only together share what they take off.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.budget.flexible_regression import predicted_residuals
@@ -105,27 +107,12 @@ def gap_is_there(energy: FloatArray) -> bool:
 def taken_off(energy: FloatArray) -> FloatArray:
     """What each effect takes off `energy` (1 + effect, draw), (effect, draw).
 
-    Where an effect takes less than one behind it the two took it together, and each counts for the mean: these are the
-    slopes of the least concave course above what is taken off in all. An effect that is sure and changes the response,
+    Where an effect takes less than one behind it the two took it together, and each counts for the mean (antitonic
+    regression over all blocks, the same groups in every draw). An effect that is sure and changes the response,
     but drowns in what slow noise does to rollouts, takes nothing.
     """
     taken = energy[:-1] - energy[1:]
-    for group in _together(taken[:, 0]):
-        taken[group] = taken[group].mean(0)
+    together = isotonic_regression(taken[:, 0], increasing=False).blocks
+    for begin, end in pairwise(together):
+        taken[begin:end] = taken[begin:end].mean(0)
     return np.maximum(taken, 0.0)
-
-
-def _together(taken: Sequence[float] | FloatArray) -> list[slice]:
-    """Neighbours pooled until no group takes more than the one before it (pool adjacent violators)."""
-    groups: list[tuple[int, int, float]] = []  # begin, end, sum
-    for number, value in enumerate(taken):
-        groups.append((number, number + 1, float(value)))
-        while len(groups) > 1 and _mean(groups[-2]) < _mean(groups[-1]):
-            begin, _, before = groups[-2]
-            groups[-2:] = [(begin, groups[-1][1], before + groups[-1][2])]
-    return [slice(begin, end) for begin, end, _ in groups]
-
-
-def _mean(group: tuple[int, int, float]) -> float:
-    begin, end, total = group
-    return total / (end - begin)
