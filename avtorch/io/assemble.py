@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError, listed, printable, quoted
+from avtorch.io.bad_rows import MOST_BAD, BadRows, disordered
 from avtorch.io.clock import clock_words, since, since_start
 from avtorch.io.mapping import SIGNALS, SignalMap
 from avtorch.io.merge import held
 from avtorch.io.segments import gap_limit, median_step
 from avtorch.io.tables import Table, read_table
 from avtorch.io.units import to_si
-from avtorch.io.validity import check_range, check_rate, check_time
+from avtorch.io.validity import check_range, check_rate, check_time, off_clock, stray
 
 _NAME = 40  # characters of the longest column name that may be a signal's, mistyped
 
@@ -48,6 +49,7 @@ def assemble(table: Table, mapping: SignalMap, *, folder: Path, following: bool)
         raise InputError(f"{source}: has {found}; a log needs at least two rows")
     signals: dict[str, FloatArray] = {}
     arrivals: dict[str, tuple[FloatArray, FloatArray]] = {}
+    bad, remarks = BadRows(table.rows), list(table.remarks)
     for signal in SIGNALS:
         column = mapping.column.get(signal, signal)
         if signal in mapping.elsewhere:
@@ -56,21 +58,24 @@ def assemble(table: Table, mapping: SignalMap, *, folder: Path, following: bool)
             if signal in mapping.stamp:
                 arrivals[signal] = _stamped(table, signal, column, mapping)
             else:
-                signals[signal] = _signal(table, signal, column, mapping)
+                signals[signal] = _signal(table, signal, column, mapping, bad, remarks)
     for signal in mapping.unit:
         if signal not in signals and signal not in arrivals:
             raise InputError(f"{source}: unit {signal}={mapping.unit[signal]}: the log has no column for {signal}")
 
-    time = signals["time"]
-    drive = signals.get("segment", np.zeros(len(time)))
     clock = mapping.column.get("time", "time")
-    check_time(time, np.diff(drive) == 0, _place(table, "time", clock))
+    _leave_out_disordered(table, signals, clock, bad)
+    signals = {signal: values[bad.kept] for signal, values in signals.items()}
+    remarks += bad.remarks()
+    time = signals["time"]
+    if len(time) < 2:
+        raise InputError(f"{source}: has {len(time)} rows without a bad cell; a log needs at least two rows")
+    drive = signals.get("segment", np.zeros(len(time)))
     # gaps are not known yet: drives follow from the log's own column, whose numbers may be of any size
     elapsed = since_start(time, np.concatenate([[0], np.cumsum(np.diff(drive) != 0)]))
     time_step = median_step(elapsed, np.diff(drive) == 0)
     check_rate(time_step, f"{source}: column {clock!r}")
 
-    remarks: list[str] = []
     keep = np.ones(len(time), bool)
     for signal, (stamps, values) in arrivals.items():
         largest = max(float(np.abs(x).max()) for x in (time, stamps))
@@ -139,12 +144,34 @@ def _place(table: Table, signal: str, column: str, rows: NDArray | None = None) 
     return lambda row: table.where(row if rows is None else int(rows[row]), column) + suffix
 
 
-def _signal(table: Table, signal: str, column: str, mapping: SignalMap) -> FloatArray:
-    values = table.numbers(column)
+def _signal(table: Table, signal: str, column: str, mapping: SignalMap, bad: BadRows, remarks: list[str]) -> FloatArray:
+    """A signal (row,) in SI units, NaN in rows that are left out."""
+    read = table.readings(column, as_time=signal == "time", as_state=signal == "engaged")
+    bad.leave_out(read.faults)
+    remarks += read.remarks
+    values = read.values
     if signal in mapping.unit:
         values = to_si(signal, mapping.unit[signal])(values)
-    check_range(signal, values, _place(table, signal, column))
+    place = _place(table, signal, column)
+    outside = stray(signal, values, place)
+    bad.leave_out(outside)
+    values[list(outside)] = np.nan
+    known = np.flatnonzero(~np.isnan(values))
+    check_range(signal, values[known], _place(table, signal, column, known))
     return values
+
+
+def _leave_out_disordered(table: Table, signals: dict[str, FloatArray], clock: str, bad: BadRows) -> None:
+    """Leaves out the rows whose stamps do not rise or are on no clock; InputError where they are many."""
+    rows = np.flatnonzero(bad.kept)
+    time = signals["time"]
+    drive = signals.get("segment", np.zeros(len(time)))
+    for faults_of in (off_clock, disordered):
+        rows = rows[bad.kept[rows]]
+        faults = faults_of(time[rows], drive[rows], _place(table, "time", clock, rows))
+        if len(faults) > MOST_BAD * len(time):
+            check_time(time[rows], np.diff(drive[rows]) == 0, _place(table, "time", clock, rows))
+        bad.leave_out({int(rows[row]): words for row, words in faults.items()})
 
 
 def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tuple[FloatArray, FloatArray]:

@@ -10,8 +10,10 @@ from itertools import islice
 from pathlib import Path
 
 from avtorch.errors import InputError, listed, printable
+from avtorch.io.opening import place
 from avtorch.io.raw_leader import RawLeader, checked_leader
-from avtorch.io.tables import Table, read_bytes, text_of
+from avtorch.io.tables import Table, read_bytes
+from avtorch.io.text.encoding import decoded
 
 
 def numbered(stem: str, names: Iterable[str]) -> list[int]:
@@ -65,7 +67,7 @@ def zalazone(table: Table, vehicle: int | None = None, order: tuple[str, ...] = 
 
 def vehicle_order(path: Path) -> tuple[str, ...]:
     """The makes that the header lines of a ZalaZONE file list, first the leader; empty where they list none."""
-    for line in islice(io.StringIO(text_of(path, read_bytes(path)), newline=""), 10):
+    for line in islice(io.StringIO(decoded(place(path), read_bytes(path))[0], newline=""), 10):
         try:
             row = next(csv.reader([line]), [])
         except csv.Error:  # no line of makes

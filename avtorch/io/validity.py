@@ -8,7 +8,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
+from avtorch.io.bad_rows import MOST_BAD, beyond
 from avtorch.io.consistency import LATER_S, Scale, may_be_late, scale_between
 from avtorch.io.units import GRAVITY
 
@@ -65,6 +67,21 @@ def check_range(signal: str, values: NDArray, where: Callable[[int], str]) -> No
             _at_first(bad, values, where, f"{span} is needed ({why}{hint})")
 
 
+def stray(signal: str, values: FloatArray, where: Callable[[int], str]) -> dict[int, str]:
+    """What is wrong with values (row,) out of a signal's range, where they are exceptions (`bad_rows.beyond`)."""
+    if signal == "engaged":
+        bad, need = ~np.isin(values, (0.0, 1.0)) & ~np.isnan(values), "0 (driver) or 1 (engaged) is needed"
+    elif signal in _LIMITS and signal in _PLAUSIBLE:
+        low, high, unit, why = _LIMITS[signal]
+        span = f"{low:g} to {high:g} {unit}".strip()
+        bad, need = beyond(values, low, high, _PLAUSIBLE[signal]), f"{span} is needed ({why})"
+    else:
+        return {}
+    if bad.sum() > MOST_BAD * len(values):
+        return {}
+    return {row: f"{where(row)}: is {values[row]:.10g}; {need}" for row in np.flatnonzero(bad).tolist()}
+
+
 def _at_first(bad: NDArray, values: NDArray, where: Callable[[int], str], need: str) -> None:
     if bad.any():
         row = int(np.argmax(bad))
@@ -77,18 +94,23 @@ _BEYOND_CLOCKS = 1e24  # nanoseconds since 1970 taken as seconds are 2e18, which
 def check_time(time: NDArray, same_drive: NDArray, where: Callable[[int], str]) -> None:
     """Raise InputError where time repeats or goes back inside a drive, or where a stamp is beyond any clock's count;
     ``same_drive`` ``(time - 1,)`` is false where a new value of ``segment`` lets it start anew."""
-    beyond = np.abs(time) > _BEYOND_CLOCKS
-    if beyond.any():
-        row = int(np.argmax(beyond))
-        raise InputError(
-            f"{where(row)}: found {time[row]:.4g} s, a stamp so far from zero that float64 cannot resolve the rows; "
-            "needs stamps within 1e9 s of the first"
-        )
+    for words in off_clock(time, time, where).values():
+        raise InputError(words)
     bad = (np.diff(time) <= 0) & same_drive
     if bad.any():
         row = int(np.argmax(bad)) + 1
         what = "repeats" if time[row] == time[row - 1] else f"goes back from {time[row - 1]:.16g} s to"
         raise InputError(f"{where(row)}: {what} {time[row]:.16g} s; time must rise from row to row")
+
+
+def off_clock(time: FloatArray, drive: FloatArray, where: Callable[[int], str]) -> dict[int, str]:
+    """What is wrong with stamps of `time` (row,) [s] beyond any clock's count, of whichever `drive`."""
+    del drive
+    return {
+        row: f"{where(row)}: found {time[row]:.4g} s, a stamp so far from zero that float64 cannot resolve the rows; "
+        "needs stamps within 1e9 s of the first"
+        for row in np.flatnonzero(np.abs(time) > _BEYOND_CLOCKS).tolist()
+    }
 
 
 def check_rate(step: float, where: str) -> None:

@@ -1,7 +1,8 @@
-"""Broken logs: each is refused in one line that states the place and the fault."""
+"""Broken logs: each is refused, or its bad rows left out, in one line that states the place and the fault."""
 
 from __future__ import annotations
 
+import gzip
 import re
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from avtorch.errors import InputError
-from avtorch.io import Log
+from avtorch.io import Log, check
 
 from .drives import drive, with_cell, write
 
@@ -43,6 +44,7 @@ CELLS = {
     "time_back": ("time", 100, 0.5, "goes back from 1.96 s to 0.5 s"),
     "time_repeats": ("time", 100, 1.96, "repeats 1.96 s"),
     "time_is_a_clock": ("time", 4, "12:00:01", "is no number"),
+    "time_ahead": ("time", 100, 1e9, "jumps ahead to 1000000000 s"),
     "spike_accel": ("accel", 77, 60.0, "is 60; -50 to 50 m/s2 is needed"),
     "spike_speed": ("speed", 77, 151.0, "is 151; -2 to 150 m/s"),
     "reverse": ("speed", 77, -15.0, "is -15"),
@@ -52,25 +54,54 @@ CELLS = {
 
 
 @pytest.mark.parametrize("case", CELLS)
-def test_a_bad_cell_is_named_by_row_line_and_column(tmp_path, case):
+def test_a_bad_cell_costs_its_row_and_is_named_by_row_line_and_column(tmp_path, case):
     column, row, cell, what = CELLS[case]
     path = write(tmp_path / "lap.csv", with_cell(SPACED, column, row, cell))
-    refused(path, f"row {row} (line {row + 1}), column '{column}'", what)
+    log = Log.read(path)
+    assert log.rows == 1499
+    assert np.array_equal(log.time, np.delete(GOOD["time"], row - 1))
+    assert np.array_equal(log.speed, np.delete(GOOD["speed"], row - 1))
+    assert len(log.remarks) == 1
+    assert f"row {row} (line {row + 1}), column '{column}': " in log.remarks[0]
+    assert what in log.remarks[0]
+    assert log.remarks[0].endswith("; the row is left out")
+
+
+@pytest.mark.parametrize("case", CELLS)
+def test_more_than_a_twentieth_of_bad_cells_is_refused_at_the_first(tmp_path, case):
+    column, row, cell, what = CELLS[case]
+    columns = SPACED
+    for at in range(row, row + 76) if row + 76 <= 1500 else range(row - 75, row + 1):
+        columns = with_cell(columns, column, at, cell)
+    path = write(tmp_path / "lap.csv", columns)
+    what = {"time_ahead": "repeats 1000000000 s", "time_back": "from 1.96 s to 0.5 s"}.get(case, what)
+    refused(path, f"column '{column}'", what)
+
+
+def test_several_bad_cells_are_counted(tmp_path):
+    columns = SPACED
+    for row in (5, 9, 40, 41, 300):
+        columns = with_cell(columns, "speed", row, "n/a")
+    log = Log.read(write(tmp_path / "lap.csv", with_cell(columns, "accel", 9, "n/a")))
+    assert log.rows == 1495
+    assert ["row 5 (line 6)" in log.remarks[0], "row 9" in log.remarks[1], "row 40" in log.remarks[2]] == [True] * 3
+    assert log.remarks[3:] == ("2 more rows are left out for a cell that is no valid value",)
+    assert any("n/a" in note for note in check(log).notes)
 
 
 @pytest.mark.parametrize(
-    ("signal", "values", "what"),
+    ("signal", "value", "what"),
     [
-        ("engaged", [2.0], "0 (driver) or 1 (engaged)"),
-        ("engaged", ["yes"], "'yes' is no number"),
-        ("segment", [0.5], "a whole number"),
-        ("grade", [3.0], "--unit grade=%"),
-        ("jerk", [1e5], "m/s3"),
-        ("lead_accel", [-99.0], "-50 to 50 m/s2"),
+        ("engaged", 2.0, "0 (driver) or 1 (engaged)"),
+        ("engaged", "yes", "'yes' is no number"),
+        ("segment", 0.5, "a whole number"),
+        ("grade", 3.0, "--unit grade=%"),
+        ("jerk", 1e5, "m/s3"),
+        ("lead_accel", -99.0, "-50 to 50 m/s2"),
     ],
 )
-def test_a_bad_optional_signal(tmp_path, signal, values, what):
-    columns = with_cell(GOOD | {signal: np.zeros(1500)}, signal, 8, values[0])
+def test_a_bad_optional_signal(tmp_path, signal, value, what):
+    columns = GOOD | {signal: [0.0] * 7 + [value] * 1493}
     refused(write(tmp_path / "lap.csv", columns), f"row 8 (line 9), column '{signal}'", what)
 
 
@@ -114,20 +145,14 @@ FILES = {
     "header_only": (b"time,accel_cmd,speed\n", "a header but no rows"),
     "one_row": (b"time,accel_cmd,speed\n0,1,2\n", "has one row"),
     "no_header": (b"0,1,2\n0.1,1,2\n0.2,1,2\n", "line 1: holds numbers"),
-    "semicolons": (b"time;accel_cmd;speed\n0;1;2\n0.1;1;2\n", "separated by semicolons"),
-    "tabs": (b"time\taccel_cmd\tspeed\n0\t1\t2\n", "separated by tabs"),
-    "spaces": (b"time accel_cmd speed\n0 1 2\n", "separated by spaces"),
-    "bars": (b"time|accel_cmd|speed\n0|1|2\n", "separated by bars"),
-    "decimal_comma": (b'time,accel_cmd,speed\n0,"1,5",2\n0.1,1,2\n', "a number with a decimal point"),
     "short_row": (b"time,accel_cmd,speed\n0,1,2\n0.1,1\n", "row 2 (line 3): has 2 cells where the header has 3"),
     "long_row": (b"time,accel_cmd,speed\n0,1,2,3\n0.1,1,2\n", "row 1 (line 2): has 4 cells"),
-    "hole": (b"time,accel_cmd,speed\n0,1,2\n\n0.1,1,2\n", "row 2 (line 3): is empty"),
     "torn_quote": (b'time,accel_cmd,speed\n0,"1,2\n0.1,1,2\n', "cannot be split into cells"),
-    "binary": (bytes(range(256)) * 8, "is not UTF-8 text"),
+    "binary": (bytes(range(1, 256)) * 8, "is not UTF-8 text"),
     "zero_bytes": (b"time,accel_cmd,speed\n0,1,\0\n", "line 2: holds a zero byte"),
-    "gzip": (b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x00\x03abc", "is not UTF-8 text"),
-    "utf16": ("time,speed\n0,1\n".encode("utf-16"), "is UTF-16"),
-    "latin1": ("time,accel_cmd,speed,größe\n0,1,2,3\n".encode("latin-1"), "line 1, byte 24: is not UTF-8"),
+    "damaged_gzip": (b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x00\x03abc", "gzip data"),
+    "torn_gzip": (gzip.compress(b"time,accel_cmd,speed\n0,1,2\n0.1,1,2\n")[:-12], "ends inside its gzip data"),
+    "odd_utf16": ("time,speed\n0,1\n".encode("utf-16")[:-1], "is not UTF-16 text"),
     "torn_parquet": (b"PAR1" + b"\x00" * 100, "damaged Parquet"),
 }
 
@@ -152,15 +177,18 @@ def test_a_bad_parquet_cell_is_named_by_row(tmp_path):
     columns = {name: list(values) for name, values in GOOD.items()}
     columns["accel"][11] = None
     pq.write_table(pa.table(columns), path)
-    said = refused(path, "row 12, column 'accel': is empty")
-    assert "line" not in said
+    (said,) = Log.read(path).remarks
+    assert said == f"{path}: row 12, column 'accel': is empty; a number is needed; the row is left out"
     columns["accel"] = [str(x) for x in GOOD["accel"][:-1]] + ["fast"]
     pq.write_table(pa.table(columns), path)
-    refused(path, "row 1500, column 'accel': 'fast'")
+    assert "row 1500, column 'accel': 'fast'" in Log.read(path).remarks[0]
     columns["accel"] = GOOD["accel"].copy()
     columns["accel"][5] = np.nan
     pq.write_table(pa.table(columns), path)
-    refused(path, "row 6, column 'accel': is NaN")
+    assert "row 6, column 'accel': is NaN" in Log.read(path).remarks[0]
+    columns["accel"] = [None] * 1500
+    pq.write_table(pa.table(columns), path)
+    refused(path, "row 1, column 'accel': is empty")
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -95,8 +96,8 @@ def test_a_faulty_row_is_named_by_all_digits_of_its_stamp(unix_drive: Path) -> N
     log = Log.read(unix_drive)
     time = log.time.copy()
     time[5] = time[4]
-    with pytest.raises(InputError, match=r"row 6, column 'time': repeats 1700000000\.163 s"):
-        Log.from_arrays(time=time, accel_cmd=log.accel_cmd, accel=log.accel)
+    (said,) = Log.from_arrays(time=time, accel_cmd=log.accel_cmd, accel=log.accel).remarks
+    assert "row 6, column 'time': repeats 1700000000.163 s" in said
 
 
 def test_estimates_are_listed_from_the_start_and_kept_on_the_clock(
@@ -114,7 +115,7 @@ def test_estimates_are_listed_from_the_start_and_kept_on_the_clock(
     assert answer["windows"][1]["end_s"] == pytest.approx(UNIX_S + 4.0, abs=1e-6)
 
 
-@pytest.mark.parametrize("first", [-(2.0**49), -1e300])
+@pytest.mark.parametrize("first", [-(2.0**49)])
 def test_a_first_stamp_too_large_to_resolve_rows_is_refused(first: float) -> None:
     """Found by the fuzzer: all steps after it are less than what float64 resolves there."""
     time = np.arange(200) / 20.0
@@ -124,13 +125,14 @@ def test_a_first_stamp_too_large_to_resolve_rows_is_refused(first: float) -> Non
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(("row", "stamp"), [(199, 1e308), (0, -1e308), (100, 1e25)])
-def test_a_stamp_beyond_any_clock_is_refused_at_its_row(row: int, stamp: float) -> None:
+@pytest.mark.parametrize(("row", "stamp"), [(199, 1e308), (0, -1e308), (0, -1e300), (100, 1e25)])
+def test_a_stamp_beyond_any_clock_costs_its_row(row: int, stamp: float) -> None:
     """The first was found by the fuzzer as an overflow."""
     time = np.arange(200) / 20.0
     time[row] = stamp
-    with pytest.raises(InputError, match=rf"row {row + 1}, column 'time': found .* needs stamps within"):
-        Log.from_arrays(time=time, accel_cmd=np.sin(time), accel=np.sin(time - 0.2))
+    log = Log.from_arrays(time=time, accel_cmd=np.sin(time), accel=np.sin(time - 0.2))
+    assert log.rows == 199
+    assert re.search(rf"row {row + 1}, column 'time': found .* needs stamps within", log.remarks[0])
 
 
 @pytest.mark.filterwarnings("error")

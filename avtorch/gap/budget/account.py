@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 
 from avtorch.errors import InputError
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.forward_selection import MOST_PARTS, Selection, baseline_noise, select
+from avtorch.gap.budget.forward_selection import MOST_PARTS, baseline_noise, select
 from avtorch.gap.budget.gap_budget import budget_of, by_chance
 from avtorch.gap.budget.given_effects import given_effects
 from avtorch.gap.budget.parts import LIKELY, MATERIAL, Budget, ChancePart, Part
+from avtorch.gap.budget.selection_step import Selection
 from avtorch.gap.budget.share_order import largest_first
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.search.fitted_model import FittedModel

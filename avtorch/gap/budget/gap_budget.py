@@ -18,10 +18,11 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.flexible_regression import left_over
-from avtorch.gap.budget.forward_selection import Selection, Step, select
+from avtorch.gap.budget.forward_selection import select
 from avtorch.gap.budget.parts import MATERIAL, Budget, ChancePart, ChannelError, Part, Unexplained
 from avtorch.gap.budget.repaired_model import lag_and_gain, parameters_of
 from avtorch.gap.budget.rollout_energy import horizon
+from avtorch.gap.budget.selection_step import Selection, Step
 from avtorch.gap.budget.share_order import energies, gap_is_there, largest_first, taken_off
 from avtorch.gap.budget.slow_disturbance import slow_disturbance
 from avtorch.gap.quantity import Quantity

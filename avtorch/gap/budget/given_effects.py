@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from avtorch.gap.budget.effect_model import EffectModel
-from avtorch.gap.budget.forward_selection import Selection, Step, one_by_one
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
+from avtorch.gap.budget.selection_step import Selection, Step, one_by_one
 from avtorch.gap.simulator.effect import Effect
 
 

@@ -14,7 +14,7 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 from torch import Tensor
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.budget.forward_selection import Selection
+from avtorch.gap.budget.selection_step import Selection
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.integrated import Integrated

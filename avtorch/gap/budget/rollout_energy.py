@@ -10,8 +10,8 @@ import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.forward_selection import Selection, Step
 from avtorch.gap.budget.parts import HORIZON_S
+from avtorch.gap.budget.selection_step import Selection, Step
 
 _BEGIN_S = 0.5  # over which the measured start of a rollout is averaged
 

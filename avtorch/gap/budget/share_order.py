@@ -16,7 +16,6 @@ from scipy.optimize import isotonic_regression
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.budget.flexible_regression import predicted_residuals
-from avtorch.gap.budget.forward_selection import Selection, Step, without_effects
 from avtorch.gap.budget.parts import MATERIAL
 from avtorch.gap.budget.rollout_energy import (
     calm_blocks,
@@ -25,6 +24,7 @@ from avtorch.gap.budget.rollout_energy import (
     relative_energy,
     rollout_squares,
 )
+from avtorch.gap.budget.selection_step import Selection, Step, without_effects
 
 _OF_THE_RESPONSE = 3.0  # times as large a share of the response, which counts beside the gap
 _LEAST_GAP = 0.1  # of the floor's energy, that there is a gap

@@ -1,0 +1,99 @@
+"""The effect that enters a model next, with the effects that explain the same.
+
+Score tests choose which effects are fitted; those fitted best are held out. Of the effects that explain the same, as
+far as the blocks can tell, the simplest is added, and the others are its aliases; so is one that explains most of the
+same with far fewer parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from avtorch.gap.budget.robust_fit import Fit, RobustFit
+from avtorch.gap.budget.score_test import Candidate, ScoreTest
+from avtorch.gap.budget.selection_step import Step, complexity, cost
+from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.integrated import Integrated
+
+_LEAST_NATS = 3.0  # in the blocks that fitted it, below which no effect is held out
+_FAR_FEWER, _MOST_OF_IT = 3, 0.4  # parameters, and share of the gain, with which a simpler effect takes precedence
+_OF_ITS_OWN = 0.5  # share of an effect's gain, on top of another, from which it is no alias of that
+_FITTED = 9  # effects that are fitted, those of which a score test promises most
+_SCREENING = 3  # iterations of these fits
+_SCREENED = 5  # effects that are held out, of those fitted
+_ONSET_NATS = 6.0  # that an onset must gain
+
+
+def candidates_for(
+    fitting: RobustFit,
+    now: Step,
+    kinds: Sequence[type[Effect]],
+    progress: Callable[[str, int, int], None] | None,
+    role: str,
+) -> tuple[ScoreTest, list[Candidate]]:
+    """A score test at `now`, and those of `kinds` that it lacks, the most promising first."""
+    test, names = ScoreTest.at(fitting, now.fit), now.fit.model.names
+    candidates = []
+    for kind in kinds:
+        if kind.name in names:
+            continue
+        if progress is not None:
+            progress(f"budget, {role}: {kind.name}", len(candidates), len(kinds) - len(names))
+        candidates.append(test.candidate(kind))
+    return test, sorted(candidates, key=lambda candidate: -candidate.promise)
+
+
+def enter(fitting: RobustFit, now: Step, test: ScoreTest, candidates: Sequence[Candidate]) -> Step | None:
+    """The best of `candidates` in, if the blocks that were held out agree on one."""
+    fits = [_fitted(fitting, test, c) for c in candidates[:_FITTED]]
+    fits = [fit for fit in fits if now.fit.nats - fit.nats > _LEAST_NATS]
+    fits.sort(key=lambda fit: fit.nats + complexity(fit))
+    tried = []
+    for rough in fits[:_SCREENED]:
+        fit = fitting.fit(rough.model, rough.z[None])
+        name = fit.model.names[-1]
+        if fit.model.at_limit(fit.z, name):
+            continue
+        held = fitting.hold_out(fit)
+        tried.append(Step(fit, held, name, fitting.evidence(now.held, held).strength()))
+    tried = [step for step in tried if step.strength > 0]
+    if not tried:
+        return None
+    best = min(tried, key=cost)
+    same = [s for s in tried if s is best or _explains_the_same(fitting, now, best, s)]
+    alike = [s for s in same if s is best or fitting.preference(s.held, best.held).strength() <= 0]
+    chosen = min([s for s in same if s in alike or _much_simpler(now, best, s)], key=lambda s: complexity(s.fit))
+    aliases = {s.entered for s in alike} | {chosen.entered}
+    return replace(chosen, aliases=tuple(sorted(name for name in aliases if name is not None)))
+
+
+def _explains_the_same(fitting: RobustFit, now: Step, best: Step, other: Step) -> bool:
+    """Whether little is left of what the other explains once the best is in."""
+    return fitting.on_top(now.held, best.held, other.held) < _OF_ITS_OWN * (cost(now) - cost(other))
+
+
+def _much_simpler(now: Step, best: Step, other: Step) -> bool:
+    """Whether the other explains most of the same with far fewer parameters.
+
+    A free course of the road follows a constant force too, and whatever else comes back at the same place; what a
+    simpler effect leaves of that, the flexible one may explain afterwards.
+    """
+    fewer = complexity(best.fit) - complexity(other.fit)
+    return fewer >= _FAR_FEWER and cost(now) - cost(other) > _MOST_OF_IT * (cost(now) - cost(best))
+
+
+def _fitted(fitting: RobustFit, test: ScoreTest, candidate: Candidate) -> Fit:
+    """The candidate fitted, from the start on or from the onset that promises most."""
+    fit = fitting.fit(candidate.model, candidate.starts, iterations=_SCREENING)
+    kind, logs = candidate.model.effects[-1], set(candidate.model.record.log)
+    if kind.own_onset is not None or issubclass(kind, Integrated) or len(logs) > 1:
+        return fit
+    late = test.late(candidate)
+    if late is None or late.promise < candidate.promise + _ONSET_NATS:
+        return fit
+    starts = np.concatenate([late.starts, late.model.coordinates(fit.known)[None]])
+    later = fitting.fit(late.model, starts, iterations=_SCREENING)
+    return later if later.nats + _ONSET_NATS < fit.nats else fit

@@ -1,0 +1,50 @@
+"""Effects of a model that others replace, where the blocks that were held out prefer these.
+
+What entered first had to explain what all the missing effects do together. Once the others are in, another effect may
+explain its part better: each is taken out in turn, and what would enter in its place is compared with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from avtorch.gap.budget.entry import candidates_for, enter
+from avtorch.gap.budget.robust_fit import RobustFit
+from avtorch.gap.budget.selection_step import Step, without_effects
+from avtorch.gap.simulator.effect import Effect
+
+_RIVAL = 0.5
+"""Share of what an effect explains that a score test must promise of another, for it to be fitted in its place."""
+
+
+def exchanged(
+    fitting: RobustFit,
+    now: Step,
+    kinds: Sequence[type[Effect]],
+    progress: Callable[[str, int, int], None] | None = None,
+) -> tuple[Step, dict[str, Step]]:
+    """`now` after all exchanges, and the steps by which new effects entered, by their names.
+
+    `kinds`: effects that may take another's place. Those of `now` are tried from the weakest on, each once.
+    """
+    entered: dict[str, Step] = {}
+    for name in _weakest_first(fitting, now):
+        rest = without_effects(fitting, now.fit, [name])
+        before = Step(rest, fitting.hold_out(rest))
+        others = [kind for kind in kinds if kind.name != name]
+        test, candidates = candidates_for(fitting, before, others, progress, f"in place of {name}")
+        rivals = [c for c in candidates if c.promise > _RIVAL * (before.fit.nats - now.fit.nats)]
+        step = enter(fitting, before, test, rivals)
+        if step is None or fitting.preference(now.held, step.held).strength() <= 0:
+            continue
+        now, entered[step.fit.model.names[-1]] = step, step
+    return now, entered
+
+
+def _weakest_first(fitting: RobustFit, now: Step) -> list[str]:
+    names = now.fit.model.names
+    strengths = {}
+    for name in names:
+        held = fitting.hold_out(without_effects(fitting, now.fit, [name]))
+        strengths[name] = fitting.evidence(held, now.held).strength()
+    return sorted(names, key=strengths.__getitem__)

@@ -1,0 +1,65 @@
+"""Models that a selection of effects goes through, and the models between them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+from avtorch.gap.budget.robust_fit import Fit, HeldOut, RobustFit
+
+_REFITTING = 5  # iterations after a model has lost an effect
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A model, the effect that `entered` last, its `strength` (`Evidence.strength`) and its `aliases` by name."""
+
+    fit: Fit
+    held: HeldOut
+    entered: str | None = None
+    strength: float = 0.0
+    aliases: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """`steps` from the bare baseline on; each has one effect more than the one before it."""
+
+    fitting: RobustFit
+    steps: tuple[Step, ...]
+
+    @property
+    def last(self) -> Step:
+        return self.steps[-1]
+
+
+def one_by_one(
+    fitting: RobustFit, last: Step, strengths: Mapping[str, float], aliases: Mapping[str, tuple[str, ...]]
+) -> tuple[Step, ...]:
+    """Steps up to `last` whose models grow by one effect each."""
+    steps, names = [], last.fit.model.names
+    for count, name in enumerate(names, start=1):
+        fit = without_effects(fitting, last.fit, names[count:])
+        held = last.held if fit is last.fit else fitting.hold_out(fit)
+        steps.append(Step(fit, held, name, strengths.get(name, 0.0), aliases.get(name, (name,))))
+    return tuple(steps)
+
+
+def without_effects(fitting: RobustFit, fit: Fit, names: Collection[str]) -> Fit:
+    """The model without some of its effects, fitted anew."""
+    if not names:
+        return fit
+    model = fit.model
+    for name in names:
+        model = model.without(name)
+    return fitting.fit(model, model.coordinates(fit.known)[None], iterations=_REFITTING)
+
+
+def cost(step: Step) -> float:
+    """Nats of the blocks that were held out."""
+    return float(step.held.nats.sum())
+
+
+def complexity(fit: Fit) -> int:
+    """Parameters, those of a force along the road among them."""
+    return fit.model.size + len(fit.model.onsets)
