@@ -1,7 +1,8 @@
 """Effects of a model that others replace, where the blocks that were held out prefer these.
 
 What entered first had to explain what all the missing effects do together. Once the others are in, another effect may
-explain its part better: each is taken out in turn, and what would enter in its place is compared with it.
+explain its part better: each is taken out in turn, and what would enter in its place is compared with it. A score test
+cannot say beforehand where that pays: of two exchanges that were right, neither was promised half of what it gained.
 """
 
 from __future__ import annotations
@@ -12,9 +13,6 @@ from avtorch.gap.budget.entry import candidates_for, enter
 from avtorch.gap.budget.robust_fit import RobustFit
 from avtorch.gap.budget.selection_step import Step, without_effects
 from avtorch.gap.simulator.effect import Effect
-
-_RIVAL = 0.5
-"""Share of what an effect explains that a score test must promise of another, for it to be fitted in its place."""
 
 
 def exchanged(
@@ -33,8 +31,7 @@ def exchanged(
         before = Step(rest, fitting.hold_out(rest))
         others = [kind for kind in kinds if kind.name != name]
         test, candidates = candidates_for(fitting, before, others, progress, f"in place of {name}")
-        rivals = [c for c in candidates if c.promise > _RIVAL * (before.fit.nats - now.fit.nats)]
-        step = enter(fitting, before, test, rivals)
+        step = enter(fitting, before, test, candidates)
         if step is None or fitting.preference(now.held, step.held).strength() <= 0:
             continue
         now, entered[step.fit.model.names[-1]] = step, step

@@ -1,10 +1,11 @@
-"""Which effects, and how many: forward, with removal, by the blocks that were held out.
+"""Which effects, and how many: forward, with exchange and removal, by the blocks that were held out.
 
 An effect enters if the blocks that were held out agree on it as surely as one effect by itself would have to
 (`held_out_evidence`): while several are missing, each hides the others, and none would pass a stricter test. Of the
 effects that explain the same, as far as the blocks can tell, the simplest is added, and the others are its aliases; so
 is one that explains most of the same with far fewer parameters. Once one has entered, each of those before it has to
-hold its place without it; at the end each has to pass as the best of all that were tried.
+hold its place without it. Then each may be exchanged for another (`exchange`); at the end each has to pass as the best
+of all that were tried.
 """
 
 from __future__ import annotations
@@ -24,7 +25,6 @@ from avtorch.gap.budget.selection_step import Selection, Step, one_by_one, witho
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant
 
-EXCHANGE = True
 MOST_PARTS = 5
 """Effects that a selection may hold."""
 _ROUNDS = 8  # of entering, as effects may leave again
@@ -58,7 +58,7 @@ def select(
             break
         entered[step.fit.model.names[-1]] = step
         now, _ = _without_the_redundant(fitting, step, tried=1, spared=step.entered)
-    if len(now.fit.model.names) > 1 and EXCHANGE:
+    if len(now.fit.model.names) > 1:
         now, others = exchanged(fitting, now, kinds, progress)
         entered |= others
     now, strengths = _without_the_redundant(fitting, now, tried=len(kinds))

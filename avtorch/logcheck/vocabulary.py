@@ -1,0 +1,104 @@
+"""Which signal a column may be, by the words of its name."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from avtorch.logcheck.header import Header
+
+_ACCEL = {"accel", "acceleration", "beschl", "beschleunigung", "acc", "ax", "along", "alon", "a", "accx"}
+_SPEED = {"speed", "veloc", "velocity", "geschw", "geschwindigkeit", "vitesse", "v", "vx", "spd", "vel", "vlon"}
+_COMMAND = {
+    "command", "commanded", "request", "requested", "demand", "demanded", "desired", "setpoint", "soll", "reference",
+    "cmd", "req", "des", "dmd", "tgt", "ref", "sp", "set", "target", "control", "ctrl", "u", "wanted",
+}  # fmt: skip
+_LEAD = {"lead", "leader", "front", "preceding", "ahead", "vorder", "object", "obj", "radar", "other", "pov"}
+_OTHER = {
+    "lat", "lateral", "vert", "vertical", "pedal", "angular", "gyro", "yaw", "roll", "pitch", "y", "z", "ay", "az",
+    "quer", "position", "jerk", "limit", "max", "min", "std", "var", "error", "err", "status", "valid", "steer",
+    "steering", "curvature", "count", "id", "distance", "rate", "vy", "vz", "covariance", "heading",
+}  # fmt: skip
+_TURNING = {"wheel", "engine", "motor", "wind", "fan", "rpm", "shaft", "rad", "fl", "fr", "rl", "rr", "gps"}
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """Words of which a name holds one (each group), words it must not hold, and words that make it less likely."""
+
+    groups: tuple[Collection[str], ...]
+    not_: Collection[str]
+    less: Collection[str] = ()
+
+
+_SIGNALS: dict[str, _Wanted] = {
+    "time": _Wanted(
+        (
+            {
+                "time",
+                "timestamp",
+                "t",
+                "stamp",
+                "zeit",
+                "zeitstempel",
+                "secs",
+                "seconds",
+                "elapsed",
+                "clock",
+                "datetime",
+            },
+        ),
+        {"gap", "headway", "collision", "ttc", "lag", "delay", "constant", "gps", "nsec", "nsecs", "nanosec"},
+        {"sent", "receive", "header"},
+    ),
+    "accel_cmd": _Wanted((_ACCEL | {"u"}, _COMMAND), _OTHER | _LEAD | {"speed", "measured", "actual"}, {"raw"}),
+    "accel": _Wanted((_ACCEL,), _OTHER | _COMMAND | _LEAD | {"speed"}, {"raw", "filtered", "model"}),
+    "speed": _Wanted((_SPEED,), _OTHER | _COMMAND | _LEAD, _TURNING | {"raw", "relative", "rel"}),
+    "engaged": _Wanted(
+        ({"engaged", "enabled", "enable", "active", "autonomous", "automatic", "auto", "autopilot", "acc", "cruise"},),
+        {"speed", "cmd", "accel", "set", "time", "x", "request"},
+    ),
+    "spacing": _Wanted(
+        ({"gap", "spacing", "headway", "clearance", "distance", "abstand", "range", "drel", "ivs"},),
+        {"time", "travelled", "total", "set", "desired", "mileage", "lateral", "target"},
+    ),
+    "lead_speed": _Wanted((_SPEED, _LEAD), {"relative", "rel", "angular", "yaw", "cmd"}),
+    "lead_accel": _Wanted((_ACCEL, _LEAD), {"relative", "rel", "angular", "yaw", "cmd"}),
+    "grade": _Wanted(({"grade", "slope", "gradient", "incline", "steigung"},), {"time", "speed"}),
+    "segment": _Wanted(({"segment", "run", "lap", "drive", "trip"},), {"time", "distance", "speed", "length"}),
+}
+_STEM = 4  # letters from which a word may begin with a wanted one, such as `acceleration` with `accel`
+
+
+def likeness(header: Header, signal: str) -> float:
+    """How well a name fits a signal: 0 not at all, 1 with nothing besides."""
+    if header.name == signal:
+        return 2.0
+    wanted = _SIGNALS[signal]
+    words = (*header.words, header.joined) if len(header.words) == 2 else header.words
+    if not words or any(_holds(words, group) is None for group in wanted.groups):
+        return 0.0
+    if any(word in wanted.not_ or _begins(word, wanted.not_) for word in header.words):
+        return 0.0
+    spare = max(len(header.words) - len(wanted.groups), 0) + 2.0 * sum(word in wanted.less for word in words)
+    return 1.0 / (1.0 + 0.15 * spare)
+
+
+def signals_named() -> tuple[str, ...]:
+    """Signals that a name may be recognised as."""
+    return tuple(_SIGNALS)
+
+
+def _begins(word: str, group: Collection[str]) -> bool:
+    return any(len(stem) >= _STEM and word.startswith(stem) for stem in group)
+
+
+def _holds(words: Collection[str], group: Collection[str]) -> str | None:
+    """The word that is one of the group, or begins or ends with one that is long enough."""
+    for word in words:
+        if word in group:
+            return word
+        for stem in group:
+            if len(stem) >= _STEM and (word.startswith(stem) or word.endswith(stem)):
+                return word
+    return None
