@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from avtorch.gap.result.diagnosis import Diagnosis
     from avtorch.inference import SGLD, BeliefStream, SequentialInference
     from avtorch.io import Log
+    from avtorch.logcheck.check import LogCheck, check
     from avtorch.validation import Validation, validate
     from avtorch.vehicle import (
         GLVD,
@@ -52,6 +53,7 @@ _HOME = {
     "avtorch.gap.result.diagnosis": ("Diagnosis",),
     "avtorch.inference": ("SGLD", "BeliefStream", "SequentialInference"),
     "avtorch.io": ("Log",),
+    "avtorch.logcheck.check": ("LogCheck", "check"),
     "avtorch.validation": ("Validation", "validate"),
     "avtorch.vehicle": (
         "GLVD",
@@ -81,6 +83,7 @@ __all__ = [
     "Leader",
     "LinearController",
     "Log",
+    "LogCheck",
     "LowerLevel",
     "Monitor",
     "SequentialInference",
@@ -89,6 +92,7 @@ __all__ = [
     "Supervisor",
     "Validation",
     "algorithm2",
+    "check",
     "compare",
     "decision",
     "diagnose",

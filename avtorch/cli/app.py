@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from cyclopts import App, CycloptsError, MissingArgumentError
 
 from avtorch.cli.blindtest import blindtest
+from avtorch.cli.check import check
 from avtorch.cli.compare import compare
 from avtorch.cli.diagnose import diagnose
 from avtorch.cli.estimate import estimate
@@ -30,6 +31,7 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
+app.command(check)
 for _command in (run, estimate, diagnose, compare, stability, validate, blindtest, paper):
     app.command(alone_in_out(_command))
 

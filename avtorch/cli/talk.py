@@ -6,13 +6,16 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from avtorch.cli.terminal import SafeConsole
+
+if TYPE_CHECKING:
+    from avtorch.logcheck.check import LogCheck
 
 
 class Talk:
@@ -57,6 +60,35 @@ class Talk:
         for note in notes:
             self.out.print(f"  {note}", markup=False)
         self.out.print()
+
+    def check(self, found: LogCheck) -> None:
+        """What a log is, how to read it, and what was seen in it."""
+        self.out.print(found.source, style="bold", markup=False)
+        self.out.print(f"  {found.form}", markup=False)
+        self.out.print()
+        proposal = found.proposal
+        if proposal is not None and proposal.signals:
+            table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
+            for name in ("signal", "column", "unit", "why"):
+                table.add_column(name)
+            for signal, one in proposal.signals.items():
+                table.add_row(signal, escape(one.column), escape(one.unit or ""), escape(one.reason))
+            self.out.print(table)
+            self.out.print()
+        for doubt in proposal.doubts if proposal is not None else ():
+            self.out.print(f"In doubt: {doubt}", style="yellow", markup=False)
+        groups = {
+            "Seen": found.quality.notes if found.quality is not None else (),
+            "Recorder": found.recorder,
+            "Excitation": found.excitation,
+        }
+        for title, notes in groups.items():
+            if notes:
+                self.notes(title, notes)
+
+    def answer(self, answer: Mapping[str, Any]) -> None:
+        """The answer as JSON."""
+        print(json.dumps(answer, default=lambda x: x.tolist()))
 
     def sentence(self, text: str) -> None:
         self.out.print(text, markup=False)
@@ -149,7 +181,7 @@ class Talk:
 
     def done(self, out: Path, answer: Mapping[str, Any]) -> None:
         if self.json:
-            print(json.dumps(answer, default=lambda x: x.tolist()))
+            self.answer(answer)
             return
         names = ", ".join(sorted(p.name for p in out.iterdir() if p.suffix in (".json", ".png") and p.is_file()))
         self.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {escape(names)}", soft_wrap=True)

@@ -134,7 +134,7 @@ def _require(table: Table, mapping: SignalMap, following: bool) -> None:
 def _advice(signal: str, names: Iterable[str]) -> str:
     # a column that is a signal already goes by its own name: a measured `accel` is no command
     plain = {name.strip().lower(): name for name in names if name not in SIGNALS and len(name) <= _NAME}
-    close = difflib.get_close_matches(signal, plain, n=1, cutoff=0.6)
+    close = difflib.get_close_matches(signal, plain, n=1, cutoff=0.75)
     name = quoted(plain[close[0]]) if close else "NAME"
     return f"columns: {listed(names)}; `--map {signal}={name}` if it goes by another name"
 

@@ -51,7 +51,7 @@ def read_mapping(
     which lies in the log's folder or below). It is a regular file of up to 1 MB, no link. Raises InputError for another
     kind of file, and for a signal, unit, table or key that is not known.
     """
-    beside = _beside(Path(path))
+    beside = mapping_beside(path)
     stated = SignalMap() if beside is None else _read_toml(beside)
     return SignalMap(
         column=_distinct({**stated.column, **pairs("map", map)}),
@@ -61,13 +61,19 @@ def read_mapping(
     )
 
 
-def _beside(log: Path) -> Path | None:
+def mapping_beside(log: str | os.PathLike[str]) -> Path | None:
     """The mapping file of a log, where there is one; a log that is called x.toml itself has none."""
+    log = Path(log)
     try:
-        beside = log.with_suffix(".toml")
+        beside = mapping_place(log)
         return beside if beside != log and os.path.lexists(beside) else None
     except (OSError, ValueError):  # no file beside the log can have its name
         return None
+
+
+def mapping_place(log: Path) -> Path:
+    """Where the mapping file of a log belongs: `lap.toml` beside `lap.csv` and beside `lap.csv.gz`."""
+    return (log.with_suffix("") if log.suffix.lower() == ".gz" else log).with_suffix(".toml")
 
 
 def pairs(option: str, given: Pairs) -> dict[str, str]:

@@ -38,7 +38,8 @@ class Table:
 
     Messages name rows as ``row 3 (line 4)``: the third row of data, and the line an editor shows. A Parquet file
     and arrays have no lines. ``decimal`` is the mark in cells of text; ``units`` are those of a row of units, by
-    column; ``faults``: rows that are no rows, such as one cut off, with what is wrong; ``remarks``: what was guessed.
+    column; ``faults``: rows that are no rows, such as one cut off, with what is wrong; ``remarks``: what was guessed;
+    ``form``: the file's format in words.
     """
 
     source: str
@@ -50,6 +51,7 @@ class Table:
     units: Mapping[str, str] = field(default_factory=dict)
     faults: Mapping[int, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
+    form: str = "a table"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "source", place(self.source))
@@ -186,7 +188,7 @@ def read_table(path: str | os.PathLike[str], *, header: str | None = None, wante
         from avtorch.io.parquet import read_parquet
 
         names, cells = read_parquet(raw, place(file), wanted)
-        return Table(place(file), names, cells)
+        return Table(place(file), names, cells, form="Parquet")
     if file.suffix.lower() in (".parquet", ".pq"):
         raise InputError(f"{place(file)}: named as Parquet but its content is not; write it anew, or name it .csv")
     text, remarks = decoded(place(file), raw)
@@ -226,7 +228,8 @@ def text_table(source: str, text: str, header: str | None, wanted: Wanted | None
         lines.append(line)
     read = dict(zip(kept, columns, strict=True))
     cells = tuple(read.get(i) for i in range(len(names)))
-    return Table(source, names, cells, lines, decimal=layout.decimal, units=units, faults=faults)
+    form = f"text, {layout.words}"
+    return Table(source, names, cells, lines, decimal=layout.decimal, units=units, faults=faults, form=form)
 
 
 def _line_of(text: str, layout: Layout, first_cell: str) -> int:

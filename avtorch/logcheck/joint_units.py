@@ -19,18 +19,21 @@ from avtorch.io.consistency import LATER_S, Scale, may_be_late, scale_between
 from avtorch.io.units import to_si
 
 # natural logarithms of how much rarer a unit is than SI in logs of cars
-_SPEED = {"m/s": 0.0, "km/h": 0.5, "mph": 1.5, "kn": 4.0, "ft/s": 4.0, "cm/s": 4.0, "mm/s": 5.0}
+_SPEED = {"m/s": 0.0, "km/h": 0.5, "mph": 1.0, "kn": 4.0, "ft/s": 4.0, "cm/s": 4.0, "mm/s": 5.0}
 _ACCEL = {"m/s2": 0.0, "g": 0.7, "km/h/s": 3.0, "mg": 3.0, "cm/s2": 4.0, "ft/s2": 4.5, "mm/s2": 5.0}
-_STATED = 3.0  # nats that a header's unit is worth
+_STATED = 2.5  # nats that a header's unit is worth
 _TURNED = 4.0  # nats that a sensor mounted backwards costs
 _ALIKE = 1.0  # nats that one unit for command and acceleration is worth
 _SAME_MOTION = 0.12  # spread of the logarithm of their scale where two channels measure one motion
+# recordings exist whose acceleration is 1.8 times the slope of their speed: one in ten is taken to have such a channel
+_MISCALIBRATED, _SHARE = 0.3, 0.1
 _RESPONSE, _GAIN = 0.35, 0.95  # the same of a car's answer to its command, and its middle
 _WORST = 40.0
 _SURE = 0.7  # correlation from which a scale says something
 _DELAYS_S = tuple(np.arange(0, 1.01, 0.1).tolist())
-_SPEED_MPS, _ACCEL_MPS2, _ACCEL_SPREAD = 70.0, 0.8, 1.2
-_PLAIN = 2.0
+_SPEED_MPS, _SPEED_SPREAD = 35.0, 8.0  # of the 99th percentile, above which speeds are rare
+_ACCEL_MPS2, _ACCEL_SPREAD = 0.8, 1.2
+_PLAIN = 3.0
 """Nats by which a choice must lead all others of other units for them to be ruled out."""
 
 
@@ -123,12 +126,21 @@ def _by_motion(of: Mapping[str, tuple[str, float, bool]], scales: Mapping[tuple[
     for (level, rate), scale in scales.items():
         signed = scale.slope * factor(level, of[level][0]) / factor(rate, of[rate][0])
         signed *= (-1.0 if of[level][2] else 1.0) * (-1.0 if of[rate][2] else 1.0)
-        middle, spread = (1.0, _SAME_MOTION) if (level, rate) == ("speed", "accel") else (_GAIN, _RESPONSE)
         weight = scale.correlation**2
-        cost += (
-            _WORST * weight if signed <= 0 else weight * min(_WORST, 0.5 * (math.log(signed / middle) / spread) ** 2)
-        )
+        if signed <= 0:
+            cost += _WORST * weight
+        elif (level, rate) == ("speed", "accel"):
+            cost += weight * min(_WORST, _off_motion(math.log(signed)))
+        else:
+            cost += weight * min(_WORST, 0.5 * (math.log(signed / _GAIN) / _RESPONSE) ** 2)
     return cost
+
+
+def _off_motion(off: float) -> float:
+    """What a scale costs that is `off` 1 by its logarithm, of two channels that measure one motion."""
+    good = (1 - _SHARE) * math.exp(-0.5 * (off / _SAME_MOTION) ** 2)
+    bad = _SHARE * _SAME_MOTION / _MISCALIBRATED * math.exp(-0.5 * (off / _MISCALIBRATED) ** 2)
+    return -math.log(max(good + bad, 1e-300))
 
 
 def _by_size(name: str, values: FloatArray, unit: str) -> float:
@@ -138,6 +150,6 @@ def _by_size(name: str, values: FloatArray, unit: str) -> float:
         return 0.0
     if name == "speed":
         top = float(np.quantile(size, 0.99))
-        return 0.0 if top <= _SPEED_MPS else min(_WORST, 0.5 * (math.log(top / _SPEED_MPS) / 0.1) ** 2)
+        return min(_WORST, 0.5 * (max(top - _SPEED_MPS, 0.0) / _SPEED_SPREAD) ** 2)
     rms = float(np.sqrt(np.mean(size**2)))
     return min(_WORST, 0.5 * (math.log(max(rms, 1e-9) / _ACCEL_MPS2) / _ACCEL_SPREAD) ** 2)

@@ -8,7 +8,8 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 
-_WITHIN_S = 1.5
+WITHIN_S = 1.5
+"""Lateness that is looked for."""
 _LEAST = 50  # rows
 
 
@@ -30,7 +31,7 @@ def lateness(time: FloatArray, parts: list[slice], first: FloatArray, second: Fl
     step = float(np.median(np.diff(t)))
     grid = np.arange(t[0], t[-1], step)
     x, y = (np.interp(grid, t, signal[part]) for signal in (first, second))
-    most = min(round(_WITHIN_S / step), len(grid) // 4)
+    most = min(round(WITHIN_S / step), len(grid) // 4)
     if most < 2 or x.std() == 0 or y.std() == 0:
         return None
     lags = np.arange(-most, most + 1)

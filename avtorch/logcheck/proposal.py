@@ -24,7 +24,8 @@ _TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _RATES_HZ = (9.5, 210.0)
 _TRIED = 60  # columns without a telling name that are compared with the others
 _ONE_MOTION, _FOLLOWS = 0.9, 0.8  # correlations from which a column without a name is taken
-_EARLY_S, _PLAINLY = 0.03, 0.01  # a response that comes so long before its command, by so much more correlation
+# a response that comes so long before its command, and so many rows, by so much more correlation
+_EARLY_S, _EARLY_ROWS, _PLAINLY = 0.08, 2.0, 0.01
 
 
 @dataclass(frozen=True)
@@ -153,12 +154,17 @@ def _by_motion(
     clock: FloatArray, parts: list[slice], columns: list[Column], found: dict[str, Column],
     reasons: dict[str, list[str]],
 ) -> None:  # fmt: skip
-    """Signals that no name tells, by how they go with the others."""
+    """Signals that no name tells, by how they go with the others.
+
+    A car's log holds many columns that go with its speed; one more acceleration is taken only with its unit.
+    """
     for signal in ("speed", "accel", "accel_cmd"):
         if signal in found:
             continue
         taken = {column.name for column in found.values()}
         rest = [c for c in columns if c.name not in taken and not c.likeness and np.ptp(_filled(c)) > 0][:_TRIED]
+        if signal == "accel":
+            rest = [c for c in rest if c.header.unit in ("m/s2", "g", "mg", "cm/s2", "ft/s2")]
         best, strength = None, 0.0
         for column in rest:
             how_much = _goes_with(signal, _filled(column), clock, parts, found)
@@ -181,7 +187,7 @@ def _goes_with(
     if signal == "accel_cmd":
         motion = _motion(clock, found)
         late = None if motion is None else lateness(clock, parts, values, motion)
-        return late.correlation if late is not None and late.seconds > _EARLY_S else 0.0
+        return late.correlation if late is not None and late.seconds > 0 else 0.0
     other = "accel" if signal == "speed" else "speed"
     if other not in found:
         return 0.0
@@ -203,7 +209,8 @@ def _swapped(clock: FloatArray, parts: list[slice], found: dict[str, Column], re
     if "accel_cmd" not in found or "accel" not in found:
         return
     late = lateness(clock, parts, _filled(found["accel_cmd"]), _filled(found["accel"]))
-    if late is None or late.correlation < _FOLLOWS or late.seconds > -_EARLY_S or late.lead < _PLAINLY:
+    early = max(_EARLY_S, _EARLY_ROWS * float(np.nanmedian(np.diff(clock))))
+    if late is None or late.correlation < _FOLLOWS or late.seconds > -early or late.lead < _PLAINLY:
         return
     found["accel_cmd"], found["accel"] = found["accel"], found["accel_cmd"]
     words = f"named the other way round, but what is called the response comes {-late.seconds:.2f} s first"
@@ -216,7 +223,7 @@ def _units(
 ) -> dict[str, str]:  # fmt: skip
     if not found:
         return {}
-    stated = {signal: column.header.unit or bare_unit(column.header, signal) for signal, column in found.items()}
+    stated = {signal: _stated(signal, column) for signal, column in found.items()}
     test = units_together(clock, {signal: _filled(column) for signal, column in found.items()}, stated, parts)
     units: dict[str, str] = {}
     for signal, unit in test.best.units.items():
@@ -225,10 +232,12 @@ def _units(
         if unit not in ("m/s", "m/s2") or turned:
             units[signal] = f"{-factor(signal, unit):.10g}" if turned else unit
         words = []
-        if told == unit:
+        if told == unit and found[signal].name == signal:
+            pass
+        elif told == unit:
             words.append(f"in {unit} by its header")
         elif told is not None:
-            words.append(f"in {unit}, against the {told} of its header: {_proof(signal, test)}")
+            words.append(f"in {unit}, not the {told} of its header: {_proof(signal, test)}")
         elif unit not in ("m/s", "m/s2"):
             words.append(f"in {unit}: {_proof(signal, test)}")
         if turned:
@@ -243,6 +252,12 @@ def _units(
         ]
         doubts.append(f"the data allow {' with '.join(differ)} nearly as well")
     return units
+
+
+def _stated(signal: str, column: Column) -> str | None:
+    """The unit of a header; a column that bears a signal's own name is in SI as far as it says."""
+    si = ("m/s" if signal == "speed" else "m/s2") if column.name == signal else None
+    return column.header.unit or bare_unit(column.header, signal) or si
 
 
 def _proof(signal: str, test: UnitTest) -> str:

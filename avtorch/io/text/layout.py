@@ -35,6 +35,18 @@ class Layout:
     marked: str = ""
     units: bool = False
 
+    @property
+    def words(self) -> str:
+        """The layout in words."""
+        words = [f"cells separated by {_MARKS[self.separator]}"]
+        words += ["decimal commas"] if self.decimal == "," else []
+        words += [f"header in line {self.header}"] if self.header > 1 else []
+        words += ["a row of units"] if self.units else []
+        return ", ".join(words)
+
+
+_MARKS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
+
 
 def cells_of(line: str, separator: str) -> list[str]:
     """The cells of one line; of a line whose quotation does not end, what a plain split gives."""

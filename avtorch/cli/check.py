@@ -1,0 +1,67 @@
+"""`avtorch check`: what a log is and how to read it, before anything is estimated from it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from avtorch.cli.arguments import OUTPUT, Json, Quiet
+from avtorch.cli.talk import Talk
+from avtorch.errors import InputError
+
+
+def check(
+    log: Path,
+    *,
+    yes: Annotated[
+        bool, Parameter(name=("--yes", "-y"), negative=(), group=OUTPUT, help="Write the proposed mapping unasked.")
+    ] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Check a log: what it holds, how to read it, what it can tell and what not.
+
+    Names and units of its columns are found from their headers and from the data, each with its reason, and proposed as
+    a mapping: LOG.toml beside the log, which every other command then reads.
+
+    Parameters
+    ----------
+    log
+        A table of text in any layout, gzipped or not, or Parquet.
+    """
+    from avtorch.io.atomic import atomic
+    from avtorch.io.mapping import mapping_beside, mapping_place
+    from avtorch.logcheck.check import check as work
+
+    talk = Talk(json=json, quiet=quiet)
+    found = work(log)
+    proposal, beside = found.proposal, mapping_place(log)
+    talk.check(found)
+    if json and not quiet:
+        talk.answer(found.to_dict())
+    if proposal is None:
+        talk.sentence(f"Read as {mapping_beside(log)} says.")
+    elif proposal.needed:
+        if yes or _agreed(talk, beside):
+            with atomic(beside) as file:
+                file.write(proposal.toml(log.name))
+            talk.sentence(f"Written to {beside}. Next: avtorch estimate {log}, or avtorch diagnose {log}")
+        else:
+            talk.sentence(f"Nothing was written; avtorch check {log} --yes writes it to {beside}")
+    elif found.fault is None:
+        talk.sentence(f"It needs no mapping. Next: avtorch estimate {log}, or avtorch diagnose {log}")
+    if found.fault is not None:
+        raise InputError(found.fault)
+
+
+def _agreed(talk: Talk, beside: Path) -> bool:
+    """Whether the user takes the proposal, by one key; unasked where nobody sits at the terminal."""
+    if talk.silent or not (sys.stdin.isatty() and sys.stdout.isatty()):
+        return False
+    try:
+        return input(f"Write this to {beside}? [Y/n] ").strip().lower() in ("", "y", "yes")
+    except EOFError:
+        return False

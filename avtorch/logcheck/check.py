@@ -1,0 +1,112 @@
+"""`avtorch.check`: what a log is, how to read it, what was seen in it, and what can be learnt from it."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from avtorch.errors import InputError
+from avtorch.io.log import Log
+from avtorch.io.mapping import mapping_beside
+from avtorch.io.opening import place
+from avtorch.io.quality import Quality
+from avtorch.io.quality import check as check_quality
+from avtorch.io.tables import read_table
+from avtorch.logcheck.proposal import Proposal, propose
+from avtorch.logcheck.recorder import excitation_notes, recorder_notes
+
+
+@dataclass(frozen=True)
+class LogCheck:
+    """A log's `source` and `form`; the `proposal` of how to read it (None: it was read as its mapping says, or was no
+    file); the `log` and its `quality`, None where it cannot be read, and then the `fault`; notes on the `recorder` and
+    on the `excitation`.
+
+    Example:
+        >>> import numpy as np
+        >>> import avtorch
+        >>> time = np.arange(0.0, 30.0, 0.05)
+        >>> rows = zip(time, np.sin(time) / 9.80665, 72 - 3.6 * np.cos(time - 0.3))
+        >>> lines = ["Zeit [s];AccReq;VehSpd_kph", *(";".join(f"{x:.5f}" for x in row) for row in rows)]
+        >>> with open("drive.csv", "w") as file:
+        ...     _ = file.write("\\n".join(lines).replace(".", ","))
+        >>> found = avtorch.check("drive.csv")
+        >>> found.proposal.map["accel_cmd"], found.proposal.unit
+        ('AccReq', {'accel_cmd': 'g', 'speed': 'km/h'})
+        >>> with open("drive.toml", "w") as file:
+        ...     _ = file.write(found.proposal.toml("drive.csv"))
+        >>> avtorch.Log.read("drive.csv").rows
+        600
+    """
+
+    source: str
+    form: str
+    proposal: Proposal | None
+    log: Log | None
+    quality: Quality | None
+    fault: str | None
+    recorder: tuple[str, ...]
+    excitation: tuple[str, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """All that was seen, in sentences."""
+        return (*(self.quality.notes if self.quality is not None else ()), *self.recorder, *self.excitation)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For a JSON answer, `avtorch.check/1`."""
+        proposal = self.proposal
+        return {
+            "schema": "avtorch.check/1",
+            "source": self.source,
+            "form": self.form,
+            "fault": self.fault,
+            "signals": {} if proposal is None else {name: asdict(one) for name, one in proposal.signals.items()},
+            "doubts": [] if proposal is None else list(proposal.doubts),
+            "mapping_needed": proposal is not None and proposal.needed,
+            "quality": None if self.quality is None else self.quality.to_dict(),
+            "recorder": list(self.recorder),
+            "excitation": list(self.excitation),
+        }
+
+
+def check(log: Log | str | os.PathLike[str]) -> LogCheck:
+    """Check a log before anything is estimated from it.
+
+    Of a file without a mapping beside it, names and units of its columns are proposed, and it is read as proposed. A
+    file with one is read as that says. Raises `InputError` for what is no table of text, no Parquet file and no
+    recording of a known format.
+
+    Example:
+        >>> import avtorch
+        >>> drive = avtorch.simulate(avtorch.Leader.default(start=30.0, duration=60.0, dt=0.05)).log()
+        >>> found = avtorch.check(drive)
+        >>> found.quality.rows == drive.rows, found.proposal
+        (True, None)
+    """
+    if isinstance(log, Log):
+        return _seen(log.name, "a log in memory", None, log)
+    table = read_table(log)
+    form = table.form
+    if mapping_beside(log) is not None:
+        return _read(log, form, None)
+    return _read(log, form, propose(table))
+
+
+def _read(path: str | os.PathLike[str], form: str, proposal: Proposal | None) -> LogCheck:
+    try:
+        if proposal is None:
+            read = Log.read(path)
+        else:
+            leader = "accel_cmd" not in proposal.signals and {"spacing", "lead_speed"} <= set(proposal.signals)
+            read = Log.read(path, map=proposal.map, unit=proposal.unit, stamp=proposal.stamp, following=leader)
+    except InputError as fault:
+        return LogCheck(place(Path(path)), form, proposal, None, None, str(fault), (), ())
+    return _seen(place(Path(path)), form, proposal, read)
+
+
+def _seen(source: str, form: str, proposal: Proposal | None, log: Log) -> LogCheck:
+    notes = tuple(recorder_notes(log)), tuple(excitation_notes(log))
+    return LogCheck(source, form, proposal, log, check_quality(log), None, *notes)

@@ -1,0 +1,107 @@
+"""What a recorder did to the signals, and what the drive excites: facts a reader of the log wants in sentences."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from avtorch.arrays import FloatArray
+from avtorch.io.log import Log
+from avtorch.io.segments import stretches
+from avtorch.logcheck.order_of_events import WITHIN_S, lateness
+
+_CHANNELS = ("accel_cmd", "accel", "speed")
+_UNITS = {"accel_cmd": "m/s²", "accel": "m/s²", "speed": "m/s"}
+_COARSE = 0.005  # of a signal's SD: a last digit from which it is told
+_AGREE = 0.8  # correlation of two signals whose lateness means something
+_TREMBLES_HZ = 3.0
+_TOLD_MPS2 = 0.02
+
+
+def quantum(values: FloatArray) -> float | None:
+    """The step by which values (row,) are rounded, in their unit; None where there is none of a size that matters."""
+    levels = np.unique(values)
+    if len(levels) < 3 or values.std() == 0:
+        return None
+    steps = np.diff(levels)
+    step = float(np.quantile(steps, 0.1))
+    if step < _COARSE * values.std():
+        return None
+    whole = (levels - levels[0]) / step
+    # float64 and conversions of units leave something of the last digit
+    return step if np.mean(np.abs(whole - np.round(whole)) < 0.05) > 0.95 else None
+
+
+def recorder_notes(log: Log) -> list[str]:
+    """Sentences on rounding, lateness and vibration."""
+    notes = []
+    for name in _CHANNELS:
+        values = getattr(log, name)
+        if values is not None and (step := quantum(values)) is not None:
+            notes.append(f"{name} is rounded to {step:.3g} {_UNITS[name]}")
+    parts = stretches(log.usable, log.segment)
+    slope = _slope(log)
+    if slope is not None and log.accel is not None:
+        late = lateness(log.elapsed, parts, slope, log.accel)
+        if late is not None and late.correlation >= _AGREE and abs(late.seconds) > 0.5 / log.rate_hz:
+            order = "after" if late.seconds > 0 else "before"
+            notes.append(
+                f"accel comes {abs(late.seconds):.2f} s {order} the slope of speed: a filter, or clocks that differ"
+            )
+    motion = log.accel if log.accel is not None else slope
+    if motion is not None and log.accel_cmd is not None:
+        late = lateness(log.elapsed, parts, log.accel_cmd, motion)
+        if late is not None and late.correlation >= _AGREE and 0 <= late.seconds < WITHIN_S:
+            notes.append(f"the car follows the command after {late.seconds:.2f} s, lag and dead time together")
+    if log.accel is not None and (size := _trembling(log.accel, log.rate_hz)) > _TOLD_MPS2:
+        notes.append(f"accel trembles by {size:.2g} m/s² above {_TREMBLES_HZ:g} Hz")
+    return notes
+
+
+def excitation_notes(log: Log) -> list[str]:
+    """Sentences on what the drive can tell, and what it cannot."""
+    usable = log.usable
+    seconds = float(usable.sum()) / log.rate_hz
+    if not usable.any():
+        return ["nothing can be told: no row counts"]
+    can, cannot = [], []
+    if log.accel_cmd is not None:
+        u = log.accel_cmd[usable]
+        size, brake = float(u.std()), float((u < -0.1).mean())
+        can.append(
+            f"the command moves by {size:.2g} m/s² (SD) over {seconds:.0f} s that count, {brake:.0%} of it braking"
+        )
+        if size < 0.1:
+            cannot.append("lag and gain: the command hardly moves")
+        if not 0.05 < brake < 0.95:
+            cannot.append("whether brake and throttle differ: one of them is hardly used")
+    if log.speed is not None:
+        low, high = np.quantile(log.speed[usable], (0.02, 0.98))
+        can.append(f"speeds from {low:.1f} to {high:.1f} m/s")
+        if high - low < 0.25 * max(high, 1.0):
+            cannot.append("what depends on speed, such as drag: speed hardly changes")
+    else:
+        cannot.append("what depends on speed or place: the log has no speed")
+    if log.accel is None or log.speed is None:
+        cannot.append("whether a sensor errs or the car: one channel alone is recorded")
+    if log.accel_cmd is None:
+        cannot.append("the actuator's gain without assuming a controller: the log has no accel_cmd")
+    if seconds < 60.0:
+        cannot.append(f"small or rare effects: {seconds:.0f} s are short")
+    return [*can, *(f"cannot tell {what}" for what in cannot)]
+
+
+def _slope(log: Log) -> FloatArray | None:
+    """The slope of speed over half a second [m/s²]."""
+    if log.speed is None:
+        return None
+    time = log.elapsed
+    return (np.interp(time + 0.25, time, log.speed) - np.interp(time - 0.25, time, log.speed)) / 0.5
+
+
+def _trembling(values: FloatArray, rate_hz: float) -> float:
+    """Root mean square of what is quicker than `_TREMBLES_HZ`."""
+    width = max(round(rate_hz / (2 * _TREMBLES_HZ)), 1)
+    if width < 3 or len(values) < 4 * width:
+        return 0.0
+    smooth = np.convolve(values, np.ones(width) / width, mode="same")
+    return float(np.std((values - smooth)[width:-width]))
