@@ -1,0 +1,80 @@
+"""A library that reads a format: loaded when a file asks for it, and never heard: its errors become one line."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+
+from avtorch.errors import InputError, printable
+
+_REASON = 160  # characters of a library's message
+
+
+def library(module: str, *, source: str, words: str, package: str, extra: str) -> ModuleType:
+    """The module of an optional library.
+
+    Raises InputError saying what to install: `source` is the file and `words` its format; `package` and `extra` are
+    the library's name and avtorch's extra that brings it.
+    """
+    with silenced():
+        try:
+            return importlib.import_module(module)
+        except ModuleNotFoundError as fault:
+            # a library that is there but lacks a part of its own is another fault, and another cure
+            if fault.name is not None and fault.name.partition(".")[0] != module.partition(".")[0]:
+                raise _broken(source, words, package, extra, fault) from None
+            raise InputError(
+                f"{source}: is {words}; reading it needs {package}: pip install 'avtorch[{extra}]'"
+            ) from None
+        except Exception as fault:
+            raise _broken(source, words, package, extra, fault) from None
+
+
+def _broken(source: str, words: str, package: str, extra: str, fault: Exception) -> InputError:
+    return InputError(
+        f"{source}: is {words}; reading it needs {package}, which cannot be loaded here ({reason(fault)}): "
+        f"pip install --force-reinstall 'avtorch[{extra}]'"
+    )
+
+
+@contextmanager
+def silenced() -> Iterator[None]:
+    """Within it, libraries neither warn nor log; what they say of a file goes into errors and remarks."""
+    before = logging.root.manager.disable
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        logging.disable(logging.CRITICAL)
+        try:
+            yield
+        finally:
+            logging.disable(before)
+
+
+@contextmanager
+def guarded(where: str, need: str) -> Iterator[None]:
+    """Within it, any error of a library becomes an InputError: `where` is the file, with the channel where one is
+    read; `need` says what would be right."""
+    with silenced():
+        try:
+            yield
+        except InputError:
+            raise
+        except Exception as fault:
+            raise InputError(f"{where}: is damaged or of an unknown kind ({reason(fault)}); {need} is needed") from None
+        except BaseException as fault:
+            # a panic of a library in Rust is no Exception; an interruption by the user is none either, and goes on
+            if type(fault).__name__ != "PanicException":
+                raise
+            raise InputError(f"{where}: is damaged ({reason(fault)}); {need} is needed") from None
+
+
+def reason(fault: BaseException) -> str:
+    """A library's message: one short line without the paths it may hold."""
+    text = next((line.strip() for line in str(fault).splitlines() if line.strip()), "")
+    text = " ".join(os.path.basename(word) if word.count("/") > 2 else word for word in text.split())
+    return printable(f"{type(fault).__name__}: {text}" if text else type(fault).__name__, _REASON)
