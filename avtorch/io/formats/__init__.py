@@ -18,9 +18,7 @@ from avtorch.io.recording import Recording
 __all__ = ["is_recording", "open_recording"]
 
 
-def open_recording(
-    path: str | os.PathLike[str], *, dbc: Sequence[str | os.PathLike[str]] | None = None
-) -> Recording:
+def open_recording(path: str | os.PathLike[str], *, dbc: Sequence[str | os.PathLike[str]] | None = None) -> Recording:
     """Open a recording; its format is recognised by how it begins, then by its suffix.
 
     `dbc` names the databases that decode a CAN log; by default the ``.dbc`` beside the log that has its name, or the

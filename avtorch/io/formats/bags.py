@@ -193,7 +193,7 @@ class _Known:
             for newer in LAYOUTS:
                 store = self._typesys.get_typestore(self._typesys.Stores.LATEST)
                 types = {}
-                for name, text in (LAYOUTS[0] | newer).items():
+                for name, text in {**LAYOUTS[0], **newer}.items():
                     if name not in store.fielddefs:
                         types |= self._typesys.get_types_from_msg(text, name)
                 store.register(types)
@@ -214,9 +214,7 @@ def _topics(connections: Sequence[Any], known: _Known) -> tuple[dict[str, Topic]
         same = all((c.msgtype, c.msgdef) == (first.msgtype, first.msgdef) for c in own)
         try:
             stores = known.stores(first)
-            fits = same and all(
-                getattr(c.ext, "serialization_format", "cdr") in ("cdr", "") for c in own
-            )
+            fits = same and all(getattr(c.ext, "serialization_format", "cdr") in ("cdr", "") for c in own)
             stamp = stamp_field(stores[0].fielddefs, first.msgtype)
             numeric_fields(stores[0].fielddefs, first.msgtype)
         except Exception:  # a definition that cannot be parsed leaves out its topic, not the bag

@@ -101,14 +101,15 @@ class _Frames:
         self._most: int | None = None
         self.bus: dict[Identifier, Any] = {}
         others: set[Identifier] = set()
-        number = 0
+        frames = 0
         for number, frame in self._all():
+            frames = number
             key = (frame.arbitration_id, bool(frame.is_extended_id))
             if self.bus.setdefault(key, frame.channel) != frame.channel:
                 others.add(key)
-        if number == 0:
+        if frames == 0:
             raise InputError(f"{source}: holds no frame; {_NEED} is needed")
-        self._most = number
+        self._most = frames
         if others:
             names = listed(f"{n:X}" for n, _ in sorted(others))
             self.remarks.append(f"identifiers that several buses have are read from the bus of their first: {names}")
@@ -165,9 +166,7 @@ class _Frames:
         return (can.ASCReader if self._kind is kinds.ASC else can.CanutilsLogReader)(text), text
 
 
-def open_can(
-    path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None
-) -> CanRecording:
+def open_can(path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.PathLike[str]] | None) -> CanRecording:
     """Open a CAN log with its databases; one pass over the log finds which messages it holds.
 
     Raises InputError for a log without a database or of another one, and for a damaged one; a log that is cut off is

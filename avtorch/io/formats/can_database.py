@@ -43,7 +43,8 @@ def databases_of(log: Path, named: Sequence[str | os.PathLike[str]] | None, sour
         return found
     what = f"its folder holds {len(found)}: {listed(path.name for path in found)}" if found else "found none beside it"
     raise InputError(
-        f"{source}: is a CAN log, which a DBC database decodes; {what}; name one by dbc, or {log.stem}.dbc beside the log"
+        f"{source}: is a CAN log, which a DBC database decodes; {what}; "
+        f"name one by dbc, or {log.stem}.dbc beside the log"
     )
 
 

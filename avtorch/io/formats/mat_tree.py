@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
+import numpy as np
+
 from avtorch.arrays import FloatArray
 from avtorch.io.size import MOST_COLUMNS
 
@@ -60,9 +62,7 @@ def find_series(tree: Tree) -> Found:
     return found
 
 
-def _visit(
-    tree: Tree, path: str, outer: tuple[str, Matrix, float] | None, found: Found, depth: int
-) -> None:
+def _visit(tree: Tree, path: str, outer: tuple[str, Matrix, float] | None, found: Found, depth: int) -> None:
     if depth > _DEEPEST or len(found.series) >= MOST_COLUMNS:
         return
     clock = _clock(tree) or outer
@@ -129,4 +129,4 @@ def vector(series: Series, load: Callable[[Matrix], FloatArray]) -> FloatArray:
     if series.axis < 0:
         return whole.reshape(-1).copy()
     squeezed = whole.reshape([n for n in whole.shape if n != 1])
-    return squeezed.take(series.index, axis=series.axis).copy()
+    return np.array(squeezed.take(series.index, axis=series.axis), dtype=np.float64)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import os
 import weakref
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -106,7 +105,7 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> MdfRecording:
         raise
 
 
-def _close(mdf: Any, stream: io.IOBase) -> None:
+def _close(mdf: Any, stream: BinaryIO) -> None:
     try:
         mdf.close()
     finally:
@@ -211,9 +210,7 @@ def _beside_texts(samples: Any, conversion: Any) -> FloatArray:
         return raw
     values = np.array(default.convert(samples), dtype=np.float64)
     for i in range(getattr(conversion, "ref_param_nr", 1) - 1):
-        low = getattr(conversion, f"val_{i}", None)
-        high = low
-        if low is None:
-            low, high = getattr(conversion, f"lower_{i}", np.nan), getattr(conversion, f"upper_{i}", np.nan)
+        one = getattr(conversion, f"val_{i}", np.nan)
+        low, high = getattr(conversion, f"lower_{i}", one), getattr(conversion, f"upper_{i}", one)
         values[(raw >= low) & (raw <= high)] = np.nan
     return values
