@@ -30,7 +30,8 @@ def open_recording(path: str | os.PathLike[str], *, dbc: Sequence[str | os.PathL
     """
     kind = kind_at(path)
     if kind is None:
-        raise InputError(f"{place(path)}: is no recording; {NEED} is needed")
+        what = "a directory without the metadata.yaml of a ROS 2 bag" if os.path.isdir(path) else "no recording"
+        raise InputError(f"{place(path)}: is {what}; {NEED} is needed")
     if dbc is not None and kind.reader != "can":
         raise InputError(f"{place(path)}: is {kind.words}, which no DBC decodes; dbc is for CAN logs")
     reader = importlib.import_module(f"avtorch.io.formats.{kind.reader}")

@@ -7,7 +7,12 @@ from typing import Any
 
 _TIME = "builtin_interfaces/msg/Time"
 _DURATION = "builtin_interfaces/msg/Duration"
-_NUMBERS = frozenset("bool byte char octet float32 float64 int8 int16 int32 int64 uint8 uint16 uint32 uint64".split())
+_NUMBERS = frozenset(
+    (
+        "bool", "byte", "char", "octet", "float32", "float64",
+        "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64",
+    )
+)  # fmt: skip
 _DEEPEST = 8
 _MOST = 2000  # fields of one type: types within types may multiply
 _BASE, _NAME = 1, 2  # kinds of a field: a number or text, another type; the rest are arrays

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import io
 import logging
 import os
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from types import ModuleType
 
 from avtorch.errors import InputError, printable
@@ -44,9 +45,10 @@ def _broken(source: str, words: str, package: str, extra: str, fault: Exception)
 
 @contextmanager
 def silenced() -> Iterator[None]:
-    """Within it, libraries neither warn nor log; what they say of a file goes into errors and remarks."""
+    """Within it, libraries neither warn, nor log, nor print; what they say of a file goes into errors and remarks."""
     before = logging.root.manager.disable
-    with warnings.catch_warnings():
+    deaf = _Deaf()
+    with warnings.catch_warnings(), redirect_stdout(deaf), redirect_stderr(deaf):
         warnings.simplefilter("ignore")
         logging.disable(logging.CRITICAL)
         try:
@@ -71,6 +73,11 @@ def guarded(where: str, need: str) -> Iterator[None]:
             if type(fault).__name__ != "PanicException":
                 raise
             raise InputError(f"{where}: is damaged ({reason(fault)}); {need} is needed") from None
+
+
+class _Deaf(io.TextIOBase):
+    def write(self, text: str) -> int:
+        return len(text)
 
 
 def reason(fault: BaseException) -> str:

@@ -88,12 +88,16 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> MdfRecording:
     try:
         with guarded(source, _NEED):
             chains = walk(stream, source)
+            if chains.cut:
+                stream.close()
+                stream = in_memory(path, most=MOST_BYTES, need=_NEED)
+                _end_here(stream, chains.cut)
             stream.seek(0)
-            mdf = asammdf.MDF(stream, process_bus_logging=False)
+            mdf = _loaded(asammdf, stream)
             if unfinished:
                 remarks.append("the recorder did not finish the file; it was completed as far as it goes")
             if chains.beyond:
-                remarks.append(f"the file is cut off: {chains.beyond} of its links point beyond its end")
+                remarks.append(f"the file is cut off: {chains.beyond} of its blocks lie behind its end, or end there")
             listing = _Listing(mdf)
         recording = MdfRecording(
             source, f"MDF {mdf.version}", mdf, listing.places, listing.units, remarks + listing.remarks
@@ -103,6 +107,35 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> MdfRecording:
     except BaseException:
         stream.close()
         raise
+
+
+def _end_here(stream: BinaryIO, cut: Mapping[int, int]) -> None:
+    """Blocks of samples that the end of the file cuts end there: asammdf leaves out those that claim more."""
+    for at, left in cut.items():
+        stream.seek(at + 8)
+        stream.write(left.to_bytes(8, "little"))
+
+
+def _loaded(asammdf: Any, stream: BinaryIO) -> Any:
+    """The file, incomplete blocks left out. What asammdf has built when it fails is closed, or it complains later."""
+    option = "raise_on_incomplete_blocks"
+    before = asammdf.get_global_option(option)
+    asammdf.set_global_option(option, False)
+    try:
+        return asammdf.MDF(stream, process_bus_logging=False)
+    except Exception as fault:
+        trace = fault.__traceback__
+        while trace is not None:
+            half = trace.tb_frame.f_locals.get("self")
+            if hasattr(half, "groups") and hasattr(half, "close"):
+                for missing in ("header", "identification"):
+                    if not hasattr(half, missing):
+                        setattr(half, missing, None)
+                half.close()
+            trace = trace.tb_next
+        raise
+    finally:
+        asammdf.set_global_option(option, before)
 
 
 def _close(mdf: Any, stream: BinaryIO) -> None:

@@ -30,6 +30,8 @@ class Chains:
     beyond: int = 0
     """Links that point beyond the end of the file, as those of a truncated one do."""
     blocks: int = 0
+    cut: dict[int, int] = field(default_factory=dict)
+    """Where a block of samples begins that the end of the file cuts, and the bytes it has left."""
     seen: set[int] = field(default_factory=set)
 
 
@@ -136,6 +138,8 @@ class _Walk4(_Walk):
             name = _at(self.stream, at, 4)[2:4]
             if name == b"DZ":
                 self.inflated(at)
+            if name == b"DT":
+                self.whole(at)
             if name not in (b"HL", b"DL", b"LD"):
                 return
             if at in listed:
@@ -150,11 +154,20 @@ class _Walk4(_Walk):
                 for piece in links[1:]:
                     if piece >= self.end:
                         self.found.beyond += 1
-                    elif piece and _at(self.stream, piece, 4) == b"##DZ":
+                    elif piece and (kind := _at(self.stream, piece, 4)) == b"##DZ":
                         self.inflated(piece)
+                    elif piece and kind == b"##DT":
+                        self.whole(piece)
             at = links[0] if links else 0
         if at >= self.end - 24:
             self.found.beyond += 1
+
+    def whole(self, at: int) -> None:
+        """A block of samples, which the end of the file may cut."""
+        head = _at(self.stream, at, 24)
+        if len(head) == 24 and at + struct.unpack_from("<Q", head, 8)[0] > self.end:
+            self.found.beyond += 1
+            self.found.cut[at] = self.end - at
 
     def inflated(self, at: int) -> None:
         """A compressed piece: its own head says how large it becomes."""

@@ -59,7 +59,6 @@ AUTOWARE = _preset(
     accel_cmd=(Source(f"{_COMMAND}/acceleration", "m/s2"),),
     speed=(Source("/vehicle/status/velocity_status/longitudinal_velocity", "m/s"),),
     accel=(Source("/localization/acceleration/accel/accel/linear/x", "m/s2"),),
-    jerk=(Source(f"{_COMMAND}/jerk", "m/s3"),),
     # AUTONOMOUS, and AUTONOMOUS_VELOCITY_ONLY
     engaged=(Source("/vehicle/status/control_mode/mode", when=(1, 3)),),
     throttle=(Source(f"{_ACTUATION}/accel_status", "1"),),

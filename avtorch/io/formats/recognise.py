@@ -57,7 +57,10 @@ def is_kind(path: str | os.PathLike[str]) -> bool:
     try:
         return kind_at(path) is not None
     except InputError:
-        return _by_suffix(file) is not None and file.is_file()
+        try:
+            return _by_suffix(file) is not None and file.is_file()
+        except OSError:  # a name that no file can have
+            return False
 
 
 def _is_folder(file: Path) -> bool:
