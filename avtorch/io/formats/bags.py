@@ -78,39 +78,32 @@ class BagRecording(Listed):
         stamp = attrgetter(topic.stamp) if topic.stamp else None
         columns = [array("d") for _ in paths]
         logged, stamped = array("d"), array("d")
-        with guarded(f"{where}: message 1", _NEED):
-            messages = self._messages(topic, where)
-        number = 0
-        while True:
-            with guarded(f"{where}: message {number + 1}", _NEED):
-                item = next(messages, None)
-                if item is None:
-                    break
-                number += 1
-                if number % 4096 == 0:
-                    refuse_cells(self.source, number * len(names))
-                at, message = item
-                logged.append(at / _NANO)
+        with guarded(lambda: f"{where}: message {len(logged) + 1}", _NEED):
+            for at, message in self._messages(topic):
+                row = take(message)[1:]
                 if stamp is not None:
                     moment = stamp(message)
                     stamped.append((moment.sec * _NANO + moment.nanosec) / _NANO)
-                for column, value in zip(columns, take(message)[1:], strict=True):
+                for column, value in zip(columns, row, strict=True):
                     column.append(value)
+                logged.append(at / _NANO)
+                if len(logged) % 4096 == 0:
+                    refuse_cells(self.source, len(logged) * len(names))
         time = np.array(stamped if len(stamped) and min(stamped) > 0 else logged, dtype=np.float64)
         return {
             channel: Channel(channel, time, np.array(column, dtype=np.float64))
             for channel, column in zip(names, columns, strict=True)
         }
 
-    def _messages(self, topic: Topic, where: str) -> Iterator[tuple[int, Any]]:
+    def _messages(self, topic: Topic) -> Iterator[tuple[int, Any]]:
         """Time of recording [ns] and message, decoded by the first store that fits the first message."""
         store = None
         for _, at, raw in self._reader.messages(list(topic.connections)):
             if store is None:
-                store = self._fitting(topic, raw, where)
+                store = self._fitting(topic, raw)
             yield at, self._decoded(store, raw, topic.type)
 
-    def _fitting(self, topic: Topic, raw: bytes, where: str) -> Any:
+    def _fitting(self, topic: Topic, raw: bytes) -> Any:
         for store in topic.stores[:-1]:
             try:
                 self._decoded(store, raw, topic.type)

@@ -16,7 +16,7 @@ from avtorch.io.formats import kinds
 from avtorch.io.formats.blf_objects import sound_part
 from avtorch.io.formats.can_database import Decoded, databases_of, messages_of
 from avtorch.io.formats.kinds import Kind
-from avtorch.io.formats.library import guarded, library, reason
+from avtorch.io.formats.library import guarded, library, reason, silenced
 from avtorch.io.formats.listed import Listed, refuse_cells
 from avtorch.io.opening import place, read_regular
 from avtorch.io.recording import Channel
@@ -25,6 +25,8 @@ from avtorch.io.size import MOST_BYTES
 _NEED = "an undamaged BLF, ASC or candump log"
 
 Identifier = tuple[int, bool]
+Wanted = dict[Identifier, list[tuple[Decoded, dict[str, tuple[array, array]]]]]
+"""By identifier, each message with the columns of time and values of its signals."""
 
 
 class CanRecording(Listed):
@@ -56,12 +58,24 @@ class CanRecording(Listed):
 
     def _read(self, names: tuple[str, ...]) -> dict[str, Channel]:
         asked = frozenset(names)
-        wanted: dict[Identifier, list[tuple[Decoded, dict[str, tuple[array, array]]]]] = {}
+        wanted: Wanted = {}
         for key, own in self._messages.items():
             for decoded in own:
                 columns = {s: (array("d"), array("d")) for s, n in decoded.channels.items() if n in asked}
                 if columns:
                     wanted.setdefault(key, []).append((decoded, columns))
+        with silenced():
+            self._decode(wanted)
+        found: dict[str, Channel] = {}
+        for own in wanted.values():
+            for decoded, columns in own:
+                for signal, (time, column) in columns.items():
+                    name = decoded.channels[signal]
+                    found[name] = Channel(name, np.array(time, dtype=np.float64), np.array(column, dtype=np.float64))
+        return {name: found[name] for name in names}
+
+    def _decode(self, wanted: Wanted) -> None:
+        """One pass over the log: samples of the wanted signals go to their columns."""
         samples = 0
         for number, key, frame in self._frames.read(frozenset(wanted)):
             for decoded, columns in wanted[key]:
@@ -80,16 +94,9 @@ class CanRecording(Listed):
                         time.append(frame.timestamp)
                         column.append(value)
                         samples += 1
-            if samples % 4096 == 0:
+            if number % 4096 == 0:
                 refuse_cells(self.source, samples)
         refuse_cells(self.source, samples)
-        found: dict[str, Channel] = {}
-        for own in wanted.values():
-            for decoded, columns in own:
-                for signal, (time, column) in columns.items():
-                    name = decoded.channels[signal]
-                    found[name] = Channel(name, np.array(time, dtype=np.float64), np.array(column, dtype=np.float64))
-        return {name: found[name] for name in names}
 
 
 class _Frames:
@@ -102,11 +109,12 @@ class _Frames:
         self.bus: dict[Identifier, Any] = {}
         others: set[Identifier] = set()
         frames = 0
-        for number, frame in self._all():
-            frames = number
-            key = (frame.arbitration_id, bool(frame.is_extended_id))
-            if self.bus.setdefault(key, frame.channel) != frame.channel:
-                others.add(key)
+        with silenced():
+            for number, frame in self._all():
+                frames = number
+                key = (frame.arbitration_id, bool(frame.is_extended_id))
+                if self.bus.setdefault(key, frame.channel) != frame.channel:
+                    others.add(key)
         if frames == 0:
             raise InputError(f"{source}: holds no frame; {_NEED} is needed")
         self._most = frames
@@ -129,19 +137,15 @@ class _Frames:
             reader, stream = self._reader()
             frames = iter(reader)
         while self._most is None or number < self._most:
-            fault = None
-            with guarded(self._source, _NEED):
-                try:
-                    frame = next(frames, None)
-                except Exception as error:
-                    frame, fault = None, error
-            if fault is not None:
+            try:
+                frame = next(frames, None)
+            except Exception as fault:
                 if number and not stream.read(1):
                     self.remarks.append(f"the log is cut off after frame {number}")
                     return
                 raise InputError(
                     f"{self._source}: frame {number + 1} cannot be read ({reason(fault)}); {_NEED} is needed"
-                )
+                ) from None
             if frame is None:
                 return
             number += 1

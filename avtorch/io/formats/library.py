@@ -7,7 +7,7 @@ import io
 import logging
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from types import ModuleType
 
@@ -58,21 +58,27 @@ def silenced() -> Iterator[None]:
 
 
 @contextmanager
-def guarded(where: str, need: str) -> Iterator[None]:
+def guarded(where: str | Callable[[], str], need: str) -> Iterator[None]:
     """Within it, any error of a library becomes an InputError: `where` is the file, with the channel where one is
-    read; `need` says what would be right."""
+    read, or tells it when asked; `need` says what would be right."""
     with silenced():
         try:
             yield
         except InputError:
             raise
         except Exception as fault:
-            raise InputError(f"{where}: is damaged or of an unknown kind ({reason(fault)}); {need} is needed") from None
+            raise InputError(
+                f"{_told(where)}: is damaged or of an unknown kind ({reason(fault)}); {need} is needed"
+            ) from None
         except BaseException as fault:
             # a panic of a library in Rust is no Exception; an interruption by the user is none either, and goes on
             if type(fault).__name__ != "PanicException":
                 raise
-            raise InputError(f"{where}: is damaged ({reason(fault)}); {need} is needed") from None
+            raise InputError(f"{_told(where)}: is damaged ({reason(fault)}); {need} is needed") from None
+
+
+def _told(where: str | Callable[[], str]) -> str:
+    return where if isinstance(where, str) else where()
 
 
 class _Deaf(io.TextIOBase):

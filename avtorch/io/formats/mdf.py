@@ -126,7 +126,7 @@ def _loaded(asammdf: Any, stream: BinaryIO) -> Any:
     except Exception as fault:
         trace = fault.__traceback__
         while trace is not None:
-            half = trace.tb_frame.f_locals.get("self")
+            half: Any = trace.tb_frame.f_locals.get("self")
             if hasattr(half, "groups") and hasattr(half, "close"):
                 for missing in ("header", "identification"):
                     if not hasattr(half, missing):

@@ -1,4 +1,7 @@
-"""MAT files: version 5 by SciPy's writer (the format's other open writer), version 7.3 by h5py as MATLAB lays it out."""
+"""MAT files: version 5 by SciPy's writer, the same library as the reader; version 7.3 as MATLAB lays it out, by h5py.
+
+Elements by hand test what no writer makes.
+"""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from mf4_rs import MdfWriter, create_float_value, create_uint_value
 from avtorch.errors import InputError
 from avtorch.io.formats import mdf_chains, open_recording
 
-from .survival import in_time, refused, survives
+from .survival import holds, refused, survives
 
 TIME = np.arange(200) * 0.02
 SPEED = 20 + np.sin(TIME)
@@ -223,10 +223,4 @@ def test_the_links_of_damaged_blocks_are_read_or_refused(tmp_path: Path, fresh_s
         content, at = bytearray(raw), rng.choice(heads) + 8 * rng.randrange(1, 8)
         number = rng.choice([*heads, 0, 1, rng.randrange(len(raw)), 2**63, 2**32 - 1])
         content[at : at + 8] = struct.pack("<Q", number)
-        path.write_bytes(content)
-        with in_time():
-            try:
-                recording = open_recording(path)
-                recording.read(recording.names)
-            except InputError as fault:
-                assert str(fault).isprintable()
+        holds(path, bytes(content))
