@@ -178,7 +178,9 @@ def test_names_that_two_databases_have_are_told_apart(tmp_path: Path) -> None:
 
 def test_a_database_of_another_car_or_none_at_all(tmp_path: Path, base: Path) -> None:
     log = candump(tmp_path / "drive.log")
-    base.write_text(DBC.replace("BO_ 256 ", "BO_ 257 ").replace("BO_ 512", "BO_ 513").replace("2566844926", "2566844927"))
+    base.write_text(
+        DBC.replace("BO_ 256 ", "BO_ 257 ").replace("BO_ 512", "BO_ 513").replace("2566844926", "2566844927")
+    )
     refused(log, "holds no message of its database; identifiers in the log: 100, 200, 18FEF1FE; in the database: 101")
     base.write_text("not a database")
     with pytest.raises(InputError, match=r"drive\.dbc: is damaged .* a DBC database is needed"):
