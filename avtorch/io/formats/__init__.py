@@ -11,6 +11,8 @@ import os
 from collections.abc import Sequence
 
 from avtorch.errors import InputError
+from avtorch.io.formats.apart import open_apart
+from avtorch.io.formats.library import refuse_missing
 from avtorch.io.formats.recognise import NEED, is_kind, kind_at
 from avtorch.io.opening import place
 from avtorch.io.recording import Recording
@@ -25,6 +27,9 @@ def open_recording(path: str | os.PathLike[str], *, dbc: Sequence[str | os.PathL
     only one in its folder. Other formats take none. Names are listed and no samples are read, except where a format
     has to be read to be listed (MAT before 7.3, Excel).
 
+    MDF, MAT and workbooks are read in a process of their own, whose libraries a damaged file may end; it lives as long
+    as the recording.
+
     Raises InputError naming the file: for what is no regular file or no recording, for a damaged one, for one whose
     library is not installed (with the command that installs it), and for a CAN log without a database.
     """
@@ -34,6 +39,9 @@ def open_recording(path: str | os.PathLike[str], *, dbc: Sequence[str | os.PathL
         raise InputError(f"{place(path)}: is {what}; {NEED} is needed")
     if dbc is not None and kind.reader != "can":
         raise InputError(f"{place(path)}: is {kind.words}, which no DBC decodes; dbc is for CAN logs")
+    refuse_missing(place(path), kind)
+    if kind.apart:
+        return open_apart(path, kind)
     reader = importlib.import_module(f"avtorch.io.formats.{kind.reader}")
     return reader.open_can(path, kind, dbc) if kind.reader == "can" else reader.open_file(path, kind)
 

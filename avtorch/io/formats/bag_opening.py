@@ -21,12 +21,12 @@ _FILES = 10_000  # of a folder
 def open_bag(file: Path, kind: Kind, source: str) -> Any:
     """An opened reader of rosbags, with `connections`, `messages` and `close`."""
     if kind is kinds.ROS1:
-        rosbag1 = _rosbags("rosbags.rosbag1", source, kind)
+        rosbag1 = library("rosbags.rosbag1", source, kind)
         opened(file, need="a ROS 1 bag").close()
         reader = rosbag1.Reader(file)
         reader.open()
         return reader
-    storages = _rosbags("rosbags.rosbag2", source, kind).Reader.STORAGE_PLUGINS
+    storages = library("rosbags.rosbag2", source, kind).Reader.STORAGE_PLUGINS
     if kind is kinds.ROS2_FOLDER:
         in_memory(file / "metadata.yaml", most=_METADATA, need="the metadata of a ROS 2 bag")
         for count, part in enumerate(sorted(file.iterdir())):
@@ -45,10 +45,6 @@ def open_bag(file: Path, kind: Kind, source: str) -> Any:
         reader = storages[".mcap"](file)
     reader.open()
     return reader
-
-
-def _rosbags(module: str, source: str, kind: Kind) -> Any:
-    return library(module, source=source, words=kind.words, package="rosbags", extra="bags")
 
 
 def _check_database(file: Path, source: str) -> None:

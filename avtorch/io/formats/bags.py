@@ -123,7 +123,7 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> BagRecording:
     InputError.
     """
     source = place(path)
-    typesys = library("rosbags.typesys", source=source, words=kind.words, package="rosbags", extra="bags")
+    typesys = library("rosbags.typesys", source, kind)
     with guarded(source, _NEED):
         reader = open_bag(Path(path), kind, source)
     try:

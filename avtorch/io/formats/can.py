@@ -153,7 +153,7 @@ class _Frames:
                 yield number, frame
 
     def _reader(self) -> tuple[Any, io.IOBase]:
-        can = library("can.io", source=self._source, words=self._kind.words, package="python-can", extra="can")
+        can = library("can.io", self._source, self._kind)
         raw = read_regular(self._path, most=MOST_BYTES, need=_NEED)
         if self._kind is kinds.BLF:
             end, fault = sound_part(raw, self._source)
@@ -177,6 +177,5 @@ def open_can(path: str | os.PathLike[str], kind: Kind, dbc: Sequence[str | os.Pa
     read as far as it goes, with a remark.
     """
     source = place(path)
-    library("can.io", source=source, words=kind.words, package="python-can", extra="can")
-    messages, units = messages_of(databases_of(Path(path), dbc, source), source, kind.words)
+    messages, units = messages_of(databases_of(Path(path), dbc, source), source, kind)
     return CanRecording(source, kind, _Frames(Path(path), kind, source), messages, units)

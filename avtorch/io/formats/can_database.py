@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from avtorch.errors import InputError, listed
+from avtorch.io.formats.kinds import Kind
 from avtorch.io.formats.library import guarded, library
 from avtorch.io.opening import place, read_regular
 
@@ -49,14 +50,14 @@ def databases_of(log: Path, named: Sequence[str | os.PathLike[str]] | None, sour
 
 
 def messages_of(
-    databases: Sequence[Path], source: str, words: str
+    databases: Sequence[Path], source: str, kind: Kind
 ) -> tuple[dict[tuple[int, bool], list[Decoded]], dict[str, str]]:
     """Messages by identifier and whether that is an extended one, and the units of their channels.
 
     A channel is ``Message.Signal``; where another message has that name already, the database's name comes first.
     Raises InputError.
     """
-    cantools = library("cantools.database", source=source, words=words, package="cantools", extra="can")
+    cantools = library("cantools.database", source, kind)
     messages: dict[tuple[int, bool], list[Decoded]] = {}
     units: dict[str, str] = {}
     taken: set[str] = set()

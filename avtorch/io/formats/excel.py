@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import io
-import json
 import os
-import subprocess
-import sys
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, quoted
 from avtorch.io.formats import kinds
-from avtorch.io.formats.excel_table import bare
+from avtorch.io.formats.excel_table import SheetTable, bare, table_of
 from avtorch.io.formats.kinds import Kind
-from avtorch.io.formats.library import library
+from avtorch.io.formats.library import guarded, library
 from avtorch.io.formats.listed import Listed
 from avtorch.io.formats.mat_tree import FINER, TIMES
 from avtorch.io.opening import place, read_regular
@@ -28,7 +24,6 @@ from avtorch.io.size import MOST_BYTES
 
 _NEED = "an undamaged workbook"
 _MOST_INFLATED = 2 * 2**30  # bytes of all parts of a workbook
-_MOST_SECONDS = 300
 _SCALES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 
 
@@ -59,27 +54,20 @@ class ExcelRecording(Listed):
 def open_file(path: str | os.PathLike[str], kind: Kind) -> ExcelRecording:
     """Open a workbook; the sheet is read at once. Raises InputError."""
     source = place(path)
-    library("python_calamine", source=source, words=kind.words, package="python-calamine", extra="excel")
     raw = read_regular(path, most=MOST_BYTES, need=_NEED)
     if kind is not kinds.XLS:
         _check_zip(raw, source)
-    answer, numbers = _ask(raw, source)
-    if "error" in answer:
-        raise InputError(
-            answer["error"]
-            or f"{source}: no sheet has a row of names and rows of numbers below it; sheets: {listed(answer['sheets'])}"
-        )
-    names, units = tuple(answer["names"]), answer["units"]
-    values = np.frombuffer(numbers, dtype=np.float64).reshape(answer["shape"][::-1])
+    sheet, others, table = _first_table(raw, source, kind)
+    names, units, values = table.names, table.units, table.numbers.T
     time_at = _time_column(names, source)
     scale = _scale(names[time_at], units)
     time = values[time_at] * scale if scale != 1.0 else values[time_at]
     dated = ~np.isnan(time)
     remarks = []
-    if answer["others"]:
-        remarks.append(f"sheet {quoted(answer['sheet'])} is read, {answer['others']} others are not")
-    if answer["texts"]:
-        remarks.append(f"{answer['texts']} cells hold a text where a number is expected; they are NaN")
+    if others:
+        remarks.append(f"sheet {quoted(sheet)} is read, {others} others are not")
+    if table.texts:
+        remarks.append(f"{table.texts} cells hold a text where a number is expected; they are NaN")
     if not dated.all():
         remarks.append(f"{int((~dated).sum())} rows without a time are left out")
     columns = {name: values[i][dated] for i, name in enumerate(names) if i != time_at}
@@ -119,17 +107,14 @@ def _check_zip(raw: bytes, source: str) -> None:
         raise InputError(f"{source}: its part {quoted(broken)} is damaged; {_NEED} is needed")
 
 
-def _ask(raw: bytes, source: str) -> tuple[dict[str, Any], bytes]:
-    command = [sys.executable, "-P", "-W", "ignore", "-m", "avtorch.io.formats.excel_process", source]
-    # -P: nothing of the folder that the user happens to work in
-    environment = dict(os.environ, PYTHONPATH=os.pathsep.join(path for path in sys.path if path))
-    try:
-        done = subprocess.run(command, input=raw, capture_output=True, timeout=_MOST_SECONDS, env=environment)
-    except subprocess.TimeoutExpired:
-        raise InputError(f"{source}: is not read within {_MOST_SECONDS} s; a smaller workbook is needed") from None
-    except OSError as fault:
-        raise InputError(f"{source}: no process can be started to read it ({fault.strerror})") from None
-    line, _, numbers = done.stdout.partition(b"\n")
-    if done.returncode != 0 or not line:
-        raise InputError(f"{source}: its sheet takes more memory than a workbook may; {_NEED}, or a smaller one")
-    return json.loads(line), numbers
+def _first_table(raw: bytes, source: str, kind: Kind) -> tuple[str, int, SheetTable]:
+    """The first sheet that holds a table, and the number of the other sheets."""
+    calamine = library("python_calamine", source, kind)
+    with guarded(source, _NEED):
+        book = calamine.load_workbook(io.BytesIO(raw))
+        sheets = list(book.sheet_names)
+        for name in sheets:
+            table = table_of(book.get_sheet_by_name(name).iter_rows(), source)
+            if table is not None and table.names:
+                return name, len(sheets) - 1, table
+    raise InputError(f"{source}: no sheet has a row of names and rows of numbers below it; sheets: {listed(sheets)}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import io
 import logging
 import os
@@ -12,35 +13,34 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from types import ModuleType
 
 from avtorch.errors import InputError, printable
+from avtorch.io.formats.kinds import Kind
 
 _REASON = 160  # characters of a library's message
 
 
-def library(module: str, *, source: str, words: str, package: str, extra: str) -> ModuleType:
-    """The module of an optional library.
+def refuse_missing(source: str, kind: Kind) -> None:
+    """Raises InputError saying what to install where the library of `kind` is not there; nothing is loaded."""
+    if kind.library is not None and importlib.util.find_spec(kind.library.module) is None:
+        raise InputError(
+            f"{source}: is {kind.words}; reading it needs {kind.library.package}: "
+            f"pip install 'avtorch[{kind.library.extra}]'"
+        )
 
-    Raises InputError saying what to install: `source` is the file and `words` its format; `package` and `extra` are
-    the library's name and avtorch's extra that brings it.
+
+def library(module: str, source: str, kind: Kind) -> ModuleType:
+    """A module of the library of `kind`, or of one that comes with the same extra.
+
+    Raises InputError for one that is not there or cannot be loaded, such as one that lacks a part of its own.
     """
     with silenced():
         try:
             return importlib.import_module(module)
-        except ModuleNotFoundError as fault:
-            # a library that is there but lacks a part of its own is another fault, and another cure
-            if fault.name is not None and fault.name.partition(".")[0] != module.partition(".")[0]:
-                raise _broken(source, words, package, extra, fault) from None
-            raise InputError(
-                f"{source}: is {words}; reading it needs {package}: pip install 'avtorch[{extra}]'"
-            ) from None
         except Exception as fault:
-            raise _broken(source, words, package, extra, fault) from None
-
-
-def _broken(source: str, words: str, package: str, extra: str, fault: Exception) -> InputError:
-    return InputError(
-        f"{source}: is {words}; reading it needs {package}, which cannot be loaded here ({reason(fault)}): "
-        f"pip install --force-reinstall 'avtorch[{extra}]'"
-    )
+            extra = kind.library.extra if kind.library is not None else ""
+            raise InputError(
+                f"{source}: is {kind.words}; reading it needs {module}, which cannot be loaded here ({reason(fault)}): "
+                f"pip install --force-reinstall 'avtorch[{extra}]'"
+            ) from None
 
 
 @contextmanager

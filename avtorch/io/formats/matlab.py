@@ -152,7 +152,7 @@ class _Stored:
 
 def _open_73(path: str | os.PathLike[str], kind: Kind) -> MatRecording:
     source = place(path)
-    h5py = library("h5py", source=source, words=kind.words, package="h5py", extra="mat")
+    h5py = library("h5py", source, kind)
     stream = opened(Path(path), need=_NEED)
     try:
         with guarded(source, _NEED):

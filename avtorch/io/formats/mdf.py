@@ -80,7 +80,7 @@ def open_file(path: str | os.PathLike[str], kind: Kind) -> MdfRecording:
     its number as in ``2.NAME``. Raises InputError.
     """
     source = place(path)
-    asammdf = library("asammdf", source=source, words=kind.words, package="asammdf", extra="mdf")
+    asammdf = library("asammdf", source, kind)
     remarks = []
     # asammdf completes an unfinished file in place, so it gets a copy in memory
     unfinished = beginning(path, 8, need=_NEED).startswith(b"UnFin")

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import datetime as dt
 import io
-import json
-import subprocess
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,10 +18,10 @@ from odf.table import Table, TableCell, TableRow
 from odf.text import P
 
 from avtorch.errors import InputError
-from avtorch.io.formats import excel, excel_process, open_recording
+from avtorch.io.formats import excel
 from avtorch.io.formats.excel_table import table_of
 
-from .survival import refused, survives
+from .survival import open_here, refused, survives
 
 Rows = Sequence[Sequence[Any]]
 TIMES = [20.0 * i for i in range(30)]
@@ -82,28 +80,10 @@ def ods(path: Path, sheets: dict[str, Rows]) -> Path:
 WRITERS: dict[str, Callable[[Path, dict[str, Rows]], Path]] = {"xlsx": xlsx, "xls": xls, "ods": ods}
 
 
-class Here:
-    """The other process in this one: its start would be most of what a loop of damaged files takes."""
-
-    returncode = 0
-
-    def __init__(self, raw: bytes, source: str) -> None:
-        try:
-            answer, numbers = excel_process._read(raw, source)
-        except InputError as fault:
-            answer, numbers = {"error": str(fault)}, b""
-        self.stdout = json.dumps(answer).encode() + b"\n" + numbers
-
-
-@pytest.fixture
-def here(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(subprocess, "run", lambda command, input, **_: Here(input, command[-1]))
-
-
 @pytest.mark.parametrize("form", WRITERS)
 def test_the_first_sheet_with_a_table_is_read(tmp_path: Path, form: str) -> None:
     path = WRITERS[form](tmp_path / f"drive.{form}", {"notes": [["about the drive"]], "log": LOG})
-    recording = open_recording(path)
+    recording = open_here(path)
     assert recording.names == ("Speed", "Accel [m/s2]")
     assert dict(recording.units) == {"Speed": "km/h", "Accel [m/s2]": "m/s2"}
     assert recording.remarks == ("sheet 'log' is read, 1 others are not",)
@@ -118,9 +98,9 @@ def table(rows: Rows) -> Any:
     return table_of(rows, "drive.xlsx")
 
 
-def test_empty_cells_and_texts_are_nan_and_are_told(tmp_path: Path, here: None) -> None:
+def test_empty_cells_and_texts_are_nan_and_are_told(tmp_path: Path) -> None:
     rows = [["t", "speed", "speed"], [0.0, 1.0, 5.0], [0.1, None, "fast"], [None, 3.0, 7.0], [0.3, "4.5", 8.0]]
-    recording = open_recording(xlsx(tmp_path / "drive.xlsx", {"a": rows}))
+    recording = open_here(xlsx(tmp_path / "drive.xlsx", {"a": rows}))
     assert recording.names == ("speed", "speed (2)")
     channels = recording.read(recording.names)
     assert channels["speed"].time.tolist() == [0.0, 0.1, 0.3]
@@ -132,10 +112,10 @@ def test_empty_cells_and_texts_are_nan_and_are_told(tmp_path: Path, here: None) 
     )
 
 
-def test_dates_are_seconds(tmp_path: Path, here: None) -> None:
+def test_dates_are_seconds(tmp_path: Path) -> None:
     start = dt.datetime(2026, 11, 23, 12, 0, 0)
     rows = [["Timestamp", "x"], *([start + dt.timedelta(milliseconds=500 * i), i] for i in range(4))]
-    time = open_recording(xlsx(tmp_path / "drive.xlsx", {"a": rows})).read(["x"])["x"].time
+    time = open_here(xlsx(tmp_path / "drive.xlsx", {"a": rows})).read(["x"])["x"].time
     begin = (start - dt.datetime(1970, 1, 1)).total_seconds()
     # a workbook counts days; milliseconds is what the reader of dates keeps of them
     assert np.abs(time - begin - 0.5 * np.arange(4)).max() <= 1e-3
@@ -151,7 +131,7 @@ def test_what_is_no_table() -> None:
     assert table([[1.0, 2.0], [3.0, 4.0]]) is None
 
 
-def test_a_sheet_without_names_or_without_a_time(tmp_path: Path, here: None) -> None:
+def test_a_sheet_without_names_or_without_a_time(tmp_path: Path) -> None:
     refused(xlsx(tmp_path / "a.xlsx", {"only": [[1.0, 2.0]]}), "no sheet has a row of names", "sheets: only")
     path = xlsx(tmp_path / "b.xlsx", {"a": [["speed", "accel"], [1.0, 2.0]]})
     refused(path, "no column is called time, t, timestamp", "columns: speed, accel")
@@ -164,13 +144,6 @@ def patched(path: Path, part: str, change: Callable[[bytes], bytes]) -> None:
         for name in old.namelist():
             new.writestr(name, change(old.read(name)) if name.endswith(part) else old.read(name))
     path.write_bytes(out.getvalue())
-
-
-def test_two_cells_that_claim_a_sheet_of_400_gb(tmp_path: Path) -> None:
-    """python-calamine ends its process here, which is not this one."""
-    path = xlsx(tmp_path / "drive.xlsx", {"a": [["t", "x"], [0.0, 1.0], [1.0, 2.0]]})
-    patched(path, "sheet1.xml", lambda raw: raw.replace(b'r="B3"', b'r="XFD1048576"').replace(b'r="3"', b'r="1048576"'))
-    refused(path, "takes more memory than a workbook may")
 
 
 def test_parts_that_inflate_to_gigabytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,22 +159,7 @@ def test_more_cells_than_a_reader_takes(monkeypatch: pytest.MonkeyPatch) -> None
         table([["time", "speed"], [1.0, 2.0], [1.0, 2.0], [1.0, 2.0]])
 
 
-def test_a_workbook_that_takes_too_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def late(*_: object, **__: object) -> None:
-        raise subprocess.TimeoutExpired("python", 300)
-
-    path = xlsx(tmp_path / "drive.xlsx", {"a": LOG})
-    monkeypatch.setattr(subprocess, "run", late)
-    refused(path, "is not read within 300 s")
-
-
-@pytest.mark.parametrize("form", ["xlsx", "ods"])
-def test_damage_is_read_or_refused(tmp_path: Path, form: str, here: None, fresh_seed: int) -> None:
+@pytest.mark.parametrize("form", WRITERS)
+def test_damage_is_read_or_refused(tmp_path: Path, form: str, fresh_seed: int) -> None:
     path = WRITERS[form](tmp_path / f"drive.{form}", {"log": LOG})
-    survives(path, path.read_bytes(), fresh_seed, cuts=10, flips=25)
-
-
-def test_damage_to_an_older_workbook_is_read_or_refused(tmp_path: Path, fresh_seed: int) -> None:
-    """It has no checksums, and what its sizes claim may end a process: each is read in its own."""
-    path = xls(tmp_path / "drive.xls", {"log": LOG})
-    survives(path, path.read_bytes(), fresh_seed, cuts=1, flips=3)
+    survives(path, path.read_bytes(), fresh_seed, cuts=8, flips=20)

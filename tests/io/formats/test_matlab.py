@@ -15,10 +15,9 @@ import pytest
 from scipy.io import savemat
 
 from avtorch.errors import InputError
-from avtorch.io.formats import open_recording
 from avtorch.io.formats.matlab import _Stored
 
-from .survival import refused, survives
+from .survival import open_here, refused, survives
 
 TIME = np.arange(150) * 0.01
 SPEED = 12 + np.cos(TIME)
@@ -73,7 +72,7 @@ WRITERS = {"5": mat5, "7.3": mat73}
 
 @pytest.mark.parametrize("version", WRITERS)
 def test_structs_columns_and_series(tmp_path: Path, version: str) -> None:
-    recording = open_recording(WRITERS[version](tmp_path / "drive.mat", LOG))
+    recording = open_here(WRITERS[version](tmp_path / "drive.mat", LOG))
     assert recording.form == f"MAT {version}"
     assert set(recording.names) == set(NAMES)
     channels = recording.read(NAMES)
@@ -92,7 +91,7 @@ def test_structs_columns_and_series(tmp_path: Path, version: str) -> None:
 @pytest.mark.parametrize("version", WRITERS)
 def test_vectors_without_a_struct_and_a_time_in_milliseconds(tmp_path: Path, version: str) -> None:
     content = {"t_ms": np.arange(0.0, 100.0, 20.0), "speed": np.arange(5.0), "gain": 2.0, "other": np.arange(7.0)}
-    recording = open_recording(WRITERS[version](tmp_path / "drive.mat", content))
+    recording = open_here(WRITERS[version](tmp_path / "drive.mat", content))
     assert recording.names == ("speed",)
     assert recording.read(["speed"])["speed"].time.tolist() == (np.arange(0.0, 100.0, 20.0) * 1e-3).tolist()
     assert recording.remarks == ("left out, no time goes with them: other",)
@@ -102,7 +101,7 @@ def test_an_array_of_structs_and_other_kinds_of_numbers(tmp_path: Path) -> None:
     cars = np.empty((1, 2), dtype=[("time", object), ("x", object)])
     cars[0, 0] = (TIME, np.arange(150, dtype=np.int16))
     cars[0, 1] = (TIME, np.arange(150, dtype=np.float32) / 4)
-    recording = open_recording(mat5(tmp_path / "drive.mat", {"car": cars, "z": TIME * 1j}))
+    recording = open_here(mat5(tmp_path / "drive.mat", {"car": cars, "z": TIME * 1j}))
     assert recording.names == ("car(1).x", "car(2).x")
     channels = recording.read(recording.names)
     assert channels["car(1).x"].values.tolist() == list(range(150))
@@ -116,7 +115,7 @@ def test_a_file_without_a_time(tmp_path: Path, version: str) -> None:
 
 
 def test_only_vectors_that_are_asked_for_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recording = open_recording(mat73(tmp_path / "drive.mat", LOG))
+    recording = open_here(mat73(tmp_path / "drive.mat", LOG))
     read: list[str] = []
     load = _Stored.load
     monkeypatch.setattr(_Stored, "load", lambda self: (read.append(self.dataset.name), load(self))[1])
@@ -131,7 +130,7 @@ def test_links_out_of_the_file_are_not_followed(tmp_path: Path) -> None:
         file["outside"] = h5py.ExternalLink(str(secret), "/code")
         file["loop"] = h5py.SoftLink("/")
         file.create_dataset("raw", (150,), np.float64, external=[(str(secret), 0, 1200)])
-    assert open_recording(path).names == ("speed",)
+    assert open_here(path).names == ("speed",)
 
 
 def element(type_: int, content: bytes) -> bytes:
@@ -168,7 +167,7 @@ def test_more_matrices_than_a_log_has(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_more_samples_than_a_reader_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recording = open_recording(mat73(tmp_path / "drive.mat", LOG))
+    recording = open_here(mat73(tmp_path / "drive.mat", LOG))
     monkeypatch.setattr("avtorch.io.formats.listed.MOST_CELLS", 299)
     with pytest.raises(InputError, match="has 300 samples"):
         recording.read(["log.speed", "log.engaged"])

@@ -12,9 +12,9 @@ from asammdf import MDF, Signal
 from mf4_rs import MdfWriter, create_float_value, create_uint_value
 
 from avtorch.errors import InputError
-from avtorch.io.formats import mdf_chains, open_recording
+from avtorch.io.formats import mdf_chains
 
-from .survival import holds, refused, survives
+from .survival import holds, open_here, refused, survives
 
 TIME = np.arange(200) * 0.02
 SPEED = 20 + np.sin(TIME)
@@ -48,7 +48,7 @@ def by_asammdf(path: Path, signals: list[Signal], version: str = "4.10") -> Path
 
 
 def test_values_and_stamps_of_another_writer_come_back_exactly(tmp_path: Path) -> None:
-    recording = open_recording(by_another(tmp_path / "drive.mf4"))
+    recording = open_here(by_another(tmp_path / "drive.mf4"))
     assert recording.form.startswith("MDF 4.")
     assert recording.names == ("chassis.speed", "count_chassis", "imu.speed", "count_imu")
     channels = recording.read(recording.names)
@@ -60,7 +60,7 @@ def test_values_and_stamps_of_another_writer_come_back_exactly(tmp_path: Path) -
 
 
 def test_groups_of_one_name_are_told_apart_by_number(tmp_path: Path) -> None:
-    recording = open_recording(by_another(tmp_path / "drive.mf4", ("imu", "imu")))
+    recording = open_here(by_another(tmp_path / "drive.mf4", ("imu", "imu")))
     assert recording.names == ("0.speed", "0.count_imu", "1.speed", "1.count_imu")
 
 
@@ -79,7 +79,7 @@ def test_units_conversions_and_texts(tmp_path: Path, version: str) -> None:
         ),
         Signal(np.array([b"word"] * 200), TIME, name="note", encoding="utf-8"),
     ]
-    recording = open_recording(by_asammdf(tmp_path / "drive.mdf", signals, version))
+    recording = open_here(by_asammdf(tmp_path / "drive.mdf", signals, version))
     assert recording.form == f"MDF {version}"
     assert recording.names == ("speed", "accel", "state")
     assert dict(recording.units) == {"speed": "km/h", "accel": "m/s2"}
@@ -102,7 +102,7 @@ def test_texts_for_a_few_values_leave_the_others_numbers(tmp_path: Path) -> None
             "default_addr": {"a": 0.5, "b": 0.0},
         },
     )  # fmt: skip
-    channel = open_recording(by_asammdf(tmp_path / "drive.mf4", [signal])).read(["speed"])["speed"]
+    channel = open_here(by_asammdf(tmp_path / "drive.mf4", [signal])).read(["speed"])["speed"]
     assert channel.values[:150].tolist() == (counts[:150] / 2).tolist()
     assert np.isnan(channel.values[150:]).all()
 
@@ -110,7 +110,7 @@ def test_texts_for_a_few_values_leave_the_others_numbers(tmp_path: Path) -> None
 def test_samples_marked_invalid_are_nan_and_stay_in_their_place(tmp_path: Path) -> None:
     invalid = np.arange(200) % 7 == 0
     signals = [Signal(SPEED, TIME, name="speed", invalidation_bits=invalid)]
-    channel = open_recording(by_asammdf(tmp_path / "drive.mf4", signals)).read(["speed"])["speed"]
+    channel = open_here(by_asammdf(tmp_path / "drive.mf4", signals)).read(["speed"])["speed"]
     assert channel.time.tolist() == TIME.tolist()
     assert np.isnan(channel.values).tolist() == invalid.tolist()
     assert channel.values[~invalid].tolist() == SPEED[~invalid].tolist()
@@ -125,7 +125,7 @@ def test_only_channels_that_are_asked_for_are_read(tmp_path: Path, monkeypatch: 
         return get(self, *args, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr(MDF, "get", spied)
-    recording = open_recording(by_another(tmp_path / "drive.mf4"))
+    recording = open_here(by_another(tmp_path / "drive.mf4"))
     assert read == []
     assert list(recording.read(["imu.speed"])) == ["imu.speed"]
     assert read == [(1, 1)]
@@ -133,13 +133,13 @@ def test_only_channels_that_are_asked_for_are_read(tmp_path: Path, monkeypatch: 
 
 
 def test_a_channel_that_is_not_there(tmp_path: Path) -> None:
-    recording = open_recording(by_another(tmp_path / "drive.mf4"))
+    recording = open_here(by_another(tmp_path / "drive.mf4"))
     with pytest.raises(InputError, match=r"drive.mf4: channel 'imu.sped' is missing; the nearest: 'imu.speed'"):
         recording.read(["imu.sped"])
 
 
 def test_more_samples_than_a_reader_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recording = open_recording(by_another(tmp_path / "drive.mf4"))
+    recording = open_here(by_another(tmp_path / "drive.mf4"))
     monkeypatch.setattr("avtorch.io.formats.listed.MOST_CELLS", 399)
     recording.read(["imu.speed"])
     with pytest.raises(InputError, match="has 400 samples in the channels that are read; needs 399 at most"):
@@ -185,7 +185,7 @@ def test_a_compressed_piece_that_claims_the_impossible(tmp_path: Path) -> None:
         mdf.append([Signal(np.zeros(100_000), np.arange(100_000) / 100, name="speed")])
         path = Path(mdf.save(tmp_path / "drive.mf4", compression=1))
     raw = bytearray(path.read_bytes())
-    assert open_recording(path).read(["speed"])["speed"].values.tolist() == [0.0] * 100_000
+    assert open_here(path).read(["speed"])["speed"].values.tolist() == [0.0] * 100_000
     at = blocks(raw, b"DZ")[0]
     raw[at + 32 : at + 40] = struct.pack("<Q", 2**40)
     path.write_bytes(raw)
@@ -198,7 +198,7 @@ def test_a_file_that_is_cut_off_is_read_as_far_as_it_goes(tmp_path: Path) -> Non
     raw = path.read_bytes()
     data = blocks(raw, b"DT")[-1]
     path.write_bytes(raw[: data + 24 + 100 * 24 + 5])
-    recording = open_recording(path)
+    recording = open_here(path)
     assert recording.remarks == ("the file is cut off: 1 of its blocks lie behind its end, or end there",)
     channels = recording.read(["chassis.speed", "imu.speed"])
     assert channels["chassis.speed"].values.tolist() == SPEED.tolist()

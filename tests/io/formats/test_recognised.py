@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import os
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from avtorch.errors import InputError
-from avtorch.io.formats import is_recording, library, open_recording
+from avtorch.io.formats import is_recording, kinds, library, open_recording
 from avtorch.io.formats.presets import PRESETS
 from avtorch.io.mapping import SIGNALS
 
@@ -63,6 +64,13 @@ def put(folder: Path, content: bytes, name: str) -> Path:
     return folder / name
 
 
+def refused_apart(path: Path, *words: str) -> None:
+    """By `open_recording` itself."""
+    with pytest.raises(InputError) as fault:
+        open_recording(path)
+    assert all(word in str(fault.value) for word in (path.name, *words)), fault.value
+
+
 @pytest.mark.parametrize("case", BEGINNINGS)
 def test_a_recording_is_known_by_how_it_begins(tmp_path: Path, case: str) -> None:
     path = put(tmp_path, *BEGINNINGS[case])
@@ -106,21 +114,19 @@ def test_databases_are_for_can_logs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("case", LIBRARIES)
 def test_a_missing_library_is_one_command_away(tmp_path: Path, case: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(module: str) -> object:
-        raise ModuleNotFoundError(f"No module named '{module}'", name=module.partition(".")[0])
-
-    load = importlib.import_module
-    monkeypatch.setattr(importlib, "import_module", lambda m: load(m) if m.startswith("avtorch.") else missing(m))
-    refused(put(tmp_path, *BEGINNINGS[case]), "reading it needs", LIBRARIES[case])
+    """Nothing is loaded to see it, and no process is started."""
+    monkeypatch.setattr(importlib.util, "find_spec", lambda module: None)
+    monkeypatch.setattr(subprocess, "Popen", None)
+    refused_apart(put(tmp_path, *BEGINNINGS[case]), "reading it needs", LIBRARIES[case])
 
 
 def test_a_library_that_lacks_a_part_of_its_own_is_another_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(module: str) -> object:
         raise ModuleNotFoundError("No module named 'lxml'", name="lxml")
 
-    monkeypatch.setattr(library.importlib, "import_module", broken)
+    monkeypatch.setattr(importlib, "import_module", broken)
     with pytest.raises(InputError, match=r"which cannot be loaded here .*lxml.*--force-reinstall 'avtorch\[mdf\]'"):
-        library.library("asammdf", source="drive.mf4", words="MDF", package="asammdf", extra="mdf")
+        library.library("asammdf", "drive.mf4", kinds.MDF)
 
 
 def test_looking_at_a_file_loads_no_library(tmp_path: Path) -> None:
