@@ -62,7 +62,9 @@ class _Child:
         self.source, self._words = place(path), kind.words
         # -P: nothing of the folder that the user happens to work in
         command = [sys.executable, "-P", "-W", "ignore", "-m", "avtorch.io.formats.apart_process"]
-        environment = dict(os.environ, PYTHONPATH=os.pathsep.join(part for part in sys.path if part))
+        # a trace of a panic, which nobody sees, takes most of a second
+        environment = dict(os.environ, RUST_BACKTRACE="0")
+        environment["PYTHONPATH"] = os.pathsep.join(part for part in sys.path if part)
         try:
             self._process = subprocess.Popen(
                 [*command, kind.words, os.fspath(path)],

@@ -19,7 +19,7 @@ from avtorch.errors import InputError
 from avtorch.io.formats import kinds
 from avtorch.io.recording import Recording
 
-MOST_MEMORY = 6 * 2**30
+MOST_MEMORY = 4 * 2**30
 """Bytes of address space, where the system can limit it: 20 million cells of a workbook take about half."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import importlib
 import os
 import random
@@ -68,32 +69,51 @@ def refused(path: Path, *words: str, dbc: Sequence[Path] | None = None) -> str:
     return said
 
 
-def holds(path: Path, content: bytes, dbc: Sequence[Path] | None = None) -> bool:
-    """Whether `content` is read; where not, it is refused as it should be.
+def survive(path: Path, contents: Sequence[bytes], dbc: Sequence[Path] | None = None) -> int:
+    """How many of the `contents` are read; the others are refused as they should be.
 
-    What is read apart is read in a copy of this process: its library may end that one, by a fault of memory only.
+    They are read in a copy of this process: a library that is to run apart may end it, by a fault of memory only. The
+    copy after that goes on behind the content that did.
     """
-    path.write_bytes(content)
-    try:
+    begun, read = 0, 0
+    while begun < len(contents):
+        answers, theirs = os.pipe()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 warns of threads; the copy uses none
+            copy = os.fork()
+        if copy == 0:
+            _serve(path, contents[begun:], dbc, theirs)
+        os.close(theirs)
+        with os.fdopen(answers, "rb") as stream:
+            said = stream.read()
+        code = os.waitstatus_to_exitcode(os.waitpid(copy, 0)[1])
+        at = begun + len(said)
+        read += said.count(b"1")
+        if code == 0:
+            break
+        fatal = code in (-signal.SIGSEGV, -signal.SIGABRT, -signal.SIGBUS, -signal.SIGFPE)
+        assert fatal, f"content {at} of {len(contents)}: status {code}"
+        path.write_bytes(contents[at])
         kind = kind_at(path)
-    except InputError:
-        return False
-    if kind is None or not kind.apart:
-        return _held(path, dbc)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # Python 3.12 warns of threads; the copy uses none
-        copy = os.fork()
-    if copy == 0:
-        signal.alarm(LATE_S)  # not caught: it ends the copy
-        try:
-            apart_process._limit_memory()
-            os._exit(0 if _held(path, dbc) else 1)
-        except BaseException:
-            traceback.print_exc()
-            os._exit(2)
-    code = os.waitstatus_to_exitcode(os.waitpid(copy, 0)[1])
-    assert code in (0, 1, -signal.SIGSEGV, -signal.SIGABRT, -signal.SIGBUS, -signal.SIGFPE), f"status {code}"
-    return code == 0
+        assert kind is not None
+        assert kind.apart, f"content {at} of {len(contents)}: status {code}"
+        begun = at + 1
+    return read
+
+
+def _serve(path: Path, contents: Sequence[bytes], dbc: Sequence[Path] | None, answers: int) -> None:
+    """In the copy: read one after the other, and end."""
+    faulthandler.disable()
+    os.environ["RUST_BACKTRACE"] = "0"
+    try:
+        apart_process._limit_memory()
+        for content in contents:
+            path.write_bytes(content)
+            os.write(answers, b"1" if _held(path, dbc) else b"0")
+        os._exit(0)
+    except BaseException:
+        traceback.print_exc()
+        os._exit(2)
 
 
 def _held(path: Path, dbc: Sequence[Path] | None) -> bool:
@@ -111,4 +131,4 @@ def survives(path: Path, raw: bytes, seed: int, *, cuts: int, flips: int, dbc: S
     rng = random.Random(seed)
     contents = [raw[: rng.randrange(len(raw))] for _ in range(cuts)]
     contents += [damaged(raw, i % KINDS, rng) for i in range(flips)]
-    return sum(holds(path, content, dbc) for content in contents)
+    return survive(path, contents, dbc)

@@ -56,9 +56,7 @@ def test_what_the_reader_refuses_is_refused(tmp_path: Path) -> None:
         recording.read(["log.sped"])
 
 
-def test_a_name_that_looks_like_an_option_and_one_of_odd_letters(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_odd_names_of_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("-c.mat", "größe\n.mat", "a b;ls.mat"):
         mat5(tmp_path / name, STRUCTS)
@@ -103,7 +101,7 @@ def test_the_process_ends_with_its_recording(tmp_path: Path) -> None:
 
 def test_no_process_can_be_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(apart.sys, "executable", str(tmp_path / "no python"))
-    with pytest.raises(InputError, match="drive.mat: no process can be started to read it"):
+    with pytest.raises(InputError, match=r"drive\.mat: no process can be started to read it"):
         open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
 
 

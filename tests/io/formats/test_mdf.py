@@ -14,7 +14,7 @@ from mf4_rs import MdfWriter, create_float_value, create_uint_value
 from avtorch.errors import InputError
 from avtorch.io.formats import mdf_chains
 
-from .survival import holds, open_here, refused, survives
+from .survival import open_here, refused, survive, survives
 
 TIME = np.arange(200) * 0.02
 SPEED = 20 + np.sin(TIME)
@@ -219,8 +219,10 @@ def test_the_links_of_damaged_blocks_are_read_or_refused(tmp_path: Path, fresh_s
     path = by_another(tmp_path / "drive.mf4")
     raw, rng = path.read_bytes(), random.Random(fresh_seed)
     heads = [at for name in (b"HD", b"DG", b"CG", b"CN", b"DT", b"TX") for at in blocks(raw, name)]
+    contents = []
     for _ in range(40):
         content, at = bytearray(raw), rng.choice(heads) + 8 * rng.randrange(1, 8)
         number = rng.choice([*heads, 0, 1, rng.randrange(len(raw)), 2**63, 2**32 - 1])
         content[at : at + 8] = struct.pack("<Q", number)
-        holds(path, bytes(content))
+        contents.append(bytes(content))
+    survive(path, contents)
