@@ -27,8 +27,8 @@ def open_recording(path: str | os.PathLike[str], *, dbc: Sequence[str | os.PathL
     only one in its folder. Other formats take none. Names are listed and no samples are read, except where a format
     has to be read to be listed (MAT before 7.3, Excel).
 
-    MDF, MAT and workbooks are read in a process of their own, whose libraries a damaged file may end; it lives as long
-    as the recording.
+    All but CAN logs are read in a process of their own, which a damaged file may end or fill; it lives as long as the
+    recording.
 
     Raises InputError naming the file: for what is no regular file or no recording, for a damaged one, for one whose
     library is not installed (with the command that installs it), and for a CAN log without a database.

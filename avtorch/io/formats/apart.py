@@ -1,8 +1,9 @@
 """A reader in a process of its own, for formats whose libraries a damaged file can end or corrupt.
 
 asammdf, SciPy's reader of MAT and python-calamine are compiled code that trusts a file's sizes: damage has been seen to
-end the process (segmentation faults, 400 GB claimed by two cells). What ends there is one InputError here. The process
-lives as long as its recording, so a second reading starts at once.
+end the process (segmentation faults, 400 GB claimed by two cells). A bag's compressed pieces inflate to whatever they
+hold. What ends there is one InputError here. The process lives as long as its recording, so a second reading starts at
+once.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class _Child:
     def __init__(self, path: str | os.PathLike[str], kind: Kind) -> None:
         self.source, self._words = place(path), kind.words
         # -P: nothing of the folder that the user happens to work in
-        command = [sys.executable, "-P", "-W", "ignore", "-m", "avtorch.io.formats.apart_process"]
+        command = [sys.executable or "python", "-P", "-W", "ignore", "-m", "avtorch.io.formats.apart_process"]
         # a trace of a panic, which nobody sees, takes most of a second
         environment = dict(os.environ, RUST_BACKTRACE="0")
         environment["PYTHONPATH"] = os.pathsep.join(part for part in sys.path if part)

@@ -15,6 +15,7 @@ _NUMBERS = frozenset(
 )  # fmt: skip
 _DEEPEST = 8
 _MOST = 2000  # fields of one type: types within types may multiply
+_MOST_VISITED = 50_000  # fields looked at for it, also those that are no numbers
 _BASE, _NAME = 1, 2  # kinds of a field: a number or text, another type; the rest are arrays
 
 Definitions = Mapping[str, Any]
@@ -26,20 +27,22 @@ def numeric_fields(definitions: Definitions, type_: str) -> list[str]:
     Raises KeyError for a type that is not defined.
     """
     found: list[str] = []
-    _collect(definitions, type_, (), found)
+    _collect(definitions, type_, (), found, [_MOST_VISITED])
     return found
 
 
-def _collect(definitions: Definitions, type_: str, before: Sequence[str], found: list[str]) -> None:
-    if len(before) >= _DEEPEST or len(found) >= _MOST:
+def _collect(definitions: Definitions, type_: str, before: Sequence[str], found: list[str], left: list[int]) -> None:
+    if len(before) >= _DEEPEST:
         return
     for name, (kind, what) in definitions[type_][1]:
+        left[0] -= 1
+        if left[0] < 0 or len(found) >= _MOST:
+            return
         path = (*before, name)
         if kind == _BASE and what[0] in _NUMBERS:
-            if len(found) < _MOST:
-                found.append(".".join(path))
+            found.append(".".join(path))
         elif kind == _NAME and what not in (_TIME, _DURATION):
-            _collect(definitions, what, path, found)
+            _collect(definitions, what, path, found, left)
 
 
 def stamp_field(definitions: Definitions, type_: str) -> str | None:

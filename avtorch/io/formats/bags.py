@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import weakref
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.formats import kinds
 from avtorch.io.formats.bag_fields import numeric_fields, stamp_field
@@ -23,7 +24,7 @@ from avtorch.io.formats.library import guarded, library
 from avtorch.io.formats.listed import Listed, refuse_cells
 from avtorch.io.opening import place
 from avtorch.io.recording import Channel
-from avtorch.io.size import MOST_COLUMNS
+from avtorch.io.size import MOST_CELLS, MOST_COLUMNS
 
 _NEED = "an undamaged ROS bag"
 _NANO = 10**9
@@ -41,6 +42,32 @@ class Topic:
     @property
     def count(self) -> int:
         return sum(max(0, connection.msgcount) for connection in self.connections)
+
+
+class _Piece:
+    """What is read of one topic: columns of its fields, the times of recording, and the stamps."""
+
+    def __init__(self, topic: Topic, paths: Sequence[str]) -> None:
+        self.topic = topic
+        self.store: Any = None  # of the types, found by the first message
+        self.columns = [array("d") for _ in paths]
+        self.logged, self.stamped = array("d"), array("d")
+        self._take: Callable[[Any], tuple[Any, ...]] = attrgetter(paths[0], *paths)  # a tuple for one field, too
+        self._stamp = attrgetter(topic.stamp) if topic.stamp else None
+
+    def take(self, at: int, message: Any) -> None:
+        """The fields of a message that was recorded `at` [ns]."""
+        row = self._take(message)[1:]
+        if self._stamp is not None:
+            moment = self._stamp(message)
+            self.stamped.append((moment.sec * _NANO + moment.nanosec) / _NANO)
+        for column, value in zip(self.columns, row, strict=True):
+            column.append(value)
+        self.logged.append(at / _NANO)
+
+    def time(self) -> FloatArray:
+        stamped = len(self.stamped) > 0 and min(self.stamped) > 0
+        return np.array(self.stamped if stamped else self.logged, dtype=np.float64)
 
 
 class BagRecording(Listed):
@@ -65,43 +92,35 @@ class BagRecording(Listed):
         for name in names:
             asked.setdefault(self._fields[name][0], []).append(name)
         refuse_cells(self.source, sum(self._topics[topic].count * len(own) for topic, own in asked.items()))
+        pieces = {name: _Piece(self._topics[name], [self._fields[c][1] for c in own]) for name, own in asked.items()}
+        self._collect(pieces)
         found: dict[str, Channel] = {}
-        for topic, own in asked.items():
-            found |= self._read_topic(topic, own)
+        for topic, piece in pieces.items():
+            time = piece.time()
+            for name, column in zip(asked[topic], piece.columns, strict=True):
+                found[name] = Channel(name, time, np.array(column, dtype=np.float64))
         return {name: found[name] for name in names}
 
-    def _read_topic(self, name: str, names: list[str]) -> dict[str, Channel]:
-        topic = self._topics[name]
-        where = f"{self.source}: topic {quoted(name, 80)}"
-        paths = [self._fields[channel][1] for channel in names]
-        take: Callable[[Any], tuple[Any, ...]] = attrgetter(paths[0], *paths)  # a tuple for one field, too
-        stamp = attrgetter(topic.stamp) if topic.stamp else None
-        columns = [array("d") for _ in paths]
-        logged, stamped = array("d"), array("d")
-        with guarded(lambda: f"{where}: message {len(logged) + 1}", _NEED):
-            for at, message in self._messages(topic):
-                row = take(message)[1:]
-                if stamp is not None:
-                    moment = stamp(message)
-                    stamped.append((moment.sec * _NANO + moment.nanosec) / _NANO)
-                for column, value in zip(columns, row, strict=True):
-                    column.append(value)
-                logged.append(at / _NANO)
-                if len(logged) % 4096 == 0:
-                    refuse_cells(self.source, len(logged) * len(names))
-        time = np.array(stamped if len(stamped) and min(stamped) > 0 else logged, dtype=np.float64)
-        return {
-            channel: Channel(channel, time, np.array(column, dtype=np.float64))
-            for channel, column in zip(names, columns, strict=True)
-        }
+    def _collect(self, pieces: Mapping[str, _Piece]) -> None:
+        """One pass over the messages of the topics of `pieces`, which take what they need of them."""
+        by_connection = {(c.topic, c.id): name for name, piece in pieces.items() for c in piece.topic.connections}
+        name, samples = "", 0
 
-    def _messages(self, topic: Topic) -> Iterator[tuple[int, Any]]:
-        """Time of recording [ns] and message, decoded by the first store that fits the first message."""
-        store = None
-        for _, at, raw in self._reader.messages(list(topic.connections)):
-            if store is None:
-                store = self._fitting(topic, raw)
-            yield at, self._decoded(store, raw, topic.type)
+        def where() -> str:
+            at = f": topic {quoted(name, 80)}: message {len(pieces[name].logged) + 1}" if name else ""
+            return f"{self.source}{at}"
+
+        with guarded(where, _NEED):
+            connections = [c for piece in pieces.values() for c in piece.topic.connections]
+            for connection, at, raw in self._reader.messages(connections):
+                name = by_connection[connection.topic, connection.id]
+                piece = pieces[name]
+                if piece.store is None:
+                    piece.store = self._fitting(piece.topic, raw)
+                piece.take(at, self._decoded(piece.store, raw, piece.topic.type))
+                samples += len(piece.columns)
+                if samples > MOST_CELLS:
+                    refuse_cells(self.source, samples)
 
     def _fitting(self, topic: Topic, raw: bytes) -> Any:
         for store in topic.stores[:-1]:

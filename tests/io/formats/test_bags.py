@@ -12,9 +12,9 @@ import pytest
 from mcap_ros2.writer import Writer as McapWriter
 
 from avtorch.errors import InputError
-from avtorch.io.formats import is_recording, open_recording
+from avtorch.io.formats import is_recording
 
-from .survival import refused, survives
+from .survival import open_here, refused, survives
 
 COUNT = 80
 START = 1_700_000_000
@@ -154,7 +154,7 @@ def nearest(stamps: list[int]) -> list[float]:
 
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
 def test_mcap_of_its_own_writer(tmp_path: Path, compression: str) -> None:
-    recording = open_recording(mcap(tmp_path / "drive.mcap", compression))
+    recording = open_here(mcap(tmp_path / "drive.mcap", compression))
     assert recording.form == "ROS 2 bag (MCAP)"
     assert recording.names == NAMES
     channels = recording.read(NAMES)
@@ -168,7 +168,7 @@ def test_mcap_of_its_own_writer(tmp_path: Path, compression: str) -> None:
 
 @pytest.mark.parametrize("newest", [True, False])
 def test_autowares_types_are_known_where_the_bag_does_not_say(tmp_path: Path, newest: bool) -> None:
-    recording = open_recording(autoware(tmp_path / "drive.db3", newest))
+    recording = open_here(autoware(tmp_path / "drive.db3", newest))
     assert recording.form == "ROS 2 bag (SQLite)"
     assert recording.remarks == ("topics left out, their type is unknown or differs: /odd",)
     names = [
@@ -187,13 +187,13 @@ def test_autowares_types_are_known_where_the_bag_does_not_say(tmp_path: Path, ne
 def test_a_bag_that_is_a_folder(tmp_path: Path) -> None:
     path = folder(tmp_path / "drive")
     assert is_recording(path)
-    recording = open_recording(path)
+    recording = open_here(path)
     assert recording.form == "ROS 2 bag (folder)"
     assert recording.read(["/speed/data"])["/speed/data"].values.tolist() == [i / 4 for i in range(COUNT)]
 
 
 def test_a_bag_of_ros_1(tmp_path: Path) -> None:
-    recording = open_recording(ros1(tmp_path / "drive.bag"))
+    recording = open_here(ros1(tmp_path / "drive.bag"))
     assert recording.form == "ROS 1 bag"
     assert recording.names == ("/cmd/header/seq", *NAMES[:6], "/speed/data")
     channels = recording.read(["/cmd/twist/linear/x", "/speed/data"])
@@ -206,7 +206,7 @@ def test_a_stamp_that_is_not_set_is_no_time(tmp_path: Path) -> None:
     """A node that leaves the stamp at 0: the time of recording is taken for all of the topic."""
     messages = [cdr("iIB", *(divmod(stamp, 10**9) if i else (0, 0)), 1) for i, stamp in enumerate(STAMPS)]
     path = sqlite(tmp_path / "drive.db3", {"/mode": ("autoware_vehicle_msgs/msg/ControlModeReport", messages)})
-    channel = open_recording(path).read(["/mode/mode"])["/mode/mode"]
+    channel = open_here(path).read(["/mode/mode"])["/mode/mode"]
     assert channel.time.tolist() == nearest([stamp + LATE for stamp in STAMPS])
 
 
@@ -218,7 +218,7 @@ def test_only_topics_that_are_asked_for_are_decoded(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(
         Typestore, "deserialize_cdr", lambda self, raw, name: (decoded.append(name), decode(self, raw, name))[1]
     )
-    recording = open_recording(mcap(tmp_path / "drive.mcap"))
+    recording = open_here(mcap(tmp_path / "drive.mcap"))
     assert decoded == []
     recording.read(["/state/mode"])
     assert decoded == ["car/msg/State"] * COUNT
@@ -245,6 +245,8 @@ def test_a_type_within_itself_and_types_that_multiply(tmp_path: Path) -> None:
     many = {str(n): ((), [(f"f{k}", (2, str(n + 1))) for k in range(50)]) for n in range(7)}
     many["7"] = ((), [("x", (1, ("float64", 0)))])
     assert len(numeric_fields(many, "0")) == 2000
+    many["7"] = ((), [("x", (1, ("string", 0)))])
+    assert numeric_fields(many, "0") == []
 
 
 def test_a_database_that_is_no_bag(tmp_path: Path) -> None:
@@ -276,7 +278,7 @@ def test_a_pipe_in_a_bags_folder_is_not_waited_for(tmp_path: Path) -> None:
 
 
 def test_more_samples_than_a_reader_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recording = open_recording(mcap(tmp_path / "drive.mcap"))
+    recording = open_here(mcap(tmp_path / "drive.mcap"))
     monkeypatch.setattr("avtorch.io.formats.listed.MOST_CELLS", 2 * COUNT - 1)
     recording.read(["/state/mode"])
     with pytest.raises(InputError, match="has 160 samples"):
