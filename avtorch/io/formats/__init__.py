@@ -1,0 +1,54 @@
+"""Recordings in the formats of the trade: MDF, ROS bags and MCAP, CAN logs, MAT files, Excel sheets.
+
+Each format is read by a library of its own, an extra such as ``avtorch[mdf]``, loaded when a file of that format is
+opened. ``avtorch[logs]`` brings all of them.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Sequence
+
+from avtorch.errors import InputError
+from avtorch.io.formats.apart import open_apart
+from avtorch.io.formats.library import refuse_missing
+from avtorch.io.formats.recognise import NEED, is_kind, kind_at
+from avtorch.io.opening import place
+from avtorch.io.recording import Recording
+
+__all__ = ["is_recording", "open_recording"]
+
+
+def open_recording(path: str | os.PathLike[str], *, dbc: Sequence[str | os.PathLike[str]] | None = None) -> Recording:
+    """Open a recording; its format is recognised by how it begins, then by its suffix.
+
+    `dbc` names the databases that decode a CAN log; by default the ``.dbc`` beside the log that has its name, or the
+    only one in its folder. Other formats take none. Names are listed and no samples are read, except where a format
+    has to be read to be listed (MAT before 7.3, Excel).
+
+    All but CAN logs are read in a process of their own, which a damaged file may end or fill; it lives as long as the
+    recording.
+
+    Raises InputError naming the file: for what is no regular file or no recording, for a damaged one, for one whose
+    library is not installed (with the command that installs it), and for a CAN log without a database.
+    """
+    kind = kind_at(path)
+    if kind is None:
+        what = "a directory without the metadata.yaml of a ROS 2 bag" if os.path.isdir(path) else "no recording"
+        raise InputError(f"{place(path)}: is {what}; {NEED} is needed")
+    if dbc is not None and kind.reader != "can":
+        raise InputError(f"{place(path)}: is {kind.words}, which no DBC decodes; dbc is for CAN logs")
+    refuse_missing(place(path), kind)
+    if kind.apart:
+        return open_apart(path, kind)
+    reader = importlib.import_module(f"avtorch.io.formats.{kind.reader}")
+    return reader.open_can(path, kind, dbc) if kind.reader == "can" else reader.open_file(path, kind)
+
+
+def is_recording(path: str | os.PathLike[str]) -> bool:
+    """Whether `open_recording` is the one to read `path`: by its first bytes, or by its suffix where they are damaged.
+
+    False for CSV, Parquet, and where there is no such file. Reads at most 4096 bytes and loads no library.
+    """
+    return is_kind(path)

@@ -1,0 +1,140 @@
+"""A reader in a process of its own, for formats whose libraries a damaged file can end or corrupt.
+
+asammdf, SciPy's reader of MAT and python-calamine are compiled code that trusts a file's sizes: damage has been seen to
+end the process (segmentation faults, 400 GB claimed by two cells). A bag's compressed pieces inflate to whatever they
+hold. What ends there is one InputError here. The process lives as long as its recording, so a second reading starts at
+once.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import weakref
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from avtorch.arrays import FloatArray
+from avtorch.errors import InputError
+from avtorch.io.formats.kinds import Kind
+from avtorch.io.formats.listed import Listed
+from avtorch.io.opening import place
+from avtorch.io.recording import Channel
+
+MOST_SECONDS = 300.0
+"""For opening, and for each reading: a workbook of 20 million cells takes about a tenth of that."""
+
+
+class ApartRecording(Listed):
+    """A recording that another process holds open."""
+
+    def __init__(self, child: _Child, listing: dict[str, Any]) -> None:
+        super().__init__(child.source, listing["form"], listing["names"], listing["units"], listing["remarks"])
+        self._child = child
+        weakref.finalize(self, child.end)
+
+    def _read(self, names: tuple[str, ...]) -> dict[str, Channel]:
+        answer = self._child.ask(names)
+        clocks = [self._child.numbers(count) for count in answer["clocks"]]
+        return {name: Channel(name, clocks[k], self._child.numbers(len(clocks[k]))) for name, k in answer["channels"]}
+
+
+def open_apart(path: str | os.PathLike[str], kind: Kind) -> ApartRecording:
+    """Open a recording in a process of its own. Raises InputError, also where that process ends or is not done within
+    300 s."""
+    child = _Child(path, kind)
+    try:
+        return ApartRecording(child, child.answer())
+    except BaseException:
+        child.end()
+        raise
+
+
+class _Child:
+    """The other process: requests are lines of JSON, answers are a line of JSON and the numbers it tells of."""
+
+    def __init__(self, path: str | os.PathLike[str], kind: Kind) -> None:
+        self.source, self._words = place(path), kind.words
+        # -P: nothing of the folder that the user happens to work in
+        command = [sys.executable or "python", "-P", "-W", "ignore", "-m", "avtorch.io.formats.apart_process"]
+        # a trace of a panic, which nobody sees, takes most of a second
+        environment = dict(os.environ, RUST_BACKTRACE="0")
+        environment["PYTHONPATH"] = os.pathsep.join(part for part in sys.path if part)
+        try:
+            self._process = subprocess.Popen(
+                [*command, kind.words, os.fspath(path)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env=environment,
+            )
+        except (OSError, ValueError) as fault:
+            raise InputError(f"{self.source}: no process can be started to read it ({fault})") from None
+        self._late = False
+
+    def ask(self, names: tuple[str, ...]) -> dict[str, Any]:
+        """The answer to a request for channels."""
+        assert self._process.stdin is not None
+        with suppress(OSError):  # where it has ended, the answer tells how
+            self._process.stdin.write(json.dumps(names).encode() + b"\n")
+            self._process.stdin.flush()
+        return self.answer()
+
+    def answer(self) -> dict[str, Any]:
+        line = self._within(lambda stream: stream.readline())
+        try:
+            answer = json.loads(line)
+        except ValueError:
+            raise self._ended() from None
+        if "error" in answer:
+            raise InputError(answer["error"])
+        return answer
+
+    def numbers(self, count: int) -> FloatArray:
+        raw = self._within(lambda stream: stream.read(8 * count))
+        if len(raw) != 8 * count:
+            raise self._ended()
+        return np.frombuffer(raw, dtype=np.float64).copy()
+
+    def _within(self, read: Any) -> bytes:
+        """What `read` takes of the answer; the process is ended when it is late."""
+
+        def end() -> None:
+            self._late = True
+            self._process.kill()
+
+        timer = threading.Timer(MOST_SECONDS, end)
+        timer.daemon = True
+        timer.start()
+        try:
+            return read(self._process.stdout)
+        finally:
+            timer.cancel()
+
+    def _ended(self) -> InputError:
+        if self._late:
+            return InputError(f"{self.source}: is not read within {MOST_SECONDS:g} s; a smaller file is needed")
+        self._process.kill()
+        code = self._process.wait()
+        how = f"status {code}"
+        if code < 0:
+            how = signal.Signals(-code).name if -code in signal.valid_signals() else f"signal {-code}"
+        return InputError(
+            f"{self.source}: is damaged, or takes more memory than it may: it ended the process that read it ({how}); "
+            f"an undamaged {self._words} file is needed"
+        )
+
+    def end(self) -> None:
+        """End the process, and leave nothing of it."""
+        self._process.kill()
+        self._process.wait()
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                with suppress(OSError):  # a request that nobody will read
+                    stream.close()

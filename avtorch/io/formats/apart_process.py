@@ -1,0 +1,89 @@
+"""The process in which a reader runs apart: opens one recording, then answers requests for its channels.
+
+Arguments are the name of the format and the path. Each request is a line of JSON, the names; each answer is a line of
+JSON, then the numbers: the clocks, then the values of the channels.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import sys
+from collections.abc import Iterable
+from typing import BinaryIO
+
+import numpy as np
+
+from avtorch.errors import InputError
+from avtorch.io.formats import kinds
+from avtorch.io.recording import Recording
+
+MOST_MEMORY = 4 * 2**30
+"""Bytes of address space, where the system can limit it: 20 million cells of a workbook take about half."""
+
+
+def main() -> None:
+    """Serve one recording until the standard input ends."""
+    _limit_memory()
+    # answers go where the output went; whatever a library prints goes nowhere
+    out = os.fdopen(os.dup(1), "wb")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    kind = kinds.named(sys.argv[1])
+    try:
+        reader = importlib.import_module(f"avtorch.io.formats.{kind.reader}")
+        recording: Recording = reader.open_file(sys.argv[2], kind)
+    except InputError as fault:
+        _answer(out, {"error": str(fault)})
+        return
+    _answer(
+        out,
+        {
+            "form": recording.form,
+            "names": recording.names,
+            "units": dict(recording.units),
+            "remarks": recording.remarks,
+        },
+    )
+    serve(recording, sys.stdin.buffer, out)
+
+
+def serve(recording: Recording, requests: Iterable[bytes], out: BinaryIO) -> None:
+    """Answer each of the requests."""
+    for line in requests:
+        try:
+            channels = list(recording.read(json.loads(line)).values())
+        except InputError as fault:
+            _answer(out, {"error": str(fault)})
+            continue
+        clocks = {id(channel.time): channel.time for channel in channels}
+        place = {key: k for k, key in enumerate(clocks)}
+        _answer(
+            out,
+            {
+                "clocks": [len(clock) for clock in clocks.values()],
+                "channels": [(channel.name, place[id(channel.time)]) for channel in channels],
+            },
+            [*clocks.values(), *(channel.values for channel in channels)],
+        )
+
+
+def _answer(out: BinaryIO, answer: dict, arrays: Iterable[np.ndarray] = ()) -> None:
+    out.write(json.dumps(answer).encode() + b"\n")
+    for array in arrays:
+        out.write(np.ascontiguousarray(array, dtype=np.float64).tobytes())
+    out.flush()
+
+
+def _limit_memory() -> None:
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY if most < 0 else min(MOST_MEMORY, most), most))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+if __name__ == "__main__":
+    main()

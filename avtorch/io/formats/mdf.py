@@ -1,0 +1,249 @@
+"""MDF 3 and 4 by asammdf: names from the blocks, samples of those channels that are asked for."""
+
+from __future__ import annotations
+
+import os
+import weakref
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from avtorch.arrays import FloatArray
+from avtorch.errors import InputError, quoted
+from avtorch.io.formats.kinds import Kind
+from avtorch.io.formats.library import guarded, library
+from avtorch.io.formats.listed import Listed, refuse_cells
+from avtorch.io.formats.mdf_chains import walk
+from avtorch.io.formats.opened import beginning, in_memory, opened
+from avtorch.io.opening import place
+from avtorch.io.recording import Channel
+from avtorch.io.size import MOST_BYTES
+
+_NEED = "an undamaged MDF 3 or 4 file"
+_NUMBERS_4 = frozenset(range(6))  # unsigned, signed and real, little and big end first; then texts, bytes, media
+_NUMBERS_3 = frozenset((0, 1, 2, 3, 9, 10, 11, 12, 13, 14, 15, 16))
+_TIME, _NO_SYNC = 1, 0  # what a master counts in MDF 4; the others are an angle, a distance, an index
+_MASTERS_4 = (2, 3)
+_VARIABLE_LENGTH = 1
+_DATES_3 = (132, 133)
+
+
+class MdfRecording(Listed):
+    """An MDF file. `places` tells group and index of each name.
+
+    Samples are physical values; a channel whose values are named by texts is read as its raw numbers, and where texts
+    name a few values of a numeric channel only, those are NaN. Invalidation bits make NaN, too.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        form: str,
+        mdf: Any,
+        places: Mapping[str, tuple[int, int]],
+        units: Mapping[str, str],
+        remarks: list[str],
+    ) -> None:
+        super().__init__(source, form, places, units, remarks)
+        self._mdf, self._places = mdf, dict(places)
+
+    def _read(self, names: tuple[str, ...]) -> dict[str, Channel]:
+        groups = self._mdf.groups
+        refuse_cells(self.source, sum(groups[self._places[name][0]].channel_group.cycles_nr for name in names))
+        times: dict[int, FloatArray] = {}
+        channels = {}
+        for name in names:
+            group, index = self._places[name]
+            with guarded(f"{self.source}: channel {quoted(name, 80)}", _NEED):
+                signal = self._mdf.get(group=group, index=index, raw=True, ignore_invalidation_bits=True)
+                values = _physical(signal)
+                time = np.array(signal.timestamps, dtype=np.float64)
+                known = times.get(group)
+                if known is not None and np.array_equal(known, time, equal_nan=True):
+                    time = known
+                times[group] = time
+                if time.shape != values.shape:
+                    raise InputError(
+                        f"{self.source}: channel {quoted(name, 80)}: has {len(time)} time stamps for "
+                        f"{len(values)} values; {_NEED} is needed"
+                    )
+                channels[name] = Channel(name, time, values)
+        return channels
+
+
+def open_file(path: str | os.PathLike[str], kind: Kind) -> MdfRecording:
+    """Open an MDF file and list its numeric channels that have a time.
+
+    A name that several groups have becomes ``GROUP.NAME``, with the group's own name where that tells them apart, else
+    its number as in ``2.NAME``. Raises InputError.
+    """
+    source = place(path)
+    asammdf = library("asammdf", source, kind)
+    remarks = []
+    # asammdf completes an unfinished file in place, so it gets a copy in memory
+    unfinished = beginning(path, 8, need=_NEED).startswith(b"UnFin")
+    stream = in_memory(path, most=MOST_BYTES, need=_NEED) if unfinished else opened(path, need=_NEED)
+    try:
+        with guarded(source, _NEED):
+            chains = walk(stream, source)
+            if chains.cut:
+                stream.close()
+                stream = in_memory(path, most=MOST_BYTES, need=_NEED)
+                _end_here(stream, chains.cut)
+            stream.seek(0)
+            mdf = _loaded(asammdf, stream)
+            if unfinished:
+                remarks.append("the recorder did not finish the file; it was completed as far as it goes")
+            if chains.beyond:
+                remarks.append(f"the file is cut off: {chains.beyond} of its blocks lie behind its end, or end there")
+            listing = _Listing(mdf)
+        recording = MdfRecording(
+            source, f"MDF {mdf.version}", mdf, listing.places, listing.units, remarks + listing.remarks
+        )
+        weakref.finalize(recording, _close, mdf, stream)
+        return recording
+    except BaseException:
+        stream.close()
+        raise
+
+
+def _end_here(stream: BinaryIO, cut: Mapping[int, int]) -> None:
+    """Blocks of samples that the end of the file cuts end there: asammdf leaves out those that claim more."""
+    for at, left in cut.items():
+        stream.seek(at + 8)
+        stream.write(left.to_bytes(8, "little"))
+
+
+def _loaded(asammdf: Any, stream: BinaryIO) -> Any:
+    """The file, incomplete blocks left out. What asammdf has built when it fails is closed, or it complains later."""
+    option = "raise_on_incomplete_blocks"
+    before = asammdf.get_global_option(option)
+    asammdf.set_global_option(option, False)
+    try:
+        return asammdf.MDF(stream, process_bus_logging=False)
+    except Exception as fault:
+        trace = fault.__traceback__
+        while trace is not None:
+            half: Any = trace.tb_frame.f_locals.get("self")
+            if hasattr(half, "groups") and hasattr(half, "close"):
+                for missing in ("header", "identification"):
+                    if not hasattr(half, missing):
+                        setattr(half, missing, None)
+                half.close()
+            trace = trace.tb_next
+        raise
+    finally:
+        asammdf.set_global_option(option, before)
+
+
+def _close(mdf: Any, stream: BinaryIO) -> None:
+    try:
+        mdf.close()
+    finally:
+        stream.close()
+
+
+class _Listing:
+    """The numeric channels of a file: places and units by name."""
+
+    def __init__(self, mdf: Any) -> None:
+        self.four = mdf.version >= "4"
+        self.remarks: list[str] = []
+        found: list[tuple[str, str, int, int, str]] = []  # name, group's name, group, index, unit
+        untimed = 0
+        for g, group in enumerate(mdf.groups):
+            if not self._has_time(mdf, g, group):
+                untimed += any(self._is_number(group, i) for i in range(len(group.channels)))
+                continue
+            for i, channel in enumerate(group.channels):
+                if self._is_number(group, i):
+                    found.append((channel.name, _group_name(group), g, i, _unit(channel)))
+        if untimed:
+            self.remarks.append(f"{untimed} groups without a time are left out")
+        names = _told_apart([x[:3] for x in found])
+        self.places = {name: x[2:4] for name, x in zip(names, found, strict=True)}
+        self.units = {name: x[4] for name, x in zip(names, found, strict=True) if x[4]}
+
+    def _has_time(self, mdf: Any, g: int, group: Any) -> bool:
+        master = mdf.masters_db.get(g)
+        if master is None:
+            # a group that shares the master of another one, as MDF 4.2 allows
+            return bool(getattr(group.channel_group, "cg_master_index", None) is not None)
+        return not self.four or group.channels[master].sync_type in (_TIME, _NO_SYNC)
+
+    def _is_number(self, group: Any, i: int) -> bool:
+        channel = group.channels[i]
+        kind = channel.channel_type
+        if self.four:
+            dependent = group.channel_dependencies[i]
+            return (
+                channel.data_type in _NUMBERS_4
+                and kind not in _MASTERS_4
+                and kind != _VARIABLE_LENGTH
+                and dependent is None
+            )
+        conversion = channel.conversion
+        dated = conversion is not None and conversion.conversion_type in _DATES_3
+        return channel.data_type in _NUMBERS_3 and kind == 0 and not dated
+
+
+def _group_name(group: Any) -> str:
+    head = group.channel_group
+    source = getattr(head, "acq_source", None)
+    return str(getattr(head, "acq_name", "") or getattr(source, "name", "") or "").strip()
+
+
+def _unit(channel: Any) -> str:
+    conversion = channel.conversion
+    unit = getattr(channel, "unit", "") or (getattr(conversion, "unit", "") if conversion is not None else "")
+    return str(unit or "").strip()
+
+
+def _told_apart(found: list[tuple[str, str, int]]) -> list[str]:
+    """A name for each channel: its own; ``GROUP.NAME`` where several have it; ``NUMBER.NAME`` where groups do, too."""
+    names, pairs = Counter(name for name, _, _ in found), Counter((group, name) for name, group, _ in found)
+    told = []
+    taken: set[str] = set()
+    for name, group, number in found:
+        new = name
+        if names[name] > 1:
+            new = f"{group}.{name}" if group and pairs[group, name] == 1 else f"{number}.{name}"
+        base, count = new, 1
+        while new in taken:
+            count += 1
+            new = f"{base} ({count})"
+        taken.add(new)
+        told.append(new)
+    return told
+
+
+def _physical(signal: Any) -> FloatArray:
+    samples, conversion = signal.samples, signal.conversion
+    if conversion is not None:
+        converted = conversion.convert(samples)
+        if getattr(converted, "dtype", None) is not None and converted.dtype.kind in "fiub":
+            values = np.array(converted, dtype=np.float64)
+        else:
+            values = _beside_texts(samples, conversion)
+    else:
+        values = np.array(samples, dtype=np.float64)
+    invalid = signal.invalidation_bits
+    if invalid is not None:
+        values[np.asarray(invalid, dtype=bool)] = np.nan
+    return values
+
+
+def _beside_texts(samples: Any, conversion: Any) -> FloatArray:
+    """Values of a channel of which texts name some: by the conversion of the others; raw where texts name all."""
+    default = conversion.referenced_blocks.get("default_addr")
+    raw = np.array(samples, dtype=np.float64)
+    if default is None or isinstance(default, (bytes, str)):
+        return raw
+    values = np.array(default.convert(samples), dtype=np.float64)
+    for i in range(getattr(conversion, "ref_param_nr", 1) - 1):
+        one = getattr(conversion, f"val_{i}", np.nan)
+        low, high = getattr(conversion, f"lower_{i}", one), getattr(conversion, f"upper_{i}", one)
+        values[(raw >= low) & (raw <= high)] = np.nan
+    return values

@@ -1,0 +1,122 @@
+"""Layouts of known recorders: where each signal of a log lies, and in which unit.
+
+A layout names what its stack calls things; whether a recording has them is seen from its channels. Units are those of
+`avtorch.io.units`. Stacks change names between versions, so a signal may have several places, the newest first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from types import MappingProxyType
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a signal lies: the name of a channel, in which ``*`` stands for any part, and its unit, "" for none.
+
+    Where a number stands for a state, `when` lists those that mean yes, as for `engaged`.
+    """
+
+    channel: str
+    unit: str = ""
+    when: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Preset:
+    """The layout of one stack: the places of each signal by its name, such as ``accel_cmd``."""
+
+    name: str
+    words: str
+    signals: Mapping[str, tuple[Source, ...]]
+
+    def find(self, names: Iterable[str]) -> dict[str, tuple[str, Source]]:
+        """For each signal that `names` hold, the channel and where it was expected; the first of several matches."""
+        there = tuple(names)
+        found: dict[str, tuple[str, Source]] = {}
+        for signal, sources in self.signals.items():
+            for source in sources:
+                match = next((name for name in there if fnmatchcase(name, source.channel)), None)
+                if match is not None:
+                    found[signal] = (match, source)
+                    break
+        return found
+
+
+def _preset(name: str, words: str, **signals: tuple[Source, ...]) -> Preset:
+    return Preset(name, words, MappingProxyType(signals))
+
+
+_COMMAND = "/control/command/control_cmd/longitudinal"
+_ACTUATION = "/vehicle/status/actuation_status/status"
+
+AUTOWARE = _preset(
+    "autoware",
+    "Autoware (ROS 2 bag)",
+    # the time of a channel is its message's stamp
+    accel_cmd=(Source(f"{_COMMAND}/acceleration", "m/s2"),),
+    speed=(Source("/vehicle/status/velocity_status/longitudinal_velocity", "m/s"),),
+    accel=(Source("/localization/acceleration/accel/accel/linear/x", "m/s2"),),
+    # AUTONOMOUS, and AUTONOMOUS_VELOCITY_ONLY
+    engaged=(Source("/vehicle/status/control_mode/mode", when=(1, 3)),),
+    throttle=(Source(f"{_ACTUATION}/accel_status", "1"),),
+    brake=(Source(f"{_ACTUATION}/brake_status", "1"),),
+)
+
+APOLLO = _preset(
+    "apollo",
+    "Apollo (channels of a record, as topic/field)",
+    time=(Source("/apollo/canbus/chassis/header/timestamp_sec", "s"),),
+    accel_cmd=(Source("/apollo/control/acceleration", "m/s2"),),
+    speed=(Source("/apollo/canbus/chassis/speed_mps", "m/s"),),
+    # in the vehicle's frame x points right and y forward
+    accel=(Source("/apollo/localization/pose/pose/linear_acceleration_vrf/y", "m/s2"),),
+    # COMPLETE_AUTO_DRIVE, and AUTO_SPEED_ONLY
+    engaged=(Source("/apollo/canbus/chassis/driving_mode", when=(1, 3)),),
+    throttle=(Source("/apollo/canbus/chassis/throttle_percentage", "%"),),
+    brake=(Source("/apollo/canbus/chassis/brake_percentage", "%"),),
+)
+
+
+def _openpilot(*path: str, unit: str = "", when: tuple[int, ...] = ()) -> tuple[Source, ...]:
+    """With dots as in the log's own schema, and with slashes as plotting tools export it."""
+    return Source(".".join(path), unit, when), Source("/" + "/".join(path), unit, when)
+
+
+OPENPILOT = _preset(
+    "openpilot",
+    "openpilot (qlog or rlog, exported)",
+    time=(Source("logMonoTime", "ns"),),
+    accel_cmd=_openpilot("carControl", "actuators", "accel", unit="m/s2"),
+    speed=_openpilot("carState", "vEgo", unit="m/s"),
+    accel=_openpilot("carState", "aEgo", unit="m/s2"),
+    # before there was one for each direction, one flag told both
+    engaged=_openpilot("carControl", "longActive", when=(1,)) + _openpilot("carControl", "enabled", when=(1,)),
+    throttle=_openpilot("carState", "gas", unit="1"),
+    brake=_openpilot("carState", "brake", unit="1"),
+)
+
+CARLA = _preset(
+    "carla",
+    "CARLA (ROS bridge)",
+    accel_cmd=(Source("/carla/*/ackermann_cmd/acceleration", "m/s2"),),
+    speed=(Source("/carla/*/vehicle_status/velocity", "m/s"), Source("/carla/*/speedometer/data", "m/s")),
+    throttle=(Source("/carla/*/vehicle_status/control/throttle", "1"),),
+    brake=(Source("/carla/*/vehicle_status/control/brake", "1"),),
+)
+
+OPENACC = _preset(
+    "openacc",
+    "OpenACC (CSV; the star is the vehicle's number; without commands)",
+    time=(Source("Time", "s"),),
+    speed=(Source("SpeedDoppler[0-9]*", "m/s"), Source("Speed[0-9]*", "m/s")),
+    accel=(Source("Accel[0-9]*", "m/s2"),),
+    spacing=(Source("Spacing[0-9]*", "m"), Source("IVS[0-9]*", "m")),
+)
+
+PRESETS: Mapping[str, Preset] = MappingProxyType(
+    {preset.name: preset for preset in (AUTOWARE, APOLLO, OPENPILOT, CARLA, OPENACC)}
+)
+"""By name, as a command would take it."""

@@ -1,0 +1,121 @@
+"""Recordings that another process holds: the same answers, and one message when it ends."""
+
+from __future__ import annotations
+
+import gc
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avtorch.errors import InputError
+from avtorch.io.formats import apart, apart_process, open_recording
+from avtorch.io.formats.apart import ApartRecording
+
+from .survival import open_here
+from .test_bags import mcap
+from .test_excel import LOG, patched, xlsx
+from .test_matlab import LOG as STRUCTS
+from .test_matlab import mat5, mat73
+from .test_mdf import by_another
+
+WRITERS = {
+    "mf4": by_another,
+    "mcap": mcap,
+    "mat": lambda path: mat5(path, STRUCTS),
+    "73.mat": lambda path: mat73(path, STRUCTS),
+    "xlsx": lambda path: xlsx(path, {"notes": [["by hand"]], "log": [*LOG, [900.0, None, 0.5, "dry"]]}),
+}
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_the_answers_are_those_of_the_reader(tmp_path: Path, form: str) -> None:
+    path = WRITERS[form](tmp_path / f"drive.{form}")
+    there, here = open_recording(path), open_here(path)
+    assert isinstance(there, ApartRecording)
+    assert (there.source, there.form, there.names) == (here.source, here.form, here.names)
+    assert (there.units, there.remarks) == (here.units, here.remarks)
+    expected = here.read(here.names)
+    for names in (here.names[:1], here.names[::-1]):
+        found = there.read(names)
+        assert tuple(found) == names
+        for name in names:
+            assert np.array_equal(found[name].time, expected[name].time)
+            assert np.array_equal(found[name].values, expected[name].values, equal_nan=True)
+    # those that share a clock there share it here
+    assert len({id(c.time) for c in found.values()}) == len({id(c.time) for c in expected.values()})
+    assert found[here.names[0]].values.flags.writeable
+
+
+def test_what_the_reader_refuses_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "drive.mat"
+    path.write_bytes(b"MATLAB 5.0 MAT-file, made by hand".ljust(124) + b"\0\1IM")
+    with pytest.raises(InputError, match="has no signal with a time; a time vector is needed"):
+        open_recording(path)
+    recording = open_recording(mat5(path, STRUCTS))
+    with pytest.raises(InputError, match=r"channel 'log.sped' is missing; the nearest: 'log.speed'"):
+        recording.read(["log.sped"])
+
+
+def test_odd_names_of_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("-c.mat", "größe\n;ls.mat"):
+        mat5(tmp_path / name, STRUCTS)
+        assert open_recording(Path(name)).names
+
+
+def test_two_cells_that_claim_a_sheet_of_400_gb(tmp_path: Path) -> None:
+    """python-calamine ends its process here, which is not this one."""
+    path = xlsx(tmp_path / "drive.xlsx", {"a": [["t", "x"], [0.0, 1.0], [1.0, 2.0]]})
+    patched(path, "sheet1.xml", lambda raw: raw.replace(b'r="B3"', b'r="XFD1048576"').replace(b'r="3"', b'r="1048576"'))
+    with pytest.raises(InputError, match=r"it ended the process that read it \(SIGABRT\); an undamaged Excel file"):
+        open_recording(path)
+
+
+def test_a_process_that_ends_between_two_readings(tmp_path: Path) -> None:
+    recording = open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
+    assert isinstance(recording, ApartRecording)
+    recording.read(["log.speed"])
+    recording._child._process.kill()
+    for _ in range(2):
+        with pytest.raises(InputError, match=r"drive.mat: is damaged, .* \(SIGKILL\); an undamaged MAT file is needed"):
+            recording.read(["log.speed"])
+
+
+def test_a_process_that_takes_too_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(apart, "MOST_SECONDS", 0.001)
+    with pytest.raises(InputError, match=r"is not read within 0.001 s; a smaller file is needed"):
+        open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
+
+
+def test_the_process_ends_with_its_recording(tmp_path: Path) -> None:
+    recording = open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
+    assert isinstance(recording, ApartRecording)
+    process = recording._child._process
+    assert process.poll() is None
+    del recording
+    gc.collect()
+    assert process.poll() is not None
+    assert process.stdout is not None
+    assert process.stdout.closed
+
+
+def test_no_process_can_be_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(apart.sys, "executable", str(tmp_path / "no python"))
+    with pytest.raises(InputError, match=r"drive\.mat: no process can be started to read it"):
+        open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
+
+
+def test_requests_are_answered_one_by_one(tmp_path: Path) -> None:
+    recording = open_here(mat5(tmp_path / "drive.mat", STRUCTS))
+    out = io.BytesIO()
+    requests = [["log.speed", "log.wheel(1)"], ["none"], ["log.cmd"]]
+    apart_process.serve(recording, [json.dumps(names).encode() for names in requests], out)
+    out.seek(0)
+    assert json.loads(out.readline()) == {"clocks": [150], "channels": [["log.speed", 0], ["log.wheel(1)", 0]]}
+    out.read(3 * 150 * 8)
+    assert "is missing" in json.loads(out.readline())["error"]
+    assert json.loads(out.readline())["clocks"] == [75]
+    assert len(out.read()) == 2 * 75 * 8

@@ -1,0 +1,165 @@
+"""Workbooks by other writers: xlsx by openpyxl, xls by xlwt, ods by odfpy."""
+
+from __future__ import annotations
+
+import datetime as dt
+import io
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import openpyxl
+import pytest
+import xlwt
+from odf.opendocument import OpenDocumentSpreadsheet
+from odf.table import Table, TableCell, TableRow
+from odf.text import P
+
+from avtorch.errors import InputError
+from avtorch.io.formats import excel
+from avtorch.io.formats.excel_table import table_of
+
+from .survival import open_here, refused, survives
+
+Rows = Sequence[Sequence[Any]]
+TIMES = [20.0 * i for i in range(30)]
+SPEEDS = [50 + i / 8 for i in range(30)]
+LOG: Rows = [
+    ["Drive 7"],
+    [],
+    ["Time", "Speed", "Accel [m/s2]", "remark"],
+    ["ms", "km/h", "", ""],
+    *([t, v, -i / 16, "dry"] for i, (t, v) in enumerate(zip(TIMES, SPEEDS, strict=True))),
+]
+
+
+def xlsx(path: Path, sheets: dict[str, Rows]) -> Path:
+    book = openpyxl.Workbook()
+    book.remove(book.worksheets[0])
+    for name, rows in sheets.items():
+        sheet = book.create_sheet(name)
+        for row in rows:
+            sheet.append(list(row))
+    book.save(path)
+    book.close()
+    return path
+
+
+def xls(path: Path, sheets: dict[str, Rows]) -> Path:
+    book = xlwt.Workbook()
+    for name, rows in sheets.items():
+        sheet = book.add_sheet(name)
+        for i, row in enumerate(rows):
+            for k, cell in enumerate(row):
+                sheet.write(i, k, cell)
+    book.save(str(path))
+    return path
+
+
+def ods(path: Path, sheets: dict[str, Rows]) -> Path:
+    book = OpenDocumentSpreadsheet()
+    for name, rows in sheets.items():
+        table = Table(name=name)
+        for row in rows:
+            line = TableRow()
+            for cell in row:
+                if isinstance(cell, str):
+                    made = TableCell(valuetype="string")
+                    made.addElement(P(text=cell))
+                else:
+                    made = TableCell(valuetype="float", value=repr(float(cell)))
+                line.addElement(made)
+            table.addElement(line)
+        book.spreadsheet.addElement(table)
+    book.save(str(path))
+    return path
+
+
+WRITERS: dict[str, Callable[[Path, dict[str, Rows]], Path]] = {"xlsx": xlsx, "xls": xls, "ods": ods}
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_the_first_sheet_with_a_table_is_read(tmp_path: Path, form: str) -> None:
+    path = WRITERS[form](tmp_path / f"drive.{form}", {"notes": [["about the drive"]], "log": LOG})
+    recording = open_here(path)
+    assert recording.names == ("Speed", "Accel [m/s2]")
+    assert dict(recording.units) == {"Speed": "km/h", "Accel [m/s2]": "m/s2"}
+    assert recording.remarks == ("sheet 'log' is read, 1 others are not",)
+    channels = recording.read(["Speed", "Accel [m/s2]"])
+    assert channels["Speed"].values.tolist() == SPEEDS
+    assert channels["Accel [m/s2]"].values.tolist() == [-i / 16 for i in range(30)]
+    assert channels["Speed"].time.tolist() == [t * 1e-3 for t in TIMES]
+    assert channels["Speed"].time is channels["Accel [m/s2]"].time
+
+
+def table(rows: Rows) -> Any:
+    return table_of(rows, "drive.xlsx")
+
+
+def test_empty_cells_and_texts_are_nan_and_are_told(tmp_path: Path) -> None:
+    rows = [["t", "speed", "speed"], [0.0, 1.0, 5.0], [0.1, None, "fast"], [None, 3.0, 7.0], [0.3, "4.5", 8.0]]
+    recording = open_here(xlsx(tmp_path / "drive.xlsx", {"a": rows}))
+    assert recording.names == ("speed", "speed (2)")
+    channels = recording.read(recording.names)
+    assert channels["speed"].time.tolist() == [0.0, 0.1, 0.3]
+    assert np.array_equal(channels["speed"].values, [1.0, np.nan, 4.5], equal_nan=True)
+    assert np.array_equal(channels["speed (2)"].values, [5.0, np.nan, 8.0], equal_nan=True)
+    assert recording.remarks == (
+        "1 cells hold a text where a number is expected; they are NaN",
+        "1 rows without a time are left out",
+    )
+
+
+def test_dates_are_seconds(tmp_path: Path) -> None:
+    start = dt.datetime(2026, 11, 23, 12, 0, 0)
+    rows = [["Timestamp", "x"], *([start + dt.timedelta(milliseconds=500 * i), i] for i in range(4))]
+    time = open_here(xlsx(tmp_path / "drive.xlsx", {"a": rows})).read(["x"])["x"].time
+    begin = (start - dt.datetime(1970, 1, 1)).total_seconds()
+    # a workbook counts days; milliseconds is what the reader of dates keeps of them
+    assert np.abs(time - begin - 0.5 * np.arange(4)).max() <= 1e-3
+    spans = table([["time", "x"], [dt.timedelta(seconds=1.5), 1], [dt.time(0, 0, 2), 2], [dt.date(1970, 1, 2), 3]])
+    assert spans.numbers[:, 0].tolist() == [1.5, 2.0, 86_400.0]
+
+
+def test_what_is_no_table() -> None:
+    assert table([]) is None
+    assert table([["time", "speed"]]) is None
+    assert table([["time"], [1.0]]) is None
+    assert table([["time", "speed"], ["a", "b"], ["c", "d"], [1.0, 2.0]]).units == {"a": "c", "b": "d"}
+    assert table([[1.0, 2.0], [3.0, 4.0]]) is None
+
+
+def test_a_sheet_without_names_or_without_a_time(tmp_path: Path) -> None:
+    refused(xlsx(tmp_path / "a.xlsx", {"only": [[1.0, 2.0]]}), "no sheet has a row of names", "sheets: only")
+    path = xlsx(tmp_path / "b.xlsx", {"a": [["speed", "accel"], [1.0, 2.0]]})
+    refused(path, "no column is called time, t, timestamp", "columns: speed, accel")
+
+
+def patched(path: Path, part: str, change: Callable[[bytes], bytes]) -> None:
+    """The workbook with one of its parts changed."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            new.writestr(name, change(old.read(name)) if name.endswith(part) else old.read(name))
+    path.write_bytes(out.getvalue())
+
+
+def test_parts_that_inflate_to_gigabytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = xlsx(tmp_path / "drive.xlsx", {"a": LOG})
+    patched(path, "sheet1.xml", lambda raw: raw + b" " * 10**6)
+    monkeypatch.setattr(excel, "_MOST_INFLATED", 10**6)
+    refused(path, "parts of", "needs 1,000,000 at most")
+
+
+def test_more_cells_than_a_reader_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avtorch.io.formats.listed.MOST_CELLS", 5)
+    with pytest.raises(InputError, match="needs 5 at most"):
+        table([["time", "speed"], [1.0, 2.0], [1.0, 2.0], [1.0, 2.0]])
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_damage_is_read_or_refused(tmp_path: Path, form: str, fresh_seed: int) -> None:
+    path = WRITERS[form](tmp_path / f"drive.{form}", {"log": LOG})
+    survives(path, path.read_bytes(), fresh_seed, cuts=8, flips=20)

@@ -1,0 +1,163 @@
+"""Which files are recordings, by content first; what is said where the library is not installed."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from avtorch.errors import InputError
+from avtorch.io.formats import is_recording, kinds, library, open_recording
+from avtorch.io.formats.presets import PRESETS
+from avtorch.io.mapping import SIGNALS
+
+from .survival import refused
+
+BEGINNINGS = {
+    "MDF": (b"MDF     4.10    ", "drive.bin"),
+    "unfinished MDF": (b"UnFinMF 4.10    ", "drive"),
+    "ROS 1": (b"#ROSBAG V2.0\n", "drive.x"),
+    "SQLite": (b"SQLite format 3\0", "drive.x"),
+    "MCAP": (b"\x89MCAP0\r\n", "drive.x"),
+    "BLF": (b"LOGG" + bytes(140), "drive.x"),
+    "ASC": (b"date Mon Nov 23 13:00:00 2026\nbase hex  timestamps absolute\n", "drive.txt"),
+    "ASC with a remark": (b"// made by hand\ndate Mon\nBase Hex timestamps absolute\n", "drive.txt"),
+    "candump": (b"(1700000000.000000) can0 123#0011\n", "drive.log"),
+    "MAT 5": (b"MATLAB 5.0 MAT-file, made by hand".ljust(124) + b"\0\1IM", "drive.x"),
+    "MAT 7.3": (b"MATLAB 7.3 MAT-file, made by hand".ljust(124) + b"\0\2IM", "drive.x"),
+    "HDF5 called MAT": (b"\x89HDF\r\n\x1a\n", "drive.MAT"),
+    "Excel": (b"PK\x03\x04" + bytes(26) + b"[Content_Types].xml", "drive"),
+    "Excel 97": (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "drive"),
+    "OpenDocument": (b"PK\x03\x04" + bytes(26) + b"mimetypeapplication/vnd.oasis.opendocument.spreadsheet", "drive"),
+}
+NONE = {
+    "CSV": (b"time,speed\n0,1\n", "drive.csv"),
+    "Parquet": (b"PAR1", "drive.parquet"),
+    "empty": (b"", "drive.csv"),
+    "log of another kind": (b"12:00 started\n", "drive.log"),
+    "ZIP": (b"PK\x03\x04" + bytes(26) + b"photo.jpg", "photos.zip"),
+    "HDF5": (b"\x89HDF\r\n\x1a\n", "drive.h5"),
+    "CSV that speaks of a date": (b"date,base\n0,1\n", "drive.csv"),
+}
+LIBRARIES = {
+    "MDF": "asammdf: pip install 'avtorch[mdf]'",
+    "ROS 1": "rosbags: pip install 'avtorch[bags]'",
+    "SQLite": "rosbags: pip install 'avtorch[bags]'",
+    "MCAP": "rosbags: pip install 'avtorch[bags]'",
+    "BLF": "python-can: pip install 'avtorch[can]'",
+    "ASC": "python-can: pip install 'avtorch[can]'",
+    "candump": "python-can: pip install 'avtorch[can]'",
+    "MAT 7.3": "h5py: pip install 'avtorch[mat]'",
+    "Excel": "python-calamine: pip install 'avtorch[excel]'",
+    "Excel 97": "python-calamine: pip install 'avtorch[excel]'",
+    "OpenDocument": "python-calamine: pip install 'avtorch[excel]'",
+}
+
+
+def put(folder: Path, content: bytes, name: str) -> Path:
+    (folder / name).write_bytes(content)
+    return folder / name
+
+
+def refused_apart(path: Path, *words: str) -> None:
+    """By `open_recording` itself."""
+    with pytest.raises(InputError) as fault:
+        open_recording(path)
+    assert all(word in str(fault.value) for word in (path.name, *words)), fault.value
+
+
+@pytest.mark.parametrize("case", BEGINNINGS)
+def test_a_recording_is_known_by_how_it_begins(tmp_path: Path, case: str) -> None:
+    path = put(tmp_path, *BEGINNINGS[case])
+    assert is_recording(path)
+    refused(path)  # there is nothing behind the beginning
+
+
+@pytest.mark.parametrize("case", NONE)
+def test_what_is_no_recording(tmp_path: Path, case: str) -> None:
+    path = put(tmp_path, *NONE[case])
+    assert not is_recording(path)
+    with pytest.raises(InputError, match=r"is no recording; an MDF, ROS bag"):
+        open_recording(path)
+
+
+@pytest.mark.parametrize("suffix", [".mf4", ".bag", ".mcap", ".db3", ".blf", ".asc", ".mat", ".xlsx", ".xls", ".ods"])
+def test_a_name_that_promises_a_format_is_no_licence_to_guess(tmp_path: Path, suffix: str) -> None:
+    path = put(tmp_path, b"\x01\x02 something else", f"drive{suffix}")
+    assert is_recording(path)
+    refused(path, "but its content is not; a file that begins with")
+    refused(put(tmp_path, b"", f"none{suffix}"), "is empty")
+
+
+def test_only_regular_files_and_bags_folders_are_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.mf4")
+    assert not is_recording(tmp_path / "pipe.mf4")
+    refused(tmp_path / "pipe.mf4", "is a named pipe")
+    assert not is_recording(tmp_path)
+    refused(tmp_path, "is a directory")
+    assert not is_recording(tmp_path / "none.mf4")
+    refused(tmp_path / "none.mf4", "no such file")
+    assert not is_recording("/dev/zero")
+    assert not is_recording(tmp_path / "a\0b.mf4")
+    assert not is_recording(tmp_path / (300 * "x" + ".mf4"))
+
+
+def test_databases_are_for_can_logs(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="dbc is for CAN logs"):
+        open_recording(put(tmp_path, *BEGINNINGS["MCAP"]), dbc=["drive.dbc"])
+
+
+@pytest.mark.parametrize("case", LIBRARIES)
+def test_a_missing_library_is_one_command_away(tmp_path: Path, case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is loaded to see it, and no process is started."""
+    monkeypatch.setattr(importlib.util, "find_spec", lambda module: None)
+    monkeypatch.setattr(subprocess, "Popen", None)
+    refused_apart(put(tmp_path, *BEGINNINGS[case]), "reading it needs", LIBRARIES[case])
+
+
+def test_a_library_that_lacks_a_part_of_its_own_is_another_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(module: str) -> object:
+        raise ModuleNotFoundError("No module named 'lxml'", name="lxml")
+
+    monkeypatch.setattr(importlib, "import_module", broken)
+    with pytest.raises(InputError, match=r"which cannot be loaded here .*lxml.*--force-reinstall 'avtorch\[mdf\]'"):
+        library.library("asammdf", "drive.mf4", kinds.MDF)
+
+
+def test_looking_at_a_file_loads_no_library(tmp_path: Path) -> None:
+    for content, name in BEGINNINGS.values():
+        put(tmp_path, content, name)
+    code = (
+        "import sys, os; from avtorch.io.formats import is_recording\n"
+        "for n in os.listdir(sys.argv[1]): is_recording(os.path.join(sys.argv[1], n))\n"
+        "print(*[m for m in ('asammdf', 'rosbags', 'can', 'cantools', 'h5py', 'python_calamine', 'torch')"
+        " if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+def test_layouts_speak_of_signals_and_units_that_logs_know() -> None:
+    from avtorch.io.units import to_si
+
+    for preset in PRESETS.values():
+        assert set(preset.signals) <= {*SIGNALS, "throttle", "brake"}
+        for signal, sources in preset.signals.items():
+            for source in sources:
+                if source.unit and signal not in ("throttle", "brake"):
+                    to_si(signal, source.unit)
+
+
+def test_a_layout_is_found_among_channels() -> None:
+    names = ["/control/command/control_cmd/longitudinal/acceleration", "/vehicle/status/control_mode/mode", "/x"]
+    found = PRESETS["autoware"].find(names)
+    assert {signal: channel for signal, (channel, _) in found.items()} == {"accel_cmd": names[0], "engaged": names[1]}
+    assert found["engaged"][1].when == (1, 3)
+    assert PRESETS["openacc"].find(["Time", "SpeedDoppler3"])["speed"][0] == "SpeedDoppler3"
+    assert PRESETS["carla"].find(["/carla/ego_vehicle/vehicle_status/velocity"])["speed"][1].unit == "m/s"
+    assert PRESETS["openpilot"].find(names) == {}
