@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +16,10 @@ from avtorch.io.bad_rows import MOST_BAD, BadRows, disordered
 from avtorch.io.clock import clock_words, since, since_start
 from avtorch.io.mapping import SIGNALS, SignalMap
 from avtorch.io.merge import held
+from avtorch.io.merged import Arrivals
 from avtorch.io.segments import gap_limit, median_step
 from avtorch.io.tables import Table, read_table
+from avtorch.io.unit_names import stated_unit
 from avtorch.io.units import to_si
 from avtorch.io.validity import check_range, check_rate, check_time, off_clock, stray
 
@@ -34,15 +36,19 @@ class Assembled:
     remarks: tuple[str, ...]
 
 
-def assemble(table: Table, mapping: SignalMap, *, folder: Path, following: bool) -> Assembled:
+def assemble(
+    table: Table, mapping: SignalMap, *, folder: Path, following: bool, arrived: Arrivals | None = None
+) -> Assembled:
     """Find, convert, check and merge the signals of a log.
 
-    ``folder`` is where other files named in the mapping lie. Rows where a signal with its own stamps had not arrived,
-    or is older than three of its own steps (0.1 s at least), are left out, which makes a gap; ``engaged`` and
-    ``segment`` are states whose messages mark changes only, so they are held indefinitely. Raises InputError for
-    everything that is certainly wrong.
+    ``folder`` is where other files named in the mapping lie; ``arrived`` holds signals that are not in the table. Rows
+    where a signal with its own stamps had not arrived, or is older than three of its own steps (0.1 s at least), are
+    left out, which makes a gap; ``engaged`` and ``segment`` are states whose messages mark changes only, so they are
+    held indefinitely. Raises InputError for everything that is certainly wrong.
     """
     source = table.source
+    arrived = arrived or {}
+    mapping = _with_stated_units(table, mapping)
     _require(table, mapping, following)
     if table.rows < 2:
         found = "one row" if table.rows == 1 else "a header but no rows"
@@ -54,6 +60,10 @@ def assemble(table: Table, mapping: SignalMap, *, folder: Path, following: bool)
         column = mapping.column.get(signal, signal)
         if signal in mapping.elsewhere:
             arrivals[signal] = _from_elsewhere(signal, mapping, folder)
+        elif signal in arrived:
+            stamps, values = arrived[signal]
+            rows = np.arange(len(stamps))
+            arrivals[signal] = _arrivals(table, signal, column, "its clock", values, stamps, rows, None, mapping)
         elif column in table.names:
             if signal in mapping.stamp:
                 arrivals[signal] = _stamped(table, signal, column, mapping)
@@ -107,6 +117,23 @@ def assemble(table: Table, mapping: SignalMap, *, folder: Path, following: bool)
     return Assembled(signals, segment, ignored, tuple(remarks))
 
 
+def _with_stated_units(table: Table, mapping: SignalMap) -> SignalMap:
+    """The mapping, with the units that the file itself states for columns for which none is given."""
+    stated = {}
+    for signal in SIGNALS:
+        text = table.units.get(mapping.column.get(signal, signal))
+        if text is not None and (unit := stated_unit(signal, text)) is not None:
+            stated[signal] = unit
+    return replace(mapping, unit={**stated, **mapping.unit})
+
+
+def _converted(signal: str, values: FloatArray, mapping: SignalMap) -> FloatArray:
+    """Values as recorded in SI units, and states as 0 and 1."""
+    if signal in mapping.state:
+        return np.where(np.isnan(values), np.nan, np.isin(values, mapping.state[signal]).astype(np.float64))
+    return to_si(signal, mapping.unit[signal])(values) if signal in mapping.unit else values
+
+
 def _require(table: Table, mapping: SignalMap, following: bool) -> None:
     def there(signal: str) -> bool:
         return mapping.column.get(signal, signal) in table.names or signal in mapping.elsewhere
@@ -150,8 +177,7 @@ def _signal(table: Table, signal: str, column: str, mapping: SignalMap, bad: Bad
     bad.leave_out(read.faults)
     remarks += read.remarks
     values = read.values
-    if signal in mapping.unit:
-        values = to_si(signal, mapping.unit[signal])(values)
+    values = _converted(signal, values, mapping)
     place = _place(table, signal, column)
     outside = stray(signal, values, place)
     bad.leave_out(outside)
@@ -187,7 +213,7 @@ def _stamped(table: Table, signal: str, column: str, mapping: SignalMap) -> tupl
         empty, full = (column, clock) if np.isnan(values[row]) else (clock, column)
         raise InputError(f"{table.where(row, empty)}: is empty where {full!r} is not; both or neither are needed")
     rows = np.flatnonzero(~np.isnan(values))
-    return _arrivals(table, signal, column, clock, values, stamps, rows, unit, mapping.unit.get(signal))
+    return _arrivals(table, signal, column, clock, values, stamps, rows, unit, mapping)
 
 
 def _from_elsewhere(signal: str, mapping: SignalMap, folder: Path) -> tuple[FloatArray, FloatArray]:
@@ -201,7 +227,7 @@ def _from_elsewhere(signal: str, mapping: SignalMap, folder: Path) -> tuple[Floa
     values, stamps = table.numbers(column), table.numbers(there.time)
     unit = there.time_unit or mapping.unit.get("time")
     rows = np.arange(len(values))
-    return _arrivals(table, signal, column, there.time, values, stamps, rows, unit, mapping.unit.get(signal))
+    return _arrivals(table, signal, column, there.time, values, stamps, rows, unit, mapping)
 
 
 def _within(folder: Path, file: str, signal: str) -> Path:
@@ -218,12 +244,12 @@ def _within(folder: Path, file: str, signal: str) -> Path:
 
 def _arrivals(
     table: Table, signal: str, column: str, clock: str, values: FloatArray, stamps: FloatArray, rows: NDArray,
-    time_unit: str | None, unit: str | None,
+    time_unit: str | None, mapping: SignalMap,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     if len(rows) == 0:
         raise InputError(f"{table.source}: column {column!r} ({signal}): holds no value at all")
     values, stamps = values[rows], stamps[rows]
-    values = values if unit is None else to_si(signal, unit)(values)
+    values = _converted(signal, values, mapping)
     stamps = stamps if time_unit is None else to_si("time", time_unit)(stamps)
     check_range(signal, values, _place(table, signal, column, rows))
     # a recorder that writes the last arrival into every row repeats stamp and value together; that is one arrival

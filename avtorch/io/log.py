@@ -19,7 +19,9 @@ from avtorch.io.assemble import assemble
 from avtorch.io.atomic import atomic
 from avtorch.io.clock import since_start
 from avtorch.io.engagement import settled_rows
+from avtorch.io.formats import is_recording, open_recording
 from avtorch.io.mapping import SIGNALS, Pairs, SignalMap, pairs, read_mapping
+from avtorch.io.merged import Arrivals, merged
 from avtorch.io.segments import median_step, stretches
 from avtorch.io.standstill import standing
 from avtorch.io.tables import Table, read_table
@@ -86,19 +88,28 @@ class Log:
         map: Pairs = None,
         unit: Pairs = None,
         stamp: Pairs = None,
+        state: Pairs = None,
         following: bool = False,
     ) -> Log:
-        """Read a CSV (UTF-8, comma, one header line) or Parquet log.
+        """Read a log: a table of text in any usual layout, gzipped or not, Parquet, or a recording.
 
+        Recordings are MDF, ROS bags and MCAP, CAN logs with a DBC, MAT and Excel, each by an extra
+        (`avtorch.io.formats`); their channels are held on the clock of the fastest of command, acceleration and speed.
         ``map`` names the columns (``{"accel": "CAN.ACC_X"}`` or ``["accel=CAN.ACC_X"]``), ``unit`` their units
         (``speed=km/h``), ``stamp`` the signals' own time columns (``speed=GPS_TIME``); the TOML file beside the log may
         give the same, and more (`avtorch.io.mapping.read_mapping`). A stamped signal is held, not interpolated; naming
         the log's own time column as its stamp declares that it is written only in the rows where it arrived.
+        ``state`` lists the numbers of ``engaged`` that mean yes (``engaged=1,3``). A row with a bad cell is left out
+        and told in ``remarks``, unless more than a twentieth of the rows have one.
         ``following`` lets a car-following log (``spacing`` and ``lead_speed``) come without ``accel_cmd``.
 
         Raises InputError, one line that names file, row (of data, from 1) and line (of the file) and column.
         """
-        mapping = read_mapping(path, map=map, unit=unit, stamp=stamp)
+        mapping = read_mapping(path, map=map, unit=unit, stamp=stamp, state=state)
+        if is_recording(path):
+            columns = {signal: mapping.column.get(signal, signal) for signal in SIGNALS if signal != "time"}
+            recorded, arrived = merged(open_recording(path), columns)
+            return cls._of(recorded, mapping, folder=Path(path).parent, following=following, arrived=arrived)
         wanted = {mapping.column.get(signal, signal) for signal in SIGNALS} | set(mapping.stamp.values())
         table = read_table(path, wanted=lambda names: wanted)
         return cls._of(table, mapping, folder=Path(path).parent, following=following)
@@ -128,8 +139,10 @@ class Log:
         return cls._of(table, SignalMap(unit=pairs("unit", unit)), folder=Path(), following=following)
 
     @classmethod
-    def _of(cls, table: Table, mapping: SignalMap, *, folder: Path, following: bool) -> Log:
-        made = assemble(table, mapping, folder=folder, following=following)
+    def _of(
+        cls, table: Table, mapping: SignalMap, *, folder: Path, following: bool, arrived: Arrivals | None = None
+    ) -> Log:
+        made = assemble(table, mapping, folder=folder, following=following, arrived=arrived)
         signals = made.signals
         time = signals["time"]
         log = cls(

@@ -12,11 +12,13 @@ from avtorch.errors import InputError, printable, quoted
 from avtorch.io.opening import place
 from avtorch.io.toml import read_toml
 from avtorch.io.units import to_si
+from avtorch.numeral import numeral
 
 SIGNALS = (
     "time", "accel_cmd", "accel", "speed", "jerk", "engaged", "spacing", "lead_speed", "lead_accel", "grade", "segment",
 )  # fmt: skip
 
+_TABLES = ("map", "unit", "stamp", "state", "signals")
 Pairs = Mapping[str, Any] | Iterable[str] | None
 
 
@@ -37,19 +39,21 @@ class SignalMap:
     column: dict[str, str] = field(default_factory=dict)
     unit: dict[str, str] = field(default_factory=dict)
     stamp: dict[str, str] = field(default_factory=dict)
+    state: dict[str, tuple[float, ...]] = field(default_factory=dict)
     elsewhere: dict[str, Elsewhere] = field(default_factory=dict)
 
 
 def read_mapping(
-    path: str | os.PathLike[str], *, map: Pairs = None, unit: Pairs = None, stamp: Pairs = None
+    path: str | os.PathLike[str], *, map: Pairs = None, unit: Pairs = None, stamp: Pairs = None, state: Pairs = None
 ) -> SignalMap:
     """The mapping for the log at ``path``: the TOML file beside it (``lap.csv`` has ``lap.toml``), overruled by the
     arguments, each a dict or a sequence of ``SIGNAL=VALUE``.
 
     The TOML file has the tables ``[map]`` (signal = "column"), ``[unit]`` (signal = "km/h"), ``[stamp]`` (signal = "its
-    own time column") and ``[signals.NAME]`` (``file``, ``time``, ``column``, ``time_unit``: a signal in another file,
-    which lies in the log's folder or below). It is a regular file of up to 1 MB, no link. Raises InputError for another
-    kind of file, and for a signal, unit, table or key that is not known.
+    own time column"), ``[state]`` (engaged = "1, 3": the numbers that mean yes) and ``[signals.NAME]`` (``file``,
+    ``time``, ``column``, ``time_unit``: a signal in another file, which lies in the log's folder or below). It is a
+    regular file of up to 1 MB, no link. Raises InputError for another kind of file, and for a signal, unit, table or
+    key that is not known.
     """
     beside = mapping_beside(path)
     stated = SignalMap() if beside is None else _read_toml(beside)
@@ -57,6 +61,7 @@ def read_mapping(
         column=_distinct({**stated.column, **pairs("map", map)}),
         unit={**stated.unit, **_units(pairs("unit", unit), "")},
         stamp={**stated.stamp, **_stamps(pairs("stamp", stamp), "")},
+        state={**stated.state, **_states(pairs("state", state), "")},
         elsewhere=stated.elsewhere,
     )
 
@@ -102,7 +107,7 @@ def pairs(option: str, given: Pairs) -> dict[str, str]:
     return answer
 
 
-_EXAMPLE = {"map": "accel=CAN.ACC_X", "unit": "speed=km/h", "stamp": "speed=GPS_TIME"}
+_EXAMPLE = {"map": "accel=CAN.ACC_X", "unit": "speed=km/h", "stamp": "speed=GPS_TIME", "state": "engaged=1,3"}
 
 
 def _known(name: str, where: str) -> None:
@@ -126,6 +131,18 @@ def _stamps(stamps: dict[str, str], where: str) -> dict[str, str]:
     return stamps
 
 
+def _states(states: dict[str, str], where: str) -> dict[str, tuple[float, ...]]:
+    found: dict[str, tuple[float, ...]] = {}
+    for signal, text in states.items():
+        if signal != "engaged":
+            raise InputError(f"{where}state {signal}={printable(text, 40)}: only engaged is a state")
+        try:
+            found[signal] = tuple(numeral(part) for part in text.split(","))
+        except ValueError:
+            raise InputError(f"{where}state {signal}={printable(text, 40)}: needs numbers such as 1,3") from None
+    return found
+
+
 def _distinct(columns: dict[str, str]) -> dict[str, str]:
     seen: dict[str, str] = {}
     for signal, column in columns.items():
@@ -141,16 +158,19 @@ def _read_toml(file: Path) -> SignalMap:
     content = read_toml(file, links=False)
     here = f"{place(file)}: "
     for name, table in content.items():
-        if name not in ("map", "unit", "stamp", "signals"):
-            raise InputError(f"{here}table [{printable(name, 40)}] is not known; tables: map, unit, stamp, signals")
+        if name not in ("map", "unit", "stamp", "state", "signals"):
+            raise InputError(
+                f"{here}table [{printable(name, 40)}] is not known; tables: map, unit, stamp, state, signals"
+            )
         if not isinstance(table, dict):
             raise InputError(f"{here}{name} is no table; write [{name}] and its lines below")
     try:
-        column, unit, stamp = (pairs(name, _texts(content.get(name, {}), name)) for name in ("map", "unit", "stamp"))
+        tables = ("map", "unit", "stamp", "state")
+        column, unit, stamp, state = (pairs(name, _texts(content.get(name, {}), name)) for name in tables)
         elsewhere = {name: _elsewhere(name, table) for name, table in content.get("signals", {}).items()}
     except InputError as fault:
         raise InputError(f"{here}{fault}") from None
-    return SignalMap(column, _units(unit, here), _stamps(stamp, here), elsewhere)
+    return SignalMap(column, _units(unit, here), _stamps(stamp, here), _states(state, here), elsewhere)
 
 
 def _texts(table: dict[str, Any], name: str) -> dict[str, str]:

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from avtorch.errors import InputError
+from avtorch.io.formats import is_recording, open_recording
 from avtorch.io.log import Log
 from avtorch.io.mapping import mapping_beside
 from avtorch.io.opening import place
 from avtorch.io.quality import Quality
 from avtorch.io.quality import check as check_quality
 from avtorch.io.tables import read_table
+from avtorch.logcheck.candidates import table_of
 from avtorch.logcheck.proposal import Proposal, propose
 from avtorch.logcheck.recorder import excitation_notes, recorder_notes
 
@@ -88,11 +90,10 @@ def check(log: Log | str | os.PathLike[str]) -> LogCheck:
     """
     if isinstance(log, Log):
         return _seen(log.name, "a log in memory", None, log)
-    table = read_table(log)
-    form = table.form
+    table = table_of(open_recording(log)) if is_recording(log) else read_table(log)
     if mapping_beside(log) is not None:
-        return _read(log, form, None)
-    return _read(log, form, propose(table))
+        return _read(log, table.form, None)
+    return _read(log, table.form, propose(table))
 
 
 def _read(path: str | os.PathLike[str], form: str, proposal: Proposal | None) -> LogCheck:
@@ -101,7 +102,7 @@ def _read(path: str | os.PathLike[str], form: str, proposal: Proposal | None) ->
             read = Log.read(path)
         else:
             leader = "accel_cmd" not in proposal.signals and {"spacing", "lead_speed"} <= set(proposal.signals)
-            read = Log.read(path, map=proposal.map, unit=proposal.unit, stamp=proposal.stamp, following=leader)
+            read = Log.read(path, **proposal.options, following=leader)
     except InputError as fault:
         return LogCheck(place(Path(path)), form, proposal, None, None, str(fault), (), ())
     return _seen(place(Path(path)), form, proposal, read)

@@ -5,46 +5,12 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+from avtorch.io.unit_names import unit_named
+
 _BRACKETS = re.compile(r"^(?P<name>.*?)[\s_.,-]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
 _BEHIND = re.compile(r"^(?P<name>.*?)(?:,\s*|\s+in\s+|\s*/\s+|[\s_.]+)(?P<unit>[^\s_.,]+)$")
 _WORDS = re.compile(r"[A-ZÄÖÜ]+(?![a-zäöüß])|[A-ZÄÖÜ]?[a-zäöüß]+|\d+")
 
-UNITS: dict[str, tuple[str, ...]] = {
-    "m/s": ("m/s", "mps", "ms-1", "m s-1", "ms^-1", "meterpersecond", "meters/second", "meter/s"),
-    "km/h": ("km/h", "kmh", "kph", "kmph", "km/hr", "kmh-1", "kilometersperhour"),
-    "mph": ("mph", "mi/h", "miles/h"),
-    "ft/s": ("ft/s", "fps"),
-    "cm/s": ("cm/s", "cmps"),
-    "mm/s": ("mm/s", "mmps"),
-    "kn": ("kn", "kt", "kts", "knots"),
-    "m/s2": ("m/s2", "m/s^2", "m/s/s", "mps2", "mpss", "mps^2", "ms-2", "ms^-2", "m/sec2", "m/s**2", "m/ss", "ms2"),
-    "g": ("g", "gee", "gs"),
-    "mg": ("mg",),
-    "cm/s2": ("cm/s2", "cm/s^2", "gal"),
-    "mm/s2": ("mm/s2", "mm/s^2"),
-    "ft/s2": ("ft/s2", "ft/s^2"),
-    "s": ("s", "sec", "secs", "second", "seconds"),
-    "ms": ("ms", "msec", "msecs", "millis", "milliseconds"),
-    "us": ("us", "usec", "micros", "microseconds"),
-    "ns": ("ns", "nsec", "nsecs", "nanos", "nanosec", "nanoseconds"),
-    "min": ("min", "minutes"),
-    "h": ("h", "hours"),
-    "m": ("m", "meter", "meters", "metres"),
-    "cm": ("cm",),
-    "mm": ("mm",),
-    "km": ("km",),
-    "ft": ("ft", "feet"),
-    "%": ("%", "pct", "percent", "perc"),
-    "deg": ("deg", "degree", "degrees"),
-    "rad": ("rad", "radian", "radians"),
-    "bar": ("bar",),
-    "kPa": ("kpa",),
-    "Nm": ("nm", "n.m", "n*m"),
-    "A": ("a", "ampere", "amps"),
-    "rpm": ("rpm", "1/min"),
-}
-"""Units as headers write them, by the name that avtorch uses."""
-_NAMED = {form: unit for unit, forms in UNITS.items() for form in forms}
 # letters that are as likely part of a name
 _ONLY_IN_BRACKETS = {"g", "s", "m", "h", "a", "min", "gs", "ms", "rad", "second", "meter"}
 _BARE = {"g": {"accel", "accel_cmd"}, "ms": {"time"}, "s": {"time"}}
@@ -65,13 +31,6 @@ class Header:
     @property
     def joined(self) -> str:
         return "".join(self.words)
-
-
-def unit_named(text: str) -> str | None:
-    """The unit that `text` writes, in avtorch's spelling, or None."""
-    plain = text.strip().strip("[]()<>{}").strip().lower()
-    plain = plain.replace("²", "2").replace("³", "3").replace("µ", "u").replace("μ", "u").replace("°", "deg")
-    return _NAMED.get(plain) or _NAMED.get(plain.replace(" ", ""))
 
 
 def header_of(name: str, stated: str | None = None) -> Header:
@@ -97,7 +56,7 @@ def _inside(word: str) -> tuple[str, str] | None:
     """A unit at the end of a single word, such as `speedkph`, and what stands before it."""
     for form in ("kmph", "kmh", "kph", "mph", "mps2", "mps"):
         if word.endswith(form) and len(word) > len(form):
-            return _NAMED[form], word[: -len(form)]
+            return unit_named(form) or form, word[: -len(form)]
     return None
 
 

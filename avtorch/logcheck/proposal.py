@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,13 +30,14 @@ _EARLY_S, _EARLY_ROWS, _PLAINLY = 0.08, 2.0, 0.01
 
 @dataclass(frozen=True)
 class Proposed:
-    """A signal's `column`, its `unit` (as `--unit` takes it; None: SI or none), whether it is written only where it
-    `arrives`, and the `reason` for all of it."""
+    """A signal's `column`, its `unit` (as `--unit` takes it; None: as the file says, or SI), whether it is written only
+    where it `arrives`, the `reason` for all of it, and `when`, numbers of a state that mean yes."""
 
     column: str
     unit: str | None
     arrives: bool
     reason: str
+    when: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,6 @@ class Proposal:
 
     signals: Mapping[str, Proposed]
     doubts: tuple[str, ...] = ()
-    clock: str | None = field(default=None)
 
     @property
     def map(self) -> dict[str, str]:
@@ -62,14 +62,23 @@ class Proposal:
         return {signal: clock for signal, one in self.signals.items() if one.arrives}
 
     @property
+    def state(self) -> dict[str, str]:
+        return {signal: ",".join(map(str, one.when)) for signal, one in self.signals.items() if one.when}
+
+    @property
     def needed(self) -> bool:
         """Whether the log is read otherwise without it."""
-        return bool(self.map or self.unit or self.stamp)
+        return bool(self.map or self.unit or self.stamp or self.state)
+
+    @property
+    def options(self) -> dict[str, dict[str, str]]:
+        """Arguments of `Log.read`, which are the tables of the file beside the log."""
+        return {"map": self.map, "unit": self.unit, "stamp": self.stamp, "state": self.state}
 
     def toml(self, name: str) -> str:
         """The file beside the log `name` that says all this, with the reasons as comments."""
         lines = [f"# How to read {printable(name, 100)}; proposed by `avtorch check`, which gives these reasons."]
-        for table, entries in (("map", self.map), ("unit", self.unit), ("stamp", self.stamp)):
+        for table, entries in self.options.items():
             if entries:
                 lines += ["", f"[{table}]"]
             for signal, value in entries.items():
@@ -144,10 +153,14 @@ def _by_name(signal: str, columns: list[Column], found: dict[str, Column], reaso
     taken = {column.name for column in found.values()}
     named = [column for column in ranked(columns, signal) if column.name not in taken and np.ptp(_filled(column)) > 0]
     if named:
-        found[signal], reasons[signal] = named[0], ["by its name"]
+        found[signal], reasons[signal] = named[0], [_by_what(named[0])]
         others = [c.name for c in named[1:] if c.likeness[signal] > 0.9 * named[0].likeness[signal]]
         if others:
             reasons[signal].append(f"as well as {', '.join(printable(name, 30) for name in others)}")
+
+
+def _by_what(column: Column) -> str:
+    return f"by the layout of {column.layout}" if column.layout else "by its name"
 
 
 def _by_motion(
@@ -229,7 +242,8 @@ def _units(
     for signal, unit in test.best.units.items():
         turned = signal in test.best.turned
         told = stated[signal]
-        if unit not in ("m/s", "m/s2") or turned:
+        # the file states it, so a table need not say it again, unless it is wrong
+        if unit not in ("m/s", "m/s2") or turned or told not in (unit, None):
             units[signal] = f"{-factor(signal, unit):.10g}" if turned else unit
         words = []
         if told == unit and found[signal].name == signal:
@@ -284,11 +298,11 @@ def _others(
     for signal in ("engaged", "spacing", "lead_speed", "lead_accel", "grade", "segment"):
         for column in ranked(columns, signal):
             values = column.values[np.isfinite(column.values)]
-            if any(column.name == one.column for one in out.values()) or not _can_be(signal, values):
+            if any(column.name == one.column for one in out.values()) or not (column.when or _can_be(signal, values)):
                 continue
             unit = _unit_besides(signal, column, signals, found)
-            reasons = ["by its name"] + ([f"in {unit}"] if unit else [])
-            out[signal] = _proposed(column, unit, reasons, known)
+            reasons = [_by_what(column)] + ([f"in {unit}"] if unit else [])
+            out[signal] = replace(_proposed(column, unit, reasons, known), when=column.when)
             break
     return out
 
