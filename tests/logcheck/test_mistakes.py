@@ -12,28 +12,9 @@ import avtorch
 from avtorch.io import Log
 from avtorch.io.units import GRAVITY
 
+from .drives import Columns, drive
+
 MPH = 3600 / 1609.344
-Columns = dict[str, np.ndarray]
-
-
-def drive(seed: int, seconds: float = 60.0, rate: float = 50.0) -> Columns:
-    """A car with a lag of 0.3 s and a gain of 0.95, and sensors with noise."""
-    rng = np.random.default_rng(seed)
-    time = np.arange(round(seconds * rate)) / rate
-    phase = rng.uniform(0, 2 * np.pi, 4)
-    command = sum(
-        0.5 * np.sin(2 * np.pi * f * time + p) for f, p in zip((0.05, 0.11, 0.23, 0.41), phase, strict=True)
-    ) + np.zeros(len(time))
-    accel = np.zeros(len(time))
-    for i in range(len(time) - 1):
-        accel[i + 1] = accel[i] + (0.95 * command[i] - accel[i]) / (0.3 * rate)
-    speed = 20 + np.concatenate([[0.0], np.cumsum(accel[:-1])]) / rate
-    return {
-        "time": time,
-        "accel_cmd": command,
-        "accel": accel + 0.03 * rng.standard_normal(len(time)),
-        "speed": speed + 0.02 * rng.standard_normal(len(time)),
-    }
 
 
 def named(d: Columns, **names: str) -> Columns:
