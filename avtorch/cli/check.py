@@ -43,16 +43,16 @@ def check(
     if json and not quiet:
         talk.answer(found.to_dict())
     if proposal is None:
-        talk.sentence(f"Read as {mapping_beside(log)} says.")
+        talk.line(f"Read as {mapping_beside(log)} says.")
     elif proposal.needed:
         if yes or _agreed(talk, beside):
             with atomic(beside) as file:
                 file.write(proposal.toml(log.name))
-            talk.sentence(f"Written to {beside}. Next: avtorch estimate {log}, or avtorch diagnose {log}")
+            talk.line(f"Written to {beside}. Next: avtorch estimate {log}, or avtorch diagnose {log}")
         else:
-            talk.sentence(f"Nothing was written; avtorch check {log} --yes writes it to {beside}")
+            talk.line(f"Nothing was written; avtorch check {log} --yes writes it to {beside}")
     elif found.fault is None:
-        talk.sentence(f"It needs no mapping. Next: avtorch estimate {log}, or avtorch diagnose {log}")
+        talk.line(f"It needs no mapping. Next: avtorch estimate {log}, or avtorch diagnose {log}")
     if found.fault is not None:
         raise InputError(found.fault)
 

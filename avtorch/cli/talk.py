@@ -63,7 +63,7 @@ class Talk:
 
     def check(self, found: LogCheck) -> None:
         """What a log is, how to read it, and what was seen in it."""
-        self.out.print(found.source, style="bold", markup=False)
+        self.out.print(found.source, style="bold", markup=False, soft_wrap=True)
         self.out.print(f"  {found.form}", markup=False)
         self.out.print()
         proposal = found.proposal
@@ -89,6 +89,10 @@ class Talk:
     def answer(self, answer: Mapping[str, Any]) -> None:
         """The answer as JSON."""
         print(json.dumps(answer, default=lambda x: x.tolist()))
+
+    def line(self, text: str) -> None:
+        """A line that the terminal wraps and not the printing, so that a path in it can be copied."""
+        self.out.print(text, markup=False, soft_wrap=True)
 
     def sentence(self, text: str) -> None:
         self.out.print(text, markup=False)
