@@ -11,6 +11,7 @@ from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.latent_filter import latent_log_likelihood
 from avtorch.inference.latent_steady import EvenRows, steady_log_likelihood
+from avtorch.inference.latent_values import steady_values
 from avtorch.inference.latent_window import LatentWindow
 from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior
 
@@ -53,12 +54,16 @@ def latent_names(*, accel: bool, speed: bool) -> tuple[str, ...]:
 def run_log_likelihood(
     p: dict[str, Float[Tensor, "*draw run"]], runs: LatentWindow, even: EvenRows | None
 ) -> Float[Tensor, "*draw run"]:
-    """Log likelihood ``(..., run)`` of parameters by name, each ``(..., run)``; ``even`` is ``even_rows(runs)``."""
+    """Log likelihood ``(..., run)`` of parameters by name, each ``(..., run)``; ``even`` is ``even_rows(runs)``.
+
+    Where no gradient is asked for, the same number comes from the routes without a graph.
+    """
     noise = {name: (p[name].square() + FINEST**2).sqrt() for name in ("accel_noise", "speed_noise") if name in p}
     noise |= {name: p[name] for name in ("road_noise",) if name in p}
     five = (p["T_L"], p["K_L"], p["process_noise"], p["coloured_sd"], p["coloured_time"])
+    differentiated = torch.is_grad_enabled() and any(x.requires_grad for x in (*five, *noise.values()))
     if even is not None:
-        return steady_log_likelihood(*five, even, **noise)
+        return (steady_log_likelihood if differentiated else steady_values)(*five, even, **noise)
     measured = {"accel": runs.accel, "speed": runs.speed}
     return latent_log_likelihood(*five, runs.time, runs.u, mask=runs.mask, **measured, **noise)
 
