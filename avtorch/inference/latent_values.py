@@ -115,27 +115,31 @@ def riccati_limit(phi: Array, H: Array, Q: Array, R: Array) -> Array:
 
     ``phi``, ``Q`` ``(case, n, n)``, variances ``R`` ``(case, m)``. The k-th step covers ``2^k`` rows.
     """
-    A, X = np.ascontiguousarray(_t(phi)), Q
+    A, X, limit = np.ascontiguousarray(_t(phi)), Q, Q.copy()
     G = H.T @ (H / R[:, :, None])
-    n = Q.shape[-1]
-    eye = np.eye(n)
+    open_ = np.arange(len(Q))
+    eye = np.eye(Q.shape[-1])
     for k in range(40):
         # one factorisation, two contiguous answers: products of strided matrices take three times as long
         factors, pivots, lost = torch.linalg.lu_factor_ex(torch.from_numpy(eye + G @ X))
-        WA, WG = (torch.linalg.lu_solve(factors, pivots, torch.from_numpy(x)).mT.contiguous().numpy() for x in (A, G))
+        WA, WG = (torch.linalg.lu_solve(factors, pivots, torch.from_numpy(x)).contiguous().numpy() for x in (A, G))
         if bool(lost.any()):
             WA[lost.numpy() != 0] = np.nan
-        # WA and WG are kept transposed, as the solver leaves them
-        half = _t(A) @ X
-        added = half @ np.ascontiguousarray(_t(WA))
+        added = np.ascontiguousarray(_t(A)) @ X @ WA
         X = X + added
-        # what a step adds is positive: its largest entry is on the diagonal. The next would add the square of it, and
-        # 1e-7 squared is below the round-off; NaN never converges
-        if k > 4 and not bool((_diagonal(added).max(1) > 1e-7 * _diagonal(X).max(1)).any()):
-            break
-        G = G + A @ np.ascontiguousarray(_t(WG)) @ np.ascontiguousarray(_t(A))
-        A = A @ np.ascontiguousarray(_t(WA))
-    return 0.5 * (X + _t(X))
+        if k >= 7:
+            # what a step adds is positive: its largest entry is on the diagonal. The next would add the square of it,
+            # and 1e-7 squared is below the round-off; NaN counts as done
+            more = _diagonal(added).max(1) > 1e-7 * _diagonal(X).max(1)
+            limit[open_] = X
+            if not bool(more.any()):
+                return 0.5 * (limit + _t(limit))
+            if not bool(more.all()):
+                open_, A, X, G, WA, WG = (x[more] for x in (open_, A, X, G, WA, WG))
+        G = G + A @ WG @ np.ascontiguousarray(_t(A))
+        A = A @ WA
+    limit[open_] = np.nan
+    return 0.5 * (limit + _t(limit))
 
 
 def _information(looks: Array, used: Array, m: int) -> Array:

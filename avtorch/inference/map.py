@@ -154,8 +154,8 @@ def _from_score(density: ScoredDensity, z: Tensor, spacing: float = 1e-5) -> tup
 def _from_values(density: Density, z: Tensor, spacing: float = 2e-3) -> tuple[Tensor, Tensor, Tensor]:
     """Central differences of values: ``1 + d + d²`` points in one call.
 
-    A log likelihood of 10⁴ nats is good to 1e-8; over the spacing squared that is 2e-3 of curvature, and what is cut off
-    is of relative order ``spacing²``. Both are far below the 0.4 of the widest noise prior.
+    A log likelihood of 10⁴ nats is good to 1e-8; over the spacing squared that is 2e-3 of curvature, and what is cut
+    off is of relative order ``spacing²``. Both are far below the 0.4 of the widest noise prior.
     """
     d = z.shape[-1]
     axes = spacing * torch.eye(d, dtype=z.dtype)

@@ -1,4 +1,5 @@
-"""Estimators behind one interface: SGLD's loop, importance sampling and the modes alone, least squares and joint Kalman filters."""
+"""Estimators behind one interface: SGLD's loop, importance sampling and the modes alone of the same posteriors, least
+squares and joint Kalman filters."""
 
 from avtorch.inference.estimators.choose import ESTIMATORS, make_estimator
 from avtorch.inference.estimators.contract import Estimator

@@ -24,7 +24,8 @@ ESTIMATORS: dict[str, type[SequentialInference] | type[WindowedEstimator]] = {
     "ekf": JointEKF,
     "ukf": JointUKF,
 }
-"""By name: SGLD over windows, importance sampling and the modes alone of the same posteriors, recursive least squares, joint extended and unscented Kalman filter.
+"""By name: SGLD over windows, importance sampling and the modes alone of the same posteriors, recursive least squares,
+joint extended and unscented Kalman filter.
 
 Example:
     >>> from avtorch.inference.estimators import ESTIMATORS
