@@ -85,6 +85,7 @@ def estimates_answer(estimates: Estimates) -> dict[str, Any]:
             "time_gap_s": float(setting.time_gap[0]),
             "gains": setting.gains[0].tolist(),
             "dead_time_s": estimates.dead_time,
+            "dead_time_inferred": None if estimates.inferred is None else estimates.inferred.to_dict(),
             "accepted": dict(zip(("T_L", "K_L"), estimates.accepted, strict=True)),
         },
         "quality": estimates.quality.to_dict(),

@@ -149,6 +149,11 @@ class _Mixture:
         return -0.5 * (nu + d) * torch.log1p(distance / nu) - log_det
 
 
+def approximated(density: Density) -> Density:
+    """The density near this one in which proposals are sought; itself where it has none."""
+    return density.approximation() if isinstance(density, ApproximatedDensity) else density
+
+
 @torch.no_grad()
 def weighted_draws(
     density: Density,
@@ -171,7 +176,7 @@ def weighted_draws(
         True
     """
     settings = ImportanceSettings() if settings is None else settings
-    nearby = density.approximation() if isinstance(density, ApproximatedDensity) else density
+    nearby = approximated(density)
     mode = find_mode(nearby, from_values=True) if mode is None else mode
     mean, root = mode.z, mode.scale
     if nearby is density:

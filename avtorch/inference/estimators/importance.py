@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from avtorch.inference.belief import Summary
 from avtorch.inference.density import Density, SelectableDensity
-from avtorch.inference.importance import ImportanceSettings, WeightedDraws, weighted_draws
+from avtorch.inference.importance import ImportanceSettings, WeightedDraws, approximated, weighted_draws
+from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.sequential import SequentialInference
+
+FIRST = ImportanceSettings()
+WIDER = ImportanceSettings(draws=512, rounds=8, degrees=3, width=1.3)
+"""Tried where the first draws' weights are not reliable: heavier and wider proposals, and four times as many draws at
+most."""
 
 
 class ImportanceSampling(SequentialInference):
     """The same windows, densities and priors as SGLD's loop; each posterior by weighted draws (`weighted_draws`).
 
-    A window whose weights are not reliable is sampled by SGLD, with ``settings``.
+    A window whose weights are not reliable is drawn again from wider proposals. If they are not either, it is sampled
+    by SGLD, with ``settings``.
 
     Takes the arguments of :class:`SequentialInference`.
 
@@ -30,28 +39,56 @@ class ImportanceSampling(SequentialInference):
     """
 
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
-        settings = ImportanceSettings()
-        draws = weighted_draws(density, settings, generator=self.generator)
-        summary, moments = _summary(draws, len(self.belief.draws), self.generator), draws.moments()
-        converged = draws.converged(settings)
-        again = (~converged).nonzero().squeeze(-1)
-        if not len(again) or (len(again) < density.windows and not isinstance(density, SelectableDensity)):
-            return summary, *moments, converged
-        whole = len(again) == density.windows
-        part = density if whole or not isinstance(density, SelectableDensity) else density.select(again)
-        chains, *log_moments, settled = super()._solve(part)
-        table = [_put(one, dim, again, other) for one, dim, other in zip(summary, (0, 0, 0, 0, 1), chains, strict=True)]
-        mean_z, cov_z = (_put(one, 0, again, other) for one, other in zip(moments, log_moments, strict=True))
-        return Summary(*table), mean_z, cov_z, converged.index_put((again,), settled)
+        mode = find_mode(approximated(density), from_values=True)
+        found = self._drawn(density, mode, FIRST)
+        for attempt in (self._wider, self._chains):
+            again = (~found.converged).nonzero().squeeze(-1)
+            if not len(again):
+                break
+            if len(again) == density.windows:
+                found = attempt(density, mode)
+            elif isinstance(density, SelectableDensity):
+                found = found.replaced(again, attempt(density.select(again), mode.select(again)))
+        return found.summary, found.mean_z, found.cov_z, found.converged
+
+    def _drawn(self, density: Density, mode: Mode, settings: ImportanceSettings) -> _Solved:
+        draws = weighted_draws(density, settings, generator=self.generator, mode=mode)
+        summary = _summary(draws, len(self.belief.draws), self.generator)
+        return _Solved(summary, *draws.moments(), mode.converged & draws.converged(settings))
+
+    def _wider(self, density: Density, mode: Mode) -> _Solved:
+        return self._drawn(density, mode, WIDER)
+
+    def _chains(self, density: Density, mode: Mode) -> _Solved:
+        return _Solved(*super()._solve(density))
 
 
-def _put(all_: Tensor, dim: int, index: Tensor, some: Tensor) -> Tensor:
-    return all_.index_copy(dim, index, some)
+class _Solved(NamedTuple):
+    """The posterior of some vehicles: summary, log moments, and where it converged ``(vehicle,)`` bool."""
+
+    summary: Summary
+    mean_z: Tensor
+    cov_z: Tensor
+    converged: Tensor
+
+    def replaced(self, index: Tensor, other: _Solved) -> _Solved:
+        """The vehicles ``index`` taken from ``other``."""
+
+        def put(mine: Tensor, theirs: Tensor, dim: int = 0) -> Tensor:
+            return mine.index_copy(dim, index, theirs)
+
+        *tables, draws = zip(self.summary, other.summary, strict=True)
+        summary = Summary(*(put(*pair) for pair in tables), put(*draws, 1))
+        return _Solved(
+            summary,
+            put(self.mean_z, other.mean_z),
+            put(self.cov_z, other.cov_z),
+            put(self.converged, other.converged),
+        )
 
 
 def _summary(draws: WeightedDraws, kept: int, generator: torch.Generator) -> Summary:
-    value = draws.z.exp()
-    weight = draws.weight[..., None]
+    value, weight = draws.z.exp(), draws.weight[..., None]
     mean = (weight * value).sum(0)
     sd = (weight * (value - mean).square()).sum(0).sqrt()
     low, high = draws.quantile(0.05).exp(), draws.quantile(0.95).exp()
