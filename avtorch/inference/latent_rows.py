@@ -9,6 +9,7 @@ a clock jitters, they are interpolated between Chebyshev nodes instead of comput
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 from avtorch.arrays import Float
 from avtorch.inference.latent_model import discretise, initial_covariance
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 ROUND_OFF = 1e-13
 """Relative error allowed to an interpolated step: that of the matrices' own arithmetic."""

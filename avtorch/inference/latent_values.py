@@ -9,6 +9,7 @@ block to block).
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from avtorch.arrays import Float
 from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, discretise, initial_covariance
 from avtorch.inference.latent_steady import BLOCK, EvenRows
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 
 @torch.no_grad()

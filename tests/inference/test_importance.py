@@ -12,7 +12,7 @@ from torch import Tensor
 from avtorch.errors import InputError
 from avtorch.inference import integrate
 from avtorch.inference.estimators import ImportanceSampling
-from avtorch.inference.importance import ImportanceSettings, approximated, weighted_draws
+from avtorch.inference.importance import ImportanceSettings, WeightedDraws, approximated, weighted_draws
 from avtorch.inference.latent import default_noise_prior
 from avtorch.validation import synthetic_windows
 from tests.bars import BAR
@@ -75,23 +75,11 @@ def test_the_same_seed_gives_the_same_draws(fresh_seed: int) -> None:
     assert one.z.shape != other.z.shape or not bool((one.z == other.z).all())
 
 
-@dataclass(frozen=True)
-class Banana:
-    """A thin ridge along a parabola, which no normal covers."""
-
-    names: tuple[str, ...] = ("x", "y")
-    windows: int = 1
-
-    def log_prob(self, z: Tensor) -> Tensor:
-        return -0.5 * z[..., 0].square() - 0.5 * ((z[..., 1] - 3 * z[..., 0].square()) / 0.003).square()
-
-    def initial(self) -> Tensor:
-        return torch.zeros(1, 2, dtype=torch.float64)
-
-
-def test_weights_that_mean_nothing_are_not_claimed(fresh_seed: int) -> None:
-    draws = weighted_draws(Banana(), generator=torch.Generator().manual_seed(fresh_seed))
-    assert not bool(draws.converged(ImportanceSettings()).any())
+def test_heavy_weights_are_not_claimed() -> None:
+    z, weight = torch.zeros(4, 3, 2, dtype=torch.float64), torch.full((4, 3), 0.25, dtype=torch.float64)
+    shape, effective = torch.tensor([0.5, 0.8, 0.5]), torch.tensor([400.0, 400.0, 20.0])
+    found = WeightedDraws(z, weight, shape, effective).converged(ImportanceSettings())
+    assert found.tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("change", [{"draws": 255}, {"draws": 10}, {"rounds": 0}, {"enough": 0.0}, {"width": -1.0}])
