@@ -4,7 +4,8 @@
 
 Windows are drawn from the law itself (speed alone, both channels, a clock that jitters; 2 s at 50 Hz) and only excited
 ones are taken; with `AVTORCH_DATA` set, windows of 10 s of the Genesis laps as well. The reference has 20 times the
-effective draws; SGLD is left out where the clock jitters, which takes it minutes a window. Cost in processor seconds, which on a busy machine vary by a factor of two: compare them in one run.
+effective draws; SGLD is left out where the clock jitters, which takes it minutes a window. Cost in processor seconds,
+which on a busy machine vary by a factor of two: compare them in one run.
 """
 
 from __future__ import annotations

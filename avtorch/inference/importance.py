@@ -39,7 +39,8 @@ class ImportanceSettings:
         rounds: the most that are made.
         enough: effective draws with which a window is done. 400 leave a mean 0.05 SD uncertain and an SD 4 %.
         degrees: of freedom of the proposals' tails.
-        width: SDs of a proposal over those it is fitted to.
+        width: SDs of a proposal over those it is fitted to. With narrower ones and lighter tails, intervals of 90 %
+            held 1 % less of a long reference's mass; with these, half a per cent.
 
     Raises:
         InputError: naming the setting that is out of range.
@@ -48,8 +49,8 @@ class ImportanceSettings:
     draws: int = 256
     rounds: int = 8
     enough: float = 400.0
-    degrees: int = 7
-    width: float = 1.1
+    degrees: int = 5
+    width: float = 1.25
 
     def __post_init__(self) -> None:
         for name, least in (("draws", 100), ("rounds", 1), ("degrees", 3)):

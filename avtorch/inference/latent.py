@@ -81,12 +81,13 @@ def _row_by_row(five: Sequence[Tensor], runs: LatentWindow, noise: dict[str, Ten
     for run in [slice(0, len(counts))] if same else [slice(r, r + 1) for r in range(len(counts))]:
         rows = counts[run.start]
         own = {name: x[..., run].reshape(-1) for name, x in noise.items()}
-        mine = [x[..., run].reshape(-1) for x in five]
+        T_L, K_L, rough, sd, slow = (x[..., run].reshape(-1) for x in five)
         measured = {
             name: x[run, :rows].expand(*lead, -1, -1).reshape(-1, rows) if same else x[run, :rows]
             for name, x in signals.items()
         }
-        values = row_values(*mine, runs.time[run.start, :rows], runs.u[run.start, :rows], **measured, **own)
+        time, u = runs.time[run.start, :rows], runs.u[run.start, :rows]
+        values = row_values(T_L, K_L, rough, sd, slow, time, u, **measured, **own)
         columns.append(values.reshape(*lead, -1))
     return torch.cat(columns, -1)
 

@@ -20,6 +20,7 @@ from avtorch.arrays import Float
 from avtorch.inference.latent_model import discretise, initial_covariance
 
 Array = NDArray[Any]
+Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 ROUND_OFF = 1e-13
 """Relative error allowed to an interpolated step: that of the matrices' own arithmetic."""
@@ -88,7 +89,7 @@ def row_values(
     return torch.from_numpy(-0.5 * (total.sum((0, 1)) + rows * len(channels) * math.log(2.0 * math.pi)))
 
 
-def _nodes(parameters: tuple[Tensor, ...], steps: Tensor) -> tuple[Tensor | None, Array]:
+def _nodes(parameters: Six, steps: Tensor) -> tuple[Tensor | None, Array]:
     """Chebyshev nodes (node,) of the steps' lengths and their weights (row, node); None where all rows cost less.
 
     A decay of rate ``r`` over lengths within ``h`` of their middle is missed by ``2 (r h / 2)^n / n!`` with ``n`` nodes
@@ -101,8 +102,9 @@ def _nodes(parameters: tuple[Tensor, ...], steps: Tensor) -> tuple[Tensor | None
     rate = 2.0 * max(float((1.0 / parameters[0]).max()), math.sqrt(3.0) / float(parameters[-1].min()))
     if not math.isfinite(rate):
         return None, np.empty(0)
+    reach = math.log(max(0.5 * rate * half, 1e-300))
     count = 4  # noise moments grow with up to the cube of the length
-    while count <= _MOST_NODES and 2.0 * (0.5 * rate * half) ** count / math.factorial(count) > ROUND_OFF:
+    while count <= _MOST_NODES and math.log(2.0) + count * reach - math.lgamma(count + 1) > math.log(ROUND_OFF):
         count += 1
     if count >= min(len(steps), _MOST_NODES):
         return None, np.empty(0)
@@ -112,7 +114,7 @@ def _nodes(parameters: tuple[Tensor, ...], steps: Tensor) -> tuple[Tensor | None
     return torch.from_numpy(0.5 * (low + high) + half * x), at @ np.linalg.inv(polynomials(x, count - 1))
 
 
-def _discretised(parameters: tuple[Tensor, ...], lengths: Tensor) -> tuple[Array, Array, Array]:
+def _discretised(parameters: Six, lengths: Tensor) -> tuple[Array, Array, Array]:
     """Transition, push per unit of command and noise: ``(step, draw, 4, 4)``, ``(step, draw, 4)`` and again
     ``(step, draw, 4, 4)``."""
     step = discretise(*parameters, lengths[:, None])

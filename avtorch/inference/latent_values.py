@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from avtorch.arrays import Float
+from avtorch.arrays import Float, IntArray
 from avtorch.inference.latent_model import ACCEL_ROW, SPEED_ROW, discretise, initial_covariance
 from avtorch.inference.latent_steady import BLOCK, EvenRows
 
@@ -40,9 +40,11 @@ def steady_values(
     lead, runs = T_L.shape[:-1], T_L.shape[-1]
     road = torch.zeros_like(T_L) if road_noise is None else road_noise
     dt = data.dt.expand(T_L.shape).reshape(-1)
-    *five, length = (p.reshape(-1) for p in (T_L, K_L, process_noise, road, coloured_sd, coloured_time))
-    step = discretise(*five, length, dt)
-    matrices = (step.transition, step.gain[..., None], step.noise, initial_covariance(five[-1], length))
+    lag, gain, rough, shaken, sd, length = (
+        p.reshape(-1) for p in (T_L, K_L, process_noise, road, coloured_sd, coloured_time)
+    )
+    step = discretise(lag, gain, rough, shaken, sd, length, dt)
+    matrices = (step.transition, step.gain[..., None], step.noise, initial_covariance(sd, length))
     sensors, noises = [], []
     for measured, noise, row in ((data.has_speed, speed_noise, SPEED_ROW), (data.has_accel, accel_noise, ACCEL_ROW)):
         if measured and noise is not None:
@@ -118,7 +120,7 @@ def riccati_limit(phi: Array, H: Array, Q: Array, R: Array) -> Array:
     """
     A, X, limit = np.ascontiguousarray(_t(phi)), Q, Q.copy()
     G = H.T @ (H / R[:, :, None])
-    open_ = np.arange(len(Q))
+    open_: IntArray = np.arange(len(Q))
     eye = np.eye(Q.shape[-1])
     for k in range(40):
         # one factorisation, two contiguous answers: products of strided matrices take three times as long
@@ -136,7 +138,8 @@ def riccati_limit(phi: Array, H: Array, Q: Array, R: Array) -> Array:
             if not bool(more.any()):
                 return 0.5 * (limit + _t(limit))
             if not bool(more.all()):
-                open_, A, X, G, WA, WG = (x[more] for x in (open_, A, X, G, WA, WG))
+                open_ = open_[more]
+                A, X, G, WA, WG = (x[more] for x in (A, X, G, WA, WG))
         G = G + A @ WG @ np.ascontiguousarray(_t(A))
         A = A @ WA
     limit[open_] = np.nan

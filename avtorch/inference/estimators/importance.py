@@ -77,8 +77,8 @@ class _Solved(NamedTuple):
         def put(mine: Tensor, theirs: Tensor, dim: int = 0) -> Tensor:
             return mine.index_copy(dim, index, theirs)
 
-        *tables, draws = zip(self.summary, other.summary, strict=True)
-        summary = Summary(*(put(*pair) for pair in tables), put(*draws, 1))
+        mean, sd, q05, q95 = (put(*pair) for pair in zip(self.summary[:4], other.summary[:4], strict=True))
+        summary = Summary(mean, sd, q05, q95, put(self.summary.draws, other.summary.draws, 1))
         return _Solved(
             summary,
             put(self.mean_z, other.mean_z),
