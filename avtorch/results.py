@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
+from avtorch.inference.estimators.importance import AGAINST_SGLD
 from avtorch.vehicle import performance, stability
 
 if TYPE_CHECKING:
@@ -78,6 +79,7 @@ def estimates_answer(estimates: Estimates) -> dict[str, Any]:
         "seconds_per_window": estimates.seconds_per_window,
         "form": estimates.form,
         "estimator": estimates.estimator,
+        "estimator_note": AGAINST_SGLD if estimates.estimator == "importance" else None,
         "excited_share": estimates.excited_share,
         "spread_over_sd": {name: estimates.spread_ratio(name) for name in ("T_L", "K_L")},
         "alerts": alert_entries(estimates.windows),

@@ -121,8 +121,9 @@ def estimate(
     printed = answer | {key: from_start(answer[key], answer["epoch_s"]) for key in ("windows", "alerts")}
     talk.windows(printed["windows"])
     talk.summary(printed, estimates_note(answer))
-    if text := dead_time_note(found.inferred):
-        talk.sentence(text)
+    for text in (dead_time_note(found.inferred), answer["estimator_note"]):
+        if text:
+            talk.sentence(text)
     talk.done(out, answer)
 
 

@@ -178,7 +178,7 @@ def weighted_draws(
     """
     settings = ImportanceSettings() if settings is None else settings
     nearby = approximated(density)
-    mode = find_mode(nearby, from_values=True) if mode is None else mode
+    mode = find_mode(nearby, from_values=True, tolerance=5e-5) if mode is None else mode
     mean, root = mode.z, mode.scale
     if nearby is density:
         return _adapted(density, settings, mean, root, generator)

@@ -13,6 +13,12 @@ from avtorch.inference.importance import ImportanceSettings, WeightedDraws, appr
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.sequential import SequentialInference
 
+AGAINST_SGLD = (
+    "Importance sampling in place of SGLD, whose gradients are dear here: on 40 windows its means lay within 0.13 SD of "
+    "a long reference in 95 %, SGLD's within 0.18."
+)
+"""The estimator's error beside SGLD's, for answers; `docs/estimators.md` has the table."""
+
 FIRST = ImportanceSettings()
 WIDER = ImportanceSettings(draws=512, rounds=8, degrees=3, width=1.3)
 """Tried where the first draws' weights are not reliable: heavier and wider proposals, and four times as many draws at
@@ -39,7 +45,8 @@ class ImportanceSampling(SequentialInference):
     """
 
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
-        mode = find_mode(approximated(density), from_values=True)
+        # proposals need no better mode: it is within a hundredth of an SD
+        mode = find_mode(approximated(density), from_values=True, tolerance=5e-5)
         found = self._drawn(density, mode, FIRST)
         for attempt in (self._wider, self._chains):
             again = (~found.converged).nonzero().squeeze(-1)
