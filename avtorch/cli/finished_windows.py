@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 from avtorch.errors import InputError
 
@@ -26,17 +26,19 @@ def finished_windows(out: Path) -> Iterator[Callable[[WatchedWindow], None]]:
     from avtorch.results import window_entry
 
     path = out / NAME
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with path.open("w", encoding="utf-8") as stream:
+    with ExitStack() as opened:
+        streams: list[TextIO] = []
 
-            def write(window: WatchedWindow) -> None:
-                stream.write(json_text(window_entry(window), indent=None).strip() + "\n")
-                stream.flush()
+        def write(window: WatchedWindow) -> None:
+            try:
+                if not streams:  # not before there is something to write: a refused log leaves no folder
+                    out.mkdir(parents=True, exist_ok=True)
+                    streams.append(opened.enter_context(path.open("w", encoding="utf-8")))
+                streams[0].write(json_text(window_entry(window), indent=None).strip() + "\n")
+                streams[0].flush()
+            except OSError as fault:
+                raise InputError(f"{path}: cannot be written ({fault.strerror}); windows go there when done") from None
 
-            yield write
-        path.unlink()
-    except OSError as fault:
-        raise InputError(
-            f"{path}: cannot be written ({fault.strerror}); the windows go there as they are done"
-        ) from None
+        yield write
+    if streams:
+        path.unlink(missing_ok=True)

@@ -47,8 +47,9 @@ def test_an_interruption_leaves_the_windows_done_so_far(tmp_path: Path) -> None:
 
 def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / NAME).mkdir()
-    with pytest.raises(InputError, match=NAME), finished_windows(tmp_path):
-        pass
+    run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
+    with pytest.raises(InputError, match=NAME), finished_windows(tmp_path) as write:
+        estimate(run.log(), estimator="map", finished=write)
 
 
 def test_lines_tell_the_share_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
