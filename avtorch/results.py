@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
+from avtorch.inference.estimators.importance import AGAINST_SGLD
 from avtorch.vehicle import performance, stability
 
 if TYPE_CHECKING:
@@ -78,6 +79,7 @@ def estimates_answer(estimates: Estimates) -> dict[str, Any]:
         "seconds_per_window": estimates.seconds_per_window,
         "form": estimates.form,
         "estimator": estimates.estimator,
+        "estimator_note": AGAINST_SGLD if estimates.estimator == "importance" else None,
         "excited_share": estimates.excited_share,
         "spread_over_sd": {name: estimates.spread_ratio(name) for name in ("T_L", "K_L")},
         "alerts": alert_entries(estimates.windows),
@@ -85,6 +87,7 @@ def estimates_answer(estimates: Estimates) -> dict[str, Any]:
             "time_gap_s": float(setting.time_gap[0]),
             "gains": setting.gains[0].tolist(),
             "dead_time_s": estimates.dead_time,
+            "dead_time_inferred": None if estimates.inferred is None else estimates.inferred.to_dict(),
             "accepted": dict(zip(("T_L", "K_L"), estimates.accepted, strict=True)),
         },
         "quality": estimates.quality.to_dict(),

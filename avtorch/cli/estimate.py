@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -24,6 +24,9 @@ from avtorch.cli.arguments import (
 )
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
+
+if TYPE_CHECKING:
+    from avtorch.decision.dead_time import DeadTime
 
 
 def estimate(
@@ -46,9 +49,12 @@ def estimate(
         Parameter(help="Likelihood: of measured jerk, or of noisy acceleration and speed."),
     ] = "auto",
     estimator: Annotated[
-        Literal["sgld", "map", "rls", "ekf", "ukf"],
-        Parameter(help="SGLD, posterior mode, recursive least squares, extended or unscented Kalman filter."),
-    ] = "sgld",
+        Literal["auto", "sgld", "importance", "map", "rls", "ekf", "ukf"],
+        Parameter(
+            help="SGLD, importance sampling, posterior mode, recursive least squares, extended or unscented Kalman "
+            "filter; auto: SGLD where jerk is measured, else importance sampling."
+        ),
+    ] = "auto",
     mode: Annotated[
         Literal["lambda", "posterior", "forgetting"],
         Parameter(help="How a posterior becomes the next prior (sgld and map)."),
@@ -59,8 +65,9 @@ def estimate(
         str, Parameter(help="    T_L,K_L of the car as it should be, which accepted_change compares with [s, -].")
     ] = "0.3,1.0",
     dead_time: Annotated[
-        float, Parameter(help="Dead time of the car [s], if known; avtorch diagnose estimates it.")
-    ] = 0.0,
+        float | None,
+        Parameter(help="Dead time of the car [s], if known; by default inferred where jerk is not measured."),
+    ] = None,
     seed: Seed = 0,
     json: Json = False,
     quiet: Quiet = False,
@@ -79,14 +86,15 @@ def estimate(
     positive("--tau", tau, "s")
     k = three_gains("--gains", gains)
     sound = positive_pair("--accepted", accepted, "T_L,K_L", "0.3,1.0")
-    not_negative("--dead-time", dead_time, "s")
+    if dead_time is not None:
+        not_negative("--dead-time", dead_time, "s")
     free_folder(out, without="run.json")
     seed_number(seed)
-    if mode != "lambda" and estimator not in ("sgld", "map"):
+    if mode != "lambda" and estimator not in PASSING_ON:
         raise InputError(f"--mode: has no meaning with --estimator {estimator}, which passes no prior on; leave it out")
 
+    from avtorch.cli.finished_windows import finished_windows
     from avtorch.decision.estimation import estimate as work
-    from avtorch.decision.monitor import Monitor
     from avtorch.decision.settings import Setting
     from avtorch.io import Log, check
     from avtorch.io.clock import from_start
@@ -95,13 +103,11 @@ def estimate(
     talk = Talk(json=json, quiet=quiet)
     drive = Log.read(log, map=map, unit=unit, stamp=stamp)
     talk.notes(f"{drive.name}", check(drive).notes)
-    if estimator == "sgld" and (form == "latent" or drive.jerk is None or drive.accel is None):
-        talk.sentence("The latent form, which needs no jerk, takes seconds a window; --estimator map takes a third.")
     setting = Setting(time_gap=tau, gains=k, scenarios=1)
-    with talk.progress("Estimating") as step:
-        options: dict[str, Any] = {"mode": mode} if estimator in ("sgld", "map") else {}
-        options |= {"form": form, "setting": setting, "dead_time": dead_time, "seed": seed}
-        options["monitor"] = Monitor(accepted=sound, dead_time=dead_time)
+    with talk.progress("Estimating") as step, finished_windows(out) as written:
+        options: dict[str, Any] = {"mode": mode} if estimator in PASSING_ON else {}
+        options |= {"form": form, "setting": setting, "dead_time": dead_time, "seed": seed, "accepted": sound}
+        options["finished"] = written
         found = work(drive, window, estimator=estimator, progress=step, **options)
     answer = estimates_answer(found)
 
@@ -115,11 +121,27 @@ def estimate(
     printed = answer | {key: from_start(answer[key], answer["epoch_s"]) for key in ("windows", "alerts")}
     talk.windows(printed["windows"])
     talk.summary(printed, estimates_note(answer))
+    for text in (dead_time_note(found.inferred), answer["estimator_note"]):
+        if text:
+            talk.sentence(text)
     talk.done(out, answer)
 
 
+PASSING_ON = ("auto", "sgld", "importance", "map")
+"""Estimators whose posteriors become priors, so that `--mode` has a meaning."""
+
 UNEXPLAINED = 1.5
 """`Estimates.spread_ratio` above which a single lag and gain do not describe the log."""
+
+
+def dead_time_note(inferred: DeadTime | None) -> str:
+    """What the log says of the dead time, in one sentence; empty where it was not inferred."""
+    if inferred is None:
+        return ""
+    span = f"90 % of its probability from {inferred.q05:.2f} to {inferred.q95:.2f} s"
+    if inferred.seconds == 0.0:
+        return f"No dead time is clear ({span}): T_L holds it. --dead-time sets one."
+    return f"Dead time inferred, {inferred.seconds:.2f} s ({span}): T_L is the lag behind it. --dead-time sets another."
 
 
 def estimates_note(answer: Mapping[str, Any]) -> str:

@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from avtorch.cli.progress_lines import ProgressLines
 from avtorch.cli.terminal import SafeConsole
 
 if TYPE_CHECKING:
@@ -28,7 +29,8 @@ class Talk:
 
     @contextmanager
     def progress(self, what: str) -> Iterator[Callable[[float, float], None]]:
-        """A bar on stderr where it is a terminal; yields a function of (done, of)."""
+        """A bar with the time left on stderr where it is a terminal, and a line now and then where it is not; yields a
+        function of (done, of)."""
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),
@@ -37,7 +39,14 @@ class Talk:
         )
         with Progress(*columns, console=self.err, transient=True, disable=not self.err.is_terminal) as bar:
             task = bar.add_task(what, total=None)
-            yield lambda done, of: bar.update(task, completed=done, total=of)
+            lines = ProgressLines(self.err, what)
+
+            def step(done: float, of: float) -> None:
+                bar.update(task, completed=done, total=of)
+                if not self.err.is_terminal:
+                    lines(done, of)
+
+            yield step
 
     @contextmanager
     def steps(self, what: str) -> Iterator[Callable[[str, int, int], None]]:

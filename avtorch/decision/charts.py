@@ -21,7 +21,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 from torch import Tensor
 
@@ -163,5 +162,8 @@ def _solve(arl_of: Any, arl: float) -> float:
         low /= 2.0
     if low <= 1e-6:
         raise InputError(f"arl: found {arl}, shorter than this chart can have")
+    # imported here, because it takes longer than all of this package and few need it
+    from scipy.optimize import brentq
+
     root: Any = brentq(lambda limit: math.log(arl_of(limit) / arl), low, high, xtol=1e-10)
     return float(root)

@@ -6,6 +6,7 @@ import math
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from statistics import fmean
 from typing import Any, Literal
 
@@ -13,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from avtorch.decision.dead_time import DeadTime, infer_dead_time
 from avtorch.decision.monitor import Monitor
 from avtorch.decision.settings import Setting
 from avtorch.decision.watch import Watch, WatchedWindow
@@ -37,7 +39,7 @@ class Estimates:
     `windows` in the order of the log; `seconds_per_window` of computing; `form` "jerk" or "latent"; `quality` of the
     log, checked first; `setting` for which P(string stable) was computed, since a log does not contain its controller;
     `estimator` by name; `accepted` (T_L [s], K_L [-]) of a sound car, with which `accepted_change` compares;
-    `dead_time` [s] that commands were given.
+    `dead_time` [s] that commands were given, and what it was `inferred` from the log to be, where it was.
 
     Example:
         >>> from avtorch import GLVDPlant, Leader, estimate, simulate
@@ -55,6 +57,7 @@ class Estimates:
     estimator: str = "sgld"
     accepted: tuple[float, float] = (0.3, 1.0)
     dead_time: float = 0.0
+    inferred: DeadTime | None = None
 
     @property
     def excited_share(self) -> float:
@@ -82,11 +85,13 @@ def estimate(
     window: float = 2.0,
     *,
     form: FormName = "auto",
-    estimator: str = "sgld",
+    estimator: str = "auto",
     setting: Setting | None = None,
     monitor: Monitor | None = None,
-    dead_time: float = 0.0,
+    accepted: tuple[float, float] = (0.3, 1.0),
+    dead_time: float | None = 0.0,
     progress: Callable[[int, int], None] | None = None,
+    finished: Callable[[WatchedWindow], None] | None = None,
     seed: int = 0,
     **inference: Any,
 ) -> Estimates:
@@ -95,15 +100,19 @@ def estimate(
     `form`: "jerk" needs measured jerk and accel (Eq. 4); "latent" takes accel and/or speed with their noise;
     "auto" is "jerk" where the log has both. Windows lie on a grid that starts afresh with each segment of the log; the
     last of a segment may be short. Rows at standstill, with `engaged` 0 and in the 2 s after a return to `engaged` are
-    masked; nothing is filtered through them. `progress(done, of)` is called with rows.
+    masked; nothing is filtered through them. `progress(done, of)` is called with rows, `finished` with each window as
+    it is done.
 
-    `estimator`: "sgld" samples each window's posterior, "map" takes its mode and curvature, "rls" is recursive least
-    squares (measured jerk only), "ekf" and "ukf" are joint Kalman filters. Further keywords are the estimator's own
-    (`mode`, `lam`, `settings`, ...; see `avtorch.inference.estimators.make_estimator`).
+    `estimator`: "sgld" samples each window's posterior by Langevin dynamics, "importance" by weighted draws; "auto" is
+    "sgld" for the jerk form and "importance" for the latent one, whose gradients are dear. "map" takes the mode and its
+    curvature, "rls" is recursive least squares (measured jerk only), "ekf" and "ukf" are joint Kalman filters. Further
+    keywords are the estimator's own (`mode`, `lam`, `settings`, ...; see
+    `avtorch.inference.estimators.make_estimator`).
 
-    `dead_time` [s] of the vehicle, where it is known (`avtorch.diagnose` estimates it): commands act that much later,
-    and the first rows of a drive, whose commands are not in the log or were not obeyed, are masked. The default monitor
-    computes its verdicts with it.
+    `dead_time` [s] of the vehicle, where it is known; None infers it first in the latent form
+    (`avtorch.decision.dead_time`) and takes none in the jerk form. Commands act that much later, and the first rows of
+    a drive, whose commands are not in the log or were not obeyed, are masked. The default monitor computes its verdicts
+    with it, and compares with `accepted` (T_L [s], K_L [-]).
 
     Raises `InputError` for a log without accel_cmd or without any row that counts, a form whose columns it lacks, a
     window longer than the log, or an estimator that is not known or cannot take the form.
@@ -131,10 +140,17 @@ def estimate(
     # a window of rows spans one step less than its length
     if window > longest + 1.5 / log.rate_hz:
         raise InputError(f"window: found {window:g} s, needs at most {longest:g} s, the longest segment of {log.name}")
-    if not (math.isfinite(dead_time) and 0.0 <= dead_time < window):
+    if dead_time is not None and not (math.isfinite(dead_time) and 0.0 <= dead_time < window):
         raise InputError(f"dead_time: found {dead_time:g} s, needs 0 or more and less than the window, {window:g} s")
     quality = check(log)
-    monitor = Monitor(dead_time=dead_time) if monitor is None else monitor
+    begun = clock.perf_counter()
+    inferred = None
+    if dead_time is None:
+        inferred = infer_dead_time(log, partial(_delayed, log)) if isinstance(chosen, LatentForm) else None
+        dead_time = 0.0 if inferred is None or inferred.seconds >= window else inferred.seconds
+    if estimator == "auto":
+        estimator = "importance" if isinstance(chosen, LatentForm) else "sgld"
+    monitor = Monitor(accepted=accepted, dead_time=dead_time) if monitor is None else monitor
     setting = Setting() if setting is None else setting
     if setting.shape != (1,):
         raise InputError(f"setting: found shape {tuple(setting.shape)}, needs one, (1,), for one log")
@@ -146,7 +162,6 @@ def estimate(
     signals = {name: torch.from_numpy(getattr(log, name)) for name in chosen.columns}
     signals["accel_cmd"] = torch.from_numpy(command)
     windows: list[WatchedWindow] = []
-    begun = clock.perf_counter()
     last, ahead = -torch.inf, 0.0
     for part in log.segments():
         time = torch.from_numpy(log.elapsed[part])
@@ -155,20 +170,25 @@ def estimate(
             ahead = last + window - float(time[0])
         time = time + ahead
         last = float(time[-1])
-        seen: list[WatchedWindow] = []
-        # block by block, so that progress can be reported and an interruption handled
-        for first in range(0, len(time), 1000):
-            block = slice(first, first + 1000)
+        later = ahead + float(log.elapsed[part.start] - log.time[part.start])
+        # about a window at a time, so that progress can be reported and an interruption handled
+        many = min(1000, max(LEAST_ROWS, int(window * log.rate_hz)))
+        for first in range(0, len(time), many):
+            block = slice(first, first + many)
             rows = {name: signal[part][block] for name, signal in signals.items()}
-            seen += watch.feed(time[block], rows, setting, usable=usable[part][block])
+            seen = watch.feed(time[block], rows, setting, usable=usable[part][block])
+            if first + many >= len(time):
+                seen += watch.flush(setting)
+            for w in seen:
+                windows.append(_on_the_logs_clock(w, later))
+                if finished is not None:
+                    finished(windows[-1])
             if progress is not None:
-                progress(part.start + min(first + 1000, len(time)), log.rows)
-        seen += watch.flush(setting)
-        windows += [_on_the_logs_clock(w, ahead + float(log.elapsed[part.start] - log.time[part.start])) for w in seen]
+                progress(part.start + min(first + many, len(time)), log.rows)
     seconds = (clock.perf_counter() - begun) / max(len(windows), 1)
     name = "jerk" if isinstance(chosen, JerkForm) else "latent"
     T, K = (float(x[0]) for x in watch.monitor.accepted)
-    return Estimates(windows, seconds, name, quality, setting, estimator, (T, K), dead_time)
+    return Estimates(windows, seconds, name, quality, setting, estimator, (T, K), dead_time, inferred)
 
 
 def _delayed(log: Log, dead_time: float) -> tuple[Array, Array]:

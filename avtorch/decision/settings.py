@@ -17,6 +17,7 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.vehicle import stability
+from avtorch.vehicle.broadcasting import broadcast_shape
 from avtorch.vehicle.controllers import NOMINAL_GAINS, LinearController
 from avtorch.vehicle.lower_level import LowerLevel
 from avtorch.vehicle.stability.conditions import Conditions, Form
@@ -80,7 +81,7 @@ class Setting:
         if k.ndim == 0 or k.shape[-1] != 3 or not bool(torch.isfinite(k).all()):
             raise InputError(f"gains: found {tuple(k.shape)} values, need finite (k_s, k_v, k_a) on the last dimension")
         try:
-            shape = torch.broadcast_shapes(
+            shape = broadcast_shape(
                 *(v.shape for v in parts.values()), k.shape[:-1], k_f.shape, (1,) if scenarios is None else (scenarios,)
             )
         except RuntimeError as error:

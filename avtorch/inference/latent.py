@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 
 import torch
 from torch import Tensor
@@ -10,7 +11,9 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.latent_filter import latent_log_likelihood
+from avtorch.inference.latent_rows import row_values
 from avtorch.inference.latent_steady import EvenRows, steady_log_likelihood
+from avtorch.inference.latent_values import steady_values
 from avtorch.inference.latent_window import LatentWindow
 from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior
 
@@ -53,18 +56,44 @@ def latent_names(*, accel: bool, speed: bool) -> tuple[str, ...]:
 def run_log_likelihood(
     p: dict[str, Float[Tensor, "*draw run"]], runs: LatentWindow, even: EvenRows | None
 ) -> Float[Tensor, "*draw run"]:
-    """Log likelihood ``(..., run)`` of parameters by name, each ``(..., run)``; ``even`` is ``even_rows(runs)``."""
+    """Log likelihood ``(..., run)`` of parameters by name, each ``(..., run)``; ``even`` is ``even_rows(runs)``.
+
+    Where no gradient is asked for, the same number comes from the routes without a graph.
+    """
     noise = {name: (p[name].square() + FINEST**2).sqrt() for name in ("accel_noise", "speed_noise") if name in p}
     noise |= {name: p[name] for name in ("road_noise",) if name in p}
     five = (p["T_L"], p["K_L"], p["process_noise"], p["coloured_sd"], p["coloured_time"])
+    differentiated = torch.is_grad_enabled() and any(x.requires_grad for x in (*five, *noise.values()))
     if even is not None:
-        return steady_log_likelihood(*five, even, **noise)
+        return (steady_log_likelihood if differentiated else steady_values)(*five, even, **noise)
+    if not differentiated:
+        return _row_by_row(five, runs, noise)
     measured = {"accel": runs.accel, "speed": runs.speed}
     return latent_log_likelihood(*five, runs.time, runs.u, mask=runs.mask, **measured, **noise)
 
 
-def even_rows(runs: LatentWindow) -> EvenRows | None:
-    """The layout of the fast route, or None where some run is not even."""
+def _row_by_row(five: Sequence[Tensor], runs: LatentWindow, noise: dict[str, Tensor]) -> Tensor:
+    lead, counts = five[0].shape[:-1], runs.mask.sum(-1).tolist()
+    signals = {name: x for name, x in (("accel", runs.accel), ("speed", runs.speed)) if x is not None}
+    same = len(counts) > 1 and all(bool((x == x[:1]).all()) for x in (runs.time, runs.u, runs.mask))
+    columns = []
+    # runs under the same clock and command are taken together, the runs as further draws
+    for run in [slice(0, len(counts))] if same else [slice(r, r + 1) for r in range(len(counts))]:
+        rows = counts[run.start]
+        own = {name: x[..., run].reshape(-1) for name, x in noise.items()}
+        T_L, K_L, rough, sd, slow = (x[..., run].reshape(-1) for x in five)
+        measured = {
+            name: x[run, :rows].expand(*lead, -1, -1).reshape(-1, rows) if same else x[run, :rows]
+            for name, x in signals.items()
+        }
+        time, u = runs.time[run.start, :rows], runs.u[run.start, :rows]
+        values = row_values(T_L, K_L, rough, sd, slow, time, u, **measured, **own)
+        columns.append(values.reshape(*lead, -1))
+    return torch.cat(columns, -1)
+
+
+def even_rows(runs: LatentWindow, *, most_steps: float = EVEN_STEPS, most_s: float = EVEN_S) -> EvenRows | None:
+    """The layout of the fast route, or None where a row of some run is further off an even grid than both bounds."""
     count = runs.mask.sum(-1)
     index = torch.arange(runs.time.shape[1], dtype=torch.float64)
     last = runs.time.gather(1, (count - 1)[:, None])[:, 0]
@@ -72,7 +101,7 @@ def even_rows(runs: LatentWindow) -> EvenRows | None:
     # A run of a single row has no step; any value will do.
     dt = torch.where(count > 1, dt, dt[count > 1].median() if bool((count > 1).any()) else 0.01)
     off = (runs.time - runs.time[:, :1] - dt[:, None] * index).abs() * runs.mask
-    if bool((off > (EVEN_STEPS * dt[:, None]).clamp(max=EVEN_S)).any()):
+    if bool((off > (most_steps * dt[:, None]).clamp(max=most_s)).any()):
         return None
     return EvenRows.build(dt, runs.u, runs.mask, accel=runs.accel, speed=runs.speed)
 
@@ -112,6 +141,18 @@ class LatentDensity:
         if len(self._owner) == self.windows:
             return per_run
         return per_run.new_zeros(*per_run.shape[:-1], self.windows).index_add(-1, self._owner, per_run)
+
+    def approximation(self) -> LatentDensity:
+        """The same law with rows moved to an even grid where none of them moves by a step, for `weighted_draws`: this
+        density itself where its rows are even, or too uneven."""
+        if self._even is not None:
+            return self
+        even = even_rows(self._runs, most_steps=1.0, most_s=torch.inf)
+        if even is None:
+            return self
+        near = copy(self)
+        near._even = even
+        return near
 
     def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]:
         return self.temper * self.log_likelihood(z) + self.prior.log_prob(z)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -44,29 +45,33 @@ def latent_excitation(
 
     by_lag, by_gain = _sensitivities(runs, *reference)
 
-    def energy(accel: Tensor, speed: Tensor) -> Tensor:
-        """``sᵀ Σ⁻¹ s`` of a signal: twice the loss of log likelihood that it causes without a command."""
-        signal = LatentWindow(
-            runs.time,
-            torch.zeros_like(runs.u),
+    def energies_of(signals: list[tuple[Tensor, Tensor]]) -> list[Tensor]:
+        """``sᵀ Σ⁻¹ s`` of signals (acceleration, speed): twice the loss of log likelihood that each causes alone."""
+        count = len(signals)
+        accel, speed = (torch.cat(parts) for parts in zip(*signals, strict=True))
+        time, mask = (x.repeat(count, 1) for x in (runs.time, runs.mask))
+        data = LatentWindow(
+            time,
+            torch.zeros_like(time),
             None if runs.accel is None else accel,
             None if runs.speed is None else speed,
-            runs.mask,
+            mask,
         )
-        return -2.0 * run_log_likelihood(p, signal, even_rows(signal))
+        repeated = {name: x.repeat(count) for name, x in p.items()}
+        return list((-2.0 * run_log_likelihood(repeated, data, even_rows(data))).chunk(count))
 
     # A force of unknown constant size, such as a slope: only changes of the command then determine the gain.
     since = runs.time - runs.time[:, :1]
     signals = (by_lag, by_gain, (torch.ones_like(since), since))
     zero = torch.zeros_like(since)
-    floor = energy(zero, zero)
-
-    def product(i: int, j: int) -> Tensor:
-        both = energy(signals[i][0] + signals[j][0], signals[i][1] + signals[j][1])
-        return 0.5 * (both - energies[i] - energies[j] - floor)
-
-    energies = [energy(*signal) - floor for signal in signals]
-    (tt, kk, cc), tk, tc, kc = energies, product(0, 1), product(0, 2), product(1, 2)
+    pairs = ((0, 1), (0, 2), (1, 2))
+    sums = [(signals[i][0] + signals[j][0], signals[i][1] + signals[j][1]) for i, j in pairs]
+    floor, *found = energies_of([(zero, zero), *signals, *sums])
+    energies = [x - floor for x in found[:3]]
+    tk, tc, kc = (
+        0.5 * (both - energies[i] - energies[j] - floor) for both, (i, j) in zip(found[3:], pairs, strict=True)
+    )
+    tt, kk, cc = energies
     cc = cc.clamp(min=1e-12)
     fisher = (tt - tc**2 / cc, kk - kc**2 / cc, tk - tc * kc / cc)
     tt, kk, tk = (torch.zeros(data.windows, dtype=torch.float64).index_add(0, owner, f) for f in fisher)
@@ -79,19 +84,24 @@ def latent_excitation(
 def _sensitivities(runs: LatentWindow, T: float, K: float) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
     """Derivatives of (acceleration, speed) by log T_L and by log K_L, each ``(run, time)``, with the command held."""
     h = 1e-4
-    lag = T * torch.tensor([[1.0 + h], [1.0 - h]], dtype=torch.float64)
-    dt = runs.time.diff().clamp(min=0.0)
-    decay = torch.exp(-dt[None] / lag[..., None])
-    target = K * runs.u
-    a = target[:, 0].expand(2, -1)
-    v = torch.zeros_like(a)
-    rows = [torch.stack((a, v))]
-    for k in range(dt.shape[1]):
-        fading = (a - target[:, k]) * (1.0 - decay[..., k])
-        v = v + target[:, k] * dt[:, k] + lag * fading
-        a = a - fading
-        rows.append(torch.stack((a, v)))
-    accel, speed = torch.stack(rows, -1)
+    shape = runs.time.shape
+    lags = (T * (1.0 + h), T * (1.0 - h))
+    found = np.zeros((2, 2, *shape))  # lag, (acceleration, speed), run, row
+    steps, targets = runs.time.diff().clamp(min=0.0).numpy(), K * runs.u.numpy()
+    for i, lag in enumerate(lags):
+        for run in range(shape[0]):
+            # plain numbers: one short recursion after another, in which a call of an array library costs most
+            kept = np.exp(-steps[run] / lag).tolist()
+            a, v = float(targets[run, 0]), 0.0
+            accel, speed = [a], [v]
+            for u, dt, decay in zip(targets[run].tolist(), steps[run].tolist(), kept, strict=False):
+                fading = (a - u) * (1.0 - decay)
+                v += u * dt + lag * fading
+                a -= fading
+                accel.append(a)
+                speed.append(v)
+            found[i, :, run] = accel, speed
+    accel, speed = torch.from_numpy(found).unbind(1)
     by_lag = ((accel[0] - accel[1]) / (2.0 * h), (speed[0] - speed[1]) / (2.0 * h))
     # The response is proportional to K_L.
     return by_lag, (accel.mean(0), speed.mean(0))

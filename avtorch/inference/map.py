@@ -67,6 +67,7 @@ def find_mode(
     start: Float[Tensor, "window parameter"] | None = None,
     iterations: int = 60,
     tolerance: float = 1e-8,
+    from_values: bool = False,
 ) -> Mode:
     """Damped Newton ascent of the log density, batched over windows.
 
@@ -77,6 +78,8 @@ def find_mode(
         start: shape ``(window, parameter)``; by default ``density.initial()``.
         tolerance: end when half the Newton decrement, the possible further decrease of the potential, is below this in
             every window. 1e-8 leaves the mode within 1.5e-4 posterior SDs.
+        from_values: take gradient and curvature from differences of the log density, all points of them in one call, in
+            place of a graph: for a density whose values are many times cheaper than its derivatives.
 
     Example:
         >>> from avtorch.inference import find_mode
@@ -88,7 +91,7 @@ def find_mode(
     """
     z = (density.initial() if start is None else start).detach().clone()
     damping = torch.ones(z.shape[0], dtype=z.dtype)
-    potential, gradient, hessian = _expand(density, z)
+    potential, gradient, hessian = _expand(density, z, from_values)
     for _ in range(iterations):
         eigenvalues, basis = torch.linalg.eigh(hessian)
         # the floor keeps a flat direction from becoming an endless step
@@ -100,7 +103,7 @@ def find_mode(
         step = -torch.einsum("wij,wj->wi", basis, projected / curvature)
         step = step / step.abs().amax(-1, keepdim=True).clamp_min(1.0)
         trial = z + damping[:, None] * step
-        new_potential, new_gradient, new_hessian = _expand(density, trial)
+        new_potential, new_gradient, new_hessian = _expand(density, trial, from_values)
         better = new_potential <= potential
         z = torch.where(better[:, None], trial, z)
         potential = torch.where(better, new_potential, potential)
@@ -117,11 +120,13 @@ def find_mode(
 
 
 def _expand(
-    density: Density, z: Float[Tensor, "window d"]
+    density: Density, z: Float[Tensor, "window d"], from_values: bool
 ) -> tuple[Float[Tensor, " window"], Float[Tensor, "window d"], Float[Tensor, "window d d"]]:
     """Potential ``(window,)``, gradient ``(window, d)`` and Hessian ``(window, d, d)``; infinite where not defined."""
     z = z.detach()
-    if isinstance(density, ScoredDensity):
+    if from_values:
+        potential, gradient, hessian = _from_values(density, z)
+    elif isinstance(density, ScoredDensity):
         potential, gradient, hessian = _from_score(density, z)
     else:
         potential, gradient, hessian = _from_graph(density, z)
@@ -144,6 +149,29 @@ def _from_score(density: ScoredDensity, z: Tensor, spacing: float = 1e-5) -> tup
         around = -density.score(z + torch.cat([torch.zeros(1, d, dtype=z.dtype), shifts, -shifts])[:, None, :])
     hessian = (around[1 : d + 1] - around[d + 1 :]) / (2 * spacing)
     return potential, around[0], hessian.movedim(0, -2)
+
+
+def _from_values(density: Density, z: Tensor, spacing: float = 2e-3) -> tuple[Tensor, Tensor, Tensor]:
+    """Central differences of values: ``1 + d + d²`` points in one call.
+
+    A log likelihood of 10⁴ nats is good to 1e-8; over the spacing squared that is 2e-3 of curvature, and what is cut
+    off is of relative order ``spacing²``. Both are far below the 0.4 of the widest noise prior.
+    """
+    d = z.shape[-1]
+    axes = spacing * torch.eye(d, dtype=z.dtype)
+    first, second = torch.triu_indices(d, d, 1)
+    shifts = torch.cat([torch.zeros(1, d, dtype=z.dtype), axes, -axes, axes[first] + axes[second]])
+    shifts = torch.cat([shifts, -shifts[2 * d + 1 :]])
+    with torch.no_grad():
+        values = -density.log_prob(z + shifts[:, None, :])
+    centre, plus, minus = values[0], values[1 : d + 1], values[d + 1 : 2 * d + 1]
+    bent = plus + minus - 2 * centre
+    pairs = len(first)
+    both = values[2 * d + 1 : 2 * d + 1 + pairs] + values[2 * d + 1 + pairs :] - 2 * centre
+    hessian = torch.zeros(d, d, len(z), dtype=z.dtype)
+    hessian[range(d), range(d)] = bent
+    hessian[first, second] = hessian[second, first] = 0.5 * (both - bent[first] - bent[second])
+    return centre, (plus - minus).T / (2 * spacing), hessian.movedim(-1, 0) / spacing**2
 
 
 def _from_graph(density: Density, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -16,6 +16,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.planes import join_planes
+from avtorch.vehicle.broadcasting import broadcast_shape
 
 _LOG_2PI = math.log(2 * math.pi)
 
@@ -224,7 +225,7 @@ class Joint:
 
     def center(self) -> Float[Tensor, "*window parameter"]:
         first, rest = self.actuation.center(), self.noise.center()
-        shape = torch.broadcast_shapes(first.shape[:-1], rest.shape[:-1])
+        shape = broadcast_shape(first.shape[:-1], rest.shape[:-1])
         return torch.cat([first.expand(*shape, -1), rest.expand(*shape, -1)], dim=-1)
 
 

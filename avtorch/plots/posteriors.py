@@ -7,17 +7,19 @@ dashed NUTS, black the truth.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from numpy.typing import ArrayLike
-from scipy.stats import gaussian_kde
 
 from avtorch.inference import Posterior, Quadrature
 from avtorch.plots.style import BLACK, BLUE, LABELS, VERMILLION
+
+if TYPE_CHECKING:
+    from scipy.stats import gaussian_kde
 
 EXACT, EXACT_FILL = "#555555", "#DADADA"
 #: Draws from which the contours of a reference are smoothed, and nodes an axis on which they are followed.
@@ -281,6 +283,9 @@ def _pair(posterior: Posterior, names: tuple[str, str], window: int) -> np.ndarr
 
 def _regions(draws: np.ndarray) -> tuple[gaussian_kde, tuple[float, float]]:
     """A smooth density of draws ``(draw, 2)``, and its heights around 50 and 90 % of them."""
+    # imported here, because scipy.stats takes as long as matplotlib and few figures need it
+    from scipy.stats import gaussian_kde
+
     kernel = gaussian_kde(draws.T)
     # leave one out: under its own kernel a draw's density would be too high
     own = 1 / (2 * np.pi * np.sqrt(np.linalg.det(kernel.covariance)))

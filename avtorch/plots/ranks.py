@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
-from scipy.stats import binom
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
@@ -73,6 +72,9 @@ def rank_band(
         >>> round(low, 1), round(high, 1)
         (-0.4, 0.4)
     """
+    # imported here, because scipy.stats takes as long as matplotlib and few figures need it
+    from scipy.stats import binom
+
     size = {name: float(np.sum(c)) for name, c in counts.items()}
     worth = {name: max(1.0, (effective or {}).get(name, n)) for name, n in size.items()}
     pool, bins = sum(size.values()), len(np.asarray(next(iter(counts.values()))))

@@ -19,9 +19,6 @@ from dataclasses import dataclass
 from typing import cast
 
 import torch
-from scipy.optimize import (  # pyright: ignore[reportMissingTypeStubs]
-    brentq,  # pyright: ignore[reportUnknownVariableType]
-)
 from torch import Tensor
 
 from avtorch.arrays import Float
@@ -101,6 +98,9 @@ def _equilibrium(controller: Controller, speed: float) -> float:
     [m/s]."""
     if not (math.isfinite(speed) and speed > 0.0):
         raise InputError(f"speed: found {speed!r}, needs a number above 0 m/s")
+    # imported here, because it takes longer than all of this package and few need it
+    from scipy.optimize import brentq  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
+
     low, high = 0.1, _FAR_M
 
     def demand(spacing: float) -> float:

@@ -1,9 +1,11 @@
-"""Broadcasting with types: torch declares none for these two."""
+"""Broadcasting with types: torch declares none for these two, and its own `broadcast_shapes` imports SymPy, which takes
+almost as long as torch itself."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,4 +17,7 @@ def broadcast(*tensors: Tensor) -> tuple[Tensor, ...]:
 
 def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
     """The shape that `shapes` broadcast to. Raises `RuntimeError` where there is none."""
-    return torch.broadcast_shapes(*shapes)  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+    try:
+        return torch.Size(np.broadcast_shapes(*(tuple(shape) for shape in shapes)))
+    except ValueError as error:
+        raise RuntimeError(str(error)) from None

@@ -1,8 +1,10 @@
-"""Estimators behind one interface: SGLD's loop, its modes alone, least squares and joint Kalman filters."""
+"""Estimators behind one interface: SGLD's loop, importance sampling and the modes alone of the same posteriors, least
+squares and joint Kalman filters."""
 
 from avtorch.inference.estimators.choose import ESTIMATORS, make_estimator
 from avtorch.inference.estimators.contract import Estimator
 from avtorch.inference.estimators.ekf import JointEKF
+from avtorch.inference.estimators.importance import ImportanceSampling
 from avtorch.inference.estimators.map import MaximumAPosteriori
 from avtorch.inference.estimators.rls import RecursiveLeastSquares
 from avtorch.inference.estimators.ukf import JointUKF
@@ -10,6 +12,7 @@ from avtorch.inference.estimators.ukf import JointUKF
 __all__ = [
     "ESTIMATORS",
     "Estimator",
+    "ImportanceSampling",
     "JointEKF",
     "JointUKF",
     "MaximumAPosteriori",

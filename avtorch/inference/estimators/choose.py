@@ -8,6 +8,7 @@ from typing import Any
 from avtorch.errors import InputError
 from avtorch.inference.estimators.contract import Estimator
 from avtorch.inference.estimators.ekf import JointEKF
+from avtorch.inference.estimators.importance import ImportanceSampling
 from avtorch.inference.estimators.map import MaximumAPosteriori
 from avtorch.inference.estimators.rls import RecursiveLeastSquares
 from avtorch.inference.estimators.ukf import JointUKF
@@ -17,17 +18,19 @@ from avtorch.inference.sequential import SequentialInference
 
 ESTIMATORS: dict[str, type[SequentialInference] | type[WindowedEstimator]] = {
     "sgld": SequentialInference,
+    "importance": ImportanceSampling,
     "map": MaximumAPosteriori,
     "rls": RecursiveLeastSquares,
     "ekf": JointEKF,
     "ukf": JointUKF,
 }
-"""By name: SGLD over windows, its modes alone, recursive least squares, joint extended and unscented Kalman filter.
+"""By name: SGLD over windows, importance sampling and the modes alone of the same posteriors, recursive least squares,
+joint extended and unscented Kalman filter.
 
 Example:
     >>> from avtorch.inference.estimators import ESTIMATORS
     >>> list(ESTIMATORS)
-    ['sgld', 'map', 'rls', 'ekf', 'ukf']
+    ['sgld', 'importance', 'map', 'rls', 'ekf', 'ukf']
 """
 
 _OF_THE_FORM = ("self", "form", "names", "noise_prior", "vehicles", "options")

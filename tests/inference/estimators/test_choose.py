@@ -108,7 +108,7 @@ def test_noisy_acceleration_alone_will_do(name, make_windows, rotating_seed):
 
 
 def test_unknown_names_and_options_are_refused():
-    with pytest.raises(InputError, match="sgld, map, rls, ekf, ukf"):
+    with pytest.raises(InputError, match="sgld, importance, map, rls, ekf, ukf"):
         make_estimator("kalman", JerkForm())
     with pytest.raises(InputError, match=r"^drift: .*'rls'.*forgetting"):
         make_estimator("rls", JerkForm(), drift=0.1)

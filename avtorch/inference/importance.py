@@ -1,0 +1,252 @@
+"""Weighted draws of a posterior by adaptive importance sampling: for a density of which a value is cheap and a gradient
+dear.
+
+Proposals are mixtures of Student's t, first around the mode, then around the weighted draws so far; every draw is
+weighed by the mixture of all proposals (adaptive multiple importance sampling, Cornuet et al., Scand. J. Statist. 39,
+2012). Draws are independent, so a window needs some thousand values of the density where chains of SGLD take tens of
+thousands of gradients. Where the weights are not reliable (`pareto_k`), the window does not count as converged.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from avtorch.arrays import Bool, Float, Int
+from avtorch.errors import InputError
+from avtorch.inference.density import Density
+from avtorch.inference.map import Mode, find_mode
+from avtorch.inference.pareto import RELIABLE, pareto_k
+
+
+@runtime_checkable
+class ApproximatedDensity(Density, Protocol):
+    """A density with a cheaper one near it, in which proposals are sought; the weights remain those of the exact."""
+
+    def approximation(self) -> Density: ...
+
+
+@dataclass(frozen=True)
+class ImportanceSettings:
+    """Settings of `weighted_draws`.
+
+    Attributes:
+        draws: per round.
+        rounds: the most that are made.
+        enough: effective draws with which a window is done. 400 leave a mean 0.05 SD uncertain and an SD 4 %.
+        degrees: of freedom of the proposals' tails.
+        width: SDs of a proposal over those it is fitted to. With narrower ones and lighter tails, intervals of 90 %
+            held 1 % less of a long reference's mass; with these, half a per cent.
+
+    Raises:
+        InputError: naming the setting that is out of range.
+    """
+
+    draws: int = 256
+    rounds: int = 8
+    enough: float = 400.0
+    degrees: int = 5
+    width: float = 1.25
+
+    def __post_init__(self) -> None:
+        for name, least in (("draws", 100), ("rounds", 1), ("degrees", 3)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: {getattr(self, name)} is less than {least}")
+        if self.draws % 2:
+            raise InputError(f"draws: {self.draws} is odd; they come in pairs")
+        for name in ("enough", "width"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name}: {getattr(self, name)} is not positive")
+
+
+@dataclass(frozen=True)
+class WeightedDraws:
+    """Draws of every window with their weights.
+
+    Attributes:
+        z: ``(draw, window, parameter)``, unconstrained.
+        weight: ``(draw, window)``, of sum 1 over the draws.
+        pareto_k: shape of the tail of the weights, ``(window,)``.
+        effective: effective number of draws, ``1 / Σ weight²``, ``(window,)``.
+    """
+
+    z: Float[Tensor, "draw window parameter"]
+    weight: Float[Tensor, "draw window"]
+    pareto_k: Float[Tensor, " window"]
+    effective: Float[Tensor, " window"]
+
+    def converged(self, settings: ImportanceSettings) -> Bool[Tensor, " window"]:
+        """Where the weights are reliable and at least a quarter of the effective draws aimed at, ``(window,)`` bool."""
+        return (self.pareto_k < RELIABLE) & (self.effective >= 0.25 * settings.enough)
+
+    def moments(self) -> tuple[Float[Tensor, "window parameter"], Float[Tensor, "window parameter parameter"]]:
+        """Mean and covariance of ``z``."""
+        return _moments(self.z, self.weight)
+
+    def quantile(self, q: float) -> Float[Tensor, "window parameter"]:
+        """Quantiles of ``z``: linear in the weight between the middles of neighbouring draws."""
+        z, order = self.z.sort(0)
+        weight = self.weight[..., None].expand_as(z).gather(0, order)
+        level = weight.cumsum(0) - 0.5 * weight
+        above = (level < q).sum(0, keepdim=True).clamp(1, len(z) - 1)
+        low, high = level.gather(0, above - 1), level.gather(0, above)
+        share = ((q - low) / (high - low).clamp_min(1e-300)).clamp(0.0, 1.0)
+        return torch.lerp(z.gather(0, above - 1), z.gather(0, above), share)[0]
+
+    def equal(self, count: int, generator: torch.Generator) -> Float[Tensor, "count window parameter"]:
+        """``count`` equally weighted draws of ``z``, by systematic resampling; a heavy draw comes more than once."""
+        # in random order, so that any leading stretch is a sample
+        return _picked(self.z, self.systematic(count, generator)[torch.randperm(count, generator=generator)])
+
+    def systematic(self, count: int, generator: torch.Generator | None) -> Int[Tensor, "count window"]:
+        """Which draw each of ``count`` equally weighted ones is, by systematic resampling."""
+        begin = torch.rand(self.z.shape[1], 1, generator=generator, dtype=self.z.dtype)
+        at = (torch.arange(count, dtype=self.z.dtype) + begin) / count
+        return torch.searchsorted(self.weight.cumsum(0).mT.contiguous(), at).clamp_max(len(self.z) - 1).mT
+
+
+def _picked(z: Tensor, index: Tensor) -> Tensor:
+    return z.gather(0, index[..., None].expand(-1, -1, z.shape[-1]))
+
+
+class _Mixture:
+    """Student's t proposals of all rounds, of equal numbers of draws."""
+
+    def __init__(self, settings: ImportanceSettings) -> None:
+        self.settings = settings
+        self.parts: list[tuple[Tensor, Tensor]] = []
+        self.logs: list[Tensor] = []
+
+    def add(self, mean: Tensor, root: Tensor, generator: torch.Generator | None) -> Tensor:
+        """A further proposal with this mean and root of covariance; returns draws of it, ``(draw, window, d)``."""
+        settings = self.settings
+        root = settings.width * root
+        self.parts.append((mean, root))
+        self.logs.append(mean.new_empty(0, len(mean)))
+        normal = torch.randn(settings.draws // 2, *mean.shape, generator=generator, dtype=mean.dtype)
+        normal = torch.cat([normal, -normal])  # antithetic: the mean of a symmetric part is free of error
+        chi = torch.randn(len(normal), len(mean), settings.degrees, generator=generator, dtype=mean.dtype)
+        stretch = (settings.degrees / chi.square().sum(-1)).sqrt()
+        return mean + stretch[..., None] * torch.einsum("wij,nwj->nwi", root, normal)
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        """Log density ``(draw, window)`` of the mixture, up to a constant, at the draws of all rounds so far.
+
+        What earlier rounds found for earlier draws is kept.
+        """
+        for i, (mean, root) in enumerate(self.parts):
+            new = z[len(self.logs[i]) :]
+            self.logs[i] = torch.cat([self.logs[i], self._student(new, mean, root)])
+        return torch.stack(self.logs).logsumexp(0) - math.log(len(self.logs))
+
+    def _student(self, z: Tensor, mean: Tensor, root: Tensor) -> Tensor:
+        nu, d = self.settings.degrees, z.shape[-1]
+        distance = torch.einsum("wij,nwj->nwi", torch.linalg.inv(root), z - mean).square().sum(-1)
+        log_det = root.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
+        return -0.5 * (nu + d) * torch.log1p(distance / nu) - log_det
+
+
+def approximated(density: Density) -> Density:
+    """The density near this one in which proposals are sought; itself where it has none."""
+    return density.approximation() if isinstance(density, ApproximatedDensity) else density
+
+
+@torch.no_grad()
+def weighted_draws(
+    density: Density,
+    settings: ImportanceSettings | None = None,
+    *,
+    generator: torch.Generator | None = None,
+    mode: Mode | None = None,
+) -> WeightedDraws:
+    """Weighted draws from the posterior of every window, with proposals around ``mode``, sought where not given.
+
+    Example:
+        >>> import torch
+        >>> from avtorch.inference import integrate
+        >>> from avtorch.inference.importance import weighted_draws
+        >>> from avtorch.validation import synthetic_windows
+        >>> density = synthetic_windows(2, seed=1).density
+        >>> draws, exact = weighted_draws(density, generator=torch.Generator().manual_seed(0)), integrate(density)
+        >>> lag = (draws.weight[..., None] * draws.z.exp()).sum(0)[:, 0]
+        >>> bool(((lag - exact.mean[:, 0]).abs() < 0.3 * exact.sd[:, 0]).all())
+        True
+    """
+    settings = ImportanceSettings() if settings is None else settings
+    nearby = approximated(density)
+    mode = find_mode(nearby, from_values=True, tolerance=5e-5) if mode is None else mode
+    mean, root = mode.z, mode.scale
+    if nearby is density:
+        return _adapted(density, settings, mean, root, generator)
+    near = _adapted(nearby, settings, mean, root, generator)
+    found = _corrected(density, nearby, near, settings, generator)
+    if bool(found.converged(settings).all()):
+        return found
+    return _adapted(density, settings, *_fitted(near.z, near.weight, root), generator)
+
+
+def _corrected(
+    density: Density,
+    nearby: Density,
+    near: WeightedDraws,
+    settings: ImportanceSettings,
+    generator: torch.Generator | None,
+) -> WeightedDraws:
+    """Draws from the density nearby, made equal in weight, with the weight that turns them into the exact one's.
+
+    A draw that came more than once weighs as often, but counts as one among the effective draws.
+    """
+    count = 2 * settings.draws
+    index = near.systematic(count, generator)
+    z = _picked(near.z, index)
+    log_ratio = density.log_prob(z) - nearby.log_prob(z)
+    log_ratio = torch.where(log_ratio.isfinite(), log_ratio, -torch.inf)
+    weight = log_ratio.softmax(0)
+    shared = torch.zeros_like(near.weight).scatter_add(0, index, weight)
+    return WeightedDraws(z, weight, torch.maximum(pareto_k(log_ratio), near.pareto_k), 1 / shared.square().sum(0))
+
+
+def _adapted(
+    density: Density, settings: ImportanceSettings, mean: Tensor, root: Tensor, generator: torch.Generator | None
+) -> WeightedDraws:
+    mixture = _Mixture(settings)
+    z, target = mean.new_empty(0, *mean.shape), mean.new_empty(0, len(mean))
+    for k in range(settings.rounds):
+        if k:
+            mean, root = _fitted(z, _tempered(target - mixture.log_prob(z)), root)
+        fresh = mixture.add(mean, root, generator)
+        z = torch.cat([z, fresh])
+        found = density.log_prob(fresh)
+        target = torch.cat([target, torch.where(found.isfinite(), found, -torch.inf)])
+        log_ratio = target - mixture.log_prob(z)
+        weight = log_ratio.softmax(0)
+        effective = 1 / weight.square().sum(0)
+        if k and bool((effective >= settings.enough).all()):
+            break
+    return WeightedDraws(z, weight, pareto_k(log_ratio), effective)
+
+
+def _tempered(log_ratio: Tensor, least: float = 40.0) -> Tensor:
+    """Weights flattened by a power until ``least`` of them count: few draws do not determine a covariance."""
+    power = torch.ones(log_ratio.shape[1], dtype=log_ratio.dtype)
+    for _ in range(6):
+        weight = (power * log_ratio).nan_to_num(nan=-torch.inf, neginf=-torch.inf).softmax(0)
+        power = torch.where(1 / weight.square().sum(0) < least, 0.6 * power, power)
+    return weight
+
+
+def _moments(z: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    mean = (weight[..., None] * z).sum(0)
+    centred = z - mean
+    return mean, torch.einsum("nw,nwi,nwj->wij", weight, centred, centred)
+
+
+def _fitted(z: Tensor, weight: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and root of covariance of weighted draws; the root ``before`` where they have none."""
+    mean, covariance = _moments(z, weight)
+    root, lost = torch.linalg.cholesky_ex(covariance)
+    return mean, torch.where((lost == 0)[:, None, None], root, before)

@@ -1,0 +1,65 @@
+"""`avtorch estimate` while it works: windows on the disk as they are done, and progress in lines."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from avtorch import GLVDPlant, Leader, estimate, simulate
+from avtorch.cli import progress_lines
+from avtorch.cli.finished_windows import NAME, finished_windows
+from avtorch.cli.progress_lines import ProgressLines
+from avtorch.errors import InputError
+from avtorch.results import window_entry
+
+
+def test_windows_are_on_the_disk_as_they_are_done_and_gone_with_the_answer(tmp_path: Path) -> None:
+    run = simulate(Leader.default(start=50.0, duration=6.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
+    path, seen = tmp_path / NAME, []
+    with finished_windows(tmp_path) as write:
+
+        def one(window):
+            write(window)
+            seen.append(len(path.read_text(encoding="utf-8").splitlines()))
+
+        found = estimate(run.log(), estimator="map", finished=one)
+        lines = path.read_text(encoding="utf-8").splitlines()
+    assert seen == [1, 2, 3]
+    assert [json.loads(line) for line in lines] == [window_entry(w) for w in found.windows]
+    assert not path.exists()
+
+
+def test_an_interruption_leaves_the_windows_done_so_far(tmp_path: Path) -> None:
+    run = simulate(Leader.default(start=50.0, duration=6.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
+
+    def stop(window):
+        write(window)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), finished_windows(tmp_path) as write:
+        estimate(run.log(), estimator="map", finished=stop)
+    assert len((tmp_path / NAME).read_text(encoding="utf-8").splitlines()) == 1
+
+
+def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / NAME).mkdir()
+    run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
+    with pytest.raises(InputError, match=NAME), finished_windows(tmp_path) as write:
+        estimate(run.log(), estimator="map", finished=write)
+
+
+def test_lines_tell_the_share_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([0.0, 4.0, 12.0, 15.0, 25.0])
+    monkeypatch.setattr(progress_lines.time, "monotonic", lambda: next(clock))
+    out = io.StringIO()
+    lines = ProgressLines(Console(file=out), "Estimating")
+    for done in (10, 30, 40, 50):
+        lines(done, 100)
+    assert out.getvalue().splitlines() == [
+        "Estimating: 30 %, about 28 s left",
+        "Estimating: 50 %, about 25 s left",
+    ]

@@ -1,0 +1,129 @@
+"""Weighted draws: their law, their refusal where weights mean nothing, and coverage on windows of the latent form."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Tensor
+
+from avtorch.errors import InputError
+from avtorch.inference import integrate
+from avtorch.inference.estimators import ImportanceSampling
+from avtorch.inference.importance import ImportanceSettings, WeightedDraws, approximated, weighted_draws
+from avtorch.inference.latent import default_noise_prior
+from avtorch.validation import synthetic_windows
+from tests.bars import BAR
+from tests.inference.latent_windows import drawn_window
+
+COVERAGE_WINDOWS = 1000
+
+
+@dataclass(frozen=True)
+class Student:
+    """Student's t in ``d`` dimensions, centred, of unit scale."""
+
+    degrees: float
+    d: int = 5
+    windows: int = 1
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(f"x{i}" for i in range(self.d))
+
+    def log_prob(self, z: Tensor) -> Tensor:
+        return -0.5 * (self.degrees + self.d) * torch.log1p(z.square().sum(-1) / self.degrees)
+
+    def initial(self) -> Tensor:
+        return torch.full((1, self.d), 0.1, dtype=torch.float64)
+
+
+@pytest.mark.statistical
+def test_moments_of_a_known_law(rotating_seed: int) -> None:
+    draws = weighted_draws(Student(30.0), generator=torch.Generator().manual_seed(rotating_seed))
+    mean, covariance = draws.moments()
+    variance = 30.0 / 28.0
+    error = (variance / float(draws.effective[0])) ** 0.5
+    assert float(mean.abs().max()) < BAR * error
+    # the fourth moment of this t is 3.23 variances squared, so that a square's SD is 1.5 times its mean
+    assert float((covariance[0].diagonal() / variance - 1).abs().max()) < BAR * 1.5 / float(draws.effective[0]) ** 0.5
+    low, high = draws.quantile(0.05), draws.quantile(0.95)
+    # 1.697: the 95 % quantile of this t; an empirical quantile's SD is that of the share over the density there
+    bar = BAR * (0.05 * 0.95 / float(draws.effective[0])) ** 0.5 / 0.098
+    assert float((low + 1.697).abs().max()) < bar
+    assert float((high - 1.697).abs().max()) < bar
+
+
+@pytest.mark.statistical
+def test_agreement_with_quadrature(rotating_seed: int) -> None:
+    density = synthetic_windows(6, seed=rotating_seed).density
+    draws = weighted_draws(density, generator=torch.Generator().manual_seed(rotating_seed))
+    exact = integrate(density)
+    where = draws.converged(ImportanceSettings()) & exact.converged
+    mean = (draws.weight[..., None] * draws.z.exp()).sum(0)
+    off = (mean - exact.mean).abs() / exact.sd
+    assert bool((off[where] < BAR / draws.effective[where, None].sqrt()).all())
+    # a window without excitation may have weights that are not reliable, and is then not claimed
+    assert bool(where.any())
+
+
+def test_the_same_seed_gives_the_same_draws(fresh_seed: int) -> None:
+    density, _ = drawn_window(torch.Generator().manual_seed(fresh_seed), accel=True, speed=True, rows=50, dt=0.02)
+    one, again, other = (weighted_draws(density, generator=torch.Generator().manual_seed(s)) for s in (3, 3, 4))
+    assert bool((one.z == again.z).all() & (one.weight == again.weight).all())
+    assert one.z.shape != other.z.shape or not bool((one.z == other.z).all())
+
+
+def test_heavy_weights_are_not_claimed() -> None:
+    z, weight = torch.zeros(4, 3, 2, dtype=torch.float64), torch.full((4, 3), 0.25, dtype=torch.float64)
+    shape, effective = torch.tensor([0.5, 0.8, 0.5]), torch.tensor([400.0, 400.0, 20.0])
+    found = WeightedDraws(z, weight, shape, effective).converged(ImportanceSettings())
+    assert found.tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("change", [{"draws": 255}, {"draws": 10}, {"rounds": 0}, {"enough": 0.0}, {"width": -1.0}])
+def test_settings_out_of_range_are_refused_by_name(change: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=f"^{next(iter(change))}: "):
+        ImportanceSettings(**change)  # type: ignore[arg-type]
+
+
+@pytest.mark.statistical
+def test_a_clock_that_jitters_changes_the_route_and_not_the_law(rotating_seed: int) -> None:
+    generator = torch.Generator().manual_seed(rotating_seed)
+    density, _ = drawn_window(generator, accel=True, speed=True, rows=100, dt=0.02, jitter=0.3)
+    assert approximated(density) is not density
+    quick = weighted_draws(density, generator=generator)
+    # a density without the neighbour: all draws by the exact filter
+    density.approximation = lambda: density  # type: ignore[method-assign]
+    long = weighted_draws(density, ImportanceSettings(draws=1024, enough=2000.0), generator=generator)
+    (mean, _), (exact, covariance) = quick.moments(), long.moments()
+    error = (1 / quick.effective + 1 / long.effective).sqrt()
+    off = (mean - exact).abs() / covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    assert bool((off < BAR * error[:, None]).all())
+
+
+@pytest.mark.slow
+@pytest.mark.statistical
+@pytest.mark.parametrize("channels", ["speed", "both", "jitter"])
+def test_intervals_hold_the_truth_as_often_as_they_say(channels: str, rotating_seed: int) -> None:
+    """90 % intervals on windows drawn from their own law, parameters from the prior: coverage of T_L and K_L."""
+    generator = torch.Generator().manual_seed(rotating_seed)
+    held = torch.zeros(2)
+    used = 0
+    settings = {"accel": channels != "speed", "speed": True, "jitter": 0.3 if channels == "jitter" else 0.0}
+    for _ in range(COVERAGE_WINDOWS // 3):
+        density, truth = drawn_window(generator, rows=100, dt=0.02, **settings)
+        loop = ImportanceSampling(
+            names=density.names,
+            noise_prior=default_noise_prior(density.names[2:]),
+            seed=int(used + rotating_seed % 1000),
+        )
+        belief = loop.update(lambda index, prior, d=density: d, torch.tensor([True]))
+        if bool(belief.converged[0]):
+            used += 1
+            held += ((belief.q05[0, :2] <= truth[:2]) & (truth[:2] <= belief.q95[0, :2])).float()
+    assert used > 0.9 * (COVERAGE_WINDOWS // 3)
+    bar = BAR * math.sqrt(0.9 * 0.1 / used)
+    assert float((held / used - 0.9).abs().max()) < bar, (held / used).tolist()

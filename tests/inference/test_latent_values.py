@@ -1,0 +1,100 @@
+"""The likelihood's values without a graph against the routes that have one, and what is differenced from them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from avtorch.inference.latent import LatentDensity, LatentWindow
+from avtorch.inference.latent_filter import latent_log_likelihood
+from avtorch.inference.latent_rows import row_values
+from avtorch.inference.latent_steady import EvenRows, steady_log_likelihood
+from avtorch.inference.latent_values import steady_values
+from avtorch.inference.map import _from_graph, _from_values, find_mode
+from tests.inference.latent_windows import drawn_window
+
+TYPICAL = (0.3, 0.9, 0.15, 0.2, 1.5, 0.1, 0.03, 0.02)
+CHANNELS = pytest.mark.parametrize("channels", ["speed", "accel", "both"])
+
+
+def signals(channels: str, runs: int, rows: int, generator: torch.Generator) -> tuple[Tensor, dict[str, Tensor | None]]:
+    u, noise = torch.randn(2, runs, rows, generator=generator, dtype=torch.float64)
+    a = u.cumsum(-1) / 10 + noise / 10
+    v = 8 + (0.02 * a).cumsum(-1) + noise / 30
+    return u, {"accel": None if channels == "speed" else a, "speed": None if channels == "accel" else v}
+
+
+def parameters(generator: torch.Generator, *shape: int) -> tuple[tuple[Tensor, ...], dict[str, Tensor]]:
+    p = torch.tensor(TYPICAL, dtype=torch.float64)
+    *five, accel, speed, road = (
+        p * torch.exp(0.5 * torch.randn(*shape, 8, generator=generator, dtype=torch.float64))
+    ).unbind(-1)
+    return tuple(five), {"accel_noise": accel, "speed_noise": speed, "road_noise": road}
+
+
+@CHANNELS
+@pytest.mark.parametrize("rows", [1, 2, 31, 33, 250])
+def test_even_values_equal_those_with_a_graph(channels: str, rows: int, fresh_seed: int) -> None:
+    generator = torch.Generator().manual_seed(fresh_seed)
+    u, measured = signals(channels, 2, 250, generator)
+    used = torch.ones(2, 250, dtype=torch.bool)
+    used[1, rows:] = False
+    data = EvenRows.build(torch.tensor([0.02, 0.1], dtype=torch.float64), u, used, **measured)
+    five, noise = parameters(generator, 3, 2)
+    found = steady_values(*five, data, **noise)
+    # the tolerance of the graph's own route against the filter: the diffuse start cancels about seven digits
+    torch.testing.assert_close(found, steady_log_likelihood(*five, data, **noise), rtol=1e-9, atol=1e-8)
+
+
+@CHANNELS
+@pytest.mark.parametrize("jitter", [0.0, 0.4, 1.9])
+def test_values_of_uneven_rows_equal_those_of_the_filter(channels: str, jitter: float, fresh_seed: int) -> None:
+    generator = torch.Generator().manual_seed(fresh_seed)
+    u, measured = signals(channels, 1, 80, generator)
+    steps = 0.02 * (1 + jitter * (torch.rand(80, generator=generator, dtype=torch.float64) - 0.5))
+    five, noise = parameters(generator, 5)
+    found = row_values(*five, steps.cumsum(0), u[0], **measured, **noise)
+    exact = latent_log_likelihood(*five, steps.cumsum(0), u, **measured, **noise)
+    torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-8)
+
+
+def test_runs_under_one_clock_are_taken_together_without_a_change(fresh_seed: int) -> None:
+    """Uneven windows under the same clock and command, one by one and stacked."""
+    generator = torch.Generator().manual_seed(fresh_seed)
+    u, measured = signals("both", 3, 40, generator)
+    time = (0.02 * (1 + 0.8 * torch.rand(40, generator=generator, dtype=torch.float64))).cumsum(0).expand(3, -1)
+    same = u[:1].expand(3, -1)
+    windows = LatentWindow(time, same, measured["accel"], measured["speed"], torch.ones(3, 40, dtype=torch.bool))
+    density = LatentDensity(windows)
+    assert density.approximation() is density or density._even is None
+    z = density.initial() + 0.1 * torch.randn(4, 3, len(density.names), generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        together = density.log_prob(z)
+        alone = [LatentDensity(windows.select(torch.tensor([w]))).log_prob(z[:, [w]]) for w in range(3)]
+    torch.testing.assert_close(together, torch.cat(alone, -1), rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.3])
+def test_derivatives_from_values_are_those_of_the_graph(jitter: float, fresh_seed: int) -> None:
+    """Central differences ``h`` apart are off by ``h²/6`` of the third and ``h²/12`` of the fourth derivative, here of
+    the order of the curvature, and by the values' round-off over ``h`` and over ``h²``."""
+    generator = torch.Generator().manual_seed(fresh_seed)
+    density, truth = drawn_window(generator, accel=True, speed=True, rows=60, dt=0.02, jitter=jitter)
+    z = truth.log()[None]
+    potential, gradient, hessian = _from_values(density, z)
+    exact = _from_graph(density, z.clone())
+    scale = float(exact[2].abs().max())
+    assert float((potential - exact[0]).abs().max()) < 1e-7
+    assert float((gradient - exact[1]).abs().max()) < 10 * 2e-3**2 * scale + 1e-4
+    assert float((hessian - exact[2]).abs().max()) < 10 * 2e-3**2 * scale + 0.05
+
+
+def test_the_mode_from_values_is_the_mode(fresh_seed: int) -> None:
+    generator = torch.Generator().manual_seed(fresh_seed)
+    density, _ = drawn_window(generator, accel=True, speed=True, rows=100, dt=0.02)
+    quick, exact = find_mode(density, from_values=True), find_mode(density)
+    off = torch.linalg.solve_triangular(exact.scale, (quick.z - exact.z)[..., None], upper=False)
+    # a hundredth of an SD, a fifth of what 400 effective draws leave open
+    assert float(off.norm()) < 1e-2
+    assert bool(quick.converged.all())
