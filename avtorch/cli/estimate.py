@@ -163,8 +163,7 @@ def estimates_note(answer: Mapping[str, Any]) -> str:
     spread = [f"{name} {x:.1f}" for name, x in answer["spread_over_sd"].items() if x is not None]
     more = f" Spread from window to window over posterior SD: {', '.join(spread)}." if spread else ""
     if any((x or 0.0) > UNEXPLAINED for x in answer["spread_over_sd"].values()):
-        more += " Lag and gain alone do not explain this log, or they changed: find the cause with avtorch diagnose"
-        more += " (pass a dead time with --dead-time)."
+        more += " Lag and gain alone do not explain this log, or they changed: find the cause with avtorch diagnose."
     elif all("accepted_change" in w["alerts"] for w in used):
         more += (
             " All of them differ from the accepted values: if the car is sound, pass its own with --accepted T_L,K_L."

@@ -22,6 +22,7 @@ from avtorch.logcheck.order_of_events import lateness
 _MOTION = ("accel_cmd", "accel", "speed")
 _TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _RATES_HZ = (9.5, 210.0)
+_LARGEST = 1e9  # of a speed or an acceleration, in any unit
 _TRIED = 60  # columns without a telling name that are compared with the others
 _ONE_MOTION, _FOLLOWS = 0.9, 0.8  # correlations from which a column without a name is taken
 # a response that comes so long before its command, and so many rows, by so much more correlation
@@ -82,8 +83,13 @@ class Proposal:
             if entries:
                 lines += ["", f"[{table}]"]
             for signal, value in entries.items():
-                lines.append(f"{signal} = {json.dumps(value)}  # {printable(self.signals[signal].reason, 200)}")
+                lines.append(f"{signal} = {_toml_text(value)}  # {printable(self.signals[signal].reason, 200)}")
         return "\n".join(lines) + "\n"
+
+
+def _toml_text(text: str) -> str:
+    """A basic string of TOML: JSON's, with characters beyond 16 bits as they are and DEL escaped."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def propose(table: Table) -> Proposal:
@@ -151,7 +157,7 @@ def _parts(clock: FloatArray) -> list[slice]:
 
 def _by_name(signal: str, columns: list[Column], found: dict[str, Column], reasons: dict[str, list[str]]) -> None:
     taken = {column.name for column in found.values()}
-    named = [column for column in ranked(columns, signal) if column.name not in taken and np.ptp(_filled(column)) > 0]
+    named = [column for column in ranked(columns, signal) if column.name not in taken and _moves(column)]
     if named:
         found[signal], reasons[signal] = named[0], [_by_what(named[0])]
         others = [c.name for c in named[1:] if c.likeness[signal] > 0.9 * named[0].likeness[signal]]
@@ -175,7 +181,7 @@ def _by_motion(
         if signal in found:
             continue
         taken = {column.name for column in found.values()}
-        rest = [c for c in columns if c.name not in taken and not c.likeness and np.ptp(_filled(c)) > 0][:_TRIED]
+        rest = [c for c in columns if c.name not in taken and not c.likeness and _moves(c)][:_TRIED]
         if signal == "accel":
             rest = [c for c in rest if c.header.unit in ("m/s2", "g", "mg", "cm/s2", "ft/s2")]
         best, strength = None, 0.0
@@ -332,6 +338,12 @@ def _unit_besides(
         return signals["accel"].unit if "accel" in signals else None
     known = {"spacing": ("cm", "mm", "km", "ft"), "grade": ("%", "deg", "rad"), "lead_accel": ("g", "cm/s2", "ft/s2")}
     return stated if stated in known.get(signal, ()) else None
+
+
+def _moves(column: Column) -> bool:
+    """Whether a column changes, by numbers that a car's motion can have in any unit."""
+    values = column.values[np.isfinite(column.values)]
+    return bool(np.abs(values).max() < _LARGEST and values.min() < values.max())
 
 
 def _filled(column: Column) -> FloatArray:

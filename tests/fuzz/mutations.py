@@ -25,7 +25,7 @@ SEED = int(os.environ.get("AVTORCH_SEED", time.time_ns() % 2**31))
 TOTAL = int(os.environ.get("AVTORCH_FUZZ", "1500"))
 WEIGHTS = {
     "csv": 400, "csv_cells": 200, "parquet": 200, "arrays": 150, "leaders": 100, "mapping": 150, "plant": 200,
-    "words": 150, "options": 100, "states": 100,
+    "words": 150, "options": 100, "states": 100, "check": 60,
 }  # fmt: skip
 
 _SECONDS = 20.0  # for one input; the slowest takes a few hundredths

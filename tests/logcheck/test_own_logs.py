@@ -160,7 +160,7 @@ def test_check_and_estimate_lead_to_the_cars_lag_and_gain(
     assert abs(log.rate_hz - 50.0) < 1e-3
     assert log.engaged.all() != (write in (semicolons, mcap))
     out = tmp_path / "out"
-    assert main(["estimate", str(path), "--out", str(out), "--window", "5", "--estimator", "map", "--quiet"]) == 0
+    assert main(["estimate", str(path), "--out", str(out), "--window", "5", "--quiet"]) == 0
     windows = [w for w in json.loads((out / "estimates.json").read_text())["windows"] if w["used"]]
     last = windows[-1]
     for name, truth in (("T_L", LAG_S), ("K_L", GAIN)):
