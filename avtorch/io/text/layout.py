@@ -67,7 +67,8 @@ def layout_of(lines: Iterable[str]) -> Layout:
     rows = [(number, cells_of(line, separator)) for number, line in plain]
     number, marked = _header(head, rows, separator)
     below = [cells for at, cells in rows if at > number]
-    return Layout(separator, _decimal(below), number, marked, _are_units(below))
+    width = len(cells_of(dict(head)[number].lstrip()[len(marked) :], separator)) if head else 0
+    return Layout(separator, _decimal(below), number, marked, _are_units(below, width))
 
 
 def _head(lines: Iterable[str]) -> list[tuple[int, str]]:
@@ -131,9 +132,9 @@ def _header(head: Sequence[tuple[int, str]], rows: Sequence[tuple[int, list[str]
     return first, ""
 
 
-def _are_units(below: Sequence[Sequence[str]]) -> bool:
-    """Whether the row below the header names units: texts, or the 1 of a bare number, above values."""
-    if len(below) < 2 or not _has_data(below[1]):
+def _are_units(below: Sequence[Sequence[str]], width: int) -> bool:
+    """Whether the row below a header of `width` names units: texts, or the 1 of a bare number, above values."""
+    if len(below) < 2 or len(below[0]) != width or not _has_data(below[1]):
         return False
     texts = [cell for cell in below[0] if cell.strip() and cell.strip() != "1"]
     return bool(texts) and not _has_data(texts)
