@@ -42,7 +42,9 @@ def check(
     talk.check(found)
     if json and not quiet:
         talk.answer(found.to_dict())
-    if proposal is None:
+    if found.follows:
+        talk.line(f"Cars that follow, without commands. Next: avtorch diagnose {log} --follower")
+    elif proposal is None:
         talk.line(f"Read as {mapping_beside(log)} says.")
     elif proposal.needed:
         if yes or _agreed(talk, beside):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from avtorch.errors import InputError
+from avtorch.io.following import read_following
 from avtorch.io.formats import is_recording, open_recording
 from avtorch.io.log import Log
 from avtorch.io.mapping import mapping_beside
@@ -24,7 +25,7 @@ from avtorch.logcheck.recorder import excitation_notes, recorder_notes
 class LogCheck:
     """A log's `source` and `form`; the `proposal` of how to read it (None: it was read as its mapping says, or was no
     file); the `log` and its `quality`, None where it cannot be read, and then the `fault`; notes on the `recorder` and
-    on the `excitation`.
+    on the `excitation`. `follows`: the log is of cars that follow, without commands.
 
     Example:
         >>> import numpy as np
@@ -51,6 +52,7 @@ class LogCheck:
     fault: str | None
     recorder: tuple[str, ...]
     excitation: tuple[str, ...]
+    follows: bool = False
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -65,6 +67,7 @@ class LogCheck:
             "source": self.source,
             "form": self.form,
             "fault": self.fault,
+            "follows": self.follows,
             "signals": {} if proposal is None else {name: asdict(one) for name, one in proposal.signals.items()},
             "doubts": [] if proposal is None else list(proposal.doubts),
             "mapping_needed": proposal is not None and proposal.needed,
@@ -104,8 +107,19 @@ def _read(path: str | os.PathLike[str], form: str, proposal: Proposal | None) ->
             leader = "accel_cmd" not in proposal.signals and {"spacing", "lead_speed"} <= set(proposal.signals)
             read = Log.read(path, **proposal.options, following=leader)
     except InputError as fault:
+        platoon = None if proposal is None or "accel_cmd" in proposal.signals else _platoon(path)
+        if platoon is not None:
+            return replace(_seen(place(Path(path)), form, None, platoon), follows=True)
         return LogCheck(place(Path(path)), form, proposal, None, None, str(fault), (), ())
     return _seen(place(Path(path)), form, proposal, read)
+
+
+def _platoon(path: str | os.PathLike[str]) -> Log | None:
+    """The first follower of a recording of cars without commands, where it has a known form."""
+    try:
+        return read_following(path)
+    except InputError:
+        return None
 
 
 def _seen(source: str, form: str, proposal: Proposal | None, log: Log) -> LogCheck:
