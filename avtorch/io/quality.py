@@ -13,10 +13,11 @@ from avtorch.io.clock import clock_words
 from avtorch.io.consistency import scale_between
 from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import Log
+from avtorch.io.mapping import PEDALS
 from avtorch.io.segments import median_step, stretches
 from avtorch.io.validity import command_scale
 
-SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead_accel", "grade")
+SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead_accel", "grade", *PEDALS, "speed_cmd")
 
 
 @dataclass(frozen=True)
