@@ -22,6 +22,7 @@ from avtorch.cli.arguments import (
     seed_number,
     three_gains,
 )
+from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
@@ -73,7 +74,8 @@ def estimate(
     Parameters
     ----------
     log
-        CSV or Parquet: time, accel_cmd, and accel or speed. LOG.toml beside it may map names and units.
+        CSV or Parquet: time, accel_cmd, and accel or speed. LOG.toml beside it may map names and units. Without
+        accel_cmd a map is made of throttle, brake, torque or current, which needs speed.
     """
     positive("--window", window, "s")
     positive("--tau", tau, "s")
@@ -95,6 +97,7 @@ def estimate(
     talk = Talk(json=json, quiet=quiet)
     drive = Log.read(log, map=map, unit=unit, stamp=stamp)
     talk.notes(f"{drive.name}", check(drive).notes)
+    (drive,), fit, about_map = commanded(talk, [drive])
     if estimator == "sgld" and (form == "latent" or drive.jerk is None or drive.accel is None):
         talk.sentence("The latent form, which needs no jerk, takes seconds a window; --estimator map takes a third.")
     setting = Setting(time_gap=tau, gains=k, scenarios=1)
@@ -104,6 +107,8 @@ def estimate(
         options["monitor"] = Monitor(accepted=sound, dead_time=dead_time)
         found = work(drive, window, estimator=estimator, progress=step, **options)
     answer = estimates_answer(found)
+    if fit is not None:
+        answer["command"] = about_map
 
     from avtorch import plots
 
@@ -112,6 +117,7 @@ def estimate(
         "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
     }
     write_answer(out, "estimates.json", answer, pictures)
+    write_pedals(fit, out)
     printed = answer | {key: from_start(answer[key], answer["epoch_s"]) for key in ("windows", "alerts")}
     talk.windows(printed["windows"])
     talk.summary(printed, estimates_note(answer))

@@ -50,9 +50,10 @@ class Log:
     sent, held until the next row (None in a car-following log, and in one whose command is no acceleration);
     ``accel`` [m/s^2] and ``speed`` [m/s], at least one of them; ``jerk`` [m/s^3]; ``engaged`` (bool, all true where the
     log has no such column); ``spacing`` [m, bumper to bumper]; ``lead_speed`` [m/s]; ``lead_accel`` [m/s^2]; ``grade``
-    [-]; commands that are no accelerations: ``throttle`` [-, share of the pedal's way], ``brake`` [-, or Pa], ``torque``
-    [Nm], ``current`` [A], ``speed_cmd`` [m/s] (`avtorch.pedals` makes an ``accel_cmd`` of them); ``segment`` (int from 0; rises at each gap and each new value of the log's own column, where time may start
-    anew). ``name`` of the source; ``ignored``: its further columns; ``remarks``: what merging left out. ``accel_kind``
+    [-]; commands that are no accelerations: ``throttle`` [-, share of the pedal's way], ``brake`` [-, or Pa],
+    ``torque`` [Nm], ``current`` [A] (`avtorch.pedals` makes ``accel_cmd`` of them), ``speed_cmd`` [m/s]; ``segment``
+    (int from 0; rises at each gap and each new value of the log's own column, where time may start anew). ``name`` of
+    the source; ``ignored``: its further columns; ``remarks``: what merging left out. ``accel_kind``
     is not in a file: ``accel`` is dv/dt, as on a vehicle bus, or what an accelerometer fixed to the car reads along it,
     dv/dt plus gravity's share on a slope; ``dataclasses.replace`` sets it.
 

@@ -6,7 +6,6 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.io.log import Log
-from avtorch.io.mapping import PEDALS
 from avtorch.io.segments import stretches
 from avtorch.logcheck.order_of_events import WITHIN_S, lateness
 

@@ -15,11 +15,25 @@ _COMMAND = {
 }  # fmt: skip
 _LEAD = {"lead", "leader", "front", "preceding", "ahead", "vorder", "object", "obj", "radar", "other", "pov"}
 _OTHER = {
-    "lat", "lateral", "vert", "vertical", "pedal", "accelerator", "angular", "gyro", "yaw", "roll", "pitch", "y", "z", "ay", "az",
+    "lat", "lateral", "vert", "vertical", "pedal", "angular", "gyro", "yaw", "roll", "pitch", "y", "z", "ay", "az",
     "quer", "position", "jerk", "limit", "max", "min", "std", "var", "error", "err", "status", "valid", "steer",
     "steering", "curvature", "count", "id", "distance", "rate", "vy", "vz", "covariance", "heading",
+    "accelerator",
 }  # fmt: skip
 _TURNING = {"wheel", "engine", "motor", "wind", "fan", "rpm", "shaft", "rad", "fl", "fr", "rl", "rr", "gps"}
+_ANSWERED = {"raw", "actual", "measured", "report", "feedback"}
+_STATE = {
+    "status", "state", "valid", "active", "enable", "limit", "max", "min", "fault", "error", "time", "mode", "ready",
+}  # fmt: skip
+_ONE_WHEEL = {"fl", "fr", "rl", "rr", "left", "right", "rear"}
+_OF_BRAKES = {
+    "light", "lamp", "switch", "park", "parking", "torque", "temp", "temperature", "on", "disc", "hold",
+}  # fmt: skip
+_OF_STEERING = {"steer", "steering", "driver", "eps", "column", "yaw", "lateral", "hand", "servo", "friction", "loss"}
+_NOW = {
+    "speed", "velocity", "accel", "gear", "lane", "position", "distance", "lap", "index", "heading", "battery",
+    "target", "leak",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -66,103 +80,18 @@ _SIGNALS: dict[str, _Wanted] = {
     "lead_accel": _Wanted((_ACCEL, _LEAD), {"relative", "rel", "angular", "yaw", "cmd"}),
     "grade": _Wanted(({"grade", "slope", "gradient", "incline", "steigung"},), {"time", "speed"}),
     "throttle": _Wanted(
-        ({"throttle", "gas", "accelerator", "gaspedal", "fahrpedal", "app", "accelpedal"},),
-        {"brake", "status", "valid", "active", "enable", "limit", "fault", "error", "time", "rate", "mode", "ready"},
-        {"raw", "actual", "measured", "report", "feedback", "body", "valve"},
+        ({"throttle", "gas", "accelerator", "gaspedal", "fahrpedal", "accelpedal"},),
+        _STATE | {"brake", "rate"},
+        _ANSWERED | {"body", "valve"},
     ),
     "brake": _Wanted(
-        ({"brake", "brk", "bremse", "bremsdruck", "brakepressure"},),
-        {
-            "throttle",
-            "status",
-            "valid",
-            "active",
-            "enable",
-            "limit",
-            "fault",
-            "error",
-            "time",
-            "light",
-            "lamp",
-            "switch",
-            "park",
-            "parking",
-            "torque",
-            "temp",
-            "temperature",
-            "left",
-            "right",
-            "fl",
-            "fr",
-            "rl",
-            "rr",
-            "ready",
-            "on",
-            "mode",
-            "rear",
-            "disc",
-            "hold",
-        },
-        {"raw", "actual", "measured", "report", "feedback"},
-    ),  # fmt: skip
+        ({"brake", "brk", "bremse", "bremsdruck"},), _STATE | _ONE_WHEEL | _OF_BRAKES | {"throttle"}, _ANSWERED
+    ),
     "torque": _Wanted(
-        ({"torque", "drehmoment", "trq", "tq", "moment"},),
-        {
-            "steer",
-            "steering",
-            "limit",
-            "max",
-            "min",
-            "status",
-            "valid",
-            "brake",
-            "driver",
-            "eps",
-            "column",
-            "fl",
-            "fr",
-            "rl",
-            "rr",
-            "left",
-            "right",
-            "yaw",
-            "error",
-            "time",
-            "lateral",
-            "friction",
-            "loss",
-            "hand",
-        },
-        {"actual", "measured", "report", "feedback", "raw"},
-    ),  # fmt: skip
-    "current": _Wanted(
-        ({"current", "strom", "amps", "amperes"},),
-        {
-            "time",
-            "speed",
-            "gear",
-            "lane",
-            "state",
-            "position",
-            "distance",
-            "limit",
-            "max",
-            "min",
-            "accel",
-            "lap",
-            "index",
-            "heading",
-            "battery",
-            "target",
-            "velocity",
-            "servo",
-            "steering",
-            "mode",
-            "leak",
-        },
-        {"actual", "measured", "raw"},
-    ),  # fmt: skip
-    "speed_cmd": _Wanted((_SPEED, _COMMAND), (_OTHER | _LEAD | _ACCEL | {"measured", "actual"}), _TURNING | {"raw"}),
+        ({"torque", "drehmoment", "trq", "tq", "moment"},), _STATE | _ONE_WHEEL | _OF_STEERING | {"brake"}, _ANSWERED
+    ),
+    "current": _Wanted(({"current", "strom", "amps", "amperes"},), _STATE | _OF_STEERING | _NOW, _ANSWERED),
+    "speed_cmd": _Wanted((_SPEED, _COMMAND), _OTHER | _LEAD | _ACCEL | {"measured", "actual"}, _TURNING | {"raw"}),
     "segment": _Wanted(({"segment", "run", "lap", "drive", "trip"},), {"time", "distance", "speed", "length"}),
 }
 _STEM = 4  # letters from which a word may begin with a wanted one, such as `acceleration` with `accel`

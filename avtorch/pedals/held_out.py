@@ -13,6 +13,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.io import Log
+from avtorch.pedals.crossed import FOLDS
 from avtorch.pedals.fit_map import fit_drive
 from avtorch.pedals.lag_search import lag_of
 from avtorch.pedals.lagged import delayed, speed_gained
@@ -21,7 +22,6 @@ from avtorch.pedals.normal_equations import normal_equations, rows_of
 from avtorch.pedals.pedal_drive import PedalDrive, Piece
 from avtorch.pedals.pedal_map import SIGN, PedalMap
 
-_FOLDS = 5
 _BEGIN_S = 0.5  # over which the speed at the beginning is averaged
 _ROUNDS = 4
 
@@ -82,7 +82,7 @@ def held_out(logs: Log | Sequence[Log]) -> HeldOut:
     drive = PedalDrive.of(logs)
     models = ("nominal", "factor", "map") if drive.has_nominal else ("factor", "map")
     squares = {model: np.full(drive.blocks, np.nan) for model in models}
-    folds = min(_FOLDS, drive.blocks)
+    folds = min(FOLDS, drive.blocks)
     for fold in range(folds):
         out = np.arange(drive.blocks) % folds == fold
         for model in models:

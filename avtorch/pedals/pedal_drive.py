@@ -22,13 +22,16 @@ _FEWEST = 4
 @dataclass(frozen=True, eq=False)
 class Piece:
     """Cells without a gap, `dt` [s] apart: `pedals` (cell,) averaged over each, `speed` (cell + 1,) [m/s] at its
-    edges, `nominal` (cell,) [m/s²] the log's own command or None, `block` (cell,): -1 where a cell does not count."""
+    edges, `nominal` (cell,) [m/s²] the log's own command or None, `block` (cell,): -1 where a cell does not count.
+    They are of `rows` of the log of that number, `log`."""
 
     dt: float
     pedals: dict[str, FloatArray]
     speed: FloatArray
     nominal: FloatArray | None
     block: IntArray
+    log: int
+    rows: slice
 
     @property
     def cells(self) -> int:
@@ -82,9 +85,9 @@ class PedalDrive:
         length = BLOCK_S if usable >= _BLOCKS * BLOCK_S else SHORT_BLOCK_S
         pieces: list[Piece] = []
         blocks = 0
-        for log in each:
+        for number, log in enumerate(each):
             for part in log.segments():
-                piece = _piece(log, part, names, length, blocks)
+                piece = _piece(log, number, part, names, length, blocks)
                 if piece is not None:
                     pieces.append(piece)
                     blocks = max(blocks, int(piece.block.max()) + 1)
@@ -94,7 +97,7 @@ class PedalDrive:
         return cls(tuple(pieces), blocks, seconds, length)
 
 
-def _piece(log: Log, part: slice, names: Sequence[str], length: float, first: int) -> Piece | None:
+def _piece(log: Log, number: int, part: slice, names: Sequence[str], length: float, first: int) -> Piece | None:
     time = log.elapsed[part]
     row = float(np.median(np.diff(time))) if len(time) > 1 else CELL_S
     dt = row * max(1, round(CELL_S / row))
@@ -111,6 +114,8 @@ def _piece(log: Log, part: slice, names: Sequence[str], length: float, first: in
         speed=np.interp(edges, time, log.speed[part]),
         nominal=None if log.accel_cmd is None else _averaged(edges, time, log.accel_cmd[part]),
         block=block,
+        log=number,
+        rows=part,
     )
 
 

@@ -24,6 +24,15 @@ class PedalTable:
     """What one pedal adds: `accel` (pedal, speed) [m/s²] at the knots `pedal` (pedal,), zero where the pedal is zero.
 
     `sd` (pedal, speed): its standard errors by blocks of the drive, None where the map was not fitted.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.pedals import PedalMap, PedalTable
+        >>> weak = PedalTable(np.array([0.0, 1.0]), np.array([[0, 0], [1.0, -2.0]]))
+        >>> PedalMap(np.array([0.0, 30.0]), np.zeros(2), {"throttle": weak})
+        Traceback (most recent call last):
+        ...
+        avtorch.errors.InputError: throttle: found an acceleration that turns back, needs one that goes one way only
     """
 
     pedal: FloatArray
