@@ -15,7 +15,7 @@ import numpy as np
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.io import Log
 from avtorch.pedals.columns import MapColumns
-from avtorch.pedals.lag_search import lag_of
+from avtorch.pedals.lag_search import DEAD_TIMES_S, LAGS_S, lag_of
 from avtorch.pedals.lagged import speed_gained
 from avtorch.pedals.least_squares import bounded_solution
 from avtorch.pedals.normal_equations import normal_equations, rows_of
@@ -24,6 +24,8 @@ from avtorch.pedals.pedal_map import PedalMap
 
 _SMOOTH = np.geomspace(1e-7, 10.0, 9)
 _FIRST_SMOOTH = 1e-3
+_ROUGHER = 0.01
+_ENOUGH = 1e-6  # of the squares left: a step that gains less ends the search
 _ROUNDS = 8
 _FOLDS = 8
 
@@ -107,21 +109,36 @@ class _Fitting:
             T_L, dead_time = self._lag(factors)
             if (T_L, dead_time) == before:
                 break
-        each = self._products(T_L, dead_time)
-        smooth = self._smooth(each)
-        factors = self._factors(each[self.used].sum(0), smooth)
-        T_L, dead_time = self._lag(factors)
-        each = self._products(T_L, dead_time)
-        whole = each[self.used].sum(0)
-        factors = self._factors(whole, smooth)
-        tested = np.append(factors, -1.0)
-        rms = float(np.sqrt(max(tested @ whole @ tested, 0.0) / self.count))
+        smooth, rougher = self._smooth(self._products(T_L, dead_time))
+        T_L, dead_time, factors = self._refined(T_L, dead_time, smooth)
+        rms = float(np.sqrt(self._solved(T_L, dead_time, smooth)[1] / self.count))
         if errors:
-            spread, *sd = self._errors(factors, T_L, dead_time, smooth)
+            spread, *sd = self._errors(factors, T_L, dead_time, rougher)
         else:
             spread, sd = None, [np.nan] * 3
         made = self.columns.map_of(factors, spread, T_L, dead_time)
         return PedalFit(made, *sd, smooth, rms, self.drive.seconds)
+
+    def _refined(self, T_L: float, dead_time: float, smooth: float) -> tuple[float, float, FloatArray]:
+        """Lag and dead time from those of a grid to between its points, and the factors, while the fit gets better."""
+        factors, left = self._solved(T_L, dead_time, smooth)
+        for _ in range(_ROUNDS):
+            joint = self._with_slopes(factors, T_L, dead_time)[self.used].sum(0)
+            step = self._jointly(joint, smooth)[:2]
+            new = float(np.clip(T_L + step[0], max(0.7 * T_L, LAGS_S[0]), min(1.4 * T_L, LAGS_S[-1])))
+            late = float(np.clip(dead_time + step[1], 0.0, DEAD_TIMES_S[-1]))
+            tried, less = self._solved(new, late, smooth)
+            if less >= left * (1 - _ENOUGH):
+                break
+            T_L, dead_time, factors, left = new, late, tried, less
+        return T_L, dead_time, factors
+
+    def _solved(self, T_L: float, dead_time: float, smooth: float) -> tuple[FloatArray, float]:
+        """The factors, and the sum of squares they leave."""
+        whole = self._products(T_L, dead_time)[self.used].sum(0)
+        factors = self._factors(whole, smooth)
+        tested = np.append(factors, -1.0)
+        return factors, max(float(tested @ whole @ tested), 0.0)
 
     def _products(self, T_L: float, dead_time: float) -> FloatArray:
         return normal_equations(self.rows, lambda p: self.made[id(p)], T_L, dead_time, self.drive.blocks)
@@ -132,9 +149,10 @@ class _Fitting:
         normal = products[:count, :count] + smooth * self.count * self.rough
         return bounded_solution(normal, products[:count, -1], self.columns.free)
 
-    def _smooth(self, each: FloatArray) -> float:
+    def _smooth(self, each: FloatArray) -> tuple[float, float]:
         """The largest weight of curvature with which blocks that are held out are predicted as well as with the best,
-        to one standard error of the difference."""
+        to one standard error of the difference; and a weight so small that a corner, too, is followed: the smallest
+        such, or a hundredth of the largest."""
         numbers = np.flatnonzero(self.used)
         folds = min(_FOLDS, len(numbers))
         whole, left = each[self.used].sum(0), np.zeros((len(_SMOOTH), len(numbers)))
@@ -146,35 +164,46 @@ class _Fitting:
                 left[i, out] = np.einsum("i,bij,j->b", x, held, x)
         more = left - left[left.sum(1).argmin()]
         error = more.std(1, ddof=1) * np.sqrt(len(numbers))
-        return float(_SMOOTH[more.sum(1) <= error].max())
+        alike = _SMOOTH[more.sum(1) <= error]
+        smooth = float(alike.max())
+        return smooth, min(float(alike.min()), _ROUGHER * smooth)
 
     def _lag(self, factors: FloatArray) -> tuple[float, float]:
         return lag_of(self.rows, [self.made[id(one.piece)] @ factors for one in self.rows], self.used)
 
-    def _errors(
-        self, factors: FloatArray, T_L: float, dead_time: float, smooth: float
-    ) -> tuple[FloatArray, float, float, float]:
-        """By leaving out each block: changes of the factors (draw, column) whose squares sum to variances, and the
-        standard errors of lag, dead time and their sum, which are fitted with them to first order."""
+    def _with_slopes(self, factors: FloatArray, T_L: float, dead_time: float) -> FloatArray:
+        """Products as `_products`, with two columns before the others: what the response to `factors` changes by with
+        lag and dead time."""
 
         def demand(piece: Piece) -> FloatArray:
             made = self.made[id(piece)]
             m = made @ factors
             gained, _ = speed_gained(m, T_L, piece.dt)
-            # demands whose response, through the same lag and dead time, is the slope of the fitted one in these two
+            # demands whose response, through the same lag and dead time, is that slope
             return np.column_stack([(gained / piece.dt - m) / T_L, -np.gradient(m, piece.dt), made])
 
-        each = normal_equations(self.rows, demand, T_L, dead_time, self.drive.blocks)
-        whole, numbers = each[self.used].sum(0), np.flatnonzero(self.used)
+        return normal_equations(self.rows, demand, T_L, dead_time, self.drive.blocks)
+
+    def _jointly(self, products: FloatArray, smooth: float) -> FloatArray:
+        """Steps of lag and dead time, and the factors, of products with slopes."""
         rough = np.pad(self.rough, ((2, 0), (2, 0)))
+        normal = products[:-1, :-1] + smooth * self.count * rough
+        return bounded_solution(normal, products[:-1, -1], self.columns.free + 2)
 
-        def solved(products: FloatArray) -> FloatArray:
-            count = len(rough)
-            normal = products[:count, :count] + smooth * self.count * rough
-            return bounded_solution(normal, products[:count, -1], self.columns.free + 2)
+    def _errors(
+        self, factors: FloatArray, T_L: float, dead_time: float, rougher: float
+    ) -> tuple[FloatArray, float, float, float]:
+        """By leaving out each block: changes of the factors (draw, column) whose squares sum to variances, and the
+        standard errors of lag, dead time and their sum, which are fitted with them to first order.
 
-        kept = np.stack([solved(whole - each[number]) for number in numbers])
+        They are those of a map fitted with the weight `rougher`, and the difference to that one is added as one more
+        change: blocks left out do not show what smoothing does to all of them alike.
+        """
+        each = self._with_slopes(factors, T_L, dead_time)
+        whole, numbers = each[self.used].sum(0), np.flatnonzero(self.used)
+        kept = np.stack([self._jointly(whole - each[number], rougher) for number in numbers])
         changes = (kept - kept.mean(0)) * np.sqrt((len(numbers) - 1) / len(numbers))
         lag_sd, dead_sd = np.sqrt((changes[:, :2] ** 2).sum(0))
         late_sd = np.sqrt((changes[:, :2].sum(1) ** 2).sum())
-        return changes[:, 2:], float(lag_sd), float(dead_sd), float(late_sd)
+        smoothed = self._factors(whole[2:, 2:], rougher) - factors
+        return np.vstack([changes[:, 2:], smoothed]), float(lag_sd), float(dead_sd), float(late_sd)
