@@ -112,12 +112,11 @@ class _Fitting:
         smooth, rougher = self._smooth(self._products(T_L, dead_time))
         T_L, dead_time, factors = self._refined(T_L, dead_time, smooth)
         rms = float(np.sqrt(self._solved(T_L, dead_time, smooth)[1] / self.count))
+        spread, sd = None, (np.nan, np.nan, np.nan)
         if errors:
-            spread, *sd = self._errors(factors, T_L, dead_time, rougher)
-        else:
-            spread, sd = None, [np.nan] * 3
+            spread, sd = self._errors(factors, T_L, dead_time, rougher)
         made = self.columns.map_of(factors, spread, T_L, dead_time)
-        return PedalFit(made, *sd, smooth, rms, self.drive.seconds)
+        return PedalFit(made, sd[0], sd[1], sd[2], smooth, rms, self.drive.seconds)
 
     def _refined(self, T_L: float, dead_time: float, smooth: float) -> tuple[float, float, FloatArray]:
         """Lag and dead time from those of a grid to between its points, and the factors, while the fit gets better."""
@@ -150,9 +149,9 @@ class _Fitting:
         return bounded_solution(normal, products[:count, -1], self.columns.free)
 
     def _smooth(self, each: FloatArray) -> tuple[float, float]:
-        """The largest weight of curvature with which blocks that are held out are predicted as well as with the best,
-        to one standard error of the difference; and a weight so small that a corner, too, is followed: the smallest
-        such, or a hundredth of the largest."""
+        """The weight of curvature with which blocks that are held out are predicted best; and one so small that a
+        corner, too, is followed: the smallest of those that do as well, to one standard error of the difference, or a
+        hundredth of the best."""
         numbers = np.flatnonzero(self.used)
         folds = min(_FOLDS, len(numbers))
         whole, left = each[self.used].sum(0), np.zeros((len(_SMOOTH), len(numbers)))
@@ -162,11 +161,11 @@ class _Fitting:
             for i, smooth in enumerate(_SMOOTH.tolist()):
                 x = np.append(self._factors(whole - held.sum(0), smooth), -1.0)
                 left[i, out] = np.einsum("i,bij,j->b", x, held, x)
-        more = left - left[left.sum(1).argmin()]
+        best = int(left.sum(1).argmin())
+        more = left - left[best]
         error = more.std(1, ddof=1) * np.sqrt(len(numbers))
-        alike = _SMOOTH[more.sum(1) <= error]
-        smooth = float(alike.max())
-        return smooth, min(float(alike.min()), _ROUGHER * smooth)
+        smooth = float(_SMOOTH[best])
+        return smooth, min(float(_SMOOTH[more.sum(1) <= error].min()), _ROUGHER * smooth)
 
     def _lag(self, factors: FloatArray) -> tuple[float, float]:
         return lag_of(self.rows, [self.made[id(one.piece)] @ factors for one in self.rows], self.used)
@@ -192,7 +191,7 @@ class _Fitting:
 
     def _errors(
         self, factors: FloatArray, T_L: float, dead_time: float, rougher: float
-    ) -> tuple[FloatArray, float, float, float]:
+    ) -> tuple[FloatArray, tuple[float, float, float]]:
         """By leaving out each block: changes of the factors (draw, column) whose squares sum to variances, and the
         standard errors of lag, dead time and their sum, which are fitted with them to first order.
 
@@ -206,4 +205,4 @@ class _Fitting:
         lag_sd, dead_sd = np.sqrt((changes[:, :2] ** 2).sum(0))
         late_sd = np.sqrt((changes[:, :2].sum(1) ** 2).sum())
         smoothed = self._factors(whole[2:, 2:], rougher) - factors
-        return np.vstack([changes[:, 2:], smoothed]), float(lag_sd), float(dead_sd), float(late_sd)
+        return np.vstack([changes[:, 2:], smoothed]), (float(lag_sd), float(dead_sd), float(late_sd))

@@ -16,7 +16,7 @@ def bounded_solution(normal: FloatArray, right: FloatArray, free: int) -> FloatA
     scale = 1 / np.sqrt(np.diag(normal) + _RIDGE * np.trace(normal) / len(normal))
     scaled = normal * scale[:, None] * scale + _RIDGE * np.eye(len(normal))
     root = np.linalg.cholesky(scaled).T  # upper
-    target = solve_triangular(root, right * scale, trans="T")
+    target = solve_triangular(root, right * scale, trans=1)
     # the free ones fit whatever the others leave of their rows, so the others see only the rows below
     x = np.empty(len(normal))
     x[free:] = nnls(root[free:, free:], target[free:])[0] if free < len(normal) else 0.0
