@@ -88,7 +88,7 @@ def _table(made: PedalMap, names: Sequence[str], side: float) -> MapTable | None
         rows = np.flatnonzero(sign * table.pedal >= 0)[:: int(sign)]
         if len(rows) < 2:
             continue
-        values = sign * table.pedal[rows]
+        values = np.abs(table.pedal[rows])
         is_share = name == "throttle" or (name == "brake" and values[-1] <= 1.2)
         share = values if is_share else values / values[-1]
         lines = ["default," + ",".join(f"{v:.2f}" for v in made.speed)]
@@ -97,7 +97,7 @@ def _table(made: PedalMap, names: Sequence[str], side: float) -> MapTable | None
         lost = [f"lag {made.T_L:.3g} s and dead time {made.dead_time:.3g} s"]
         if not is_share:
             unit = "Pa" if name == "brake" else UNIT[name]
-            lost.append(f"the unit of {name}: 1 in the first column is {sign * values[-1]:.6g} {unit}")
+            lost.append(f"the unit of {name}: 1 in the first column is {values[-1]:.6g} {unit}")
         lost += [f"{other}, which adds to {name}" for other in names if other != name and side > 0]
         return MapTable("\n".join(lines) + "\n", tuple(lost))
     return None
