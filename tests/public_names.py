@@ -17,6 +17,7 @@ PACKAGES = (
     "avtorch.decision",
     "avtorch.validation",
     "avtorch.io",
+    "avtorch.pedals",
     "avtorch.gap",
     "avtorch.gap.effects",
     "avtorch.blindtest",

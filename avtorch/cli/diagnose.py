@@ -18,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, positive, seed_number
 from avtorch.cli.diagnosis_table import budget_table, diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.cli.follower import follow, refuse
+from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.resume import FITS, begin_anew
 from avtorch.cli.simulator import read_simulator
 from avtorch.cli.talk import Talk
@@ -109,7 +110,8 @@ def diagnose(
     ----------
     logs
         CSV or Parquet: time, accel_cmd, and accel or speed. Several are drives of one car. LOG.toml beside a log may
-        map names and units. With --follower: time, speed, spacing, lead_speed, or an OpenACC, NGSIM or I-24 file.
+        map names and units. Without accel_cmd a map is made of throttle, brake, torque or current, which needs speed.
+        With --follower: time, speed, spacing, lead_speed, or an OpenACC, NGSIM or I-24 file.
     """
     if budget is not None:
         positive("--budget", budget, "s")
@@ -144,7 +146,7 @@ def diagnose(
     for option, given in (("--vehicle", vehicle), ("--law", law), ("--event", event)):
         if given is not None:
             raise InputError(f"{option}: has a meaning with --follower only")
-    drives = [Log.read(path, map=map, unit=unit, stamp=stamp) for path in logs]
+    drives, fit, about_map = commanded(talk, [Log.read(path, map=map, unit=unit, stamp=stamp) for path in logs])
     for path, drive in zip(logs, drives, strict=True):
         _usable(path, drive, accel_kind)
         _check_effects(chosen or (), path, drive)
@@ -188,7 +190,7 @@ def diagnose(
     from avtorch.io import answer_set
     from avtorch.report import write_report
 
-    notes = found.notes
+    notes = found.notes if fit is None else (*found.notes, about_map)
     try:
         ahead = next_experiment(found, limits, seed=seed)
     except InputError as error:  # this car within these limits: no reason to lose the answer
@@ -202,6 +204,7 @@ def diagnose(
     with answer_set(out, DIAGNOSIS_FILES) as staged:
         written = [*found.write(staged), *write_table(ahead, staged), *write_exports(found.plant, staged)]
         written.append(write_report(found, staged, quality=quality, experiment=ahead))
+    written += write_pedals(fit, out)
     if talk.json:
         talk.done(out, found.to_dict())
         return

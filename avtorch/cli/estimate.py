@@ -22,6 +22,7 @@ from avtorch.cli.arguments import (
     seed_number,
     three_gains,
 )
+from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
@@ -80,7 +81,8 @@ def estimate(
     Parameters
     ----------
     log
-        CSV or Parquet: time, accel_cmd, and accel or speed. LOG.toml beside it may map names and units.
+        CSV or Parquet: time, accel_cmd, and accel or speed. LOG.toml beside it may map names and units. Without
+        accel_cmd a map is made of throttle, brake, torque or current, which needs speed.
     """
     positive("--window", window, "s")
     positive("--tau", tau, "s")
@@ -103,6 +105,7 @@ def estimate(
     talk = Talk(json=json, quiet=quiet)
     drive = Log.read(log, map=map, unit=unit, stamp=stamp)
     talk.notes(f"{drive.name}", check(drive).notes)
+    (drive,), fit, about_map = commanded(talk, [drive])
     setting = Setting(time_gap=tau, gains=k, scenarios=1)
     with talk.progress("Estimating") as step, finished_windows(out) as written:
         options: dict[str, Any] = {"mode": mode} if estimator in PASSING_ON else {}
@@ -110,6 +113,8 @@ def estimate(
         options["finished"] = written
         found = work(drive, window, estimator=estimator, progress=step, **options)
     answer = estimates_answer(found)
+    if fit is not None:
+        answer["command"] = about_map
 
     from avtorch import plots
 
@@ -118,6 +123,7 @@ def estimate(
         "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
     }
     write_answer(out, "estimates.json", answer, pictures)
+    write_pedals(fit, out)
     printed = answer | {key: from_start(answer[key], answer["epoch_s"]) for key in ("windows", "alerts")}
     talk.windows(printed["windows"])
     talk.summary(printed, estimates_note(answer))

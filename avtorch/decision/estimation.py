@@ -23,6 +23,7 @@ from avtorch.inference.form import Form, JerkForm
 from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.stream import BeliefStream
 from avtorch.io.log import Log
+from avtorch.io.no_command import no_command
 from avtorch.io.quality import Quality, check
 
 Array = NDArray[Any]
@@ -125,7 +126,7 @@ def estimate(
         [0.5, 0.9]
     """
     if log.accel_cmd is None:
-        raise InputError(f"{log.name}: has no accel_cmd; T_L and K_L need the demanded acceleration")
+        raise no_command(log, "; T_L and K_L need the demanded acceleration")
     if not log.usable.any():
         raise InputError(
             f"{log.name}: has no row to use; all are driven by hand (engaged 0), within 2 s after, or at standstill"

@@ -14,7 +14,7 @@ from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.bad_rows import MOST_BAD, BadRows, disordered
 from avtorch.io.clock import clock_words, since, since_start
-from avtorch.io.mapping import SIGNALS, SignalMap
+from avtorch.io.mapping import PEDALS, SIGNALS, SignalMap
 from avtorch.io.merge import held
 from avtorch.io.merged import Arrivals
 from avtorch.io.segments import gap_limit, median_step
@@ -143,12 +143,18 @@ def _require(table: Table, mapping: SignalMap, following: bool) -> None:
             if column not in table.names and signal not in mapping.elsewhere:
                 there_are = listed(table.names)
                 raise InputError(f"{table.source}: column {quoted(column)} ({signal}) is missing; columns: {there_are}")
-    needed = ("time", "spacing", "lead_speed") if following and not there("accel_cmd") else ("time", "accel_cmd")
+    commanded = any(there(signal) for signal in ("accel_cmd", *PEDALS, "speed_cmd"))
+    if following and not there("accel_cmd"):
+        needed = ("time", "spacing", "lead_speed")
+    else:
+        needed = ("time",) if commanded else ("time", "accel_cmd")
     for signal in needed:
         if not there(signal):
             advice = _advice(signal, table.names)
             if signal == "accel_cmd" and there("spacing") and there("lead_speed"):
                 advice += "; `--follower` diagnoses a car-following log without it"
+            elif signal == "accel_cmd":
+                advice += f"; {', '.join(PEDALS)} or speed_cmd can stand for it"
             raise InputError(f"{table.source}: column {signal!r} is missing; {advice}")
     if not there("accel") and not there("speed"):
         advice = _advice("speed", table.names)

@@ -20,7 +20,7 @@ from avtorch.io.atomic import atomic
 from avtorch.io.clock import since_start
 from avtorch.io.engagement import settled_rows
 from avtorch.io.formats import is_recording, open_recording
-from avtorch.io.mapping import SIGNALS, Pairs, SignalMap, pairs, read_mapping
+from avtorch.io.mapping import PEDALS, SIGNALS, Pairs, SignalMap, pairs, read_mapping
 from avtorch.io.merged import Arrivals, merged
 from avtorch.io.segments import median_step, stretches
 from avtorch.io.standstill import standing
@@ -47,11 +47,13 @@ class Log:
     """A drive. Every signal is ``(time,)``, float64, in SI units, or None where the log does not have it.
 
     ``time`` [s], on the recorder's own clock (``elapsed``: from the log's start); ``accel_cmd`` [m/s^2], the command
-    sent, held until the next row (None only in a car-following log);
+    sent, held until the next row (None in a car-following log, and in one whose command is no acceleration);
     ``accel`` [m/s^2] and ``speed`` [m/s], at least one of them; ``jerk`` [m/s^3]; ``engaged`` (bool, all true where the
     log has no such column); ``spacing`` [m, bumper to bumper]; ``lead_speed`` [m/s]; ``lead_accel`` [m/s^2]; ``grade``
-    [-]; ``segment`` (int from 0; rises at each gap and each new value of the log's own column, where time may start
-    anew). ``name`` of the source; ``ignored``: its further columns; ``remarks``: what merging left out. ``accel_kind``
+    [-]; commands that are no accelerations: ``throttle`` [-, share of the pedal's way], ``brake`` [-, or Pa],
+    ``torque`` [Nm], ``current`` [A] (`avtorch.pedals` makes ``accel_cmd`` of them), ``speed_cmd`` [m/s]; ``segment``
+    (int from 0; rises at each gap and each new value of the log's own column, where time may start anew). ``name`` of
+    the source; ``ignored``: its further columns; ``remarks``: what merging left out. ``accel_kind``
     is not in a file: ``accel`` is dv/dt, as on a vehicle bus, or what an accelerometer fixed to the car reads along it,
     dv/dt plus gravity's share on a slope; ``dataclasses.replace`` sets it.
 
@@ -79,6 +81,11 @@ class Log:
     ignored: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     accel_kind: AccelKind = "kinematic"
+    throttle: FloatArray | None = None
+    brake: FloatArray | None = None
+    torque: FloatArray | None = None
+    current: FloatArray | None = None
+    speed_cmd: FloatArray | None = None
 
     @classmethod
     def read(
@@ -198,6 +205,11 @@ class Log:
         return since_start(self.time, self.segment)
 
     @property
+    def pedals(self) -> tuple[str, ...]:
+        """Those of ``throttle``, ``brake``, ``torque`` and ``current`` that the log has."""
+        return tuple(name for name in PEDALS if getattr(self, name) is not None)
+
+    @property
     def seconds(self) -> float:
         """Time recorded, gaps left out [s]."""
         return float(sum(self.elapsed[part][-1] - self.elapsed[part][0] for part in self.segments()))
@@ -214,7 +226,7 @@ class Log:
         if self.speed is not None:
             return self.speed >= STANDSTILL_MPS
         moving = np.ones(self.rows, bool)
-        if self.accel is None or self.accel_cmd is None:
+        if self.accel is None or self.accel_cmd is None:  # pedals alone do not tell a car at rest from one at speed
             return moving
         for part in self.engaged_segments():
             if part.stop - part.start > 1:

@@ -16,7 +16,10 @@ from avtorch.numeral import numeral
 
 SIGNALS = (
     "time", "accel_cmd", "accel", "speed", "jerk", "engaged", "spacing", "lead_speed", "lead_accel", "grade", "segment",
+    "throttle", "brake", "torque", "current", "speed_cmd",
 )  # fmt: skip
+PEDALS = ("throttle", "brake", "torque", "current")
+"""Commands that are no accelerations; a map makes one of them (`avtorch.pedals`)."""
 
 _TABLES = ("map", "unit", "stamp", "state", "signals")
 Pairs = Mapping[str, Any] | Iterable[str] | None

@@ -13,10 +13,11 @@ from avtorch.io.clock import clock_words
 from avtorch.io.consistency import scale_between
 from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import Log
+from avtorch.io.mapping import PEDALS
 from avtorch.io.segments import median_step, stretches
 from avtorch.io.validity import command_scale
 
-SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead_accel", "grade")
+SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "spacing", "lead_speed", "lead_accel", "grade", *PEDALS, "speed_cmd")
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,7 @@ def check(log: Log) -> Quality:
     if masked == log.rows:
         notes.append("no row is left to estimate from")
     notes.extend(f"{name} is constant ({present[name][0]:.6g}): it excites nothing" for name in constant)
-    notes.extend(_on_missing(missing))
+    notes.extend(_on_missing(missing, log.pedals))
     notes.extend(_repeats(present, log))
     notes.extend(doubtful)
     notes.extend(_disagreements(log))
@@ -158,9 +159,10 @@ def check(log: Log) -> Quality:
     )  # fmt: skip
 
 
-def _on_missing(missing: tuple[str, ...]) -> list[str]:
+def _on_missing(missing: tuple[str, ...], pedals: tuple[str, ...]) -> list[str]:
+    assumed = f"a map of {' and '.join(pedals)}" if pedals else "an assumed controller"
     sentences = {
-        "accel_cmd": "no accel_cmd: every result on the actuator is conditional on an assumed controller",
+        "accel_cmd": f"no accel_cmd: every result on the actuator is conditional on {assumed}",
         "accel": "no accel: speed is the only channel, so the log cannot distinguish sensor faults from real forces",
         "speed": "no speed: accel is the only channel, short stops go unnoticed, and sensor faults resemble forces",
     }

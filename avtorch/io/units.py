@@ -27,6 +27,10 @@ _ACCEL = {
 _JERK = {"m/s3": 1.0, "mps3": 1.0, "g/s": GRAVITY, "cm/s3": 0.01, "mm/s3": 0.001, "ft/s3": _FOOT}
 _TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 _GRADE = {"-": 1.0, "1": 1.0, "%": 0.01, "percent": 0.01, "permille": 0.001}
+_SHARE = {"-": 1.0, "1": 1.0, "%": 0.01, "percent": 0.01}
+_PRESSURE = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "bar": 1e5, "psi": 6894.757293168}
+_TORQUE = {"Nm": 1.0, "kNm": 1000.0, "lbft": 1.3558179483314004}
+_CURRENT = {"A": 1.0, "mA": 0.001}
 # an angle is not converted by a factor: the grade is its tangent
 _ANGLE: dict[str, Callable[[NDArray], NDArray]] = {"rad": np.tan, "deg": lambda x: np.tan(np.radians(x))}
 
@@ -40,6 +44,11 @@ _UNITS: dict[str, dict[str, float]] = {
     "lead_speed": _SPEED,
     "lead_accel": _ACCEL,
     "grade": _GRADE,
+    "throttle": _SHARE,
+    "brake": _SHARE | _PRESSURE,
+    "torque": _TORQUE,
+    "current": _CURRENT,
+    "speed_cmd": _SPEED,
 }
 SIGNALS_WITH_UNIT = tuple(_UNITS)
 

@@ -27,6 +27,11 @@ _LIMITS: dict[str, tuple[float, float, str, str]] = {
     "jerk": (-5000.0, 5000.0, "m/s3", "no car does that"),
     "spacing": (0.0, 10000.0, "m", "spacing is bumper to bumper and never negative"),
     "grade": (-0.5, 0.5, "", "grade is rise over run"),
+    "throttle": (-1.2, 1.2, "", "throttle is a share of the pedal's way"),
+    "brake": (-1e6, 1e8, "", "brake is a share of the pedal's way, or a pressure in Pa"),
+    "torque": (-1e5, 1e5, "Nm", "no car's drive does that"),
+    "current": (-1e4, 1e4, "A", "no car's drive does that"),
+    "speed_cmd": (-20.0, 150.0, "m/s", "speed_cmd is forward speed"),
 }
 # units that would bring a too large value back: unit, its size in SI
 _SUSPECTS: dict[str, tuple[tuple[str, float], ...]] = {
@@ -37,6 +42,9 @@ _SUSPECTS: dict[str, tuple[tuple[str, float], ...]] = {
     "lead_accel": (("cm/s2", 0.01), ("mm/s2", 0.001)),
     "spacing": (("cm", 0.01), ("mm", 0.001)),
     "grade": (("%", 0.01),),
+    "throttle": (("%", 0.01),),
+    "current": (("mA", 0.001),),
+    "speed_cmd": (("km/h", 1 / 3.6), ("cm/s", 0.01), ("mm/s", 0.001)),
 }
 _PLAUSIBLE = {
     "speed": 70.0,
@@ -46,6 +54,11 @@ _PLAUSIBLE = {
     "lead_accel": 12.0,
     "spacing": 300.0,
     "grade": 0.3,
+    "throttle": 1.0,
+    "brake": 3e7,
+    "torque": 1e4,
+    "current": 1000.0,
+    "speed_cmd": 70.0,
 }
 
 

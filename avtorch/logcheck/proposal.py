@@ -12,14 +12,18 @@ from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import printable
 from avtorch.io.bad_rows import MOST_BAD
 from avtorch.io.consistency import scale_between
+from avtorch.io.mapping import PEDALS
 from avtorch.io.segments import gap_limit, stretches
 from avtorch.io.tables import Table
+from avtorch.io.unit_names import stated_unit
 from avtorch.logcheck.candidates import Column, columns_of, ranked
 from avtorch.logcheck.header import bare_unit
 from avtorch.logcheck.joint_units import UnitTest, factor, units_together
 from avtorch.logcheck.order_of_events import lateness
 
 _MOTION = ("accel_cmd", "accel", "speed")
+_COMMANDS = (*PEDALS, "speed_cmd")
+_MOST_SHARE, _MOST_PERCENT = 1.2, 120.0  # of a pedal's way; it may be calibrated a little wrongly
 _TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _RATES_HZ = (9.5, 210.0)
 _LARGEST = 1e9  # of a speed or an acceleration, in any unit
@@ -113,7 +117,7 @@ def propose(table: Table) -> Proposal:
     for signal in _MOTION:
         if signal in found:
             signals[signal] = _proposed(found[signal], units.get(signal), reasons[signal], known)
-        elif signal == "accel_cmd":
+        elif signal == "accel_cmd" and not any(ranked(left, name) for name in _COMMANDS):
             doubts.append("no column looks like the commanded acceleration; name it with --map accel_cmd=COLUMN")
     if "accel" not in found and "speed" not in found:
         doubts.append("no column looks like the car's speed or acceleration; name one with --map speed=COLUMN")
@@ -301,9 +305,12 @@ def _others(
 ) -> dict[str, Proposed]:
     """Signals besides the motion, by name and by what values they can have."""
     out: dict[str, Proposed] = {}
-    for signal in ("engaged", "spacing", "lead_speed", "lead_accel", "grade", "segment"):
+    for signal in ("engaged", "spacing", "lead_speed", "lead_accel", "grade", "segment", *_COMMANDS):
         for column in ranked(columns, signal):
             values = column.values[np.isfinite(column.values)]
+            # beside an acceleration they are not needed; one that bears the signal's name is read in any case
+            if signal in _COMMANDS and "accel_cmd" in signals and column.name != signal:
+                continue
             if any(column.name == one.column for one in out.values()) or not (column.when or _can_be(signal, values)):
                 continue
             unit = _unit_besides(signal, column, signals, found)
@@ -327,6 +334,8 @@ def _unit_besides(
     signal: str, column: Column, signals: Mapping[str, Proposed], found: Mapping[str, Column]
 ) -> str | None:
     stated = column.header.unit
+    if signal in _COMMANDS:
+        return _unit_of_command(signal, column)
     if signal == "lead_speed" and "speed" in found and "speed" in signals:
         # it goes about as fast as the car behind it
         ego = np.nanmean(np.abs(found["speed"].values)) * factor("speed", signals["speed"].unit or "m/s")
@@ -344,6 +353,16 @@ def _moves(column: Column) -> bool:
     """Whether a column changes, by numbers that a car's motion can have in any unit."""
     values = column.values[np.isfinite(column.values)]
     return bool(np.abs(values).max() < _LARGEST and values.min() < values.max())
+
+
+def _unit_of_command(signal: str, column: Column) -> str | None:
+    """Of a pedal, torque, current or speed that is commanded: as stated, or percent where no share is so large."""
+    unit = column.header.unit or bare_unit(column.header, signal)
+    if unit is not None:
+        known = stated_unit(signal, unit)
+        return None if known in (None, "m/s", "Nm", "A", "Pa") else known
+    top = float(np.nanmax(np.abs(column.values)))
+    return "%" if signal in ("throttle", "brake") and _MOST_SHARE < top <= _MOST_PERCENT else None
 
 
 def _filled(column: Column) -> FloatArray:

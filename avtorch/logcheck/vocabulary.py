@@ -18,8 +18,22 @@ _OTHER = {
     "lat", "lateral", "vert", "vertical", "pedal", "angular", "gyro", "yaw", "roll", "pitch", "y", "z", "ay", "az",
     "quer", "position", "jerk", "limit", "max", "min", "std", "var", "error", "err", "status", "valid", "steer",
     "steering", "curvature", "count", "id", "distance", "rate", "vy", "vz", "covariance", "heading",
+    "accelerator",
 }  # fmt: skip
 _TURNING = {"wheel", "engine", "motor", "wind", "fan", "rpm", "shaft", "rad", "fl", "fr", "rl", "rr", "gps"}
+_ANSWERED = {"raw", "actual", "measured", "report", "feedback"}
+_STATE = {
+    "status", "state", "valid", "active", "enable", "limit", "max", "min", "fault", "error", "time", "mode", "ready",
+}  # fmt: skip
+_ONE_WHEEL = {"fl", "fr", "rl", "rr", "left", "right", "rear"}
+_OF_BRAKES = {
+    "light", "lamp", "switch", "park", "parking", "torque", "temp", "temperature", "on", "disc", "hold",
+}  # fmt: skip
+_OF_STEERING = {"steer", "steering", "driver", "eps", "column", "yaw", "lateral", "hand", "servo", "friction", "loss"}
+_NOW = {
+    "speed", "velocity", "accel", "gear", "lane", "position", "distance", "lap", "index", "heading", "battery",
+    "target", "leak",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -65,6 +79,19 @@ _SIGNALS: dict[str, _Wanted] = {
     "lead_speed": _Wanted((_SPEED, _LEAD), {"relative", "rel", "angular", "yaw", "cmd"}),
     "lead_accel": _Wanted((_ACCEL, _LEAD), {"relative", "rel", "angular", "yaw", "cmd"}),
     "grade": _Wanted(({"grade", "slope", "gradient", "incline", "steigung"},), {"time", "speed"}),
+    "throttle": _Wanted(
+        ({"throttle", "gas", "accelerator", "gaspedal", "fahrpedal", "accelpedal"},),
+        _STATE | {"brake", "rate"},
+        _ANSWERED | {"body", "valve"},
+    ),
+    "brake": _Wanted(
+        ({"brake", "brk", "bremse", "bremsdruck"},), _STATE | _ONE_WHEEL | _OF_BRAKES | {"throttle"}, _ANSWERED
+    ),
+    "torque": _Wanted(
+        ({"torque", "drehmoment", "trq", "tq", "moment"},), _STATE | _ONE_WHEEL | _OF_STEERING | {"brake"}, _ANSWERED
+    ),
+    "current": _Wanted(({"current", "strom", "amps", "amperes"},), _STATE | _OF_STEERING | _NOW, _ANSWERED),
+    "speed_cmd": _Wanted((_SPEED, _COMMAND), _OTHER | _LEAD | _ACCEL | {"measured", "actual"}, _TURNING | {"raw"}),
     "segment": _Wanted(({"segment", "run", "lap", "drive", "trip"},), {"time", "distance", "speed", "length"}),
 }
 _STEM = 4  # letters from which a word may begin with a wanted one, such as `acceleration` with `accel`

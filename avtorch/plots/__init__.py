@@ -21,6 +21,7 @@ from avtorch.plots.figures import (
 )
 from avtorch.plots.gaps import gap_figure, gap_peak, gap_probability, gap_throughput
 from avtorch.plots.paper_figures import PAPER_PICTURES, paper_pictures
+from avtorch.plots.pedals import pedal_figure, pedal_lines
 from avtorch.plots.plane import gain_curve, region, setting_region, verdict_legend, verdict_map
 from avtorch.plots.posterior_figures import VALIDATION_PICTURES, validation_figures
 from avtorch.plots.posteriors import agreement_scatter, exact_density, joint_cloud, marginals
@@ -59,6 +60,8 @@ __all__ = [
     "operating_figure",
     "overview_figure",
     "paper_pictures",
+    "pedal_figure",
+    "pedal_lines",
     "pooled_rank_counts",
     "probability_figure",
     "rank_band",

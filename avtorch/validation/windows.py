@@ -18,6 +18,7 @@ from avtorch.inference.priors import Joint, Prior, default_actuation_prior, defa
 from avtorch.inference.sampler import SamplerSettings
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.log import Log
+from avtorch.io.no_command import no_command
 from avtorch.io.us06 import US06_SPEED_MPS
 from avtorch.validation.simulation import simulate_windows
 
@@ -158,7 +159,7 @@ def windows_of_log(log: Log, *, window: float = 2.0, count: int | None = None) -
         ('jerk', [2.0, 4.0, 6.0])
     """
     if log.accel_cmd is None:
-        raise InputError(f"{log.name}: has no accel_cmd; T_L and K_L need the demanded acceleration")
+        raise no_command(log, "; T_L and K_L need the demanded acceleration")
     if not (math.isfinite(window) and window > 0):
         raise InputError(f"window: found {window:g} s, needs a finite number above 0")
     if count is not None and count < 1:

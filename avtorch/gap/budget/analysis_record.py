@@ -18,6 +18,7 @@ from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.simulator.simulator_input import SimulatorInput
 from avtorch.io import Log
+from avtorch.io.no_command import no_command
 
 RATE_HZ = 20.0
 """Rows a second, about: the noise above half of this is not modelled, and only a driveline's ring shows there."""
@@ -165,7 +166,7 @@ class _Piece:
 
 def _pieces(log: Log, number: int, step: float, channels: Sequence[str], length: float) -> list[_Piece]:
     if log.accel_cmd is None:
-        raise InputError(f"{log.name}: has no accel_cmd, needed for a budget of the gap")
+        raise no_command(log, ", needed for a budget of the gap")
     pieces, travelled = [], 0.0
     for part in log.segments():
         time = log.elapsed[part]

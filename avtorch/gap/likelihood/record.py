@@ -28,6 +28,7 @@ from avtorch.io import Log, fingerprint
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.engagement import SETTLE_S
 from avtorch.io.log import AccelKind
+from avtorch.io.no_command import no_command
 
 RATE_HZ = 20.0
 """Rows are averaged as long as the resulting rate is at least this [Hz]."""
@@ -128,7 +129,7 @@ class Record:
         segments = 0
         for number, log in enumerate(each):
             if log.accel_cmd is None:
-                raise InputError(f"{log.name}: has no accel_cmd, which the diagnosis needs")
+                raise no_command(log, ", which the diagnosis needs")
             first_segment = segments - int(log.segment[0])
             segments = first_segment + int(log.segment[-1]) + 1
             for cut in rolled(log, max(group, multiple)):

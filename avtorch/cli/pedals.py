@@ -1,0 +1,73 @@
+"""Logs whose command is no acceleration: a map makes one of their pedals before anything else is done."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from avtorch.cli.talk import Talk
+from avtorch.errors import InputError
+
+if TYPE_CHECKING:
+    from avtorch.io import Log
+    from avtorch.pedals import HeldOut, PedalFit
+
+PICTURE = "pedal_map.png"
+
+
+def commanded(talk: Talk, drives: Sequence[Log]) -> tuple[list[Log], PedalFit | None, str]:
+    """The drives with an `accel_cmd`, the fit of the map that made it, and a sentence on it.
+
+    Drives of which one has an `accel_cmd`, or that have no pedals, are returned as they are, with None and "".
+    """
+    if any(drive.accel_cmd is not None or not drive.pedals for drive in drives):
+        return list(drives), None, ""
+    from avtorch.pedals import fit_pedals, held_out
+
+    with talk.waiting("Fitting a map of the pedals"):
+        fit = fit_pedals(drives)
+        sentence = map_sentence(fit, held_out(drives))
+    talk.sentence(sentence)
+    return [fit.map.commanded(drive) for drive in drives], fit, sentence
+
+
+def map_sentence(fit: PedalFit, score: HeldOut) -> str:
+    """What stands for the command, how good it is, and what it cannot tell."""
+    made = fit.map
+    ranges = [f"{name} {_range(name, table.pedal)}" for name, table in made.pedals.items()]
+    worth = "better" if score.better_than("factor") else "not surely better"
+    names = " and ".join(made.pedals)
+    return (
+        f"The log has no accel_cmd: a map of {names} and speed stands for it ({', '.join(ranges)}, speed "
+        f"{made.speed[0]:.3g} to {made.speed[-1]:.3g} m/s). On blocks held out its rollouts of {score.horizon_s:g} s "
+        f"miss speed by {score.rmse('map'):.2g} m/s, one constant factor by {score.rmse('factor'):.2g} m/s: {worth}. "
+        "The map and K_L cannot be told apart: K_L is 1 by the map's scale."
+    )
+
+
+def _range(name: str, knots: object) -> str:
+    import numpy as np
+
+    values = np.asarray(knots)
+    low, high = float(values[0]), float(values[-1])
+    if name == "throttle" or (name == "brake" and high <= 1.2):
+        return f"{100 * low:.3g} to {100 * high:.3g} %"
+    if name == "brake":
+        return f"{low / 1e5:.3g} to {high / 1e5:.3g} bar"
+    return f"{low:.3g} to {high:.3g} {'Nm' if name == 'torque' else 'A'}"
+
+
+def write_pedals(fit: PedalFit | None, out: Path) -> list[Path]:
+    """Writes the map, its tables for other tools and its picture; returns the files."""
+    if fit is None:
+        return []
+    from avtorch import plots
+    from avtorch.pedals import write_map
+
+    written = write_map(fit.map, out)
+    try:
+        plots.save(plots.pedal_figure(fit.map), out / PICTURE)
+    except OSError as fault:
+        raise InputError(f"{out / PICTURE}: {fault.strerror}; needs a folder that can be written") from None
+    return [*written, out / PICTURE]

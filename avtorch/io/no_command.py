@@ -1,0 +1,16 @@
+"""What is said of a log without a commanded acceleration, where one is needed."""
+
+from __future__ import annotations
+
+from avtorch.errors import InputError
+from avtorch.io.log import Log
+
+
+def no_command(log: Log, need: str) -> InputError:
+    """The error; `need`: what needs the command, such as ``which the diagnosis needs``."""
+    words = f"{log.name}: has no accel_cmd{need}"
+    if log.pedals:
+        words += f"; avtorch.pedals.fit_pedals makes one of its {' and '.join(log.pedals)}"
+    elif log.speed_cmd is not None:
+        words += "; a speed that is commanded holds the car's own speed controller, which is not modelled"
+    return InputError(words)

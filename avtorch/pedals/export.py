@@ -1,0 +1,192 @@
+"""A map of pedals as files: whole, and as the tables of acceleration that vehicle interfaces take.
+
+- `pedal_map.csv`: everything, a row a knot; `read_map` reads it.
+- `accel_map.csv` and `brake_map.csv`, in the layout of Autoware's `raw_vehicle_cmd_converter`: speeds [m/s] in the
+  first row behind `default`, pedals from 0 to 1 in the first column, accelerations [m/s²].
+
+CARLA has no such table: its cars are an engine's torque curve, gears and tyres. Autoware drives them by these two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from avtorch.arrays import FloatArray
+from avtorch.errors import InputError
+from avtorch.io import atomic
+from avtorch.io.opening import place
+from avtorch.io.tables import Table, read_table
+from avtorch.pedals.pedal_map import UNIT, PedalMap, PedalTable
+
+MAP_FILE, ACCEL_FILE, BRAKE_FILE = "pedal_map.csv", "accel_map.csv", "brake_map.csv"
+_DRIVING = ("throttle", "torque", "current")
+_HEADER = ("pedal", "value", "speed", "accel", "sd")
+_NUMBER = {"coasting": 0, "throttle": 1, "brake": 2, "torque": 3, "current": 4}
+_LAG, _DELAY = 5, 6
+"""Which quantity a row is of; numbers, so that the file is a table like others."""
+
+
+@dataclass(frozen=True)
+class MapTable:
+    """`text` of a table for another tool, and what of the map it does not hold, a few words each.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.pedals import PedalMap, PedalTable, brake_table
+        >>> brake = PedalTable(np.array([0.0, 4e6]), np.array([[0, 0], [-6.0, -7.0]]))
+        >>> for words in brake_table(PedalMap(np.array([0.0, 30.0]), np.zeros(2), {"brake": brake})).lost:
+        ...     print(words)
+        lag 0.3 s and dead time 0 s
+        the unit of brake: 1 in the first column is 4e+06 Pa
+    """
+
+    text: str
+    lost: tuple[str, ...]
+
+
+def accel_table(made: PedalMap) -> MapTable | None:
+    """The table of the pedal that drives, in Autoware's layout; None where none does.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.pedals import PedalMap, PedalTable, accel_table
+        >>> throttle = PedalTable(np.array([0.0, 0.1, 1.0]), np.array([[0, 0], [0, 0], [4.0, 2.0]]))
+        >>> table = accel_table(PedalMap(np.array([0.0, 30.0]), np.array([0.0, -0.6]), {"throttle": throttle}))
+        >>> print(table.text, end="")
+        default,0.00,30.00
+        0,0.000,-0.600
+        0.1,0.000,-0.600
+        1,4.000,1.400
+    """
+    return _table(made, [name for name in _DRIVING if name in made.pedals], 1.0)
+
+
+def brake_table(made: PedalMap) -> MapTable | None:
+    """The table of the brake in Autoware's layout, or of torque or current below zero; None where there is neither.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.pedals import PedalMap, PedalTable, brake_table
+        >>> current = PedalTable(np.array([-2.0, 0.0, 8.0]), np.array([[-1.0, -1.5], [0, 0], [4.0, 3.0]]))
+        >>> print(brake_table(PedalMap(np.array([0.0, 3.0]), np.zeros(2), {"current": current})).text, end="")
+        default,0.00,3.00
+        0,0.000,0.000
+        1,-1.000,-1.500
+    """
+    return _table(made, [name for name in ("brake", "torque", "current") if name in made.pedals], -1.0)
+
+
+def _table(made: PedalMap, names: Sequence[str], side: float) -> MapTable | None:
+    for name in names:
+        table = made.pedals[name]
+        sign = 1.0 if name == "brake" else side
+        rows = np.flatnonzero(sign * table.pedal >= 0)[:: int(sign)]
+        if len(rows) < 2:
+            continue
+        values = np.abs(table.pedal[rows])
+        is_share = name == "throttle" or (name == "brake" and values[-1] <= 1.2)
+        share = values if is_share else values / values[-1]
+        lines = ["default," + ",".join(f"{v:.2f}" for v in made.speed)]
+        for x, accel in zip(share, table.accel[rows] + made.coasting, strict=True):
+            lines.append(f"{x:.6g}," + ",".join(f"{a:.3f}" for a in accel))
+        lost = [f"lag {made.T_L:.3g} s and dead time {made.dead_time:.3g} s"]
+        if not is_share:
+            unit = "Pa" if name == "brake" else UNIT[name]
+            lost.append(f"the unit of {name}: 1 in the first column is {values[-1]:.6g} {unit}")
+        lost += [f"{other}, which adds to {name}" for other in names if other != name and side > 0]
+        return MapTable("\n".join(lines) + "\n", tuple(lost))
+    return None
+
+
+def write_map(made: PedalMap, folder: str | PathLike[str]) -> list[Path]:
+    """Write `pedal_map.csv`, and the tables for other tools that the map can fill; returns the files.
+
+    Raises `InputError` where the folder cannot be written.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.pedals import PedalMap, PedalTable, read_map, write_map
+        >>> brake = PedalTable(np.array([0.0, 1.0]), np.array([[0, 0], [-6.0, -7.0]]))
+        >>> made = PedalMap(np.array([0.0, 30.0]), np.array([0.0, -0.6]), {"brake": brake}, T_L=0.2)
+        >>> [path.name for path in write_map(made, "out")], read_map("out/pedal_map.csv").T_L
+        (['pedal_map.csv', 'brake_map.csv'], 0.2)
+    """
+    texts = {MAP_FILE: _text(made)}
+    for name, table in ((ACCEL_FILE, accel_table(made)), (BRAKE_FILE, brake_table(made))):
+        if table is not None:
+            texts[name] = table.text
+    out = Path(folder)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as fault:
+        raise InputError(f"{place(out)}: {fault.strerror}; needs a folder that can be written") from None
+    for name, text in texts.items():
+        with atomic(out / name) as stream:
+            stream.write(text)
+    return [out / name for name in texts]
+
+
+def _text(made: PedalMap) -> str:
+    words = ", ".join(f"{number} {name}" for name, number in _NUMBER.items())
+    words += f", {_LAG} lag [s], {_DELAY} delay [s]"
+    lines = [f"# pedal: {words}; value in {_units(made)}; speed [m/s]; accel and sd [m/s2]", ",".join(_HEADER)]
+    tables = {"coasting": PedalTable(np.zeros(1), made.coasting[None], _row(made.coasting_sd)), **made.pedals}
+    for name, table in tables.items():
+        sd = np.zeros_like(table.accel) if table.sd is None else table.sd
+        for x, accels, errors in zip(table.pedal.tolist(), table.accel.tolist(), sd.tolist(), strict=True):
+            for v, a, e in zip(made.speed.tolist(), accels, errors, strict=True):
+                lines.append(f"{_NUMBER[name]},{x!r},{v!r},{a!r},{e!r}")
+    for number, seconds in ((_LAG, made.T_L), (_DELAY, made.dead_time)):
+        lines.append(f"{number},{float(seconds)!r},0,0,0")
+    return "\n".join(lines) + "\n"
+
+
+def _row(sd: FloatArray | None) -> FloatArray | None:
+    return None if sd is None else sd[None]
+
+
+def _units(made: PedalMap) -> str:
+    return ", ".join(f"{UNIT[name]} ({name})" for name in made.pedals)
+
+
+def read_map(path: str | PathLike[str]) -> PedalMap:
+    """A map from its `pedal_map.csv`.
+
+    Raises `InputError` for any other file, and for a table whose knots do not rise or that is not monotone.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.pedals import PedalMap, PedalTable, read_map, write_map
+        >>> brake = PedalTable(np.array([0.0, 1.0]), np.array([[0, 0], [-6.0, -7.0]]))
+        >>> made = PedalMap(np.array([0.0, 30.0]), np.array([0.0, -0.6]), {"brake": brake}, T_L=0.2)
+        >>> read_map(write_map(made, "out")[0]).pedals["brake"].accel.tolist()
+        [[0.0, 0.0], [-6.0, -7.0]]
+    """
+    table = read_table(path)
+    kind, value, speed, accel, sd = (table.numbers(name) for name in _HEADER)
+    at = np.unique(speed[kind == 0])
+    found: dict[str, PedalTable] = {}
+    for name, number in _NUMBER.items():
+        rows = kind == number
+        if not rows.any():
+            continue
+        knots = np.unique(value[rows])
+        if not np.array_equal(speed[rows], np.tile(at, len(knots))):
+            raise _unfit(table, name)
+        shape = len(knots), len(at)
+        found[name] = PedalTable(knots, accel[rows].reshape(shape), sd[rows].reshape(shape))
+    if "coasting" not in found or any((kind == number).sum() != 1 for number in (_LAG, _DELAY)):
+        raise _unfit(table, "coasting, lag or delay")
+    coasting = found.pop("coasting")
+    T_L, dead_time = (float(value[kind == number][0]) for number in (_LAG, _DELAY))
+    assert coasting.sd is not None
+    return PedalMap(at, coasting.accel[0], found, T_L, dead_time, coasting.sd[0])
+
+
+def _unfit(table: Table, name: str) -> InputError:
+    return InputError(f"{table.source}: found no full table of {name}, needs the {MAP_FILE} that avtorch writes")

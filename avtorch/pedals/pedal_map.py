@@ -1,0 +1,123 @@
+"""The map from pedals and speed to the acceleration that they demand of the car.
+
+Bilinear in pedal and speed between knots, as a simulator's table is read, so an exported table is the map itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avtorch.arrays import FloatArray
+from avtorch.errors import InputError
+from avtorch.io import Log
+
+SIGN = {"throttle": 1.0, "brake": -1.0, "torque": 1.0, "current": 1.0}
+"""Whether more of a pedal makes the car faster or slower."""
+UNIT = {"throttle": "-", "brake": "- or Pa", "torque": "Nm", "current": "A"}
+
+
+@dataclass(frozen=True, eq=False)
+class PedalTable:
+    """What one pedal adds: `accel` (pedal, speed) [m/s²] at the knots `pedal` (pedal,), zero where the pedal is zero.
+
+    `sd` (pedal, speed): its standard errors by blocks of the drive, None where the map was not fitted.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.pedals import PedalMap, PedalTable
+        >>> weak = PedalTable(np.array([0.0, 1.0]), np.array([[0, 0], [1.0, -2.0]]))
+        >>> PedalMap(np.array([0.0, 30.0]), np.zeros(2), {"throttle": weak})
+        Traceback (most recent call last):
+        ...
+        avtorch.errors.InputError: throttle: found an acceleration that turns back, needs one that goes one way only
+    """
+
+    pedal: FloatArray
+    accel: FloatArray
+    sd: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PedalMap:
+    """The acceleration demanded: `coasting` (speed,) [m/s²] at the knots `speed` (speed,) [m/s], and what the `pedals`
+    add by name; followed with a lag `T_L` [s] after a `dead_time` [s].
+
+    The car's gain K_L is 1 by the map's scale: a car whose gain is halved has half the map.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.pedals import PedalMap, PedalTable
+        >>> throttle = PedalTable(np.array([0.0, 0.1, 1.0]), np.array([[0, 0], [0, 0], [4.0, 2.0]]))
+        >>> made = PedalMap(np.array([0.0, 30.0]), np.array([0.0, -0.6]), {"throttle": throttle})
+        >>> made.accel(np.array([15.0, 15.0]), throttle=np.array([0.05, 0.55])).round(2).tolist()
+        [-0.3, 1.2]
+    """
+
+    speed: FloatArray
+    coasting: FloatArray
+    pedals: Mapping[str, PedalTable]
+    T_L: float = 0.3
+    dead_time: float = 0.0
+    coasting_sd: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        if not self.pedals or set(self.pedals) - set(SIGN):
+            raise InputError(f"pedals: found {', '.join(self.pedals) or 'none'}, needs some of {', '.join(SIGN)}")
+        _check("speed", self.speed, self.coasting, self.speed.shape)
+        for name, table in self.pedals.items():
+            _check(name, table.pedal, table.accel, (len(table.pedal), len(self.speed)))
+            if (SIGN[name] * np.diff(table.accel, axis=0) < 0).any():
+                raise InputError(f"{name}: found an acceleration that turns back, needs one that goes one way only")
+
+    def accel(self, speed: FloatArray, **pedals: FloatArray) -> FloatArray:
+        """The acceleration demanded (row,) [m/s²] at `speed` (row,) [m/s] and pedals (row,) by name.
+
+        Beyond its knots the map goes on as at the last one. Raises `InputError` where a pedal is missing.
+        """
+        missing = [name for name in self.pedals if name not in pedals]
+        if missing:
+            raise InputError(f"pedals: found no {' and no '.join(missing)}, needs {', '.join(self.pedals)}")
+        out = np.interp(speed, self.speed, self.coasting)
+        for name, table in self.pedals.items():
+            out = out + _bilinear(table.pedal, self.speed, table.accel, pedals[name], speed)
+        return out
+
+    def commanded(self, log: Log) -> Log:
+        """The same drive with the acceleration that its pedals demand as `accel_cmd` (row,), in the place of any other.
+
+        The part that depends on speed is that at the measured one. Raises `InputError` for a log without speed or
+        without one of the pedals.
+        """
+        if log.speed is None:
+            raise InputError(f"{log.name}: has no speed, which a map of pedals needs")
+        given = {name: getattr(log, name) for name in self.pedals}
+        for name, values in given.items():
+            if values is None:
+                raise InputError(f"{log.name}: has no {name}, which the map needs")
+        return replace(log, accel_cmd=self.accel(np.maximum(log.speed, 0.0), **given))
+
+
+def _check(name: str, knots: FloatArray, values: FloatArray, shape: tuple[int, ...]) -> None:
+    if values.shape != shape or len(knots) < 2 or not (np.diff(knots) > 0).all() or not np.isfinite(values).all():
+        raise InputError(
+            f"{name}: found {len(knots)} knots and values of shape {values.shape}, "
+            f"needs two knots or more that rise and finite values of shape {shape}"
+        )
+
+
+def _bilinear(x: FloatArray, y: FloatArray, table: FloatArray, at_x: FloatArray, at_y: FloatArray) -> FloatArray:
+    i, a = place(x, at_x)
+    j, b = place(y, at_y)
+    low = (1 - b) * table[i, j] + b * table[i, j + 1]
+    high = (1 - b) * table[i + 1, j] + b * table[i + 1, j + 1]
+    return (1 - a) * low + a * high
+
+
+def place(knots: FloatArray, at: FloatArray) -> tuple[np.ndarray, FloatArray]:
+    """The interval of each value (row,) among rising knots, and how far in it the value is, from 0 to 1."""
+    at = np.clip(at, knots[0], knots[-1])
+    number = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
+    return number, (at - knots[number]) / (knots[number + 1] - knots[number])

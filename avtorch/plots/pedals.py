@@ -1,0 +1,69 @@
+"""Drawings of a map of pedals."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, styled
+
+if TYPE_CHECKING:
+    from avtorch.pedals import PedalMap
+
+_COLOURS = (VERMILLION, ORANGE, GREEN, BLUE, BLACK)
+_UNITS = {"throttle": (100.0, "%"), "torque": (1.0, "Nm"), "current": (1.0, "A")}
+
+
+def pedal_lines(ax: Axes, made: PedalMap, pedal: str, *, lines: int = 4) -> Axes:
+    """The acceleration that one pedal demands, the others at rest, at some speeds between the slowest and the fastest
+    that the map knows; bands: one standard error, by blocks of the drive, of what the pedal adds.
+
+    Example:
+        >>> import numpy as np
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.pedals import PedalMap, PedalTable
+        >>> from avtorch.plots import pedal_lines
+        >>> throttle = PedalTable(np.array([0.0, 0.1, 1.0]), np.array([[0, 0], [0, 0], [4.0, 2.0]]))
+        >>> made = PedalMap(np.array([0.0, 30.0]), np.array([0.0, -0.6]), {"throttle": throttle})
+        >>> pedal_lines(Figure().subplots(), made, "throttle").get_xlabel()
+        'throttle [%]'
+    """
+    table = made.pedals[pedal]
+    if pedal == "brake":
+        scale, unit = (100.0, "%") if float(np.abs(table.pedal).max()) <= 1.2 else (1e-5, "bar")
+    else:
+        scale, unit = _UNITS[pedal]
+    rows = np.unique(np.linspace(0, len(made.speed) - 1, lines).round().astype(int))
+    for colour, row in zip(_COLOURS, rows, strict=False):
+        level = made.coasting[row] + table.accel[:, row]
+        ax.plot(scale * table.pedal, level, color=colour, marker=".", label=f"{made.speed[row]:.3g} m/s")
+        if table.sd is not None:
+            error = table.sd[:, row]
+            ax.fill_between(scale * table.pedal, level - error, level + error, color=colour, alpha=0.15, linewidth=0)
+    ax.axhline(0.0, color=GREY, linestyle=":", linewidth=1)
+    ax.set(xlabel=f"{pedal} [{unit}]", ylabel="acceleration demanded [m/s²]")
+    return ax
+
+
+@styled
+def pedal_figure(made: PedalMap) -> Figure:
+    """A panel for each pedal of a map, side by side.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.pedals import PedalMap, PedalTable
+        >>> from avtorch.plots import pedal_figure
+        >>> throttle = PedalTable(np.array([0.0, 0.1, 1.0]), np.array([[0, 0], [0, 0], [4.0, 2.0]]))
+        >>> made = PedalMap(np.array([0.0, 30.0]), np.array([0.0, -0.6]), {"throttle": throttle})
+        >>> len(pedal_figure(made).axes)
+        1
+    """
+    count = len(made.pedals)
+    figure = Figure(figsize=(1.5 + 4.2 * count, 3.8), layout="constrained")
+    for ax, pedal in zip(figure.subplots(1, count, squeeze=False)[0], made.pedals, strict=True):
+        pedal_lines(ax, made, pedal).set_title(pedal)
+        ax.legend(loc="best")
+    return figure

@@ -1,0 +1,34 @@
+"""`avtorch estimate` on a log of pedals: it makes a command of them first, and says what that cannot tell."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from avtorch.cli import main
+from tests.pedals.cars import drive, plain
+
+
+@pytest.mark.slow
+def test_estimate_makes_a_map_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drive(plain, 41, seconds=60.0).write(tmp_path / "lap.csv")
+    out = tmp_path / "out"
+    arguments = ["--window", "20", "--estimator", "ekf", "--out", str(out)]
+    assert main(["estimate", str(tmp_path / "lap.csv"), *arguments]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "a map of throttle and brake and speed stands for it" in said
+    assert "K_L is 1 by the map's scale" in said
+    for name in ("pedal_map.csv", "accel_map.csv", "brake_map.csv", "pedal_map.png"):
+        assert (out / name).stat().st_size > 0
+    assert "cannot be told apart" in json.loads((out / "estimates.json").read_text())["command"]
+
+
+def test_a_speed_that_is_commanded_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "lap.csv"
+    log.write_text("time,speed,speed_cmd\n" + "".join(f"{0.05 * i:.2f},{10 + i % 7},12\n" for i in range(400)))
+    assert main(["estimate", str(log), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert "speed controller" in error
+    assert error.count("\n") == 1

@@ -1,0 +1,67 @@
+"""Files of a map: read back whole, and in the layout that vehicle interfaces take."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avtorch.errors import InputError
+from avtorch.pedals import PedalMap, PedalTable, accel_table, brake_table, fit_pedals, read_map, write_map
+from tests.pedals.cars import drive, plain
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    made = fit_pedals(drive(plain, 31, seconds=60.0)).map
+    files = write_map(made, tmp_path)
+    assert [file.name for file in files] == ["pedal_map.csv", "accel_map.csv", "brake_map.csv"]
+    back = read_map(files[0])
+    assert back.T_L == made.T_L
+    assert back.dead_time == made.dead_time
+    assert np.array_equal(back.coasting, made.coasting)
+    for name, table in made.pedals.items():
+        assert np.array_equal(back.pedals[name].pedal, table.pedal)
+        assert np.array_equal(back.pedals[name].accel, table.accel)
+        assert table.sd is not None
+        assert np.array_equal(back.pedals[name].sd, table.sd)
+
+
+def test_the_tables_are_the_map(tmp_path: Path) -> None:
+    made = fit_pedals(drive(plain, 31, seconds=60.0)).map
+    write_map(made, tmp_path)
+    for file, name in (("accel_map.csv", "throttle"), ("brake_map.csv", "brake")):
+        with open(tmp_path / file, newline="") as stream:
+            head, *rows = list(csv.reader(stream))
+        assert head[0] == "default"
+        speed = np.array(head[1:], float)
+        assert (np.diff(speed) > 0).all()
+        for row in rows:
+            rest = {other: np.zeros(len(speed)) for other in made.pedals}
+            want = made.accel(made.speed, **(rest | {name: np.full(len(speed), float(row[0]))}))
+            assert np.array(row[1:], float) == pytest.approx(want, abs=1e-3)  # three decimals, and those of the pedal
+
+
+def test_what_a_table_does_not_hold_is_told() -> None:
+    torque = PedalTable(np.array([0.0, 600.0]), np.array([[0.0, 0.0], [2.0, 1.0]]))
+    made = PedalMap(np.array([0.0, 20.0]), np.array([0.0, -0.2]), {"torque": torque})
+    table = accel_table(made)
+    assert table is not None
+    assert "the unit of torque: 1 in the first column is 600 Nm" in table.lost
+    assert any(words.startswith("lag") for words in table.lost)
+    assert brake_table(made) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("a,b\n1,2\n", "column 'pedal' is missing"),
+        ("pedal,value,speed,accel,sd\n1,0,0,0,0\n1,1,0,1,0\n", "no full table"),
+        ("pedal,value,speed,accel,sd\n0,0,0,0,0\n0,0,9,0,0\n1,0,0,0,0\n1,1,9,1,0\n", "no full table of throttle"),
+    ],
+)
+def test_other_files_are_refused(text: str, told: str, tmp_path: Path) -> None:
+    (tmp_path / "map.csv").write_text(text)
+    with pytest.raises(InputError, match=told):
+        read_map(tmp_path / "map.csv")
