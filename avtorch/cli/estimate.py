@@ -27,7 +27,7 @@ from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
-    from avtorch.decision.dead_time import DeadTime
+    from avtorch.decision.dead_time import InferredDeadTime
 
 
 def estimate(
@@ -140,7 +140,7 @@ UNEXPLAINED = 1.5
 """`Estimates.spread_ratio` above which a single lag and gain do not describe the log."""
 
 
-def dead_time_note(inferred: DeadTime | None) -> str:
+def dead_time_note(inferred: InferredDeadTime | None) -> str:
     """What the log says of the dead time, in one sentence; empty where it was not inferred."""
     if inferred is None:
         return ""

@@ -34,7 +34,7 @@ CLEAR = 3.0
 
 
 @dataclass(frozen=True)
-class DeadTime:
+class InferredDeadTime:
     """An inferred dead time.
 
     Attributes:
@@ -43,8 +43,8 @@ class DeadTime:
         nats: evidence of the most likely one over none.
 
     Example:
-        >>> from avtorch.decision.dead_time import DeadTime
-        >>> DeadTime(0.0, 0.0, 0.06, 1.2).to_dict()
+        >>> from avtorch.decision.dead_time import InferredDeadTime
+        >>> InferredDeadTime(0.0, 0.0, 0.06, 1.2).to_dict()
         {'seconds': 0.0, 'q05': 0.0, 'q95': 0.06, 'nats': 1.2}
     """
 
@@ -58,7 +58,7 @@ class DeadTime:
         return {"seconds": self.seconds, "q05": self.q05, "q95": self.q95, "nats": self.nats}
 
 
-def infer_dead_time(log: Log, command: Command) -> DeadTime | None:
+def infer_dead_time(log: Log, command: Command) -> InferredDeadTime | None:
     """The dead time of a log with ``accel`` and/or ``speed``; None where no stretch is excited."""
     stretches = _stretches(log, command(0.0)[0], command(GRID_S[-1])[1])
     if not stretches:
@@ -80,7 +80,7 @@ def infer_dead_time(log: Log, command: Command) -> DeadTime | None:
     density = np.exp(np.interp(fine, tried, evidence) - evidence[best])
     level = np.cumsum(density) / density.sum()
     q05, q95 = (float(fine[np.searchsorted(level, q)]) for q in (0.05, 0.95))
-    return DeadTime(float(tried[best]) if nats >= CLEAR else 0.0, q05, q95, nats)
+    return InferredDeadTime(float(tried[best]) if nats >= CLEAR else 0.0, q05, q95, nats)
 
 
 def _stretches(log: Log, u: FloatArray, known: BoolArray) -> list[slice]:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from avtorch.decision.dead_time import DeadTime, infer_dead_time
+from avtorch.decision.dead_time import InferredDeadTime, infer_dead_time
 from avtorch.decision.monitor import Monitor
 from avtorch.decision.settings import Setting
 from avtorch.decision.watch import Watch, WatchedWindow
@@ -58,7 +58,7 @@ class Estimates:
     estimator: str = "sgld"
     accepted: tuple[float, float] = (0.3, 1.0)
     dead_time: float = 0.0
-    inferred: DeadTime | None = None
+    inferred: InferredDeadTime | None = None
 
     @property
     def excited_share(self) -> float:

@@ -56,10 +56,13 @@ def assemble(
     signals: dict[str, FloatArray] = {}
     arrivals: dict[str, tuple[FloatArray, FloatArray]] = {}
     bad, remarks = BadRows(table.rows), list(table.remarks)
+    spare = _not_needed(table, mapping, arrived)
     for signal in SIGNALS:
         column = mapping.column.get(signal, signal)
         if signal in mapping.elsewhere:
             arrivals[signal] = _from_elsewhere(signal, mapping, folder)
+        elif signal in spare:
+            _spare(table, signal, signals, mapping, remarks)
         elif signal in arrived:
             stamps, values = arrived[signal]
             rows = np.arange(len(stamps))
@@ -191,6 +194,29 @@ def _signal(table: Table, signal: str, column: str, mapping: SignalMap, bad: Bad
     known = np.flatnonzero(~np.isnan(values))
     check_range(signal, values[known], _place(table, signal, column, known))
     return values
+
+
+def _not_needed(table: Table, mapping: SignalMap, arrived: Arrivals) -> set[str]:
+    """Commands that are no accelerations, in a log that has one and does not ask for them by its mapping."""
+    command = "accel_cmd" in arrived or mapping.column.get("accel_cmd", "accel_cmd") in table.names
+    others = {*PEDALS, "speed_cmd"} - set(mapping.column) - set(mapping.unit) - set(mapping.elsewhere)
+    return others if command else set()
+
+
+def _spare(table: Table, signal: str, signals: dict[str, FloatArray], mapping: SignalMap, remarks: list[str]) -> None:
+    """Reads a signal that is not needed, or tells why it is left out: it costs no row and refuses no log."""
+    if signal not in table.names or table.cells[table.names.index(signal)] is None:
+        return
+    rows = BadRows(table.rows)
+    try:
+        values = _signal(table, signal, signal, mapping, rows, [])
+    except InputError as fault:
+        remarks.append(f"{fault}; {signal} is left out")
+        return
+    if rows.kept.all():
+        signals[signal] = values
+    else:
+        remarks.append(f"{rows.remarks()[0].removesuffix('; the row is left out')}; {signal} is left out")
 
 
 def _leave_out_disordered(table: Table, signals: dict[str, FloatArray], clock: str, bad: BadRows) -> None:

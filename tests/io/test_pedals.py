@@ -88,3 +88,18 @@ def test_estimates_of_pedals_alone_say_what_to_do() -> None:
     log = Log.from_arrays(**columns(throttle=np.linspace(0.0, 0.9, 1500)))
     with pytest.raises(InputError, match=r"avtorch\.pedals\.fit_pedals makes one of its throttle"):
         avtorch.estimate(log, window=5.0)
+
+
+def test_beside_a_command_they_refuse_nothing_and_cost_no_row(tmp_path: Path) -> None:
+    """Many logs hold a throttle in per cent, or a current with a torn cell; with a command neither is needed."""
+    given = drive()
+    current = [repr(float(x)) for x in np.linspace(0.0, 9.0, 1500)]
+    current[4] = "n/a"
+    path = write(tmp_path / "lap.csv", given | {"throttle": np.linspace(0.0, 90.0, 1500), "current": current})
+    log = Log.read(path)
+    assert log.rows == 1500
+    assert log.pedals == ()
+    told = " ".join(log.remarks)
+    assert "`--unit throttle=%` if that is its unit); throttle is left out" in told
+    assert "row 5 (line 6), column 'current': 'n/a' is no number; a number is needed; current is left out" in told
+    assert Log.read(path, unit=["throttle=%"]).pedals == ("throttle",)
