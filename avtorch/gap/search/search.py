@@ -41,6 +41,7 @@ Progress = Callable[[str, int, int], None]
 Kinds = Sequence[type[Effect]]
 
 _SINGLES = 6  # effects that are fitted with noise of their own
+_RANDOM = 3  # kinds of random effects that are added in the end
 
 
 class Search:
@@ -83,6 +84,7 @@ class Search:
                 record = Record.of(logs)
                 none = self.fits.bare(record)
         found = self._deterministic(record, none)
+        self.progress("random effects", 0, _RANDOM)
         if with_tails:
             again = self._tails(raw, max(found, key=lambda f: f.log_evidence))
             before = 0 if glitches is None else int(glitches.hit.sum())
@@ -94,8 +96,10 @@ class Search:
                 none = self.fits.bare(record)
                 found = self._deterministic(record, none)
             glitches = again
+        self.progress("random effects", 1, _RANDOM)
         if "losses" in self._random.own and not self.budget.spent():
             found += self._held(Record.of(logs, rate_hz=1e9, multiple=record.group), found, none)
+        self.progress("random effects", 2, _RANDOM)
         for law in self._random.laws["command"]:
             if not self.budget.spent():
                 rows = Record.of(logs, rate_hz=1e9, multiple=record.group)
