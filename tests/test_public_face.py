@@ -49,6 +49,37 @@ def test_import_is_light() -> None:
 
 
 @pytest.mark.slow
+def test_estimate_imports_no_more_than_it_needs(tmp_path: Path) -> None:
+    """Half of the command's time was imports that no estimate uses."""
+    log = avtorch.simulate(avtorch.Leader.default(start=50.0, duration=6.0, dt=0.05)).log()
+    log.write(tmp_path / "drive.csv")
+    tokens = ["estimate", str(tmp_path / "drive.csv"), "--out", str(tmp_path / "out"), "--estimator", "map", "--quiet"]
+    heavy = (
+        *("scipy.stats", "scipy.optimize", "scipy.interpolate", "scipy.signal", "sympy", "pandas", "pyarrow", "pyro"),
+        *("arviz", "avtorch.gap", "avtorch.validation", "avtorch.paper", "avtorch.blindtest"),
+    )
+    code = (
+        f"import sys; from avtorch.cli.app import main; assert main({tokens!r}) == 0;"
+        f"print(*[m for m in {heavy!r} if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+def test_pictures_as_type_checkers_see_them_are_those_that_are_loaded() -> None:
+    tree = ast.parse(Path(avtorch.plots.__file__).read_text(encoding="utf-8"))
+    block = next(n for n in tree.body if isinstance(n, ast.If))
+    seen = {
+        (alias.name, node.module) for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
+    assert seen == set(avtorch.plots._MODULE_OF.items())
+    assert {name for name, _ in seen} == set(avtorch.plots.__all__)
+    assert all(getattr(avtorch.plots, name) is not None for name in avtorch.plots.__all__)
+    with pytest.raises(AttributeError, match="belief_figur"):
+        avtorch.plots.belief_figur  # noqa: B018
+
+
+@pytest.mark.slow
 def test_numerics_need_no_plotting() -> None:
     code = "import sys, avtorch; avtorch.GLVD, avtorch.SGLD, avtorch.simulate; print('matplotlib' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

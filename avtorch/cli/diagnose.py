@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -13,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Group, Parameter
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, positive, seed_number
 from avtorch.cli.diagnosis_table import budget_table, diagnosis_headline, diagnosis_notes, diagnosis_table
@@ -140,7 +137,7 @@ def diagnose(
         idle |= {option: not default for option, default in usual.items()}
         refuse(logs, **idle, **{option: value is not None for option, value in track.items()})
         source = {"map": map, "unit": unit, "stamp": stamp, "vehicle": vehicle, "event": event}
-        with _progress(talk, None) as step:
+        with talk.whole("Diagnosing") as step:
             follow(talk, logs[0], out, source=source, law=law, effects=chosen, seed=seed, step=step)
         return
     for option, given in (("--vehicle", vehicle), ("--law", law), ("--event", event)):
@@ -162,7 +159,7 @@ def diagnose(
     from avtorch.gap.diagnose import diagnose as work
 
     try:
-        with _progress(talk, budget) as step:
+        with talk.whole("Diagnosing", budget) as step:
             found = work(
                 drives,
                 baseline=simulator,
@@ -298,24 +295,3 @@ def _check_effects(names: Sequence[str], path: Path, drive: Log) -> None:
         for signal, needed in (("accel", EFFECTS[name].place == "sensor"), ("speed", EFFECTS[name].needs_speed)):
             if needed and getattr(drive, signal) is None:
                 raise InputError(f"--effects: found {name}, which no log without {signal} can show, such as {path}")
-
-
-@contextmanager
-def _progress(talk: Talk, budget: float | None) -> Iterator[Callable[[str, int, int], None]]:
-    """A bar for each stage of the search on stderr where it is a terminal; takes (what, done, of)."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("" if budget is None else f"of {budget:g} s at most"),
-    )
-    begun = time.monotonic()
-    with Progress(*columns, console=talk.err, transient=True, disable=not talk.err.is_terminal) as bar:
-        task = bar.add_task("Diagnosing", total=None)
-        bar.tasks[0].start_time = begun
-
-        def step(what: str, done: int, of: int) -> None:
-            bar.update(task, description=what, completed=done, total=of)
-
-        yield step

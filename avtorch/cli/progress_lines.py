@@ -11,16 +11,24 @@ EVERY_S = 10.0
 
 
 class ProgressLines:
-    """Called with (done, of), prints a line on `console` every `EVERY_S`."""
+    """Called with (done, of), and a stage where there are several, prints a line on `console` every `EVERY_S`."""
 
     def __init__(self, console: Console, what: str) -> None:
         self.console, self.what = console, what
         self._begun = self._last = time.monotonic()
 
-    def __call__(self, done: float, of: float) -> None:
+    def left_s(self, done: float, of: float) -> float | None:
+        """Time that is left [s] if it goes on as before; None where that is not known yet."""
+        return self._left_s(time.monotonic(), done, of) if 0 < done < of else None
+
+    def _left_s(self, now: float, done: float, of: float) -> float:
+        return (now - self._begun) * (of - done) / done
+
+    def __call__(self, done: float, of: float, stage: str | None = None) -> None:
         now = time.monotonic()
         if now - self._last < EVERY_S or not 0 < done < of:
             return
         self._last = now
-        left = (now - self._begun) * (of - done) / done
-        self.console.print(f"{self.what}: {100 * done / of:.0f} %, about {left:.0f} s left", markup=False)
+        left = self._left_s(now, done, of)
+        of_what = "" if stage is None else f" ({stage})"
+        self.console.print(f"{self.what}: {100 * done / of:.0f} %, about {left:.0f} s left{of_what}", markup=False)

@@ -57,6 +57,29 @@ class Talk:
             yield lambda stage, done, of: bar.update(task, description=stage, completed=done, total=of)
 
     @contextmanager
+    def whole(self, what: str, most_s: float | None = None) -> Iterator[Callable[[str, int, int], None]]:
+        """One bar over all stages, with the time left, on stderr where it is a terminal, and a line now and then where
+        it is not; yields a function of (stage, done, of). `most_s`: time at most [s]."""
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f} %{task.fields[left]}"),
+            TextColumn("" if most_s is None else f"of {most_s:g} s at most"),
+        )
+        with Progress(*columns, console=self.err, transient=True, disable=not self.err.is_terminal) as bar:
+            task = bar.add_task(what, total=None, left="")
+            lines = ProgressLines(self.err, what)
+
+            def step(stage: str, done: int, of: int) -> None:
+                left = lines.left_s(done, of)
+                told = "" if left is None else f", about {left:.0f} s left"
+                bar.update(task, description=f"{what}: {stage}", completed=done, total=of, left=told)
+                if not self.err.is_terminal:
+                    lines(done, of, stage)
+
+            yield step
+
+    @contextmanager
     def waiting(self, what: str) -> Iterator[None]:
         if self.err.is_terminal:
             with self.err.status(what):

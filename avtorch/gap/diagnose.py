@@ -40,6 +40,7 @@ from avtorch.gap.selection.plausibility import implausible
 from avtorch.gap.selection.verdict import Candidate, verdict_of
 from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.simulator.plant import GapPlant, plant
+from avtorch.gap.whole_progress import WholeProgress
 from avtorch.io import Log
 
 
@@ -69,7 +70,8 @@ def diagnose(
     Laplace's approximation. `material`: share of the gap from which something counts. `budget_s`: after this time no
     new hypothesis is fitted; where that cuts the search short, `complete` is False and the verdict provisional: `scope`
     lists what was tested, and the verdict is distinguished only from that. `accel_kind`: whether `accel` is dv/dt or an
-    accelerometer's reading (default: as the logs state). `progress(what, done, of)` is called at each step.
+    accelerometer's reading (default: as the logs state). `progress(what, done, of)` is called at each step, with `done`
+    of `of` in the whole diagnosis.
     `checkpoint`: a file that stores fits; a later search of the same logs with the same settings continues from it, to
     the same answer.
 
@@ -85,6 +87,7 @@ def diagnose(
         >>> found.verdict.name, round(found.probability("dead_time"), 2)
         ('sensor_bias', 0.0)
     """
+    progress = None if progress is None else WholeProgress(progress)
     each = [logs] if isinstance(logs, Log) else list(logs)
     if accel_kind is not None:
         if accel_kind not in ("kinematic", "specific-force"):
@@ -162,7 +165,8 @@ def diagnose(
     # an unknown cause gets the onset of the most probable named effect
     onset = None if verdict.name == "none" or selected is not None else _onset(winner or top, race)
     alike = {part for name in verdict.alias_set for part in name.split("+")}
-    held = cross_validate(race, winner or top, blamed=named, alike=sorted(alike), progress=progress)
+    # where nothing is named, no effect closes anything
+    held = cross_validate(race, winner, alike=sorted(alike), progress=progress) if named and winner else None
     attribution = RowAttribution.of(race, winner or top)
     simulator = repaired(race.none, base)
     car, beliefs = None, belief(race.none)
@@ -171,7 +175,7 @@ def diagnose(
     elif selected is not None and budget is not None and budget.parts:
         car = repaired_plant(selected, base, float(simulator.sigma))
         beliefs = parameter_draws(selected, seed=seed)
-    shrinkage = gap_closed(held) if held is not None and named else None
+    shrinkage = None if held is None else gap_closed(held)
     if selected is not None and car is not None:
         shrinkage = shrinkage_of(selected)
     return Diagnosis(

@@ -9,10 +9,6 @@ from typing import cast
 
 import numpy as np
 import torch
-from scipy.interpolate import PchipInterpolator  # pyright: ignore[reportMissingTypeStubs]
-from scipy.ndimage import (  # pyright: ignore[reportMissingTypeStubs]
-    gaussian_filter1d,  # pyright: ignore[reportUnknownVariableType]
-)
 from torch import Tensor
 
 from avtorch.arrays import Float, FloatArray
@@ -91,6 +87,12 @@ class Leader:
         if steps < 1:
             raise InputError(f"leader {name}: found {t[-1] - t[0]:g} s, needs at least one step of dt = {dt:g} s")
         grid = np.arange(steps + 1) * dt
+        # imported here: a log that is estimated or diagnosed needs no leader, and these take a quarter of a second
+        from scipy.interpolate import PchipInterpolator  # pyright: ignore[reportMissingTypeStubs]
+        from scipy.ndimage import (  # pyright: ignore[reportMissingTypeStubs]
+            gaussian_filter1d,  # pyright: ignore[reportUnknownVariableType]
+        )
+
         raw = PchipInterpolator(t, v)(np.minimum(t[0] + grid, t[-1]))
         # mean acceleration of each step: summing these gives back the speed exactly
         mean_accel: FloatArray = np.diff(raw) / dt

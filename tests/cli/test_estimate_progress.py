@@ -63,3 +63,11 @@ def test_lines_tell_the_share_and_the_time_left(monkeypatch: pytest.MonkeyPatch)
         "Estimating: 30 %, about 28 s left",
         "Estimating: 50 %, about 25 s left",
     ]
+
+
+def test_lines_name_the_stage_where_there_are_several(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([0.0, 20.0])
+    monkeypatch.setattr(progress_lines.time, "monotonic", lambda: next(clock))
+    out = io.StringIO()
+    ProgressLines(Console(file=out), "Diagnosing")(250, 1000, "pairs")
+    assert out.getvalue().splitlines() == ["Diagnosing: 25 %, about 60 s left (pairs)"]

@@ -65,7 +65,7 @@ def account(
     if record is None:
         return None
     if progress is not None:
-        progress("Budget of the gap", 0, 1)
+        progress("budget", 0, 1)
     fitting, bare = baseline_noise(record, base)
     named = [] if winner is None else list(winner.hypothesis.effects)
     values = {} if winner is None else winner.values

@@ -26,9 +26,11 @@ def exchanged(
     `kinds`: effects that may take another's place. Those of `now` are tried from the weakest on, each once.
     """
     entered: dict[str, Step] = {}
-    for name in _weakest_first(fitting, now):
-        rest = without_effects(fitting, now.fit, [name])
-        before = Step(rest, fitting.hold_out(rest))
+    without = {name: _without(fitting, now, name) for name in now.fit.model.names}
+    strengths = {name: fitting.evidence(step.held, now.held).strength() for name, step in without.items()}
+    for name in sorted(strengths, key=strengths.__getitem__):
+        # those made of a model in which nothing has been exchanged yet still hold
+        before = _without(fitting, now, name) if entered else without[name]
         others = [kind for kind in kinds if kind.name != name]
         test, candidates = candidates_for(fitting, before, others, progress, f"in place of {name}")
         step = enter(fitting, before, test, candidates)
@@ -38,10 +40,6 @@ def exchanged(
     return now, entered
 
 
-def _weakest_first(fitting: RobustFit, now: Step) -> list[str]:
-    names = now.fit.model.names
-    strengths = {}
-    for name in names:
-        held = fitting.hold_out(without_effects(fitting, now.fit, [name]))
-        strengths[name] = fitting.evidence(held, now.held).strength()
-    return sorted(names, key=strengths.__getitem__)
+def _without(fitting: RobustFit, now: Step, name: str) -> Step:
+    rest = without_effects(fitting, now.fit, [name])
+    return Step(rest, fitting.hold_out(rest))

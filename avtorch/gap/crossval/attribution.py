@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.crossval.random_effect_density import random_effect_density
+from avtorch.gap.crossval.random_effect_density import RandomEffectDensity
 from avtorch.gap.crossval.refit import Refit
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
@@ -44,7 +44,7 @@ class RowAttribution:
         fitted, bare = Refit.whole(found), Refit.whole(race.none)
         white = fitted.white(record)
         rows, flat = (r.white(record).row_likelihoods(r.errors) for r in (fitted, bare))
-        gained = rows + random_effect_density(found, race.raw, record) - flat
+        gained = rows + RandomEffectDensity(found, race.raw)(record) - flat
         net_gain = found.log_evidence - race.none.log_evidence - complexity_penalties(race.found)[found.name]
         return cls(
             record=record,

@@ -16,7 +16,7 @@ from avtorch.gap.crossval.black_box import BlackBoxRegression
 from avtorch.gap.crossval.closed_loop_errors import ClosedLoopMetric, closed_loop_metrics
 from avtorch.gap.crossval.folds import Fold, folds, whole_drive_folds
 from avtorch.gap.crossval.noise_floor import NoiseFloor
-from avtorch.gap.crossval.random_effect_density import random_effect_density
+from avtorch.gap.crossval.random_effect_density import RandomEffectDensity
 from avtorch.gap.crossval.refit import Refit
 from avtorch.gap.crossval.rollout_errors import RolloutMetric, rollout_metrics
 from avtorch.gap.crossval.scores import FoldScorer, FoldScores, parameter_spread
@@ -62,14 +62,12 @@ def cross_validate(
     race: SearchResult,
     verdict: FittedModel,
     *,
-    blamed: bool = True,
     alike: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> CrossValidation | None:
     """Cross-validate a `verdict` among the fitted models of a search; None where the drives are too short to split.
 
-    `blamed` False: it is the most probable named effect but not the verdict. `alike`: effects excluded as placebo,
-    because they may be the cause as well.
+    `alike`: effects excluded as placebo, because they may be the cause as well.
     """
     record = race.record
     parts = folds(record)
@@ -77,11 +75,12 @@ def cross_validate(
         return None
     price = complexity_penalties(race.found)
     contenders = _contenders(race, verdict, price)
-    placebo_effect = _placebo_effect(verdict, {*alike, *verdict.name.split("+")}, record.channels) if blamed else None
+    placebo_effect = _placebo_effect(verdict, {*alike, *verdict.name.split("+")}, record.channels)
     bare = race.none.values
     kinds = (*rollout_metrics(record.channels), *closed_loop_metrics(record.channels, bare["T_L"], bare["K_L"]))
     whole = Refit.whole(verdict)
-    all_in = {f.name: random_effect_density(f, race.raw, record) for f in contenders}
+    densities = {f.name: RandomEffectDensity(f, race.raw) for f in contenders}
+    all_in = {name: density(record) for name, density in densities.items()}
     # random effects are penalised alike in every fold: by their row gains less their evidence, over all rows
     owed = {f.name: price[f.name] + all_in[f.name].sum() - _chance_evidence(f) for f in contenders}
     images = parameter_spread(whole)
@@ -93,7 +92,7 @@ def cross_validate(
         refits = [Refit.of(f, part.fits) for f in contenders]
         none, own = refits[0], next(r for r in refits if r.found is verdict)
         scorer = FoldScorer(record, part, kinds, none.values["T_L"])
-        gains = {r.name: random_effect_density(r.found, race.raw, part.fits) for r in refits}
+        gains = {r.name: densities[r.name](part.fits) for r in refits}
         best = max(refits, key=lambda r: r.log_evidence + gains[r.name][~scorer.inside].sum() - owed[r.name])
         chance = gains[best.name]
         boxes = {r.name: _black_box_prediction(r, part) for r in (none, best)}

@@ -150,16 +150,21 @@ def _quadratic(
 
 
 def whitened_jacobian(
-    hypothesis: Hypothesis, white: WhiteningFilter, z: Float[FloatArray, " coordinate"], onset: int | None = None
+    hypothesis: Hypothesis,
+    white: WhiteningFilter,
+    z: Float[FloatArray, " coordinate"],
+    onset: int | None = None,
+    *,
+    coarse: bool = False,
 ) -> Float[FloatArray, "direction row"]:
     """Whitened derivatives (direction, row) of the rollout at `z` by the parameters and the road grade."""
     moved = np.repeat(z[None], len(z) + 1, 0)
     moved[1:] += _STEP * np.eye(len(z))
-    e = white(hypothesis.rollouts(moved, onset)).reshape(len(z) + 1, -1)
+    e = white(hypothesis.rollouts(moved, onset, coarse=coarse)).reshape(len(z) + 1, -1)
     columns = (e[1:] - e[:1]) / _STEP
     if hypothesis.grade_means is None:
         return columns
-    return np.concatenate([columns, grade_marginal(white, hypothesis, onset, coarse=False).image])
+    return np.concatenate([columns, grade_marginal(white, hypothesis, onset, coarse=coarse).image])
 
 
 def _integrated(

@@ -235,11 +235,12 @@ class Hypothesis:
     def grade_along(self, coefficients: Float[FloatArray, "column knot"]) -> Float[FloatArray, " column"]:
         """Root mean square grade over all drives, (column,), for coefficients (column, knot)."""
         drives = self.record.coarse
-        squares = [
-            road.magnitude(_position(drive), own).square().mean(-1) * len(drive.time)
-            for road, drive, own in self._each_road(drives, coefficients)
-        ]
-        return torch.stack(squares).sum(0).div(sum(len(d.time) for d in drives)).sqrt().numpy()
+        squares = []
+        for road, drive, own in self._each_road(drives, coefficients):
+            # linear in the coefficients: their second moments over the road serve all columns
+            each = road.magnitude(_position(drive), torch.eye(own.shape[-1], dtype=torch.float64))
+            squares.append(((own @ (each @ each.T)) * own).sum(-1))
+        return torch.stack(squares).sum(0).div(sum(len(d.time) for d in drives)).clamp_min(0.0).sqrt().numpy()
 
 
 def _position(drive: SimulatorInput) -> torch.Tensor:

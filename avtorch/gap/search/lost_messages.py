@@ -79,19 +79,25 @@ def lost_messages(
     return LostMessages(evidence, fraction, found.sd * _SD, onset if more > 1 else None)
 
 
-def lost_message_gains(
-    white: WhiteningFilter, errors: FloatArray, command: FloatArray, T_L: float, K_L: float, fits: BoolArray
-) -> FloatArray:
-    """Log likelihood ratio (counted,) of each row, losses over none, at the fraction fitted to the rows in `fits`.
+@dataclass(frozen=True, eq=False)
+class LossRatios:
+    """Log likelihood ratios, losses over none, `rows` (fraction, counted) at fractions of prior coordinates `z`."""
 
-    Arguments as in `lost_messages`.
-    """
-    bank = LossHistories.of(white, white(errors)[..., 0], command, T_L, K_L)
-    if not len(bank.place):
-        return np.zeros(white.record.rows)
-    z = np.linspace(-3.0, 3.0, 13)
-    rows = bank.ratios(_fraction(z))
-    return rows[int((rows[:, fits].sum(1) - 0.5 * z**2).argmax())]
+    z: FloatArray
+    rows: FloatArray
+
+    @classmethod
+    def of(cls, white: WhiteningFilter, errors: FloatArray, command: FloatArray, T_L: float, K_L: float) -> LossRatios:
+        """Arguments as in `lost_messages`."""
+        bank = LossHistories.of(white, white(errors)[..., 0], command, T_L, K_L)
+        z = np.linspace(-3.0, 3.0, 13)
+        if not len(bank.place):
+            return cls(z, np.zeros((len(z), white.record.rows)))
+        return cls(z, bank.ratios(_fraction(z)))
+
+    def fitted_to(self, fits: BoolArray) -> FloatArray:
+        """The ratio (counted,) of each row at the fraction that is best in the rows `fits`."""
+        return self.rows[int((self.rows[:, fits].sum(1) - 0.5 * self.z**2).argmax())]
 
 
 def _fraction(z: FloatArray) -> FloatArray:

@@ -47,6 +47,8 @@ class PairSearch:
             return []
         top = single[0].log_evidence - none.log_evidence
         bases = [f for f in single if not f.blown and f.log_evidence - none.log_evidence > 0.2 * top][:_BASES]
+        steps = len(bases) + _PAIRS + _SWAPS
+        self.progress("pairs", 0, steps)
         made = {f.name: f for base in bases[:2] for f in self.random.forced(base)}
         for base in bases[:2]:
             # what drifts slowly is a gust or a road, and the noise that was fitted without either hides the road
@@ -65,15 +67,17 @@ class PairSearch:
         alone = {f.name: f.values for f in single if not f.blown}
         screened: dict[str, Screened] = {}
         for i, base in enumerate(bases):
-            self.progress("pairs", i, len(bases))
+            self.progress("pairs", i, steps)
             if self.budget.spent():
                 break
             for look in self._joined(base, white, alone, _SECONDS if i == 0 else _SECONDS // 2):
                 known = screened.get(look.hypothesis.name)
                 if known is None or look.value > known.value:
                     screened[look.hypothesis.name] = look
+        self.progress("pairs", len(bases), steps)
         done = self._settle_pairs(list(screened.values()), _PAIRS, noise, made)
-        for _ in range(_SWAPS):
+        for swap in range(_SWAPS):
+            self.progress("pairs", len(bases) + _PAIRS + swap, steps)
             if done is None or done.log_evidence < single[0].log_evidence + _SECOND or self.budget.spent():
                 break
             # a better partner for either half, now that the noise is what the best pair leaves over

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,6 +20,7 @@ from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.integrated import Integrated
 
 _AT_ONCE = 32
+_CLOSELY = 4  # starts of an effect in a long log that are looked at row by row
 _MANY = 50  # with more starts of one effect, only the fit of that effect alone is used
 _MUCH = 6_000_000  # the same limit for starts times rows
 
@@ -46,56 +47,36 @@ class PairBase:
         return self._rested[1]
 
     @cached_property
-    def _silent(self) -> FloatArray:
-        return self.hypothesis.rollouts(self._rested[0][None], self.onset)[0]
+    def _fine(self) -> _Directions:
+        return _Directions.of(self, self._rested[0], coarse=False)
 
     @cached_property
-    def _errors(self) -> FloatArray:
-        """Whitened errors (row,), with the base's own parameter directions projected out."""
-        return self._apart(self.white(self.hypothesis.record.measured - self._silent).reshape(1, -1))[0]
-
-    @cached_property
-    def _own(self) -> tuple[FloatArray, FloatArray]:
-        """Whitened derivatives (direction, row) of the rollout by the base's parameters, and their inverse Gram."""
-        columns = whitened_jacobian(self.hypothesis, self.white, self._rested[0], self.onset)
-        columns = columns[np.linalg.norm(columns, axis=1) > 1e-9]
-        gram = columns @ columns.T
-        return columns, np.asarray(np.linalg.pinv(gram, rcond=1e-10, hermitian=True), np.float64)
-
-    def _apart(self, images: FloatArray) -> FloatArray:
-        """Whitened `images` (column, row), with the base's own parameter directions projected out."""
-        columns, inverse = self._own
-        return images - (images @ columns.T) @ inverse @ columns
+    def _coarse(self) -> _Directions:
+        return _Directions.of(self, self._rested[0], coarse=True)
 
     def score(self, hypothesis: Hypothesis, alone: Mapping[str, Mapping[str, float]]) -> tuple[float, FloatArray]:
         """Approximate gain [nats] of a `hypothesis` with one more effect, and the start that gives it.
 
         From one linear step from each start, with the base's own parameter directions projected out. `alone`: modes of
-        single effects, by name and parameter; effects with a large grid of starts begin there.
+        single effects, by name and parameter; effects with a large grid of starts begin there. In a long log averaged
+        commands choose the starts of a large grid; the gain is that of single rows all the same.
         """
+        record = self.hypothesis.record
         (more,) = set(hypothesis.effects) - set(self.hypothesis.effects)
         known = {k: v for k, v in alone.get(more.name, {}).items() if "." in k}
         begin = np.zeros((0, hypothesis.size))
         if known:
             begin = hypothesis.z_of({**self.values, **known})[None]
-        rows = self.hypothesis.record.rows * self.hypothesis.record.group
-        if not known or len(effect_starts(hypothesis, more.name)) * rows <= _MUCH:
+        if not known or len(effect_starts(hypothesis, more.name)) * record.rows * record.group <= _MUCH:
             begin = np.concatenate([begin, start_points(hypothesis, self.values)])
         if hypothesis.grade_means is not None and self.hypothesis.grade_means is None:
             step, value = modes(hypothesis, self.white, begin[:1], onset=self.onset, iterations=2)
             return float(value[0]) - self.flat, step[0]
-        e = self._errors
-        best, at = -np.inf, begin[0]
-        for i in range(0, len(begin), _AT_ONCE):
-            some = begin[i : i + _AT_ONCE]
-            apart = self.white(hypothesis.rollouts(some, self.onset) - self._silent).reshape(len(some), -1)
-            apart = self._apart(apart)
-            # a start that overshoots still gives the direction
-            gains = _gained(apart**2, apart * e, self.onset is None, self.hypothesis.record)
-            k = int(gains.argmax())
-            if gains[k] > best:
-                best, at = float(gains[k]), some[k]
-        return best, at
+        if record.coarse is not record.drives and len(begin) > _CLOSELY:
+            begin = begin[np.argsort(-self._coarse.gains(hypothesis, begin), kind="stable")[:_CLOSELY]]
+        gains = self._fine.gains(hypothesis, begin)
+        k = int(gains.argmax())
+        return float(gains[k]), begin[k]
 
     def partners(
         self, kinds: Sequence[type[Effect]], alone: Mapping[str, Mapping[str, float]], *, most: int, least: float
@@ -112,13 +93,55 @@ class PairBase:
         return [(pair, start) for gain, start, pair in scored[:most] if gain > least]
 
 
-def _gained(squares: FloatArray, crosses: FloatArray, onsets: bool, record: Record) -> FloatArray:
+@dataclass(frozen=True, eq=False)
+class _Directions:
+    """What is left of errors and of new directions once a base's own parameters have taken their part.
+
+    `silent`: the base's rollout, `errors` (row,): its whitened errors, apart from `columns` (direction, row), the
+    whitened derivatives of the rollout by its parameters, of which `inverse` is the inverse Gram.
+    """
+
+    base: PairBase
+    coarse: bool
+    silent: FloatArray
+    columns: FloatArray
+    inverse: FloatArray
+    errors: FloatArray
+
+    @classmethod
+    def of(cls, base: PairBase, z: FloatArray, *, coarse: bool) -> _Directions:
+        columns = whitened_jacobian(base.hypothesis, base.white, z, base.onset, coarse=coarse)
+        columns = columns[np.linalg.norm(columns, axis=1) > 1e-9]
+        inverse = np.asarray(np.linalg.pinv(columns @ columns.T, rcond=1e-10, hermitian=True), np.float64)
+        silent = base.hypothesis.rollouts(z[None], base.onset, coarse=coarse)[0]
+        measured = base.hypothesis.record.measured
+        whole = (measured.mean(-1, keepdims=True) if coarse else measured) - silent
+        made = cls(base, coarse, silent, columns, inverse, np.zeros(0))
+        return replace(made, errors=made._apart(base.white(whole).reshape(1, -1))[0])
+
+    def _apart(self, images: FloatArray) -> FloatArray:
+        """Whitened `images` (column, row), with the base's own parameter directions projected out."""
+        return images - (images @ self.columns.T) @ self.inverse @ self.columns
+
+    def gains(self, hypothesis: Hypothesis, begin: FloatArray) -> FloatArray:
+        """Gain [nats] (start,) of the best multiple of the direction to each start, as `_gained` has it."""
+        out, base = [], self.base
+        for i in range(0, len(begin), _AT_ONCE):
+            some = begin[i : i + _AT_ONCE]
+            moved = hypothesis.rollouts(some, base.onset, coarse=self.coarse) - self.silent
+            apart = self._apart(base.white(moved).reshape(len(some), -1))
+            # a start that overshoots still gives the direction
+            out.append(_gained(apart**2, apart * self.errors, base.onset is None, base.hypothesis.record, self.coarse))
+        return np.concatenate(out)
+
+
+def _gained(squares: FloatArray, crosses: FloatArray, onsets: bool, record: Record, coarse: bool) -> FloatArray:
     """Gain [nats] (column,) of the best multiple of a direction, from rows' contributions (column, row).
 
     Over the whole drive or, with `onsets`, from any row on.
     """
     square, cross = (
-        x.reshape(len(x), -1, record.rows, record.group).sum((1, 3))[:, ::-1].cumsum(1)[:, ::-1]
+        x.reshape(len(x), -1, record.rows, 1 if coarse else record.group).sum((1, 3))[:, ::-1].cumsum(1)[:, ::-1]
         for x in (squares, crosses)
     )
     gains = np.where(square > 1e-6, 0.5 * np.maximum(cross, 0) ** 2 / np.maximum(square, 1e-6), 0.0)

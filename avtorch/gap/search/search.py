@@ -41,6 +41,7 @@ Progress = Callable[[str, int, int], None]
 Kinds = Sequence[type[Effect]]
 
 _SINGLES = 6  # effects that are fitted with noise of their own
+_RANDOM = 3  # kinds of random effects that are added in the end
 
 
 class Search:
@@ -82,20 +83,24 @@ class Search:
                 logs = without_outliers(logs, raw, glitches)
                 record = Record.of(logs)
                 none = self.fits.bare(record)
-        found = self._deterministic(record, none)
+        found = self._singles(record, none)
+        # before the pairs, which take most of the time, so that these are searched once
+        again = self._other_tails(raw, found, glitches) if with_tails else None
+        if again is not None:
+            logs, record, none = self._cleaned(raw, again)
+            found = self._singles(record, none)
+        found += self._pairs(record, found, none)
+        self.progress("random effects", 0, _RANDOM)
         if with_tails:
-            again = self._tails(raw, max(found, key=lambda f: f.log_evidence))
-            before = 0 if glitches is None else int(glitches.hit.sum())
-            differ = abs(before - int(again.hit.sum())) > 0.3 * before + 3
-            changed = (glitches is not None and glitches.plain) != again.plain or (again.plain and differ)
-            if changed and not self.budget.spent():
-                logs = without_outliers(self.logs, raw, again) if again.plain else self.logs
-                record = Record.of(logs)
-                none = self.fits.bare(record)
-                found = self._deterministic(record, none)
-            glitches = again
+            last = self._other_tails(raw, found, glitches)
+            if again is None and last is not None:
+                logs, record, none = self._cleaned(raw, last)
+                found = self._singles(record, none)
+                found += self._pairs(record, found, none)
+        self.progress("random effects", 1, _RANDOM)
         if "losses" in self._random.own and not self.budget.spent():
             found += self._held(Record.of(logs, rate_hz=1e9, multiple=record.group), found, none)
+        self.progress("random effects", 2, _RANDOM)
         for law in self._random.laws["command"]:
             if not self.budget.spent():
                 rows = Record.of(logs, rate_hz=1e9, multiple=record.group)
@@ -110,8 +115,12 @@ class Search:
         return SearchResult(record, raw, tuple(logs), tuple(best.values()), self.budget.complete, scope)
 
     # deterministic causes and gusts --------------------------------------------------------------------------------
-    def _deterministic(self, record: Record, none: FittedModel) -> list[FittedModel]:
-        kinds = [e for e in self.effects if not e.random and is_observable(e, record.channels)]
+    def _kinds(self, record: Record) -> list[type[Effect]]:
+        return [e for e in self.effects if not e.random and is_observable(e, record.channels)]
+
+    def _singles(self, record: Record, none: FittedModel) -> list[FittedModel]:
+        """The bare baseline first, then single effects and forces."""
+        kinds = self._kinds(record)
         white = WhiteningFilter(record, none.noise.noise)
         screened: list[Screened] = []
         floor, coarse_floor = (
@@ -145,11 +154,15 @@ class Search:
             noise = max((f for f in found if not f.blown), key=lambda f: f.log_evidence).noise.noise
             found.append(self.fits.best_form([look for look in screened if look.hypothesis.name == name], noise))
         found += self._left_behind([look for look in screened if look.hypothesis.name not in fitted], white, none)
-        if self.pairs and not self.budget.spent():
-            self._paired = True
-            pairs = PairSearch(kinds, self._random, self.fits, self.budget, self.progress)
-            found += pairs.fitted(found, none)
         return found
+
+    def _pairs(self, record: Record, singles: Sequence[FittedModel], none: FittedModel) -> list[FittedModel]:
+        if not self.pairs or self.budget.spent():
+            return []
+        self._paired = True
+        return PairSearch(self._kinds(record), self._random, self.fits, self.budget, self.progress).fitted(
+            singles, none
+        )
 
     def _left_behind(self, rest: Sequence[Screened], white: WhiteningFilter, none: FittedModel) -> list[FittedModel]:
         """The other hypotheses, with the evidence of their screening fits."""
@@ -172,6 +185,20 @@ class Search:
         for law in self._random.laws["tails"]:
             self._glitches.append((law, heavy_tails(errors, raw.dt, law=law.tails, size=law.size)))
         return max((found for _, found in self._glitches), key=lambda found: found.evidence)
+
+    def _other_tails(self, raw: Record, found: Sequence[FittedModel], before: HeavyTails | None) -> HeavyTails | None:
+        """Outliers under the best model so far, where these are other rows than `before` and there is time left."""
+        again = self._tails(raw, max(found, key=lambda f: f.log_evidence))
+        count = 0 if before is None else int(before.hit.sum())
+        differ = abs(count - int(again.hit.sum())) > 0.3 * count + 3
+        changed = (before is not None and before.plain) != again.plain or (again.plain and differ)
+        return again if changed and not self.budget.spent() else None
+
+    def _cleaned(self, raw: Record, tails: HeavyTails) -> tuple[Sequence[Log], Record, FittedModel]:
+        """The logs without these outliers where they are plain, their record, and the bare baseline on it."""
+        logs = without_outliers(self.logs, raw, tails) if tails.plain else self.logs
+        record = Record.of(logs)
+        return logs, record, self.fits.bare(record)
 
     def _alone_and_best(self, found: list[FittedModel], none: FittedModel) -> list[FittedModel]:
         """Models to which errors of the command are added: as these resemble a delay, always the bare baseline, too."""

@@ -37,7 +37,7 @@ class Integrated(Effect):
         raise NotImplementedError(f"{type(self).__name__} has no force")
 
     def magnitude(self, position: Tensor, coefficients: Tensor) -> Tensor:
-        """The quantity whose root mean square is the size, (..., time), with the same arguments."""
+        """The quantity whose root mean square is the size, (..., time), linear too, with the same arguments."""
         raise NotImplementedError(f"{type(self).__name__} has no magnitude")
 
     def size_along(self, position: Tensor) -> Tensor:

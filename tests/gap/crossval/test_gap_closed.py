@@ -7,7 +7,7 @@ from avtorch.blindtest import draw_case
 from avtorch.gap.crossval.cross_validate import cross_validate
 from avtorch.gap.crossval.folds import folds
 from avtorch.gap.crossval.gap_closed import DENSITY, gap_closed
-from avtorch.gap.crossval.random_effect_density import random_effect_density
+from avtorch.gap.crossval.random_effect_density import RandomEffectDensity
 from avtorch.gap.search.search import Search
 from avtorch.gap.selection.model_probabilities import favourite
 from avtorch.gap.simulator.plant import plant
@@ -72,7 +72,7 @@ def test_glitches_show_in_the_density_alone(rotating_seed: int) -> None:
     assert told.metric == DENSITY
     assert told.top.closed is not None
     assert 0.8 < told.top.closed.mean <= 1.1
-    gains = random_effect_density(found, race.raw, folds(race.record)[0].fits)
+    gains = RandomEffectDensity(found, race.raw)(folds(race.record)[0].fits)
     assert gains.shape == (race.record.rows,)
     assert gains.sum() == pytest.approx(found.tails.ratios.sum(), rel=0.1)  # type: ignore[union-attr]
     assert np.isfinite(gains).all()

@@ -14,6 +14,7 @@ from avtorch.arrays import FloatArray
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest.drives import Recorded
 from avtorch.gap import (
+    EFFECTS,
     AerodynamicDrag,
     CommandHold,
     ConstantResistance,
@@ -133,10 +134,31 @@ def test_the_best_of_equal_names_is_kept(fresh_seed: int, monkeypatch: pytest.Mo
         more = [replace(none, name="twice", log_evidence=none.log_evidence + x, grade_rms=x) for x in (2.0, 5.0, 3.0)]
         return [none, *more, replace(none, name="behind", log_evidence=none.log_evidence - 4)]
 
-    monkeypatch.setattr(Search, "_deterministic", three)
-    race = _search(_log({}, fresh_seed, seconds=20.0), [SensorBias])
+    monkeypatch.setattr(Search, "_singles", three)
+    race = _search(_log({}, fresh_seed, seconds=20.0), [SensorBias], pairs=False)
     assert [f.name for f in race.found] == ["twice", "none", "behind"]
     assert race.best.grade_rms == 5.0
+
+
+def test_pairs_are_searched_once_where_other_rows_turn_out_as_outliers(
+    fresh_seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+
+    def counted(name: str) -> None:
+        own = getattr(Search, name)
+
+        def call(self: Search, *given: object) -> object:
+            calls.append(name)
+            return own(self, *given)
+
+        monkeypatch.setattr(Search, name, call)
+
+    counted("_singles")
+    counted("_pairs")
+    monkeypatch.setattr(Search, "_other_tails", lambda self, raw, found, before: self._tails(raw, found[0]))
+    _search(_log({}, fresh_seed, seconds=20.0), [SensorBias, EFFECTS["outliers"]])
+    assert calls == ["_singles", "_singles", "_pairs"]
 
 
 def _steps(rng: np.random.Generator, seconds: float = 50.0) -> FloatArray:
