@@ -52,7 +52,7 @@ def compare(
     Parameters
     ----------
     before
-        CSV or Parquet, as for diagnose: the drive before the change.
+        A log, as for diagnose: the drive before the change.
     after
         The drive after it. The same file twice compares two simulators on one drive.
     """

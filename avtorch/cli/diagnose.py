@@ -106,8 +106,9 @@ def diagnose(
     Parameters
     ----------
     logs
-        CSV or Parquet: time, accel_cmd, and accel or speed. Several are drives of one car. LOG.toml beside a log may
-        map names and units. Without accel_cmd a map is made of throttle, brake, torque or current, which needs speed.
+        Tables of text, Parquet or recordings: time, accel_cmd, and accel or speed. Several are drives of one car.
+        avtorch check LOG finds names and units and writes LOG.toml beside it. Without accel_cmd a map is made of
+        throttle, brake, torque or current, which needs speed.
         With --follower: time, speed, spacing, lead_speed, or an OpenACC, NGSIM or I-24 file.
     """
     if budget is not None:

@@ -81,8 +81,9 @@ def estimate(
     Parameters
     ----------
     log
-        CSV or Parquet: time, accel_cmd, and accel or speed. LOG.toml beside it may map names and units. Without
-        accel_cmd a map is made of throttle, brake, torque or current, which needs speed.
+        A table of text, Parquet or a recording: time, accel_cmd, and accel or speed. avtorch check LOG finds names and
+        units and writes LOG.toml beside it. Without accel_cmd a map is made of throttle, brake, torque or current,
+        which needs speed.
     """
     positive("--window", window, "s")
     positive("--tau", tau, "s")

@@ -65,7 +65,7 @@ def validate(
     Parameters
     ----------
     log
-        CSV or Parquet, as for estimate. Without measured jerk there is no quadrature, and NUTS is the reference.
+        A log, as for estimate. Without measured jerk there is no quadrature, and NUTS is the reference.
     """
     if synthetic and log is not None:
         raise InputError(f"--synthetic: found together with {log}; needs one of a log and --synthetic")

@@ -17,6 +17,7 @@ from avtorch.io.quality import Quality
 from avtorch.io.quality import check as check_quality
 from avtorch.io.tables import read_table
 from avtorch.logcheck.candidates import table_of
+from avtorch.logcheck.duration import duration_note
 from avtorch.logcheck.proposal import Proposal, propose
 from avtorch.logcheck.recorder import excitation_notes, recorder_notes
 
@@ -123,5 +124,6 @@ def _platoon(path: str | os.PathLike[str]) -> Log | None:
 
 
 def _seen(source: str, form: str, proposal: Proposal | None, log: Log) -> LogCheck:
-    notes = tuple(recorder_notes(log)), tuple(excitation_notes(log))
-    return LogCheck(source, form, proposal, log, check_quality(log), None, *notes)
+    quality = check_quality(log)
+    excitation = [*excitation_notes(log), duration_note(log, quality.jitter)]
+    return LogCheck(source, form, proposal, log, quality, None, tuple(recorder_notes(log)), tuple(excitation))
