@@ -172,7 +172,7 @@ def _advice(signal: str, names: Iterable[str]) -> str:
     plain = {name.strip().lower(): name for name in names if name not in SIGNALS and len(name) <= _NAME}
     close = difflib.get_close_matches(signal, plain, n=1, cutoff=0.75)
     name = quoted(plain[close[0]]) if close else "NAME"
-    return f"columns: {listed(names)}; `--map {signal}={name}` if it goes by another name; `avtorch check` finds it"
+    return f"columns: {listed(names)}; `--map {signal}={name}` if it goes by another name"
 
 
 def _place(table: Table, signal: str, column: str, rows: NDArray | None = None) -> Callable[[int], str]:

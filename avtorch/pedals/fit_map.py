@@ -32,8 +32,10 @@ _FOLDS = 8
 
 @dataclass(frozen=True, eq=False)
 class PedalFit:
-    """A fitted `map`, and standard errors by blocks [s] of its lag, of its dead time and of their sum (nan where they
-    were not asked for); the sum, how late the car is, is known far better than its parts. `smooth`: weight of the map's
+    """A fitted map with what is known of its errors.
+
+    Standard errors are by blocks [s], of the lag of `map`, of its dead time and of their sum (nan where they were not
+    asked for); the sum, how late the car is, is known far better than its parts. `smooth`: weight of the map's
     curvature, chosen by blocks held out; `rms` [m/s²]: what the fit leaves of accelerations over a second; `seconds`:
     how long a drive it saw.
 

@@ -18,8 +18,10 @@ _UNITS = {"throttle": (100.0, "%"), "torque": (1.0, "Nm"), "current": (1.0, "A")
 
 
 def pedal_lines(ax: Axes, made: PedalMap, pedal: str, *, lines: int = 4) -> Axes:
-    """The acceleration that one pedal demands, the others at rest, at some speeds between the slowest and the fastest
-    that the map knows; bands: one standard error, by blocks of the drive, of what the pedal adds.
+    """The acceleration that one pedal demands, the others at rest.
+
+    Lines are at some speeds between the slowest and the fastest that the map knows; bands are one standard error, by
+    blocks of the drive, of what the pedal adds.
 
     Example:
         >>> import numpy as np
