@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -67,12 +68,31 @@ def plain(raw: bytes) -> str:
         return raw.decode("cp1252")
 
 
+DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d*),(\d+(?:[eE][+-]?\d+)?\s*)$")
+
+
 def simple(raw: bytes) -> tuple[list[str], list[list[str]]]:
-    """Header and rows as the csv module has them, without empty lines, and without blank rows at the end."""
-    rows = [row for row in csv.reader(io.StringIO(plain(raw), newline="")) if "".join(row).strip() or len(row) > 1]
-    while not any(cell.strip() for cell in rows[-1]):
-        rows.pop()
-    return rows[0], rows[1:]
+    """Header and rows as the csv module has them, without empty lines, and without blank rows at the end.
+
+    Commas or semicolons stand between cells, whichever the header has more of.
+    """
+    lines = plain(raw)
+    head = next(line for line in lines.splitlines() if line.strip())
+    separator = max(",;", key=head.count)
+    rows = csv.reader(io.StringIO(lines, newline=""), delimiter=separator)
+    table = [row for row in rows if "".join(row).strip() or len(row) > 1]
+    while not any(cell.strip() for cell in table[-1]):
+        table.pop()
+    cells = [cell for row in table[1:] for cell in row]
+    if sum(bool(DECIMAL_COMMA.fullmatch(cell)) for cell in cells) > sum("." in cell for cell in cells):
+        table[1:] = [[DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in row] for row in table[1:]]
+    return table[0], table[1:]
+
+
+def numbers_in(raw: bytes) -> set[float]:
+    """Every number of a text, whatever stands between its cells."""
+    rows = [row for mark in ",;" for row in csv.reader(io.StringIO(plain(raw), newline=""), delimiter=mark)]
+    return {number for row in rows for cell in row for number in (_float(cell), _float(cell.replace(",", ".")))}
 
 
 def left_out(log: Log) -> int:
@@ -243,12 +263,10 @@ LEADERS.append(b"Vehicle_order,Audi(A8),BMW(X5)\nRows,24\n" + text(ZALAZONE))
 def test_damaged_recordings(folder: Path, raw: bytes, event: int | None, vehicle: int | None) -> None:
     path = folder / "leader.csv"
     path.write_bytes(raw)
-    numbers = None
     leader = outcome(lambda: read_leader(path, event=event, vehicle=vehicle, duration=None))
     log = outcome(lambda: read_following(path, event=event, vehicle=vehicle))
     found = [x for x in (leader, log) if x is not None]
-    if found:
-        numbers = {x for row in csv.reader(io.StringIO(plain(raw), newline="")) for x in map(_float, row)}
+    numbers = numbers_in(raw) if found else set()
     for x in found:
         assert printable(x.name) == x.name
         assert np.isfinite(x.speed).all()
@@ -256,7 +274,7 @@ def test_damaged_recordings(folder: Path, raw: bytes, event: int | None, vehicle
         assert (np.diff(x.time) > 0).all()
         assert isinstance(x, RawLeader) or x.spacing is not None
         # as recorded, or in km/h; what is below zero was set to zero
-        known = {0.0} | {y for v in numbers or () for y in (v, v / 3.6)}
+        known = {0.0} | {y for v in numbers for y in (v, v / 3.6)}
         assert set(x.speed.tolist()) <= known
 
 
