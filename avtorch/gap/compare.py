@@ -39,7 +39,6 @@ from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
 from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.simulator.plant import GapPlant, plant
-from avtorch.gap.simulator.simulator_input import Response
 from avtorch.io import Log
 
 Simulator = GapPlant | str | PathLike[str] | None
@@ -242,10 +241,7 @@ def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float
 
 
 def _rolled(record: Record, simulator: GapPlant) -> FloatArray:
-    responses: list[Response] = []
-    for drives in record.segments:
-        own = simulator.prepared(*drives)
-        responses += [own.response(drive) for drive in drives]
+    responses = [simulator.response(drive) for drive in record.drives]
     seen = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
     return np.stack([record.at_counted_rows(seen[name]) for name in record.channels])
 

@@ -47,8 +47,8 @@ class EffectModel:
 
     def __post_init__(self) -> None:
         whole = plant([_coarse(e(), self.record) for e in self.effects], baseline=self.base)
-        whole = whole.prepared(*(s.drive for s in self.record.stretches))
         own = {e.name for e in self.effects}
+        whole = whole.prepared(*(s.drive for s in self.record.stretches), fitted=own)
         index: dict[str, slice] = {}
         low: list[float] = []
         high: list[float] = []

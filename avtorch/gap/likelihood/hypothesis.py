@@ -64,11 +64,12 @@ class Hypothesis:
 
     @cached_property
     def plant(self) -> GapPlant:
-        return plant(list(self.effects), baseline=self.baseline).prepared(*self.record.segments[0])
+        own = [e.name for e in self.effects]
+        return plant(list(self.effects), baseline=self.baseline).prepared(*self.record.segments[0], fitted=own)
 
     @cached_property
     def _without(self) -> GapPlant:
-        return plant([], baseline=self.baseline).prepared(*self.record.segments[0])
+        return plant([], baseline=self.baseline)
 
     @cached_property
     def coordinates(self) -> tuple[Coordinate, ...]:

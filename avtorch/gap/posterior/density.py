@@ -136,7 +136,7 @@ class RolloutDensity:
 
     @cached_property
     def _without(self) -> GapPlant:
-        return plant([], baseline=self.hypothesis.baseline).prepared(*self.hypothesis.record.segments[0])
+        return plant([], baseline=self.hypothesis.baseline)
 
     def _rolled(self, z: Tensor) -> Tensor:
         """Rollouts of the channels, (column, channel, counted, group)."""

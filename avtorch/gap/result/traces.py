@@ -9,7 +9,6 @@ import numpy as np
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.simulator.plant import GapPlant
-from avtorch.gap.simulator.simulator_input import Response
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +37,6 @@ class Traces:
 
 def rolled_out(record: Record, simulator: GapPlant) -> FloatArray:
     """Rollouts (channel, counted, group) of a simulator over the whole drives of a record."""
-    responses: list[Response] = []
-    for drives in record.segments:
-        own = simulator.prepared(*drives)
-        responses += [own.response(drive) for drive in drives]
+    responses = [simulator.response(drive) for drive in record.drives]
     channels = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
     return np.stack([record.at_counted_rows(channels[name]) for name in record.channels])
