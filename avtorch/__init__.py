@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from avtorch.decision.strategist import Strategist
     from avtorch.decision.supervisor import Supervisor
     from avtorch.errors import InputError
+    from avtorch.external.external_simulator import ExternalSimulator
     from avtorch.gap.compare import compare
     from avtorch.gap.diagnose import diagnose
     from avtorch.gap.result.diagnosis import Diagnosis
@@ -48,6 +49,7 @@ _HOME = {
     "avtorch.decision.strategist": ("Strategist",),
     "avtorch.decision.supervisor": ("Supervisor",),
     "avtorch.errors": ("InputError",),
+    "avtorch.external.external_simulator": ("ExternalSimulator",),
     "avtorch.gap.compare": ("compare",),
     "avtorch.gap.diagnose": ("diagnose",),
     "avtorch.gap.result.diagnosis": ("Diagnosis",),
@@ -78,6 +80,7 @@ __all__ = [
     "ClosedLoop",
     "Diagnosis",
     "Estimates",
+    "ExternalSimulator",
     "GLVDPlant",
     "InputError",
     "Leader",

@@ -19,6 +19,7 @@ from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.resume import FITS, begin_anew
 from avtorch.cli.simulator import read_simulator
 from avtorch.cli.talk import Talk
+from avtorch.cli.tested_simulator import tested_simulator
 from avtorch.errors import InputError, quoted
 from avtorch.numeral import numeral
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from avtorch.io import Log
 
 TRACK = Group("Next experiment", sort_key=20)
+TESTED = Group("A simulator of your own", sort_key=19)
 FOLLOWER = Group("Car following", sort_key=21)
 CAUSES = ("none", "unknown", "pair")
 """Hypotheses besides the effects that a prior may weigh; `pair`: all pairs together."""
@@ -52,6 +54,25 @@ def diagnose(
     baseline: Annotated[
         str, Parameter(help="Your simulator: glvd, effects such as dead_time=0.2, or a TOML file.")
     ] = "glvd",
+    simulated: Annotated[
+        list[str] | None,
+        Parameter(
+            group=TESTED,
+            negative=(),
+            help="Its output under the same commands, one file for each log; or the prefix of the log's own columns "
+            "that hold it, such as sim. for sim.speed; repeatable.",
+        ),
+    ] = None,
+    simulator: Annotated[
+        str | None,
+        Parameter(
+            group=TESTED,
+            help="The simulator itself, MODULE:NAME or FILE.py:NAME, with reset(speed, accel) and step(accel_cmd, dt).",
+        ),
+    ] = None,
+    step: Annotated[
+        float | None, Parameter(group=TESTED, help="The simulator's own step [s]; default: the log's.")
+    ] = None,
     prior: Annotated[
         list[str] | None,
         Parameter(
@@ -127,19 +148,22 @@ def diagnose(
     }
     chosen = _effects(effects)
     weights = _prior(prior or ())
-    simulator = read_simulator("--baseline", baseline)
+    assumed = read_simulator("--baseline", baseline)
+    if assumed is not None and (simulated or simulator is not None):
+        raise InputError("--baseline: found beside --simulated or --simulator, needs one simulator")
 
     from avtorch.io import Log, check
 
     talk = Talk(json=json, quiet=quiet)
     if follower:
         usual = {"accel_kind": accel_kind == "kinematic", "no_pairs": pairs, "posterior": posterior == "sgld"}
-        idle = {"baseline": simulator, "prior": weights, "budget": budget is not None}
+        idle = {"simulated": simulated, "simulator": simulator, "step": step is not None}
+        idle |= {"baseline": assumed, "prior": weights, "budget": budget is not None}
         idle |= {option: not default for option, default in usual.items()}
         refuse(logs, **idle, **{option: value is not None for option, value in track.items()})
         source = {"map": map, "unit": unit, "stamp": stamp, "vehicle": vehicle, "event": event}
-        with talk.whole("Diagnosing") as step:
-            follow(talk, logs[0], out, source=source, law=law, effects=chosen, seed=seed, step=step)
+        with talk.whole("Diagnosing") as done:
+            follow(talk, logs[0], out, source=source, law=law, effects=chosen, seed=seed, step=done)
         return
     for option, given in (("--vehicle", vehicle), ("--law", law), ("--event", event)):
         if given is not None:
@@ -149,6 +173,7 @@ def diagnose(
         _usable(path, drive, accel_kind)
         _check_effects(chosen or (), path, drive)
     limits = _limits(drives, track)
+    own = tested_simulator(simulated or (), simulator, step, list(zip(logs, drives, strict=True)))
     if not resume:
         begin_anew(out)
     quality = []
@@ -160,10 +185,10 @@ def diagnose(
     from avtorch.gap.diagnose import diagnose as work
 
     try:
-        with talk.whole("Diagnosing", budget) as step:
+        with talk.whole("Diagnosing", budget) as done:
             found = work(
                 drives,
-                baseline=simulator,
+                baseline=own or assumed,
                 prior=weights or None,
                 accel_kind=accel_kind,
                 effects=chosen,
@@ -172,7 +197,7 @@ def diagnose(
                 budget_s=budget,
                 material=material,
                 seed=seed,
-                progress=step,
+                progress=done,
                 checkpoint=out / FITS,
             )
     except KeyboardInterrupt:

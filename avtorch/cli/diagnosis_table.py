@@ -22,14 +22,14 @@ _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 def diagnosis_headline(found: Diagnosis) -> list[str]:
     """The verdict in one sentence, its budget, its implausible parameters, and the diagnosis' reason below."""
-    from avtorch.gap.result.sentences import budget, headline
+    from avtorch.gap.result.sentences import budget, headline, tested
 
     odd = found.winner.implausible
     style = (
         "bold yellow" if odd else {"unknown": "bold yellow", "none": "bold green"}.get(found.verdict.name, "bold cyan")
     )
     lines = [f"[{style}]{escape(headline(found))}[/]", *(f"[yellow]{escape(line)}[/]" for line in odd)]
-    return [*lines, *map(escape, budget(found)), f"[dim]{escape(found.verdict.why)}[/]"]
+    return [*lines, *map(escape, tested(found)), *map(escape, budget(found)), f"[dim]{escape(found.verdict.why)}[/]"]
 
 
 def budget_table(budget: Budget) -> Table:

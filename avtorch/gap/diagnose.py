@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -44,10 +44,27 @@ from avtorch.gap.whole_progress import WholeProgress
 from avtorch.io import Log
 
 
+class SimulatorBesideCar(Protocol):
+    """A car's drives and a simulator that is not made of effects: diagnosed by `logs` with `plant` as the baseline."""
+
+    @property
+    def logs(self) -> Sequence[Log]: ...
+    @property
+    def plant(self) -> GapPlant: ...
+    def told(self, found: Diagnosis) -> Diagnosis: ...
+
+
+@runtime_checkable
+class BlackBoxSimulator(Protocol):
+    """A simulator that is not made of effects; `avtorch.external.ExternalSimulator` is one."""
+
+    def beside(self, logs: Sequence[Log], progress: Callable[[str, int, int], None] | None) -> SimulatorBesideCar: ...
+
+
 def diagnose(
     logs: Log | Sequence[Log],
     *,
-    baseline: GapPlant | str | PathLike[str] | None = None,
+    baseline: GapPlant | BlackBoxSimulator | str | PathLike[str] | None = None,
     prior: Mapping[str, float] | None = None,
     accel_kind: Literal["kinematic", "specific-force"] | None = None,
     effects: Sequence[str | type[Effect]] | None = None,
@@ -65,13 +82,13 @@ def diagnose(
     blocks under noise of any spectrum: any number of them.
 
     Args: `baseline`: the user's simulator (default: bare GLVD); its effects keep their values, `T_L` and `K_L` are
-    fitted. `prior`: weights over causes, see `model_probabilities`. `effects`: those to test, by name or class
-    (default: all registered). `pairs`: also test several at once. `posterior` of the verdict's parameters: by SGLD, or
-    Laplace's approximation. `material`: share of the gap from which something counts. `budget_s`: after this time no
-    new hypothesis is fitted; where that cuts the search short, `complete` is False and the verdict provisional: `scope`
-    lists what was tested, and the verdict is distinguished only from that. `accel_kind`: whether `accel` is dv/dt or an
-    accelerometer's reading (default: as the logs state). `progress(what, done, of)` is called at each step, with `done`
-    of `of` in the whole diagnosis.
+    fitted. One that is not made of effects comes as an `avtorch.ExternalSimulator`. `prior`: weights over causes, see
+    `model_probabilities`. `effects`: those to test, by name or class (default: all registered). `pairs`: also test
+    several at once. `posterior` of the verdict's parameters: by SGLD, or Laplace's approximation. `material`: share of
+    the gap from which something counts. `budget_s`: after this time no new hypothesis is fitted; where that cuts the
+    search short, `complete` is False and the verdict provisional: `scope` lists what was tested, and the verdict is
+    distinguished only from that. `accel_kind`: whether `accel` is dv/dt or an accelerometer's reading (default: as the
+    logs state). `progress(what, done, of)` is called at each step, with `done` of `of` in the whole diagnosis.
     `checkpoint`: a file that stores fits; a later search of the same logs with the same settings continues from it, to
     the same answer.
 
@@ -87,7 +104,7 @@ def diagnose(
         >>> found.verdict.name, round(found.probability("dead_time"), 2)
         ('sensor_bias', 0.0)
     """
-    progress = None if progress is None else WholeProgress(progress)
+    told, progress = progress, None if progress is None else WholeProgress(progress)
     each = [logs] if isinstance(logs, Log) else list(logs)
     if accel_kind is not None:
         if accel_kind not in ("kinematic", "specific-force"):
@@ -97,6 +114,22 @@ def diagnose(
         raise InputError(f"posterior: found {posterior!r}, needs 'laplace' or 'sgld'")
     if not 0 < material < 1:
         raise InputError(f"material: found {material}, needs a share between 0 and 1")
+    if isinstance(baseline, BlackBoxSimulator):
+        beside = baseline.beside(each, progress)
+        found = diagnose(
+            beside.logs,
+            baseline=beside.plant,
+            prior=prior,
+            effects=effects,
+            pairs=pairs,
+            posterior=posterior,
+            budget_s=budget_s,
+            material=material,
+            seed=seed,
+            progress=told,
+            checkpoint=checkpoint,
+        )
+        return beside.told(found)
     measured, read = each, [with_sensor_noise(log) for log in each]
     each, noise_added = [log for log, _ in read], dict.fromkeys(note for _, note in read if note)
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)

@@ -74,7 +74,13 @@ def report_html(
         log=found.log,
         headline=sentences.headline(found),
         odd=found.winner.implausible,
-        lead=[*sentences.budget(found), found.verdict.why, sentences.aliases(found), *sentences.onset(found)],
+        lead=[
+            *sentences.tested(found),
+            *sentences.budget(found),
+            found.verdict.why,
+            sentences.aliases(found),
+            *sentences.onset(found),
+        ],
         tone="amber"
         if found.winner.implausible
         else {"unknown": "amber", "none": "green"}.get(found.verdict.name, "blue"),

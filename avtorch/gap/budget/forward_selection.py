@@ -39,12 +39,11 @@ def select(
     most: int = MOST_PARTS,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Selection:
-    """The effects of `kinds` that `base` lacks on these drives, at `most` so many, with every step on the way.
+    """The effects of `kinds` that `base` lacks on these drives, or has with other parameters than the car.
 
-    `begun`: a selection of the same record, which is continued.
+    At `most` so many, with every step on the way. `begun`: a selection of the same record, which is continued.
     """
-    present = {e.name for e in base.effects}
-    kinds = [k for k in kinds if not k.random and k.name not in present and _observable(k, record)]
+    kinds = [k for k in kinds if not k.random and _observable(k, record)]
     if begun is None:
         fitting, start = baseline_noise(record, base)
         begun = Selection(fitting, (Step(start, fitting.hold_out(start)),))

@@ -14,6 +14,7 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 from torch import Tensor
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.budget.robust_fit import Fit
 from avtorch.gap.budget.selection_step import Selection
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.effect import Effect
@@ -54,8 +55,13 @@ def repaired_plant(selection: Selection, base: GapPlant, sigma: float) -> GapPla
 
     `sigma`: its jerk noise.
     """
-    model, z = selection.last.fit.model, selection.last.fit.z
-    values = {key: x if x.dim() else float(x) for key, x in model.values(z).items()}
+    return plant_of(selection.last.fit, base, sigma)
+
+
+def plant_of(fit: Fit, base: GapPlant, sigma: float | None = None) -> GapPlant:
+    """`base` with the effects, lag and gain of a fit; `sigma`: its jerk noise, default: that of `base`."""
+    model = fit.model
+    values = {key: x if x.dim() else float(x) for key, x in model.values(fit.z).items()}
     filled = model.plant.with_values(values)
     own = set(model.names)
     effects: Sequence[Effect] = [e for e in filled.effects if e.name in own]

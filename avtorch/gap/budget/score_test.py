@@ -7,7 +7,7 @@ row, without a fit of their own.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -20,6 +20,7 @@ from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.integrated import Integrated
 
+_OTHER_SIZES = (0.7, 1.4)  # times the baseline's own value
 _FAINT = -2.0  # prior SD, for effects that name no first values
 _MOST_STARTS = 60
 _LIMITS = 12  # places over the physical range, for a parameter whose effect vanishes at infinity
@@ -71,7 +72,7 @@ class ScoreTest:
         if issubclass(kind, Integrated):
             return Candidate(model, starts, self._promise_of_all(model, starts[0]))
         change = self._change(model, starts)
-        scaled = _sizes(model, kind)
+        scaled = _centres(model, kind)
         least, most = (_LEAST, _LARGEST) if scaled else (1 / _ROOM, _ROOM)
         both = _either_sign(model, scaled)
         gain, amount, step = self._gains(*self._sums(change), least, most, both)
@@ -95,7 +96,7 @@ class ScoreTest:
 
         d, w = change.ravel(), self.weight
         size, along, shared = later(w * d * d), later(w * d * self.white), later(self.slope * (w * d))
-        scaled = _sizes(candidate.model, kind)
+        scaled = _centres(candidate.model, kind)
         least, most = (_LEAST, _LARGEST) if scaled else (1 / _ROOM, _ROOM)
         gain, amount, step = self._gains(size, along, shared.T, least, most, _either_sign(candidate.model, scaled))
         # a block at least on either side
@@ -142,42 +143,52 @@ class ScoreTest:
         return float(0.5 * downhill @ np.linalg.solve(weighed @ slope.T + np.eye(model.size), downhill))
 
     def _moved(
-        self, model: EffectModel, start: FloatArray, amount: float, step: FloatArray, scaled: Sequence[str]
+        self, model: EffectModel, start: FloatArray, amount: float, step: FloatArray, scaled: Mapping[str, float]
     ) -> FloatArray:
         """`start` (size,) with its effect `amount` times as large, and the other parameters as they give way."""
         known = dict(model.named(start))
         for key, at in self.fit.model.index.items():
             known[key] = self.fit.z[at] + step[at]
         parameters, values = model.plant.parameters(), model.values(start)
-        for key in scaled:
+        for key, centre in scaled.items():
             parameter = parameters[key]
-            assert parameter.neutral is not None
             low, high = parameter.physical
-            inside = np.clip(parameter.neutral + amount * (float(values[key]) - parameter.neutral), low, high)
+            inside = np.clip(centre + amount * (float(values[key]) - centre), low, high)
             known[key] = np.array([float(parameter.unconstrain(torch.tensor(inside, dtype=torch.float64)))])
         return np.clip(model.coordinates(known), model.low, model.high)
 
 
-def _sizes(model: EffectModel, kind: type[Effect]) -> tuple[str, ...]:
-    """Parameters of `kind` with a neutral value: the response is about proportional to their distance from it."""
-    found = []
+def _centres(model: EffectModel, kind: type[Effect]) -> Mapping[str, float]:
+    """Parameters of `kind` and where they change nothing: the response is about proportional to the distance from it.
+
+    That is the baseline's own value where it has the effect, else the neutral one.
+    """
+    given = _given(model, kind)
+    found = {}
     for key, parameter in model.plant.parameters().items():
-        finite = parameter.neutral is not None and np.isfinite(parameter.neutral)
-        if key.startswith(f"{kind.name}.") and key in model.index and finite:
-            found.append(key)
-    return tuple(found)
+        centre = given.get(key, parameter.neutral)
+        if key.startswith(f"{kind.name}.") and key in model.index and centre is not None and np.isfinite(centre):
+            found[key] = float(centre)
+    return found
 
 
-def _either_sign(model: EffectModel, scaled: Sequence[str]) -> bool:
-    """Whether physics allows values on both sides of neutral."""
+def _given(model: EffectModel, kind: type[Effect]) -> Mapping[str, float]:
+    """The baseline's own values of the effect's parameters; empty where it lacks the effect."""
+    own = [e for e in model.base.effects if e.name == kind.name]
+    return {f"{kind.name}.{key}": float(x) for e in own for key, x in e.values().items() if x.dim() == 0}
+
+
+def _either_sign(model: EffectModel, centres: Mapping[str, float]) -> bool:
+    """Whether physics allows values on both sides of the centres."""
     parameters = model.plant.parameters()
-    return bool(scaled) and all(parameters[k].physical[0] < (parameters[k].neutral or 0.0) for k in scaled)
+    return bool(centres) and all(parameters[k].physical[0] < centre for k, centre in centres.items())
 
 
 def _starts(model: EffectModel, fit: Fit, kind: type[Effect]) -> FloatArray:
     """First vectors (start, size): the parameters so far, with the effect's own first values."""
     time = model.record.time
     known, parameters = dict(fit.known), model.plant.parameters()
+    given = _given(model, kind)
     grids, keys = [], []
     for name, values in kind.starts_in(float(time.min()), float(time.max())).items():
         key = f"{kind.name}.{name}"
@@ -189,6 +200,8 @@ def _starts(model: EffectModel, fit: Fit, kind: type[Effect]) -> FloatArray:
         if len(kind.parameters) == 1 and parameter.neutral is not None and np.isinf(parameter.neutral):
             low, high = (abs(x) for x in parameter.physical)
             points = torch.as_tensor(np.geomspace(low, high, _LIMITS + 2)[1:-1] * np.sign(parameter.neutral))
+        if key in given:  # a change of the value that the baseline has
+            points = given[key] * torch.tensor(_OTHER_SIZES, dtype=torch.float64)
         grids.append([float(z) for z in parameter.unconstrain(points)])
     starts = [model.coordinates({**known, **dict(zip(keys, z, strict=True))}) for z in product(*grids)]
     own = [key for key in model.index if key.startswith(f"{kind.name}.")]

@@ -21,6 +21,7 @@ from avtorch.gap.result import sentences
 from avtorch.gap.result.gap_size import GapSize
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.predictive_model import PredictiveModel
+from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.search.fitted_model import Scope
 from avtorch.gap.selection.verdict import (
@@ -128,6 +129,7 @@ class Diagnosis:
     onset_from_start_s: float | None = None
     onset_log: int = 0
     budget: Budget | None = None
+    tested: SimulatorUnderTest | None = None
 
     def __post_init__(self) -> None:
         if self.onset_s is not None and self.onset_from_start_s is None:
@@ -145,6 +147,7 @@ class Diagnosis:
         """The sentences of the terminal, one per line."""
         lines = [
             sentences.headline(self),
+            *sentences.tested(self),
             *sentences.budget(self),
             *self.winner.implausible,
             self.verdict.why,
@@ -194,7 +197,7 @@ class Diagnosis:
             "complete": self.complete,
             "not_tried": None if self.scope is None else self.scope.to_dict(),
             "notes": list(self.notes),
-        }
+        } | ({} if self.tested is None else {"simulator": self.tested.to_dict()})
 
     def write(self, folder: str | PathLike[str]) -> list[Path]:
         """Publish `diagnosis.json` and, where there is a plant, `plant.toml` at the same moment; returns the files.

@@ -11,6 +11,7 @@ from avtorch.gap.crossval.localisation import UNITS, Location
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.gap_size import GapSize
 from avtorch.gap.result.log_facts import LogFacts
+from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
 from avtorch.gap.search.fitted_model import Scope
 from avtorch.gap.selection.verdict import Candidate, Verdict, meanings
 from avtorch.io.clock import clock_words
@@ -61,6 +62,8 @@ class Findings(Protocol):
     def complete(self) -> bool: ...
     @property
     def scope(self) -> Scope | None: ...
+    @property
+    def tested(self) -> SimulatorUnderTest | None: ...
 
 
 def headline(found: Findings) -> str:
@@ -80,17 +83,52 @@ def _verdict(found: Findings) -> str:
     if verdict.name == "none" and not _all_tried(found):
         comma = "," if _cut(found) else ""
         return f"None of the {_known(found)}{comma} brings the simulator closer to this log ({p}){but}."
+    if verdict.name == "none" and found.tested is not None and found.tested.wrong:
+        wrong = " and ".join(str(p) for p in found.tested.wrong)
+        return f"The simulator lacks nothing that this log shows ({p}), but a parameter is wrong: {wrong}."
     if verdict.name == "none":
         first = "The" if found.winner.probability >= SURE else "No effect stands out: probably the"
         return f"{first} simulator lacks nothing that this log shows ({p}){but}."
     if found.budget is not None and (len(verdict.names) > 1 or verdict.partial):
         return str(found.budget)
+    if found.tested is not None and not found.tested.missing:
+        own = [x for x in found.tested.wrong if "." in x.name]
+        return f"A parameter of the simulator is wrong ({p}): {'; '.join(map(str, own))}." if own else _lacks(found, p)
+    return _lacks(found, p)
+
+
+def _lacks(found: Findings, p: str) -> str:
+    """That the simulator lacks the verdict's effects, `p` as words."""
+    verdict, odd = found.verdict, found.winner.implausible
     meaning = meanings(verdict.name)
     # an implausible fit is not described by the effect's usual meaning
     rest = ", but as fitted that is physically implausible." if odd else f": {meaning}." if meaning else "."
     share = found.winner.probability
     who = "The" if share >= SURE else "Probably the" if share >= 0.5 else "Perhaps the"
     return f"{who} simulator lacks {' and '.join(verdict.names)} ({p}){rest}"
+
+
+def tested(found: Findings) -> list[str]:
+    """What is said of a simulator that is not avtorch's own, beyond the headline."""
+    facts = found.tested
+    if facts is None:
+        return []
+    own = list(facts.surrogate.report())
+    holds = f" with {', '.join(own)}" if own else ""
+    left = max(facts.left.values(), default=0.0)
+    lag, gain = float(facts.surrogate.T_L), float(facts.surrogate.K_L)
+    lines = [
+        f"Of the simulator itself ({facts.name}): it answers as a lag of {lag:.2f} s and a gain of {gain:.2f}{holds}, "
+        f"but for {100 * left:.1f} % of its response, which is taken from its output."
+    ]
+    errors = [f"{name} {value:.2g} {_UNIT[name]}" for name, value in facts.rollout.items()]
+    if errors:
+        lines.append(f"Its error against the car as it is, over 10 s: {', '.join(errors)}.")
+    said = headline(found)
+    wrong = [str(x) for x in facts.wrong if str(x) not in said]
+    if wrong:
+        lines.append(f"Parameters that differ: {'; '.join(wrong)}.")
+    return [*lines, *facts.notes]
 
 
 def budget(found: Findings) -> list[str]:

@@ -1,0 +1,63 @@
+"""The user's own simulator, as it is given on the command line: its output, columns of the log, or an object."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from avtorch.errors import InputError, quoted
+
+if TYPE_CHECKING:
+    from avtorch.external import ExternalSimulator
+    from avtorch.io import Log
+
+_CHANNELS = ("accel", "speed")
+
+
+def tested_simulator(
+    simulated: Sequence[str], simulator: str | None, step: float | None, drives: Sequence[tuple[Path, Log]]
+) -> ExternalSimulator | None:
+    """None where neither is given. Raises `InputError` where both are, or what is given cannot be read."""
+    if not simulated and simulator is None:
+        if step is not None:
+            raise InputError("--step: has a meaning with --simulator only")
+        return None
+    if simulated and simulator is not None:
+        raise InputError("--simulated, --simulator: found both, needs the output or the simulator itself")
+    from avtorch.external import ExternalSimulator, load_simulator
+
+    if simulator is not None:
+        if step is not None and not 0 < step < math.inf:
+            raise InputError(f"--step: found {step:g}, needs a step above 0 s")
+        try:
+            return ExternalSimulator(load_simulator(simulator), name=simulator, step_s=step)
+        except InputError as fault:
+            raise InputError(f"--simulator: {str(fault).removeprefix('simulator: ')}") from None
+    if step is not None:
+        raise InputError("--step: has a meaning with --simulator only")
+    if len(simulated) == 1 and not Path(simulated[0]).exists() and simulated[0].endswith((".", "_")):
+        return ExternalSimulator([_columns(simulated[0], path, drive) for path, drive in drives], name=simulated[0])
+    if len(simulated) != len(drives):
+        raise InputError(f"--simulated: found {len(simulated)} files for {len(drives)} logs, needs one for each log")
+    from avtorch.io import Log
+
+    outputs = [Log.read(path, following=True) for path in simulated]
+    return ExternalSimulator(outputs, name=", ".join(Path(path).name for path in simulated))
+
+
+def _columns(prefix: str, path: Path, drive: Log) -> Log:
+    """The simulator's output in columns of the log itself, such as `sim.speed`."""
+    from avtorch.io import Log
+
+    there = {name: f"{prefix}{name}" for name in _CHANNELS if f"{prefix}{name}" in drive.ignored}
+    if not there:
+        known = ", ".join(drive.ignored[:8]) or "no further columns"
+        raise InputError(
+            f"--simulated {quoted(prefix)}: no such file, and {path} has no column {prefix}accel or {prefix}speed "
+            f"(it has {known})"
+        )
+    read = Log.read(path, map=there)
+    return replace(read, name=f"{prefix}*", **{name: None for name in _CHANNELS if name not in there})

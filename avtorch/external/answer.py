@@ -1,0 +1,119 @@
+"""A simulator of the user's against drives of a car: what it lacks, and which of its parameters are wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
+
+from avtorch.arrays import FloatArray
+from avtorch.external.surrogate import Surrogate
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.simulator_under_test import SAME_KIND, ParameterDifference, SimulatorUnderTest
+from avtorch.io import Log
+
+HORIZON_S = 10.0
+_LEVEL = 0.005  # of a two-sided test, that a parameter differs
+_MATERIAL = {"T_L": 0.1, "K_L": 0.03}  # relative difference that a controller notices
+_FOLDS = 6
+
+
+def rollout_errors(logs: Sequence[Log], simulated: Sequence[Log]) -> dict[str, float]:
+    """Root mean squared error of the simulator's output as it is, by channel: acceleration [m/s²], and the speed that
+    it gains within 10 s [m/s], over usable rows.
+    """
+    errors: dict[str, list[FloatArray]] = {}
+    for log, other in zip(logs, simulated, strict=True):
+        usable = log.usable & other.engaged
+        for part in log.engaged_segments():
+            if log.accel is not None and other.accel is not None:
+                errors.setdefault("accel", []).append((other.accel - log.accel)[part][usable[part]])
+            if log.speed is not None and other.speed is not None:
+                rows = max(1, round(HORIZON_S * log.rate_hz))
+                for begin in range(part.start, part.stop, rows):
+                    own = slice(begin, min(begin + rows, part.stop))
+                    away = (other.speed - log.speed)[own]
+                    errors.setdefault("speed", []).append((away - away[0])[usable[own]])
+    joined = {name: np.concatenate(parts) for name, parts in errors.items()}
+    return {name: float(np.sqrt(np.mean(x**2))) for name, x in joined.items() if len(x)}
+
+
+def with_simulator(
+    found: Diagnosis,
+    surrogate: Surrogate,
+    *,
+    name: str,
+    source: str,
+    offset_s: Sequence[float],
+    rollout: dict[str, float],
+    notes: Sequence[str],
+) -> Diagnosis:
+    """`found`, a diagnosis with the surrogate as its baseline, with what it says of the simulator itself."""
+    own = surrogate.plant.report()
+    named = [n for n in found.verdict.names if n in own]
+    differences = _lag_and_gain(found, surrogate)
+    missing = []
+    for effect in found.verdict.names:
+        if effect in ("none", "unknown"):
+            continue
+        if effect not in own or not _of_a_size(found, effect, surrogate):
+            missing.append(effect)
+    for effect in named:
+        wrong = effect not in missing
+        for key, car in _parameters(found, effect).items():
+            if key in own[effect]:
+                value = float(own[effect][key])
+                differences.append(ParameterDifference(f"{effect}.{key}", value, car, wrong and not _holds(car, value)))
+    facts = SimulatorUnderTest(
+        name,
+        source,
+        tuple(offset_s),
+        surrogate.plant,
+        surrogate.left,
+        rollout,
+        tuple(differences),
+        tuple(missing),
+        tuple(notes),
+    )
+    return replace(found, tested=facts)
+
+
+def _lag_and_gain(found: Diagnosis, surrogate: Surrogate) -> list[ParameterDifference]:
+    """T_L and K_L, fitted together with the verdict's effects; their spread is that between folds of the drives."""
+    if found.budget is None:
+        return []
+    quantile = float(student.ppf(1 - _LEVEL / 2, _FOLDS - 1))  # pyright: ignore[reportUnknownMemberType]
+    out = []
+    for name, car in found.budget.repaired.items():
+        value = float(getattr(surrogate.plant, name))
+        away = abs(car.mean - value)
+        out.append(ParameterDifference(name, value, car, away > quantile * car.sd and away > _MATERIAL[name] * value))
+    return out
+
+
+def _parameters(found: Diagnosis, effect: str) -> dict[str, Quantity]:
+    """Of an effect of the verdict, from the budget's part where there is one."""
+    parts = [] if found.budget is None else [p for p in found.budget.parts if p.name == effect]
+    if parts:
+        return dict(parts[0].parameters)
+    alone = found.verdict.names == (effect,)
+    keys = {key if alone else key.removeprefix(f"{effect}."): q for key, q in found.winner.parameters.items()}
+    return {key: q for key, q in keys.items() if alone or f"{effect}.{key}" in found.winner.parameters}
+
+
+def _of_a_size(found: Diagnosis, effect: str, surrogate: Surrogate) -> bool:
+    """Whether the simulator's own effect and the car's are of one size, so that its parameter is wrong, and the effect
+    not missing."""
+    own = surrogate.plant.report()[effect]
+    for key, car in _parameters(found, effect).items():
+        if key in own:
+            small, large = sorted((abs(float(own[key])), abs(car.mean)))
+            return small > SAME_KIND * large and float(own[key]) * car.mean >= 0
+    return False
+
+
+def _holds(car: Quantity, value: float) -> bool:
+    return car.q05 <= value <= car.q95

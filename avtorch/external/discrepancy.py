@@ -1,0 +1,51 @@
+"""What a simulator does beyond its surrogate, and a car's log without it.
+
+Let S be the simulator, M its surrogate, and y what the car did under the same commands. The simulator predicts y as
+
+    S(u) = M(u) + d,   d = S(u) - M(u),
+
+so the gap between car and simulator is that between `y - d` and the chain M. A diagnosis with M as its baseline, of a
+log from which `d` is subtracted, is a diagnosis of the simulator; `d` is known row by row and needs no model. Effects
+and parameters are then asked of M: exact where they act on the output (sensors, forces), where they commute with the
+rest of the simulator (a delay), or where M holds what they do not commute with; else to first order in `d`, which is
+small where the surrogate is good.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from avtorch.arrays import FloatArray
+from avtorch.errors import InputError
+from avtorch.gap.simulator.plant import GapPlant
+from avtorch.gap.simulator.simulator_input import SimulatorInput
+from avtorch.io import Log
+
+
+def discrepancy(simulated: Log, surrogate: GapPlant) -> dict[str, FloatArray]:
+    """`d` by channel, (time,): acceleration [m/s²] and, from each segment's start, speed [m/s]."""
+    found = {name: np.zeros(simulated.rows) for name in ("accel", "speed") if getattr(simulated, name) is not None}
+    for segment in range(int(simulated.segment[-1]) + 1):
+        rows = simulated.segment == segment
+        if rows.sum() < 2:
+            continue
+        response = surrogate.response(SimulatorInput.from_log(simulated, segment))
+        answers = {"accel": response.accel_measured, "speed": response.speed}
+        for name, values in found.items():
+            values[rows] = getattr(simulated, name)[rows] - answers[name].numpy()
+    return found
+
+
+def without_discrepancy(log: Log, simulated: Log, surrogate: GapPlant) -> Log:
+    """The car's `log` less what the simulator does beyond its surrogate, row by row.
+
+    Raises `InputError` where the simulator's output lacks a channel of the log.
+    """
+    known = discrepancy(simulated, surrogate)
+    channels = {name: getattr(log, name) for name in ("accel", "speed") if getattr(log, name) is not None}
+    shared = {name: values - known[name] for name, values in channels.items() if name in known}
+    if not shared:
+        raise InputError(f"{simulated.name}: found {' and '.join(known)}, needs {' or '.join(channels)} as {log.name}")
+    return replace(log, **{name: shared.get(name) for name in channels})

@@ -1,0 +1,165 @@
+"""A simulator driven along the commands of a car's log, in an open loop.
+
+It begins anew wherever the car does: at each segment, where the driver lets go, and at each start from standstill.
+Between these it drives on its own, at its own speed.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from avtorch.arrays import FloatArray
+from avtorch.errors import InputError, quoted
+from avtorch.external.simulator import Simulator
+from avtorch.io import STANDSTILL_MPS, Log
+
+LIMIT_S = 30.0
+"""Longest that a simulator may take for one step or one reset [s]."""
+_AVERAGED_S = 0.3  # over which the car's acceleration at the beginning of a drive is averaged
+
+
+def driven_along(
+    simulator: Simulator,
+    log: Log,
+    *,
+    name: str = "simulator",
+    step_s: float | None = None,
+    limit_s: float = LIMIT_S,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Log:
+    """What `simulator` does under the commands of `log`, in its rows.
+
+    `step_s`: the simulator's own step [s], for one that takes no other; default: from row to row. A row in which the
+    car is under the driver keeps the car's readings.
+
+    Raises `InputError` for a log without `accel_cmd`, and where the simulator raises, hangs for `limit_s`, or returns
+    what is no pair of finite numbers, with the time in the log.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch import Log
+        >>> from avtorch.external.driving import driven_along
+        >>> class Car:
+        ...     def reset(self, *, speed, accel):
+        ...         self.speed, self.accel = speed, accel
+        ...     def step(self, accel_cmd, dt):
+        ...         self.accel += (1 - np.exp(-dt / 0.4)) * (accel_cmd - self.accel)
+        ...         self.speed += dt * self.accel
+        ...         return self.accel, self.speed
+        >>> time = np.arange(0.0, 10.0, 0.05)
+        >>> log = Log.from_arrays(time=time, accel_cmd=0.5 + 0 * time, accel=0 * time, speed=20 + 0 * time)
+        >>> round(float(driven_along(Car(), log).accel[-1]), 3)
+        0.5
+    """
+    if log.accel_cmd is None:
+        raise InputError(f"{log.name}: has no accel_cmd, which the simulator would be driven by")
+    if step_s is not None and not 0 < step_s < math.inf:
+        raise InputError(f"step_s: found {step_s}, needs a step above 0 s")
+    accel = np.zeros(log.rows) if log.accel is None else log.accel.copy()
+    speed = np.zeros(log.rows) if log.speed is None else log.speed.copy()
+    parts = drives_of(log)
+    with _limited(limit_s) as again:
+        drive = _Drive(simulator, name, step_s, again)
+        for number, part in enumerate(parts):
+            if progress is not None:
+                progress("driving the simulator", number, len(parts))
+            accel[part], speed[part] = drive.along(log, part)
+    return replace(log, name=name, accel=accel, speed=speed)
+
+
+def drives_of(log: Log) -> list[slice]:
+    """Rows of `log` that the simulator drives in one go."""
+    out = []
+    for part in log.engaged_segments():
+        starts = [part.start]
+        if log.speed is not None:
+            stands = log.speed[part] < STANDSTILL_MPS
+            starts += [part.start + int(k) for k in np.flatnonzero(np.diff(stands.astype(int)) == -1)]
+        edges = [*dict.fromkeys(starts), part.stop]
+        out += [slice(a, b) for a, b in pairwise(edges) if b - a > 1]
+    return out
+
+
+class _Drive:
+    """One simulator, with what is said where it fails."""
+
+    def __init__(self, simulator: Simulator, name: str, step_s: float | None, again: Callable[[], None]) -> None:
+        self._simulator, self._name, self._step_s, self._again = simulator, name, step_s, again
+
+    def along(self, log: Log, part: slice) -> tuple[FloatArray, FloatArray]:
+        """Acceleration and speed (row,) in the rows of `part`."""
+        assert log.accel_cmd is not None
+        time, command = log.time[part], log.accel_cmd[part].tolist()
+        begin_accel = command[0]
+        if log.accel is not None:
+            rows = max(1, round(_AVERAGED_S * log.rate_hz))
+            begin_accel = float(log.accel[part][:rows].mean())
+        begin_speed = 0.0 if log.speed is None else max(float(log.speed[part][0]), 0.0)
+        self._called(float(time[0]), lambda: self._simulator.reset(speed=begin_speed, accel=begin_accel), "reset")
+        out = [(begin_accel, begin_speed)]
+        steps, stamps = np.diff(time).tolist(), time.tolist()
+        for u, dt, stamp in zip(command[:-1], steps, stamps[:-1], strict=True):
+            out.append(self._stepped(u, dt, stamp))
+        both = np.array(out)
+        return both[:, 0], both[:, 1]
+
+    def _stepped(self, u: float, dt: float, stamp: float) -> tuple[float, float]:
+        count, own = 1, dt
+        if self._step_s is not None:
+            count, own = max(1, round(dt / self._step_s)), self._step_s
+        answer: object = None
+        for _ in range(count):
+            answer = self._called(stamp, lambda: self._simulator.step(u, own), "step")
+        try:
+            accel, speed = answer  # type: ignore[misc]  # what a user's object returns is checked here
+            pair = float(accel), float(speed)
+        except (TypeError, ValueError):
+            raise self._fault(stamp, f"step returned {quoted(repr(answer))}, needs (accel, speed)") from None
+        if not (math.isfinite(pair[0]) and math.isfinite(pair[1])):
+            raise self._fault(stamp, f"step returned {pair}, needs finite numbers")
+        return pair
+
+    def _called(self, stamp: float, call: Callable[[], object], what: str) -> object:
+        self._again()
+        try:
+            return call()
+        except _TooLongError as late:
+            raise self._fault(stamp, f"{what} took more than {late.args[0]:g} s") from None
+        except InputError:
+            raise
+        except Exception as error:
+            raise self._fault(stamp, f"{what} raised {type(error).__name__}: {quoted(str(error))}") from error
+
+    def _fault(self, stamp: float, what: str) -> InputError:
+        return InputError(f"{self._name}: at {stamp:.6g} s of the log {what}")
+
+
+class _TooLongError(BaseException):
+    """A call that has not returned; no Exception, so that a simulator's own handlers do not take it."""
+
+
+@contextmanager
+def _limited(limit_s: float) -> Iterator[Callable[[], None]]:
+    """Calls that end after `limit_s` each, counted from the last call of what this yields. Only where the system has
+    such alarms, in the main thread."""
+    if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
+        yield lambda: None
+        return
+
+    def late(_signal: int, _frame: object) -> None:
+        raise _TooLongError(limit_s)
+
+    before = signal.signal(signal.SIGALRM, late)
+    try:
+        yield lambda: signal.setitimer(signal.ITIMER_REAL, limit_s) and None
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)

@@ -1,0 +1,101 @@
+"""The simulator that is diagnosed, where it is not avtorch's own: what it is, and which of its parameters are wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from avtorch.gap.quantity import Quantity, unit_of, words_of
+from avtorch.gap.simulator.plant import GapPlant
+
+SAME_KIND = 0.25
+"""Least size of an effect in the simulator, relative to the car's, from which it is there and has a wrong size."""
+
+
+@dataclass(frozen=True)
+class ParameterDifference:
+    """A parameter `name` (`T_L`, `K_L`, or `effect.parameter`) of the simulator, and of the `car` that was driven.
+
+    `differs`: surely, and by more than matters.
+
+    Example:
+        >>> from avtorch.gap.quantity import Quantity
+        >>> from avtorch.gap.result.simulator_under_test import ParameterDifference
+        >>> print(ParameterDifference("T_L", 0.4, Quantity(0.82, 0.02, 0.79, 0.85), differs=True))
+        T_L 0.40 s, on the car 0.82 s (0.79 to 0.85)
+    """
+
+    name: str
+    simulator: float
+    car: Quantity
+    differs: bool
+
+    def __str__(self) -> str:
+        effect, _, key = self.name.rpartition(".")
+        unit = {"T_L": " s", "K_L": ""}.get(key) if not effect else f" {unit_of(key)}".replace(" -", "")
+        words = f"{effect}: {words_of(key)}" if effect else key
+        form = ".3g" if effect else ".2f"
+        own, mean, low, high = (format(x, form) for x in (self.simulator, self.car.mean, self.car.q05, self.car.q95))
+        return f"{words} {own}{unit}, on the car {mean}{unit} ({low} to {high})"
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "simulator": self.simulator,
+            "car": self.car.to_dict(),
+            "differs": self.differs,
+        }
+
+
+@dataclass(frozen=True)
+class SimulatorUnderTest:
+    """A simulator that is not avtorch's own.
+
+    `name`; `source`: "output" or "simulator"; `offset_s`: what its clock was ahead of the log's, by drive. `surrogate`:
+    the chain of effects that answers as it does, except for the shares `left` of the response, by channel.
+    `rollout`: its error against the car over 10 s as it is, by channel [m/s², m/s], before anything is fitted.
+    `parameters`: those of the surrogate, beside the car's. `missing`: effects of the verdict that it does not have.
+
+    Example:
+        >>> from avtorch.gap import plant
+        >>> from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
+        >>> facts = SimulatorUnderTest("sim.csv", "output", (0.0,), plant([]), {"speed": 0.001}, {"speed": 0.12})
+        >>> facts.to_dict()["surrogate"]["T_L"], facts.wrong
+        (0.3, ())
+    """
+
+    name: str
+    source: str
+    offset_s: tuple[float, ...]
+    surrogate: GapPlant
+    left: Mapping[str, float]
+    rollout: Mapping[str, float]
+    parameters: tuple[ParameterDifference, ...] = ()
+    missing: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def wrong(self) -> tuple[ParameterDifference, ...]:
+        """Parameters that differ."""
+        return tuple(p for p in self.parameters if p.differs)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "source": self.source,
+            "offset_s": list(self.offset_s),
+            "surrogate": {
+                "effects": {
+                    effect: {key: float(x) for key, x in values.items() if x.dim() == 0}
+                    for effect, values in self.surrogate.report().items()
+                },
+                "T_L": float(self.surrogate.T_L),
+                "K_L": float(self.surrogate.K_L),
+                "left": dict(self.left),
+            },
+            "rollout_10s": dict(self.rollout),
+            "parameters": [p.to_dict() for p in self.parameters],
+            "missing": list(self.missing),
+            "notes": list(self.notes),
+        }
