@@ -2,7 +2,7 @@
 
 import sys
 
-from avtorch.cli.app import main
+from avtorch.cli.process import run
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run())

@@ -16,7 +16,7 @@ from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, positi
 from avtorch.cli.diagnosis_table import budget_table, diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.cli.follower import follow, refuse
 from avtorch.cli.pedals import commanded, write_pedals
-from avtorch.cli.resume import FITS, begin_anew
+from avtorch.cli.resume import EARLIER_FITS, FITS, begin_anew
 from avtorch.cli.simulator import read_simulator
 from avtorch.cli.talk import Talk
 from avtorch.cli.tested_simulator import tested_simulator
@@ -175,7 +175,7 @@ def diagnose(
     limits = _limits(drives, track)
     own = tested_simulator(simulated or (), simulator, step, list(zip(logs, drives, strict=True)))
     if not resume:
-        begin_anew(out)
+        begin_anew(out, FITS, EARLIER_FITS)
     quality = []
     for drive in drives:
         noted = check(drive).notes

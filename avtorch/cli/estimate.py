@@ -23,6 +23,7 @@ from avtorch.cli.arguments import (
     three_gains,
 )
 from avtorch.cli.pedals import commanded, write_pedals
+from avtorch.cli.resume import WINDOWS, begin_anew
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
@@ -69,6 +70,7 @@ def estimate(
         float | None,
         Parameter(help="Dead time of the car [s], if known; by default inferred where jerk is not measured."),
     ] = None,
+    resume: Annotated[bool, Parameter(help="Resume an interrupted run in --out, or start again.")] = True,
     seed: Seed = 0,
     json: Json = False,
     quiet: Quiet = False,
@@ -76,7 +78,8 @@ def estimate(
     """Estimate the vehicle's actuation, lag and gain, from a recorded drive, window by window.
 
     A check of the log comes first. Then one posterior of (T_L, K_L) per window, alerts, and P(string stable) under the
-    controller named by --tau and --gains, which a log does not hold.
+    controller named by --tau and --gains, which a log does not hold. Give the command again to resume a run that was
+    interrupted.
 
     Parameters
     ----------
@@ -108,11 +111,21 @@ def estimate(
     talk.notes(f"{drive.name}", check(drive).notes)
     (drive,), fit, about_map = commanded(talk, [drive])
     setting = Setting(time_gap=tau, gains=k, scenarios=1)
-    with talk.progress("Estimating") as step, finished_windows(out) as written:
-        options: dict[str, Any] = {"mode": mode} if estimator in PASSING_ON else {}
-        options |= {"form": form, "setting": setting, "dead_time": dead_time, "seed": seed, "accepted": sound}
-        options["finished"] = written
-        found = work(drive, window, estimator=estimator, progress=step, **options)
+    if not resume:
+        begin_anew(out, WINDOWS)
+    options: dict[str, Any] = {"mode": mode} if estimator in PASSING_ON else {}
+    options |= {"form": form, "setting": setting, "dead_time": dead_time, "seed": seed, "accepted": sound}
+    options |= {"estimator": estimator, "checkpoint": out / WINDOWS}
+    try:
+        with talk.progress("Estimating") as step, finished_windows(out) as written:
+            found = work(drive, window, progress=step, finished=written, **options)
+    except KeyboardInterrupt:
+        if (out / WINDOWS).exists():
+            message = (
+                f"no answer was written; finished windows are kept in {out / WINDOWS}: the same command resumes there"
+            )
+            raise KeyboardInterrupt(message) from None
+        raise
     answer = estimates_answer(found)
     if fit is not None:
         answer["command"] = about_map

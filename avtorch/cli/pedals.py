@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from avtorch.pedals import HeldOut, PedalFit
 
 PICTURE = "pedal_map.png"
+FILES = ("pedal_map.csv", "accel_map.csv", "brake_map.csv", PICTURE)
+"""Every file of a map, named here because `avtorch.pedals` brings SciPy, which a log without pedals does not need."""
 
 
 def commanded(talk: Talk, drives: Sequence[Log]) -> tuple[list[Log], PedalFit | None, str]:
@@ -59,15 +61,22 @@ def _range(name: str, knots: object) -> str:
 
 
 def write_pedals(fit: PedalFit | None, out: Path) -> list[Path]:
-    """Writes the map, its tables for other tools and its picture; returns the files."""
-    if fit is None:
-        return []
-    from avtorch import plots
-    from avtorch.pedals import write_map
+    """Write the map, its tables for other tools and its picture; returns the files. Those of an earlier log's map that
+    are not written again are removed.
 
-    written = write_map(fit.map, out)
+    Raises `InputError` where that cannot be done.
+    """
+    written: list[Path] = []
     try:
-        plots.save(plots.pedal_figure(fit.map), out / PICTURE)
+        if fit is not None:
+            from avtorch import plots
+            from avtorch.pedals import write_map
+
+            written = [*write_map(fit.map, out), out / PICTURE]
+            plots.save(plots.pedal_figure(fit.map), out / PICTURE)
+        for name in FILES:
+            if out / name not in written:
+                (out / name).unlink(missing_ok=True)
     except OSError as fault:
-        raise InputError(f"{out / PICTURE}: {fault.strerror}; needs a folder that can be written") from None
-    return [*written, out / PICTURE]
+        raise InputError(f"{fault.filename or out}: {fault.strerror}; needs a folder that can be written") from None
+    return written

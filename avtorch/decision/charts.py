@@ -21,7 +21,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy.special import ndtr, ndtri
 from torch import Tensor
 
 from avtorch.errors import InputError
@@ -34,7 +33,7 @@ _NODES = 80  # the kernel is a smooth normal density: the ARL has settled to abo
 
 def shewhart_arl(limit: float) -> float:
     """Exact in-control ARL [windows] of the two-sided Shewhart chart."""
-    return 1.0 / (2.0 * float(ndtr(-limit)))
+    return 1.0 / math.erfc(limit / math.sqrt(2.0))
 
 
 def ewma_arl(limit: float, weight: float) -> float:
@@ -62,7 +61,7 @@ def cusum_arl(limit: float, reference: float) -> float:
     # Unknowns: the ARL from zero, where the chart has an atom, then from each node.
     states = np.concatenate([[0.0], nodes])
     kernel = np.empty((_NODES + 1, _NODES + 1))
-    kernel[:, 0] = ndtr(reference - states)
+    kernel[:, 0] = torch.special.ndtr(torch.from_numpy(reference - states)).numpy()
     kernel[:, 1:] = _density(nodes + reference - states[:, None]) * weights
     return float(np.linalg.solve(np.eye(_NODES + 1) - kernel, np.ones(_NODES + 1))[0] / 2.0)
 
@@ -77,7 +76,7 @@ def chart_limit(kind: ChartKind, arl: float, *, weight: float = 0.2, reference: 
     if not (math.isfinite(arl) and arl > 1.0):
         raise InputError(f"arl: found {arl}, need a finite number of windows above 1")
     if kind == "shewhart":
-        return float(-ndtri(0.5 / arl))
+        return -float(torch.special.ndtri(torch.tensor(0.5 / arl, dtype=torch.float64)))
     if kind == "ewma":
         if not 0.0 < weight <= 1.0:
             raise InputError(f"weight: found {weight}, need a number above 0 and up to 1")

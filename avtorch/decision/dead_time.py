@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
@@ -60,11 +61,12 @@ class InferredDeadTime:
 
 def infer_dead_time(log: Log, command: Command) -> InferredDeadTime | None:
     """The dead time of a log with ``accel`` and/or ``speed``; None where no stretch is excited."""
+    command = cache(command)  # asked for again by every stretch
     stretches = _stretches(log, command(0.0)[0], command(GRID_S[-1])[1])
     if not stretches:
         return None
     coarse = np.array(GRID_S)
-    start = [_mode(log, command, piece, 0.0) for piece in stretches]
+    start = _modes(log, command, stretches, 0.0)
     evidence = _evidence(log, command, stretches, start, coarse)
     best = int(evidence.argmax())
     near = coarse[max(best - 1, 0)], coarse[min(best + 1, len(coarse) - 1)]
@@ -74,7 +76,7 @@ def infer_dead_time(log: Log, command: Command) -> InferredDeadTime | None:
     evidence = _evidence(log, command, stretches, there, tried)
     best = int(evidence.argmax())
     at_best = start if best == 0 else _modes(log, command, stretches, float(tried[best]), there)
-    nats = sum(_laplace(x) - _laplace(y) for x, y in zip(at_best, start, strict=True))
+    nats = float((_laplace(at_best) - _laplace(start)).sum())
     # the evidence between the points tried is interpolated
     fine = np.linspace(tried[0], tried[-1], 1001)
     density = np.exp(np.interp(fine, tried, evidence) - evidence[best])
@@ -118,44 +120,36 @@ class _AtNoise:
         return self.density.initial()[:, :2]
 
 
-def _mode(log: Log, command: Command, piece: slice, dead_time: float, start: Mode | None = None) -> Mode:
-    """Lag, gain and noise of a stretch at one dead time."""
-    density = _density(log, command, piece, [dead_time])
-    begin = None if start is None else start.z
+def _modes(log: Log, command: Command, stretches: list[slice], dead_time: float, near: Mode | None = None) -> Mode:
+    """Lag, gain and noise of every stretch at one dead time."""
+    density = _density(log, command, stretches, [dead_time])
+    begin = None if near is None else near.z
     return find_mode(density, start=begin, from_values=True, iterations=25, tolerance=1e-3)
 
 
-def _modes(log: Log, command: Command, stretches: list[slice], dead_time: float, near: list[Mode]) -> list[Mode]:
-    return [_mode(log, command, piece, dead_time, start) for piece, start in zip(stretches, near, strict=True)]
+def _laplace(mode: Mode) -> Tensor:
+    """Log evidence of every window by Laplace's approximation [nats], up to a constant."""
+    return mode.log_prob + mode.scale.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
 
 
-def _laplace(mode: Mode) -> float:
-    """Log evidence by Laplace's approximation [nats], up to a constant."""
-    return float((mode.log_prob + mode.scale.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1))[0])
-
-
-def _evidence(log: Log, command: Command, stretches: list[slice], modes: list[Mode], tried: FloatArray) -> FloatArray:
+def _evidence(log: Log, command: Command, stretches: list[slice], modes: Mode, tried: FloatArray) -> FloatArray:
     """Log evidence ``(dead time,)`` [nats] over lag and gain, at the noise of the modes, summed over stretches."""
-    total = np.zeros(len(tried))
-    for piece, mode in zip(stretches, modes, strict=True):
-        density = _density(log, command, piece, tried.tolist())
-        start = mode.z.expand(len(tried), -1)
-        found = find_mode(
-            _AtNoise(density, start[:, 2:]), start=start[:, :2], from_values=True, iterations=25, tolerance=1e-3
-        )
-        total += (found.log_prob + found.scale.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)).numpy()
-    return total
+    density = _density(log, command, stretches, tried.tolist())
+    start = modes.z.repeat_interleave(len(tried), 0)
+    at_noise = _AtNoise(density, start[:, 2:])
+    found = find_mode(at_noise, start=start[:, :2], from_values=True, iterations=25, tolerance=1e-3)
+    return _laplace(found).reshape(len(stretches), -1).sum(0).numpy()
 
 
-def _density(log: Log, command: Command, piece: slice, tried: list[float]) -> LatentDensity:
-    """One stretch at several dead times, a window each.
+def _density(log: Log, command: Command, stretches: list[slice], tried: list[float]) -> LatentDensity:
+    """Every stretch at several dead times, a window each.
 
     The rows that the longest dead time leaves without a known command are masked for all, so that all explain the same
     rows.
     """
     known = command(GRID_S[-1])[1]
-    windows = LatentWindow.stack([_window(log, piece, command(x)[0], known) for x in tried])
-    return LatentDensity(windows).approximation()
+    each = [_window(log, piece, command(x)[0], known) for piece in stretches for x in tried]
+    return LatentDensity(LatentWindow.stack(each)).approximation()
 
 
 def _window(log: Log, piece: slice, u: FloatArray, known: BoolArray) -> LatentWindow:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from os import PathLike
 from statistics import fmean
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from avtorch.decision.dead_time import InferredDeadTime, infer_dead_time
+from avtorch.decision.kept_windows import KeptWindows, Place, estimated_work
 from avtorch.decision.monitor import Monitor
 from avtorch.decision.settings import Setting
 from avtorch.decision.watch import Watch, WatchedWindow
@@ -93,6 +97,7 @@ def estimate(
     dead_time: float | None = 0.0,
     progress: Callable[[int, int], None] | None = None,
     finished: Callable[[WatchedWindow], None] | None = None,
+    checkpoint: str | PathLike[str] | None = None,
     seed: int = 0,
     **inference: Any,
 ) -> Estimates:
@@ -103,6 +108,10 @@ def estimate(
     last of a segment may be short. Rows at standstill, with `engaged` 0 and in the 2 s after a return to `engaged` are
     masked; nothing is filtered through them. `progress(done, of)` is called with rows, `finished` with each window as
     it is done.
+
+    `checkpoint`, with the default monitor only: a file that an interrupted call leaves, and from which one with the
+    same log and options continues, to the same result to the bit; windows finished before the interruption come without
+    their draws. It is removed at the end.
 
     `estimator`: "sgld" samples each window's posterior by Langevin dynamics, "importance" by weighted draws; "auto" is
     "sgld" for the jerk form and "importance" for the latent one, whose gradients are dear. "map" takes the mode and its
@@ -116,7 +125,8 @@ def estimate(
     with it, and compares with `accepted` (T_L [s], K_L [-]).
 
     Raises `InputError` for a log without accel_cmd or without any row that counts, a form whose columns it lacks, a
-    window longer than the log, or an estimator that is not known or cannot take the form.
+    window longer than the log, or an estimator that is not known or cannot take the form;
+    and for a `checkpoint` that is damaged, belongs to other work or cannot be written.
 
     Example:
         >>> from avtorch import GLVDPlant, Leader, estimate, simulate
@@ -151,6 +161,8 @@ def estimate(
         dead_time = 0.0 if inferred is None or inferred.seconds >= window else inferred.seconds
     if estimator == "auto":
         estimator = "importance" if isinstance(chosen, LatentForm) else "sgld"
+    if checkpoint is not None and monitor is not None:
+        raise InputError("checkpoint: found with a monitor, whose thresholds it does not name; needs one of the two")
     monitor = Monitor(accepted=accepted, dead_time=dead_time) if monitor is None else monitor
     setting = Setting() if setting is None else setting
     if setting.shape != (1,):
@@ -162,34 +174,65 @@ def estimate(
     usable = torch.from_numpy(log.usable & known)
     signals = {name: torch.from_numpy(getattr(log, name)) for name in chosen.columns}
     signals["accel_cmd"] = torch.from_numpy(command)
-    windows: list[WatchedWindow] = []
-    last, ahead = -torch.inf, 0.0
+    name = "jerk" if isinstance(chosen, JerkForm) else "latent"
+    settings = {"window": window, "form": name, "dead_time": dead_time, "estimator": estimator, "seed": seed}
+    settings |= {"accepted": accepted, "mode": inference.get("mode")}
+    kept = KeptWindows(
+        checkpoint, {} if checkpoint is None else estimated_work(log, settings, watch.state_dict(), setting, inference)
+    )
+    windows, begin = kept.restored(watch, setting)
+    tell = (lambda _: None) if finished is None else finished
+    for w in windows:
+        tell(w)
+    try:
+        for place, seen in _fed(log, watch, setting, window, signals, usable, begin):
+            kept.keep(watch, seen, place)
+            windows += seen
+            for w in seen:
+                tell(w)
+            if progress is not None:
+                progress(place.row, log.rows)
+    except BaseException:
+        with suppress(InputError):  # report the first failure
+            kept.write()
+        raise
+    kept.remove()
+    seconds = (clock.perf_counter() - begun) / max(len(windows), 1)
+    T, K = (float(x[0]) for x in watch.monitor.accepted)
+    return Estimates(windows, seconds, name, quality, setting, estimator, (T, K), dead_time, inferred)
+
+
+def _fed(
+    log: Log,
+    watch: Watch,
+    setting: Setting,
+    window: float,
+    signals: dict[str, Tensor],
+    usable: Tensor,
+    place: Place,
+) -> Iterator[tuple[Place, list[WatchedWindow]]]:
+    """Feeds the log from `place` on, about a window at a time, so that progress can be reported and an interruption
+    handled; yields how far it came and the windows that were finished."""
+    row, last, ahead = place.row, place.last, place.ahead
+    many = min(1000, max(LEAST_ROWS, int(window * log.rate_hz)))
     for part in log.segments():
-        time = torch.from_numpy(log.elapsed[part])
+        if part.stop <= row:
+            continue
+        own = torch.from_numpy(log.elapsed[part])
         # a segment's clock may start anew, the stream's must go on
-        if float(time[0]) + ahead <= last:
-            ahead = last + window - float(time[0])
-        time = time + ahead
+        if row <= part.start and float(own[0]) + ahead <= last:
+            ahead = last + window - float(own[0])
+        time = own + ahead
         last = float(time[-1])
         later = ahead + float(log.elapsed[part.start] - log.time[part.start])
-        # about a window at a time, so that progress can be reported and an interruption handled
-        many = min(1000, max(LEAST_ROWS, int(window * log.rate_hz)))
-        for first in range(0, len(time), many):
+        for first in range(max(row - part.start, 0), len(time), many):
             block = slice(first, first + many)
             rows = {name: signal[part][block] for name, signal in signals.items()}
             seen = watch.feed(time[block], rows, setting, usable=usable[part][block])
             if first + many >= len(time):
                 seen += watch.flush(setting)
-            for w in seen:
-                windows.append(_on_the_logs_clock(w, later))
-                if finished is not None:
-                    finished(windows[-1])
-            if progress is not None:
-                progress(part.start + min(first + many, len(time)), log.rows)
-    seconds = (clock.perf_counter() - begun) / max(len(windows), 1)
-    name = "jerk" if isinstance(chosen, JerkForm) else "latent"
-    T, K = (float(x[0]) for x in watch.monitor.accepted)
-    return Estimates(windows, seconds, name, quality, setting, estimator, (T, K), dead_time, inferred)
+            place = Place(part.start + min(first + many, len(time)), last, ahead)
+            yield place, [_on_the_logs_clock(w, later) for w in seen]
 
 
 def _delayed(log: Log, dead_time: float) -> tuple[Array, Array]:

@@ -20,7 +20,7 @@ from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.density import Density
 from avtorch.inference.map import Mode, find_mode
-from avtorch.inference.pareto import RELIABLE, pareto_k
+from avtorch.inference.pareto import pareto_k, reliable
 
 
 @runtime_checkable
@@ -80,8 +80,12 @@ class WeightedDraws:
     effective: Float[Tensor, " window"]
 
     def converged(self, settings: ImportanceSettings) -> Bool[Tensor, " window"]:
-        """Where the weights are reliable and at least a quarter of the effective draws aimed at, ``(window,)`` bool."""
-        return (self.pareto_k < RELIABLE) & (self.effective >= 0.25 * settings.enough)
+        """Where the weights are reliable and at least half of the effective draws aimed at, ``(window,)`` bool.
+
+        With a quarter of them, and one threshold of ``pareto_k`` for any number of draws, intervals of 90 % of windows
+        near the thresholds held the truth in 85 %.
+        """
+        return (self.pareto_k < reliable(len(self.z))) & (self.effective >= 0.5 * settings.enough)
 
     def moments(self) -> tuple[Float[Tensor, "window parameter"], Float[Tensor, "window parameter parameter"]]:
         """Mean and covariance of ``z``."""

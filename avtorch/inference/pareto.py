@@ -13,6 +13,12 @@ RELIABLE = 0.7
 """Above this shape a mean weighted by the ratios is unreliable for any number of them (Vehtari et al. 2024)."""
 
 
+def reliable(draws: int) -> float:
+    """The shape up to which a mean weighted by this many ratios is reliable: of 512 draws 0.63, of 2154 or more
+    `RELIABLE` (Vehtari et al. 2024, section 3.2.3)."""
+    return min(1 - 1 / math.log10(draws), RELIABLE) if draws > 10 else -math.inf
+
+
 def pareto_k(log_ratio: Float[Tensor, "draw window"]) -> Float[Tensor, " window"]:
     """Shape ``k`` of the tail of ratios given by their logarithm ``(draw, window)``; returns ``(window,)``.
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from scipy.special import sici
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float
@@ -71,6 +70,9 @@ class Quadrature:
 
         It integrates the band-limited interpolant of the marginal, as accurate as the grid itself.
         """
+        # imported here, because few commands integrate and scipy.special takes a tenth of a second
+        from scipy.special import sici
+
         spacing = self.nodes[..., 1:2] - self.nodes[..., :1]
         distance = torch.pi * (values.log().unsqueeze(-1) - self.nodes) / spacing
         sine_integral = torch.from_numpy(sici(distance.numpy())[0])

@@ -102,10 +102,8 @@ def write_state(path: str | PathLike[str], state: Mapping[str, Any]) -> None:
     Raises:
         InputError: where the place cannot be written, or is a symlink, a folder or a device.
     """
-    content = io.BytesIO()
-    torch.save(dict(state), content)
     of = {key: state[key] for key in ("estimator", "form", "window", "vehicles")}
-    write_sealed(Path(path), content.getvalue(), schema=SCHEMA, of=of)
+    write_sealed(Path(path), packed(state), schema=SCHEMA, of=of)
 
 
 def read_state(path: str | PathLike[str]) -> dict[str, Any]:
@@ -115,6 +113,22 @@ def read_state(path: str | PathLike[str]) -> dict[str, Any]:
         InputError: for any file that is not exactly as written.
     """
     content = read_sealed_bytes(Path(path), schema=SCHEMA, most=MOST, remedy=_REMEDY).content
+    return unpacked(content, Path(path), _REMEDY)
+
+
+def packed(state: Mapping[str, Any]) -> bytes:
+    """Tensors and plain values as bytes."""
+    content = io.BytesIO()
+    torch.save(dict(state), content)
+    return content.getvalue()
+
+
+def unpacked(content: bytes, path: Path, remedy: str) -> dict[str, Any]:
+    """The inverse of :func:`packed`, for the content of the file at ``path``.
+
+    Raises:
+        Damaged: for anything else; the message ends with ``remedy``.
+    """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             # as torch writes it, so that a small file cannot unfold into a large one
@@ -124,4 +138,4 @@ def read_state(path: str | PathLike[str]) -> dict[str, Any]:
     # torch.load has no documented list of errors
     except Exception as fault:
         reason = (str(fault).splitlines() or [type(fault).__name__])[0][:100]
-        raise Damaged(f"{path}: holds no tensors and plain values ({reason}); {_REMEDY}") from None
+        raise Damaged(f"{path}: holds no tensors and plain values ({reason}); {remedy}") from None

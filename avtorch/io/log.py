@@ -23,7 +23,6 @@ from avtorch.io.formats import is_recording, open_recording
 from avtorch.io.mapping import PEDALS, SIGNALS, Pairs, SignalMap, pairs, read_mapping
 from avtorch.io.merged import Arrivals, merged
 from avtorch.io.segments import median_step, stretches
-from avtorch.io.standstill import standing
 from avtorch.io.tables import Table, read_table
 from avtorch.io.validity import check_units
 
@@ -228,6 +227,9 @@ class Log:
         moving = np.ones(self.rows, bool)
         if self.accel is None or self.accel_cmd is None:  # pedals alone do not tell a car at rest from one at speed
             return moving
+        # imported here: most logs have speed, and scipy.ndimage takes a quarter of a second
+        from avtorch.io.standstill import standing
+
         for part in self.engaged_segments():
             if part.stop - part.start > 1:
                 step = float(np.median(np.diff(self.elapsed[part])))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from avtorch import Leader, simulate
 from avtorch.cli import main
 from tests.pedals.cars import drive, plain
 
@@ -32,3 +33,17 @@ def test_a_speed_that_is_commanded_is_refused_in_one_line(tmp_path: Path, capsys
     error = capsys.readouterr().err
     assert "speed controller" in error
     assert error.count("\n") == 1
+
+
+def test_a_map_of_an_earlier_log_does_not_stay_beside_an_answer_without_one(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    kept = out / "notes.csv"
+    left = [out / name for name in ("pedal_map.csv", "accel_map.csv", "brake_map.csv", "pedal_map.png")]
+    for path in (*left, kept):
+        path.write_text("of the earlier log\n")
+    run = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02))
+    run.log().write(tmp_path / "lap.csv")
+    assert main(["estimate", str(tmp_path / "lap.csv"), "--estimator", "map", "--quiet", "--out", str(out)]) == 0
+    assert not any(path.exists() for path in left)
+    assert kept.exists()

@@ -77,10 +77,15 @@ def test_the_same_seed_gives_the_same_draws(fresh_seed: int) -> None:
 
 
 def test_heavy_weights_are_not_claimed() -> None:
-    z, weight = torch.zeros(4, 3, 2, dtype=torch.float64), torch.full((4, 3), 0.25, dtype=torch.float64)
-    shape, effective = torch.tensor([0.5, 0.8, 0.5]), torch.tensor([400.0, 400.0, 20.0])
-    found = WeightedDraws(z, weight, shape, effective).converged(ImportanceSettings())
-    assert found.tolist() == [True, False, False]
+    shape, effective = torch.tensor([0.6, 0.8, 0.5, 0.65]), torch.tensor([400.0, 400.0, 150.0, 400.0])
+    # a shape of 0.65 needs a thousand draws or more
+    for count, claimed in ((512, [True, False, False, False]), (4096, [True, False, False, True])):
+        z, weight = (
+            torch.zeros(count, 4, 2, dtype=torch.float64),
+            torch.full((count, 4), 1 / count, dtype=torch.float64),
+        )
+        found = WeightedDraws(z, weight, shape, effective).converged(ImportanceSettings())
+        assert found.tolist() == claimed
 
 
 @pytest.mark.parametrize("change", [{"draws": 255}, {"draws": 10}, {"rounds": 0}, {"enough": 0.0}, {"width": -1.0}])

@@ -88,7 +88,7 @@ class DeadTime(Effect):
         """Uneven steps: up to three commands act in one step; the last two are averaged."""
         time, dt = row.time, row.dt
         ends = torch.cat([time[1:], (time[-1] + dt[-1]).reshape(1)])
-        first = torch.searchsorted(time, (time - delay).detach().contiguous(), right=True) - 1
+        first = torch.searchsorted(time.contiguous(), (time - delay).detach().contiguous(), right=True) - 1
         last = len(time) - 1
         until = [ends[(first + i).clamp(0, last)] + delay - time for i in range(2)]
         first_part = torch.minimum(until[0].clamp_min(0.0), dt)

@@ -410,3 +410,17 @@ def test_effects_report_wrong_values() -> None:
     with pytest.raises(InputError, match="no_such"):
         gap.effect_class("no_such")
     assert isinstance(plant([gap.DeadTime]), GapPlant)
+
+
+def test_a_clock_in_a_column_of_a_table_warns_of_nothing(recwarn: pytest.WarningsRecorder) -> None:
+    """Uneven times that lie apart in memory, as those of a row-wise table do."""
+    table = torch.rand(50, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).add(0.5).cumsum(0) * 0.01
+    time, command = table[:, 0], table[:, 1]
+    torch.set_warn_always(True)  # torch says it once in a process
+    try:
+        late = plant([gap.DeadTime(0.05)]).response(SimulatorInput(time, command)).accel
+    finally:
+        torch.set_warn_always(False)
+    assert not recwarn.list
+    same = plant([gap.DeadTime(0.05)]).response(SimulatorInput(time.contiguous(), command)).accel
+    assert torch.equal(late, same)

@@ -1,0 +1,141 @@
+"""`avtorch estimate` interrupted or killed, and given again: the answer of an uninterrupted run, to the bit."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import avtorch.results
+from avtorch.cli import main
+from avtorch.cli.finished_windows import NAME
+from avtorch.cli.resume import WINDOWS
+from avtorch.decision import kept_windows
+from avtorch.io import Log
+
+
+def two_segments(path: Path) -> str:
+    """18 s of speed at 50 Hz in two segments of 10 and 8 s, the second on a clock that starts anew."""
+    dt, rng = 0.02, np.random.default_rng(5)
+    command = np.repeat(rng.normal(0.0, 1.0, 36), 25)
+    accel = np.convolve(command, np.exp(-np.arange(0, 2, dt) / 0.3) * dt / 0.3)[: len(command)]
+    speed = 15.0 + np.cumsum(accel) * dt + 0.01 * rng.standard_normal(len(command))
+    segment = (np.arange(len(command)) > 499).astype(float)
+    time = np.where(segment == 0, np.arange(len(command)), np.arange(len(command)) - 500) * dt
+    Log.from_arrays(time=time, accel_cmd=command, speed=speed, segment=segment).write(path)
+    return str(path)
+
+
+def answer(out: Path) -> dict[str, Any]:
+    found = json.loads((out / "estimates.json").read_text(encoding="utf-8"))
+    found.pop("seconds_per_window")  # a measured time
+    return found
+
+
+@pytest.fixture
+def interrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> tuple[list[str], Path]:
+    """A command that was interrupted at its sixth window, and its folder."""
+    line = ["estimate", two_segments(tmp_path / "drive.csv"), "--quiet", "--dead-time", "0"]
+    out, count, entry = tmp_path / "out", 0, avtorch.results.window_entry
+
+    def stop(*args: Any) -> dict[str, Any]:
+        nonlocal count
+        count += 1
+        if count == 6:
+            raise KeyboardInterrupt
+        return entry(*args)
+
+    with monkeypatch.context() as until:
+        until.setattr(avtorch.results, "window_entry", stop)
+        assert main([*line, "--out", str(out)]) == 130
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert f"interrupted; no answer was written; finished windows are kept in {out / WINDOWS}" in told
+    assert "the same command resumes there" in told
+    return line, out
+
+
+def test_the_same_command_goes_on_to_the_same_answer(interrupted: tuple[list[str], Path], tmp_path: Path) -> None:
+    line, out = interrupted
+    with (out / NAME).open("a", encoding="utf-8") as torn:  # killed in the middle of a line
+        torn.write('{"start_s": 10.0, "end_')
+    assert main([*line, "--out", str(out)]) == 0
+    assert main([*line, "--out", str(tmp_path / "whole")]) == 0
+    assert answer(out) == answer(tmp_path / "whole")
+    used = [w["used"] for w in answer(out)["windows"]]
+    assert sum(used) > 5, "the belief has to be carried over the interruption"
+    assert not (out / WINDOWS).exists()
+    assert not (out / NAME).exists()
+
+
+def test_windows_done_before_are_not_computed_again(
+    interrupted: tuple[list[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line, out = interrupted
+    fed: list[float] = []
+    feed = kept_windows.Watch.feed
+    monkeypatch.setattr(
+        kept_windows.Watch, "feed", lambda self, time, *a, **k: (fed.append(len(time)), feed(self, time, *a, **k))[1]
+    )
+    assert main([*line, "--out", str(out)]) == 0
+    assert 0 < sum(fed) < 900 - 600, "a row of the six windows that were finished was fed again"
+
+
+def test_a_killed_run_goes_on_from_what_was_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    line = ["estimate", two_segments(tmp_path / "drive.csv"), "--quiet", "--dead-time", "0"]
+    monkeypatch.setattr(kept_windows, "EVERY_S", 0.0)
+    out, killed, seen, entry = tmp_path / "out", tmp_path / "killed", [], avtorch.results.window_entry
+
+    def copied(*args: Any) -> dict[str, Any]:
+        seen.append(args)
+        if len(seen) == 3:
+            killed.mkdir()
+            shutil.copy(out / WINDOWS, killed)
+        return entry(*args)
+
+    with monkeypatch.context() as until:
+        until.setattr(avtorch.results, "window_entry", copied)
+        assert main([*line, "--out", str(out)]) == 0
+    assert main([*line, "--out", str(killed)]) == 0
+    assert answer(killed) == answer(out)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [(["--seed", "1"], "seed 0"), (["--window", "1"], "window 2.0"), (["--tau", "1.2"], "other settings")],
+)
+def test_other_settings_are_refused_in_one_line(
+    interrupted: tuple[list[str], Path], capsys: pytest.CaptureFixture[str], more: list[str], words: str
+) -> None:
+    line, out = interrupted
+    capsys.readouterr()
+    assert main([*line, *more, "--out", str(out)]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert f"{out / WINDOWS}: was begun with {words}; needs the same log and settings" in told
+    assert "avtorch estimate --no-resume" in told
+    assert main([*line, *more, "--no-resume", "--out", str(out)]) == 0
+
+
+def test_another_log_of_the_same_name_is_refused(
+    interrupted: tuple[list[str], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    line, out = interrupted
+    path = Path(line[1])
+    path.write_text(path.read_text(encoding="utf-8").replace("15.0", "15.1", 1), encoding="utf-8")
+    assert main([*line, "--out", str(out)]) == 2
+    assert "was begun with another log (" in capsys.readouterr().err
+
+
+def test_a_damaged_file_is_refused(interrupted: tuple[list[str], Path], capsys: pytest.CaptureFixture[str]) -> None:
+    line, out = interrupted
+    content = (out / WINDOWS).read_bytes()
+    (out / WINDOWS).write_bytes(content[: len(content) // 2])
+    assert main([*line, "--out", str(out)]) == 2
+    assert "is damaged" in capsys.readouterr().err
