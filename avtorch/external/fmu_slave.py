@@ -93,16 +93,23 @@ class AvtorchBlock(Fmi2Slave):
         self.register_variable(seed, nested=False)
 
     def to_xml(self, model_options: Any = ()) -> Element:
-        """The model description with the units, which pythonfmu does not know."""
+        """The model description, with what pythonfmu leaves out."""
         root = super().to_xml({"canHandleVariableCommunicationStepSize": self._dt is None, **dict(model_options)})
         definitions = Element("UnitDefinitions")
         for name, powers in _BASE.items():
             SubElement(SubElement(definitions, "Unit", name=name), "BaseUnit", powers)
         root.insert(1, definitions)
         for variable in root.iter("ScalarVariable"):
-            unit = self._units.get(variable.attrib["name"])
+            name = variable.attrib["name"]
+            if name in self._values:
+                variable[0].set("start", repr(self._values[name]))  # 16 digits do not hold every number
+            unit = self._units.get(name)
             if unit in _BASE:
                 variable[0].set("unit", unit)
+        structure = root.find("ModelStructure")
+        if structure is not None:  # what an initialised FMU computes: all outputs, which pythonfmu does not list
+            unknowns = SubElement(structure, "InitialUnknowns")
+            unknowns.extend(Element("Unknown", output.attrib) for output in structure.iterfind("Outputs/Unknown"))
         return root
 
     # drives --------------------------------------------------------------------------------------------------------
