@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from avtorch.arrays import FloatArray, IntArray
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.external.fmu_child import FmuProcess
 from avtorch.external.fmu_variables import SIGNALS, STARTS, Variable, ports
@@ -197,7 +197,7 @@ class FmuSimulator:
                 f"accel_cmd, dt: found shapes {command.shape} and {steps.shape}, needs (row,), and one step or as many"
             )
         steps = np.broadcast_to(steps, command.shape)
-        self._lengths(steps, None)  # before the FMU starts
+        self._parts(steps, None)  # before the FMU starts
         self.reset(speed=speed, accel=accel)
         return self._advance(command, steps)
 
@@ -206,7 +206,7 @@ class FmuSimulator:
             raise InputError(f"{place(self.path)}: no drive is under way; needs reset first")
         if not np.isfinite(command).all():
             raise InputError(f"accel_cmd: found {command[~np.isfinite(command)][0]}, needs finite numbers")
-        length, count = self._lengths(dt, self._step)
+        length, count = self._parts(dt, self._step)
         if not len(command):
             return command.copy(), command.copy()
         self._step = float(dt[0])
@@ -214,33 +214,29 @@ class FmuSimulator:
         shown = self._shared.process().ask({"rows": len(command)}, numbers).reshape(2, -1)
         return shown[0] * self._ports["accel"].factor, shown[1] * self._ports["speed"].factor
 
-    def _lengths(self, dt: FloatArray, before: float | None) -> tuple[FloatArray, IntArray]:
+    def _parts(self, dt: FloatArray, before: float | None) -> tuple[FloatArray, FloatArray]:
         """Length [s] and number of the FMU's steps in each step of the log."""
         if not (able := np.isfinite(dt) & (dt > 0)).all():
             raise InputError(f"dt: found {dt[~able][0]:g} s, needs finite steps above 0 s")
         h, free = self._listing["step"], self._listing["variable_step"]
         if h is None:
-            alike = dt[0] if before is None and len(dt) else before
-            if not free and len(dt) and (np.abs(dt - alike) > _WHOLE * dt).any():
+            steps = dt if before is None else np.append(dt, before)
+            if not free and len(steps) and np.ptp(steps) > _WHOLE * steps[-1]:
                 raise InputError(
-                    f"dt: found steps from {min(dt.min(), alike):g} to {max(dt.max(), alike):g} s; {place(self.path)} "
-                    "needs steps that are all alike, such as a resampled log's"
+                    f"dt: found steps from {steps.min():g} to {steps.max():g} s; {place(self.path)} needs steps that "
+                    "are all alike, such as a resampled log's"
                 )
-            return dt, np.ones(len(dt), dtype=np.int64)
-        whole = np.maximum(np.rint(dt / h), 1.0)
-        off = np.abs(dt - whole * h) > _WHOLE * dt
-        if not off.any():
-            return np.full(len(dt), h), whole.astype(np.int64)
-        if not free:
-            found = dt[off][0]
-            down = h * max(math.floor(found / h), 1)
-            up = down + h
+            return dt, np.ones_like(dt)
+        count = np.maximum(np.rint(dt / h), 1.0)
+        off = np.abs(dt - count * h) > _WHOLE * dt
+        if off.any() and not free:
+            down = h * max(math.floor(dt[off][0] / h), 1)
             raise InputError(
-                f"dt: found {found:g} s; {place(self.path)} takes steps of {h:g} s, needs a whole number of them, such "
-                f"as {down:g} or {up:g} s"
+                f"dt: found {dt[off][0]:g} s; {place(self.path)} takes steps of {h:g} s, needs a whole number of them, "
+                f"such as {down:g} or {down + h:g} s"
             )
-        count = np.where(off, np.ceil(dt / h), whole)
-        return np.where(off, dt / count, h), count.astype(np.int64)
+        count = np.where(off, np.ceil(dt / h), count)
+        return np.where(off, dt / count, h), count
 
     # its process ---------------------------------------------------------------------------------------------------
     def close(self) -> None:

@@ -13,8 +13,8 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +34,11 @@ class FmuProcess:
 
     def __init__(self, path: Path, source: str, step_seconds: float) -> None:
         self.source = source
-        self._seconds = step_seconds
-        self._late = False
         folder = tempfile.TemporaryDirectory(prefix="avtorch_fmu_", ignore_cleanup_errors=True)
         clock = Path(folder.name, "clock")
         clock.write_bytes(np.array([NOT_RUNNING]).tobytes())
         with clock.open("rb") as file:
-            self._clock = memoryview(mmap.mmap(file.fileno(), 8, access=mmap.ACCESS_READ)).cast("d")
+            view = memoryview(mmap.mmap(file.fileno(), 8, access=mmap.ACCESS_READ)).cast("d")
         unpacked = Path(folder.name, "fmu")
         unpacked.mkdir()
         # -P: nothing of the folder that the user happens to work in; a file, as its package would load PyTorch
@@ -58,15 +56,17 @@ class FmuProcess:
             )
         except (OSError, ValueError) as fault:
             raise InputError(f"{self.source}: no process can be started to run it ({fault})") from None
-        self._finish = weakref.finalize(self, _end, self._process, folder)
-        try:
-            self.listing: dict[str, Any] = self._answer(OPENING_SECONDS)
-        except BaseException:
-            self.end()
-            raise
-        if "refused" in self.listing:
-            self.end()
-            raise InputError(self.listing["refused"])
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._requests, self._answers = self._process.stdin, self._process.stdout
+        self._watch = _Watch(self._process, view)
+        self._finish = weakref.finalize(self, _end, self._process, self._watch, folder)
+        self._watch.start()
+        with self._watched(OPENING_SECONDS):
+            self.listing: dict[str, Any] = self._answer()
+            if "refused" in self.listing:
+                raise InputError(self.listing["refused"])
+        self._seconds = step_seconds
 
     @property
     def alive(self) -> bool:
@@ -74,57 +74,43 @@ class FmuProcess:
 
     def ask(self, request: dict[str, Any], numbers: FloatArray | None = None) -> FloatArray:
         """The numbers that answer a request. Raises InputError naming the simulated time, and ends the process."""
-        try:
-            return self._asked(request, numbers)
-        except BaseException:  # an interruption, too: the rest of the answer would be taken for the next one
-            self.end()
-            raise
-
-    def _asked(self, request: dict[str, Any], numbers: FloatArray | None) -> FloatArray:
-        stream = self._process.stdin
-        assert stream is not None
-        with suppress(OSError):  # where it has ended, the answer tells how
-            stream.write(json.dumps(request).encode() + b"\n")
-            if numbers is not None:
-                stream.write(np.ascontiguousarray(numbers, dtype=np.float64).tobytes())
-            stream.flush()
-        answer = self._answer(self._seconds)
-        if "error" in answer:
-            raise self._failed(answer["error"])
-        raw = self._within(lambda stream: stream.read(8 * answer["numbers"]), self._seconds)
-        if len(raw) != 8 * answer["numbers"]:
-            raise self._ended(self._seconds)
+        with self._watched(self._seconds):
+            with suppress(OSError):  # where it has ended, the answer tells how
+                self._requests.write(json.dumps(request).encode() + b"\n")
+                if numbers is not None:
+                    self._requests.write(np.ascontiguousarray(numbers, dtype=np.float64).tobytes())
+                self._requests.flush()
+            answer = self._answer()
+            if "error" in answer:
+                raise self._failed(answer["error"])
+            raw = self._answers.read(8 * answer["numbers"])
+            if len(raw) != 8 * answer["numbers"]:
+                raise self._ended()
         return np.frombuffer(raw, dtype=np.float64).copy()
 
-    def _answer(self, seconds: float) -> dict[str, Any]:
+    @contextmanager
+    def _watched(self, seconds: float) -> Iterator[None]:
+        """Within it the process is ended when its clock stands still for `seconds`; and by any error, an interruption
+        too, after which the rest of an answer would be taken for the next one."""
+        self._watch.begin(seconds)
         try:
-            return json.loads(self._within(lambda stream: stream.readline(), seconds))
-        except ValueError:
-            raise self._ended(seconds) from None
-
-    def _within(self, read: Callable[[Any], bytes], seconds: float) -> bytes:
-        """What `read` takes of the answer; the process is ended when its clock stands still for `seconds`."""
-        done = threading.Event()
-
-        def watch() -> None:
-            shown, since = math.nan, time.monotonic()
-            while not done.wait(min(seconds / 8, 1.0)):
-                if self._clock[0] != shown:
-                    shown, since = self._clock[0], time.monotonic()
-                elif time.monotonic() - since > seconds:
-                    self._late = True
-                    _kill(self._process)
-                    return
-
-        threading.Thread(target=watch, daemon=True).start()
-        try:
-            return read(self._process.stdout)
+            yield
+        except BaseException:
+            self.end()
+            raise
         finally:
-            done.set()
+            self._watch.rest()
 
-    def _ended(self, seconds: float) -> InputError:
-        if self._late:
-            return self._failed(f"it does not answer within {seconds:g} s; a longer step_seconds gives it more")
+    def _answer(self) -> dict[str, Any]:
+        try:
+            return json.loads(self._answers.readline())
+        except ValueError:
+            raise self._ended() from None
+
+    def _ended(self) -> InputError:
+        if self._watch.late:
+            within = f"{self._watch.seconds:g} s"
+            return self._failed(f"it does not answer within {within}; a longer step_seconds gives it more")
         _kill(self._process)
         code = self._process.wait()
         how = f"status {code}"
@@ -133,13 +119,47 @@ class FmuProcess:
         return self._failed(f"it ended the process that ran it ({how})")
 
     def _failed(self, what: str) -> InputError:
-        at = self._clock[0]
+        at = self._watch.clock[0]
         when = "before the first step" if at == NOT_RUNNING else f"in the step that begins at {at:.6g} s of the drive"
         return InputError(f"{self.source}: {when}: {what}")
 
     def end(self) -> None:
         """End the process, and leave nothing of it."""
         self._finish()
+
+
+class _Watch(threading.Thread):
+    """Ends a process whose clock stands still while it owes an answer; one thread, as starting one takes longer than a
+    step."""
+
+    def __init__(self, process: subprocess.Popen, clock: memoryview[float]) -> None:
+        super().__init__(daemon=True)
+        self.clock = clock
+        self.seconds = OPENING_SECONDS
+        self.late = False
+        self._process = process
+        self._asked, self._owes = 0, False
+        self._over = threading.Event()
+
+    def begin(self, seconds: float) -> None:
+        self.seconds, self._asked, self._owes = seconds, self._asked + 1, True
+
+    def rest(self) -> None:
+        self._owes = False
+
+    def end(self) -> None:
+        self._over.set()
+
+    def run(self) -> None:
+        shown, since = (0, math.nan), time.monotonic()
+        while not self._over.wait(min(self.seconds / 8, 1.0)):
+            now = (self._asked, self.clock[0])
+            if not self._owes or now != shown:
+                shown, since = now, time.monotonic()
+            elif time.monotonic() - since > self.seconds:
+                self.late = True
+                _kill(self._process)
+                return
 
 
 def _kill(process: subprocess.Popen) -> None:
@@ -150,7 +170,8 @@ def _kill(process: subprocess.Popen) -> None:
             process.kill()
 
 
-def _end(process: subprocess.Popen, folder: tempfile.TemporaryDirectory) -> None:
+def _end(process: subprocess.Popen, watch: _Watch, folder: tempfile.TemporaryDirectory) -> None:
+    watch.end()
     _kill(process)
     process.wait()
     for stream in (process.stdin, process.stdout):

@@ -172,11 +172,11 @@ class RunningFmu:
             get()
         return [float(cell[0]) for _, cell in self._gets]
 
-    def drive(self, command: FloatArray, length: FloatArray, count: FloatArray, clock: memoryview) -> FloatArray:
+    def drive(self, command: FloatArray, length: FloatArray, count: FloatArray, clock: memoryview[float]) -> FloatArray:
         """Hold each command over `count` steps of `length` [s]; the outputs at the end of each (output, row)."""
         shown = np.empty((len(self._gets), len(command)))
         for k, (u, h, n) in enumerate(zip(command.tolist(), length.tolist(), count.astype(int).tolist(), strict=True)):
-            self._command[0] = u
+            self._command[0], clock[0] = u, self._time
             self._set()
             for _ in range(n):
                 clock[0] = self._time
@@ -208,7 +208,7 @@ class RunningFmu:
 
 def _variable(v: Any, units: dict[str, Any]) -> dict[str, Any]:
     unit = v.unit or (v.declaredType.unit if v.declaredType is not None else None)
-    base = units.get(unit)
+    base = units.get(unit or "")
     powers = {name: getattr(base, name) for name in ("kg", "m", "s", "A", "K", "mol", "cd", "rad")} if base else None
     return {
         "name": v.name,
@@ -240,15 +240,15 @@ def reason(fault: Exception) -> str:
     return printable(text.removesuffix(".") if kind == "FMICallException" else f"{kind}: {text}", 160)
 
 
-def serve(fmu: RunningFmu, requests: BinaryIO, out: BinaryIO, clock: memoryview) -> None:
+def serve(fmu: RunningFmu, requests: BinaryIO, out: BinaryIO, clock: memoryview[float]) -> None:
     """Answer each of the requests; an error ends it, for nothing is certain of an FMU after one."""
     for line in requests:
         request = json.loads(line)
         try:
             if "rows" in request:
                 rows = request["rows"]
-                numbers = np.frombuffer(requests.read(24 * rows)).reshape(3, rows)
-                shown = fmu.drive(*numbers, clock)
+                command, length, count = np.frombuffer(requests.read(24 * rows)).reshape(3, rows)
+                shown = fmu.drive(command, length, count, clock)
             else:
                 shown = np.array(fmu.reset(**request))
         except Exception as fault:

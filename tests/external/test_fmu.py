@@ -15,6 +15,7 @@ import pytest
 
 from avtorch import InputError
 from avtorch.external import FmuSimulator, Simulator
+from avtorch.io.mapping import read_mapping
 from tests.external import fmus
 
 DT = 0.02
@@ -153,6 +154,11 @@ def test_a_name_that_is_given_decides(build: Build, way: str) -> None:
     np.testing.assert_allclose(
         driven(build.open(path, **arguments), accel=0.0), expected(accel=0.0, drag=4e-4), **CLOSE
     )
+
+
+def test_a_log_is_read_beside_the_names_of_an_fmu(tmp_path: Path) -> None:
+    (tmp_path / "lap.toml").write_text("[map]\naccel = 'ACC_X'\n[fmu]\naccel = 'y1'\n[fmu.unit]\naccel = 'g'\n")
+    assert read_mapping(tmp_path / "lap.csv").column == {"accel": "ACC_X"}
 
 
 @pytest.mark.parametrize(

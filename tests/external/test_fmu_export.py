@@ -52,10 +52,9 @@ def response(car: GapPlant, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     "effects",
     [
         [DeadTime(0.13), SensorLag(0.2), SensorBias(0.1), AerodynamicDrag(4e-4)],
-        [SecondOrderActuator()],
-        [RateLimit(2.0)],
+        [SecondOrderActuator(), RateLimit(4.0)],
     ],
-    ids=["chain", "second order", "rate limit"],
+    ids=["chain", "actuator"],
 )
 def test_the_whole_car_is_the_plant(effects: Sequence[Effect], tmp_path: Path) -> None:
     car = plant(effects, K_L=0.8)
