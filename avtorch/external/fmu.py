@@ -31,9 +31,9 @@ class FmuSimulator:
 
     `names`: the FMU's variables by signal: `accel_cmd`, `accel`, `speed`, and `speed0`, `accel0` for the start of a
     drive; `unit`: units by signal, where the FMU states none or a wrong one. Both may stand in a TOML file, in the
-    tables `[fmu]` and `[fmu.unit]`: `mapping` names it, and by default it is the one beside the FMU (`car.toml` beside
-    `car.fmu`). A signal without a name is the variable that has the signal's own name, or the only one that it can be
-    by causality, unit and name. `notes` says what was taken for what.
+    tables `[fmu]` and `[fmu.unit]`: the one beside the FMU (`car.toml` beside `car.fmu`), overruled by the one that
+    `mapping` names. A signal without a name is the variable that has the signal's own name, or the only one that it can
+    be by causality, unit and name. `notes` says what was taken for what.
 
     Start: where `speed0` and `accel0` are mapped, or the FMU lets the start values of its two outputs be set, a drive
     begins at the speed and acceleration asked for; otherwise at the FMU's own, which `notes` then says. The command is
@@ -43,8 +43,8 @@ class FmuSimulator:
     of the log's step, none longer than its own.
 
     It runs in a process of its own. A crash, an error, an answer that is not finite, or a step that takes longer than
-    `step_seconds` ends that process and is an InputError that names the simulated time; the next `reset` starts
-    another. `close`, or leaving a `with` block, ends it for good.
+    `step_seconds` (120 s to begin a drive) ends that process and is an InputError that names the simulated time; the
+    next `reset` starts another. `close`, or leaving a `with` block, ends it for good.
 
     Raises InputError for what is no FMU with co-simulation for this machine, for a signal that is not found or may be
     several variables (with the candidates), for a unit of another quantity, and without `pip install 'avtorch[fmu]'`.
@@ -280,19 +280,22 @@ class _Shared:
 
 
 def _told(path: Path, mapping: str | os.PathLike[str] | None) -> tuple[dict[str, str], dict[str, str]]:
-    """Names and units by the TOML file that was named, or that lies beside the FMU."""
-    file = mapping_beside(path) if mapping is None else Path(mapping)
-    if file is None:
-        return {}, {}
-    table = read_toml(file, links=mapping is not None).get("fmu", {})
-    here = f"{place(file)}: [fmu]"
-    if not isinstance(table, dict):
-        raise InputError(f"{place(file)}: fmu is no table; write [fmu] and its lines below")
-    names = {key: value for key, value in table.items() if key != "unit"}
-    units = table.get("unit", {})
-    if not isinstance(units, dict):
-        raise InputError(f"{here} unit: is no table; write [fmu.unit] and its lines below")
-    return _known(here, names, (*SIGNALS, *STARTS)), _known(f"{place(file)}: [fmu.unit]", units, SIGNALS)
+    """Names and units by the TOML file beside the FMU, overruled by the one that was named."""
+    names: dict[str, str] = {}
+    units: dict[str, str] = {}
+    for file, links in ((mapping_beside(path), False), (mapping, True)):
+        if file is None:
+            continue
+        here, table = f"{place(file)}: ", read_toml(file, links=links).get("fmu", {})
+        if not isinstance(table, dict):
+            raise InputError(f"{here}fmu is no table; write [fmu] and its lines below")
+        inner = table.get("unit", {})
+        if not isinstance(inner, dict):
+            raise InputError(f"{here}[fmu] unit is no table; write [fmu.unit] and its lines below")
+        own = {key: value for key, value in table.items() if key != "unit"}
+        names |= _known(f"{here}[fmu]", own, (*SIGNALS, *STARTS))
+        units |= _known(f"{here}[fmu.unit]", inner, SIGNALS)
+    return names, units
 
 
 def _known(where: str, given: Mapping[str, Any] | None, signals: tuple[str, ...]) -> dict[str, str]:

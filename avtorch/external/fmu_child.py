@@ -26,7 +26,7 @@ from avtorch.external import fmu_process
 from avtorch.external.fmu_process import NOT_RUNNING
 
 OPENING_SECONDS = 120.0
-"""For unpacking and loading: hundreds of MB take seconds, starting the tool behind an FMU can take a minute."""
+"""For unpacking, for loading and for the begin of a drive: starting the tool behind an FMU can take a minute."""
 
 
 class FmuProcess:
@@ -73,8 +73,9 @@ class FmuProcess:
         return self._finish.alive
 
     def ask(self, request: dict[str, Any], numbers: FloatArray | None = None) -> FloatArray:
-        """The numbers that answer a request. Raises InputError naming the simulated time, and ends the process."""
-        with self._watched(self._seconds):
+        """The numbers that answer a request: for steps, with their `numbers`, or to begin a drive. Raises InputError
+        naming the simulated time, and ends the process."""
+        with self._watched(OPENING_SECONDS if numbers is None else self._seconds):
             with suppress(OSError):  # where it has ended, the answer tells how
                 self._requests.write(json.dumps(request).encode() + b"\n")
                 if numbers is not None:
@@ -109,8 +110,8 @@ class FmuProcess:
 
     def _ended(self) -> InputError:
         if self._watch.late:
-            within = f"{self._watch.seconds:g} s"
-            return self._failed(f"it does not answer within {within}; a longer step_seconds gives it more")
+            more = "" if self._watch.seconds == OPENING_SECONDS else "; a longer step_seconds gives it more"
+            return self._failed(f"it does not answer within {self._watch.seconds:g} s{more}")
         _kill(self._process)
         code = self._process.wait()
         how = f"status {code}"

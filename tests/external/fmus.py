@@ -21,7 +21,7 @@ START = {
     "accel_scale": 1.0, "speed_scale": 1.0, "only_step": 0.0, "fault": 0,
 }  # fmt: skip
 """Variables by their references, in order."""
-NONE, ERROR, NAN, HANG, CRASH, EXIT = range(6)
+NONE, ERROR, NAN, HANG, CRASH, EXIT, HANG_AT_START = range(7)
 
 _SOURCE = r"""
 #include <math.h>
@@ -34,7 +34,10 @@ typedef struct { double x[COUNT], a, slope, v; void *log, *env; } Car;
 static Car *made(void) { Car *c = calloc(1, sizeof(Car)); memcpy(c->x, start, sizeof start); return c; }
 static void show(Car *c) { c->x[A] = c->a * c->x[ACCEL_SCALE]; c->x[V] = c->v * c->x[SPEED_SCALE]; }
 static void begin(Car *c) {
-    c->v = c->x[V0] / c->x[SPEED_SCALE]; c->a = c->x[A0] / c->x[ACCEL_SCALE]; c->slope = 0; show(c);
+    double *x = c->x; /* by the outputs' own start values, where one is set */
+    c->v = (x[V] ? x[V] : x[V0]) / x[SPEED_SCALE]; c->a = (x[A] ? x[A] : x[A0]) / x[ACCEL_SCALE]; c->slope = 0;
+    show(c);
+    if (x[FAULT] == 6) for (volatile int on = 1; on;) {}
 }
 static int step(Car *c, double t, double h) {
     double *x = c->x, u = x[U] / x[ACCEL_SCALE], w = x[OMEGA];

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from avtorch import InputError
-from avtorch.external import FmuSimulator, Simulator
+from avtorch.external import FmuSimulator, Simulator, fmu_child
 from avtorch.io.mapping import read_mapping
 from tests.external import fmus
 
@@ -132,6 +132,16 @@ def test_outputs_are_found_by_their_units(build: Build) -> None:
     np.testing.assert_allclose(driven(build.open(build.fmu(given=given))), expected(), **CLOSE)
 
 
+@pytest.mark.parametrize(("name", "unit", "how"), [("y", "m/s2", "unit"), ("accel_request", None, "name")])
+def test_of_several_inputs_the_one_that_fits_is_taken(build: Build, name: str, unit: str | None, how: str) -> None:
+    given = fmus.variables(names={"u": name}, units={"u": unit})
+    given["drag"] |= {"causality": "input", "variability": None, "initial": None}
+    car = build.open(build.fmu(given=given))
+    assert any(note.startswith(f"accel_cmd: variable {name!r} (by its {how})") for note in car.notes)
+    assert "inputs that keep their start values: drag" in car.notes
+    np.testing.assert_allclose(driven(car), expected(), **CLOSE)
+
+
 def test_several_that_may_be_meant_are_listed(build: Build) -> None:
     with pytest.raises(
         InputError, match=r"accel may be several .*: y1 \[m/s2\], y2 \[m/s\], drag \[m/s2\]; needs names="
@@ -181,7 +191,7 @@ def test_a_name_that_does_not_fit_is_refused(build: Build, names: dict[str, str]
     [
         ("fmu = 3", r"car\.toml: fmu is no table"),
         ("[fmu]\nspeed = 3", r"car\.toml: \[fmu\] speed: is a int"),
-        ("[fmu]\nunit = 'g'", r"\[fmu\] unit: is no table"),
+        ("[fmu]\nunit = 'g'", r"\[fmu\] unit is no table"),
         ("[fmu.unit]\nspeed = 'furlong'", r"speed=furlong: not known"),
         ("[fmu]\nspee = 'v'", r"\[fmu\] spee: not known"),
     ],
@@ -208,6 +218,15 @@ def test_a_start_that_cannot_be_set_is_the_fmus_own_and_told(build: Build) -> No
     assert "speed: the FMU begins at 3 m/s, the drive at 20 m/s" in car.notes
     driven(car, speed=3.0)
     assert not any("the FMU begins" in note for note in car.notes)
+
+
+def test_outputs_with_start_values_are_started_by_them(build: Build, fmi: int) -> None:
+    given = fmus.variables(units={"v": "km/h"})
+    for name in ("a", "v"):
+        given[name] |= {"initial": "exact", "start": 0.0}
+    car = build.open(build.fmu(fmi, given), names={}).with_parameters({"speed_scale": 3.6})
+    np.testing.assert_allclose(driven(car), expected(), **CLOSE)
+    assert "speed0: variable 'v' (its start value), in km/h" in car.notes
 
 
 # steps -------------------------------------------------------------------------------------------------------------
@@ -301,6 +320,13 @@ def test_a_failure_names_its_time_and_the_next_drive_is_a_new_one(
     with pytest.raises(InputError, match="no drive is under way"):
         bad.step(0.0, DT)
     np.testing.assert_allclose(driven(car), expected(), **CLOSE)
+
+
+def test_a_start_that_hangs_is_ended(build: Build, monkeypatch: pytest.MonkeyPatch) -> None:
+    car = build.open(build.fmu()).with_parameters({"fault": fmus.HANG_AT_START})
+    monkeypatch.setattr(fmu_child, "OPENING_SECONDS", 0.4)
+    with pytest.raises(InputError, match=r"car\.fmu: before the first step: it does not answer within 0\.4 s$"):
+        car.reset(speed=20.0, accel=0.0)
 
 
 def test_a_failure_step_by_step(build: Build) -> None:
