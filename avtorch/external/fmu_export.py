@@ -45,9 +45,9 @@ def write_fmu(
     The parameters of the plant and of its effects are parameters of the FMU; random effects are drawn by its parameter
     `seed`, the jerk noise is left out.
 
-    The FMU holds the plant, a script and the libraries of PythonFMU for 64-bit Linux and Windows, but neither Python nor
-    avtorch: the machine that imports it needs a Python that finds avtorch. A tool that is no Python program is given one
-    on Linux by `LD_PRELOAD=.../libpython3.11.so`, on Windows by the `PATH`, and avtorch by `PYTHONPATH`.
+    The FMU holds the plant, a script and the libraries of PythonFMU for 64-bit Linux and Windows, but neither Python
+    nor avtorch: the machine that imports it needs a Python that finds avtorch. A tool that is no Python program is
+    given one on Linux by `LD_PRELOAD=.../libpython3.11.so`, on Windows by the `PATH`, and avtorch by `PYTHONPATH`.
 
     Raises InputError for a diagnosis without a plant, for a plant that no text can state, with `around` for effects
     within the actuator that are no gain and without `dt`, where the file cannot be written, and without

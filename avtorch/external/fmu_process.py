@@ -121,12 +121,12 @@ class RunningFmu:
         described, kind = self._described, self._described.coSimulation
         units = {unit.name: unit.baseUnit for unit in described.unitDefinitions if unit.baseUnit is not None}
         experiment = described.defaultExperiment
-        step = kind.fixedInternalStepSize if experiment is None else kind.fixedInternalStepSize or experiment.stepSize
+        step = _number(kind.fixedInternalStepSize or (None if experiment is None else experiment.stepSize))
         return {
             "form": f"FMI {described.fmiVersion}",
             "made_by": described.generationTool or "",
             "variable_step": bool(kind.canHandleVariableCommunicationStepSize),
-            "step": None if step is None else float(step),
+            "step": step if step is not None and 0 < step < math.inf else None,
             "remarks": self.remarks,
             "variables": [_variable(v, units) for v in described.modelVariables if not v.shape],
         }

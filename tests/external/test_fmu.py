@@ -260,6 +260,11 @@ def test_steps_must_be_alike_where_the_fmu_says_no_more(build: Build) -> None:
         car.step(0.0, 0.03)
 
 
+@pytest.mark.parametrize("step", [0.0, -1.0, np.nan, np.inf])
+def test_a_step_that_is_stated_and_is_none_counts_as_unstated(build: Build, fmi: int, step: float) -> None:
+    np.testing.assert_allclose(driven(build.open(build.fmu(fmi, step=step))), expected(), **CLOSE)
+
+
 @pytest.mark.parametrize("dt", [0.0, -0.1, np.nan, np.inf])
 def test_a_step_that_is_none_is_refused(build: Build, dt: float) -> None:
     with pytest.raises(InputError, match="dt: found"):
