@@ -21,6 +21,7 @@ PACKAGES = (
     "avtorch.gap",
     "avtorch.gap.effects",
     "avtorch.blindtest",
+    "avtorch.external",
     "avtorch.follower",
     "avtorch.remedy",
     "avtorch.experiment",

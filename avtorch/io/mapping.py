@@ -22,6 +22,7 @@ PEDALS = ("throttle", "brake", "torque", "current")
 """Commands that are no accelerations; a map makes one of them (`avtorch.pedals`)."""
 
 _TABLES = ("map", "unit", "stamp", "state", "signals")
+_OTHERS = ("fmu",)  # tables of the same file that are not about the log
 Pairs = Mapping[str, Any] | Iterable[str] | None
 
 
@@ -54,9 +55,9 @@ def read_mapping(
 
     The TOML file has the tables ``[map]`` (signal = "column"), ``[unit]`` (signal = "km/h"), ``[stamp]`` (signal = "its
     own time column"), ``[state]`` (engaged = "1, 3": the numbers that mean yes) and ``[signals.NAME]`` (``file``,
-    ``time``, ``column``, ``time_unit``: a signal in another file, which lies in the log's folder or below). It is a
-    regular file of up to 1 MB, no link. Raises InputError for another kind of file, and for a signal, unit, table or
-    key that is not known.
+    ``time``, ``column``, ``time_unit``: a signal in another file, which lies in the log's folder or below). A table
+    ``[fmu]`` is left to `avtorch.external.FmuSimulator`. It is a regular file of up to 1 MB, no link. Raises InputError
+    for another kind of file, and for a signal, unit, table or key that is not known.
     """
     beside = mapping_beside(path)
     stated = SignalMap() if beside is None else _read_toml(beside)
@@ -161,10 +162,9 @@ def _read_toml(file: Path) -> SignalMap:
     content = read_toml(file, links=False)
     here = f"{place(file)}: "
     for name, table in content.items():
-        if name not in ("map", "unit", "stamp", "state", "signals"):
-            raise InputError(
-                f"{here}table [{printable(name, 40)}] is not known; tables: map, unit, stamp, state, signals"
-            )
+        if name not in (*_TABLES, *_OTHERS):
+            known = ", ".join((*_TABLES, *_OTHERS))
+            raise InputError(f"{here}table [{printable(name, 40)}] is not known; tables: {known}")
         if not isinstance(table, dict):
             raise InputError(f"{here}{name} is no table; write [{name}] and its lines below")
     try:

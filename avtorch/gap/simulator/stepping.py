@@ -21,7 +21,7 @@ from avtorch.gap.simulator.order import actuator_of, at_place, substeps
 from avtorch.vehicle.noise import Noise
 from avtorch.vehicle.plant import Motion
 
-_ROUNDS = 5
+ROUNDS = 5
 
 
 @dataclass(frozen=True)
@@ -68,26 +68,26 @@ def begin(
     a, v, u = (x.expand(shape) for x in (a, v, u))
     zero = torch.zeros_like(v)
     past = SimulationState(effects, T_L, K_L, noise, 0, 0.0, dt, a, v, zero, ActuatorState(a), zero, {})
-    row = _row(past, 0.0, v, zero, dt)
+    row = context_of(past, 0.0, v, zero, dt)
     memory: dict[str, Any] = {}
     for e in effects:  # each in steady state at the previous one's output
         if e.place in ("command", "actuator"):
-            at = _draw(past, e, row, past.row)
+            at = drawn_for(past, e, row, past.row)
             memory[e.name] = e.start(u, at)
             if e.place == "command":
                 out = e.advance(u, at, memory[e.name])[0]
                 u = out[1] if isinstance(out, tuple) else out
     bodies, force = at_place(effects, "body"), zero
     for e in bodies:
-        at = _draw(past, e, row, past.row)
+        at = drawn_for(past, e, row, past.row)
         force = force + e.advance(a, at, e.start(a, at))[0]
     own = a - force  # the actuator's share is the car's acceleration less the other forces
     for e in bodies:
-        at = _draw(past, e, row, past.row)
+        at = drawn_for(past, e, row, past.row)
         memory[e.name] = e.advance(own, at, e.start(own, at))[1]
     measured = a
     for e in at_place(effects, "sensor"):
-        at = _draw(past, e, row, past.row)
+        at = drawn_for(past, e, row, past.row)
         measured, memory[e.name] = e.advance(measured, at, e.start(measured, at))
     return replace(past, actuator=actuator_of(effects).steady_state(own), force=force, memory=memory)
 
@@ -96,12 +96,12 @@ def move(past: SimulationState, v: Tensor, u: Tensor, dt: float, eps: Tensor) ->
     """One step, `u` and jerk noise `eps` held: `(measured acceleration, speed, displacement)` and the new state."""
     # by trapezoids of the speeds, as for a log
     position = past.position if past.row == 0 else past.position + 0.5 * past.dt * (past.speed + v)
-    row = _row(past, past.time, v, position, dt)
+    row = context_of(past, past.time, v, position, dt)
     number, time = past.row + 1, past.time + dt
     memory = dict(past.memory)
 
     def hook(e: Effect, x: Tensor) -> Any:
-        y, memory[e.name] = e.advance(x, _draw(past, e, row, past.row), memory[e.name])
+        y, memory[e.name] = e.advance(x, drawn_for(past, e, row, past.row), memory[e.name])
         return y
 
     parts = substeps(past.effects, u, row, hook)
@@ -112,18 +112,18 @@ def move(past: SimulationState, v: Tensor, u: Tensor, dt: float, eps: Tensor) ->
     force, speed = past.force, v + gained
     if bodies:
         speed = speed + dt * past.force
-        for _ in range(_ROUNDS if any(e.needs_speed for e in bodies) else 1):
-            after = _row(past, time, speed, position + 0.5 * dt * (v + speed), dt)
+        for _ in range(ROUNDS if any(e.needs_speed for e in bodies) else 1):
+            after = context_of(past, time, speed, position + 0.5 * dt * (v + speed), dt)
             force = torch.zeros_like(speed)
             for e in bodies:
-                y, kept = e.advance(state.accel, _draw(past, e, after, number), past.memory[e.name])
+                y, kept = e.advance(state.accel, drawn_for(past, e, after, number), past.memory[e.name])
                 force, memory[e.name] = force + y, kept
             speed = v + gained + 0.5 * dt * (past.force + force)
         moved = moved + dt * dt * (past.force / 3 + force / 6)
-    after = _row(past, time, speed, position + 0.5 * dt * (v + speed), dt)
+    after = context_of(past, time, speed, position + 0.5 * dt * (v + speed), dt)
     seen = state.accel + force
     for e in at_place(past.effects, "sensor"):
-        seen, memory[e.name] = e.advance(seen, _draw(past, e, after, number), memory[e.name])
+        seen, memory[e.name] = e.advance(seen, drawn_for(past, e, after, number), memory[e.name])
     kept = replace(
         past,
         row=number,
@@ -139,12 +139,12 @@ def move(past: SimulationState, v: Tensor, u: Tensor, dt: float, eps: Tensor) ->
     return (seen, speed, v * dt + moved), kept
 
 
-def _row(past: SimulationState, time: float, v: Tensor, x: Tensor, dt: float) -> EffectContext:
+def context_of(past: SimulationState, time: float, v: Tensor, x: Tensor, dt: float) -> EffectContext:
     now, step = torch.tensor(time, dtype=torch.float64), torch.tensor(dt, dtype=torch.float64)
     return EffectContext(now, step, v, x, past.T_L, past.K_L, whole=False)
 
 
-def _draw(past: SimulationState, effect: Effect, row: EffectContext, number: int) -> EffectContext:
+def drawn_for(past: SimulationState, effect: Effect, row: EffectContext, number: int) -> EffectContext:
     """The row with the effect's own draw, if it is random."""
     if not effect.random:
         return row

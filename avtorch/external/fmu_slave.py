@@ -1,0 +1,147 @@
+"""The script within an exported FMU: a plant, or its effects around another simulator, as variables of FMI.
+
+`pythonfmu` puts it into the FMU beside `plant.toml` and `block.json`, and runs it there, in the interpreter of the
+machine that imports the FMU. It is no part of what `avtorch` imports.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, SubElement
+
+import torch
+from pythonfmu import (  # pyright: ignore[reportMissingImports]
+    DefaultExperiment,
+    Fmi2Causality,
+    Fmi2Initial,
+    Fmi2Slave,
+    Fmi2Variability,
+    Integer,
+    Real,
+)
+
+from avtorch.gap import GapPlant
+from avtorch.gap.simulator.around import Around
+
+_BASE = {"m/s2": {"m": "1", "s": "-2"}, "m/s": {"m": "1", "s": "-1"}, "s": {"s": "1"}, "m": {"m": "1"}}
+
+
+class AvtorchBlock(Fmi2Slave):
+    """Inputs, outputs and parameters of a block."""
+
+    author = "avtorch"
+
+    def __init__(self, **given: Any) -> None:
+        super().__init__(**given)
+        folder = Path(self.resources)
+        block = json.loads((folder / "block.json").read_text(encoding="utf-8"))
+        self._plant = GapPlant.from_toml((folder / "plant.toml").read_text(encoding="utf-8"))
+        self._dt: float | None = block["dt"]
+        self.modelName = block["name"]
+        self.description = block["description"]
+        if self._dt is not None:
+            self.default_experiment = DefaultExperiment(step_size=self._dt)
+        self._units: dict[str, str] = {}
+        self._values: dict[str, float] = {}
+        self._seed = 0
+        self._cell = {"accel_cmd": 0.0, "accel_sim": 0.0, "speed_sim": 0.0, "speed0": 0.0, "accel0": 0.0}
+        self._around: Around | None = None
+        self._car: tuple[torch.Tensor, torch.Tensor] | None = None
+        self._add("accel_cmd", "m/s2", "input")
+        if self._dt is None:
+            self._add("accel", "m/s2", "output", lambda: float(self._started()[0]))
+            self._add("speed", "m/s", "output", lambda: float(self._started()[1]))
+            self._add("speed0", "m/s", "parameter")
+            self._add("accel0", "m/s2", "parameter")
+        else:
+            self._add("accel_sim", "m/s2", "input")
+            self._add("speed_sim", "m/s", "input")
+            self._add("accel_cmd_out", "m/s2", "output", lambda: self._outside().command(*self._inputs()))
+            self._add("accel", "m/s2", "output", lambda: self._outside().car(*self._inputs())[0])
+            self._add("speed", "m/s", "output", lambda: self._outside().car(*self._inputs())[1])
+        self._add_parameters()
+
+    def _add(self, name: str, unit: str, causality: str, getter: Callable[[], float] | None = None) -> None:
+        self._units[name] = unit
+        fixed = {"variability": Fmi2Variability.fixed, "initial": Fmi2Initial.exact} if causality == "parameter" else {}
+        own = {"getter": getter} if getter is not None else self._reached(self._cell, name)
+        self.register_variable(Real(name, causality=getattr(Fmi2Causality, causality), **fixed, **own), nested=False)
+
+    @staticmethod
+    def _reached(cell: dict[str, float], name: str) -> dict[str, Callable]:
+        return {"getter": lambda: cell[name], "setter": lambda value: cell.__setitem__(name, value)}
+
+    def _add_parameters(self) -> None:
+        fixed = {"causality": Fmi2Causality.parameter, "variability": Fmi2Variability.fixed}
+        fixed["initial"] = Fmi2Initial.exact
+        coordinates = self._plant.parameters()
+        for name, value in self._plant.values().items():
+            if value.numel() != 1 or (self._dt is not None and name in ("T_L", "K_L")):
+                continue
+            self._values[name] = float(value)
+            unit = coordinates[name].unit if name in coordinates else "-"
+            self._units[name] = unit.replace("²", "2").replace("³", "3")
+            self.register_variable(Real(name, **fixed, **self._reached(self._values, name)), nested=False)
+
+        def seeded(value: int) -> None:
+            self._seed = value
+
+        seed = Integer("seed", getter=lambda: self._seed, setter=seeded, **fixed)
+        self.register_variable(seed, nested=False)
+
+    def to_xml(self, model_options: Any = ()) -> Element:
+        """The model description, with what pythonfmu leaves out."""
+        root = super().to_xml({"canHandleVariableCommunicationStepSize": self._dt is None, **dict(model_options)})
+        definitions = Element("UnitDefinitions")
+        for name, powers in _BASE.items():
+            SubElement(SubElement(definitions, "Unit", name=name), "BaseUnit", powers)
+        root.insert(1, definitions)
+        for variable in root.iter("ScalarVariable"):
+            name = variable.attrib["name"]
+            if name in self._values:
+                variable[0].set("start", repr(self._values[name]))  # 16 digits do not hold every number
+            unit = self._units.get(name)
+            if unit in _BASE:
+                variable[0].set("unit", unit)
+        structure = root.find("ModelStructure")
+        if structure is not None:  # what an initialised FMU computes: all outputs, which pythonfmu does not list
+            unknowns = SubElement(structure, "InitialUnknowns")
+            unknowns.extend(Element("Unknown", output.attrib) for output in structure.iterfind("Outputs/Unknown"))
+        return root
+
+    # drives --------------------------------------------------------------------------------------------------------
+    def exit_initialization_mode(self) -> None:
+        """Take the parameters as they are now."""
+        plant = self._plant.with_values({k: torch.tensor(x, dtype=torch.float64) for k, x in self._values.items()})
+        self._run = GapPlant(plant.effects, T_L=plant.T_L, K_L=plant.K_L, sigma=plant.sigma, seed=self._seed)
+        self._around = None if self._dt is None else Around(self._run, self._dt)
+        self._car = self._started()
+
+    def do_step(self, current_time: float, step_size: float) -> bool:
+        """Go on to the next communication point."""
+        if self._dt is not None:
+            if abs(step_size - self._dt) > 1e-9 * self._dt:
+                raise ValueError(f"step size: found {step_size!r} s, needs {self._dt!r} s")
+            self._outside().advance(*self._inputs())
+            return True
+        accel, speed = self._started()
+        command, none = torch.tensor(self._cell["accel_cmd"], dtype=torch.float64), torch.zeros((), dtype=torch.float64)
+        accel, speed, _ = self._run.step(accel, speed, command, step_size, none)
+        self._car = accel, speed.clamp_min(0.0)  # a car does not roll back
+        return True
+
+    def _started(self) -> tuple[torch.Tensor, torch.Tensor]:
+        if self._car is not None:
+            return self._car
+        return tuple(torch.tensor(self._cell[name], dtype=torch.float64) for name in ("accel0", "speed0"))  # pyright: ignore[reportReturnType]
+
+    def _inputs(self) -> tuple[float, float, float]:
+        return self._cell["accel_cmd"], self._cell["accel_sim"], self._cell["speed_sim"]
+
+    def _outside(self) -> Around:
+        if self._around is None:
+            self._around = Around(self._plant, self._dt or 0.0)
+        return self._around

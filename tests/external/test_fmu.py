@@ -1,0 +1,400 @@
+"""FMUs as simulators: a car in C, driven as the test's own Python drives it; and what no FMU may do."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from avtorch import InputError
+from avtorch.external import FmuSimulator, Simulator, fmu_child
+from avtorch.io.mapping import read_mapping
+from tests.external import fmus
+
+DT = 0.02
+TIME = np.arange(100) * DT
+COMMAND = np.sin(2.1 * TIME) + 0.5 * np.sign(np.sin(5.0 * TIME))
+# thousands of additions of numbers of the size of the speed, 20 m/s, each rounded once in C and once in Python
+CLOSE: dict[str, float] = {"rtol": 0.0, "atol": 1000 * len(TIME) * DT * 20 * 2.0**-52}
+
+
+@pytest.fixture(scope="session")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
+    return {fmi: fmus.library(tmp_path_factory.mktemp(f"fmi{fmi}"), fmi) for fmi in (2, 3)}
+
+
+@pytest.fixture(params=[2, 3], ids=["fmi2", "fmi3"])
+def fmi(request: pytest.FixtureRequest) -> int:
+    return request.param
+
+
+class Build:
+    """Packs the car in C with a description of its own; what it opened is closed at the end."""
+
+    def __init__(self, folder: Path, compiled: dict[int, Path]) -> None:
+        self.folder, self.compiled, self.opened = folder, compiled, []
+
+    def fmu(self, fmi: int = 2, given: dict | None = None, **other: Any) -> Path:
+        xml = fmus.description(fmi, given if given is not None else fmus.variables(), **other)
+        return fmus.packed(self.folder / "car.fmu", xml, self.compiled[fmi], fmus.BINARIES[fmi])
+
+    def open(self, path: Path, **arguments: Any) -> FmuSimulator:
+        arguments = {"names": {"speed0": "v0", "accel0": "a0"}, **arguments}
+        self.opened.append(FmuSimulator(path, **arguments))
+        return self.opened[-1]
+
+
+@pytest.fixture
+def build(tmp_path: Path, compiled: dict[int, Path]) -> Iterator[Build]:
+    build = Build(tmp_path, compiled)
+    yield build
+    for simulator in build.opened:
+        simulator.close()
+
+
+def driven(car: FmuSimulator, dt: float = DT, **start: float) -> tuple[np.ndarray, np.ndarray]:
+    return car.drive(COMMAND, dt, **{"speed": 20.0, "accel": 0.4, **start})
+
+
+def expected(**given: float) -> tuple[list[float], list[float]]:
+    return fmus.drive(COMMAND, DT, **{"speed": 20.0, "accel": 0.4, **given})
+
+
+def test_a_drive_is_the_models_own(build: Build, fmi: int) -> None:
+    car = build.open(build.fmu(fmi))
+    assert isinstance(car, Simulator)
+    np.testing.assert_allclose(driven(car), expected(), **CLOSE)
+
+
+def test_a_drive_is_its_steps_and_a_second_one_is_the_same(build: Build, fmi: int) -> None:
+    car = build.open(build.fmu(fmi))
+    accel, speed = driven(car)
+    car.reset(speed=20.0, accel=0.4)
+    steps = [car.step(u, DT) for u in COMMAND[:10].tolist()]
+    assert steps == list(zip(accel[:10], speed[:10], strict=True))
+    np.testing.assert_array_equal(driven(car), (accel, speed))
+
+
+def test_steps_of_different_lengths(build: Build, fmi: int) -> None:
+    steps = np.where(np.arange(20) % 2, 0.01, 0.05)
+    accel, _ = build.open(build.fmu(fmi)).drive(COMMAND[:20], steps, speed=20.0, accel=0.0)
+    # each of the model's own steps is 1 ms, so that holding a command for 50 ms is holding it five times for 10 ms
+    fine = np.repeat(COMMAND[:20], np.rint(steps / 0.01).astype(int))
+    ends = np.cumsum(np.rint(steps / 0.01).astype(int)) - 1
+    np.testing.assert_allclose(accel, np.array(fmus.drive(fine, 0.01, speed=20.0, accel=0.0)[0])[ends], **CLOSE)
+
+
+# units -------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("accel", "speed"), [("gees", "km/h"), ("g", "kph")], ids=["defined", "named"])
+def test_units_that_the_fmu_states_are_converted(build: Build, fmi: int, accel: str, speed: str) -> None:
+    given = fmus.variables(units={"u": accel, "a": accel, "a0": accel, "v": speed, "v0": speed})
+    given["accel_scale"]["start"], given["speed_scale"]["start"] = 1 / 9.80665, 3.6
+    # the start of the description is what a tool shows; the model has its own, so it is told
+    car = build.open(build.fmu(fmi, given)).with_parameters({"accel_scale": 1 / 9.80665, "speed_scale": 3.6})
+    np.testing.assert_allclose(driven(car), expected(), **CLOSE)
+
+
+def test_units_that_are_given_overrule_the_fmu(build: Build) -> None:
+    car = build.open(build.fmu(given=fmus.variables(units={"v": "m/s"})), unit={"speed": "km/h"})
+    np.testing.assert_allclose(driven(car.with_parameters({"speed_scale": 3.6}))[1], expected()[1], **CLOSE)
+    assert any("km/h as given" in note for note in car.notes)
+
+
+def test_a_unit_in_the_name_counts(build: Build) -> None:
+    car = build.open(build.fmu(given=fmus.variables(names={"v": "vehicle_speed_kmh"})))
+    assert any("in km/h by its name" in note for note in car.notes)
+    shown = driven(car.with_parameters({"speed_scale": 3.6}), speed=0.0)[1]
+    np.testing.assert_allclose(shown, expected(speed=0.0)[1], **CLOSE)
+
+
+def test_a_unit_of_another_quantity_is_refused(build: Build, fmi: int) -> None:
+    path = build.fmu(fmi, fmus.variables(units={"u": "N"}))
+    with pytest.raises(InputError, match=r"accel_cmd is variable 'u' in 'N'; .*\[fmu\.unit\]"):
+        build.open(path)
+
+
+# names -------------------------------------------------------------------------------------------------------------
+def ambiguous() -> dict[str, dict]:
+    given = fmus.variables(names={"a": "y1", "v": "y2"}, units={"a": "m/s2", "v": "m/s", "drag": "m/s2"})
+    given["drag"] |= {"causality": "output", "variability": None, "initial": None, "start": None}
+    return given
+
+
+def test_outputs_are_found_by_their_units(build: Build) -> None:
+    given = fmus.variables(names={"a": "y1", "v": "y2"}, units={"a": "m/s2", "v": "m/s"})
+    np.testing.assert_allclose(driven(build.open(build.fmu(given=given))), expected(), **CLOSE)
+
+
+@pytest.mark.parametrize(("name", "unit", "how"), [("y", "m/s2", "unit"), ("accel_request", None, "name")])
+def test_of_several_inputs_the_one_that_fits_is_taken(build: Build, name: str, unit: str | None, how: str) -> None:
+    given = fmus.variables(names={"u": name}, units={"u": unit})
+    given["drag"] |= {"causality": "input", "variability": None, "initial": None}
+    car = build.open(build.fmu(given=given))
+    assert any(note.startswith(f"accel_cmd: variable {name!r} (by its {how})") for note in car.notes)
+    assert "inputs that keep their start values: drag" in car.notes
+    np.testing.assert_allclose(driven(car), expected(), **CLOSE)
+
+
+def test_several_that_may_be_meant_are_listed(build: Build) -> None:
+    with pytest.raises(
+        InputError, match=r"accel may be several .*: y1 \[m/s2\], y2 \[m/s\], drag \[m/s2\]; needs names="
+    ):
+        build.open(build.fmu(given=ambiguous()))
+
+
+@pytest.mark.parametrize("way", ["argument", "beside", "mapping"])
+def test_a_name_that_is_given_decides(build: Build, way: str) -> None:
+    path, names = build.fmu(given=ambiguous()), {"accel": "y1", "speed0": "v0", "accel0": "a0"}
+    text = "[map]\naccel = 'ACC_X'\n[fmu]\n" + "".join(f"{k} = '{v}'\n" for k, v in names.items())
+    arguments: dict[str, Any] = {"names": names}
+    if way == "beside":
+        arguments = {"names": None}
+        path.with_suffix(".toml").write_text(text)
+    if way == "mapping":
+        arguments = {"names": None, "mapping": build.folder / "lap.toml"}
+        arguments["mapping"].write_text(text)
+        path.with_suffix(".toml").write_text("[fmu]\naccel = 'y2'\n")  # overruled
+    np.testing.assert_allclose(
+        driven(build.open(path, **arguments), accel=0.0), expected(accel=0.0, drag=4e-4), **CLOSE
+    )
+
+
+def test_a_log_is_read_beside_the_names_of_an_fmu(tmp_path: Path) -> None:
+    (tmp_path / "lap.toml").write_text("[map]\naccel = 'ACC_X'\n[fmu]\naccel = 'y1'\n[fmu.unit]\naccel = 'g'\n")
+    assert read_mapping(tmp_path / "lap.csv").column == {"accel": "ACC_X"}
+
+
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        ({"accel_cmd": "steer"}, r"accel_cmd = 'steer': there is no such real variable; candidates: u"),
+        ({"accel_cmd": "a"}, r"accel_cmd = 'a': its causality is output; an input is needed"),
+        ({"speed0": "v"}, r"speed0 = 'v': its causality is output"),
+        ({"accel": "v", "speed": "v"}, r"variable 'v' is both accel and speed"),
+        ({"jerk": "v"}, r"names jerk: not known"),
+    ],
+)
+def test_a_name_that_does_not_fit_is_refused(build: Build, names: dict[str, str], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        build.open(build.fmu(), names=names)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("fmu = 3", r"car\.toml: fmu is no table"),
+        ("[fmu]\nspeed = 3", r"car\.toml: \[fmu\] speed: is a int"),
+        ("[fmu]\nunit = 'g'", r"\[fmu\] unit is no table"),
+        ("[fmu.unit]\nspeed = 'furlong'", r"speed=furlong: not known"),
+        ("[fmu]\nspee = 'v'", r"\[fmu\] spee: not known"),
+    ],
+)
+def test_a_mapping_file_that_is_wrong_is_refused(build: Build, text: str, message: str) -> None:
+    path = build.fmu()
+    path.with_suffix(".toml").write_text(text)
+    with pytest.raises(InputError, match=message):
+        build.open(path)
+
+
+def test_an_fmu_without_a_speed_is_refused(build: Build) -> None:
+    given = fmus.variables()
+    given["v"]["causality"] = "local"
+    with pytest.raises(InputError, match=r"speed may be several of its outputs, or none: a; needs names="):
+        build.open(build.fmu(given=given))
+
+
+# start -------------------------------------------------------------------------------------------------------------
+def test_a_start_that_cannot_be_set_is_the_fmus_own_and_told(build: Build) -> None:
+    car = build.open(build.fmu(), names={"accel0": "a0"})
+    np.testing.assert_allclose(driven(car), expected(speed=fmus.START["v0"]), **CLOSE)
+    assert "speed0: cannot be set; a drive begins at the FMU's own" in car.notes
+    assert "speed: the FMU begins at 3 m/s, the drive at 20 m/s" in car.notes
+    driven(car, speed=3.0)
+    assert not any("the FMU begins" in note for note in car.notes)
+
+
+def test_outputs_with_start_values_are_started_by_them(build: Build, fmi: int) -> None:
+    given = fmus.variables(units={"v": "km/h"})
+    for name in ("a", "v"):
+        given[name] |= {"initial": "exact", "start": 0.0}
+    car = build.open(build.fmu(fmi, given), names={}).with_parameters({"speed_scale": 3.6})
+    np.testing.assert_allclose(driven(car), expected(), **CLOSE)
+    assert "speed0: variable 'v' (its start value), in km/h" in car.notes
+
+
+# steps -------------------------------------------------------------------------------------------------------------
+def test_a_fixed_step_is_taken_a_whole_number_of_times(build: Build, fmi: int) -> None:
+    car = build.open(build.fmu(fmi, step=0.005, variable_step=False)).with_parameters({"only_step": 0.005})
+    np.testing.assert_allclose(driven(car), expected(), **CLOSE)
+    assert "steps of 0.005 s, no others" in car.notes
+
+
+@pytest.mark.parametrize("dt", [0.008, 0.002])
+def test_another_step_is_refused_with_those_that_are_right(build: Build, dt: float) -> None:
+    car = build.open(build.fmu(step=0.005, variable_step=False))
+    with pytest.raises(InputError, match=rf"dt: found {dt:g} s; .* takes steps of 0.005 s, .* 0.005 or 0.01 s"):
+        driven(car, dt)
+
+
+def test_a_step_that_is_only_preferred_is_divided(build: Build) -> None:
+    """0.02 s at 0.008 s at most: three parts of the model's own 7 steps each."""
+    accel, _ = driven(build.open(build.fmu(step=0.008)))
+    fine = fmus.drive(np.repeat(COMMAND, 3), DT / 3, speed=20.0, accel=0.4)[0]
+    np.testing.assert_allclose(accel, fine[2::3], **CLOSE)
+
+
+def test_steps_must_be_alike_where_the_fmu_says_no_more(build: Build) -> None:
+    car = build.open(build.fmu(variable_step=False))
+    with pytest.raises(InputError, match=r"dt: found steps from 0\.02 to 0\.03 s; .* all alike"):
+        car.drive(COMMAND[:3], [0.02, 0.03, 0.02], speed=20.0, accel=0.0)
+    car.reset(speed=20.0, accel=0.0)
+    car.step(0.0, 0.02)
+    with pytest.raises(InputError, match="all alike"):
+        car.step(0.0, 0.03)
+
+
+@pytest.mark.parametrize("step", [0.0, -1.0, np.nan, np.inf])
+def test_a_step_that_is_stated_and_is_none_counts_as_unstated(build: Build, fmi: int, step: float) -> None:
+    np.testing.assert_allclose(driven(build.open(build.fmu(fmi, step=step))), expected(), **CLOSE)
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.1, np.nan, np.inf])
+def test_a_step_that_is_none_is_refused(build: Build, dt: float) -> None:
+    with pytest.raises(InputError, match="dt: found"):
+        driven(build.open(build.fmu()), dt)
+
+
+# parameters --------------------------------------------------------------------------------------------------------
+def test_parameters_are_listed_and_set(build: Build, fmi: int) -> None:
+    car = build.open(build.fmu(fmi))
+    starts = {k: x for k, x in fmus.START.items() if k not in ("u", "a", "v", "v0", "a0")}
+    assert car.parameters() == starts
+    slow = car.with_parameters({"omega": 2.0, "drag": 0.0})
+    assert slow.parameters() == {**starts, "omega": 2.0, "drag": 0.0}
+    np.testing.assert_allclose(driven(slow), expected(omega=2.0, drag=0.0), **CLOSE)
+    np.testing.assert_allclose(driven(car), expected(), **CLOSE)
+    with pytest.raises(InputError, match="needs reset first"):  # the process has begun the other one's drive
+        slow.step(0.0, DT)
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"mass": 1.0}, r"parameters: found 'mass', needs one of omega, damping"),
+        ({"v0": 1.0}, r"parameters: found 'v0'"),
+        ({"omega": np.nan}, r"omega: found nan, needs a finite number"),
+        ({"omega": 31.0}, r"omega: found 31.0, needs a finite number from 0.1 to 30"),
+        ({"fault": 0.5}, r"fault: found 0.5, needs a whole number"),
+    ],
+)
+def test_parameters_that_do_not_fit_are_refused(build: Build, values: dict[str, float], text: str) -> None:
+    given = fmus.variables()
+    given["omega"] |= {"min": 0.1, "max": 30.0}
+    with pytest.raises(InputError, match=text):
+        build.open(build.fmu(given=given)).with_parameters(values)
+
+
+# failures ----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("fault", "what"),
+    [
+        (fmus.ERROR, r"fmi\dDoStep failed with status 3 \(error\): fuse 17 has blown"),
+        (fmus.NAN, r"it answers nan"),
+        (fmus.HANG, r"it does not answer within 0\.4 s"),
+        (fmus.CRASH, r"it ended the process that ran it \(SIGABRT\)"),
+        (fmus.EXIT, r"it ended the process that ran it \(status 7\)"),
+    ],
+    ids=["error", "nan", "hang", "crash", "exit"],
+)
+def test_a_failure_names_its_time_and_the_next_drive_is_a_new_one(
+    build: Build, fmi: int, fault: int, what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(build.folder))
+    car = build.open(build.fmu(fmi), step_seconds=0.4)
+    bad = car.with_parameters({"fault": fault})
+    with pytest.raises(InputError, match=rf"car\.fmu: in the step that begins at 1 s of the drive: {what}"):
+        driven(bad)
+    assert not list(build.folder.glob("avtorch_fmu_*"))  # nothing is left of it
+    with pytest.raises(InputError, match="no drive is under way"):
+        bad.step(0.0, DT)
+    np.testing.assert_allclose(driven(car), expected(), **CLOSE)
+
+
+def test_a_start_that_hangs_is_ended(build: Build, monkeypatch: pytest.MonkeyPatch) -> None:
+    car = build.open(build.fmu()).with_parameters({"fault": fmus.HANG_AT_START})
+    monkeypatch.setattr(fmu_child, "OPENING_SECONDS", 0.4)
+    with pytest.raises(InputError, match=r"car\.fmu: before the first step: it does not answer within 0\.4 s$"):
+        car.reset(speed=20.0, accel=0.0)
+
+
+def test_a_failure_step_by_step(build: Build) -> None:
+    car = build.open(build.fmu()).with_parameters({"fault": fmus.CRASH})
+    car.reset(speed=20.0, accel=0.0)
+    for _ in range(50):
+        car.step(0.0, DT)
+    with pytest.raises(InputError, match="begins at 1 s"):
+        car.step(0.0, DT)
+
+
+def test_numbers_that_are_none_are_refused(build: Build) -> None:
+    car = build.open(build.fmu())
+    with pytest.raises(InputError, match="accel_cmd: found nan"):
+        car.drive([0.0, np.nan], DT, speed=20.0, accel=0.0)
+    with pytest.raises(InputError, match="speed: found inf"):
+        car.reset(speed=np.inf, accel=0.0)
+    with pytest.raises(InputError, match=r"shapes \(3,\) and \(2,\)"):
+        car.drive([0.0, 0.0, 0.0], [DT, DT], speed=20.0, accel=0.0)
+
+
+def test_what_is_closed_is_refused(build: Build) -> None:
+    with build.open(build.fmu()) as car:
+        car.reset(speed=20.0, accel=0.0)
+    for call in (lambda: car.reset(speed=20.0, accel=0.0), lambda: car.step(0.0, DT)):
+        with pytest.raises(InputError, match=r"is closed|no drive"):
+            call()
+
+
+# what is no FMU ----------------------------------------------------------------------------------------------------
+def test_what_cannot_be_run_is_refused(build: Build, fmi: int) -> None:
+    car = build.folder / "car.fmu"
+    with pytest.raises(InputError, match="no such file"):
+        build.open(car)
+    car.write_text("no ZIP file")
+    with pytest.raises(InputError, match="is damaged or of an unknown kind"):
+        build.open(car)
+    with zipfile.ZipFile(car, "w") as archive:
+        archive.writestr("readme.txt", "")
+    with pytest.raises(InputError, match=r"without modelDescription\.xml"):
+        build.open(car)
+    with pytest.raises(InputError, match="with model exchange alone"):
+        build.open(build.fmu(fmi, kind="ModelExchange"))
+    xml = fmus.description(fmi, fmus.variables())
+    fmus.packed(car, xml, build.compiled[fmi], "riscv-windows")
+    with pytest.raises(InputError, match=rf"has binaries for riscv-windows; this machine needs {fmus.BINARIES[fmi]}"):
+        build.open(car)
+    (build.folder / "broken").write_bytes(b"\x7fELF" + bytes(200))
+    fmus.packed(car, xml, build.folder / "broken", fmus.BINARIES[fmi])
+    with pytest.raises(InputError, match="is damaged or of an unknown kind"):
+        build.open(car)
+
+
+def test_a_description_that_departs_from_the_standard_is_told(build: Build, fmi: int) -> None:
+    xml = fmus.description(fmi, fmus.variables()).replace("<ModelVariables>", '<ModelVariables maker="x">')
+    path = fmus.packed(build.folder / "car.fmu", xml, build.compiled[fmi], fmus.BINARIES[fmi])
+    car = build.open(path)
+    assert any("departs from the standard" in note and "maker" in note for note in car.notes)
+    np.testing.assert_allclose(driven(car), expected(), **CLOSE)
+
+
+def test_what_is_not_installed_is_told(build: Build, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "fmpy" else there(name, *rest))
+    with pytest.raises(InputError, match=re.escape("pip install 'avtorch[fmu]'")):
+        build.open(build.fmu())
