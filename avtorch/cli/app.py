@@ -12,6 +12,7 @@ from cyclopts import App, CycloptsError, MissingArgumentError
 
 from avtorch.cli.blindtest import blindtest
 from avtorch.cli.check import check
+from avtorch.cli.check_simulator import check_simulator
 from avtorch.cli.compare import compare
 from avtorch.cli.diagnose import diagnose
 from avtorch.cli.estimate import estimate
@@ -32,6 +33,7 @@ app = App(
     suppress_keyboard_interrupt=False,
 )
 app.command(check)
+app.command(check_simulator)
 for _command in (run, estimate, diagnose, compare, stability, validate, blindtest, paper):
     app.command(alone_in_out(_command))
 

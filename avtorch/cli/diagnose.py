@@ -67,7 +67,8 @@ def diagnose(
         str | None,
         Parameter(
             group=TESTED,
-            help="The simulator itself, MODULE:NAME or FILE.py:NAME, with reset(speed, accel) and step(accel_cmd, dt).",
+            help="The simulator itself: an FMU, or MODULE:NAME or FILE.py:NAME with reset(speed, accel) and "
+            "step(accel_cmd, dt).",
         ),
     ] = None,
     step: Annotated[

@@ -28,12 +28,14 @@ def tested_simulator(
     if simulated and simulator is not None:
         raise InputError("--simulated, --simulator: found both, needs the output or the simulator itself")
     from avtorch.external import ExternalSimulator, load_simulator
+    from avtorch.io.mapping import mapping_beside
 
     if simulator is not None:
         if step is not None and not 0 < step < math.inf:
             raise InputError(f"--step: found {step:g}, needs a step above 0 s")
         try:
-            return ExternalSimulator(load_simulator(simulator), name=simulator, step_s=step)
+            beside = mapping_beside(drives[0][0])
+            return ExternalSimulator(load_simulator(simulator, mapping=beside), name=simulator, step_s=step)
         except InputError as fault:
             raise InputError(f"--simulator: {str(fault).removeprefix('simulator: ')}") from None
     if step is not None:

@@ -76,9 +76,8 @@ def with_simulator(
         rollout,
         tuple(differences),
         tuple(missing),
-        tuple(notes),
     )
-    return replace(found, tested=facts)
+    return replace(found, tested=facts, notes=(*found.notes, *notes))
 
 
 def _lag_and_gain(found: Diagnosis, surrogate: Surrogate) -> list[ParameterDifference]:

@@ -18,11 +18,12 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, quoted
-from avtorch.external.simulator import Simulator
+from avtorch.external.simulator import Simulator, WholeDrives
 from avtorch.io import STANDSTILL_MPS, Log
 
 LIMIT_S = 30.0
 """Longest that a simulator may take for one step or one reset [s]."""
+_JUMP_MPS2 = 20.0  # no car accelerates like that
 _AVERAGED_S = 0.3  # over which the car's acceleration at the beginning of a drive is averaged
 
 
@@ -103,13 +104,17 @@ class _Drive:
             rows = max(1, round(_AVERAGED_S * log.rate_hz))
             begin_accel = float(log.accel[part][:rows].mean())
         begin_speed = 0.0 if log.speed is None else max(float(log.speed[part][0]), 0.0)
-        self._called(float(time[0]), lambda: self._simulator.reset(speed=begin_speed, accel=begin_accel), "reset")
-        out = [(begin_accel, begin_speed)]
-        steps, stamps = np.diff(time).tolist(), time.tolist()
-        for u, dt, stamp in zip(command[:-1], steps, stamps[:-1], strict=True):
-            out.append(self._stepped(u, dt, stamp))
-        both = np.array(out)
-        return both[:, 0], both[:, 1]
+        steps = np.diff(time)
+        if self._step_s is None and isinstance(self._simulator, WholeDrives):
+            later = np.stack(self._simulator.drive(command[:-1], steps, speed=begin_speed, accel=begin_accel), -1)
+        else:
+            self._called(float(time[0]), lambda: self._simulator.reset(speed=begin_speed, accel=begin_accel), "reset")
+            rows = zip(command[:-1], steps.tolist(), time.tolist(), strict=False)
+            later = np.array([self._stepped(u, dt, stamp) for u, dt, stamp in rows])
+        accel, speed = np.concatenate([[[begin_accel, begin_speed]], later]).T
+        if abs(speed[1] - speed[0]) > _JUMP_MPS2 * steps[0]:  # it begins at a speed of its own
+            accel[0], speed[0] = accel[1], speed[1] - steps[0] * accel[1]
+        return accel, speed
 
     def _stepped(self, u: float, dt: float, stamp: float) -> tuple[float, float]:
         count, own = 1, dt

@@ -122,5 +122,5 @@ class SimulatorBesideCar:
             source="simulator" if self.simulator.output is None else "output",
             offset_s=self.offsets,
             rollout=self.rollout,
-            notes=(),
+            notes=tuple(getattr(self.simulator.of, "notes", ())),
         )

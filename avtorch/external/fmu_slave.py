@@ -36,7 +36,7 @@ class AvtorchBlock(Fmi2Slave):
 
     def __init__(self, **given: Any) -> None:
         super().__init__(**given)
-        folder = Path(self.resources)
+        folder = Path(str(self.resources))
         block = json.loads((folder / "block.json").read_text(encoding="utf-8"))
         self._plant = GapPlant.from_toml((folder / "plant.toml").read_text(encoding="utf-8"))
         self._dt: float | None = block["dt"]
@@ -94,7 +94,8 @@ class AvtorchBlock(Fmi2Slave):
 
     def to_xml(self, model_options: Any = ()) -> Element:
         """The model description, with what pythonfmu leaves out."""
-        root = super().to_xml({"canHandleVariableCommunicationStepSize": self._dt is None, **dict(model_options)})
+        options: dict[str, Any] = {"canHandleVariableCommunicationStepSize": self._dt is None, **dict(model_options)}
+        root = super().to_xml(options)
         definitions = Element("UnitDefinitions")
         for name, powers in _BASE.items():
             SubElement(SubElement(definitions, "Unit", name=name), "BaseUnit", powers)

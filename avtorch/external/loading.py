@@ -5,16 +5,19 @@ from __future__ import annotations
 import importlib
 import inspect
 import sys
+from os import PathLike
 from pathlib import Path
 
 from avtorch.errors import InputError, quoted
+from avtorch.external.fmu import FmuSimulator
 from avtorch.external.simulator import Simulator
 
 
-def load_simulator(text: str) -> Simulator:
-    """The simulator called `module:name` (`package.module:Class`, `module:make`), or in a file (`car.py:Car`).
+def load_simulator(text: str, *, mapping: str | PathLike[str] | None = None) -> Simulator:
+    """The simulator called `module:name` (`package.module:Class`, `module:make`), in a file (`car.py:Car`), or an FMU.
 
     A class is instantiated, a function called, both without arguments; of a function, its value is the simulator.
+    `mapping`: a TOML file that names an FMU's variables, see `FmuSimulator`.
     Raises `InputError` for a text of another form, a module or name that is not there, what cannot be made, or an
     object without `reset` and `step`.
 
@@ -27,10 +30,12 @@ def load_simulator(text: str) -> Simulator:
         ...     print(str(error).split(";")[0])
         simulator: math:sqrt raised TypeError when called without arguments
     """
+    if text.lower().endswith(".fmu"):
+        return FmuSimulator(text, mapping=mapping)
     home, colon, name = text.rpartition(":")
     if not colon or not home or not name.isidentifier():
         raise InputError(
-            f"simulator: found {quoted(text)}, needs MODULE:NAME, such as my_car:Car or path/my_car.py:Car"
+            f"simulator: found {quoted(text)}, needs MODULE:NAME, such as my_car:Car or path/my_car.py:Car, or an FMU"
         )
     module = _module(home)
     if not hasattr(module, name):

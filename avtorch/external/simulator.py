@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol, runtime_checkable
 
+from avtorch.arrays import FloatArray
+
 
 @runtime_checkable
 class Simulator(Protocol):
@@ -30,4 +32,16 @@ class Simulator(Protocol):
 
     def step(self, accel_cmd: float, dt: float) -> tuple[float, float]:
         """Hold the command [m/s²] for `dt` [s]; the acceleration [m/s²] and speed [m/s] at the end of it."""
+        ...
+
+
+@runtime_checkable
+class WholeDrives(Protocol):
+    """A simulator that also takes a drive as a whole, where many calls would be slow."""
+
+    def drive(
+        self, accel_cmd: FloatArray, dt: FloatArray, *, speed: float, accel: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """`reset`, then a step for each command (row,) [m/s²] and length (row,) [s]: accelerations (row,) [m/s²] and
+        speeds (row,) [m/s] at the ends of the steps."""
         ...

@@ -44,8 +44,16 @@ class Surrogate:
     left: Mapping[str, float]
 
 
-def surrogate_of(simulated: Sequence[Log], *, progress: Callable[[str, int, int], None] | None = None) -> Surrogate:
-    """The surrogate of the simulator whose output these logs are. `progress(what, done, of)` is called at each effect.
+def surrogate_of(
+    simulated: Sequence[Log],
+    *,
+    enough: float = ENOUGH,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Surrogate:
+    """The surrogate of the simulator whose output these logs are.
+
+    `enough`: share of the response that may be left over.
+    `progress(what, done, of)` is called at each effect.
 
     Raises `InputError` where the drives are too short, see `AnalysisRecord.for_budget`.
 
@@ -67,7 +75,7 @@ def surrogate_of(simulated: Sequence[Log], *, progress: Callable[[str, int, int]
     for number in range(MOST_EFFECTS):
         if progress is not None:
             progress("simulator", number, MOST_EFFECTS)
-        if (_errors(now) < ENOUGH * size).all():
+        if (_errors(now) < enough * size).all():
             break
         fitting = _fitting(record, np.maximum(_errors(now), _LEAST_ERROR * size))
         now = fitting.fit(now.model, now.z[None])
@@ -75,7 +83,7 @@ def surrogate_of(simulated: Sequence[Log], *, progress: Callable[[str, int, int]
         if entered is None:
             break
         now = entered
-    now = _without_the_idle(record, now, size)
+    now = _without_the_idle(record, now, size, enough)
     left = dict(zip(record.channels, (_errors(now) / size).tolist(), strict=True))
     return Surrogate(plant_of(now, bare.base), left)
 
@@ -120,7 +128,7 @@ def _entered(fitting: RobustFit, now: Fit, kinds: Sequence[type[Effect]]) -> Fit
     return fits[min(worth)[1]] if worth else None
 
 
-def _without_the_idle(record: AnalysisRecord, now: Fit, size: FloatArray) -> Fit:
+def _without_the_idle(record: AnalysisRecord, now: Fit, size: FloatArray, enough: float) -> Fit:
     """The model without effects that the others make superfluous, the most superfluous first."""
     while now.model.names:
         errors = np.maximum(_errors(now), _LEAST_ERROR * size)
@@ -129,7 +137,7 @@ def _without_the_idle(record: AnalysisRecord, now: Fit, size: FloatArray) -> Fit
         for name in now.model.names:
             model = now.model.without(name)
             without.append(fitting.fit(model, model.coordinates(now.known)[None], iterations=8))
-        cost = [float((_errors(fit) / np.maximum(errors, ENOUGH * size)).max()) for fit in without]
+        cost = [float((_errors(fit) / np.maximum(errors, enough * size)).max()) for fit in without]
         if min(cost) > 1 / _WORTH:
             break
         now = without[int(np.argmin(cost))]

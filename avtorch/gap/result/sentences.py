@@ -128,7 +128,7 @@ def tested(found: Findings) -> list[str]:
     wrong = [str(x) for x in facts.wrong if str(x) not in said]
     if wrong:
         lines.append(f"Parameters that differ: {'; '.join(wrong)}.")
-    return [*lines, *facts.notes]
+    return lines
 
 
 def budget(found: Findings) -> list[str]:

@@ -73,7 +73,6 @@ class SimulatorUnderTest:
     rollout: Mapping[str, float]
     parameters: tuple[ParameterDifference, ...] = ()
     missing: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
 
     @property
     def wrong(self) -> tuple[ParameterDifference, ...]:
@@ -97,5 +96,4 @@ class SimulatorUnderTest:
             "rollout_10s": dict(self.rollout),
             "parameters": [p.to_dict() for p in self.parameters],
             "missing": list(self.missing),
-            "notes": list(self.notes),
         }
