@@ -1,7 +1,8 @@
 """The mode of a hypothesis's parameters: Gauss-Newton on whitened errors, from many starts at once.
 
 Derivatives are forward differences: all columns of all starts are one batch of rollouts. They are taken only where a
-step follows; the place where a fit ends needs its value alone. The slope of a road is linear in its coefficients, which are integrated out exactly.
+step follows; the place where a fit ends needs its value alone. The slope of a road is linear in its coefficients, which
+are integrated out exactly.
 
 The likelihood in a dead time has a crease, where its slope jumps, at every whole number of rows, because a command is
 held until the next. Where the last step has crossed one, the crease itself is tried, too.

@@ -51,9 +51,9 @@ class Record:
 
     `accel`, `speed` (row, group): measured, all drives' rows concatenated; None: not in the log. `time` (row,) [s] from
     the start of its log; `stamp` (row,) [s] on that log's own clock, `log` (row,) its number; `command` (row,), mean of
-    a group. `source`: index of every counted row in these arrays; `stretch` (counted,) numbers the stretches. `group`: rows averaged into one. `coarse` are drives
-    of averaged commands; in a short log they are the drives themselves. `cuts` are the origins of the drives; drives of
-    one segment share a road, and `position` continues along it.
+    a group. `source`: index of every counted row in these arrays; `stretch` (counted,) numbers the stretches. `group`:
+    rows averaged into one. `coarse` are drives of averaged commands; in a short log they are the drives themselves.
+    `cuts` are the origins of the drives; drives of one segment share a road, and `position` continues along it.
     """
 
     drives: tuple[SimulatorInput, ...]

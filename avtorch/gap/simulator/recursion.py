@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.linalg.blas import dtbsv
+from scipy.linalg import get_blas_funcs
 from scipy.signal import lfilter
 from torch import Tensor
 
@@ -102,11 +102,12 @@ def _substituted(n: int, alpha: _Components, beta: _Components) -> _Components:
     for i in range(n):
         for j in range(n):
             below[:, :-1, j, n + i - j] = -alpha[i * n + j].reshape(-1, shape[-1])[:, 1:]
-    x = dtbsv(2 * n - 1, below.reshape(-1, 2 * n).T, torch.stack(beta, -1).numpy().ravel(), lower=1, diag=1)
+    x = _SUBSTITUTE(2 * n - 1, below.reshape(-1, 2 * n).T, torch.stack(beta, -1).numpy().ravel(), lower=1, diag=1)
     return list(torch.from_numpy(x).reshape(*shape, n).unbind(-1))
 
 
 _ONE = np.ones(1)
+_SUBSTITUTE = get_blas_funcs("tbsv", dtype=np.float64)
 
 
 def _aligned(n: int, alpha: _Components, beta: _Components, start: _Components) -> list[Any]:
