@@ -107,7 +107,7 @@ def _substituted(n: int, alpha: _Components, beta: _Components) -> _Components:
 
 
 _ONE = np.ones(1)
-_SUBSTITUTE = get_blas_funcs("tbsv", dtype=np.float64)
+_SUBSTITUTE = get_blas_funcs(("tbsv",), dtype=np.float64)[0]
 
 
 def _aligned(n: int, alpha: _Components, beta: _Components, start: _Components) -> list[Any]:
