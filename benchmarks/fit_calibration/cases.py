@@ -97,7 +97,7 @@ def searched(case: Case, *, effects: Sequence[type] | None = None) -> KeptCase:
         case.kind,
         case.truth_name,
         tuple(KeptCandidate(f.name, float(f.log_evidence - flat)) for f in race.found),
-        {f.name: left_over(f, race) for f in race.found if f.name in named},
+        {f.name: left_over(f, race.record) for f in race.found if f.name in named},
     )
 
 

@@ -4,6 +4,7 @@ more."""
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,12 @@ import pytest
 import avtorch
 from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes
 from avtorch.gap import DeadTime, Outliers, SensorBias, plant
+from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.search.fitted_model import FittedModel
+from avtorch.gap.search.own_noise_fit import OwnNoiseFits
+from avtorch.gap.search.screening import Screened
 from avtorch.gap.search.time_budget import TimeBudget
 from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.io import Log
@@ -90,6 +95,25 @@ def test_without_pairs_nothing_holds_a_pair() -> None:
     # the truth is a pair: the sentences leave room for it
     assert "and pairs. Probabilities cover only what was tried" in str(found)
     assert "every other hypothesis." not in sentences.aliases(found)
+
+
+def test_where_the_likelihood_is_lost_held_out_blocks_decide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No adequate noise after the best single effect: neither others nor pairs get noise of their own."""
+    monkeypatch.setattr("avtorch.gap.diagnose._unknown", lambda found, record, prior: 1.0)
+    settled: list[str] = []
+    best_form = OwnNoiseFits.best_form
+
+    def counted(self: OwnNoiseFits, forms: Sequence[Screened], noise: NoiseModel) -> FittedModel:
+        settled.append(forms[0].hypothesis.name)
+        return best_form(self, forms, noise)
+
+    monkeypatch.setattr(OwnNoiseFits, "best_form", counted)
+    found = avtorch.diagnose(_log(), effects=["sensor_bias", "dead_time", "sensor_lag"])
+    assert settled == ["dead_time"]
+    assert found.complete
+    answer = found.to_dict()
+    assert answer["not_tried"]["pairs"] == "lost"
+    assert any("tried no pairs" in note for note in answer["notes"])
 
 
 def test_effects_that_were_not_asked_for_are_not_ruled_out() -> None:

@@ -91,6 +91,11 @@ def _record(logs: Sequence[Log]) -> AnalysisRecord | None:
         return None
 
 
+def divisible(logs: Sequence[Log]) -> bool:
+    """Whether these drives are long enough to hold out blocks, so that there is an account."""
+    return _record(logs) is not None
+
+
 def _onsets(winner: FittedModel | None, logs: Sequence[Log]) -> dict[str, float]:
     """When the winner's effects set in [s from the log's start]; of several drives nothing is said."""
     if winner is None or winner.onset is None or len(logs) > 1:

@@ -1,7 +1,8 @@
 """The mode of a hypothesis's parameters: Gauss-Newton on whitened errors, from many starts at once.
 
-Derivatives are forward differences: all columns of all starts are one batch of rollouts, which costs hardly more than
-one. The slope of a road is linear in its coefficients, which are integrated out exactly.
+Derivatives are forward differences: all columns of all starts are one batch of rollouts. They are taken only where a
+step follows; the place where a fit ends needs its value alone. The slope of a road is linear in its coefficients, which
+are integrated out exactly.
 
 The likelihood in a dead time has a crease, where its slope jumps, at every whole number of rows, because a command is
 held until the next. Where the last step has crossed one, the crease itself is tried, too.
@@ -63,20 +64,29 @@ def modes(
     gradient, square = np.zeros((count, size)), np.tile(np.eye(size), (count, 1, 1))
     trial = z
     live = np.ones(count, bool)
+    delayed = any(effect.shift is not None for effect in hypothesis.effects)
     on_crease, promised = z.copy(), np.full(count, np.nan)
-    for _ in range(iterations):
-        g, h, v = _quadratic(hypothesis, white, trial[live], onset, coarse)
+    at = _Place(hypothesis, white, onset, coarse)
+    for turn in range(iterations):
         where = np.flatnonzero(live)
+        v, base = at.value(trial[where])
         good = v < value[where]
         gain = value[where] - v
-        step = trial[where] - best[where]
-        crease = _crease(step, value[where], gradient[where], square[where], v, g)
-        on_crease[where] = best[where] + crease.share[:, None] * step
-        promised[where] = np.minimum(value[where], v) - crease.value
-        up = where[good]
-        best[up], value[up], gradient[up], square[up] = trial[up], v[good], g[good], h[good]
         damping[where] = np.where(good, damping[where] * 0.2, np.maximum(damping[where] * 8, 1e-2))
         live[where] = ~(good & (gain < enough)) & (damping[where] < 1e4)
+        # a crease shows in the slopes at both ends of a step
+        ends = np.ones(len(where), bool) if delayed else good & live[where] & (turn < iterations - 1)
+        g, h = np.empty((len(where), size)), np.empty((len(where), size, size))
+        if ends.any():
+            g[ends], h[ends] = at.curvature(trial[where[ends]], base[ends])
+        if delayed:
+            step = trial[where] - best[where]
+            crease = _crease(step, value[where], gradient[where], square[where], v, g)
+            on_crease[where] = best[where] + crease.share[:, None] * step
+            promised[where] = np.minimum(value[where], v) - crease.value
+        up = where[good]
+        best[up], value[up] = trial[up], v[good]
+        gradient[where[good & ends]], square[where[good & ends]] = g[good & ends], h[good & ends]
         if not live.any():
             break
         diagonal = np.einsum("cii->ci", square)
@@ -84,13 +94,24 @@ def modes(
         step = step[:, :, 0]
         step *= np.minimum(1.0, _LONGEST / np.maximum(np.abs(step).max(1, keepdims=True), 1e-12))
         trial = np.clip(best + step, -5.0, 5.0)
-    delayed = any(effect.shift is not None for effect in hypothesis.effects)
-    last = np.flatnonzero(promised > enough) if delayed else np.empty(0, int)
+    last = np.flatnonzero(promised > enough)
     if last.size:
-        _, _, v = _quadratic(hypothesis, white, on_crease[last], onset, coarse)
+        v, _ = at.value(on_crease[last])
         up = last[v < value[last]]
         best[up], value[up] = on_crease[up], v[v < value[last]]
     return best, white.constant_of(coarse=coarse) - value
+
+
+def log_joint(
+    hypothesis: Hypothesis,
+    white: WhiteningFilter,
+    z: Float[FloatArray, "start coordinate"],
+    onset: int | None = None,
+    *,
+    coarse: bool = False,
+) -> Float[FloatArray, " start"]:
+    """Log joint densities (start,) at `z` (start, coordinate), as `modes` has them."""
+    return white.constant_of(coarse=coarse) - _Place(hypothesis, white, onset, coarse).value(z)[0]
 
 
 class _Crease(NamedTuple):
@@ -122,31 +143,47 @@ def _crease(
     return _Crease(share, value + slope * share + 0.5 * curvature * share**2)
 
 
-def _quadratic(
-    hypothesis: Hypothesis,
-    white: WhiteningFilter,
-    z: Float[FloatArray, "start coordinate"],
-    onset: int | None,
-    coarse: bool = False,
-) -> tuple[
-    Float[FloatArray, "start coordinate"], Float[FloatArray, "start coordinate coordinate"], Float[FloatArray, " start"]
-]:
-    """Gradient, Gauss-Newton matrix and value of the negative log joint density (up to a constant) at `z`."""
-    count, size = z.shape
-    moved = np.repeat(z[:, None], size + 1, 1)
-    moved[:, 1:] += _STEP * np.eye(size)
-    errors = hypothesis.errors(moved.reshape(-1, size), onset, coarse=coarse)
-    e = white(errors)
-    flat = e.reshape(count, size + 1, -1)
-    columns = (flat[:, 1:] - flat[:, :1]) / _STEP
-    base = flat[:, 0]
-    square = columns @ columns.transpose(0, 2, 1)
-    cross = np.einsum("cpr,cr->cp", columns, base)
-    value = 0.5 * np.einsum("cr,cr->c", base, base)
-    if hypothesis.grade_means is not None:
-        slope = grade_marginal(white, hypothesis, onset, coarse=coarse)
-        square, cross, value = _integrated(slope, columns, base, square, cross, value)
-    return cross + z, square + np.eye(size), value + 0.5 * (z**2).sum(1)
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """The negative log joint density (up to a constant) of a hypothesis under a noise, and its derivatives."""
+
+    hypothesis: Hypothesis
+    white: WhiteningFilter
+    onset: int | None
+    coarse: bool
+
+    def value(
+        self, z: Float[FloatArray, "start coordinate"]
+    ) -> tuple[Float[FloatArray, " start"], Float[FloatArray, "start row"]]:
+        """At `z`, with the whitened errors there, of which `curvature` makes use."""
+        base = self._whitened(z)
+        value = 0.5 * (np.einsum("cr,cr->c", base, base) + (z**2).sum(1))
+        if self.hypothesis.grade_means is not None:
+            value -= self._slope.weighed(base @ self._slope.image.T)[0]
+        return value, base
+
+    def curvature(
+        self, z: Float[FloatArray, "start coordinate"], base: Float[FloatArray, "start row"]
+    ) -> tuple[Float[FloatArray, "start coordinate"], Float[FloatArray, "start coordinate coordinate"]]:
+        """Gradient and Gauss-Newton matrix at `z`, with the road grade's coefficients and size integrated out."""
+        count, size = z.shape
+        columns = self._whitened((z[:, None] + _STEP * np.eye(size)).reshape(-1, size)).reshape(count, size, -1)
+        columns -= base[:, None]
+        columns /= _STEP
+        square, cross = columns @ columns.transpose(0, 2, 1), np.einsum("cpr,cr->cp", columns, base)
+        if self.hypothesis.grade_means is not None:
+            match, towards = base @ self._slope.image.T, columns @ self._slope.image.T
+            _, taken = self._slope.weighed(match)
+            square -= np.einsum("cpk,ck,cqk->cpq", towards, taken, towards)
+            cross -= np.einsum("cpk,ck->cp", towards, taken * match)
+        return cross + z, square + np.eye(size)
+
+    def _whitened(self, z: Float[FloatArray, "column coordinate"]) -> Float[FloatArray, "column row"]:
+        return self.white(self.hypothesis.errors(z, self.onset, coarse=self.coarse)).reshape(len(z), -1)
+
+    @property
+    def _slope(self) -> GradeMarginal:
+        return grade_marginal(self.white, self.hypothesis, self.onset, coarse=self.coarse)
 
 
 def whitened_jacobian(
@@ -165,23 +202,6 @@ def whitened_jacobian(
     if hypothesis.grade_means is None:
         return columns
     return np.concatenate([columns, grade_marginal(white, hypothesis, onset, coarse=coarse).image])
-
-
-def _integrated(
-    slope: GradeMarginal,
-    columns: FloatArray,
-    base: FloatArray,
-    square: FloatArray,
-    cross: FloatArray,
-    value: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The quadratic with the road grade's coefficients and size integrated out, (start, ...)."""
-    match = base @ slope.image.T
-    towards = columns @ slope.image.T
-    total, taken = slope.weighed(match)
-    square = square - np.einsum("cpk,ck,cqk->cpq", towards, taken, towards)
-    cross = cross - np.einsum("cpk,ck->cp", towards, taken * match)
-    return square, cross, value - total
 
 
 def grade_marginal(white: WhiteningFilter, hypothesis: Hypothesis, onset: int | None, *, coarse: bool) -> GradeMarginal:
@@ -224,13 +244,15 @@ def finish(
 ) -> GaussNewtonFit:
     """Covariance, residuals and Laplace evidence at a mode `z` (coordinate,)."""
     size = len(z)
-    _, square, value = (x[0] for x in _quadratic(hypothesis, white, z[None], onset))
+    at = _Place(hypothesis, white, onset, coarse=False)
+    value, base = at.value(z[None])
+    square = at.curvature(z[None], base)[1][0]
     errors = hypothesis.errors(z[None], onset)[0]
     rms, profile = None, None
     if hypothesis.grade_means is not None:
         rms, profile, part = _sloped(hypothesis, white, errors, onset)
         errors = errors - part
-    log_joint = white.constant_of(coarse=False) - float(value)
+    log_joint = white.constant_of(coarse=False) - float(value[0])
     return (
         GaussNewtonFit(
             z=z,

@@ -93,33 +93,37 @@ def fit_noise(
         more = {} if law is None else {k: max(x, 1e-6) for k, x in law.force(z[size:]).items()}
         return replace(start, **own, **more)
 
-    def white(z: FloatArray) -> WhiteningFilter:
-        return whitening_filter(record, model(z), **onsets)
+    coarse = errors.shape[-1] == 1
+
+    def scored(z: FloatArray) -> tuple[FloatArray, float, float]:
+        """Each row's log likelihood, the log joint density, and the mean square of the white errors."""
+        white = whitening_filter(record, model(z), **onsets)
+        rows = white.row_likelihoods(errors)
+        total = float(rows.sum())
+        square = 2 * (white.constant_of(coarse=coarse) - total) / errors.size
+        return rows, total - 0.5 * float(z @ z), square
 
     begin = np.log([getattr(start, n) for n in NAMES])
     z = np.concatenate([(begin - means) / sds, np.zeros(extra) if law_z is None else law_z])
     z = np.clip(z, -ends, ends)
-    rows = white(z).row_likelihoods(errors)
-    value = float(rows.sum()) - 0.5 * float(z @ z)
-    if not 0.5 < float((white(z)(errors) ** 2).mean()) < 2.0:
+    rows, value, square = scored(z)
+    if not 0.5 < square < 2.0:
         # far from the mode scores mislead: start at the best point of a coarse grid of sizes
         for shifts in product((-1.4, 0.0, 1.4), repeat=3):
             other = z.copy()
             for name, shift in zip(("process_sd", "accel_sd", "speed_sd"), shifts, strict=True):
                 other[NAMES.index(name)] = shift
-            tried = white(other).row_likelihoods(errors)
-            worth = float(tried.sum()) - 0.5 * float(other @ other)
-            if worth > value:
-                z, rows, value = other, tried, worth
+            tried = scored(other)
+            if tried[1] > value:
+                z, (rows, value, square) = other, tried
     damping, information = 1e-2, np.eye(len(z))
     for _ in range(iterations):
         ahead = [model(x) for x in z + _STEP * np.eye(len(z))]
         before = [before_onset(n, **onsets) for n in ahead]
-        whites = WhiteningFilter.each(record, ahead, before, coarse=errors.shape[-1] == 1)
+        whites = WhiteningFilter.each(record, ahead, before, coarse=coarse)
         slopes = np.stack([(w.row_likelihoods(errors) - rows) / _STEP for w in whites])
         # squared scores estimate the information near the mode; far from it they are too large by the square of this
-        excess = max(1.0, float((white(z)(errors) ** 2).mean()))
-        information = slopes @ slopes.T / excess**2 + np.eye(len(z))
+        information = slopes @ slopes.T / max(1.0, square) ** 2 + np.eye(len(z))
         gradient = slopes.sum(1) - z
         # coordinates at a bound with an outward gradient stay fixed
         held = ((z >= ends) & (gradient > 0)) | ((z <= -ends) & (gradient < 0))
@@ -132,15 +136,14 @@ def fit_noise(
             new = z.copy()
             new[free] += step
             new = np.clip(new, -ends, ends)
-            new_rows = white(new).row_likelihoods(errors)
-            new_value = float(new_rows.sum()) - 0.5 * float(new @ new)
-            if new_value >= value:
+            after = scored(new)
+            if after[1] >= value:
                 better = True
                 break
             damping = max(damping * 8, 1e-2)
         if not better:
             break
-        gained, z, rows, value = new_value - value, new, new_rows, new_value
+        gained, z, (rows, value, square) = after[1] - value, new, after
         damping *= 0.2
         if gained < 0.02:
             break

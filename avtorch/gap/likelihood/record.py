@@ -34,7 +34,6 @@ RATE_HZ = 20.0
 """Rows are averaged as long as the resulting rate is at least this [Hz]."""
 _SHORTEST_S = 2.0
 _FEW = 20_000  # rows of a log short enough to be rolled out in full wherever means would suffice
-_GAP_S = 5.0  # zeros between stretches, over which a filter's state decays
 _FAR_M = 1000.0  # several correlation lengths of the road grade: beyond it roads are independent
 
 
@@ -52,10 +51,9 @@ class Record:
 
     `accel`, `speed` (row, group): measured, all drives' rows concatenated; None: not in the log. `time` (row,) [s] from
     the start of its log; `stamp` (row,) [s] on that log's own clock, `log` (row,) its number; `command` (row,), mean of
-    a group. `source`, `target`: index of every counted row in these arrays, and in the padded array of `length` rows
-    that is filtered; `stretch` (counted,) numbers the stretches. `group`: rows averaged into one. `coarse` are drives
-    of averaged commands; in a short log they are the drives themselves. `cuts` are the origins of the drives; drives of
-    one segment share a road, and `position` continues along it.
+    a group. `source`: index of every counted row in these arrays; `stretch` (counted,) numbers the stretches. `group`:
+    rows averaged into one. `coarse` are drives of averaged commands; in a short log they are the drives themselves.
+    `cuts` are the origins of the drives; drives of one segment share a road, and `position` continues along it.
     """
 
     drives: tuple[SimulatorInput, ...]
@@ -69,9 +67,7 @@ class Record:
     command: Float[FloatArray, " row"]
     dt: float
     source: Int[IntArray, " counted"]
-    target: Int[IntArray, " counted"]
     stretch: Int[IntArray, " counted"]
-    length: int
     group: int
 
     @property
@@ -88,7 +84,7 @@ class Record:
     def channels(self) -> tuple[str, ...]:
         return tuple(name for name in ("accel", "speed") if getattr(self, name) is not None)
 
-    @property
+    @cached_property
     def starts(self) -> Int[IntArray, " stretch"]:
         """Index of each stretch's first counted row."""
         return np.flatnonzero(np.diff(self.stretch, prepend=-1))
@@ -165,7 +161,7 @@ class Record:
         if not drives and all(log.engaged.all() for log in each):
             raise InputError(f"{', '.join(names)}: no drive of two seconds or more, nothing to diagnose")
         dt = float(np.median(steps)) if drives else np.inf
-        source, target, stretch, length = _places(columns["use"], dt)
+        source, stretch = _places(columns["use"], dt)
         if not drives or len(source) < 10 / dt:
             seconds = len(source) * dt if drives else 0.0
             each_return = f" and each of {returns} return{'s' * (returns != 1)} to engaged" if returns else ""
@@ -192,9 +188,7 @@ class Record:
             command=command,
             dt=dt,
             source=source,
-            target=target,
             stretch=stretch,
-            length=length,
             group=group,
         )
 
@@ -222,8 +216,8 @@ class Record:
         sizes = [len(d.time) * each // self.group for d in self.coarse]
         use = np.zeros(sum(sizes))
         use[self.source[rows]] = 1.0
-        source, target, stretch, length = _places(np.split(use, np.cumsum(sizes)[:-1]), self.dt)
-        return replace(self, source=source, target=target, stretch=stretch, length=length)
+        source, stretch = _places(np.split(use, np.cumsum(sizes)[:-1]), self.dt)
+        return replace(self, source=source, stretch=stretch)
 
     def place(self, row: int, *, coarse: bool = False) -> Place:
         """Where the group of a counted `row` begins in the drives, or in the `coarse` ones."""
@@ -234,12 +228,6 @@ class Record:
             place -= len(drives[number].time)
             number += 1
         return Place(number, place)
-
-    def padded(self, values: Float[FloatArray, "*column counted group"]) -> Float[FloatArray, "*column padded"]:
-        """Counted rows' `values` (..., counted, group) at their positions in (..., length * group), zeros elsewhere."""
-        out = np.zeros((*values.shape[:-2], self.length, values.shape[-1]))
-        out[..., self.target, :] = values
-        return out.reshape(*values.shape[:-2], -1)
 
     def at_counted_rows(
         self, responses: Sequence[Tensor], *, coarse: bool = False
@@ -328,22 +316,15 @@ def _quiet(speed: FloatArray, dt: float) -> FloatArray:
     return np.asarray(np.maximum(gaussian_filter1d(speed, 0.15 / dt, mode="nearest"), 0.0))
 
 
-def _places(use: list[FloatArray], dt: float) -> tuple[IntArray, IntArray, IntArray, int]:
-    source, target, stretch = [], [], []
-    offset, place, number = 0, 0, 0
-    gap = round(_GAP_S / dt)
+def _places(use: list[FloatArray], dt: float) -> tuple[IntArray, IntArray]:
+    """The rows in use (counted,), of stretches that are long enough, and the number of each one's stretch."""
+    source, stretch, offset = [], [], 0
     for rows in use:
         edges = np.flatnonzero(np.diff(np.concatenate([[0], rows.astype(int), [0]])))
         for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-            if (end - begin) * dt < _SHORTEST_S:
-                continue
-            n = end - begin
-            source.append(offset + np.arange(begin, end))
-            target.append(place + np.arange(n))
-            stretch.append(np.full(n, number))
-            place, number = place + n + gap, number + 1
+            if (end - begin) * dt >= _SHORTEST_S:
+                stretch.append(np.full(end - begin, len(source)))
+                source.append(offset + np.arange(begin, end))
         offset += len(rows)
     empty = np.zeros(0, np.int64)
-    if not source:
-        return empty, empty, empty, 0
-    return np.concatenate(source), np.concatenate(target), np.concatenate(stretch), place
+    return (np.concatenate(source), np.concatenate(stretch)) if source else (empty, empty)

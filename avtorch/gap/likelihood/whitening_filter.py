@@ -72,18 +72,21 @@ class WhiteningFilter:
     def _filtered(
         self, errors: Float[FloatArray, "*column channel counted group"]
     ) -> Float[FloatArray, "*column channel counted group"]:
-        """Errors (..., channel, counted, group) through the filter."""
+        """Errors (..., channel, counted, group) through the filter, each stretch from rest."""
         count, group = errors.shape[-3], errors.shape[-1]
-        record = self.record
-        padded = record.padded(errors)
         out = np.empty(errors.shape)
         for (tops, bottom, _), part in self._parts(group == 1):
-            target = record.target[part]
-            history = padded[..., : (target[-1] + 1) * group]
-            for o in range(count):
-                total = sum(np.asarray(lfilter(tops[o][i], bottom, history[..., i, :], axis=-1)) for i in range(count))
-                rows = np.asarray(total).reshape(*total.shape[:-1], -1, group)  # type: ignore[union-attr]
-                out[..., o, part, :] = rows[..., target, :]
+            for stretch in self._stretches:
+                # a later filter has seen the whole stretch
+                rows, kept = slice(stretch.start, min(stretch.stop, part.stop)), max(stretch.start, part.start)
+                if kept >= rows.stop:
+                    continue
+                own = errors[..., rows, :].reshape(*errors.shape[:-2], -1)
+                for o in range(count):
+                    total = _filtered(tops[o], bottom, own)
+                    out[..., o, kept : rows.stop, :] = total.reshape(*total.shape[:-1], -1, group)[
+                        ..., kept - rows.start :, :
+                    ]
         return out
 
     def transpose(
@@ -97,13 +100,16 @@ class WhiteningFilter:
             images = self._without_offset(images)
         total = np.zeros_like(images)
         for (tops, bottom, _), part in self._parts(group == 1):
-            own = np.zeros_like(images)
-            own[..., part, :] = images[..., part, :]
-            back = record.padded(own)[..., ::-1]
-            for i in range(count):
-                through = [np.asarray(lfilter(tops[o][i], bottom, back[..., o, :], axis=-1)) for o in range(count)]
-                rows = np.sum(through, 0)[..., ::-1].reshape(*back.shape[:-2], -1, group)
-                total[..., i, :, :] += rows[..., record.target, :]
+            for stretch in self._stretches:
+                rows, kept = slice(stretch.start, min(stretch.stop, part.stop)), max(stretch.start, part.start)
+                if kept >= rows.stop:
+                    continue
+                own = np.array(images[..., rows, :])
+                own[..., : kept - rows.start, :] = 0.0
+                back = own.reshape(*own.shape[:-2], -1)[..., ::-1]
+                for i in range(count):
+                    through = _filtered([top[i] for top in tops], bottom, back)[..., ::-1]
+                    total[..., i, rows, :] += through.reshape(*through.shape[:-1], -1, group)
         if offset:  # the first speed of each stretch was subtracted from all of its rows
             total[..., -1, record.starts, 0] -= np.add.reduceat(total[..., -1, :, :].sum(-1), record.starts, -1)
         return total
@@ -111,10 +117,7 @@ class WhiteningFilter:
     def response(self, errors: Float[FloatArray, "channel time"]) -> Float[FloatArray, "channel time"]:
         """Whitened image of errors (channel, time) at consecutive rows from the first on, with the offset included."""
         tops, bottom, _ = self._parts(False)[-1][0]
-        count = len(errors)
-        return np.stack(
-            [sum(np.asarray(lfilter(tops[o][i], bottom, errors[i])) for i in range(count)) for o in range(count)]
-        )
+        return np.stack([_filtered(top, bottom, errors) for top in tops])
 
     @cached_property
     def _offsets(self) -> dict[bool, tuple[FloatArray, FloatArray]]:
@@ -134,8 +137,17 @@ class WhiteningFilter:
         self, e: Float[FloatArray, "*column channel counted group"]
     ) -> Float[FloatArray, "*column channel counted group"]:
         image, square = self._offset(e.shape[-1] == 1)
-        part = np.add.reduceat((e * image).sum((-3, -1)), self.record.starts, -1) / square
-        return e - image * part[..., None, self.record.stretch, None]
+        out = np.empty_like(e)
+        for number, stretch in enumerate(self._stretches):
+            rows, own = e[..., stretch, :], image[:, stretch]
+            part = rows.reshape(*e.shape[:-3], -1) @ own.ravel() / square[number]
+            np.subtract(rows, part[..., None, None, None] * own, out=out[..., stretch, :])
+        return out
+
+    @property
+    def _stretches(self) -> list[slice]:
+        starts = self.record.starts.tolist()
+        return [slice(*ends) for ends in pairwise([*starts, self.record.rows])]
 
     def __call__(
         self, errors: Float[FloatArray, "*column channel counted group"]
@@ -147,7 +159,8 @@ class WhiteningFilter:
         if "speed" not in self.record.channels:
             return self._filtered(errors)
         errors = errors.copy()
-        errors[..., -1, :, :] -= errors[..., -1, self.record.starts, :1][..., self.record.stretch, :]
+        for stretch in self._stretches:
+            errors[..., -1, stretch, :] -= errors[..., -1, stretch.start, :1][..., None, :].copy()
         return self._without_offset(self._filtered(errors))
 
     @cached_property
@@ -191,6 +204,16 @@ class WhiteningFilter:
     def row_likelihoods(self, errors: Float[FloatArray, "channel counted group"]) -> Float[FloatArray, " counted"]:
         """Log likelihood (counted,) of each row of errors (channel, counted, group); the rows sum to the total."""
         return self.constants(coarse=errors.shape[-1] == 1) - 0.5 * (self(errors) ** 2).sum((0, 2))
+
+
+def _filtered(
+    tops: Sequence[FloatArray], bottom: FloatArray, inputs: Float[FloatArray, "*column channel time"]
+) -> Float[FloatArray, "*column time"]:
+    """The sum of `inputs` (..., channel, time), each through its `tops` over the common `bottom`."""
+    first, *others = (np.asarray(lfilter(top, bottom, inputs[..., i, :], axis=-1)) for i, top in enumerate(tops))
+    for other in others:
+        first += other
+    return first
 
 
 def sensed(

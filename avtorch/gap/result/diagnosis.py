@@ -177,7 +177,7 @@ class Diagnosis:
 
         Beyond the schema's keys it has `moved`, `onset_s`, `plausible` and `plausibility` of each effect, the last two
         of the verdict, `onset_from_start_s`, `setting`, `remaining`, `complete`, `not_tried` (`effects` by name;
-        `pairs`, of which "all", "some" or "none" were tried) and `notes`.
+        `pairs`, of which "all", "some", "none" were tried, or "lost") and `notes`.
         """
         return {
             "schema": f"avtorch.diagnosis/{1 if self.budget is None else 2}",

@@ -251,7 +251,7 @@ def untried(scope: Scope) -> list[str]:
     """The hypotheses that were not tried, and the resulting meaning of the probabilities."""
     few, rest = scope.not_scored[:_UNTRIED], len(scope.not_scored) - _UNTRIED
     parts = [*few, *([f"{rest} more effects"] if rest > 0 else [])]
-    parts += {"all": [], "some": ["some of the pairs"], "none": ["pairs"]}[scope.pairs]
+    parts += {"some": ["some of the pairs"], "none": ["pairs"]}.get(scope.pairs, [])
     if not parts:
         return []
     listing = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -148,17 +148,20 @@ class FittedModel:
         )
 
 
+Pairs = Literal["all", "some", "none", "lost"]
+
+
 @dataclass(frozen=True)
 class Scope:
     """What a search tried: names of single effects `scored` and `not_scored`, and which `pairs`.
 
     `not_scored`: effects excluded by the budget or by the user. `pairs`: "all" that screening selected, "some" before
-    the budget ended, or "none".
+    the budget ended, "none", or "lost": none, as the likelihood could no longer give the answer.
     """
 
     scored: tuple[str, ...] = ()
     not_scored: tuple[str, ...] = ()
-    pairs: Literal["all", "some", "none"] = "all"
+    pairs: Pairs = "all"
 
     @classmethod
     def of(
@@ -166,7 +169,7 @@ class Scope:
         effects: Sequence[type[Effect]],
         tried: Collection[str],
         channels: Collection[str],
-        pairs: Literal["all", "some", "none"],
+        pairs: Pairs,
     ) -> Self:
         """The scope of a search among `effects`, limited to those observable in `channels`; `tried`: by name."""
         own = {e.name: e for e in effects}
@@ -177,7 +180,7 @@ class Scope:
     @property
     def whole(self) -> bool:
         """Whether every hypothesis was tried."""
-        return not self.not_scored and self.pairs == "all"
+        return not self.not_scored and self.pairs in ("all", "lost")
 
     def to_dict(self) -> dict[str, Any]:
         return {"effects": list(self.not_scored), "pairs": self.pairs}

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.likelihood.gauss_newton import modes, residuals
+from avtorch.gap.likelihood.gauss_newton import log_joint, modes, residuals
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
@@ -24,6 +24,7 @@ from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant
 
 _TURNS = 10  # of parameters and noise, at most
+_TRADES = 3  # of a delay for lag that are followed, those that begin best
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +89,11 @@ class OwnNoiseFits:
         hypothesis: Hypothesis, z: FloatArray, white: WhiteningFilter, onset: int | None, coarse: bool
     ) -> FloatArray:
         """`z`, or the best place from which the fit separates a dead time and the lag better."""
-        places = np.concatenate([z[None], lag_delay_starts(hypothesis, z)])
-        if len(places) == 1:
+        places = lag_delay_starts(hypothesis, z)
+        if not len(places):
             return z
+        best = np.argsort(-log_joint(hypothesis, white, places, onset, coarse=coarse))[:_TRADES]
+        places = np.concatenate([z[None], places[best]])
         moved, values = modes(hypothesis, white, places, onset=onset, iterations=3, coarse=coarse, enough=ENOUGH)
         return moved[values.argmax()]
 

