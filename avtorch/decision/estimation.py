@@ -175,7 +175,7 @@ def estimate(
     signals = {name: torch.from_numpy(getattr(log, name)) for name in chosen.columns}
     signals["accel_cmd"] = torch.from_numpy(command)
     name = "jerk" if isinstance(chosen, JerkForm) else "latent"
-    settings = {"window": window, "form": name, "dead_time": dead_time, "estimator": estimator, "seed": seed}
+    settings = {"window": window, "form": name, "delay": dead_time, "estimator": estimator, "seed": seed}
     settings |= {"accepted": accepted, "mode": inference.get("mode")}
     kept = KeptWindows(
         checkpoint, {} if checkpoint is None else estimated_work(log, settings, watch.state_dict(), setting, inference)
