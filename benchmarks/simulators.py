@@ -52,7 +52,9 @@ class Vehicle:
     def step(self, accel_cmd: float, dt: float) -> tuple[float, float]:
         raise NotImplementedError("takes whole drives")
 
-    def drive(self, accel_cmd: FloatArray, dt: FloatArray, *, speed: float, accel: float) -> tuple[FloatArray, ...]:
+    def whole_drive(
+        self, accel_cmd: FloatArray, dt: FloatArray, *, speed: float, accel: float
+    ) -> tuple[FloatArray, ...]:
         command = np.append(accel_cmd, accel_cmd[-1])
         pilot = Recorded(command, start_speed=speed)
         run = simulate(self._car, pilot, seconds=len(command) / RATE_HZ, rate_hz=RATE_HZ, effects=self._effects)
@@ -119,8 +121,8 @@ def _drawn(rng: np.random.Generator, number: int) -> dict[str, Any] | None:
         other, effects = change(s)
         run = driven(other, effects)
         start = float(run.speed[0])
-        plain = Vehicle(car, own).drive(run.command, np.zeros(0), speed=start, accel=0.0)[0]
-        with_it = Vehicle(other, effects).drive(run.command, np.zeros(0), speed=start, accel=0.0)[0]
+        plain = Vehicle(car, own).whole_drive(run.command, np.zeros(0), speed=start, accel=0.0)[0]
+        with_it = Vehicle(other, effects).whole_drive(run.command, np.zeros(0), speed=start, accel=0.0)[0]
         columns = [] if kind == "parameter" else [plain, np.gradient(plain)]
         return _excess(with_it - plain, columns, float(run.noise_accel.std())), s
 
@@ -157,7 +159,7 @@ def answered(case: Mapping[str, Any], by: str) -> dict[str, Any]:
     begun = time.process_time()
     if by == "output":
         speed = float(log.speed[0])
-        accel, speeds = simulator.drive(log.accel_cmd[:-1], np.zeros(0), speed=speed, accel=0.0)
+        accel, speeds = simulator.whole_drive(log.accel_cmd[:-1], np.zeros(0), speed=speed, accel=0.0)
         output = Log.from_arrays(
             name="simulator",
             time=log.time[1:],
@@ -218,7 +220,7 @@ def main() -> None:
         for key in ("right", "in_alias_set", "right_kind"):
             hits = sum(row[key] for row in own)
             if own:
-                low, high = wilson(hits, len(own))
+                low, high = wilson(hits, len(own)) or (0.0, 1.0)
                 print(f"{kind}: {key} {hits} of {len(own)} ({low:.2f} to {high:.2f})")
     print(f"median {np.median([row['seconds'] for row in rows]):.1f} processor s")
 

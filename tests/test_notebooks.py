@@ -136,12 +136,21 @@ def your_own(names: Names) -> None:
     assert not bool(names["saved"].rows.collided)
 
 
+def your_simulator(names: Names) -> None:
+    assert names["check"].values["dead_time.delay_s"] == pytest.approx(0.1, abs=0.01)
+    assert names["check"].values["second_order_actuator.natural_frequency_radps"] == pytest.approx(6.0, rel=0.03)
+    assert names["found"].verdict.name == "constant_resistance"
+    assert names["found"].tested.missing == ("constant_resistance",)
+    assert names["errors"]["wrapped"] < 0.1 * names["errors"]["as it was"]
+
+
 CLAIMS: dict[str, Callable[[Names], None]] = {
     "1_vehicle_and_stability": vehicle_and_stability,
     "2_sgld_nuts_quadrature": sgld_nuts_quadrature,
     "3_a_drive_watched_and_saved": a_drive_watched_and_saved,
     "4_diagnosing_a_gap": diagnosing_a_gap,
     "6_your_own": your_own,
+    "7_your_simulator": your_simulator,
 }
 
 

@@ -106,7 +106,7 @@ class _Drive:
         begin_speed = 0.0 if log.speed is None else max(float(log.speed[part][0]), 0.0)
         steps = np.diff(time)
         if self._step_s is None and isinstance(self._simulator, WholeDrives):
-            later = np.stack(self._simulator.drive(command[:-1], steps, speed=begin_speed, accel=begin_accel), -1)
+            later = np.stack(self._simulator.whole_drive(command[:-1], steps, speed=begin_speed, accel=begin_accel), -1)
         else:
             self._called(float(time[0]), lambda: self._simulator.reset(speed=begin_speed, accel=begin_accel), "reset")
             rows = zip(command[:-1], steps.tolist(), time.tolist(), strict=False)

@@ -182,7 +182,7 @@ class FmuSimulator:
         accel, speed = self._advance(np.array([accel_cmd], dtype=np.float64), np.array([dt], dtype=np.float64))
         return float(accel[0]), float(speed[0])
 
-    def drive(
+    def whole_drive(
         self, accel_cmd: ArrayLike, dt: ArrayLike, *, speed: float, accel: float
     ) -> tuple[FloatArray, FloatArray]:
         """`reset`, then one step for each command (row,) [m/s²], of one length or of each row's own (row,) [s]: the

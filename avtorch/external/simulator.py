@@ -39,7 +39,7 @@ class Simulator(Protocol):
 class WholeDrives(Protocol):
     """A simulator that also takes a drive as a whole, where many calls would be slow."""
 
-    def drive(
+    def whole_drive(
         self, accel_cmd: FloatArray, dt: FloatArray, *, speed: float, accel: float
     ) -> tuple[FloatArray, FloatArray]:
         """`reset`, then a step for each command (row,) [m/s²] and length (row,) [s]: accelerations (row,) [m/s²] and

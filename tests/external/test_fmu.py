@@ -60,7 +60,7 @@ def build(tmp_path: Path, compiled: dict[int, Path]) -> Iterator[Build]:
 
 
 def driven(car: FmuSimulator, dt: float = DT, **start: float) -> tuple[np.ndarray, np.ndarray]:
-    return car.drive(COMMAND, dt, **{"speed": 20.0, "accel": 0.4, **start})
+    return car.whole_drive(COMMAND, dt, **{"speed": 20.0, "accel": 0.4, **start})
 
 
 def expected(**given: float) -> tuple[list[float], list[float]]:
@@ -84,7 +84,7 @@ def test_a_drive_is_its_steps_and_a_second_one_is_the_same(build: Build, fmi: in
 
 def test_steps_of_different_lengths(build: Build, fmi: int) -> None:
     steps = np.where(np.arange(20) % 2, 0.01, 0.05)
-    accel, _ = build.open(build.fmu(fmi)).drive(COMMAND[:20], steps, speed=20.0, accel=0.0)
+    accel, _ = build.open(build.fmu(fmi)).whole_drive(COMMAND[:20], steps, speed=20.0, accel=0.0)
     # each of the model's own steps is 1 ms, so that holding a command for 50 ms is holding it five times for 10 ms
     fine = np.repeat(COMMAND[:20], np.rint(steps / 0.01).astype(int))
     ends = np.cumsum(np.rint(steps / 0.01).astype(int)) - 1
@@ -253,7 +253,7 @@ def test_a_step_that_is_only_preferred_is_divided(build: Build) -> None:
 def test_steps_must_be_alike_where_the_fmu_says_no_more(build: Build) -> None:
     car = build.open(build.fmu(variable_step=False))
     with pytest.raises(InputError, match=r"dt: found steps from 0\.02 to 0\.03 s; .* all alike"):
-        car.drive(COMMAND[:3], [0.02, 0.03, 0.02], speed=20.0, accel=0.0)
+        car.whole_drive(COMMAND[:3], [0.02, 0.03, 0.02], speed=20.0, accel=0.0)
     car.reset(speed=20.0, accel=0.0)
     car.step(0.0, 0.02)
     with pytest.raises(InputError, match="all alike"):
@@ -346,11 +346,11 @@ def test_a_failure_step_by_step(build: Build) -> None:
 def test_numbers_that_are_none_are_refused(build: Build) -> None:
     car = build.open(build.fmu())
     with pytest.raises(InputError, match="accel_cmd: found nan"):
-        car.drive([0.0, np.nan], DT, speed=20.0, accel=0.0)
+        car.whole_drive([0.0, np.nan], DT, speed=20.0, accel=0.0)
     with pytest.raises(InputError, match="speed: found inf"):
         car.reset(speed=np.inf, accel=0.0)
     with pytest.raises(InputError, match=r"shapes \(3,\) and \(2,\)"):
-        car.drive([0.0, 0.0, 0.0], [DT, DT], speed=20.0, accel=0.0)
+        car.whole_drive([0.0, 0.0, 0.0], [DT, DT], speed=20.0, accel=0.0)
 
 
 def test_what_is_closed_is_refused(build: Build) -> None:

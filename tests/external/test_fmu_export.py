@@ -59,8 +59,8 @@ def response(car: GapPlant, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def test_the_whole_car_is_the_plant(effects: Sequence[Effect], tmp_path: Path) -> None:
     car = plant(effects, K_L=0.8)
     with FmuSimulator(write_fmu(car, tmp_path / "car.fmu")) as fmu:
-        accel, speed = fmu.drive(COMMAND, DT, speed=20.0, accel=0.3)
-        slow_accel, slow_speed = fmu.with_parameters({"K_L": 0.5}).drive(COMMAND, DT, speed=20.0, accel=0.3)
+        accel, speed = fmu.whole_drive(COMMAND, DT, speed=20.0, accel=0.3)
+        slow_accel, slow_speed = fmu.with_parameters({"K_L": 0.5}).whole_drive(COMMAND, DT, speed=20.0, accel=0.3)
         assert {name: fmu.parameters()[name] for name in car.values()} == {k: float(v) for k, v in car.values().items()}
     for one, a, v in ((car, accel, speed), (car.with_values({"K_L": 0.5}), slow_accel, slow_speed)):
         expected_accel, expected_speed = response(one, np.concatenate([[20.0], v[:-1]]))
@@ -83,7 +83,7 @@ def test_its_description_keeps_the_standard_and_states_units(tmp_path: Path) -> 
 
 def test_a_car_that_stops_does_not_roll_back(tmp_path: Path) -> None:
     with FmuSimulator(write_fmu(plant(T_L=0.3), tmp_path / "car.fmu")) as car:
-        _, speed = car.drive(np.repeat([-3.0, 2.0], 60), DT, speed=2.0, accel=0.0)
+        _, speed = car.whole_drive(np.repeat([-3.0, 2.0], 60), DT, speed=2.0, accel=0.0)
     assert speed[:60].min() == 0.0 == speed.min()
     assert speed[-1] > 3.0
 
@@ -91,7 +91,7 @@ def test_a_car_that_stops_does_not_roll_back(tmp_path: Path) -> None:
 def test_random_effects_are_drawn_by_the_seed(tmp_path: Path) -> None:
     with FmuSimulator(write_fmu(plant([Gust]), tmp_path / "car.fmu")) as car:
         one, other = (car.with_parameters({"seed": seed}) for seed in (1, 2))
-        drives = [fmu.drive(COMMAND[:20], DT, speed=20.0, accel=0.3)[1].tolist() for fmu in (one, one, other)]
+        drives = [fmu.whole_drive(COMMAND[:20], DT, speed=20.0, accel=0.3)[1].tolist() for fmu in (one, one, other)]
     assert drives[0] == drives[1] != drives[2]
 
 

@@ -163,3 +163,10 @@ def test_what_it_lacks_goes_around_it() -> None:
     as_it_was, better = (driven_along(x, noisy) for x in (OdeCar(), wrap(OdeCar(), found)))
     before, after = (np.sqrt(np.mean((x.speed - car.speed)[200:] ** 2)) for x in (as_it_was, better))
     assert after < 0.1 * before
+
+
+def test_an_attribute_called_drive_is_the_simulators_own() -> None:
+    class Driven(OdeCar):
+        drive = 1.0
+
+    assert driven_along(Driven(), lap(20)).rows == 20
