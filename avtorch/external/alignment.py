@@ -38,35 +38,36 @@ def aligned(simulated: Log, log: Log) -> Aligned:
     """
     if simulated.accel is None and simulated.speed is None:
         raise InputError(f"{simulated.name}: has neither accel nor speed, needs one of the two")
-    offset = _offset(simulated, log)
-    time = log.time + offset
+    shift = _shift(simulated, log)
+    time = log.elapsed + shift
     inside = _covered(simulated, time)
     if inside.mean() < 0.5:
         raise InputError(
-            f"{simulated.name}: covers {inside.mean():.0%} of the rows of {log.name}; needs the same drive, from "
-            f"{log.time[0]:.6g} to {log.time[-1]:.6g} s"
+            f"{simulated.name}: covers {inside.mean():.0%} of the rows of {log.name}; needs the same drive, of "
+            f"{log.elapsed[-1]:.6g} s"
         )
     channels = {
-        name: None if values is None else np.interp(time, simulated.time, values)
+        name: None if values is None else np.interp(time, simulated.elapsed, values)
         for name, values in (("accel", simulated.accel), ("speed", simulated.speed))
     }
     if simulated.accel_cmd is not None and log.accel_cmd is not None:
         _check_commands(simulated, log, time, inside & log.engaged)
     whole = replace(log, name=simulated.name, engaged=log.engaged & inside, **channels)
-    return Aligned(whole, offset)
+    return Aligned(whole, shift + simulated.epoch_s - log.epoch_s)
 
 
-def _offset(simulated: Log, log: Log) -> float:
-    """What the simulator's clock is ahead of the car's [s]."""
-    overlap = simulated.time[0] < log.time[-1] and log.time[0] < simulated.time[-1]
-    begun = 0.0 if overlap else float(simulated.time[0] - log.time[0])
+def _shift(simulated: Log, log: Log) -> float:
+    """What is added to the car's elapsed time for the simulator's [s]."""
+    apart = log.epoch_s - simulated.epoch_s
+    overlap = -log.elapsed[-1] < apart < simulated.elapsed[-1]
+    begun = apart if overlap else 0.0
     if simulated.accel_cmd is None or log.accel_cmd is None:
         return begun
     from scipy.signal import correlate, correlation_lags
 
-    grid = np.arange(log.time[0] - _FARTHEST_S, log.time[-1] + _FARTHEST_S, _GRID_S)
-    one = _standard(_held(log.time, log.accel_cmd, grid))
-    other = _standard(_held(simulated.time - begun, simulated.accel_cmd, grid))
+    grid = np.arange(-_FARTHEST_S, log.elapsed[-1] + _FARTHEST_S, _GRID_S)
+    one = _standard(_held(log.elapsed, log.accel_cmd, grid))
+    other = _standard(_held(simulated.elapsed - begun, simulated.accel_cmd, grid))
     shared = correlate(other, one, mode="full", method="fft")
     lags = correlation_lags(len(other), len(one))
     near = np.abs(lags) <= _FARTHEST_S / _GRID_S
@@ -90,7 +91,7 @@ def _covered(simulated: Log, time: FloatArray) -> BoolArray:
     """Rows that lie within a segment of the output."""
     inside = np.zeros(len(time), dtype=bool)
     for part in simulated.segments():
-        own = simulated.time[part]
+        own = simulated.elapsed[part]
         inside |= (time >= own[0] - 1e-6) & (time <= own[-1] + 1e-6)
     return inside
 
@@ -98,9 +99,9 @@ def _covered(simulated: Log, time: FloatArray) -> BoolArray:
 def _check_commands(simulated: Log, log: Log, time: FloatArray, rows: BoolArray) -> None:
     assert simulated.accel_cmd is not None
     assert log.accel_cmd is not None
-    other = _held(simulated.time, simulated.accel_cmd, time)
+    other = _held(simulated.elapsed, simulated.accel_cmd, time)
     # a row's command may change within the other's row: the better of two neighbours
-    late = _held(simulated.time, simulated.accel_cmd, time - 1.0 / simulated.rate_hz)
+    late = _held(simulated.elapsed, simulated.accel_cmd, time - 1.0 / simulated.rate_hz)
     apart = np.minimum(np.abs(other - log.accel_cmd), np.abs(late - log.accel_cmd))[rows]
     size = float(log.accel_cmd[rows].std())
     if size and float(np.sqrt((apart**2).mean())) > _SAME * size:

@@ -98,7 +98,7 @@ class _Drive:
     def along(self, log: Log, part: slice) -> tuple[FloatArray, FloatArray]:
         """Acceleration and speed (row,) in the rows of `part`."""
         assert log.accel_cmd is not None
-        time, command = log.time[part], log.accel_cmd[part].tolist()
+        time, command = log.elapsed[part], log.accel_cmd[part].tolist()
         begin_accel = command[0]
         if log.accel is not None:
             rows = max(1, round(_AVERAGED_S * log.rate_hz))

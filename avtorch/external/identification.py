@@ -96,6 +96,18 @@ def check_simulator(
 
     Raises `InputError` for an object that is no simulator, one that fails (see `driven_along`), a step or speeds out of
     range, and one that does not respond.
+
+    Example:
+        >>> from avtorch import InputError
+        >>> from avtorch.external import check_simulator
+        >>> class Parked:
+        ...     def reset(self, *, speed, accel): pass
+        ...     def step(self, accel_cmd, dt): return 0.0, 0.0
+        >>> try:
+        ...     check_simulator(Parked())
+        ... except InputError as error:
+        ...     print(error)
+        Parked: does not respond to commands between -2.5 and 2.5 m/s²
     """
     if not isinstance(simulator, Simulator):
         raise InputError(
