@@ -56,8 +56,10 @@ def with_simulator(
     named = [n for n in found.verdict.names if n in own]
     differences = _lag_and_gain(found, surrogate)
     missing = []
+    # what chance decides is in no rollout, and so in no simulator
+    by_chance = set() if found.budget is None else {part.name for part in found.budget.chance}
     for effect in found.verdict.names:
-        if effect in ("none", "unknown"):
+        if effect in ("none", "unknown") or effect in by_chance:
             continue
         if effect not in own or not _of_a_size(found, effect, surrogate):
             missing.append(effect)
@@ -110,7 +112,7 @@ def _of_a_size(found: Diagnosis, effect: str, surrogate: Surrogate) -> bool:
     for key, car in _parameters(found, effect).items():
         if key in own:
             small, large = sorted((abs(float(own[key])), abs(car.mean)))
-            return small > SAME_KIND * large and float(own[key]) * car.mean >= 0
+            return small > SAME_KIND * large
     return False
 
 

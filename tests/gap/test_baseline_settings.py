@@ -77,3 +77,18 @@ def test_a_comparison_keeps_them() -> None:
     )
     other = plant([SpeedDependentGain(0.3, mean_speed=MEAN_SPEED)], T_L=0.4, K_L=0.9)
     assert compare(noisy, noisy, baseline=other, baseline_after=car, effects=[]).simulator == "closer"
+
+
+@pytest.mark.parametrize("simulator", SIMULATORS, ids=lambda p: p.effects[0].name)
+def test_an_effect_that_is_fitted_anew_keeps_them_too(simulator: GapPlant) -> None:
+    """So that its slope and `K_L` can be laid beside the simulator's."""
+    log, kind = drive_of(simulator), type(simulator.effects[0])
+    budget, likelihood = (
+        EffectModel(AnalysisRecord.of([log]), simulator, (kind,)),
+        Hypothesis(Record.of(log), (kind,), simulator),
+    )
+    for fitted in (budget.plant, likelihood.plant):
+        assert fitted.effects[0].mean_speed == 10.0  # type: ignore[attr-defined]
+    lacking = EffectModel(AnalysisRecord.of([log]), plant([]), (kind,)).plant
+    assert log.speed is not None
+    assert lacking.effects[0].mean_speed == pytest.approx(log.speed.mean(), rel=0.01)  # type: ignore[attr-defined]

@@ -46,9 +46,11 @@ class EffectModel:
     high: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
-        whole = plant([_coarse(e(), self.record) for e in self.effects], baseline=self.base)
         own = {e.name for e in self.effects}
-        whole = whole.prepared(*(s.drive for s in self.record.stretches), fitted=own)
+        kept = {e.name: self.base.kept(e) for e in self.effects}
+        effects = [kept[e.name] or _coarse(e(), self.record) for e in self.effects]
+        new = [name for name, effect in kept.items() if effect is None]
+        whole = plant(effects, baseline=self.base).prepared(*(s.drive for s in self.record.stretches), fitted=new)
         index: dict[str, slice] = {}
         low: list[float] = []
         high: list[float] = []

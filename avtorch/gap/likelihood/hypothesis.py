@@ -64,8 +64,10 @@ class Hypothesis:
 
     @cached_property
     def plant(self) -> GapPlant:
-        own = [e.name for e in self.effects]
-        return plant(list(self.effects), baseline=self.baseline).prepared(*self.record.segments[0], fitted=own)
+        kept = [self.baseline.kept(kind) for kind in self.effects]
+        own = [e or kind() for e, kind in zip(kept, self.effects, strict=True)]
+        new = [kind.name for e, kind in zip(kept, self.effects, strict=True) if e is None]
+        return plant(own, baseline=self.baseline).prepared(*self.record.segments[0], fitted=new)
 
     @cached_property
     def _without(self) -> GapPlant:
