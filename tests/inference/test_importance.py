@@ -96,10 +96,16 @@ def test_settings_out_of_range_are_refused_by_name(change: dict[str, float]) -> 
 
 @pytest.mark.statistical
 def test_a_clock_that_jitters_changes_the_route_and_not_the_law(rotating_seed: int) -> None:
+    """On a window whose draws are reliable; of some they are not, and the answer does not use them."""
     generator = torch.Generator().manual_seed(rotating_seed)
-    density, _ = drawn_window(generator, accel=True, speed=True, rows=100, dt=0.02, jitter=0.3)
-    assert approximated(density) is not density
-    quick = weighted_draws(density, generator=generator)
+    for _ in range(20):  # about one in eight is not
+        density, _ = drawn_window(generator, accel=True, speed=True, rows=100, dt=0.02, jitter=0.3)
+        assert approximated(density) is not density
+        quick = weighted_draws(density, generator=generator)
+        if bool(quick.converged(ImportanceSettings())[0]):
+            break
+    else:
+        pytest.fail("no window of twenty has reliable draws")
     # a density without the neighbour: all draws by the exact filter
     density.approximation = lambda: density  # type: ignore[method-assign]
     long = weighted_draws(density, ImportanceSettings(draws=1024, enough=2000.0), generator=generator)
