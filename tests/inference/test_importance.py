@@ -98,7 +98,7 @@ def test_settings_out_of_range_are_refused_by_name(change: dict[str, float]) -> 
 def test_a_clock_that_jitters_changes_the_route_and_not_the_law(rotating_seed: int) -> None:
     """On a window whose draws are reliable; of some they are not, and the answer does not use them."""
     generator = torch.Generator().manual_seed(rotating_seed)
-    for _ in range(20):  # about one in eight is not
+    for _ in range(20):
         density, _ = drawn_window(generator, accel=True, speed=True, rows=100, dt=0.02, jitter=0.3)
         assert approximated(density) is not density
         quick = weighted_draws(density, generator=generator)
