@@ -64,7 +64,7 @@ print(check)
 
 figure = Figure(figsize=(9, 3.0), layout="constrained")
 ax = figure.subplots()
-part = slice(0, round(60 / 0.02))
+part = slice(0, round(55 / 0.02))
 ax.step(
     check.output.time[part], check.output.accel_cmd[part], color="0.3", linewidth=0.9, where="post", label="command"
 )
