@@ -15,6 +15,7 @@ from rich.markup import escape
 from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, positive, seed_number
 from avtorch.cli.diagnosis_table import budget_table, diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.cli.follower import follow, refuse
+from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.resume import EARLIER_FITS, FITS, begin_anew
 from avtorch.cli.simulator import read_simulator
@@ -225,10 +226,10 @@ def diagnose(
         setting=None if setting is None else setting.to_dict(),
         next_experiment=None if ahead is None else ahead.to_dict(),
     )
-    with answer_set(out, DIAGNOSIS_FILES) as staged:
+    with answer_set(out, (*DIAGNOSIS_FILES, *PEDAL_FILES)) as staged:
         written = [*found.write(staged), *write_table(ahead, staged), *write_exports(found.plant, staged)]
         written.append(write_report(found, staged, quality=quality, experiment=ahead))
-    written += write_pedals(fit, out)
+        written += write_pedals(fit, staged)
     if talk.json:
         talk.done(out, found.to_dict())
         return

@@ -22,6 +22,7 @@ from avtorch.cli.arguments import (
     seed_number,
     three_gains,
 )
+from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.resume import WINDOWS, begin_anew
 from avtorch.cli.talk import Talk, write_answer
@@ -136,8 +137,9 @@ def estimate(
         "belief.png": lambda: plots.belief_figure(answer["windows"], answer=answer, log=drive),
         "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
     }
-    write_answer(out, "estimates.json", answer, pictures)
-    write_pedals(fit, out)
+    write_answer(
+        out, "estimates.json", answer, pictures, more=lambda staged: write_pedals(fit, staged), also=PEDAL_FILES
+    )
     printed = answer | {key: from_start(answer[key], answer["epoch_s"]) for key in ("windows", "alerts")}
     talk.windows(printed["windows"])
     talk.summary(printed, estimates_note(answer))

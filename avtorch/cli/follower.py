@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes
+from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError
 
@@ -55,7 +56,7 @@ def follow(
     gap = replace(gap, notes=(*gap.notes, *found.conditional))
     lines = loop_lines(found)
     answer = replace(found, diagnosis=gap).to_dict()
-    with answer_set(out, DIAGNOSIS_FILES) as staged:
+    with answer_set(out, (*DIAGNOSIS_FILES, *PEDAL_FILES)) as staged:
         written = [*gap.write(staged), *write_exports(gap.plant, staged)]
         write_json(staged / "diagnosis.json", answer)
         written.append(write_report(gap, staged, quality=noted, sections={"The loop": lines}))

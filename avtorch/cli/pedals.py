@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from avtorch.cli.talk import Talk
-from avtorch.errors import InputError
 
 if TYPE_CHECKING:
     from avtorch.io import Log
@@ -60,23 +59,17 @@ def _range(name: str, knots: object) -> str:
     return f"{low:.3g} to {high:.3g} {'Nm' if name == 'torque' else 'A'}"
 
 
-def write_pedals(fit: PedalFit | None, out: Path) -> list[Path]:
-    """Write the map, its tables for other tools and its picture; returns the files. Those of an earlier log's map that
-    are not written again are removed.
+def write_pedals(fit: PedalFit | None, staged: Path) -> list[Path]:
+    """Write the map, its tables for other tools and its picture into the folder of an answer set that has `FILES`;
+    returns the files. Without a map none.
 
     Raises `InputError` where that cannot be done.
     """
-    written: list[Path] = []
-    try:
-        if fit is not None:
-            from avtorch import plots
-            from avtorch.pedals import write_map
+    if fit is None:
+        return []
+    from avtorch import plots
+    from avtorch.pedals import write_map
 
-            written = [*write_map(fit.map, out), out / PICTURE]
-            plots.save(plots.pedal_figure(fit.map), out / PICTURE)
-        for name in FILES:
-            if out / name not in written:
-                (out / name).unlink(missing_ok=True)
-    except OSError as fault:
-        raise InputError(f"{fault.filename or out}: {fault.strerror}; needs a folder that can be written") from None
-    return written
+    written = write_map(fit.map, staged)
+    plots.save(plots.pedal_figure(fit.map), staged / PICTURE)
+    return [*written, staged / PICTURE]

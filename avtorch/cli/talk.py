@@ -252,14 +252,16 @@ def write_answer(
     answer: Mapping[str, Any],
     pictures: Mapping[str, Callable[[], Any]],
     *,
+    more: Callable[[Path], object] = lambda staged: None,
     also: Sequence[str] = (),
 ) -> None:
-    """Publish the answer and its pictures as one set; `also`: files that an earlier answer of this kind may have
-    left."""
+    """Publish the answer and its pictures as one set; `more` writes further files into it, out of `also`, the files
+    that an earlier answer of this kind may have left."""
     from avtorch.io import answer_set, write_json
     from avtorch.plots import save
 
     with answer_set(out, list(dict.fromkeys([name, *pictures, *also]))) as staged:
         for file, draw in pictures.items():
             save(draw(), staged / file)
+        more(staged)
         write_json(staged / name, answer)
