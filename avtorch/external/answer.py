@@ -10,6 +10,7 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
 from avtorch.external.surrogate import Surrogate
+from avtorch.gap.budget.robust_fit import RobustFit
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.simulator_under_test import SAME_KIND, ParameterDifference, SimulatorUnderTest
@@ -18,7 +19,6 @@ from avtorch.io import Log
 HORIZON_S = 10.0
 _LEVEL = 0.005  # of a two-sided test, that a parameter differs
 _MATERIAL = {"T_L": 0.1, "K_L": 0.03}  # relative difference that a controller notices
-_FOLDS = 6
 
 
 def rollout_errors(logs: Sequence[Log], simulated: Sequence[Log]) -> dict[str, float]:
@@ -86,7 +86,7 @@ def _lag_and_gain(found: Diagnosis, surrogate: Surrogate) -> list[ParameterDiffe
     """T_L and K_L, fitted together with the verdict's effects; their spread is that between folds of the drives."""
     if found.budget is None:
         return []
-    quantile = float(student.ppf(1 - _LEVEL / 2, _FOLDS - 1))  # pyright: ignore[reportUnknownMemberType]
+    quantile = float(student.ppf(1 - _LEVEL / 2, RobustFit.folds - 1))  # pyright: ignore[reportUnknownMemberType]
     out = []
     for name, car in found.budget.repaired.items():
         value = float(getattr(surrogate.plant, name))

@@ -29,7 +29,7 @@ def discrepancy(simulated: Log, surrogate: GapPlant) -> dict[str, FloatArray]:
     found = {name: np.zeros(simulated.rows) for name in ("accel", "speed") if getattr(simulated, name) is not None}
     for segment in range(int(simulated.segment[-1]) + 1):
         rows = simulated.segment == segment
-        if rows.sum() < 2:
+        if rows.sum() < 2 or not simulated.engaged[rows].any():  # under the driver there is no simulator
             continue
         response = surrogate.response(SimulatorInput.from_log(simulated, segment))
         answers = {"accel": response.accel_measured, "speed": response.speed}

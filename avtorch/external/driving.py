@@ -36,7 +36,7 @@ def driven_along(
     limit_s: float = LIMIT_S,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Log:
-    """What `simulator` does under the commands of `log`, in its rows.
+    """What `simulator` does under the commands of `log`, in its rows; each of its drives is a segment.
 
     `step_s`: the simulator's own step [s], for one that takes no other; default: from row to row. A row in which the
     car is under the driver keeps the car's readings.
@@ -73,7 +73,11 @@ def driven_along(
             if progress is not None:
                 progress("driving the simulator", number, len(parts))
             accel[part], speed[part] = drive.along(log, part)
-    return replace(log, name=name, accel=accel, speed=speed)
+    edges = np.zeros(log.rows + 1, dtype=np.int64)
+    for part in parts:
+        edges[[part.start, part.stop]] = 1
+    edges[1:-1] |= np.diff(log.segment) != 0
+    return replace(log, name=name, accel=accel, speed=speed, segment=np.cumsum(edges[:-1]) - edges[0])
 
 
 def drives_of(log: Log) -> list[slice]:

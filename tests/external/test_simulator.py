@@ -13,7 +13,9 @@ from scipy.integrate import solve_ivp
 
 from avtorch import ExternalSimulator, InputError, diagnose
 from avtorch.external import check_simulator, load_simulator, wrap
+from avtorch.external.discrepancy import discrepancy
 from avtorch.external.driving import driven_along, drives_of
+from avtorch.external.surrogate import surrogate_of
 from avtorch.io import Log
 
 
@@ -61,6 +63,23 @@ def test_it_begins_anew_where_the_car_does() -> None:
     engaged[200:240] = 0
     parts = drives_of(lap(speed=speed, engaged=engaged))
     assert [(p.start, p.stop) for p in parts] == [(0, 119), (119, 200), (240, 400)]  # from the last row at standstill
+
+
+def test_what_it_leaves_starts_anew_with_it() -> None:
+    """A stop and an override, under which the car's speed goes its own way: no offset of speed is left behind them."""
+    time = 0.05 * np.arange(2400)
+    command = 0.6 * np.sin(0.9 * time) + 0.4 * np.sin(2.1 * time) + 0.2
+    engaged, speed = np.ones(2400), np.full(2400, 20.0)
+    engaged[800:900] = 0
+    speed[800:] = 14.0  # the driver brakes
+    speed[1600:1700] = 0.0
+    log = Log.from_arrays(time=time, accel_cmd=command, accel=np.zeros(2400), speed=speed, engaged=engaged)
+    output = driven_along(OdeCar(), log)
+    surrogate = surrogate_of([output])
+    known = discrepancy(output, surrogate.plant)
+    # a hundredth of the speed that the simulator gains and loses by itself
+    assert np.abs(known["speed"]).max() < 0.01 * np.ptp(output.speed[:800])
+    assert max(surrogate.left.values()) < 0.005
 
 
 def test_its_own_step() -> None:
