@@ -28,7 +28,7 @@ def rollout_errors(logs: Sequence[Log], simulated: Sequence[Log]) -> dict[str, f
     errors: dict[str, list[FloatArray]] = {}
     for log, other in zip(logs, simulated, strict=True):
         usable = log.usable & other.engaged
-        for part in log.engaged_segments():
+        for part in other.engaged_segments():
             if log.accel is not None and other.accel is not None:
                 errors.setdefault("accel", []).append((other.accel - log.accel)[part][usable[part]])
             if log.speed is not None and other.speed is not None:

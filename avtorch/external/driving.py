@@ -12,14 +12,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, quoted
+from avtorch.external.drives import drives_of, in_drives
 from avtorch.external.simulator import Simulator, WholeDrives
-from avtorch.io import STANDSTILL_MPS, Log
+from avtorch.io import Log
 
 LIMIT_S = 30.0
 """Longest that a simulator may take for one step or one reset [s]."""
@@ -39,7 +39,7 @@ def driven_along(
     """What `simulator` does under the commands of `log`, in its rows; each of its drives is a segment.
 
     `step_s`: the simulator's own step [s], for one that takes no other; default: from row to row. A row in which the
-    car is under the driver keeps the car's readings.
+    car is under the driver keeps the car's readings; one in which either stands is not `engaged`.
 
     Raises `InputError` for a log without `accel_cmd`, and where the simulator raises, hangs for `limit_s`, or returns
     what is no pair of finite numbers, with the time in the log.
@@ -73,24 +73,7 @@ def driven_along(
             if progress is not None:
                 progress("driving the simulator", number, len(parts))
             accel[part], speed[part] = drive.along(log, part)
-    edges = np.zeros(log.rows + 1, dtype=np.int64)
-    for part in parts:
-        edges[[part.start, part.stop]] = 1
-    edges[1:-1] |= np.diff(log.segment) != 0
-    return replace(log, name=name, accel=accel, speed=speed, segment=np.cumsum(edges[:-1]) - edges[0])
-
-
-def drives_of(log: Log) -> list[slice]:
-    """Rows of `log` that the simulator drives in one go."""
-    out = []
-    for part in log.engaged_segments():
-        starts = [part.start]
-        if log.speed is not None:
-            stands = log.speed[part] < STANDSTILL_MPS
-            starts += [part.start + int(k) for k in np.flatnonzero(np.diff(stands.astype(int)) == -1)]
-        edges = [*dict.fromkeys(starts), part.stop]
-        out += [slice(a, b) for a, b in pairwise(edges) if b - a > 1]
-    return out
+    return in_drives(replace(log, name=name, accel=accel, speed=speed), log)
 
 
 class _Drive:

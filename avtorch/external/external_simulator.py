@@ -10,6 +10,7 @@ from avtorch.errors import InputError, quoted
 from avtorch.external.alignment import aligned
 from avtorch.external.answer import rollout_errors, with_simulator
 from avtorch.external.discrepancy import without_discrepancy
+from avtorch.external.drives import in_drives
 from avtorch.external.driving import driven_along
 from avtorch.external.simulator import Simulator
 from avtorch.external.surrogate import Surrogate, surrogate_of
@@ -79,7 +80,7 @@ class ExternalSimulator:
                 raise InputError(f"simulated: found {len(self.output)} logs for {len(logs)} drives, needs one for each")
             for other, log in zip(self.output, logs, strict=True):
                 found = aligned(other, log)
-                outputs.append(found.log)
+                outputs.append(in_drives(found.log, log))
                 offsets.append(found.offset_s)
         else:
             assert isinstance(self.of, Simulator)

@@ -121,3 +121,16 @@ def test_the_right_simulator_lacks_nothing(as_it_is: tuple[Log, Log]) -> None:
     assert found.tested is not None
     assert not found.tested.wrong
     assert found.tested.missing == ()
+
+
+def test_a_standstill_is_no_gap() -> None:
+    """At rest a car stays at rest, which no effect does: there nothing counts, and nothing is carried over from there.
+
+    The car's noise sets it 0.2 m/s from its simulator in a drive, and the surrogate a few hundredths from that.
+    """
+    car, simulated = drive(11, manoeuvre="stop_and_go", seconds=60.0)
+    assert not car.moving.all()
+    beside = ExternalSimulator(simulated).beside([car])
+    known = car.speed - beside.logs[0].speed
+    assert np.abs(known[beside.logs[0].usable]).max() < 0.1
+    assert max(beside.surrogate.left.values()) < 0.02

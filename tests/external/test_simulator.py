@@ -14,7 +14,8 @@ from scipy.integrate import solve_ivp
 from avtorch import ExternalSimulator, InputError, diagnose
 from avtorch.external import check_simulator, load_simulator, wrap
 from avtorch.external.discrepancy import discrepancy
-from avtorch.external.driving import driven_along, drives_of
+from avtorch.external.drives import drives_of
+from avtorch.external.driving import driven_along
 from avtorch.external.surrogate import surrogate_of
 from avtorch.io import Log
 
