@@ -27,6 +27,7 @@ from avtorch.blindtest import EFFECTS, Car, Recorded, draw_car, draw_drive, simu
 from avtorch.blindtest.intervals import wilson
 from avtorch.blindtest.strength import excess_range, solve_strength
 from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.io import STANDSTILL_MPS
 
 SECONDS, RATE_HZ = 100.0, 50
 Effects = Mapping[str, Mapping[str, float]]
@@ -76,12 +77,15 @@ def _drawn(rng: np.random.Generator, number: int) -> dict[str, Any] | None:
     kind = "none" if place < 5 else "parameter" if place < 11 else "effect"
     car, plan = draw_car(rng), draw_drive(rng, seconds=SECONDS)
     plan = replace(plan, rate_hz=RATE_HZ)
+    # a gain whose slope is wrong is right at the drive's mean speed: elsewhere it would be the gain that is wrong
+    pilot = simulate(car, plan.pilot(), seconds=SECONDS, rate_hz=RATE_HZ, seed=number)
+    speed = float(pilot.speed[pilot.speed > STANDSTILL_MPS].mean())
     own = {
         "second_order_actuator": {
             "natural_frequency_radps": rng.uniform(4.0, 9.0),
             "damping_ratio": rng.uniform(0.6, 1.1),
         },
-        "speed_dependent_gain": {"gain_slope": rng.uniform(-0.25, 0.25), "reference_speed_mps": 15.0},
+        "speed_dependent_gain": {"gain_slope": rng.uniform(-0.25, 0.25), "reference_speed_mps": speed},
         "aerodynamic_drag": {
             "drag_per_m": rng.uniform(2e-4, 6e-4),
             "wind_mps": 0.0,
@@ -121,10 +125,11 @@ def _drawn(rng: np.random.Generator, number: int) -> dict[str, Any] | None:
         other, effects = change(s)
         run = driven(other, effects)
         start = float(run.speed[0])
-        plain = Vehicle(car, own).whole_drive(run.command, np.zeros(0), speed=start, accel=0.0)[0]
-        with_it = Vehicle(other, effects).whole_drive(run.command, np.zeros(0), speed=start, accel=0.0)[0]
-        columns = [] if kind == "parameter" else [plain, np.gradient(plain)]
-        return _excess(with_it - plain, columns, float(run.noise_accel.std())), s
+        plain, plain_speed = Vehicle(car, own).whole_drive(run.command, np.zeros(0), speed=start, accel=0.0)
+        with_it, other_speed = Vehicle(other, effects).whole_drive(run.command, np.zeros(0), speed=start, accel=0.0)
+        moving = np.minimum(plain_speed, other_speed) > STANDSTILL_MPS
+        columns = [] if kind == "parameter" else [plain[moving], np.gradient(plain)[moving]]
+        return _excess((with_it - plain)[moving], columns, float(run.noise_accel.std())), s
 
     strength = 0.0
     if kind != "none":

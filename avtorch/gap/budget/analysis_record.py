@@ -229,9 +229,9 @@ def _window(rows: int) -> FloatArray:
 
 
 def _averaged(x: FloatArray, window: FloatArray) -> FloatArray:
-    """The weighted mean around each row."""
+    """The weighted mean around each row; beyond an end, what is mirrored through the reading there: a trend goes on."""
     reach = len(window) // 2
-    return np.convolve(np.pad(x, reach, mode="edge"), window, "valid")
+    return np.convolve(np.pad(x, reach, mode="reflect", reflect_type="odd"), window, "valid")
 
 
 def _settled(usable: BoolArray, rows: int) -> BoolArray:

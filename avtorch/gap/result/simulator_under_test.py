@@ -9,7 +9,7 @@ from typing import Any
 from avtorch.gap.quantity import Quantity, unit_of, words_of
 from avtorch.gap.simulator.plant import GapPlant
 
-SAME_KIND = 0.25
+SAME_KIND = 0.1
 """Least size of an effect in the simulator, relative to the car's, from which it is there and has a wrong size."""
 
 

@@ -23,6 +23,13 @@ def test_a_command_keeps_its_integral() -> None:
     np.testing.assert_allclose(summed, np.interp(ends, log.elapsed, held), atol=1e-9)
 
 
+def test_a_car_that_accelerates_does_so_to_the_last_row() -> None:
+    """Readings are averaged around each row, also where a drive ends."""
+    log = log_of(seconds=60.0, dt=0.01)
+    record = AnalysisRecord.of([replace(log, speed=10.0 + 0.3 * log.elapsed, accel=0.3 + 0.0 * log.elapsed)])
+    np.testing.assert_allclose(record.measured[:, record.counts], 0.3, rtol=1e-9)
+
+
 def test_a_slow_log_is_taken_row_by_row() -> None:
     log = log_of(seconds=80.0, dt=0.1)
     record = AnalysisRecord.of([log])
