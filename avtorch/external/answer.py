@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
+from avtorch.errors import InputError
+from avtorch.external.adjusting import Rollouts, adjusted
+from avtorch.external.discrepancy import responses
 from avtorch.external.surrogate import Surrogate
-from avtorch.gap.budget.robust_fit import RobustFit
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.simulator_under_test import SAME_KIND, ParameterDifference, SimulatorUnderTest
+from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log
 
 HORIZON_S = 10.0
-_LEVEL = 0.005  # of a two-sided test, that a parameter differs
+_FARTHEST = 4.0  # times as large or small, that lag and gain may be on the car
 _MATERIAL = {"T_L": 0.1, "K_L": 0.03}  # relative difference that a controller notices
 
 
@@ -49,12 +51,15 @@ def with_simulator(
     source: str,
     offset_s: Sequence[float],
     rollout: dict[str, float],
+    own_parameters: Sequence[ParameterDifference],
+    lag_and_gain: Sequence[ParameterDifference],
+    rollouts: int,
     notes: Sequence[str],
 ) -> Diagnosis:
     """`found`, a diagnosis with the surrogate as its baseline, with what it says of the simulator itself."""
     own = surrogate.plant.report()
     named = [n for n in found.verdict.names if n in own]
-    differences = _lag_and_gain(found, surrogate)
+    differences = [*own_parameters, *lag_and_gain]
     missing = []
     # what chance decides is in no rollout, and so in no simulator
     by_chance = set() if found.budget is None else {part.name for part in found.budget.chance}
@@ -78,21 +83,34 @@ def with_simulator(
         rollout,
         tuple(differences),
         tuple(missing),
+        rollouts,
     )
     return replace(found, tested=facts, notes=(*found.notes, *notes))
 
 
-def _lag_and_gain(found: Diagnosis, surrogate: Surrogate) -> list[ParameterDifference]:
-    """T_L and K_L, fitted together with the verdict's effects; their spread is that between folds of the drives."""
-    if found.budget is None:
+def lag_and_gain(
+    logs: Sequence[Log], outputs: Sequence[Log], surrogate: GapPlant, found: GapPlant | None
+) -> list[ParameterDifference]:
+    """T_L and K_L of the `surrogate`, with the effects that were `found`, fitted to the car's `logs`.
+
+    They differ as the simulator's own parameters do (`adjusted`), and by more than a controller notices.
+    """
+    before = {name: float(getattr(surrogate, name)) for name in _MATERIAL}
+    car = surrogate if found is None else found
+
+    def drive(values: Mapping[str, float]) -> list[Log]:
+        other = GapPlant(car.effects, T_L=values["T_L"], K_L=values["K_L"], sigma=0.0)
+        return [replace(out, **responses(out, other)) for out in outputs]
+
+    limits = {name: (x / _FARTHEST, x * _FARTHEST) for name, x in before.items()}
+    try:
+        fitted = adjusted(Rollouts(logs, before, drive, most=100), limits)
+    except InputError:  # a drive too short for blocks to be held out
         return []
-    quantile = float(student.ppf(1 - _LEVEL / 2, RobustFit.folds - 1))  # pyright: ignore[reportUnknownMemberType]
-    out = []
-    for name, car in found.budget.repaired.items():
-        value = float(getattr(surrogate.plant, name))
-        away = abs(car.mean - value)
-        out.append(ParameterDifference(name, value, car, away > quantile * car.sd and away > _MATERIAL[name] * value))
-    return out
+    return [
+        replace(p, own=False, differs=p.differs and abs(p.car.mean - p.simulator) > _MATERIAL[p.name] * p.simulator)
+        for p in fitted.parameters
+    ]
 
 
 def _parameters(found: Diagnosis, effect: str) -> dict[str, Quantity]:

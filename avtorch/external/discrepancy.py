@@ -15,8 +15,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.simulator.plant import GapPlant
@@ -24,18 +22,24 @@ from avtorch.gap.simulator.simulator_input import SimulatorInput
 from avtorch.io import Log
 
 
-def discrepancy(simulated: Log, surrogate: GapPlant) -> dict[str, FloatArray]:
-    """`d` by channel, (time,): acceleration [m/s²] and, from each segment's start, speed [m/s]."""
-    found = {name: np.zeros(simulated.rows) for name in ("accel", "speed") if getattr(simulated, name) is not None}
-    for segment in range(int(simulated.segment[-1]) + 1):
-        rows = simulated.segment == segment
-        if rows.sum() < 2 or not simulated.engaged[rows].any():  # under the driver there is no simulator
+def responses(drives: Log, plant: GapPlant) -> dict[str, FloatArray]:
+    """What `plant` does in `drives` by the channels that these have, (time,): acceleration [m/s²] and speed [m/s], anew
+    from each segment's first row. Rows under the driver keep what is there."""
+    found = {name: values.copy() for name in ("accel", "speed") if (values := getattr(drives, name)) is not None}
+    for segment in range(int(drives.segment[-1]) + 1):
+        rows = drives.segment == segment
+        if rows.sum() < 2 or not drives.engaged[rows].any():  # under the driver there is no simulator
             continue
-        response = surrogate.response(SimulatorInput.from_log(simulated, segment))
+        response = plant.response(SimulatorInput.from_log(drives, segment))
         answers = {"accel": response.accel_measured, "speed": response.speed}
         for name, values in found.items():
-            values[rows] = getattr(simulated, name)[rows] - answers[name].numpy()
+            values[rows] = answers[name].numpy()
     return found
+
+
+def discrepancy(simulated: Log, surrogate: GapPlant) -> dict[str, FloatArray]:
+    """`d` by channel, (time,): acceleration [m/s²] and, from each segment's start, speed [m/s]."""
+    return {name: getattr(simulated, name) - values for name, values in responses(simulated, surrogate).items()}
 
 
 def without_discrepancy(log: Log, simulated: Log, surrogate: GapPlant) -> Log:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 from avtorch.errors import InputError, quoted
+from avtorch.external.adjusting import Adjusted, Rollouts, adjusted
 from avtorch.external.alignment import aligned
-from avtorch.external.answer import rollout_errors, with_simulator
-from avtorch.external.discrepancy import without_discrepancy
+from avtorch.external.answer import lag_and_gain, rollout_errors, with_simulator
+from avtorch.external.discrepancy import responses, without_discrepancy
 from avtorch.external.drives import in_drives
 from avtorch.external.driving import driven_along
+from avtorch.external.parameters import Limits, values_of, with_values
 from avtorch.external.simulator import Simulator
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.result.diagnosis import Diagnosis
@@ -27,7 +29,9 @@ class ExternalSimulator:
 
     `of`: its output under the car's commands, a log (or one for each of the car's drives), or the simulator itself: an
     object with `reset` and `step` (`Simulator`), or a class of such. `name`: what it is called in the answer. `step_s`:
-    its own step [s], where it takes no other.
+    its own step [s], where it takes no other. `adjustable`: lowest and highest value of each of its parameters that may
+    be wrong, see `avtorch.external.parameters.values_of`; these are fitted to the car, with at most `most_rollouts`
+    drives through its log, and the diagnosis is of the simulator with the values that the car has.
 
     Raises `InputError` for anything else.
 
@@ -48,6 +52,8 @@ class ExternalSimulator:
     of: Log | Sequence[Log] | Simulator | type
     name: str = ""
     step_s: float | None = None
+    adjustable: Limits = field(default_factory=dict)
+    most_rollouts: int = 50
 
     def __post_init__(self) -> None:
         found: Any = self.of() if isinstance(self.of, type) and callable(getattr(self.of, "step", None)) else self.of
@@ -62,6 +68,10 @@ class ExternalSimulator:
                 f"simulator: {quoted(own)} has no {missing}; needs reset(speed, accel) and step(accel_cmd, dt)"
             )
         default = found[0].name if isinstance(found, tuple) else type(found).__name__
+        if self.adjustable:
+            if isinstance(found, tuple):
+                raise InputError("adjustable: has no meaning for an output, needs the simulator itself")
+            values_of(cast("Simulator", found), self.adjustable)
         object.__setattr__(self, "of", found)
         object.__setattr__(self, "name", self.name or default)
 
@@ -74,40 +84,57 @@ class ExternalSimulator:
         """What a diagnosis against it needs. Raises `InputError` where the output does not belong to these drives, or
         the simulator fails under their commands.
         """
-        offsets, outputs = [], []
+        offsets, rollouts, fitted = [0.0] * len(logs), None, None
         if self.output is not None:
             if len(self.output) != len(logs):
                 raise InputError(f"simulated: found {len(self.output)} logs for {len(logs)} drives, needs one for each")
-            for other, log in zip(self.output, logs, strict=True):
-                found = aligned(other, log)
-                outputs.append(in_drives(found.log, log))
-                offsets.append(found.offset_s)
+            found = [aligned(other, log) for other, log in zip(self.output, logs, strict=True)]
+            offsets = [each.offset_s for each in found]
+            outputs = first = [in_drives(each.log, log) for each, log in zip(found, logs, strict=True)]
         else:
             assert isinstance(self.of, Simulator)
-            outputs = [
-                driven_along(self.of, log, name=self.name, step_s=self.step_s, progress=progress) for log in logs
-            ]
-            offsets = [0.0] * len(logs)
+            rollouts = self._rollouts(self.of, logs, progress)
+            first = rollouts.at(rollouts.start)
+            fitted = adjusted(rollouts, self.adjustable) if self.adjustable else None
+            outputs = fitted.outputs if fitted is not None and fitted.wrong else first
         surrogate = surrogate_of(outputs, progress=progress)
         cars = [replace(log, engaged=other.engaged) for log, other in zip(logs, outputs, strict=True)]
         freed = tuple(
             without_discrepancy(log, other, surrogate.plant) for log, other in zip(cars, outputs, strict=True)
         )
-        return SimulatorBesideCar(self, surrogate, freed, tuple(offsets), rollout_errors(cars, outputs))
+        errors = rollout_errors(cars, first)
+        return SimulatorBesideCar(self, surrogate, tuple(outputs), freed, tuple(offsets), errors, rollouts, fitted)
+
+    def _rollouts(self, simulator: Simulator, logs: Sequence[Log], progress: Progress | None) -> Rollouts:
+        """Drives of the simulator by the values of its adjustable parameters."""
+
+        def drive(values: Mapping[str, float]) -> list[Log]:
+            if progress is not None and self.adjustable:
+                progress("fitting its parameters", len(rollouts), self.most_rollouts)
+            car = with_values(simulator, values) if values else simulator
+            along = None if self.adjustable else progress
+            return [driven_along(car, log, name=self.name, step_s=self.step_s, progress=along) for log in logs]
+
+        rollouts = Rollouts(logs, values_of(simulator, self.adjustable), drive, self.most_rollouts)
+        return rollouts
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatorBesideCar:
     """A diagnosis against `simulator`: that of `logs` with `plant` as its baseline.
 
-    `logs`: the car's, less what the simulator does beyond its surrogate.
+    `outputs`: the simulator's. `logs`: the car's, less what the simulator does beyond its surrogate. `fitted`: its own
+    parameters fitted to the car, where it may adjust any.
     """
 
     simulator: ExternalSimulator
     surrogate: Surrogate
+    outputs: tuple[Log, ...]
     logs: tuple[Log, ...]
     offsets: tuple[float, ...]
     rollout: dict[str, float]
+    rollouts: Rollouts | None = None
+    fitted: Adjusted | None = None
 
     @property
     def plant(self) -> GapPlant:
@@ -116,6 +143,18 @@ class SimulatorBesideCar:
 
     def told(self, found: Diagnosis) -> Diagnosis:
         """The diagnosis, with what it says of the simulator."""
+        out = self._told(found, self.fitted)
+        if self.fitted is None or out.tested is None or found.plant is None or not out.tested.missing:
+            return out
+        # without what is missing its parameters stood in for that
+        assert self.rollouts is not None
+        missing = set(out.tested.missing)
+        rest = [effect for effect in found.plant.effects if effect.name not in missing]
+        bare = GapPlant(rest, T_L=found.plant.T_L, K_L=found.plant.K_L, sigma=0.0)
+        cars = [_without(*each, found.plant, bare) for each in zip(self.rollouts.logs, self.outputs, strict=True)]
+        return self._told(found, adjusted(self.rollouts, self.simulator.adjustable, logs=cars))
+
+    def _told(self, found: Diagnosis, fitted: Adjusted | None) -> Diagnosis:
         return with_simulator(
             found,
             self.surrogate,
@@ -123,5 +162,14 @@ class SimulatorBesideCar:
             source="simulator" if self.simulator.output is None else "output",
             offset_s=self.offsets,
             rollout=self.rollout,
+            own_parameters=() if fitted is None else fitted.parameters,
+            lag_and_gain=lag_and_gain(self.logs, self.outputs, self.plant, found.plant),
+            rollouts=0 if fitted is None else fitted.rollouts,
             notes=tuple(getattr(self.simulator.of, "notes", ())),
         )
+
+
+def _without(log: Log, drives: Log, car: GapPlant, bare: GapPlant) -> Log:
+    """The car's log less what it does beyond a `bare` one."""
+    whole, less = responses(drives, car), responses(drives, bare)
+    return replace(log, **{n: getattr(log, n) - whole[n] + less[n] for n in whole if getattr(log, n) is not None})

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import torch
 
 from avtorch.errors import InputError
+from avtorch.external.parameters import with_values
 from avtorch.external.simulator import Simulator
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.plant import GapPlant
@@ -54,8 +55,11 @@ def wrap(simulator: Simulator, found: Diagnosis) -> Wrapped:
     if found.plant is None and not found.tested.wrong:
         raise InputError(f"found: the verdict is {found.verdict.name}; there is nothing to put around the simulator")
     own = found.tested.surrogate
-    values = {p.name: p.car.mean for p in found.tested.parameters if p.name in ("T_L", "K_L")}
+    values = {p.name: p.car.mean for p in found.tested.parameters if p.name in ("T_L", "K_L") and not p.own}
     car = own.with_values(values) if found.plant is None else found.plant
+    adjusted = {p.name: p.car.mean for p in found.tested.parameters if p.own}
+    if any(p.own for p in found.tested.wrong):
+        simulator = with_values(simulator, adjusted)
     return Wrapped(simulator, own, car)
 
 

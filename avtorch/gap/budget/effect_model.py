@@ -23,7 +23,7 @@ from avtorch.gap.simulator.plant import GapPlant, plant
 
 LATENESS = "recorder.lateness"
 """The coordinate that is no parameter of an effect: how late speed is read against acceleration."""
-_LATENESS_S = 0.04  # its standard deviation [s]
+LATENESS_S = 0.04  # its standard deviation [s]
 _BEYOND = 3.0  # times as far as physics allows
 _WIDEST = 6.0  # prior standard deviations, where physics sets no limit
 _AT_LIMIT = 0.02  # prior standard deviations from a limit
@@ -174,7 +174,7 @@ class EffectModel:
         """
         if LATENESS not in self.index:
             return channels
-        seconds = _LATENESS_S * np.clip(z, self.low, self.high)[..., self.index[LATENESS]]
+        seconds = LATENESS_S * np.clip(z, self.low, self.high)[..., self.index[LATENESS]]
         out = np.array(np.broadcast_to(channels, (*z.shape[:-1], *channels.shape[-2:])))
         for name, late in (("speed", seconds), ("accel", -seconds)):
             channel = self.record.channels.index(name)

@@ -92,7 +92,7 @@ def _verdict(found: Findings) -> str:
     if found.budget is not None and (len(verdict.names) > 1 or verdict.partial):
         return str(found.budget)
     if found.tested is not None and not found.tested.missing:
-        own = [x for x in found.tested.wrong if "." in x.name]
+        own = [x for x in found.tested.wrong if x.own or "." in x.name]
         return f"A parameter of the simulator is wrong ({p}): {'; '.join(map(str, own))}." if own else _lacks(found, p)
     return _lacks(found, p)
 
@@ -117,9 +117,10 @@ def tested(found: Findings) -> list[str]:
     holds = f" with {', '.join(own)}" if own else ""
     left = max(facts.left.values(), default=0.0)
     lag, gain = float(facts.surrogate.T_L), float(facts.surrogate.K_L)
+    adjusted = " with the car's values" if any(x.own for x in facts.wrong) else ""
     lines = [
-        f"Of the simulator itself ({facts.name}): it answers as a lag of {lag:.2f} s and a gain of {gain:.2f}{holds}, "
-        f"but for {100 * left:.1f} % of its response, which is taken from its output."
+        f"Of the simulator itself ({facts.name}{adjusted}): it answers as a lag of {lag:.2f} s and a gain of {gain:.2f}"
+        f"{holds}, but for {100 * left:.1f} % of its response, which is taken from its output."
     ]
     errors = [f"{name} {value:.2g} {_UNIT[name]}" for name, value in facts.rollout.items()]
     if errors:

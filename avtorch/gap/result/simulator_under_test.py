@@ -17,7 +17,7 @@ SAME_KIND = 0.1
 class ParameterDifference:
     """A parameter `name` (`T_L`, `K_L`, or `effect.parameter`) of the simulator, and of the `car` that was driven.
 
-    `differs`: surely, and by more than matters.
+    `differs`: surely, and by more than matters. `own`: it is one of the simulator's own, by its user's name.
 
     Example:
         >>> from avtorch.gap.quantity import Quantity
@@ -30,12 +30,15 @@ class ParameterDifference:
     simulator: float
     car: Quantity
     differs: bool
+    own: bool = False
 
     def __str__(self) -> str:
-        effect, _, key = self.name.rpartition(".")
-        unit = {"T_L": " s", "K_L": ""}.get(key) if not effect else f" {unit_of(key)}".replace(" -", "")
+        effect, _, key = ("", "", self.name) if self.own else self.name.rpartition(".")
+        unit = (
+            ("" if self.own else {"T_L": " s", "K_L": ""}[key]) if not effect else f" {unit_of(key)}".replace(" -", "")
+        )
         words = f"{effect}: {words_of(key)}" if effect else key
-        form = ".3g" if effect else ".2f"
+        form = ".3g" if effect or self.own else ".2f"
         own, mean, low, high = (format(x, form) for x in (self.simulator, self.car.mean, self.car.q05, self.car.q95))
         return f"{words} {own}{unit}, on the car {mean}{unit} ({low} to {high})"
 
@@ -45,6 +48,7 @@ class ParameterDifference:
             "simulator": self.simulator,
             "car": self.car.to_dict(),
             "differs": self.differs,
+            "own": self.own,
         }
 
 
@@ -55,7 +59,9 @@ class SimulatorUnderTest:
     `name`; `source`: "output" or "simulator"; `offset_s`: what its clock was ahead of the log's, by drive. `surrogate`:
     the chain of effects that answers as it does, except for the shares `left` of the response, by channel.
     `rollout`: its error against the car over 10 s as it is, by channel [m/s², m/s], before anything is fitted.
-    `parameters`: those of the surrogate, beside the car's. `missing`: effects of the verdict that it does not have.
+    `parameters`: the simulator's own that it was allowed to adjust, and those of the surrogate, beside the car's; where
+    one of its own differs, the surrogate is that of the simulator with the car's values. `missing`: effects of the
+    verdict that it does not have. `rollouts`: how often the simulator was driven through the drives to fit its own.
 
     Example:
         >>> from avtorch.gap import plant
@@ -73,6 +79,7 @@ class SimulatorUnderTest:
     rollout: Mapping[str, float]
     parameters: tuple[ParameterDifference, ...] = ()
     missing: tuple[str, ...] = ()
+    rollouts: int = 0
 
     @property
     def wrong(self) -> tuple[ParameterDifference, ...]:
@@ -96,4 +103,5 @@ class SimulatorUnderTest:
             "rollout_10s": dict(self.rollout),
             "parameters": [p.to_dict() for p in self.parameters],
             "missing": list(self.missing),
+            "rollouts": self.rollouts,
         }

@@ -1,0 +1,215 @@
+"""Is a parameter of the simulator wrong? The user's own parameters, fitted to the car in their own terms.
+
+The simulator is driven at its present values and beside each of them, and taken for linear between: `n + 1` times for
+`n` parameters, and again at the better values, until these stay where they are. Slow simulators are asked seldom, and
+never twice for the same values. Whether other values are needed at all is decided as it is for effects: by blocks of
+the drives that the fit has not seen (`RobustFit.evidence`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
+
+import numpy as np
+from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
+
+from avtorch.arrays import FloatArray
+from avtorch.errors import InputError, listed
+from avtorch.external.parameters import Limits
+from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.effect_model import LATENESS, LATENESS_S
+from avtorch.gap.budget.flexible_regression import left_over
+from avtorch.gap.budget.noise_whitening import NoiseWhitening
+from avtorch.gap.budget.robust_fit import Fit, HeldOut, RobustFit
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.simulator_under_test import ParameterDifference
+from avtorch.io import Log
+
+_ROUNDS = 4  # of linearising
+_BESIDE = 0.02  # of a parameter's range: where the simulator is driven beside its value
+_STAYS = 0.02  # prior standard deviations, a hundredth of the range
+_SURELY = 0.95  # of an interval that does not hold the present value
+
+Values = Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """The simulator's `outputs` by drive with the values that fit the car.
+
+    `parameters`: what it had, and what the car has; they differ where blocks held out agree that other values are
+    needed. `rollouts`: how many times the car's drives were driven through.
+    """
+
+    outputs: tuple[Log, ...]
+    parameters: tuple[ParameterDifference, ...]
+    rollouts: int
+
+    @property
+    def wrong(self) -> bool:
+        return any(p.differs for p in self.parameters)
+
+
+@dataclass(eq=False)
+class Rollouts:
+    """A simulator under the commands of the car's drives `logs`, by the values of its parameters; from `start` on.
+
+    `drive` makes the outputs of the drives; it is not called twice for the same values. Raises `InputError` where it
+    would be called more than `most` times.
+    """
+
+    logs: Sequence[Log]
+    start: Values
+    drive: Callable[[Values], Sequence[Log]]
+    most: int
+    _found: dict[tuple[float, ...], tuple[Log, ...]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def at(self, values: Values) -> tuple[Log, ...]:
+        key = tuple(values.values())
+        if key not in self._found:
+            if len(self._found) >= self.most:
+                raise InputError(f"most_rollouts: found {self.most}, needs more for {listed(self.start)} to settle")
+            self._found[key] = tuple(self.drive(values))
+        return self._found[key]
+
+
+def adjusted(rollouts: Rollouts, limits: Limits, *, logs: Sequence[Log] | None = None) -> Adjusted:
+    """The parameters named in `limits` fitted to the car's drives.
+
+    `logs`: these drives less what else is known of the car; default: as they are. Rows in which the simulator stands,
+    or the driver drives, do not count.
+    Raises `InputError` as `Rollouts`, and for drives that are too short.
+    """
+    before = rollouts.start
+    first = rollouts.at(before)
+    cars = [replace(log, engaged=out.engaged) for log, out in zip(logs or rollouts.logs, first, strict=True)]
+    record = AnalysisRecord.for_budget(cars)
+    model = _Linear.around(record, cars, rollouts, before, limits)
+    fitting = _fitting(record, model)
+    fit = _fitted(fitting, model)
+    for _ in range(_ROUNDS - 1):
+        if np.abs(fit.z[: len(limits)]).max() < _STAYS:
+            break
+        model = _Linear.around(record, cars, rollouts, model.parameters(fit.z), limits)
+        fit = _fitted(fitting, model)
+    values = model.parameters(fit.z)
+    outputs = rollouts.at(values)
+    held = fitting.hold_out(fit)
+    needed = fitting.evidence(_as_it_is(record, cars, fitting, first), held).strength(len(limits)) > 0
+    spread = model.parameters_each(held.z)
+    found = tuple(_difference(name, before[name], values[name], spread[name], needed) for name in limits)
+    return Adjusted(outputs, found, len(rollouts))
+
+
+def _as_it_is(record: AnalysisRecord, cars: Sequence[Log], fitting: RobustFit, first: Sequence[Log]) -> HeldOut:
+    """The simulator as it is, of which nothing but the lateness of speed is fitted."""
+    plain = _Linear(record, _measured(record, cars, first), np.zeros((0, *record.measured.shape)), {}, {})
+    return fitting.hold_out(_fitted(fitting, plain))
+
+
+def _difference(name: str, before: float, value: float, folds: FloatArray, needed: bool) -> ParameterDifference:
+    """`folds` (fold,): the parameter without each fold in turn, whose spread is a jackknife's."""
+    k = len(folds)
+    sd = float(np.sqrt((k - 1) / k * ((folds - folds.mean()) ** 2).sum()))
+    reach, surely = (
+        float(student.ppf(p, k - 1)) * sd  # pyright: ignore[reportUnknownMemberType]
+        for p in (0.95, 0.5 + _SURELY / 2)
+    )
+    car = Quantity(value, sd, value - reach, value + reach)
+    return ParameterDifference(name, before, car, needed and abs(value - before) > surely, own=True)
+
+
+def _fitting(record: AnalysisRecord, model: _Linear) -> RobustFit:
+    """With the noise that is left once commands, speed and time have predicted what they can."""
+    rough = RobustFit(NoiseWhitening.band(record, record.measured - model.center))
+    return RobustFit(NoiseWhitening.autoregressive(record, left_over(rough, _fitted(rough, model))))
+
+
+def _fitted(fitting: RobustFit, model: _Linear) -> Fit:
+    # what a fit asks of a model is there; that it is made of effects is not asked
+    return fitting.fit(cast("Any", model), np.zeros((1, model.size)), iterations=10)
+
+
+def _measured(record: AnalysisRecord, cars: Sequence[Log], outputs: Sequence[Log]) -> FloatArray:
+    """The outputs as the channels of the car's record, (channel, row) [m/s²]."""
+    channels = {"accel": "accel" in record.channels, "speed": "speed" in record.channels}
+    logs = [
+        replace(log, **{name: getattr(out, name) if there else None for name, there in channels.items()})
+        for log, out in zip(cars, outputs, strict=True)
+    ]
+    return AnalysisRecord.for_budget(logs).measured
+
+
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    """What `RobustFit` fits: `center` and `slopes` (parameter, channel, row) for one prior SD of each.
+
+    The coordinates are those of the parameters named in `limits`, half of their range each, from `values` on, and, with
+    two channels, how late speed is read against acceleration.
+    """
+
+    record: AnalysisRecord
+    center: FloatArray
+    slopes: FloatArray
+    values: Values
+    limits: Limits
+    index: dict[str, slice] = field(init=False)
+    low: FloatArray = field(init=False)
+    high: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        ends = np.array([[x - self.values[n] for x in self.limits[n]] for n in self.limits]).reshape(-1, 2)
+        low, high = (ends / _scales(self.limits)[:, None]).T
+        index, slopes = {name: slice(n, n + 1) for n, name in enumerate(self.limits)}, self.slopes
+        if len(self.record.channels) == 2:
+            late = np.zeros_like(self.center)
+            at = self.record.channels.index("speed")
+            for stretch in self.record.stretches:
+                late[at, stretch.rows] = -LATENESS_S * np.gradient(self.center[at, stretch.rows]) / self.record.dt
+            index[LATENESS] = slice(len(low), len(low) + 1)
+            slopes, low, high = np.concatenate([slopes, late[None]]), np.append(low, -6.0), np.append(high, 6.0)
+        for name, value in (("slopes", slopes), ("index", index), ("low", low), ("high", high)):
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def around(
+        cls, record: AnalysisRecord, cars: Sequence[Log], rollouts: Rollouts, values: Values, limits: Limits
+    ) -> _Linear:
+        center = _measured(record, cars, rollouts.at(values))
+        slopes = []
+        for (name, (low, high)), scale in zip(limits.items(), _scales(limits), strict=True):
+            step = _BESIDE * (high - low)
+            step = step if values[name] + step <= high else -step
+            beside = _measured(record, cars, rollouts.at({**values, name: values[name] + step}))
+            slopes.append((beside - center) * scale / step)
+        return cls(record, center, np.array(slopes), values, limits)
+
+    @property
+    def size(self) -> int:
+        return len(self.low)
+
+    def simulate(self, z: FloatArray) -> FloatArray:
+        """(..., channel, row) at `z` (..., size)."""
+        return self.center + np.tensordot(np.clip(z, self.low, self.high), self.slopes, 1)
+
+    def traded(self, z: FloatArray) -> FloatArray:
+        return np.zeros((0, len(z)))
+
+    def parameters(self, z: FloatArray) -> dict[str, float]:
+        return {name: float(x[0]) for name, x in self.parameters_each(z[None]).items()}
+
+    def parameters_each(self, z: FloatArray) -> dict[str, FloatArray]:
+        """By name, (fold,), of coordinates (fold, size)."""
+        inside = np.clip(z, self.low, self.high)
+        scales = zip(self.limits, _scales(self.limits), strict=True)
+        return {name: self.values[name] + inside[:, n] * scale for n, (name, scale) in enumerate(scales)}
+
+
+def _scales(limits: Limits) -> FloatArray:
+    """Prior standard deviations: half of each range."""
+    return np.array([0.5 * (high - low) for low, high in limits.values()])
