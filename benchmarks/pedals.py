@@ -35,6 +35,7 @@ RECORDINGS: dict[str, tuple[str, dict[str, list[str]]]] = {
     "dart, 10:02, motion capture": ("dart/09_16_2024_10_02_28_vicon50Hz.csv", {}),
     "dart, 10:27, motion capture": ("dart/09_16_2024_10_27_02_vicon50Hz.csv", {}),
     "volvo_truck": ("volvo_truck/052311_grade.csv", {"map": ["torque=engine_torque_cmd_Nm"]}),
+    "volvo_truck, its reference speed": ("volvo_truck/052311_grade.csv", {"map": ["speed_cmd=ref_v"]}),
 }
 """Recordings by name: the file, and how its pedals are read."""
 

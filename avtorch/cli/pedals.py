@@ -10,8 +10,9 @@ from avtorch.cli.talk import Talk
 
 if TYPE_CHECKING:
     from avtorch.io import Log
-    from avtorch.pedals import HeldOut, PedalFit
+    from avtorch.pedals import HeldOut, PedalFit, PedalTable
 
+_UNITS = {"torque": "Nm", "current": "A", "speed_error": "m/s", "speed_cmd_rate": "m/s²"}
 PICTURE = "pedal_map.png"
 FILES = ("pedal_map.csv", "accel_map.csv", "brake_map.csv", PICTURE)
 """Every file of a map, named here because `avtorch.pedals` brings SciPy, which a log without pedals does not need."""
@@ -20,13 +21,14 @@ FILES = ("pedal_map.csv", "accel_map.csv", "brake_map.csv", PICTURE)
 def commanded(talk: Talk, drives: Sequence[Log]) -> tuple[list[Log], PedalFit | None, str]:
     """The drives with an `accel_cmd`, the fit of the map that made it, and a sentence on it.
 
-    Drives of which one has an `accel_cmd`, or that have no pedals, are returned as they are, with None and "".
+    Drives of which one has an `accel_cmd`, or neither pedals nor a `speed_cmd`, are returned as they are, with None
+    and "".
     """
-    if any(drive.accel_cmd is not None or not drive.pedals for drive in drives):
+    if any(drive.accel_cmd is not None or (not drive.pedals and drive.speed_cmd is None) for drive in drives):
         return list(drives), None, ""
     from avtorch.pedals import fit_pedals, held_out
 
-    with talk.waiting("Fitting a map of the pedals"):
+    with talk.waiting("Fitting a map of the commands"):
         fit = fit_pedals(drives)
         sentence = map_sentence(fit, held_out(drives))
     talk.sentence(sentence)
@@ -39,12 +41,27 @@ def map_sentence(fit: PedalFit, score: HeldOut) -> str:
     ranges = [f"{name} {_range(name, table.pedal)}" for name, table in made.pedals.items()]
     worth = "better" if score.better_than("factor") else "not surely better"
     names = " and ".join(made.pedals)
-    return (
+    said = (
         f"The log has no accel_cmd: a map of {names} and speed stands for it ({', '.join(ranges)}, speed "
         f"{made.speed[0]:.3g} to {made.speed[-1]:.3g} m/s). On blocks held out its rollouts of {score.horizon_s:g} s "
         f"miss speed by {score.rmse('map'):.2g} m/s, one constant factor by {score.rmse('factor'):.2g} m/s: {worth}. "
         "The map and K_L cannot be told apart: K_L is 1 by the map's scale."
     )
+    if "speed_error" not in made.pedals:
+        return said
+    return (
+        f"{said} The command answers to the measured speed, and so to its noise: 0.1 m/s move it by "
+        f"{0.1 * _steepest(made.pedals['speed_error']):.2g} m/s²."
+    )
+
+
+def _steepest(table: PedalTable) -> float:
+    """The steepest slope [1/s] of what a speed error adds, in the intervals beside zero."""
+    import numpy as np
+
+    slopes = np.diff(table.accel, axis=0) / np.diff(table.pedal)[:, None]
+    beside = (table.pedal[:-1] <= 0) & (table.pedal[1:] >= 0)
+    return float(slopes[beside].max())
 
 
 def _range(name: str, knots: object) -> str:
@@ -56,7 +73,7 @@ def _range(name: str, knots: object) -> str:
         return f"{100 * low:.3g} to {100 * high:.3g} %"
     if name == "brake":
         return f"{low / 1e5:.3g} to {high / 1e5:.3g} bar"
-    return f"{low:.3g} to {high:.3g} {'Nm' if name == 'torque' else 'A'}"
+    return f"{low:.3g} to {high:.3g} {_UNITS[name]}"
 
 
 def write_pedals(fit: PedalFit | None, staged: Path) -> list[Path]:

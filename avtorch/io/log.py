@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
-from avtorch.errors import InputError
+from avtorch.errors import InputError, quoted
 from avtorch.io.assemble import assemble
 from avtorch.io.atomic import atomic
 from avtorch.io.clock import since_start
@@ -22,6 +22,7 @@ from avtorch.io.engagement import settled_rows
 from avtorch.io.formats import is_recording, open_recording
 from avtorch.io.mapping import PEDALS, SIGNALS, Pairs, SignalMap, pairs, read_mapping
 from avtorch.io.merged import Arrivals, merged
+from avtorch.io.opening import place
 from avtorch.io.segments import median_step, stretches
 from avtorch.io.tables import Table, read_table
 from avtorch.io.validity import check_units
@@ -99,7 +100,7 @@ class Log:
     ) -> Log:
         """Read a log: a table of text in any usual layout, gzipped or not, Parquet, or a recording.
 
-        Recordings are MDF, ROS bags and MCAP, CAN logs with a DBC, MAT and Excel, each by an extra
+        Recordings are MDF, ROS bags and MCAP, Apollo records, CAN logs with a DBC, MAT and Excel, each by an extra
         (`avtorch.io.formats`); their channels are held on the clock of the fastest of command, acceleration and speed.
         ``map`` names the columns (``{"accel": "CAN.ACC_X"}`` or ``["accel=CAN.ACC_X"]``), ``unit`` their units
         (``speed=km/h``), ``stamp`` the signals' own time columns (``speed=GPS_TIME``); the TOML file beside the log may
@@ -113,6 +114,11 @@ class Log:
         """
         mapping = read_mapping(path, map=map, unit=unit, stamp=stamp, state=state)
         if is_recording(path):
+            if mapping.column.get("time", "time") != "time":
+                named = quoted(mapping.column["time"])
+                raise InputError(
+                    f"{place(path)}: time is mapped to {named}; channels of a recording have clocks of their own"
+                )
             columns = {signal: mapping.column.get(signal, signal) for signal in SIGNALS if signal != "time"}
             recorded, arrived = merged(open_recording(path), columns)
             return cls._of(recorded, mapping, folder=Path(path).parent, following=following, arrived=arrived)

@@ -9,8 +9,7 @@ from avtorch.io.log import Log
 def no_command(log: Log, need: str) -> InputError:
     """The error; `need`: what needs the command, such as ``which the diagnosis needs``."""
     words = f"{log.name}: has no accel_cmd{need}"
-    if log.pedals:
-        words += f"; avtorch.pedals.fit_pedals makes one of its {' and '.join(log.pedals)}"
-    elif log.speed_cmd is not None:
-        words += "; a speed that is commanded holds the car's own speed controller, which is not modelled"
+    others = log.pedals or (("speed_cmd",) if log.speed_cmd is not None else ())
+    if others:
+        words += f"; avtorch.pedals.fit_pedals makes one of its {' and '.join(others)}"
     return InputError(words)

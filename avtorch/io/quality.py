@@ -144,7 +144,7 @@ def check(log: Log) -> Quality:
     if masked == log.rows:
         notes.append("no row is left to estimate from")
     notes.extend(f"{name} is constant ({present[name][0]:.6g}): it excites nothing" for name in constant)
-    notes.extend(_on_missing(missing, log.pedals))
+    notes.extend(_on_missing(missing, log))
     notes.extend(_repeats(present, log))
     notes.extend(doubtful)
     notes.extend(_disagreements(log))
@@ -159,8 +159,9 @@ def check(log: Log) -> Quality:
     )  # fmt: skip
 
 
-def _on_missing(missing: tuple[str, ...], pedals: tuple[str, ...]) -> list[str]:
-    assumed = f"a map of {' and '.join(pedals)}" if pedals else "an assumed controller"
+def _on_missing(missing: tuple[str, ...], log: Log) -> list[str]:
+    mapped = log.pedals or (("speed_cmd",) if log.speed_cmd is not None else ())
+    assumed = f"a map of {' and '.join(mapped)}" if mapped else "an assumed controller"
     sentences = {
         "accel_cmd": f"no accel_cmd: every result on the actuator is conditional on {assumed}",
         "accel": "no accel: speed is the only channel, so the log cannot distinguish sensor faults from real forces",

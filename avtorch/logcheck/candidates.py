@@ -62,7 +62,8 @@ def table_of(recording: Recording) -> Table:
     Those of a known layout stand alone for their signals.
     """
     _, known = layout_of(recording.names)
-    named: dict[str, list[str]] = {signal: [channel] for signal, (channel, _) in known.items()}
+    # channels of a recording bring their clocks along, so a layout's column of time is none of them
+    named: dict[str, list[str]] = {signal: [channel] for signal, (channel, _) in known.items() if signal != "time"}
     for name in recording.names:
         header = header_of(name, recording.units.get(name))
         for signal in signals_named():

@@ -83,7 +83,11 @@ def excitation_notes(log: Log) -> list[str]:
         cannot.append("what depends on speed or place: the log has no speed")
     if log.accel is None or log.speed is None:
         cannot.append("whether a sensor errs or the car: one channel alone is recorded")
-    if log.accel_cmd is None and log.pedals:
+    if log.accel_cmd is None and not log.pedals and log.speed_cmd is not None:
+        cannot.append("the actuator's gain from the map of speed_cmd, whose scale it is")
+        if np.ptp(log.speed_cmd[usable]) == 0:
+            cannot.append("the controller of speed_cmd, which never moves: only wind and noise move the car")
+    elif log.accel_cmd is None and log.pedals:
         cannot.append(f"the actuator's gain from the map of {' and '.join(log.pedals)}, whose scale it is")
     elif log.accel_cmd is None:
         cannot.append("the actuator's gain without assuming a controller: the log has no accel_cmd")

@@ -1,4 +1,4 @@
-"""Commands that are no accelerations: maps from pedals, torque or current to the acceleration they demand.
+"""Commands that are no accelerations: maps from them to the acceleration they demand.
 
 Example:
     >>> import numpy as np

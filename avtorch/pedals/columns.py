@@ -7,6 +7,7 @@ monotone in the pedal at every speed, and a dead zone or a saturation is a ramp 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +15,10 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.pedals.pedal_drive import PedalDrive, Piece
 from avtorch.pedals.pedal_map import SIGN, PedalMap, PedalTable, place
+from avtorch.pedals.speed_loop import RATE
 
 _SECONDS_A_KNOT = 12.0
-_PEDAL_KNOTS, _SPEED_KNOTS = (3, 8), (2, 7)
+_PEDAL_KNOTS, _SPEED_KNOTS, _LOOP_KNOTS = (3, 8), (2, 7), (2, 4)
 _OUTLYING = 0.001  # of the cells may lie beyond the outermost knot of speed
 
 
@@ -32,12 +34,14 @@ class MapColumns:
         """Knots where the drive has been, more of them the longer it is."""
         many = drive.seconds / _SECONDS_A_KNOT
         v = drive.counted("speed")
+        # a loop keeps to its speed, and its slope adds a straight line if anything
+        across = _LOOP_KNOTS if drive.is_loop else _SPEED_KNOTS
         low, high = np.quantile(v, (_OUTLYING, 1 - _OUTLYING))
-        speed = _between(v[(v > low) & (v < high)], low, max(high, low + 0.1), _number(many / 2, _SPEED_KNOTS))
+        speed = _between(v[(v > low) & (v < high)], low, max(high, low + 0.1), _number(many / 2, across))
         pedal = {}
         for name in drive.names:
             x = drive.counted(name)
-            knots, most = [np.zeros(1)], _number(many / 2, _PEDAL_KNOTS)
+            knots, most = [np.zeros(1)], 2 if name == RATE else _number(many / 2, _PEDAL_KNOTS)
             if x.max() > 0:
                 knots.append(_between(x[x > 0], 0.0, float(x.max()), most)[1:])
             if x.min() < 0:
@@ -54,11 +58,15 @@ class MapColumns:
         return self.free + sum((len(x) - 1) * len(self.speed) for x in self.pedal.values())
 
     def of(self, piece: Piece) -> FloatArray:
-        """The columns (cell, column) [m/s² per factor]."""
-        hats = _hats(self.speed, piece.middle)
+        """The columns (cell, column) [m/s² per factor] of the measured drive."""
+        return self.at(piece.middle, piece.pedals)
+
+    def at(self, speed: FloatArray, pedals: Mapping[str, FloatArray]) -> FloatArray:
+        """The columns (row, column) at `speed` (row,) and `pedals` (row,) by name."""
+        hats = _hats(self.speed, speed)
         out = [hats]
         for name, knots in self.pedal.items():
-            ramps = SIGN[name] * _ramps(knots, piece.pedals[name])
+            ramps = SIGN[name] * _ramps(knots, pedals[name])
             out.append((ramps[:, :, None] * hats[:, None, :]).reshape(len(hats), -1))
         return np.concatenate(out, 1)
 

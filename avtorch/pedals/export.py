@@ -22,11 +22,12 @@ from avtorch.io import atomic
 from avtorch.io.opening import place
 from avtorch.io.tables import Table, read_table
 from avtorch.pedals.pedal_map import UNIT, PedalMap, PedalTable
+from avtorch.pedals.speed_loop import ERROR, RATE
 
 MAP_FILE, ACCEL_FILE, BRAKE_FILE = "pedal_map.csv", "accel_map.csv", "brake_map.csv"
 _DRIVING = ("throttle", "torque", "current")
 _HEADER = ("pedal", "value", "speed", "accel", "sd")
-_NUMBER = {"coasting": 0, "throttle": 1, "brake": 2, "torque": 3, "current": 4}
+_NUMBER = {"coasting": 0, "throttle": 1, "brake": 2, "torque": 3, "current": 4, ERROR: 7, RATE: 8}
 _LAG, _DELAY = 5, 6
 """Which quantity a row is of; numbers, so that the file is a table like others."""
 

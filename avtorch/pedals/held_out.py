@@ -94,7 +94,7 @@ def held_out(logs: Log | Sequence[Log]) -> HeldOut:
 
 def map_demand(made: PedalMap) -> Demand:
     """The demand of a map."""
-    return lambda piece, speed, cells: made.accel(speed, **{n: x[cells] for n, x in piece.pedals.items()})
+    return lambda piece, speed, cells: made.accel(speed, **piece.inputs(cells, speed))
 
 
 def _fitted(model: str, drive: PedalDrive, used: np.ndarray) -> tuple[Demand, float, float]:
@@ -118,8 +118,14 @@ def _fitted(model: str, drive: PedalDrive, used: np.ndarray) -> tuple[Demand, fl
         T_L, dead_time = lag_of(rows, [columns(one.piece) @ factors for one in rows], used)
         if (T_L, dead_time) == before:
             break
-    found = {id(piece): columns(piece) @ factors for piece in drive.pieces}
-    return lambda piece, speed, cells: found[id(piece)][cells], T_L, dead_time
+    if model == "nominal":
+        return lambda piece, speed, cells: columns(piece)[cells, 0], T_L, dead_time
+
+    def demand(piece: Piece, speed: FloatArray, cells: IntArray) -> FloatArray:
+        given = piece.inputs(cells, speed)
+        return np.column_stack([SIGN[name] * given[name] for name in piece.pedals]) @ factors
+
+    return demand, T_L, dead_time
 
 
 def roll_out(drive: PedalDrive, demand: Demand, T_L: float, dead_time: float) -> FloatArray:
@@ -147,13 +153,23 @@ def _errors(
     # the speed at the beginning: the mean about it of what is measured, on the line through it
     around = np.clip(start[:, None] + np.arange(-(begin // 2), begin // 2 + 1), 0, piece.cells)
     v, a = piece.speed[around].mean(1), accel.copy()
-    total = np.zeros(len(start))
+    total, rolled = np.zeros(len(start)), np.empty((int(length.max()), len(start)))
     for step in range(int(length.max())):
         at = np.minimum(start + step, piece.cells - 1)
         inside = step < length
         total += np.where(inside, (v - piece.speed[at]) ** 2, 0.0)
-        now, then = (np.maximum(at - cells, 0) for cells in (whole, whole + 1))
-        m = (1 - part) * demand(piece, np.maximum(v, 0.0), now) + part * demand(piece, np.maximum(v, 0.0), then)
+        rolled[step] = v
+        now, then = (_late(piece, demand, rolled, at, step, cells) for cells in (whole, whole + 1))
+        m = (1 - part) * now + part * then
         v = np.maximum(v + m * dt + (a - m) * T_L * (1 - keep), 0.0)
         a = keep * a + (1 - keep) * m
     return total / length
+
+
+def _late(piece: Piece, demand: Demand, rolled: FloatArray, at: IntArray, step: int, cells: int) -> FloatArray:
+    """The demand (block,) of so many `cells` ago: of pedals at the speed of now, which slows the car at once; of a loop
+    at the one that its controller saw then, rolled out, or measured before the beginning."""
+    past = np.maximum(at - cells, 0)
+    if piece.speed_cmd is None:
+        return demand(piece, np.maximum(rolled[step], 0.0), past)
+    return demand(piece, np.maximum(rolled[step - cells], 0.0) if step >= cells else piece.middle[past], past)

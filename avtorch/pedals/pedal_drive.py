@@ -11,6 +11,7 @@ from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.io import Log
 from avtorch.io.mapping import PEDALS
+from avtorch.pedals.speed_loop import ERROR, RATE, inputs_of, jumps
 
 CELL_S = 0.05
 BLOCK_S, SHORT_BLOCK_S = 10.0, 5.0
@@ -23,7 +24,8 @@ _FEWEST = 4
 class Piece:
     """Cells without a gap, `dt` [s] apart: `pedals` (cell,) averaged over each, `speed` (cell + 1,) [m/s] at its
     edges, `nominal` (cell,) [m/s²] the log's own command or None, `block` (cell,): -1 where a cell does not count.
-    They are of `rows` of the log of that number, `log`."""
+    They are of `rows` of the log of that number, `log`. Of a commanded speed, `speed_cmd` (cell,) [m/s], the `pedals`
+    are its error and its slope."""
 
     dt: float
     pedals: dict[str, FloatArray]
@@ -32,6 +34,14 @@ class Piece:
     block: IntArray
     log: int
     rows: slice
+    speed_cmd: FloatArray | None = None
+
+    def inputs(self, cells: IntArray, speed: FloatArray) -> dict[str, FloatArray]:
+        """What the map takes in `cells` (row,), had the car the `speed` (row,) [m/s]: a loop's error is that of it."""
+        out = {name: values[cells] for name, values in self.pedals.items()}
+        if self.speed_cmd is not None:
+            out[ERROR] = self.speed_cmd[cells] - speed
+        return out
 
     @property
     def cells(self) -> int:
@@ -58,6 +68,11 @@ class PedalDrive:
         return tuple(self.pieces[0].pedals)
 
     @property
+    def is_loop(self) -> bool:
+        """Whether the command is a speed."""
+        return ERROR in self.names
+
+    @property
     def has_nominal(self) -> bool:
         return all(piece.nominal is not None for piece in self.pieces)
 
@@ -68,19 +83,10 @@ class PedalDrive:
 
     @classmethod
     def of(cls, logs: Log | Sequence[Log]) -> PedalDrive:
-        """Raises `InputError` for logs without pedals or speed, and for drives too short for four blocks."""
+        """Raises `InputError` for logs without pedals or a commanded speed, or without speed, and for drives too short
+        for four blocks."""
         each = [logs] if isinstance(logs, Log) else list(logs)
-        names = tuple(name for name in PEDALS if each and all(getattr(log, name) is not None for log in each))
-        if not names:
-            raise InputError(f"logs: found no pedal that all of them have, needs some of {', '.join(PEDALS)}")
-        for log in each:
-            if log.speed is None:
-                raise InputError(f"{log.name}: found no speed, needs it for a map of {' and '.join(names)}")
-        for name in names:
-            if all(np.ptp(getattr(log, name)[log.usable]) == 0 for log in each if log.usable.any()):
-                names = tuple(other for other in names if other != name)
-        if not names:
-            raise InputError("logs: found no pedal that moves, needs one that does")
+        names = _inputs(each)
         usable = sum(float(log.usable.sum()) / log.rate_hz for log in each)
         length = BLOCK_S if usable >= _BLOCKS * BLOCK_S else SHORT_BLOCK_S
         pieces: list[Piece] = []
@@ -97,6 +103,27 @@ class PedalDrive:
         return cls(tuple(pieces), blocks, seconds, length)
 
 
+def _inputs(logs: Sequence[Log]) -> tuple[str, ...]:
+    """The pedals that all logs have and that move; without any, what a commanded speed asks of its controller."""
+    names = tuple(name for name in PEDALS if logs and all(getattr(log, name) is not None for log in logs))
+    is_loop = not names and bool(logs) and all(log.speed_cmd is not None for log in logs)
+    asked = ("speed_cmd",) if is_loop else names
+    if not asked:
+        needs = f"{', '.join(PEDALS)}, or speed_cmd"
+        raise InputError(f"logs: found no pedal that all of them have, needs some of {needs}")
+    for log in logs:
+        if log.speed is None:
+            raise InputError(f"{log.name}: found no speed, needs it for a map of {' and '.join(asked)}")
+    moves = tuple(
+        name for name in asked if any(np.ptp(getattr(log, name)[log.usable]) > 0 for log in logs if log.usable.any())
+    )
+    if not moves:
+        raise InputError(f"logs: found no {'speed_cmd' if is_loop else 'pedal'} that moves, needs one that does")
+    if not is_loop:
+        return moves
+    return (ERROR,) if any(jumps(log) for log in logs) else (ERROR, RATE)
+
+
 def _piece(log: Log, number: int, part: slice, names: Sequence[str], length: float, first: int) -> Piece | None:
     time = log.elapsed[part]
     row = float(np.median(np.diff(time))) if len(time) > 1 else CELL_S
@@ -106,16 +133,18 @@ def _piece(log: Log, number: int, part: slice, names: Sequence[str], length: flo
         return None
     edges = time[0] + dt * np.arange(cells + 1)
     assert log.speed is not None
+    inputs = inputs_of(log, names)
     usable = np.interp(edges, time, log.usable[part].astype(float)) > 0.999
     block = _blocks(usable[1:] & usable[:-1], length / dt, _SHORTEST_S / dt, first)
     return Piece(
         dt=dt,
-        pedals={name: _averaged(edges, time, getattr(log, name)[part]) for name in names},
+        pedals={name: _averaged(edges, time, values[part]) for name, values in inputs.items() if values is not None},
         speed=np.interp(edges, time, log.speed[part]),
         nominal=None if log.accel_cmd is None else _averaged(edges, time, log.accel_cmd[part]),
         block=block,
         log=number,
         rows=part,
+        speed_cmd=_averaged(edges, time, log.speed_cmd[part]) if ERROR in names and log.speed_cmd is not None else None,
     )
 
 

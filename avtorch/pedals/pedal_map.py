@@ -13,10 +13,12 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.io import Log
+from avtorch.io.mapping import PEDALS
+from avtorch.pedals.speed_loop import ERROR, RATE, inputs_of
 
-SIGN = {"throttle": 1.0, "brake": -1.0, "torque": 1.0, "current": 1.0}
+SIGN = {"throttle": 1.0, "brake": -1.0, "torque": 1.0, "current": 1.0, ERROR: 1.0, RATE: 1.0}
 """Whether more of a pedal makes the car faster or slower."""
-UNIT = {"throttle": "-", "brake": "- or Pa", "torque": "Nm", "current": "A"}
+UNIT = {"throttle": "-", "brake": "- or Pa", "torque": "Nm", "current": "A", ERROR: "m/s", RATE: "m/s2"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +96,11 @@ class PedalMap:
         """
         if log.speed is None:
             raise InputError(f"{log.name}: has no speed, which a map of pedals needs")
-        given = {name: getattr(log, name) for name in self.pedals}
-        for name, values in given.items():
+        given: dict[str, FloatArray] = {}
+        for name, values in inputs_of(log, self.pedals).items():
             if values is None:
-                raise InputError(f"{log.name}: has no {name}, which the map needs")
+                raise InputError(f"{log.name}: has no {name if name in PEDALS else 'speed_cmd'}, which the map needs")
+            given[name] = values
         return replace(log, accel_cmd=self.accel(np.maximum(log.speed, 0.0), **given))
 
 

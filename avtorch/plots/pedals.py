@@ -14,11 +14,17 @@ if TYPE_CHECKING:
     from avtorch.pedals import PedalMap
 
 _COLOURS = (VERMILLION, ORANGE, GREEN, BLUE, BLACK)
-_UNITS = {"throttle": (100.0, "%"), "torque": (1.0, "Nm"), "current": (1.0, "A")}
+_UNITS = {
+    "throttle": (100.0, "%"),
+    "torque": (1.0, "Nm"),
+    "current": (1.0, "A"),
+    "speed_error": (1.0, "m/s"),
+    "speed_cmd_rate": (1.0, "m/s²"),
+}
 
 
 def pedal_lines(ax: Axes, made: PedalMap, pedal: str, *, lines: int = 4) -> Axes:
-    """The acceleration that one pedal demands, the others at rest.
+    """The acceleration that one pedal demands, the others at rest; likewise a commanded speed's error, and its slope.
 
     Lines are at some speeds between the slowest and the fastest that the map knows; bands are one standard error, by
     blocks of the drive, of what the pedal adds.

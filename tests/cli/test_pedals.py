@@ -9,6 +9,7 @@ import pytest
 
 from avtorch import Leader, simulate
 from avtorch.cli import main
+from tests.pedals import speed_cars
 from tests.pedals.cars import drive, plain
 
 
@@ -26,12 +27,28 @@ def test_estimate_makes_a_map_first(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "cannot be told apart" in json.loads((out / "estimates.json").read_text())["command"]
 
 
-def test_a_speed_that_is_commanded_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.slow
+def test_estimate_makes_a_map_of_a_commanded_speed_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    speed_cars.drive(42, seconds=60.0, steps=True).write(tmp_path / "lap.csv")
+    out = tmp_path / "out"
+    arguments = ["--window", "20", "--estimator", "ekf", "--out", str(out)]
+    assert main(["estimate", str(tmp_path / "lap.csv"), *arguments]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "a map of speed_error and speed stands for it (speed_error -" in said
+    assert "The command answers to the measured speed, and so to its noise" in said
+    for name in ("pedal_map.csv", "pedal_map.png"):
+        assert (out / name).stat().st_size > 0
+    assert not (out / "accel_map.csv").exists()
+
+
+def test_a_commanded_speed_that_never_moves_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     log = tmp_path / "lap.csv"
     log.write_text("time,speed,speed_cmd\n" + "".join(f"{0.05 * i:.2f},{10 + i % 7},12\n" for i in range(400)))
     assert main(["estimate", str(log), "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
-    assert "speed controller" in error
+    assert "found no speed_cmd that moves" in error
     assert error.count("\n") == 1
 
 

@@ -1,4 +1,4 @@
-"""Recordings in the formats of the trade: MDF, ROS bags and MCAP, CAN logs, MAT files, Excel sheets.
+"""Recordings in the formats of the trade: MDF, ROS bags and MCAP, Apollo records, CAN logs, MAT files, Excel sheets.
 
 Each format is read by a library of its own, an extra such as ``avtorch[mdf]``, loaded when a file of that format is
 opened. ``avtorch[logs]`` brings all of them.

@@ -26,7 +26,7 @@ from avtorch.io.opening import place
 from avtorch.io.recording import Channel
 from avtorch.io.size import MOST_CELLS, MOST_COLUMNS
 
-_NEED = "an undamaged ROS bag"
+_NEED = "an undamaged ROS bag with its index (`rosbag reindex` or `mcap recover` mends one that was cut off)"
 _NANO = 10**9
 
 

@@ -37,6 +37,7 @@ _ROSBAGS = Library("rosbags", "rosbags", "bags")
 _CAN = Library("can", "python-can", "can")
 _H5PY = Library("h5py", "h5py", "mat")
 _CALAMINE = Library("python_calamine", "python-calamine", "excel")
+_CYBER = Library("cyber_record", "cyber-record", "apollo")
 
 MDF = Kind("MDF", "mdf", _ASAMMDF, (".mf4", ".mdf", ".mf3"), "'MDF' or 'UnFinMF'", apart=True)
 ROS1 = Kind("ROS 1 bag", "bags", _ROSBAGS, (".bag",), "'#ROSBAG V2.0'", apart=True)
@@ -51,8 +52,9 @@ MAT73 = Kind("MAT 7.3", "matlab", _H5PY, (), "'MATLAB 7.3 MAT-file'", apart=True
 EXCEL = Kind("Excel", "excel", _CALAMINE, (".xlsx", ".xlsm", ".xlsb"), "'PK', as a ZIP file", apart=True)
 XLS = Kind("Excel 97", "excel", _CALAMINE, (".xls",), "the bytes D0 CF 11 E0", apart=True)
 ODS = Kind("OpenDocument", "excel", _CALAMINE, (".ods",), "'PK', as a ZIP file", apart=True)
+APOLLO = Kind("Apollo record", "apollo", _CYBER, (".record",), "a section of type 0 with its header", apart=True)
 
-KINDS = (MDF, ROS1, ROS2_SQLITE, ROS2_MCAP, ROS2_FOLDER, BLF, ASC, CANDUMP, MAT5, MAT73, EXCEL, XLS, ODS)
+KINDS = (MDF, ROS1, ROS2_SQLITE, ROS2_MCAP, ROS2_FOLDER, BLF, ASC, CANDUMP, MAT5, MAT73, EXCEL, XLS, ODS, APOLLO)
 
 
 def named(words: str) -> Kind:

@@ -67,7 +67,7 @@ AUTOWARE = _preset(
 
 APOLLO = _preset(
     "apollo",
-    "Apollo (channels of a record, as topic/field)",
+    "Apollo (cyber record)",
     time=(Source("/apollo/canbus/chassis/header/timestamp_sec", "s"),),
     accel_cmd=(Source("/apollo/control/acceleration", "m/s2"),),
     speed=(Source("/apollo/canbus/chassis/speed_mps", "m/s"),),

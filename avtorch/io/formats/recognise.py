@@ -12,7 +12,7 @@ from avtorch.io.formats.kinds import Kind
 from avtorch.io.formats.opened import beginning
 from avtorch.io.opening import place
 
-NEED = "an MDF, ROS bag, MCAP, BLF, ASC, candump, MAT, Excel or OpenDocument file"
+NEED = "an MDF, ROS bag, MCAP, Apollo record, BLF, ASC, candump, MAT, Excel or OpenDocument file"
 _AHEAD = 4096  # bytes that tell a format
 
 _MAGIC = (
@@ -83,11 +83,19 @@ def _by_content(head: bytes, suffix: str) -> Kind | None:
         return kinds.MAT73
     if head.startswith(b"PK\x03\x04"):
         return _office(head, suffix)
+    if _is_apollo(head):
+        return kinds.APOLLO
     if _CANDUMP.match(head):
         return kinds.CANDUMP
     if _ASC_DATE.match(head) and _BASE.search(head):
         return kinds.ASC
     return None
+
+
+def _is_apollo(head: bytes) -> bool:
+    """Apollo numbers its records (``.record.00012``), and they begin with no word: a section of type 0 and some size
+    up to 2048, in which the header's first field is the version."""
+    return head[:4] == bytes(4) and 2 <= int.from_bytes(head[8:16], "little") <= 2048 and head[16:17] == b"\x08"
 
 
 def _office(head: bytes, suffix: str) -> Kind | None:

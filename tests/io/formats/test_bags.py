@@ -294,6 +294,14 @@ def test_damage_is_read_or_refused(tmp_path: Path, form: str, fresh_seed: int) -
     survives(path, path.read_bytes(), fresh_seed, cuts=8, flips=20)
 
 
+@pytest.mark.parametrize("form", ["mcap", "bag"])
+def test_a_bag_that_was_cut_off_says_how_to_mend_it(tmp_path: Path, form: str) -> None:
+    path = WRITERS[form](tmp_path / f"drive.{form}")
+    raw = path.read_bytes()
+    path.write_bytes(raw[: len(raw) * 4 // 5])
+    refused(path, "`rosbag reindex` or `mcap recover` mends one that was cut off")
+
+
 def test_damage_to_the_folders_metadata_is_read_or_refused(tmp_path: Path, fresh_seed: int) -> None:
     import random
 

@@ -24,6 +24,7 @@ BEGINNINGS = {
     "ROS 1": (b"#ROSBAG V2.0\n", "drive.x"),
     "SQLite": (b"SQLite format 3\0", "drive.x"),
     "MCAP": (b"\x89MCAP0\r\n", "drive.x"),
+    "Apollo": (bytes(8) + (64).to_bytes(8, "little") + b"\x08\x01\x10\0", "20261123.record.00007"),
     "BLF": (b"LOGG" + bytes(140), "drive.x"),
     "ASC": (b"date Mon Nov 23 13:00:00 2026\nbase hex  timestamps absolute\n", "drive.txt"),
     "ASC with a remark": (b"// made by hand\ndate Mon\nBase Hex timestamps absolute\n", "drive.txt"),
@@ -44,11 +45,13 @@ NONE = {
     "HDF5": (b"\x89HDF\r\n\x1a\n", "drive.h5"),
     "CSV that speaks of a date": (b"date,base\n0,1\n", "drive.csv"),
 }
+SUFFIXES = (".mf4", ".bag", ".mcap", ".db3", ".record", ".blf", ".asc", ".mat", ".xlsx", ".xls", ".ods")
 LIBRARIES = {
     "MDF": "asammdf: pip install 'avtorch[mdf]'",
     "ROS 1": "rosbags: pip install 'avtorch[bags]'",
     "SQLite": "rosbags: pip install 'avtorch[bags]'",
     "MCAP": "rosbags: pip install 'avtorch[bags]'",
+    "Apollo": "cyber-record: pip install 'avtorch[apollo]'",
     "BLF": "python-can: pip install 'avtorch[can]'",
     "ASC": "python-can: pip install 'avtorch[can]'",
     "candump": "python-can: pip install 'avtorch[can]'",
@@ -86,7 +89,7 @@ def test_what_is_no_recording(tmp_path: Path, case: str) -> None:
         open_recording(path)
 
 
-@pytest.mark.parametrize("suffix", [".mf4", ".bag", ".mcap", ".db3", ".blf", ".asc", ".mat", ".xlsx", ".xls", ".ods"])
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_name_that_promises_a_format_is_no_licence_to_guess(tmp_path: Path, suffix: str) -> None:
     path = put(tmp_path, b"\x01\x02 something else", f"drive{suffix}")
     assert is_recording(path)
