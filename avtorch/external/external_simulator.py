@@ -74,26 +74,28 @@ class ExternalSimulator:
         """What a diagnosis against it needs. Raises `InputError` where the output does not belong to these drives, or
         the simulator fails under their commands.
         """
-        offsets, outputs = [], []
-        if self.output is not None:
-            if len(self.output) != len(logs):
-                raise InputError(f"simulated: found {len(self.output)} logs for {len(logs)} drives, needs one for each")
-            for other, log in zip(self.output, logs, strict=True):
-                found = aligned(other, log)
-                outputs.append(in_drives(found.log, log))
-                offsets.append(found.offset_s)
-        else:
-            assert isinstance(self.of, Simulator)
-            outputs = [
-                driven_along(self.of, log, name=self.name, step_s=self.step_s, progress=progress) for log in logs
-            ]
-            offsets = [0.0] * len(logs)
+        outputs, offsets = self.outputs(logs, progress)
         surrogate = surrogate_of(outputs, progress=progress)
         cars = [replace(log, engaged=other.engaged) for log, other in zip(logs, outputs, strict=True)]
         freed = tuple(
             without_discrepancy(log, other, surrogate.plant) for log, other in zip(cars, outputs, strict=True)
         )
-        return SimulatorBesideCar(self, surrogate, freed, tuple(offsets), rollout_errors(cars, outputs))
+        return SimulatorBesideCar(self, surrogate, freed, offsets, rollout_errors(cars, outputs))
+
+    def outputs(
+        self, logs: Sequence[Log], progress: Progress | None = None
+    ) -> tuple[tuple[Log, ...], tuple[float, ...]]:
+        """Its output in the rows of each log, and what its clock was ahead of the log's [s]. Raises as `beside`."""
+        if self.output is not None:
+            if len(self.output) != len(logs):
+                raise InputError(f"simulated: found {len(self.output)} logs for {len(logs)} drives, needs one for each")
+            found = [aligned(other, log) for other, log in zip(self.output, logs, strict=True)]
+            driven = tuple(in_drives(x.log, log) for x, log in zip(found, logs, strict=True))
+            return driven, tuple(x.offset_s for x in found)
+        assert isinstance(self.of, Simulator)
+        own, name, step_s = self.of, self.name, self.step_s
+        driven = tuple(driven_along(own, log, name=name, step_s=step_s, progress=progress) for log in logs)
+        return driven, (0.0,) * len(logs)
 
 
 @dataclass(frozen=True, eq=False)

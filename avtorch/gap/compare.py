@@ -28,13 +28,13 @@ from avtorch.errors import InputError, quoted
 from avtorch.gap.change.change_cause import ChangeCause, cause_of_change
 from avtorch.gap.change.two_sides import FEWEST_BLOCKS, TwoSides
 from avtorch.gap.crossval.folds import blocks_of
-from avtorch.gap.crossval.rollout_errors import HORIZON_S, RolloutMetric, products, reached
+from avtorch.gap.crossval.rollout_errors import HORIZON_S, RolloutMetric, block_squares, reached
 from avtorch.gap.dead_time_or_lag import DeadTimeFit, compare_explanations
 from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import Change, Comparison, DeadTimeTest, SimulatorChange
 from avtorch.gap.result.diagnosis import LogFacts
+from avtorch.gap.result.traces import rolled_out
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
 from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
@@ -103,9 +103,9 @@ def compare(
     sure = float(student.ppf(0.95, blocks - 1))  # pyright: ignore[reportUnknownMemberType]
     car = {
         name: Change(
-            _log_quantity(one.mean[i], one.covariance[i, i], sure),
-            _log_quantity(two.mean[i], two.covariance[i, i], sure),
-            _log_quantity(away[i], covariance[i, i], sure),
+            Quantity.of_logarithm(one.mean[i], one.covariance[i, i], sure),
+            Quantity.of_logarithm(two.mean[i], two.covariance[i, i], sure),
+            Quantity.of_logarithm(away[i], covariance[i, i], sure),
         )
         for i, name in enumerate(_CAR)
     }
@@ -227,9 +227,9 @@ def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float
     for i, (side, simulator) in enumerate(zip(sides, simulators, strict=True)):
         rng = np.random.default_rng(0 if same else i)
         record = side.found.hypothesis.record
-        errors = record.measured - _rolled(record, simulator)
+        errors = record.measured - rolled_out(record, simulator)
         blocks = blocks_of(record, fewest=FEWEST_BLOCKS)
-        squares = _squares(record, errors, blocks, float(simulator.T_L), horizon)
+        squares = block_squares(record, errors, blocks, float(simulator.T_L), horizon)
         rows = np.array([(b.stop - b.start) * record.group for b in blocks], float)
         weights = rng.multinomial(len(blocks), np.full(len(blocks), 1 / len(blocks)), size=_DRAWS)
         weights = np.concatenate([np.ones((1, len(blocks))), weights])
@@ -240,33 +240,9 @@ def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float
     }
 
 
-def _rolled(record: Record, simulator: GapPlant) -> FloatArray:
-    responses = [simulator.response(drive) for drive in record.drives]
-    seen = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
-    return np.stack([record.at_counted_rows(seen[name]) for name in record.channels])
-
-
-def _squares(
-    record: Record, errors: FloatArray, blocks: Sequence[slice], lag: float, horizon: float
-) -> dict[str, FloatArray]:
-    """Squared rollout errors by metric; the metric is named after `HORIZON_S` even where the drives are shorter."""
-    out: dict[str, FloatArray] = {}
-    for channel in record.channels:
-        squares = products(RolloutMetric(channel, horizon), record, errors[None], blocks, lag)
-        out[RolloutMetric(channel, HORIZON_S).name] = squares[:, 0, 0]
-    return out
-
-
 def _of_draws(x: FloatArray) -> Quantity:
     q05, q95 = np.quantile(x[1:], (0.05, 0.95))
     return Quantity(float(x[0]), float(x[1:].std()), min(float(q05), float(x[0])), max(float(q95), float(x[0])))
-
-
-def _log_quantity(mean: float, variance: float, sure: float) -> Quantity:
-    """exp(x) for a normal x of this `mean` and `variance`; `sure`: half its central 90 % in standard deviations."""
-    sd = float(np.sqrt(variance))
-    middle = float(np.exp(mean))
-    return Quantity(middle, middle * sd, float(np.exp(mean - sure * sd)), float(np.exp(mean + sure * sd)))
 
 
 def _simulator_change(gap: Mapping[str, Change]) -> SimulatorChange:
