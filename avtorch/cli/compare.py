@@ -14,7 +14,7 @@ from avtorch.cli.arguments import OUTPUT, Json, Quiet, free_folder
 from avtorch.cli.simulator import read_simulator
 from avtorch.cli.simulators_table import simulators_table
 from avtorch.cli.talk import Talk
-from avtorch.cli.tested_simulator import simulators_of
+from avtorch.cli.tested_simulator import simulators_of, tested_simulator
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def compare(
         list[str] | None,
         Parameter(
             negative=(),
-            help="A simulator: MODULE:NAME, FILE.py:NAME or an FMU; effects such as dead_time=0.2, or TOML. Give two.",
+            help="A simulator: MODULE:NAME, FILE.py:NAME or an FMU; effects such as dead_time=0.2, or TOML.",
         ),
     ] = None,
     simulated: Annotated[
@@ -77,7 +77,7 @@ def compare(
     before
         A log, as for diagnose: the drive before the change; or the only one, with two simulators.
     after
-        The drive after it.
+        The drive after it; with one simulator or none.
     """
     if out is not None:
         free_folder(out)
@@ -93,10 +93,10 @@ def compare(
             raise InputError("--baseline: found beside --simulator or --simulated, needs a plant as --simulator")
         _nearer(before, simulator or (), simulated or (), step, out, map, unit, Talk(json=json, quiet=quiet))
         return
-    if two:
-        raise InputError("--simulator, --simulated: found beside two logs; needs one log and two simulators")
-    if step is not None:
-        raise InputError("--step: has a meaning with --simulator only")
+    if len(simulator or ()) > 1:
+        raise InputError(f"--simulator: found {len(two)} beside two logs, needs one, or one log")
+    if two and (baseline != "glvd" or baseline_after is not None):
+        raise InputError("--baseline: found beside --simulator or --simulated, needs one simulator")
     base = read_simulator("--baseline", baseline)
     other = None if baseline_after is None else read_simulator("--baseline-after", baseline_after)
     if baseline_after is not None and (base is None or other is None):
@@ -106,8 +106,9 @@ def compare(
 
     talk = Talk(json=json, quiet=quiet)
     logs = [_log(path, map, unit, talk) for path in (before, after)]
+    own = tested_simulator(simulated or (), (simulator or (None,))[0], step, [(before, logs[0]), (after, logs[1])])
     with talk.steps("Comparing") as step_done:
-        comparison = work(*logs, baseline=base, baseline_after=other, progress=step_done)
+        comparison = work(*logs, baseline=own or base, baseline_after=other, progress=step_done)
     _answer(talk, comparison, _table(comparison), out)
 
 

@@ -25,6 +25,7 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, quoted
+from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.change.change_cause import ChangeCause, cause_of_change
 from avtorch.gap.change.two_sides import FEWEST_BLOCKS, TwoSides
 from avtorch.gap.crossval.folds import blocks_of
@@ -53,7 +54,7 @@ def compare(
     before: Log | Sequence[Log],
     after: Log | Sequence[Log],
     *,
-    baseline: Simulator = None,
+    baseline: Simulator | BlackBoxSimulator = None,
     baseline_after: Simulator = None,
     level: float = LEVEL,
     effects: Sequence[str | type[Effect]] | None = None,
@@ -63,8 +64,10 @@ def compare(
 
     `baseline`: the simulator with which both are compared (`baseline_after`: another one for the second set), with its
     own `T_L` and `K_L`; default: bare GLVD fitted to the drives before. Its effects keep their values in the fits of
-    the car. `level`: significance level of a difference between the drives. `effects`: candidates, by name or class,
-    for the cause of a change, beside T_L, K_L and dead time (default: all registered; none: `[]`).
+    the car. One that is not made of effects comes as an `avtorch.ExternalSimulator`, for all drives (two such:
+    `avtorch.compare_simulators`). `level`: significance level of a difference between the drives. `effects`:
+    candidates, by name or class, for the cause of a change, beside T_L, K_L and dead time (default: all registered;
+    none: `[]`).
     `progress(what, done, of)` is called at every hypothesis.
 
     Raises `InputError` for logs that cannot be diagnosed or hold less than five blocks of 4 s of usable driving,
@@ -84,6 +87,12 @@ def compare(
         raise InputError(f"level: found {level}, needs a number between 0 and 1")
     sides = [[x] if isinstance(x, Log) else list(x) for x in (before, after)]
     kinds = _kinds(effects)
+    if isinstance(baseline, BlackBoxSimulator):
+        if baseline_after is not None:
+            raise InputError("baseline_after: found beside a simulator that is no plant, needs compare_simulators")
+        beside = baseline.beside([*sides[0], *sides[1]], progress)
+        sides = [list(beside.logs[: len(sides[0])]), list(beside.logs[len(sides[0]) :])]
+        baseline = beside.plant
     given = [baseline, baseline if baseline_after is None else baseline_after]
     plants = [b if isinstance(b, GapPlant) else plant([], baseline=b) for b in given]
     if progress is not None:

@@ -87,7 +87,10 @@ REFUSED = [
     (["--simulator", "T_L=0.4", "--simulated", "none."], "'none.': no such file, and"),
     (["--simulator", "T_L=0.4", "--simulator", "K_L=0.9", "--step", "0.1"], "--step: has a meaning with an object"),
     (["--simulator", "T_L=0.4", "--simulator", "K_L=0.9", "--baseline", "T_L=0.2"], "--baseline: found beside"),
-    (["{}/real.csv", "--simulator", "T_L=0.4"], "found beside two logs"),
+    (["{}/real.csv", "--simulator", "T_L=0.4", "--simulator", "T_L=0.5"], "found 2 beside two logs, needs one"),
+    (["{}/real.csv", "--simulator", "my_car:Car", "--baseline", "T_L=0.2"], "--baseline: found beside"),
+    (["{}/real.csv", "--simulator", "T_L=0.4"], "found 'T_L=0.4', needs MODULE:NAME"),
+    (["{}/real.csv", "--simulated", "{}/sim.csv"], "--simulated: found 1 files for 2 logs"),
     (["{}/real.csv", "--step", "0.1"], "--step: has a meaning with --simulator only"),
 ]
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from avtorch import ExternalSimulator, InputError, compare_simulators
+from avtorch import ExternalSimulator, InputError, compare, compare_simulators
 from avtorch.external.driven_plant import DrivenPlant
 from avtorch.external.scored_blocks import LogRatio
 from avtorch.external.simulator_comparison import OTHERS
@@ -140,6 +140,26 @@ def test_what_cannot_be_compared_is_refused(both: tuple[Log, Log]) -> None:
         compare_simulators(replace(car, accel=None), "T_L=0.3", ExternalSimulator(replace(output, speed=None)))
     with pytest.raises(InputError, match="found 4 blocks of 4 s of usable driving, needs 5 or more"):
         compare_simulators(car[slice(0, 1050)], "T_L=0.3", "T_L=0.4")
+
+
+def test_two_drives_against_one_simulator() -> None:
+    """The car before is the simulator; after, it has three quarters of the gain. The simulator's
+    errors are those of the plant that it is."""
+    rng = np.random.default_rng(6)
+    own = "aerodynamic_drag=0.0005"
+    one, two = (log_of(plant(baseline=own, T_L=0.35, K_L=gain), seconds=60.0, rng=rng) for gain in (1.0, 0.75))
+    told = compare(one, two, baseline=ExternalSimulator(OdeCar), effects=[])
+    assert told.changed
+    assert told.simulator == "farther"
+    gain = told.car["K_L"]
+    assert gain.before.q05 < 1.0 < gain.before.q95
+    assert gain.after.q05 < 0.75 < gain.after.q95
+    as_plant = compare(one, two, baseline=f"{own}, T_L=0.35", effects=[])
+    for metric, moved in told.gap.items():
+        assert moved.before.mean == pytest.approx(as_plant.gap[metric].before.mean, rel=1e-3)
+        assert moved.after.mean == pytest.approx(as_plant.gap[metric].after.mean, rel=1e-3)
+    with pytest.raises(InputError, match="needs compare_simulators"):
+        compare(one, one, baseline=ExternalSimulator(OdeCar), baseline_after="T_L=0.3")
 
 
 @pytest.mark.statistical
