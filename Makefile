@@ -27,7 +27,7 @@ demo: $(VENV)/.installed
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n $(JOBS) -m "not slow" $(PYTEST_ARGS)
 
-test-all: $(VENV)/.installed-dev
+test-all: $(VENV)/.installed-sumo
 	$(BIN)/python -m pytest -n $(JOBS) $(PYTEST_ARGS)
 
 # Parquet in a process of its own: should pyarrow end or corrupt it, the other targets are still tried.
@@ -63,6 +63,11 @@ $(VENV)/.installed: $(VENV)/.torch pyproject.toml
 $(VENV)/.installed-dev: $(VENV)/.torch pyproject.toml
 	$(PIP) --editable '.[dev]'
 	@touch $@ $(VENV)/.installed
+
+# what only the slow tests need, too heavy for `make test`
+$(VENV)/.installed-sumo: $(VENV)/.installed-dev
+	$(PIP) --editable '.[sumo]'
+	@touch $@
 
 $(VENV)/.installed-docs: $(VENV)/.torch pyproject.toml
 	$(PIP) --editable '.[docs]'

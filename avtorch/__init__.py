@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from avtorch.decision.strategist import Strategist
     from avtorch.decision.supervisor import Supervisor
     from avtorch.errors import InputError
+    from avtorch.external.compare_simulators import compare_simulators
     from avtorch.external.external_simulator import ExternalSimulator
     from avtorch.gap.compare import compare
     from avtorch.gap.diagnose import diagnose
@@ -49,6 +50,7 @@ _HOME = {
     "avtorch.decision.strategist": ("Strategist",),
     "avtorch.decision.supervisor": ("Supervisor",),
     "avtorch.errors": ("InputError",),
+    "avtorch.external.compare_simulators": ("compare_simulators",),
     "avtorch.external.external_simulator": ("ExternalSimulator",),
     "avtorch.gap.compare": ("compare",),
     "avtorch.gap.diagnose": ("diagnose",),
@@ -97,6 +99,7 @@ __all__ = [
     "algorithm2",
     "check",
     "compare",
+    "compare_simulators",
     "decision",
     "diagnose",
     "estimate",

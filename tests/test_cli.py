@@ -299,7 +299,10 @@ def test_an_interruption_leaves_the_older_answer_and_its_pictures(
     ("arguments", "said"),
     [
         (["estimate"], "LOG: missing; needs a file, see avtorch estimate --help"),
-        (["compare", "before.csv"], "AFTER: missing; needs a file, see avtorch compare --help"),
+        (
+            ["compare", "before.csv"],
+            "AFTER: missing; needs a file, or two of --simulator and --simulated, see avtorch compare --help",
+        ),
         (["run"], "--out: missing; needs a folder for the answer and the pictures, such as --out out/run"),
         (["blindtest", "--out", "here"], "--n: missing; see avtorch blindtest --help"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,11 +12,15 @@ from rich.table import Table
 
 from avtorch.cli.arguments import OUTPUT, Json, Quiet, free_folder
 from avtorch.cli.simulator import read_simulator
+from avtorch.cli.simulators_table import simulators_table
 from avtorch.cli.talk import Talk
+from avtorch.cli.tested_simulator import simulators_of, tested_simulator
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
+    from avtorch.external import SimulatorComparison
     from avtorch.gap.result.comparison import Change, Comparison
+    from avtorch.io import Log
 
 _ROWS = {
     "T_L": "lag T_L [s]",
@@ -27,9 +32,25 @@ _ROWS = {
 
 def compare(
     before: Path,
-    after: Path,
+    after: Path | None = None,
     /,
     *,
+    simulator: Annotated[
+        list[str] | None,
+        Parameter(
+            negative=(),
+            help="A simulator: MODULE:NAME, FILE.py:NAME or an FMU; effects such as dead_time=0.2, or TOML.",
+        ),
+    ] = None,
+    simulated: Annotated[
+        list[str] | None,
+        Parameter(
+            negative=(), help="A simulator by its output: a file, or the prefix of columns of the log, such as sim."
+        ),
+    ] = None,
+    step: Annotated[
+        float | None, Parameter(help="The simulators' own step [s], if they take no other; default: the log's.")
+    ] = None,
     baseline: Annotated[
         str, Parameter(help="The simulator: effects such as dead_time=0.2, or TOML; glvd is fitted to BEFORE.")
     ] = "glvd",
@@ -49,44 +70,96 @@ def compare(
 ) -> None:
     """Did a change to the car, or to the simulator, help? By how much, with intervals.
 
+    Two simulators and one log: which is nearer to the car, and by what.
+
     Parameters
     ----------
     before
-        A log, as for diagnose: the drive before the change.
+        A log, as for diagnose: the drive before the change; or the only one, with two simulators.
     after
-        The drive after it. The same file twice compares two simulators on one drive.
+        The drive after it; with one simulator or none.
     """
     if out is not None:
         free_folder(out)
-    simulator = read_simulator("--baseline", baseline)
+    two = [*(simulator or ()), *(simulated or ())]
+    if after is None:
+        if not two:
+            raise InputError(
+                "AFTER: missing; needs a file, or two of --simulator and --simulated, see avtorch compare --help"
+            )
+        if len(two) != 2:
+            raise InputError(f"--simulator, --simulated: found {len(two)} beside one log, needs two")
+        if baseline != "glvd" or baseline_after is not None:
+            raise InputError("--baseline: found beside --simulator or --simulated, needs a plant as --simulator")
+        _nearer(before, simulator or (), simulated or (), step, out, map, unit, Talk(json=json, quiet=quiet))
+        return
+    if len(simulator or ()) > 1:
+        raise InputError(f"--simulator: found {len(two)} beside two logs, needs one, or one log")
+    if two and (baseline != "glvd" or baseline_after is not None):
+        raise InputError("--baseline: found beside --simulator or --simulated, needs one simulator")
+    base = read_simulator("--baseline", baseline)
     other = None if baseline_after is None else read_simulator("--baseline-after", baseline_after)
-    if baseline_after is not None and (simulator is None or other is None):
+    if baseline_after is not None and (base is None or other is None):
         raise InputError("--baseline-after: found without two simulators; needs --baseline and --baseline-after given")
 
     from avtorch.gap.compare import compare as work
-    from avtorch.io import Log, answer_set, check, write_json
 
     talk = Talk(json=json, quiet=quiet)
-    logs = [Log.read(path, map=map, unit=unit) for path in (before, after)]
-    for path, log in zip((before, after), logs, strict=True):
-        if not log.usable.any():
-            raise InputError(
-                f"{path}: has no row to use; all are driven by hand (engaged 0), within 2 s after, or at standstill"
-            )
-        talk.notes(log.name, check(log).notes)
-    with talk.steps("Comparing") as step:
-        comparison = work(*logs, baseline=simulator, baseline_after=other, progress=step)
+    logs = [_log(path, map, unit, talk) for path in (before, after)]
+    own = tested_simulator(simulated or (), (simulator or (None,))[0], step, [(before, logs[0]), (after, logs[1])])
+    with talk.steps("Comparing") as step_done:
+        comparison = work(*logs, baseline=own or base, baseline_after=other, progress=step_done)
+    _answer(talk, comparison, _table(comparison), out)
+
+
+def _nearer(
+    path: Path,
+    simulator: Sequence[str],
+    simulated: Sequence[str],
+    step: float | None,
+    out: Path | None,
+    map: list[str] | None,
+    unit: list[str] | None,
+    talk: Talk,
+) -> None:
+    """Two simulators and a log."""
+    log = _log(path, map, unit, talk)
+    first, second = simulators_of(simulator, simulated, step, path, log)
+
+    from avtorch.external import compare_simulators
+
+    with talk.steps("Comparing") as step_done:
+        found = compare_simulators(log, first, second, progress=step_done)
+    _answer(talk, found, simulators_table(found), out)
+    if not talk.json:
+        for which in (x for x in (found.first, found.second) if x.notes):
+            talk.notes(which.name, which.notes)
+
+
+def _log(path: Path, map: list[str] | None, unit: list[str] | None, talk: Talk) -> Log:
+    from avtorch.io import Log, check
+
+    log = Log.read(path, map=map, unit=unit)
+    if not log.usable.any():
+        raise InputError(
+            f"{path}: has no row to use; all are driven by hand (engaged 0), within 2 s after, or at standstill"
+        )
+    talk.notes(log.name, check(log).notes)
+    return log
+
+
+def _answer(talk: Talk, found: Comparison | SimulatorComparison, table: Table, out: Path | None) -> None:
+    from avtorch.io import answer_set, write_json
+
     if out is not None:
         with answer_set(out, ("comparison.json",)) as staged:
-            write_json(staged / "comparison.json", comparison.to_dict())
+            write_json(staged / "comparison.json", found.to_dict())
     if talk.json:
-        import json as text
-
-        print(text.dumps(comparison.to_dict()))
+        talk.answer(found.to_dict())
         return
-    talk.out.print(f"[bold]{escape(comparison.why)}[/bold]")
+    talk.out.print(f"[bold]{escape(found.why)}[/bold]")
     talk.out.print()
-    talk.out.print(_table(comparison))
+    talk.out.print(table)
     if out is not None:
         talk.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: comparison.json", soft_wrap=True)
 

@@ -227,7 +227,9 @@ def diagnose(
         next_experiment=None if ahead is None else ahead.to_dict(),
     )
     with answer_set(out, (*DIAGNOSIS_FILES, *PEDAL_FILES)) as staged:
-        written = [*found.write(staged), *write_table(ahead, staged), *write_exports(found.plant, staged)]
+        pedals = None if fit is None else fit.map
+        written = [*found.write(staged), *write_table(ahead, staged)]
+        written += write_exports(found.plant, staged, pedals=pedals)
         written.append(write_report(found, staged, quality=quality, experiment=ahead))
         written += write_pedals(fit, staged)
     if talk.json:
@@ -250,6 +252,7 @@ _FILES = {
     ".toml": " (the repaired simulator)",
     ".csv": " (what to drive next)",
     ".yaml": " (in that tool's terms)",
+    ".xml": " (in that tool's terms)",
     ".html": " (to read)",
 }
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from avtorch.cli.simulator import read_simulator
 from avtorch.errors import InputError, quoted
 
 if TYPE_CHECKING:
@@ -48,6 +49,34 @@ def tested_simulator(
 
     outputs = [Log.read(path, following=True) for path in simulated]
     return ExternalSimulator(outputs, name=", ".join(Path(path).name for path in simulated))
+
+
+def simulators_of(
+    simulator: Sequence[str], simulated: Sequence[str], step: float | None, path: Path, drive: Log
+) -> list[ExternalSimulator | str]:
+    """Simulators of any kind beside one log, those of --simulator first: plants as text, objects, FMUs, output.
+
+    Raises `InputError` for what cannot be read.
+    """
+    found: list[ExternalSimulator | str] = []
+    for text in simulator:
+        if text.lower().endswith(".toml") or not (":" in text or text.lower().endswith(".fmu")):
+            if read_simulator("--simulator", text) is None:
+                raise InputError("--simulator: found glvd, which would be fitted to the log; needs its T_L, as T_L=0.4")
+            found.append(text)
+        else:
+            found.append(_one((), text, step, path, drive))
+    if step is not None and all(isinstance(x, str) for x in found):
+        raise InputError("--step: has a meaning with an object or an FMU as --simulator only")
+    return [*found, *(_one((text,), None, None, path, drive) for text in simulated)]
+
+
+def _one(
+    simulated: Sequence[str], simulator: str | None, step: float | None, path: Path, drive: Log
+) -> ExternalSimulator:
+    found = tested_simulator(simulated, simulator, step, [(path, drive)])
+    assert found is not None
+    return found
 
 
 def _columns(prefix: str, path: Path, drive: Log) -> Log:

@@ -84,36 +84,41 @@ class ExternalSimulator:
         """What a diagnosis against it needs. Raises `InputError` where the output does not belong to these drives, or
         the simulator fails under their commands.
         """
-        offsets, rollouts, fitted = [0.0] * len(logs), None, None
+        if not self.adjustable:
+            outputs, offsets = self.outputs(logs, progress)
+            return _beside(self, logs, outputs, offsets, rollout_errors(logs, outputs), None, None, progress)
+        rollouts = self._rollouts(logs, progress)
+        first = rollouts.at(rollouts.start)
+        fitted = adjusted(rollouts, self.adjustable)
+        outputs = fitted.outputs if fitted.wrong else first
+        offsets = (0.0,) * len(logs)
+        return _beside(self, logs, outputs, offsets, rollout_errors(logs, first), rollouts, fitted, progress)
+
+    def outputs(
+        self, logs: Sequence[Log], progress: Progress | None = None
+    ) -> tuple[tuple[Log, ...], tuple[float, ...]]:
+        """Its output in the rows of each log, and what its clock was ahead of the log's [s]. Raises as `beside`."""
         if self.output is not None:
             if len(self.output) != len(logs):
                 raise InputError(f"simulated: found {len(self.output)} logs for {len(logs)} drives, needs one for each")
             found = [aligned(other, log) for other, log in zip(self.output, logs, strict=True)]
-            offsets = [each.offset_s for each in found]
-            outputs = first = [in_drives(each.log, log) for each, log in zip(found, logs, strict=True)]
-        else:
-            assert isinstance(self.of, Simulator)
-            rollouts = self._rollouts(self.of, logs, progress)
-            first = rollouts.at(rollouts.start)
-            fitted = adjusted(rollouts, self.adjustable) if self.adjustable else None
-            outputs = fitted.outputs if fitted is not None and fitted.wrong else first
-        surrogate = surrogate_of(outputs, progress=progress)
-        cars = [replace(log, engaged=other.engaged) for log, other in zip(logs, outputs, strict=True)]
-        freed = tuple(
-            without_discrepancy(log, other, surrogate.plant) for log, other in zip(cars, outputs, strict=True)
-        )
-        errors = rollout_errors(cars, first)
-        return SimulatorBesideCar(self, surrogate, tuple(outputs), freed, tuple(offsets), errors, rollouts, fitted)
+            driven = tuple(in_drives(x.log, log) for x, log in zip(found, logs, strict=True))
+            return driven, tuple(x.offset_s for x in found)
+        assert isinstance(self.of, Simulator)
+        return self._driven(self.of, logs, progress), (0.0,) * len(logs)
 
-    def _rollouts(self, simulator: Simulator, logs: Sequence[Log], progress: Progress | None) -> Rollouts:
+    def _driven(self, car: Simulator, logs: Sequence[Log], progress: Progress | None = None) -> tuple[Log, ...]:
+        own, step_s = self.name, self.step_s
+        return tuple(driven_along(car, log, name=own, step_s=step_s, progress=progress) for log in logs)
+
+    def _rollouts(self, logs: Sequence[Log], progress: Progress | None) -> Rollouts:
         """Drives of the simulator by the values of its adjustable parameters."""
+        simulator = cast("Simulator", self.of)
 
-        def drive(values: Mapping[str, float]) -> list[Log]:
-            if progress is not None and self.adjustable:
+        def drive(values: Mapping[str, float]) -> tuple[Log, ...]:
+            if progress is not None:
                 progress("fitting its parameters", len(rollouts), self.most_rollouts)
-            car = with_values(simulator, values) if values else simulator
-            along = None if self.adjustable else progress
-            return [driven_along(car, log, name=self.name, step_s=self.step_s, progress=along) for log in logs]
+            return self._driven(with_values(simulator, values), logs)
 
         rollouts = Rollouts(logs, values_of(simulator, self.adjustable), drive, self.most_rollouts)
         return rollouts
@@ -143,7 +148,7 @@ class SimulatorBesideCar:
 
     def told(self, found: Diagnosis) -> Diagnosis:
         """The diagnosis, with what it says of the simulator."""
-        out = self._told(found, self.fitted)
+        out = self._told(found)
         if self.fitted is None or out.tested is None or found.plant is None or not out.tested.missing:
             return out
         # without what is missing its parameters stood in for that
@@ -151,10 +156,14 @@ class SimulatorBesideCar:
         missing = set(out.tested.missing)
         rest = [effect for effect in found.plant.effects if effect.name not in missing]
         bare = GapPlant(rest, T_L=found.plant.T_L, K_L=found.plant.K_L, sigma=0.0)
-        cars = [_without(*each, found.plant, bare) for each in zip(self.rollouts.logs, self.outputs, strict=True)]
-        return self._told(found, adjusted(self.rollouts, self.simulator.adjustable, logs=cars))
+        logs = self.rollouts.logs
+        cars = [_without(*each, found.plant, bare) for each in zip(logs, self.outputs, strict=True)]
+        fitted = adjusted(self.rollouts, self.simulator.adjustable, logs=cars)
+        outputs = fitted.outputs if fitted.wrong else self.rollouts.at(self.rollouts.start)
+        again = _beside(self.simulator, logs, outputs, self.offsets, self.rollout, self.rollouts, fitted)
+        return again._told(found)
 
-    def _told(self, found: Diagnosis, fitted: Adjusted | None) -> Diagnosis:
+    def _told(self, found: Diagnosis) -> Diagnosis:
         return with_simulator(
             found,
             self.surrogate,
@@ -162,9 +171,9 @@ class SimulatorBesideCar:
             source="simulator" if self.simulator.output is None else "output",
             offset_s=self.offsets,
             rollout=self.rollout,
-            own_parameters=() if fitted is None else fitted.parameters,
+            own_parameters=() if self.fitted is None else self.fitted.parameters,
             lag_and_gain=lag_and_gain(self.logs, self.outputs, self.plant, found.plant),
-            rollouts=0 if fitted is None else fitted.rollouts,
+            rollouts=0 if self.fitted is None else self.fitted.rollouts,
             notes=tuple(getattr(self.simulator.of, "notes", ())),
         )
 
@@ -173,3 +182,20 @@ def _without(log: Log, drives: Log, car: GapPlant, bare: GapPlant) -> Log:
     """The car's log less what it does beyond a `bare` one."""
     whole, less = responses(drives, car), responses(drives, bare)
     return replace(log, **{n: getattr(log, n) - whole[n] + less[n] for n in whole if getattr(log, n) is not None})
+
+
+def _beside(
+    simulator: ExternalSimulator,
+    logs: Sequence[Log],
+    outputs: Sequence[Log],
+    offsets: tuple[float, ...],
+    errors: dict[str, float],
+    rollouts: Rollouts | None,
+    fitted: Adjusted | None,
+    progress: Progress | None = None,
+) -> SimulatorBesideCar:
+    """With the surrogate of these `outputs`, and the car's logs less what it leaves over."""
+    surrogate = surrogate_of(outputs, progress=progress)
+    cars = [replace(log, engaged=other.engaged) for log, other in zip(logs, outputs, strict=True)]
+    freed = tuple(without_discrepancy(log, other, surrogate.plant) for log, other in zip(cars, outputs, strict=True))
+    return SimulatorBesideCar(simulator, surrogate, tuple(outputs), freed, offsets, errors, rollouts, fitted)

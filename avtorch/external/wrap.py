@@ -10,14 +10,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import torch
-
 from avtorch.errors import InputError
+from avtorch.external.driven_plant import DrivenPlant
 from avtorch.external.parameters import with_values
 from avtorch.external.simulator import Simulator
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.plant import GapPlant
-from avtorch.vehicle.plant import Motion
 
 
 def wrap(simulator: Simulator, found: Diagnosis) -> Wrapped:
@@ -70,37 +68,20 @@ class Wrapped:
     simulator: Simulator
     own: GapPlant
     car: GapPlant
-    _without: _Chain = field(init=False, repr=False)
-    _with: _Chain = field(init=False, repr=False)
+    _without: DrivenPlant = field(init=False, repr=False)
+    _with: DrivenPlant = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._without, self._with = _Chain(self.own), _Chain(self.car)
+        self._without, self._with = DrivenPlant(self.own), DrivenPlant(self.car)
 
     def reset(self, *, speed: float, accel: float) -> None:
         """Begin a drive, see `Simulator.reset`."""
         self.simulator.reset(speed=speed, accel=accel)
         for chain in (self._without, self._with):
-            chain.begin(speed, accel)
+            chain.reset(speed=speed, accel=accel)
 
     def step(self, accel_cmd: float, dt: float) -> tuple[float, float]:
         """Hold the command, see `Simulator.step`."""
         accel, speed = self.simulator.step(accel_cmd, dt)
         with_it, without = self._with.step(accel_cmd, dt), self._without.step(accel_cmd, dt)
         return accel + with_it[0] - without[0], speed + with_it[1] - without[1]
-
-
-class _Chain:
-    """A chain of effects driven step by step, without noise."""
-
-    def __init__(self, plant: GapPlant) -> None:
-        self._plant = GapPlant(plant.effects, T_L=plant.T_L, K_L=plant.K_L, sigma=0.0)
-        self._state: Motion | None = None
-
-    def begin(self, speed: float, accel: float) -> None:
-        self._plant.reset()
-        self._accel, self._speed = (torch.tensor([x], dtype=torch.float64) for x in (accel, speed))
-
-    def step(self, command: float, dt: float) -> tuple[float, float]:
-        u = torch.tensor([command], dtype=torch.float64)
-        self._accel, self._speed, _ = self._plant.step(self._accel, self._speed, u, dt, torch.zeros_like(u))
-        return float(self._accel), float(self._speed)

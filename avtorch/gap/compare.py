@@ -25,16 +25,17 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, quoted
+from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.change.change_cause import ChangeCause, cause_of_change
 from avtorch.gap.change.two_sides import FEWEST_BLOCKS, TwoSides
 from avtorch.gap.crossval.folds import blocks_of
-from avtorch.gap.crossval.rollout_errors import HORIZON_S, RolloutMetric, products, reached
+from avtorch.gap.crossval.rollout_errors import HORIZON_S, RolloutMetric, block_squares, reached
 from avtorch.gap.dead_time_or_lag import DeadTimeFit, compare_explanations
 from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import Change, Comparison, DeadTimeTest, SimulatorChange
 from avtorch.gap.result.diagnosis import LogFacts
+from avtorch.gap.result.traces import rolled_out
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
 from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
@@ -53,7 +54,7 @@ def compare(
     before: Log | Sequence[Log],
     after: Log | Sequence[Log],
     *,
-    baseline: Simulator = None,
+    baseline: Simulator | BlackBoxSimulator = None,
     baseline_after: Simulator = None,
     level: float = LEVEL,
     effects: Sequence[str | type[Effect]] | None = None,
@@ -63,8 +64,10 @@ def compare(
 
     `baseline`: the simulator with which both are compared (`baseline_after`: another one for the second set), with its
     own `T_L` and `K_L`; default: bare GLVD fitted to the drives before. Its effects keep their values in the fits of
-    the car. `level`: significance level of a difference between the drives. `effects`: candidates, by name or class,
-    for the cause of a change, beside T_L, K_L and dead time (default: all registered; none: `[]`).
+    the car. One that is not made of effects comes as an `avtorch.ExternalSimulator`, for all drives (two such:
+    `avtorch.compare_simulators`). `level`: significance level of a difference between the drives. `effects`:
+    candidates, by name or class, for the cause of a change, beside T_L, K_L and dead time (default: all registered;
+    none: `[]`).
     `progress(what, done, of)` is called at every hypothesis.
 
     Raises `InputError` for logs that cannot be diagnosed or hold less than five blocks of 4 s of usable driving,
@@ -84,6 +87,12 @@ def compare(
         raise InputError(f"level: found {level}, needs a number between 0 and 1")
     sides = [[x] if isinstance(x, Log) else list(x) for x in (before, after)]
     kinds = _kinds(effects)
+    if isinstance(baseline, BlackBoxSimulator):
+        if baseline_after is not None:
+            raise InputError("baseline_after: found beside a simulator that is no plant, needs compare_simulators")
+        beside = baseline.beside([*sides[0], *sides[1]], progress)
+        sides = [list(beside.logs[: len(sides[0])]), list(beside.logs[len(sides[0]) :])]
+        baseline = beside.plant
     given = [baseline, baseline if baseline_after is None else baseline_after]
     plants = [b if isinstance(b, GapPlant) else plant([], baseline=b) for b in given]
     if progress is not None:
@@ -103,9 +112,9 @@ def compare(
     sure = float(student.ppf(0.95, blocks - 1))  # pyright: ignore[reportUnknownMemberType]
     car = {
         name: Change(
-            _log_quantity(one.mean[i], one.covariance[i, i], sure),
-            _log_quantity(two.mean[i], two.covariance[i, i], sure),
-            _log_quantity(away[i], covariance[i, i], sure),
+            Quantity.of_logarithm(one.mean[i], one.covariance[i, i], sure),
+            Quantity.of_logarithm(two.mean[i], two.covariance[i, i], sure),
+            Quantity.of_logarithm(away[i], covariance[i, i], sure),
         )
         for i, name in enumerate(_CAR)
     }
@@ -227,9 +236,9 @@ def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float
     for i, (side, simulator) in enumerate(zip(sides, simulators, strict=True)):
         rng = np.random.default_rng(0 if same else i)
         record = side.found.hypothesis.record
-        errors = record.measured - _rolled(record, simulator)
+        errors = record.measured - rolled_out(record, simulator)
         blocks = blocks_of(record, fewest=FEWEST_BLOCKS)
-        squares = _squares(record, errors, blocks, float(simulator.T_L), horizon)
+        squares = block_squares(record, errors, blocks, float(simulator.T_L), horizon)
         rows = np.array([(b.stop - b.start) * record.group for b in blocks], float)
         weights = rng.multinomial(len(blocks), np.full(len(blocks), 1 / len(blocks)), size=_DRAWS)
         weights = np.concatenate([np.ones((1, len(blocks))), weights])
@@ -240,33 +249,9 @@ def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float
     }
 
 
-def _rolled(record: Record, simulator: GapPlant) -> FloatArray:
-    responses = [simulator.response(drive) for drive in record.drives]
-    seen = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
-    return np.stack([record.at_counted_rows(seen[name]) for name in record.channels])
-
-
-def _squares(
-    record: Record, errors: FloatArray, blocks: Sequence[slice], lag: float, horizon: float
-) -> dict[str, FloatArray]:
-    """Squared rollout errors by metric; the metric is named after `HORIZON_S` even where the drives are shorter."""
-    out: dict[str, FloatArray] = {}
-    for channel in record.channels:
-        squares = products(RolloutMetric(channel, horizon), record, errors[None], blocks, lag)
-        out[RolloutMetric(channel, HORIZON_S).name] = squares[:, 0, 0]
-    return out
-
-
 def _of_draws(x: FloatArray) -> Quantity:
     q05, q95 = np.quantile(x[1:], (0.05, 0.95))
     return Quantity(float(x[0]), float(x[1:].std()), min(float(q05), float(x[0])), max(float(q95), float(x[0])))
-
-
-def _log_quantity(mean: float, variance: float, sure: float) -> Quantity:
-    """exp(x) for a normal x of this `mean` and `variance`; `sure`: half its central 90 % in standard deviations."""
-    sd = float(np.sqrt(variance))
-    middle = float(np.exp(mean))
-    return Quantity(middle, middle * sd, float(np.exp(mean - sure * sd)), float(np.exp(mean + sure * sd)))
 
 
 def _simulator_change(gap: Mapping[str, Change]) -> SimulatorChange:

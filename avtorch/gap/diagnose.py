@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
 import numpy as np
 
 from avtorch.errors import InputError
+from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.budget.account import account, divisible, restated
 from avtorch.gap.budget.forward_selection import MOST_PARTS
 from avtorch.gap.budget.parts import MATERIAL
@@ -50,23 +51,6 @@ _NO_PAIRS = (
     "The likelihood tried no pairs: its noise does not hold for this log with the best single effect, so held-out "
     "blocks select the effects, any number of them."
 )
-
-
-class SimulatorBesideCar(Protocol):
-    """A car's drives and a simulator that is not made of effects: diagnosed by `logs` with `plant` as the baseline."""
-
-    @property
-    def logs(self) -> Sequence[Log]: ...
-    @property
-    def plant(self) -> GapPlant: ...
-    def told(self, found: Diagnosis) -> Diagnosis: ...
-
-
-@runtime_checkable
-class BlackBoxSimulator(Protocol):
-    """A simulator that is not made of effects; `avtorch.external.ExternalSimulator` is one."""
-
-    def beside(self, logs: Sequence[Log], progress: Callable[[str, int, int], None] | None) -> SimulatorBesideCar: ...
 
 
 def diagnose(

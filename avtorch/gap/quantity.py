@@ -72,6 +72,12 @@ class Quantity:
         q05, q95 = sorted(map(float, values[-2:]))
         return cls(average, math.sqrt(variance), q05, q95)
 
+    @classmethod
+    def of_logarithm(cls, mean: float, variance: float, sure: float) -> Quantity:
+        """exp(x) for an x of this `mean` and `variance`; `sure`: half its central 90 % in standard deviations."""
+        sd, middle = math.sqrt(variance), math.exp(mean)
+        return cls(middle, middle * sd, math.exp(mean - sure * sd), math.exp(mean + sure * sd))
+
     def to_dict(self) -> dict[str, float]:
         """The quantity as JSON: mean, sd, q05, q95."""
         return asdict(self)

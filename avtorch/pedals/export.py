@@ -4,7 +4,8 @@
 - `accel_map.csv` and `brake_map.csv`, in the layout of Autoware's `raw_vehicle_cmd_converter`: speeds [m/s] in the
   first row behind `default`, pedals from 0 to 1 in the first column, accelerations [m/s²].
 
-CARLA has no such table: its cars are an engine's torque curve, gears and tyres. Autoware drives them by these two.
+CARLA's cars are an engine's torque curve, gears and tyres, and read no table; in the terms of their pedals
+`avtorch.remedy.to_carla` has both of these in one file.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ _LAG, _DELAY = 5, 6
 """Which quantity a row is of; numbers, so that the file is a table like others."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MapTable:
-    """`text` of a table for another tool, and what of the map it does not hold, a few words each.
+    """A table for another tool: `accel` (pedal, speed) [m/s²] at pedals (pedal,) from 0 to 1 and speeds (speed,) [m/s];
+    what of the map it does not hold, a few words each (`lost`).
 
     Example:
         >>> import numpy as np
@@ -43,11 +45,22 @@ class MapTable:
         >>> for words in brake_table(PedalMap(np.array([0.0, 30.0]), np.zeros(2), {"brake": brake})).lost:
         ...     print(words)
         lag 0.3 s and dead time 0 s
-        the unit of brake: 1 in the first column is 4e+06 Pa
+        the unit of brake: a pedal of 1 is 4e+06 Pa
     """
 
-    text: str
+    pedal: FloatArray
+    speed: FloatArray
+    accel: FloatArray
     lost: tuple[str, ...]
+
+    @property
+    def text(self) -> str:
+        """The table in Autoware's layout."""
+        lines = ["default," + ",".join(f"{v:.2f}" for v in self.speed)]
+        lines += [
+            f"{x:.6g}," + ",".join(f"{a:.3f}" for a in row) for x, row in zip(self.pedal, self.accel, strict=True)
+        ]
+        return "\n".join(lines) + "\n"
 
 
 def accel_table(made: PedalMap) -> MapTable | None:
@@ -92,15 +105,12 @@ def _table(made: PedalMap, names: Sequence[str], side: float) -> MapTable | None
         values = np.abs(table.pedal[rows])
         is_share = name == "throttle" or (name == "brake" and values[-1] <= 1.2)
         share = values if is_share else values / values[-1]
-        lines = ["default," + ",".join(f"{v:.2f}" for v in made.speed)]
-        for x, accel in zip(share, table.accel[rows] + made.coasting, strict=True):
-            lines.append(f"{x:.6g}," + ",".join(f"{a:.3f}" for a in accel))
         lost = [f"lag {made.T_L:.3g} s and dead time {made.dead_time:.3g} s"]
         if not is_share:
             unit = "Pa" if name == "brake" else UNIT[name]
-            lost.append(f"the unit of {name}: 1 in the first column is {values[-1]:.6g} {unit}")
+            lost.append(f"the unit of {name}: a pedal of 1 is {values[-1]:.6g} {unit}")
         lost += [f"{other}, which adds to {name}" for other in names if other != name and side > 0]
-        return MapTable("\n".join(lines) + "\n", tuple(lost))
+        return MapTable(share, made.speed, table.accel[rows] + made.coasting, tuple(lost))
     return None
 
 

@@ -3,40 +3,30 @@
 - Autoware's planning simulator (`simple_planning_simulator`, model `DELAY_STEER_ACC_GEARED_WO_FALL_GUARD` and its
   kin): `acc_time_delay` [s], `acc_time_constant` [s], `vel_rate_lim` [m/s²], `acc_scaling_factor` of the debug model
 - openpilot (`CarParams`): `longitudinalActuatorDelay` [s], from command to response, lag and all
+- SUMO's `vType` (`sumo.py`) and the pedals of CARLA (`carla.py`)
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+import math
 from os import PathLike
 from pathlib import Path
 
 from avtorch.gap import GapPlant
 from avtorch.io import answer_set, atomic
+from avtorch.pedals import PedalMap
+from avtorch.remedy.carla import to_carla
+from avtorch.remedy.exported import Exported, delay_of, delays_of, gain_lost, not_exported
+from avtorch.remedy.sumo import to_sumo
 
+FILES = ("plant.autoware.yaml", "plant.openpilot.yaml", "plant.sumo.xml", "plant.carla.yaml")
+"""Every file of an export.
 
-@dataclass(frozen=True)
-class Exported:
-    """`values` by the tool's own names; `lost`: properties of the plant that the tool cannot express, one sentence
-    each.
-
-    Example:
-        >>> from avtorch.gap import plant
-        >>> from avtorch.remedy import to_autoware
-        >>> exported = to_autoware(plant(baseline="sensor_bias=0.1"))
-        >>> exported.tool, sorted(exported.values), len(exported.lost)
-        ('Autoware planning simulator', ['acc_time_constant', 'acc_time_delay', 'debug_acc_scaling_factor'], 1)
-    """
-
-    tool: str
-    values: Mapping[str, float]
-    lost: tuple[str, ...]
-
-    def to_text(self) -> str:
-        """YAML lines, with the lost properties as comments."""
-        lines = [f"# {self.tool}", *(f"# not expressed: {text}" for text in self.lost)]
-        return "\n".join([*lines, *(f"{name}: {value:.6g}" for name, value in self.values.items())]) + "\n"
+Example:
+    >>> from avtorch.remedy.exports import FILES
+    >>> [name.split(".")[1] for name in FILES]
+    ['autoware', 'openpilot', 'sumo', 'carla']
+"""
 
 
 def to_autoware(plant: GapPlant) -> Exported:
@@ -52,16 +42,18 @@ def to_autoware(plant: GapPlant) -> Exported:
         debug_acc_scaling_factor: 1
     """
     values = {
-        "acc_time_delay": _delay(plant),
+        "acc_time_delay": delay_of(plant),
         "acc_time_constant": float(plant.T_L),
         "debug_acc_scaling_factor": float(plant.K_L),
     }
-    limits = [limit for e in plant.effects if (limit := e.accel_limit()) is not None]
-    if limits:
-        values["vel_rate_lim"] = min(limits)
-    partly = [e for e in plant.effects if e.export_loss]
-    lost = [f"{e.name}: {e.export_loss}" for e in partly]
-    return Exported("Autoware planning simulator", values, (*lost, *_not_exported(plant, {e.name for e in partly})))
+    bounds = [x for e in plant.effects for x in e.accel_limits() or () if math.isfinite(x)]
+    if bounds:
+        values["vel_rate_lim"] = max(abs(x) for x in bounds)
+    limiting = [e.name for e in plant.effects if e.accel_limits() is not None]
+    lost = [f"{name}: limits that differ for driving and braking; the tool's one is the wider" for name in limiting]
+    lost += [f"{e.name}: {e.export_loss}" for e in plant.effects if e.export_loss]
+    partly = [*limiting, *delays_of(plant), *(e.name for e in plant.effects if e.export_loss)]
+    return Exported("Autoware planning simulator", values, (*lost, *not_exported(plant, partly)))
 
 
 def to_openpilot(plant: GapPlant) -> Exported:
@@ -73,13 +65,17 @@ def to_openpilot(plant: GapPlant) -> Exported:
         >>> {k: round(v, 2) for k, v in to_openpilot(plant(baseline="dead_time=0.2", T_L=0.4)).values.items()}
         {'longitudinalActuatorDelay': 0.6}
     """
-    delay = _delay(plant) + float(plant.T_L)
-    lost = [f"K_L {float(plant.K_L):.3g}: a gain is learned on the way"] if abs(float(plant.K_L) - 1) > 0.01 else []
-    return Exported("openpilot CarParams", {"longitudinalActuatorDelay": delay}, (*lost, *_not_exported(plant)))
+    delay = delay_of(plant) + float(plant.T_L)
+    lost = gain_lost(plant, "a gain is learned on the way")
+    return Exported(
+        "openpilot CarParams", {"longitudinalActuatorDelay": delay}, (*lost, *not_exported(plant, delays_of(plant)))
+    )
 
 
-def write_exports(plant: GapPlant | None, folder: str | PathLike[str]) -> list[Path]:
-    """Publish `plant.autoware.yaml` and `plant.openpilot.yaml` together; returns the files. None: earlier ones go.
+def write_exports(plant: GapPlant | None, folder: str | PathLike[str], *, pedals: PedalMap | None = None) -> list[Path]:
+    """Publish the `FILES` of a plant together; returns those written. Those that are not written go.
+
+    Without a `plant` there is none but CARLA's, without a map of `pedals` all but CARLA's.
 
     Raises `InputError` where the folder cannot be written.
 
@@ -87,27 +83,13 @@ def write_exports(plant: GapPlant | None, folder: str | PathLike[str]) -> list[P
         >>> from avtorch.gap import plant
         >>> from avtorch.remedy import write_exports
         >>> [path.name for path in write_exports(plant(baseline="dead_time=0.2"), "out")]
-        ['plant.autoware.yaml', 'plant.openpilot.yaml']
+        ['plant.autoware.yaml', 'plant.openpilot.yaml', 'plant.sumo.xml']
     """
-    tools = {"plant.autoware.yaml": to_autoware, "plant.openpilot.yaml": to_openpilot}
-    with answer_set(folder, list(tools)) as staged:
-        for name, export in tools.items():
-            if plant is not None:
-                with atomic(staged / name) as stream:
-                    stream.write(export(plant).to_text())
-    return [] if plant is None else [Path(folder) / name for name in tools]
-
-
-def _delay(plant: GapPlant) -> float:
-    """Total delay [s] that all effects add to the command."""
-    return sum((float(getattr(e, e.shift)) for e in plant.effects if e.shift is not None), 0.0)
-
-
-def _not_exported(plant: GapPlant, reported: Collection[str] = ()) -> tuple[str, ...]:
-    lost = []
-    for e in plant.effects:
-        if e.name in reported or e.shift is not None:
-            continue
-        where = "the sensor's, not the car's" if e.place == "sensor" else e.meaning
-        lost.append(f"{e.name}: {where}")
-    return tuple(lost)
+    made = [None] * 3 if plant is None else [to_autoware(plant), to_openpilot(plant), to_sumo(plant)]
+    exports = dict(zip(FILES, [*made, None if pedals is None else to_carla(pedals, plant)], strict=True))
+    there = {name: exported for name, exported in exports.items() if exported is not None}
+    with answer_set(folder, FILES) as staged:
+        for name, exported in there.items():
+            with atomic(staged / name) as stream:
+                stream.write(exported.to_text())
+    return [Path(folder) / name for name in there]

@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 
 from avtorch.cli import main
+from avtorch.external import write_fmu
 from avtorch.gap import plant
+from tests.cli.test_own_simulator import CAR
 from tests.gap.records import log_of
 
 
@@ -24,6 +26,83 @@ def test_it_says_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert told["changed"] is True
     assert main(["compare", str(one), str(one), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["changed"] is False
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A car's log, and simulators of every kind: an object and an FMU of the car, an output and columns that lag."""
+    folder = tmp_path_factory.mktemp("two")
+    car = log_of(plant(baseline="dead_time=0.5", T_L=0.4), seconds=40.0)
+    car.write(folder / "real.csv")
+    simulated = log_of(plant(T_L=0.4), seconds=40.0, noise=None)
+    simulated.write(folder / "sim.csv")
+    (folder / "my_car.py").write_text(CAR)  # ten steps late, of 0.05 s
+    write_fmu(plant(baseline="dead_time=0.5", T_L=0.4), folder / "car.fmu")
+    return folder
+
+
+MIXES = {
+    "output, object": (
+        ["--simulator", "{}/my_car.py:Car", "--simulated", "{}/sim.csv"],
+        "first",
+        "simulator",
+        "output",
+    ),
+    "plant, FMU": (["--simulator", "T_L=0.4", "--simulator", "{}/car.fmu"], "second", "plant", "simulator"),
+    "own, FMU": (["--simulator", "{}/my_car.py:Car", "--simulator", "{}/car.fmu"], None, "simulator", "simulator"),
+}
+
+
+@pytest.mark.parametrize("mix", MIXES)
+def test_two_simulators_of_any_kind(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], mix: str) -> None:
+    given, nearer, *sources = MIXES[mix]
+    arguments = [x.format(folder) for x in given]
+    assert main(["compare", str(folder / "real.csv"), *arguments, "--out", str(tmp_path)]) == 0
+    told = json.loads((tmp_path / "comparison.json").read_text())
+    assert told["schema"] == "avtorch.simulators/1"
+    assert told["nearer"] == nearer
+    assert [told[which]["source"] for which in ("first", "second")] == sources
+    said = " ".join(capsys.readouterr().out.split())
+    if nearer is None:
+        assert "cannot tell which simulator is nearer" in said
+        assert told["differences"] == []
+    else:
+        assert "is nearer to the car" in said
+        assert [d["name"] for d in told["differences"]] == ["dead_time"]
+        assert told["differences"][0]["ratio"]["q95"] < 1
+        assert "error of the farther (90 %)" in said
+
+
+def test_two_simulators_in_one_line_of_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    two = ["--simulator", "T_L=0.4", "--simulator", "dead_time=0.5, T_L=0.4"]
+    assert main(["compare", str(folder / "real.csv"), *two, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["nearer"] == "second"
+
+
+REFUSED = [
+    (["--simulator", "T_L=0.4"], "found 1 beside one log, needs two"),
+    (["--simulator", "T_L=0.4", "--simulator", "glvd"], "--simulator: found glvd, which would be fitted to the log"),
+    (["--simulator", "T_L=0.4", "--simulator", "no.toml"], "--simulator 'no.toml': no such file"),
+    (["--simulator", "T_L=0.4", "--simulator", "no_such:Car"], "--simulator: no_such could not be imported"),
+    (["--simulator", "T_L=0.4", "--simulated", "none."], "'none.': no such file, and"),
+    (["--simulator", "T_L=0.4", "--simulator", "K_L=0.9", "--step", "0.1"], "--step: has a meaning with an object"),
+    (["--simulator", "T_L=0.4", "--simulator", "K_L=0.9", "--baseline", "T_L=0.2"], "--baseline: found beside"),
+    (["{}/real.csv", "--simulator", "T_L=0.4", "--simulator", "T_L=0.5"], "found 2 beside two logs, needs one"),
+    (["{}/real.csv", "--simulator", "my_car:Car", "--baseline", "T_L=0.2"], "--baseline: found beside"),
+    (["{}/real.csv", "--simulator", "T_L=0.4"], "found 'T_L=0.4', needs MODULE:NAME"),
+    (["{}/real.csv", "--simulated", "{}/sim.csv"], "--simulated: found 1 files for 2 logs"),
+    (["{}/real.csv", "--step", "0.1"], "--step: has a meaning with --simulator only"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "told"), REFUSED, ids=lambda x: x if isinstance(x, str) else None)
+def test_what_is_no_pair_of_simulators_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], told: str
+) -> None:
+    assert main(["compare", str(folder / "real.csv"), *(x.format(folder) for x in arguments)]) == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.count("\n") == 1
 
 
 def test_what_it_cannot_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

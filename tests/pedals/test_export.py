@@ -48,7 +48,7 @@ def test_what_a_table_does_not_hold_is_told() -> None:
     made = PedalMap(np.array([0.0, 20.0]), np.array([0.0, -0.2]), {"torque": torque})
     table = accel_table(made)
     assert table is not None
-    assert "the unit of torque: 1 in the first column is 600 Nm" in table.lost
+    assert "the unit of torque: a pedal of 1 is 600 Nm" in table.lost
     assert any(words.startswith("lag") for words in table.lost)
     assert brake_table(made) is None
 

@@ -29,7 +29,7 @@ def test_of_a_named_cause_and_of_none(tmp_path: Path) -> None:
     json.dumps(told.to_dict(), allow_nan=False)
     assert set(late.belief or ()) == {"T_L", "K_L", "dead_time.delay_s"}
     names = [p.name for p in write_exports(late.plant, tmp_path)]
-    assert names == ["plant.autoware.yaml", "plant.openpilot.yaml"]
+    assert names == ["plant.autoware.yaml", "plant.openpilot.yaml", "plant.sumo.xml"]
     plain = draw_case(0, 20, mix={"none": 1.0}, seconds=60.0, manoeuvre="steps").log()
     nothing = avtorch.diagnose(plain, effects=["sensor_bias"], pairs=False)
     assert nothing.verdict.name == "none"

@@ -97,6 +97,20 @@ def products(
     return out
 
 
+def block_squares(
+    record: Record, errors: FloatArray, blocks: Sequence[slice], lag: float, horizon: float
+) -> dict[str, FloatArray]:
+    """Squared rollout errors of each block (block,), by metric, of a long rollout's `errors` (channel, counted, group).
+
+    Rollouts last `horizon` [s]; the metric is named after `HORIZON_S` even where that is shorter.
+    """
+    out: dict[str, FloatArray] = {}
+    for channel in record.channels:
+        squares = products(RolloutMetric(channel, horizon), record, errors[None], blocks, lag)
+        out[RolloutMetric(channel, HORIZON_S).name] = squares[:, 0, 0]
+    return out
+
+
 def rms(metric: RolloutMetric, record: Record, errors: FloatArray, lag: float) -> float:
     """Root mean square of a long rollout's `errors` (channel, counted, group) by a measure, over all counted rows;
     `lag` [s]."""

@@ -39,7 +39,6 @@ class Saturation(Effect):
     equation = "K u within [a_min, a_max]"
     linear = False
     one_sided = True
-    export_loss = "limits that differ for driving and braking; the tool's one is the wider"
     starts = fixed(
         accel_max_mps2=(0.5, 0.75, 1.0, 1.25, 1.6, 2.1, 5.0),
         accel_min_mps2=(-0.8, -1.2, -1.6, -2.1, -2.8, -8.0),
@@ -66,5 +65,5 @@ class Saturation(Effect):
         high, low = tensor(self.accel_max_mps2) / gain, tensor(self.accel_min_mps2) / gain
         return torch.maximum(torch.minimum(x, high), low)
 
-    def accel_limit(self) -> float:
-        return max(float(self.accel_max_mps2), -float(self.accel_min_mps2))
+    def accel_limits(self) -> tuple[float, float]:
+        return float(self.accel_min_mps2), float(self.accel_max_mps2)

@@ -62,6 +62,8 @@ DIAGNOSIS_FILES = (
     "plant.toml",
     "plant.autoware.yaml",
     "plant.openpilot.yaml",
+    "plant.sumo.xml",
+    "plant.carla.yaml",
     "manoeuvre.csv",
     "report.html",
 )

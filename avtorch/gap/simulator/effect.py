@@ -29,7 +29,7 @@ The defaults suit an ordinary effect:
 | cross-validation        | `of_the_drive`                                         | parameters are the car's        |
 | linearisation           | `linear`, `one_sided`                                  | proportional to the command     |
 | delay                   | `shift`, `role`                                        | none                            |
-| exports, plots          | `accel_limit`, `export_loss`, `pictured`                 | not exported; plotted at 12 m/s |
+| exports, plots          | `accel_limits`, `export_loss`, `pictured`                | not exported; plotted at 12 m/s |
 """
 
 from __future__ import annotations
@@ -219,8 +219,9 @@ class Effect:
         """Fields of `Actuator` that it sets: `tau` [s], `jerk` [m/s³]."""
         return {}
 
-    def accel_limit(self) -> float | None:
-        """Largest acceleration of either sign [m/s²] that the car can reach with it; None: no limit."""
+    def accel_limits(self) -> tuple[float, float] | None:
+        """Lowest (negative) and highest acceleration [m/s²] that the car can reach with it, -inf or inf where there is
+        no limit; None: neither."""
         return None
 
     def values_after_onset(self) -> Mapping[str, float]:
