@@ -106,7 +106,8 @@ def compare(
 
     talk = Talk(json=json, quiet=quiet)
     logs = [_log(path, map, unit, talk) for path in (before, after)]
-    own = tested_simulator(simulated or (), (simulator or (None,))[0], step, [(before, logs[0]), (after, logs[1])])
+    drives = [(before, logs[0]), (after, logs[1])]
+    own = tested_simulator(simulated or (), (simulator or (None,))[0], step, drives, adjust=(), rollouts=None)
     with talk.steps("Comparing") as step_done:
         comparison = work(*logs, baseline=own or base, baseline_after=other, progress=step_done)
     _answer(talk, comparison, _table(comparison), out)

@@ -75,6 +75,18 @@ def diagnose(
     step: Annotated[
         float | None, Parameter(group=TESTED, help="The simulator's own step [s]; default: the log's.")
     ] = None,
+    adjust: Annotated[
+        list[str] | None,
+        Parameter(
+            group=TESTED,
+            negative=(),
+            help="A parameter of the simulator that may be wrong, NAME=LOW:HIGH, such as lag=0.1:1.0; repeatable.",
+        ),
+    ] = None,
+    rollouts: Annotated[
+        int | None,
+        Parameter(group=TESTED, help="How often the simulator may be driven along the logs for that; default: 50."),
+    ] = None,
     prior: Annotated[
         list[str] | None,
         Parameter(
@@ -159,7 +171,8 @@ def diagnose(
     talk = Talk(json=json, quiet=quiet)
     if follower:
         usual = {"accel_kind": accel_kind == "kinematic", "no_pairs": pairs, "posterior": posterior == "sgld"}
-        idle = {"simulated": simulated, "simulator": simulator, "step": step is not None}
+        idle = {"simulated": simulated, "simulator": simulator, "step": step is not None, "adjust": adjust}
+        idle |= {"rollouts": rollouts is not None}
         idle |= {"baseline": assumed, "prior": weights, "budget": budget is not None}
         idle |= {option: not default for option, default in usual.items()}
         refuse(logs, **idle, **{option: value is not None for option, value in track.items()})
@@ -175,7 +188,8 @@ def diagnose(
         _usable(path, drive, accel_kind)
         _check_effects(chosen or (), path, drive)
     limits = _limits(drives, track)
-    own = tested_simulator(simulated or (), simulator, step, list(zip(logs, drives, strict=True)))
+    with_paths = list(zip(logs, drives, strict=True))
+    own = tested_simulator(simulated or (), simulator, step, with_paths, adjust=adjust or (), rollouts=rollouts)
     if not resume:
         begin_anew(out, FITS, EARLIER_FITS)
     quality = []

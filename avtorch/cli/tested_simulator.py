@@ -16,15 +16,25 @@ if TYPE_CHECKING:
     from avtorch.io import Log
 
 _CHANNELS = ("accel", "speed")
+_OPTIONS = {"adjustable": "--adjust", "most_rollouts": "--rollouts", "simulator": "--simulator"}
+"""Options by how errors of what they hold begin."""
 
 
 def tested_simulator(
-    simulated: Sequence[str], simulator: str | None, step: float | None, drives: Sequence[tuple[Path, Log]]
+    simulated: Sequence[str],
+    simulator: str | None,
+    step: float | None,
+    drives: Sequence[tuple[Path, Log]],
+    *,
+    adjust: Sequence[str],
+    rollouts: int | None,
 ) -> ExternalSimulator | None:
     """None where neither is given. Raises `InputError` where both are, or what is given cannot be read."""
+    if simulator is None:
+        for option, given in (("--step", step is not None), ("--adjust", adjust), ("--rollouts", rollouts is not None)):
+            if given:
+                raise InputError(f"{option}: has a meaning with --simulator only")
     if not simulated and simulator is None:
-        if step is not None:
-            raise InputError("--step: has a meaning with --simulator only")
         return None
     if simulated and simulator is not None:
         raise InputError("--simulated, --simulator: found both, needs the output or the simulator itself")
@@ -34,13 +44,19 @@ def tested_simulator(
     if simulator is not None:
         if step is not None and not 0 < step < math.inf:
             raise InputError(f"--step: found {step:g}, needs a step above 0 s")
+        if rollouts is not None and not adjust:
+            raise InputError("--rollouts: has a meaning with --adjust only")
+        limits = _limits(adjust)
         try:
-            beside = mapping_beside(drives[0][0])
-            return ExternalSimulator(load_simulator(simulator, mapping=beside), name=simulator, step_s=step)
+            own = load_simulator(simulator, mapping=mapping_beside(drives[0][0]))
+            most = ExternalSimulator.most_rollouts if rollouts is None else rollouts
+            return ExternalSimulator(own, simulator, step, adjustable=limits, most_rollouts=most)
         except InputError as fault:
-            raise InputError(f"--simulator: {str(fault).removeprefix('simulator: ')}") from None
-    if step is not None:
-        raise InputError("--step: has a meaning with --simulator only")
+            text = str(fault)
+            for start, option in _OPTIONS.items():
+                if text.startswith(start):
+                    raise InputError(f"{option}{text.removeprefix(start)}") from None
+            raise InputError(f"--simulator: {text}") from None
     if len(simulated) == 1 and not Path(simulated[0]).exists() and simulated[0].endswith((".", "_")):
         return ExternalSimulator([_columns(simulated[0], path, drive) for path, drive in drives], name=simulated[0])
     if len(simulated) != len(drives):
@@ -71,10 +87,25 @@ def simulators_of(
     return [*found, *(_one((text,), None, None, path, drive) for text in simulated)]
 
 
+def _limits(adjust: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """`NAME=LOW:HIGH` by name."""
+    out = {}
+    for text in adjust:
+        name, equals, ends = text.partition("=")
+        low, colon, high = ends.partition(":")
+        try:
+            out[name.strip()] = float(low), float(high)
+        except ValueError:
+            equals = ""
+        if not equals or not colon or not name.strip():
+            raise InputError(f"--adjust: found {quoted(text)}, needs NAME=LOW:HIGH, such as lag=0.1:1.0")
+    return out
+
+
 def _one(
     simulated: Sequence[str], simulator: str | None, step: float | None, path: Path, drive: Log
 ) -> ExternalSimulator:
-    found = tested_simulator(simulated, simulator, step, [(path, drive)])
+    found = tested_simulator(simulated, simulator, step, [(path, drive)], adjust=(), rollouts=None)
     assert found is not None
     return found
 

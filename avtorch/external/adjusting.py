@@ -78,6 +78,11 @@ class Rollouts:
         return self._found[key]
 
 
+def fewest_rollouts(limits: Limits) -> int:
+    """As it is, beside each value, and with the values that fit: alone, and once effects are known."""
+    return len(limits) + 3
+
+
 def adjusted(rollouts: Rollouts, limits: Limits, *, logs: Sequence[Log] | None = None) -> Adjusted:
     """The parameters named in `limits` fitted to the car's drives.
 
@@ -93,7 +98,8 @@ def adjusted(rollouts: Rollouts, limits: Limits, *, logs: Sequence[Log] | None =
     fitting = _fitting(record, model)
     fit = _fitted(fitting, model)
     for _ in range(_ROUNDS - 1):
-        if np.abs(fit.z[: len(limits)]).max() < _STAYS:
+        left = rollouts.most - len(rollouts)
+        if np.abs(fit.z[: len(limits)]).max() < _STAYS or left < fewest_rollouts(limits):
             break
         model = _Linear.around(record, cars, rollouts, model.parameters(fit.z), limits)
         fit = _fitted(fitting, model)

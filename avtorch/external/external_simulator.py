@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from avtorch.errors import InputError, quoted
-from avtorch.external.adjusting import Adjusted, Rollouts, adjusted
+from avtorch.errors import InputError, listed, quoted
+from avtorch.external.adjusting import Adjusted, Rollouts, adjusted, fewest_rollouts
 from avtorch.external.alignment import aligned
 from avtorch.external.answer import lag_and_gain, rollout_errors, with_simulator
 from avtorch.external.discrepancy import responses, without_discrepancy
@@ -72,6 +72,9 @@ class ExternalSimulator:
             if isinstance(found, tuple):
                 raise InputError("adjustable: has no meaning for an output, needs the simulator itself")
             values_of(cast("Simulator", found), self.adjustable)
+            if self.most_rollouts < fewest_rollouts(self.adjustable):
+                needed = f"{fewest_rollouts(self.adjustable)} or more to adjust {listed(self.adjustable)}"
+                raise InputError(f"most_rollouts: found {self.most_rollouts}, needs {needed}")
         object.__setattr__(self, "of", found)
         object.__setattr__(self, "name", self.name or default)
 

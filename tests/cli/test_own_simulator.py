@@ -90,3 +90,36 @@ def test_what_cannot_be_is_refused_in_one_line(
     error = capsys.readouterr().err
     assert told in error
     assert error.count("\n") == 1
+
+
+def test_its_own_parameters_are_fitted_to_the_car(files: Path, tmp_path: Path) -> None:
+    """An object whose lag is wrong by its own name: the car has 0.3 s behind a second-order actuator of 6 rad/s."""
+    given = [str(files / "real.csv"), "--simulator", f"{files / 'my_car.py'}:Car", "--adjust", "lag=0.05:1.5"]
+    found = diagnosed(files, tmp_path / "out", *given, "--rollouts", "12")["simulator"]
+    own = [p for p in found["parameters"] if p["own"]]
+    assert [p["name"] for p in own] == ["lag"]
+    assert own[0]["simulator"] == 0.4
+    assert found["rollouts"] <= 12
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["--adjust", "lag"], "--adjust: found 'lag', needs NAME=LOW:HIGH, such as lag=0.1:1.0"),
+        (["--adjust", "lag=0.1:x"], "--adjust: found 'lag=0.1:x', needs NAME=LOW:HIGH, such as lag=0.1:1.0"),
+        (["--adjust", "mass=1:2"], "--adjust: found 'mass', needs one of lag"),
+        (
+            ["--adjust", "lag=1:0.1"],
+            "--adjust lag: found limits 1 and 0.1, needs two finite numbers that rise",
+        ),
+        (["--adjust", "lag=0.5:1"], "--adjust lag: is 0.4, needs limits that hold it, found 0.5 to 1"),
+        (["--adjust", "lag=0.1:1", "--rollouts", "2"], "--rollouts: found 2, needs 4 or more to adjust lag"),
+        (["--rollouts", "9"], "--rollouts: has a meaning with --adjust only"),
+    ],
+)
+def test_what_cannot_be_adjusted_is_told(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], given: list[str], said: str
+) -> None:
+    simulator = ["--simulator", f"{files / 'my_car.py'}:Car"]
+    assert main(["diagnose", str(files / "real.csv"), *simulator, *given, "--out", str(tmp_path / "out")]) == 2
+    assert said in " ".join(capsys.readouterr().err.split())

@@ -13,6 +13,11 @@ SAME_KIND = 0.1
 """Least size of an effect in the simulator, relative to the car's, from which it is there and has a wrong size."""
 
 
+def _short(x: float) -> str:
+    """Three digits that say something, without an exponent up to a million."""
+    return f"{float(f'{x:.3g}'):g}"
+
+
 @dataclass(frozen=True)
 class ParameterDifference:
     """A parameter `name` (`T_L`, `K_L`, or `effect.parameter`) of the simulator, and of the `car` that was driven.
@@ -38,8 +43,8 @@ class ParameterDifference:
             ("" if self.own else {"T_L": " s", "K_L": ""}[key]) if not effect else f" {unit_of(key)}".replace(" -", "")
         )
         words = f"{effect}: {words_of(key)}" if effect else key
-        form = ".3g" if effect or self.own else ".2f"
-        own, mean, low, high = (format(x, form) for x in (self.simulator, self.car.mean, self.car.q05, self.car.q95))
+        shown = _short if effect or self.own else "{:.2f}".format
+        own, mean, low, high = map(shown, (self.simulator, self.car.mean, self.car.q05, self.car.q95))
         return f"{words} {own}{unit}, on the car {mean}{unit} ({low} to {high})"
 
     def to_dict(self) -> dict[str, Any]:

@@ -1,0 +1,134 @@
+"""The user's own parameters: fitted in their own terms, with what is missing in its place, by few rollouts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from avtorch import ExternalSimulator, InputError, Leader, diagnose, simulate
+from avtorch.external.adjusting import Rollouts, adjusted
+from avtorch.external.driving import driven_along
+from avtorch.external.parameters import values_of, with_values
+from avtorch.gap import DeadTime, plant
+from avtorch.io import Log
+
+LIMITS = {"lag": (0.05, 1.5), "mass": (1000.0, 3000.0)}
+NOISE = 0.02
+
+
+@dataclass
+class Truck:
+    """A lag, and a gain that its mass decides: it was made for 1500 kg."""
+
+    lag: float = 0.3
+    mass: float = 1500.0
+    gain: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.gain = 1500.0 / self.mass
+
+    def reset(self, *, speed: float, accel: float) -> None:
+        self.speed, self.accel = speed, accel
+
+    def step(self, accel_cmd: float, dt: float) -> tuple[float, float]:
+        before, goal = self.accel, self.gain * accel_cmd
+        self.accel = goal + np.exp(-dt / self.lag) * (before - goal)
+        self.speed += dt * (before + self.accel) / 2
+        return self.accel, self.speed
+
+
+def recorded(car: Truck, seed: int, *, seconds: float = 90.0) -> Log:
+    """What `car` does, with noise in both channels."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, seconds, 0.05)
+    command = 0.8 * np.sin(0.5 * time) + 0.5 * np.sin(1.3 * time + 1.0) + 0.3 * np.sin(0.11 * time)
+    log = Log.from_arrays(time=time, accel_cmd=command, accel=0 * time, speed=np.full(len(time), 20.0))
+    run = driven_along(car, log)
+    accel, speed = (x + NOISE * rng.standard_normal(len(time)) for x in (run.accel, run.speed))
+    return Log.from_arrays(time=time, accel_cmd=command, accel=accel, speed=speed)
+
+
+def fitted(log: Log, most: int = 50) -> tuple[dict[str, tuple[float, float, bool]], int]:
+    """Value, SD and whether it differs, by parameter; and rollouts."""
+    own = Truck()
+    rollouts = Rollouts([log], values_of(own, LIMITS), lambda v: [driven_along(with_values(own, v), log)], most)
+    found = adjusted(rollouts, LIMITS)
+    return {p.name: (p.car.mean, p.car.sd, p.differs) for p in found.parameters}, found.rollouts
+
+
+@pytest.mark.statistical
+def test_what_is_wrong_is_found_in_the_users_terms(rotating_seed: int) -> None:
+    found, _ = fitted(recorded(Truck(lag=0.5, mass=1800.0), rotating_seed))
+    for name, truth in (("lag", 0.5), ("mass", 1800.0)):
+        value, sd, differs = found[name]
+        assert differs
+        # six folds: Student's law of five degrees of freedom is beyond eight in 1 of 4,000
+        assert abs(value - truth) < 8 * sd
+        assert sd < 0.05 * truth
+
+
+def test_what_is_right_stays() -> None:
+    """Of ten drives: 2 % are meant to be accused, so two or more of ten by chance in 1.6 % of all sets of ten."""
+    accused = [any(differs for _, _, differs in fitted(recorded(Truck(), seed))[0].values()) for seed in range(10)]
+    assert sum(accused) < 2
+
+
+def test_few_rollouts_are_enough_and_no_more_are_made() -> None:
+    log = recorded(Truck(lag=0.9, mass=1200.0), 1)
+    found, count = fitted(log)
+    assert count <= 13  # four times three, and the last
+    few, least = fitted(log, most=5)
+    assert least <= 5
+    for name, reach in (("lag", 0.2), ("mass", 300.0)):  # once linear is nearer than before, by a third at least
+        assert abs(few[name][0] - found[name][0]) < reach
+    with pytest.raises(InputError, match="most_rollouts: found 3, needs 5 or more to adjust lag, mass"):
+        ExternalSimulator(Truck, adjustable=LIMITS, most_rollouts=3)
+
+
+def test_a_missing_effect_is_not_taken_for_a_wrong_parameter() -> None:
+    """Alone the lag would stand in for the dead time, at 0.6 s; with it in place the lag is what it was."""
+    car = plant([DeadTime(0.3)], T_L=0.3, sigma=0.05)
+    log = simulate(Leader.default(start=30.0, duration=60.0, dt=0.05), plant=car).log()
+    mine = ExternalSimulator(Truck, adjustable=LIMITS)
+    alone = mine.beside([log]).fitted
+    assert alone is not None
+    assert alone.wrong
+    found = diagnose(log, baseline=mine, effects=["dead_time", "sensor_bias"], pairs=False, posterior="laplace")
+    assert found.tested is not None
+    assert found.tested.missing == ("dead_time",)
+    assert [p.name for p in found.tested.wrong] == []
+    assert float(found.tested.surrogate.T_L) == pytest.approx(0.3, abs=0.01)
+
+
+def test_a_wrong_parameter_is_no_missing_effect() -> None:
+    log = recorded(Truck(mass=1900.0), 3, seconds=60.0)
+    mine = ExternalSimulator(Truck, adjustable=LIMITS)
+    found = diagnose(log, baseline=mine, effects=["dead_time", "sensor_bias"], pairs=False, posterior="laplace")
+    assert found.tested is not None
+    assert found.tested.missing == ()
+    assert [p.name for p in found.tested.wrong] == ["mass"]
+    assert "Parameters that differ: mass 1500, on the car 1900" in str(found)
+
+
+def test_a_dataclass_is_made_anew() -> None:
+    assert with_values(Truck(), {"mass": 3000.0}).gain == 0.5  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [
+        ({"wheel": (0.1, 1.0)}, "adjustable: found 'wheel', needs one of gain, lag, mass"),
+        ({"lag": (1.0, 0.1)}, "adjustable lag: found limits 1 and 0.1, needs two finite numbers that rise"),
+        ({"lag": (0.5, 1.0)}, "adjustable lag: is 0.3, needs limits that hold it, found 0.5 to 1"),
+    ],
+)
+def test_what_cannot_be_adjusted_is_refused(limits: dict[str, tuple[float, float]], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        ExternalSimulator(Truck, adjustable=limits)
+
+
+def test_an_output_has_no_parameters() -> None:
+    with pytest.raises(InputError, match="needs the simulator itself"):
+        ExternalSimulator(recorded(Truck(), 1, seconds=20.0), adjustable=LIMITS)
