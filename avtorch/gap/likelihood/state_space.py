@@ -73,17 +73,18 @@ class StateSpace:
     def _handed_on(self, given: Float[FloatArray, "block state"]) -> Float[FloatArray, "block state"]:
         """States behind blocks that each add what is `given`."""
         count, size = given.shape
-        if count not in self._bands:
-            below = np.zeros((count, size, 2 * size))  # (block, column, further down)
+        if len(self._band) < count * size:
+            below = np.zeros((size, 2 * size))  # (column, further down)
             for i, j in np.ndindex(size, size):
-                below[:-1, j, size + i - j] = -self._blocks.power[j, i]
-            self._bands[count] = below.reshape(-1, 2 * size).T
-        return _SUBSTITUTE(2 * size - 1, self._bands[count], given.ravel(), lower=1, diag=1).reshape(count, size)
+                below[j, size + i - j] = -self._blocks.power[j, i]
+            vars(self)["_band"] = np.tile(below, (count, 1))
+        band = self._band[: count * size].T
+        return _SUBSTITUTE(2 * size - 1, band, given.ravel(), lower=1, diag=1).reshape(count, size)
 
     @cached_property
-    def _bands(self) -> dict[int, FloatArray]:
-        """The matrix of so many blocks, which has the states of all of them as its unknowns."""
-        return {}
+    def _band(self) -> FloatArray:
+        """The matrix of all states of the most blocks so far, by (column, further down); fewer blocks have its head."""
+        return np.zeros((0, 2 * len(self.A)))
 
     @cached_property
     def _blocks(self) -> _Blocks:
