@@ -1,8 +1,8 @@
 """How long `avtorch estimate` and `avtorch diagnose` take for a log, on one core of a server of 2026.
 
 Both go with the rows that count. `estimate` without measured jerk took 2.2 s for 6,000 rows of one channel, 3.1 s of
-two channels and 12.7 s for 15,000 uneven rows, and 2.5 s to start and draw. `diagnose` took 6 to 61 s for logs of 30,000
-rows: the more effects act, the longer.
+two channels and 12.7 s for 15,000 uneven rows, and 2.5 s to start and draw. `diagnose` took 6 to 61 s for logs of
+30,000 rows: the more effects act, the longer.
 """
 
 from __future__ import annotations
