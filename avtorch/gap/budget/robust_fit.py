@@ -129,8 +129,9 @@ class RobustFit:
         for _ in range(iterations):
             each = [self._steps(model, z[k], white[k], slope, kept[k], _CLOSE) for k in range(count)]
             most = max(len(x) for x in each)
-            steps = np.stack([np.concatenate([z[k, None], x, *[x[:1]] * (most - len(x))]) for k, x in enumerate(each)])
-            tried = self.white(model, steps.reshape(-1, model.size)).reshape(count, most + 1, *here.shape)
+            steps = np.stack([np.concatenate([x, *[x[:1]] * (most - len(x))]) for x in each])
+            tried = self.white(model, steps.reshape(-1, model.size)).reshape(count, most, *here.shape)
+            steps, tried = np.concatenate([z[:, None], steps], 1), np.concatenate([white[:, None], tried], 1)
             best = self._cost(tried, steps, kept[:, None]).argmin(1)
             z, white = steps[np.arange(count), best], tried[np.arange(count), best]
         fold = self.whitening.spread(self.fold.astype(float)).astype(int)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.simulator.domain import Domain
 from avtorch.gap.simulator.effect import Effect, fixed, register
 from avtorch.gap.simulator.effect_context import EffectContext
@@ -78,45 +80,67 @@ class GearShift(Effect):
         v, lost, after = row.speed, torch.zeros(()), []
         for s, (v_before, above, since) in zip(self._thresholds(), state, strict=True):
             up = ~above & (v > s)
-            since = torch.where(up, self._crossing(v_before, v, s, row), since)
+            since = torch.where(up, self._crossing(v_before, v, s, row.time, row.dt), since)
             above = (above | up) & (v > s - _REARMED)
-            lost = torch.maximum(lost, self._covered(since, row))
+            lost = torch.maximum(lost, _covered(since, tensor(self.duration_s), row.time, row.dt))
             after.append((v, above, since))
         return (self._factor(lost, x), 1.0), after
 
     def over(self, x: Tensor, row: EffectContext) -> tuple[Tensor, float]:
-        v, lost = row.speed, torch.zeros(())
-        before = torch.cat([v[..., :1], v[..., :-1]], -1)
-        rows = torch.arange(v.shape[-1])
-        for s in self._thresholds():
-            # hysteresis: the state is that of the last row that armed or fired
-            fired = torch.where(v > s, rows, -1).cummax(-1).values
-            armed = torch.where(v <= s - _REARMED, rows, -1).cummax(-1).values
-            above = fired > armed
-            was = torch.cat([v[..., :1] > s, above[..., :-1]], -1)
-            up = (v > s) & ~was
-            last = torch.where(up, rows, -1).cummax(-1).values
-            crossing = self._crossing(before, v, s, row)
-            crossing = crossing.expand(np.broadcast_shapes(crossing.shape, last.shape))
-            since = torch.where(last < 0, _NEVER, crossing.gather(-1, last.expand_as(crossing).clamp_min(0)))
-            lost = torch.maximum(lost, self._covered(since, row))
-        return self._factor(lost, x), 1.0
+        """From the few rows that follow an upshift; elsewhere no drive is lost."""
+        v, duration, thresholds = row.speed, tensor(self.duration_s), self._thresholds()
+        shape = np.broadcast_shapes(v.shape, *((*p.shape[:-1], 1) for p in (duration, *thresholds)))
+        columns, steps = math.prod(shape[:-1]), shape[-1]
+        lost = torch.zeros(columns * steps, dtype=v.dtype)
+        speed, time, dt = (y.expand(shape).reshape(columns, steps) for y in (v, row.time, row.dt))
+        duration = duration.expand(*shape[:-1], 1).reshape(columns, 1)
+        reach = torch.arange(int(duration.detach().max() / row.dt.min()) + 3)
+        for s in thresholds:
+            level = s.expand(*shape[:-1], 1).reshape(columns, 1)
+            column, up, until = _upshifts(speed.numpy(), level.detach().numpy())
+            at = column, up
+            since = self._crossing(speed[column, up - 1], speed[at], level[column, 0], time[at], dt[at])
+            rows = up[:, None] + reach
+            event, ahead = (rows < until[:, None]).nonzero(as_tuple=True)
+            column, rows = column[event], rows[event, ahead]
+            own = _covered(since[event], duration[column, 0], time[column, rows], dt[column, rows])
+            lost = lost.scatter_reduce(0, column * steps + rows, own, "amax")
+        return self._factor(lost.reshape(shape), x), 1.0
 
     def _thresholds(self) -> list[Tensor]:
         if self.speeds is not None:
             return [tensor(s) for s in self.speeds]
         return [tensor(self.first_mps) * tensor(self.gear_ratio) ** i for i in range(_SHIFTS)]
 
-    def _crossing(self, before: Tensor, v: Tensor, s: Tensor, row: EffectContext) -> Tensor:
+    @staticmethod
+    def _crossing(before: Tensor, v: Tensor, s: Tensor, time: Tensor, dt: Tensor) -> Tensor:
         """Start of the interruption: one row after the crossing, so that it is known when a step begins."""
         gained = v - before
         share = ((v - s) / torch.where(gained > 0, gained, 1.0)).clamp(0.0, 1.0)
-        return row.time + (1 - share) * row.dt
-
-    def _covered(self, since: Tensor, row: EffectContext) -> Tensor:
-        begin = torch.maximum(row.time, since)
-        end = torch.minimum(row.time + row.dt, since + tensor(self.duration_s))
-        return ((end - begin) / row.dt).clamp_min(0.0)
+        return time + (1 - share) * dt
 
     def _factor(self, lost: Tensor, x: Tensor) -> Tensor:
-        return torch.where(x > 0, 1 - tensor(self.depth) * lost, 1.0)
+        return 1 - tensor(self.depth) * lost * (x > 0)
+
+
+def _covered(since: Tensor, duration: Tensor, time: Tensor, dt: Tensor) -> Tensor:
+    """Share of a step that lies in an interruption."""
+    return ((torch.minimum(time + dt, since + duration) - torch.maximum(time, since)) / dt).clamp_min(0.0)
+
+
+def _upshifts(v: FloatArray, s: FloatArray) -> tuple[Tensor, Tensor, Tensor]:
+    """Columns and rows (event,) at which `v` (column, time) has risen through `s` (column, 1), in order, and the row of
+    the column's next event. Between two of them the car has been slower by what changes the gear back."""
+    steps, above = v.shape[-1], v > s
+    risen = np.flatnonzero(np.diff(above, axis=-1, prepend=above[:, :1]) & above)
+    fallen = np.flatnonzero(np.diff(above, axis=-1, prepend=above[:, :1]) & ~above)
+    last = np.searchsorted(fallen, risen) - 1
+    again = last >= np.searchsorted(fallen, risen // steps * steps)  # it was above before, in that column
+    places = np.stack([fallen[last[again]], risen[again]], -1).ravel()
+    slowest = np.minimum.reduceat(v.ravel(), places)[::2] if places.size else np.zeros(0)
+    shifted = np.ones(len(risen), bool)
+    shifted[again] = slowest <= s[risen[again] // steps, 0] - _REARMED
+    column, row = np.divmod(risen[shifted], steps)
+    follows = np.append(column[1:] == column[:-1], False)
+    until = np.where(follows, np.append(row[1:], steps), steps)
+    return torch.from_numpy(column), torch.from_numpy(row), torch.from_numpy(until)

@@ -1,4 +1,4 @@
-"""The steady-state Kalman filter of a noise model, as a recursive filter from errors to innovations of unit covariance.
+"""The steady-state Kalman filter of a noise model, as a filter from errors to innovations of unit covariance.
 
 The interval between rows is integrated exactly; the filter uses the steady-state gain, which is reached within some
 rows.
@@ -13,9 +13,10 @@ from scipy.linalg import expm
 
 from avtorch.arrays import Float, FloatArray
 from avtorch.gap.likelihood.noise_model import NoiseModel
+from avtorch.gap.likelihood.state_space import StateSpace
 
-Filter = tuple[list[list[FloatArray]], FloatArray, float]
-"""Numerators by (out, in), the denominator, log det of the innovations' covariance."""
+Filter = tuple[StateSpace, float]
+"""From errors to innovations of unit covariance, and the log det of their covariance before."""
 
 
 def designed(noises: Sequence[NoiseModel], dt: float, channels: tuple[str, ...]) -> list[Filter]:
@@ -39,23 +40,9 @@ def designed(noises: Sequence[NoiseModel], dt: float, channels: tuple[str, ...])
     gain = move @ ahead @ see.mT @ np.linalg.inv(s)
     mix = np.linalg.inv(np.linalg.cholesky(s))
     inner = move - gain @ see
-    # adj(z - inner) and det(z - inner) by the Faddeev-LeVerrier recursion
-    size, count = inner.shape[-1], len(use)
-    m, terms = np.broadcast_to(np.eye(size), inner.shape), []
-    bottom = np.ones((len(noises), size + 1))
-    for k in range(1, size + 1):
-        terms.append(m)
-        m = inner @ m
-        bottom[:, k] = -np.trace(m, axis1=-2, axis2=-1) / k
-        m = m + bottom[:, k, None, None] * np.eye(size)
-    # innovations: errors minus predictions, 1 - see adj gain / det
-    tops = np.zeros((len(noises), count, count, size + 1))
-    for k, term in enumerate(terms):
-        tops[..., k + 1] = -(see @ term @ gain)
-    tops += np.eye(count)[:, :, None] * bottom[:, None, None, :]
-    mixed = np.einsum("noi,nijk->nojk", mix, tops)
-    sizes = np.linalg.slogdet(s)[1]
-    return [([list(row) for row in mixed[i]], bottom[i], float(sizes[i])) for i in range(len(noises))]
+    tops = -(mix @ see)
+    sizes = np.linalg.slogdet(s)[1].tolist()
+    return [(StateSpace(*own), size) for *own, size in zip(inner, gain, tops, mix, sizes, strict=True)]
 
 
 def error_dynamics(

@@ -73,51 +73,44 @@ class WhiteningFilter:
         self, errors: Float[FloatArray, "*column channel counted group"]
     ) -> Float[FloatArray, "*column channel counted group"]:
         """Errors (..., channel, counted, group) through the filter, each stretch from rest."""
-        count, group = errors.shape[-3], errors.shape[-1]
+        group = errors.shape[-1]
         out = np.empty(errors.shape)
-        for (tops, bottom, _), part in self._parts(group == 1):
+        for (whiten, _), part in self._parts(group == 1):
             for stretch in self._stretches:
                 # a later filter has seen the whole stretch
                 rows, kept = slice(stretch.start, min(stretch.stop, part.stop)), max(stretch.start, part.start)
                 if kept >= rows.stop:
                     continue
-                own = errors[..., rows, :].reshape(*errors.shape[:-2], -1)
-                for o in range(count):
-                    total = _filtered(tops[o], bottom, own)
-                    out[..., o, kept : rows.stop, :] = total.reshape(*total.shape[:-1], -1, group)[
-                        ..., kept - rows.start :, :
-                    ]
+                white = whiten(errors[..., rows, :].reshape(*errors.shape[:-2], -1))
+                out[..., kept : rows.stop, :] = white.reshape(*white.shape[:-1], -1, group)[..., kept - rows.start :, :]
         return out
 
     def transpose(
         self, images: Float[FloatArray, "*column channel counted group"]
     ) -> Float[FloatArray, "*column channel counted group"]:
         """Transpose of the map, for images (..., channel, counted, group): the filter run backward in time."""
-        record, (count, group) = self.record, images.shape[-3::2]
-        images = np.array(images)
+        record, group = self.record, images.shape[-1]
+        images = np.array(images, order="C")
         offset = "speed" in record.channels
         if offset:
-            images = self._without_offset(images)
+            self._without_offset(images)
         total = np.zeros_like(images)
-        for (tops, bottom, _), part in self._parts(group == 1):
+        for (whiten, _), part in self._parts(group == 1):
             for stretch in self._stretches:
                 rows, kept = slice(stretch.start, min(stretch.stop, part.stop)), max(stretch.start, part.start)
                 if kept >= rows.stop:
                     continue
                 own = np.array(images[..., rows, :])
                 own[..., : kept - rows.start, :] = 0.0
-                back = own.reshape(*own.shape[:-2], -1)[..., ::-1]
-                for i in range(count):
-                    through = _filtered([top[i] for top in tops], bottom, back)[..., ::-1]
-                    total[..., i, rows, :] += through.reshape(*through.shape[:-1], -1, group)
+                back = whiten.transpose(own.reshape(*own.shape[:-2], -1)[..., ::-1])[..., ::-1]
+                total[..., rows, :] += back.reshape(*back.shape[:-1], -1, group)
         if offset:  # the first speed of each stretch was subtracted from all of its rows
             total[..., -1, record.starts, 0] -= np.add.reduceat(total[..., -1, :, :].sum(-1), record.starts, -1)
         return total
 
     def response(self, errors: Float[FloatArray, "channel time"]) -> Float[FloatArray, "channel time"]:
         """Whitened image of errors (channel, time) at consecutive rows from the first on, with the offset included."""
-        tops, bottom, _ = self._parts(False)[-1][0]
-        return np.stack([_filtered(top, bottom, errors) for top in tops])
+        return self._parts(False)[-1][0][0](errors)
 
     @cached_property
     def _offsets(self) -> dict[bool, tuple[FloatArray, FloatArray]]:
@@ -136,13 +129,13 @@ class WhiteningFilter:
     def _without_offset(
         self, e: Float[FloatArray, "*column channel counted group"]
     ) -> Float[FloatArray, "*column channel counted group"]:
+        """`e`, changed in place."""
         image, square = self._offset(e.shape[-1] == 1)
-        out = np.empty_like(e)
-        for number, stretch in enumerate(self._stretches):
-            rows, own = e[..., stretch, :], image[:, stretch]
-            part = rows.reshape(*e.shape[:-3], -1) @ own.ravel() / square[number]
-            np.subtract(rows, part[..., None, None, None] * own, out=out[..., stretch, :])
-        return out
+        for column in e.reshape(-1, *e.shape[-3:]):
+            for number, stretch in enumerate(self._stretches):
+                rows, own = column[:, stretch], image[:, stretch]
+                rows -= np.vdot(rows, own) / square[number] * own
+        return e
 
     @property
     def _stretches(self) -> list[slice]:
@@ -184,7 +177,7 @@ class WhiteningFilter:
         record = self.record
         each, count = 1 if coarse else record.group, len(record.channels)
         out = np.empty(record.rows)
-        for (_, _, size), part in self._parts(coarse):
+        for (_, size), part in self._parts(coarse):
             out[part] = -0.5 * each * (size + count * np.log(2 * np.pi))
         if "speed" in record.channels:
             out -= 0.5 * float(np.log(self._offset(coarse)[1]).sum()) / record.rows
@@ -204,16 +197,6 @@ class WhiteningFilter:
     def row_likelihoods(self, errors: Float[FloatArray, "channel counted group"]) -> Float[FloatArray, " counted"]:
         """Log likelihood (counted,) of each row of errors (channel, counted, group); the rows sum to the total."""
         return self.constants(coarse=errors.shape[-1] == 1) - 0.5 * (self(errors) ** 2).sum((0, 2))
-
-
-def _filtered(
-    tops: Sequence[FloatArray], bottom: FloatArray, inputs: Float[FloatArray, "*column channel time"]
-) -> Float[FloatArray, "*column time"]:
-    """The sum of `inputs` (..., channel, time), each through its `tops` over the common `bottom`."""
-    first, *others = (np.asarray(lfilter(top, bottom, inputs[..., i, :], axis=-1)) for i, top in enumerate(tops))
-    for other in others:
-        first += other
-    return first
 
 
 def sensed(

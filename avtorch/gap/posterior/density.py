@@ -103,14 +103,14 @@ class RolloutDensity:
 
     def value(self, z: Tensor) -> Tensor:
         """`log_prob` without a graph."""
-        with torch.no_grad():
-            values = [torch.as_tensor(self._log_likelihood(self._rolled(b).numpy())[0]) for b in self._blocks(z)]
-        return torch.cat(values).reshape(z.shape[:-1]) + self._prior(z)
+        with torch.inference_mode():  # no derivatives: faster recursions
+            values = [self._log_likelihood(self._rolled(b).numpy())[0] for b in self._blocks(z)]
+        return torch.as_tensor(np.concatenate(values)).reshape(z.shape[:-1]) + self._prior(z)
 
     # parts of the density --------------------------------------------------------------------------------------------
     def images(self, z: Tensor) -> FloatArray:
         """Whitened errors (column, row) for `z` (column, coordinate)."""
-        with torch.no_grad():
+        with torch.inference_mode():
             return np.concatenate([self._image(self._errors(self._rolled(b).numpy())) for b in self._blocks(z)])
 
     @cached_property

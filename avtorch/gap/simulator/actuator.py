@@ -88,10 +88,11 @@ class Actuator:
             return before, slope
 
         # row by row without derivatives; one Newton iteration then supplies them
-        a = _joined(accel0, solve(step, accel0, by_rows(limited_row, accel0, parts, jerk)))
+        rows = by_rows(limited_row, accel0, parts, jerk)
+        a = _joined(accel0, rows if torch.is_inference_mode_enabled() else solve(step, accel0, rows))
         at, gained = a[..., :-1], torch.zeros_like(a[..., 1:])
         for part in parts:
-            at, _, speed, _ = _limited(at, part, jerk)
+            at, _, speed = _limited(at, part, jerk)
             gained = gained + speed
         return a, gained
 
@@ -102,8 +103,8 @@ class Actuator:
                 alpha, m1, m2 = motion_coefficients(T, h)
                 d = state.accel - g
                 return ActuatorState(g + alpha * d), h * g + m1 * d, 0.5 * h * h * g + m2 * d
-            accel, _, speed, place = _limited(state.accel, part, self.jerk)
-            return ActuatorState(accel), speed, place
+            accel, _, speed = _limited(state.accel, part, self.jerk)
+            return ActuatorState(accel), speed, _limited_place(state.accel, part, self.jerk)
         assert state.swing is not None
         slewed = state.target
         if self.jerk is not None:
@@ -168,19 +169,30 @@ def _first_over(accel0: Tensor, parts: list[Substep]) -> tuple[Tensor, Tensor]:
     return a, gained
 
 
-def _limited(a: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Rate-limited part from `a`: acceleration after it, its derivative by `a`, changes of speed and position."""
-    g, T, h = part.target, part.lag, part.length
+def _limited(a: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rate-limited part from `a`: acceleration after it, its derivative by `a`, change of speed."""
+    g, T = part.target, part.lag
+    at_limit, cut = _at_limit(a, part, jerk)
+    rest, left = part.length - at_limit, g - a - cut
+    lost = torch.expm1(-rest / T)
+    after = g - left * (1 + lost)
+    return after, 1 + lost, (a + 0.5 * cut) * at_limit + rest * g + T * lost * left
+
+
+def _limited_place(a: Tensor, part: Substep, jerk: Tensor) -> Tensor:
+    """Change of the position over that part, besides `speed length`."""
+    at_limit, cut = _at_limit(a, part, jerk)
+    rest, left = part.length - at_limit, part.target - a - cut
+    place = at_limit * at_limit * (0.5 * a + cut / 6) + (a + 0.5 * cut) * at_limit * rest
+    return place + 0.5 * rest * rest * part.target - motion_coefficients(part.lag, rest)[2] * left
+
+
+def _at_limit(a: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor]:
+    """Time at the limit, before the exponential part, and the change of the acceleration in it."""
     J = jerk.clamp_max(_NO_LIMIT)
-    d = g - a
-    at_limit = torch.minimum((d.abs() / J - T).clamp_min(0.0), h)  # time at the limit, then exponential
-    cut = torch.sign(d) * J * at_limit
-    rest, left = h - at_limit, d - cut
-    alpha, m1, m2 = motion_coefficients(T, rest)
-    first = a * at_limit + 0.5 * cut * at_limit
-    place = at_limit * at_limit * (0.5 * a + cut / 6) + first * rest
-    place = place + 0.5 * rest * rest * g - m2 * left
-    return g - left * alpha, alpha, first + rest * g - m1 * left, place
+    d = part.target - a
+    at_limit = torch.minimum((d.abs() / J - part.lag).clamp_min(0.0), part.length)
+    return at_limit, torch.sign(d) * J * at_limit
 
 
 def _slewed(r: Tensor, part: Substep, jerk: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -203,8 +215,8 @@ def _slewed_over(accel0: Tensor, parts: list[Substep], jerk: Tensor) -> list[Sub
             slope = slope * own
         return before, slope
 
-    guess = by_rows(slewed_row, accel0, parts, jerk)
-    ends = _joined(accel0, solve(step, accel0, guess))
+    rows = by_rows(slewed_row, accel0, parts, jerk)
+    ends = _joined(accel0, rows if torch.is_inference_mode_enabled() else solve(step, accel0, rows))
     at, out = ends[..., :-1], []
     for part in parts:
         at, _, mean = _slewed(at, part, jerk)

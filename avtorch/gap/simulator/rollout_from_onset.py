@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -33,8 +32,9 @@ def rollout_from_onset(
         before, after = without.response(drive, base), plant.response(drive, values)
         after = Response(after.accel[..., row:], after.accel_measured[..., row:], after.speed[..., row:])
     else:
-        before = without.response(_part(drive, slice(0, row + 1)), base)
-        after = plant.response(_part(drive, slice(row, None)), values, actuator0=before.accel[..., row])
+        until, since = drive.cut(row)
+        before = without.response(until, base)
+        after = plant.response(since, values, actuator0=before.accel[..., row])
     gone_on = after.speed - after.speed[..., :1] + before.speed[..., row : row + 1]
     whole = Response(
         _joined(before.accel, after.accel, row),
@@ -42,14 +42,6 @@ def rollout_from_onset(
         _joined(before.speed, gone_on, row),
     )
     return [*earlier, whole, *later]
-
-
-def _part(drive: SimulatorInput, rows: slice) -> SimulatorInput:
-    speed = None if drive.speed is None else drive.speed[..., rows]
-    position0 = 0.0 if drive.position is None else drive.position[..., rows][..., 0]
-    return replace(
-        drive, time=drive.time[rows], command=drive.command[..., rows], speed=speed, position0=position0
-    )  # fmt: skip
 
 
 def _joined(before: Tensor, after: Tensor, row: int) -> Tensor:
