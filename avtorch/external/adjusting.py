@@ -8,6 +8,7 @@ the drives that the fit has not seen (`RobustFit.evidence`).
 
 from __future__ import annotations
 
+import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
@@ -56,14 +57,15 @@ class Adjusted:
 class Rollouts:
     """A simulator under the commands of the car's drives `logs`, by the values of its parameters; from `start` on.
 
-    `drive` makes the outputs of the drives; it is not called twice for the same values. Raises `InputError` where it
-    would be called more than `most` times.
+    `drive` makes the outputs of the drives; it is not called twice for the same values. `seconds` it has taken. Raises
+    `InputError` where it would be called more than `most` times.
     """
 
     logs: Sequence[Log]
     start: Values
     drive: Callable[[Values], Sequence[Log]]
     most: int
+    seconds: float = 0.0
     _found: dict[tuple[float, ...], tuple[Log, ...]] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -74,7 +76,9 @@ class Rollouts:
         if key not in self._found:
             if len(self._found) >= self.most:
                 raise InputError(f"most_rollouts: found {self.most}, needs more for {listed(self.start)} to settle")
+            begun = clock.monotonic()
             self._found[key] = tuple(self.drive(values))
+            self.seconds += clock.monotonic() - begun
         return self._found[key]
 
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import signal
 import threading
-from collections.abc import Callable, Iterator
+import time as clock
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -24,6 +25,8 @@ from avtorch.io import Log
 LIMIT_S = 30.0
 """Longest that a simulator may take for one step or one reset [s]."""
 _JUMP_MPS2 = 20.0  # no car accelerates like that
+_TRIED_ROWS = 200  # by which the time for all is foreseen
+_WORTH_SAYING_S = 3.0
 _AVERAGED_S = 0.3  # over which the car's acceleration at the beginning of a drive is averaged
 
 
@@ -69,11 +72,24 @@ def driven_along(
     parts = drives_of(log)
     with _limited(limit_s) as again:
         drive = _Drive(simulator, name, step_s, again)
+        what = "driving the simulator" if progress is None else f"driving the simulator{_foreseen(drive, log, parts)}"
         for number, part in enumerate(parts):
             if progress is not None:
-                progress("driving the simulator", number, len(parts))
+                progress(what, number, len(parts))
             accel[part], speed[part] = drive.along(log, part)
     return in_drives(replace(log, name=name, accel=accel, speed=speed), log)
+
+
+def _foreseen(drive: _Drive, log: Log, parts: Sequence[slice]) -> str:
+    """How long it will take, by its first rows; nothing where that is short."""
+    rows = sum(part.stop - part.start for part in parts)
+    if rows < 10 * _TRIED_ROWS:
+        return ""
+    first = max(parts, key=lambda part: part.stop - part.start)
+    begun = clock.monotonic()
+    drive.along(log, slice(first.start, min(first.stop, first.start + _TRIED_ROWS)))
+    seconds = (clock.monotonic() - begun) * rows / _TRIED_ROWS
+    return f", about {seconds:.0f} s" if seconds > _WORTH_SAYING_S else ""
 
 
 class _Drive:

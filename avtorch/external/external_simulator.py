@@ -119,9 +119,10 @@ class ExternalSimulator:
         simulator = cast("Simulator", self.of)
 
         def drive(values: Mapping[str, float]) -> tuple[Log, ...]:
-            if progress is not None:
-                progress("fitting its parameters", len(rollouts), self.most_rollouts)
-            return self._driven(with_values(simulator, values), logs)
+            if progress is not None and len(rollouts):
+                each = rollouts.seconds / len(rollouts)
+                progress(f"fitting its parameters, {each:.2g} s a drive", len(rollouts), self.most_rollouts)
+            return self._driven(with_values(simulator, values), logs, None if len(rollouts) else progress)
 
         rollouts = Rollouts(logs, values_of(simulator, self.adjustable), drive, self.most_rollouts)
         return rollouts

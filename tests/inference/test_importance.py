@@ -11,14 +11,16 @@ from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.inference import integrate
+from avtorch.inference.density import Density
 from avtorch.inference.estimators import ImportanceSampling
+from avtorch.inference.estimators.importance import FIRST, _Solved
 from avtorch.inference.importance import ImportanceSettings, WeightedDraws, approximated, weighted_draws
-from avtorch.inference.latent import default_noise_prior
+from avtorch.inference.latent import LatentDensity, default_noise_prior
+from avtorch.inference.latent_window import LatentWindow
+from avtorch.inference.map import Mode
 from avtorch.validation import synthetic_windows
 from tests.bars import BAR
 from tests.inference.latent_windows import drawn_window
-
-COVERAGE_WINDOWS = 1000
 
 
 @dataclass(frozen=True)
@@ -129,26 +131,28 @@ def _below(draws: WeightedDraws, bound: Tensor) -> tuple[Tensor, Tensor]:
     return share, (weight**2 * (below - share) ** 2).sum(0).sqrt()
 
 
+class Drawn(ImportanceSampling):
+    """Without SGLD behind it, which takes minutes where rows are uneven: windows that it would sample are not used."""
+
+    def _chains(self, density: Density, mode: Mode) -> _Solved:
+        never = torch.zeros(density.windows, dtype=torch.bool)
+        return self._drawn(density, mode, FIRST)._replace(converged=never)
+
+
 @pytest.mark.slow
 @pytest.mark.statistical
-@pytest.mark.parametrize("channels", ["speed", "both", "jitter"])
-def test_intervals_hold_the_truth_as_often_as_they_say(channels: str, rotating_seed: int) -> None:
+@pytest.mark.parametrize(("channels", "windows"), [("speed", 333), ("both", 333), ("jitter", 111)])
+def test_intervals_hold_the_truth_as_often_as_they_say(channels: str, windows: int, rotating_seed: int) -> None:
     """90 % intervals on windows drawn from their own law, parameters from the prior: coverage of T_L and K_L."""
     generator = torch.Generator().manual_seed(rotating_seed)
-    held = torch.zeros(2)
-    used = 0
     settings = {"accel": channels != "speed", "speed": True, "jitter": 0.3 if channels == "jitter" else 0.0}
-    for _ in range(COVERAGE_WINDOWS // 3):
-        density, truth = drawn_window(generator, rows=100, dt=0.02, **settings)
-        loop = ImportanceSampling(
-            names=density.names,
-            noise_prior=default_noise_prior(density.names[2:]),
-            seed=int(used + rotating_seed % 1000),
-        )
-        belief = loop.update(lambda index, prior, d=density: d, torch.tensor([True]))
-        if bool(belief.converged[0]):
-            used += 1
-            held += ((belief.q05[0, :2] <= truth[:2]) & (truth[:2] <= belief.q95[0, :2])).float()
-    assert used > 0.9 * (COVERAGE_WINDOWS // 3)
-    bar = BAR * math.sqrt(0.9 * 0.1 / used)
-    assert float((held / used - 0.9).abs().max()) < bar, (held / used).tolist()
+    drawn = [drawn_window(generator, rows=100, dt=0.02, **settings) for _ in range(windows)]
+    density = LatentDensity(LatentWindow.stack([each.data for each, _ in drawn]))
+    truth = torch.stack([each[:2] for _, each in drawn])
+    noise = default_noise_prior(density.names[2:])
+    loop = Drawn(vehicles=windows, names=density.names, noise_prior=noise, seed=rotating_seed % 1000)
+    belief = loop.update(lambda index, prior: density, torch.ones(windows, dtype=torch.bool))
+    inside = ((belief.q05[:, :2] <= truth) & (truth <= belief.q95[:, :2])).double()[belief.converged]
+    assert len(inside) > 0.9 * windows
+    bar = BAR * math.sqrt(0.9 * 0.1 / len(inside))
+    assert float((inside.mean(0) - 0.9).abs().max()) < bar, inside.mean(0).tolist()
