@@ -14,7 +14,7 @@ from avtorch.cli.arguments import OUTPUT, Json, Quiet, free_folder
 from avtorch.cli.simulator import read_simulator
 from avtorch.cli.simulators_table import simulators_table
 from avtorch.cli.talk import Talk
-from avtorch.cli.tested_simulator import simulators_of, tested_simulator
+from avtorch.cli.tested_simulator import simulator_of, simulators_of
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def compare(
     talk = Talk(json=json, quiet=quiet)
     logs = [_log(path, map, unit, talk) for path in (before, after)]
     drives = [(before, logs[0]), (after, logs[1])]
-    own = tested_simulator(simulated or (), (simulator or (None,))[0], step, drives, adjust=(), rollouts=None)
+    own = simulator_of(simulated or (), (simulator or (None,))[0], step, drives, adjust=(), rollouts=None, processes=1)
     with talk.steps("Comparing") as step_done:
         comparison = work(*logs, baseline=own or base, baseline_after=other, progress=step_done)
     _answer(talk, comparison, _table(comparison), out)

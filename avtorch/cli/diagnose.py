@@ -20,7 +20,7 @@ from avtorch.cli.pedals import commanded, write_pedals
 from avtorch.cli.resume import EARLIER_FITS, FITS, begin_anew
 from avtorch.cli.simulator import read_simulator
 from avtorch.cli.talk import Talk
-from avtorch.cli.tested_simulator import tested_simulator
+from avtorch.cli.tested_simulator import simulator_of
 from avtorch.errors import InputError, quoted
 from avtorch.numeral import numeral
 
@@ -87,6 +87,9 @@ def diagnose(
         int | None,
         Parameter(group=TESTED, help="How often the simulator may be driven along the logs for that; default: 50."),
     ] = None,
+    processes: Annotated[
+        int, Parameter(group=TESTED, help="How many of these drives at once, for a slow simulator.")
+    ] = 1,
     prior: Annotated[
         list[str] | None,
         Parameter(
@@ -172,7 +175,7 @@ def diagnose(
     if follower:
         usual = {"accel_kind": accel_kind == "kinematic", "no_pairs": pairs, "posterior": posterior == "sgld"}
         idle = {"simulated": simulated, "simulator": simulator, "step": step is not None, "adjust": adjust}
-        idle |= {"rollouts": rollouts is not None}
+        idle |= {"rollouts": rollouts is not None, "processes": processes != 1}
         idle |= {"baseline": assumed, "prior": weights, "budget": budget is not None}
         idle |= {option: not default for option, default in usual.items()}
         refuse(logs, **idle, **{option: value is not None for option, value in track.items()})
@@ -189,7 +192,9 @@ def diagnose(
         _check_effects(chosen or (), path, drive)
     limits = _limits(drives, track)
     with_paths = list(zip(logs, drives, strict=True))
-    own = tested_simulator(simulated or (), simulator, step, with_paths, adjust=adjust or (), rollouts=rollouts)
+    own = simulator_of(
+        simulated or (), simulator, step, with_paths, adjust=adjust or (), rollouts=rollouts, processes=processes
+    )
     if not resume:
         begin_anew(out, FITS, EARLIER_FITS)
     quality = []

@@ -16,18 +16,24 @@ if TYPE_CHECKING:
     from avtorch.io import Log
 
 _CHANNELS = ("accel", "speed")
-_OPTIONS = {"adjustable": "--adjust", "most_rollouts": "--rollouts", "simulator": "--simulator"}
+_OPTIONS = {
+    "adjustable": "--adjust",
+    "most_rollouts": "--rollouts",
+    "processes": "--processes",
+    "simulator": "--simulator",
+}
 """Options by how errors of what they hold begin."""
 
 
-def tested_simulator(
+def simulator_of(
     simulated: Sequence[str],
     simulator: str | None,
     step: float | None,
     drives: Sequence[tuple[Path, Log]],
     *,
-    adjust: Sequence[str],
-    rollouts: int | None,
+    adjust: Sequence[str] = (),
+    rollouts: int | None = None,
+    processes: int = 1,
 ) -> ExternalSimulator | None:
     """None where neither is given. Raises `InputError` where both are, or what is given cannot be read."""
     if simulator is None:
@@ -50,7 +56,7 @@ def tested_simulator(
         try:
             own = load_simulator(simulator, mapping=mapping_beside(drives[0][0]))
             most = ExternalSimulator.most_rollouts if rollouts is None else rollouts
-            return ExternalSimulator(own, simulator, step, adjustable=limits, most_rollouts=most)
+            return ExternalSimulator(own, simulator, step, adjustable=limits, most_rollouts=most, processes=processes)
         except InputError as fault:
             text = str(fault)
             for start, option in _OPTIONS.items():
@@ -105,7 +111,7 @@ def _limits(adjust: Sequence[str]) -> dict[str, tuple[float, float]]:
 def _one(
     simulated: Sequence[str], simulator: str | None, step: float | None, path: Path, drive: Log
 ) -> ExternalSimulator:
-    found = tested_simulator(simulated, simulator, step, [(path, drive)], adjust=(), rollouts=None)
+    found = simulator_of(simulated, simulator, step, [(path, drive)])
     assert found is not None
     return found
 

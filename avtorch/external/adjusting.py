@@ -57,13 +57,13 @@ class Adjusted:
 class Rollouts:
     """A simulator under the commands of the car's drives `logs`, by the values of its parameters; from `start` on.
 
-    `drive` makes the outputs of the drives; it is not called twice for the same values. `seconds` it has taken. Raises
-    `InputError` where it would be called more than `most` times.
+    `drive` makes the outputs of the drives, for several values at once; none is driven twice. `seconds` it has taken.
+    Raises `InputError` where more than `most` would be driven.
     """
 
     logs: Sequence[Log]
     start: Values
-    drive: Callable[[Values], Sequence[Log]]
+    drive: Callable[[Sequence[Values]], Sequence[Sequence[Log]]]
     most: int
     seconds: float = 0.0
     _found: dict[tuple[float, ...], tuple[Log, ...]] = field(default_factory=dict)
@@ -72,14 +72,20 @@ class Rollouts:
         return len(self._found)
 
     def at(self, values: Values) -> tuple[Log, ...]:
-        key = tuple(values.values())
-        if key not in self._found:
-            if len(self._found) >= self.most:
-                raise InputError(f"most_rollouts: found {self.most}, needs more for {listed(self.start)} to settle")
+        return self.each([values])[0]
+
+    def each(self, places: Sequence[Values]) -> list[tuple[Log, ...]]:
+        """The outputs at each of these values."""
+        keys = [tuple(values.values()) for values in places]
+        new = {key: values for key, values in zip(keys, places, strict=True) if key not in self._found}
+        if len(self._found) + len(new) > self.most:
+            raise InputError(f"most_rollouts: found {self.most}, needs more for {listed(self.start)} to settle")
+        if new:
             begun = clock.monotonic()
-            self._found[key] = tuple(self.drive(values))
+            driven = self.drive(list(new.values()))
+            self._found |= {key: tuple(outputs) for key, outputs in zip(new, driven, strict=True)}
             self.seconds += clock.monotonic() - begun
-        return self._found[key]
+        return [self._found[key] for key in keys]
 
 
 def fewest_rollouts(limits: Limits) -> int:
@@ -190,13 +196,12 @@ class _Linear:
     def around(
         cls, record: AnalysisRecord, cars: Sequence[Log], rollouts: Rollouts, values: Values, limits: Limits
     ) -> _Linear:
-        center = _measured(record, cars, rollouts.at(values))
-        slopes = []
-        for (name, (low, high)), scale in zip(limits.items(), _scales(limits), strict=True):
-            step = _BESIDE * (high - low)
-            step = step if values[name] + step <= high else -step
-            beside = _measured(record, cars, rollouts.at({**values, name: values[name] + step}))
-            slopes.append((beside - center) * scale / step)
+        steps = {name: _BESIDE * (high - low) for name, (low, high) in limits.items()}
+        steps = {name: x if values[name] + x <= limits[name][1] else -x for name, x in steps.items()}
+        beside = [{**values, name: values[name] + step} for name, step in steps.items()]
+        center, *others = (_measured(record, cars, outputs) for outputs in rollouts.each([values, *beside]))
+        scales = zip(others, _scales(limits), steps.values(), strict=True)
+        slopes = [(other - center) * scale / step for other, scale, step in scales]
         return cls(record, center, np.array(slopes), values, limits)
 
     @property

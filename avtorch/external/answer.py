@@ -98,9 +98,9 @@ def lag_and_gain(
     before = {name: float(getattr(surrogate, name)) for name in _MATERIAL}
     car = surrogate if found is None else found
 
-    def drive(values: Mapping[str, float]) -> list[Log]:
-        other = GapPlant(car.effects, T_L=values["T_L"], K_L=values["K_L"], sigma=0.0)
-        return [replace(out, **responses(out, other)) for out in outputs]
+    def drive(places: Sequence[Mapping[str, float]]) -> list[list[Log]]:
+        others = [GapPlant(car.effects, T_L=values["T_L"], K_L=values["K_L"], sigma=0.0) for values in places]
+        return [[replace(out, **responses(out, other)) for out in outputs] for other in others]
 
     limits = {name: (x / _FARTHEST, x * _FARTHEST) for name, x in before.items()}
     try:

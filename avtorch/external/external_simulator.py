@@ -14,6 +14,7 @@ from avtorch.external.discrepancy import responses, without_discrepancy
 from avtorch.external.drives import in_drives
 from avtorch.external.driving import driven_along
 from avtorch.external.parameters import Limits, values_of, with_values
+from avtorch.external.side_by_side import side_by_side
 from avtorch.external.simulator import Simulator
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.result.diagnosis import Diagnosis
@@ -21,6 +22,7 @@ from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log
 
 Progress = Callable[[str, int, int], None]
+_MOST_PROCESSES = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +33,7 @@ class ExternalSimulator:
     object with `reset` and `step` (`Simulator`), or a class of such. `name`: what it is called in the answer. `step_s`:
     its own step [s], where it takes no other. `adjustable`: lowest and highest value of each of its parameters that may
     be wrong, see `avtorch.external.parameters.values_of`; these are fitted to the car, with at most `most_rollouts`
-    drives through its log, and the diagnosis is of the simulator with the values that the car has.
+    drives through its log, in so many `processes`, and the diagnosis is of the simulator with the car's values.
 
     Raises `InputError` for anything else.
 
@@ -54,6 +56,7 @@ class ExternalSimulator:
     step_s: float | None = None
     adjustable: Limits = field(default_factory=dict)
     most_rollouts: int = 50
+    processes: int = 1
 
     def __post_init__(self) -> None:
         found: Any = self.of() if isinstance(self.of, type) and callable(getattr(self.of, "step", None)) else self.of
@@ -68,6 +71,8 @@ class ExternalSimulator:
                 f"simulator: {quoted(own)} has no {missing}; needs reset(speed, accel) and step(accel_cmd, dt)"
             )
         default = found[0].name if isinstance(found, tuple) else type(found).__name__
+        if not (isinstance(self.processes, int) and 1 <= self.processes <= _MOST_PROCESSES):
+            raise InputError(f"processes: found {self.processes!r}, needs a number from 1 to {_MOST_PROCESSES}")
         if self.adjustable:
             if isinstance(found, tuple):
                 raise InputError("adjustable: has no meaning for an output, needs the simulator itself")
@@ -118,11 +123,17 @@ class ExternalSimulator:
         """Drives of the simulator by the values of its adjustable parameters."""
         simulator = cast("Simulator", self.of)
 
-        def drive(values: Mapping[str, float]) -> tuple[Log, ...]:
-            if progress is not None and len(rollouts):
+        def one(own: Simulator, values: Mapping[str, float]) -> tuple[Log, ...]:
+            return self._driven(with_values(own, values), logs)
+
+        def drive(places: Sequence[Mapping[str, float]]) -> list[tuple[Log, ...]]:
+            first = not len(rollouts)  # by which it is told how long the others take
+            if progress is not None and not first:
                 each = rollouts.seconds / len(rollouts)
                 progress(f"fitting its parameters, {each:.2g} s a drive", len(rollouts), self.most_rollouts)
-            return self._driven(with_values(simulator, values), logs, None if len(rollouts) else progress)
+            if first and len(places) == 1:
+                return [self._driven(simulator, logs, progress)]
+            return side_by_side(simulator, one, places, self.processes)
 
         rollouts = Rollouts(logs, values_of(simulator, self.adjustable), drive, self.most_rollouts)
         return rollouts

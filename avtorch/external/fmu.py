@@ -238,6 +238,12 @@ class FmuSimulator:
         count = np.where(off, np.ceil(dt / h), count)
         return np.where(off, dt / count, h), count
 
+    def apart(self) -> FmuSimulator:
+        """The same FMU with the same parameters in another process, which `close` ends."""
+        other = object.__new__(FmuSimulator)
+        other.__dict__.update(self.__dict__, _shared=self._shared.another(), _drive=None, _start_notes=())
+        return other
+
     # its process ---------------------------------------------------------------------------------------------------
     def close(self) -> None:
         """End the process of the FMU; a later `reset` is refused."""
@@ -265,6 +271,9 @@ class _Shared:
     @property
     def alive(self) -> bool:
         return self._process is not None and self._process.alive
+
+    def another(self) -> _Shared:
+        return _Shared(self._path, self._seconds)
 
     def process(self) -> FmuProcess:
         if self._closed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -46,6 +47,8 @@ def recorded(car: Truck, seed: int, *, seconds: float = 90.0) -> Log:
     command = 0.8 * np.sin(0.5 * time) + 0.5 * np.sin(1.3 * time + 1.0) + 0.3 * np.sin(0.11 * time)
     log = Log.from_arrays(time=time, accel_cmd=command, accel=0 * time, speed=np.full(len(time), 20.0))
     run = driven_along(car, log)
+    assert run.accel is not None
+    assert run.speed is not None
     accel, speed = (x + NOISE * rng.standard_normal(len(time)) for x in (run.accel, run.speed))
     return Log.from_arrays(time=time, accel_cmd=command, accel=accel, speed=speed)
 
@@ -53,7 +56,11 @@ def recorded(car: Truck, seed: int, *, seconds: float = 90.0) -> Log:
 def fitted(log: Log, most: int = 50) -> tuple[dict[str, tuple[float, float, bool]], int]:
     """Value, SD and whether it differs, by parameter; and rollouts."""
     own = Truck()
-    rollouts = Rollouts([log], values_of(own, LIMITS), lambda v: [driven_along(with_values(own, v), log)], most)
+
+    def drive(places: Sequence[Mapping[str, float]]) -> list[list[Log]]:
+        return [[driven_along(with_values(own, values), log)] for values in places]
+
+    rollouts = Rollouts([log], values_of(own, LIMITS), drive, most)
     found = adjusted(rollouts, LIMITS)
     return {p.name: (p.car.mean, p.car.sd, p.differs) for p in found.parameters}, found.rollouts
 
@@ -110,6 +117,28 @@ def test_a_wrong_parameter_is_no_missing_effect() -> None:
     assert found.tested.missing == ()
     assert [p.name for p in found.tested.wrong] == ["mass"]
     assert "Parameters that differ: mass 1500, on the car 1900" in str(found)
+
+
+def test_processes_change_nothing_but_the_time() -> None:
+    log = recorded(Truck(lag=0.5), 5, seconds=40.0)
+    one, two = (ExternalSimulator(Truck, adjustable=LIMITS, processes=count).beside([log]).fitted for count in (1, 2))
+    assert one is not None
+    assert two is not None
+    assert one.parameters == two.parameters
+    with pytest.raises(InputError, match="processes: found 0, needs a number from 1 to 64"):
+        ExternalSimulator(Truck, processes=0)
+
+
+def test_a_fault_in_another_process_is_told() -> None:
+    class Brittle(Truck):
+        def step(self, accel_cmd: float, dt: float) -> tuple[float, float]:
+            if self.lag != 0.3:
+                raise ZeroDivisionError("no lag")
+            return super().step(accel_cmd, dt)
+
+    mine = ExternalSimulator(Brittle, adjustable=LIMITS, processes=2)
+    with pytest.raises(InputError, match="Brittle: at 0 s of the log step raised ZeroDivisionError: 'no lag'"):
+        mine.beside([recorded(Truck(), 5, seconds=40.0)])
 
 
 def test_a_dataclass_is_made_anew() -> None:

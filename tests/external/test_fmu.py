@@ -15,6 +15,7 @@ import pytest
 
 from avtorch import InputError
 from avtorch.external import FmuSimulator, Simulator, fmu_child
+from avtorch.external.side_by_side import side_by_side
 from avtorch.io.mapping import read_mapping
 from tests.external import fmus
 
@@ -282,6 +283,15 @@ def test_parameters_are_listed_and_set(build: Build, fmi: int) -> None:
     np.testing.assert_allclose(driven(car), expected(), **CLOSE)
     with pytest.raises(InputError, match="needs reset first"):  # the process has begun the other one's drive
         slow.step(0.0, DT)
+
+
+def test_side_by_side_each_in_a_process_of_its_own(build: Build) -> None:
+    car = build.open(build.fmu())
+    places = [{"omega": 2.0}, {"omega": 3.0}, {"omega": 4.0}]
+    found = side_by_side(car, lambda own, values: driven(own.with_parameters(values)), places, 2)
+    for shown, values in zip(found, places, strict=True):
+        np.testing.assert_allclose(shown, expected(**values), **CLOSE)
+    np.testing.assert_allclose(driven(car), expected(), **CLOSE)  # its own process goes on
 
 
 @pytest.mark.parametrize(
