@@ -1,12 +1,15 @@
 """What does a simulator lack that is not made of effects? Sealed cases of the reference vehicle.
 
-``python -m benchmarks.simulators --n 100 --seed 1 [--by output|simulator] [--out FILE]``
+``python -m benchmarks.simulators --n 100 --seed 1 [--by output|simulator] [--recorder ordinary] [--out
+FILE]``
 
 The simulator, by its output or driven along, is the blind test's reference vehicle, simulated millisecond by
 millisecond, with an actuator of second order, a map that depends on speed, drag and a delay of its own, all drawn. The
 car is the same (a quarter of the cases), the same with one of these parameters changed (three tenths), or the same with
 an effect besides (the rest), of medium visibility: what lag and gain cannot follow is 1.25 to 2.83 times the noise.
-Causes that cannot be that visible on a drive are drawn anew. With --out, cases already there are kept.
+Causes that cannot be that visible on a drive are drawn anew. Behind an ordinary recorder the car's readings are
+filtered, held, rounded and shaken, with clocks of their own; it loses no rows and nobody takes over, so that both have
+the same commands. With --out, cases already there are kept.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ import numpy as np
 
 from avtorch import ExternalSimulator, Log, diagnose
 from avtorch.arrays import FloatArray
-from avtorch.blindtest import EFFECTS, Car, Recorded, draw_car, draw_drive, simulate
+from avtorch.blindtest import EFFECTS, Car, Recorded, draw_car, draw_drive, draw_recorder, simulate
 from avtorch.blindtest.intervals import wilson
 from avtorch.blindtest.strength import excess_range, solve_strength
 from avtorch.gap.result.diagnosis import Diagnosis
@@ -159,6 +162,12 @@ def _excess(difference: FloatArray, columns: list[FloatArray], noise: float) -> 
     return float(np.sqrt(np.mean(x**2))) / noise
 
 
+def behind_a_recorder(case: Mapping[str, Any], seed: int) -> dict[str, Any]:
+    drawn = draw_recorder(np.random.default_rng((seed, case["number"], 1)), RATE_HZ)
+    recorder = replace(drawn, dropped=0.0, overrides_per_min=0.0)
+    return {**case, "log": recorder.record(case["log"], case["number"])}
+
+
 def answered(case: Mapping[str, Any], by: str) -> dict[str, Any]:
     log, simulator = case["log"], case["simulator"]
     begun = time.process_time()
@@ -209,12 +218,14 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--by", choices=["output", "simulator"], default="output")
+    parser.add_argument("--recorder", choices=["ideal", "ordinary"], default="ideal")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     out: Path | None = given.out
     rows = [json.loads(x) for x in out.read_text().splitlines()] if out and out.exists() else []
     for number in sorted(set(range(given.n)) - {row["number"] for row in rows}):
-        row = answered(draw(given.seed, number), given.by)
+        case = draw(given.seed, number)
+        row = answered(behind_a_recorder(case, given.seed) if given.recorder == "ordinary" else case, given.by)
         rows.append(row)
         print(json.dumps(row), flush=True)
         if out:
