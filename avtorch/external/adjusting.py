@@ -125,7 +125,10 @@ def adjusted(rollouts: Rollouts, limits: Limits, *, logs: Sequence[Log] | None =
 def _as_it_is(record: AnalysisRecord, cars: Sequence[Log], fitting: RobustFit, first: Sequence[Log]) -> HeldOut:
     """The simulator as it is, of which nothing but the lateness of speed is fitted."""
     plain = _Linear(record, _measured(record, cars, first), np.zeros((0, *record.measured.shape)), {}, {})
-    return fitting.hold_out(_fitted(fitting, plain))
+    if plain.size:
+        return fitting.hold_out(_fitted(fitting, plain))
+    white = fitting.white(cast("Any", plain), np.zeros(0))
+    return HeldOut(fitting.nats(white), np.zeros((0, 0)), white)
 
 
 def _difference(name: str, before: float, value: float, folds: FloatArray, needed: bool) -> ParameterDifference:

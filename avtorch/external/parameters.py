@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import fields, is_dataclass, replace
+from inspect import getattr_static
 from typing import Any, Protocol, runtime_checkable
 
 from avtorch.errors import InputError, listed, quoted
@@ -33,8 +34,8 @@ def values_of(simulator: Simulator, limits: Limits) -> dict[str, float]:
     if isinstance(simulator, Adjustable):
         known = dict(simulator.parameters())
     else:
-        names = {*vars(simulator), *(n for n in vars(type(simulator)) if not n.startswith("_"))}
-        found: dict[str, Any] = {name: getattr(simulator, name, None) for name in sorted(names)}
+        # as they stand there: a property may not be ready before a drive begins
+        found: dict[str, Any] = {n: getattr_static(simulator, n) for n in dir(simulator) if not n.startswith("_")}
         known = {n: float(x) for n, x in found.items() if isinstance(x, int | float) and not isinstance(x, bool)}
     for name, (low, high) in limits.items():
         if name not in known:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -66,8 +66,11 @@ def fitted(log: Log, most: int = 50) -> tuple[dict[str, tuple[float, float, bool
 
 
 @pytest.mark.statistical
-def test_what_is_wrong_is_found_in_the_users_terms(rotating_seed: int) -> None:
-    found, _ = fitted(recorded(Truck(lag=0.5, mass=1800.0), rotating_seed))
+@pytest.mark.parametrize("channel", ["both", "speed", "accel"])
+def test_what_is_wrong_is_found_in_the_users_terms(channel: str, rotating_seed: int) -> None:
+    log = recorded(Truck(lag=0.5, mass=1800.0), rotating_seed)
+    log = {"both": log, "speed": replace(log, accel=None), "accel": replace(log, speed=None)}[channel]
+    found, _ = fitted(log)
     for name, truth in (("lag", 0.5), ("mass", 1800.0)):
         value, sd, differs = found[name]
         assert differs
@@ -143,6 +146,22 @@ def test_a_fault_in_another_process_is_told() -> None:
 
 def test_a_dataclass_is_made_anew() -> None:
     assert with_values(Truck(), {"mass": 3000.0}).gain == 0.5  # type: ignore[attr-defined]
+
+
+def test_attributes_of_an_object_and_of_its_classes_are_parameters() -> None:
+    class Car(Truck):
+        delay_s, fast = 0.1, True
+
+        @property
+        def speed_kph(self) -> float:
+            return 3.6 * self.speed  # not there before a drive
+
+    car = Car()
+    assert values_of(car, {"delay_s": (0.0, 0.5)}) == {"delay_s": 0.1}
+    other = with_values(car, {"delay_s": 0.3})
+    assert (other.delay_s, car.delay_s) == (0.3, 0.1)  # type: ignore[attr-defined]
+    with pytest.raises(InputError, match="found 'speed_kph', needs one of delay_s, gain, lag, mass"):
+        values_of(car, {"speed_kph": (0.0, 100.0)})
 
 
 @pytest.mark.parametrize(
