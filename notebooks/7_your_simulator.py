@@ -140,7 +140,7 @@ plots.show(figure, OUT / "speeds.png")
 #
 # - Give the car another `delay_s` in place of the force. The answer is then a parameter that is wrong, not an effect
 #   that is missing.
-# - Say what may be wrong: `ExternalSimulator(Simulator, adjustable={"delay_s": (0.0, 0.5)})` fits the delay to the car by
-#   its own name, and says whether it is that or something missing.
+# - Say what may be wrong: `ExternalSimulator(Simulator, adjustable={"delay_s": (0.0, 0.5)})` fits the delay to the car
+#   by its own name, and says whether it is that or something missing.
 # - Take the simulator's output instead of the simulator: `ExternalSimulator(before)`.
 # - Write what was found as an FMU: `avtorch.external.write_fmu(found, "better.fmu")`.
