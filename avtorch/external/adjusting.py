@@ -117,8 +117,11 @@ def adjusted(rollouts: Rollouts, limits: Limits, *, logs: Sequence[Log] | None =
     outputs = rollouts.at(values)
     held = fitting.hold_out(fit)
     needed = fitting.evidence(_as_it_is(record, cars, fitting, first), held).strength(len(limits)) > 0
-    spread = model.parameters_each(held.z)
-    found = tuple(_difference(name, before[name], values[name], spread[name], needed) for name in limits)
+    errors = dict(zip(limits, (_errors(fitting, model, fit) * _scales(limits)).tolist(), strict=True))
+    found = tuple(
+        _difference(name, before[name], values[name], errors[name], fitting.whitening.blocks - 1, needed)
+        for name in limits
+    )
     return Adjusted(outputs, found, len(rollouts))
 
 
@@ -131,12 +134,24 @@ def _as_it_is(record: AnalysisRecord, cars: Sequence[Log], fitting: RobustFit, f
     return HeldOut(fitting.nats(white), np.zeros((0, 0)), white)
 
 
-def _difference(name: str, before: float, value: float, folds: FloatArray, needed: bool) -> ParameterDifference:
-    """`folds` (fold,): the parameter without each fold in turn, whose spread is a jackknife's."""
-    k = len(folds)
-    sd = float(np.sqrt((k - 1) / k * ((folds - folds.mean()) ** 2).sum()))
+def _errors(fitting: RobustFit, model: _Linear, fit: Fit) -> FloatArray:
+    """Standard errors (parameter,) of the coordinates by how much the blocks disagree (Liang and Zeger's sandwich)."""
+    own = cast("Any", model)
+    white = fitting.white(own, fit.z)
+    slope = fitting.slope(own, fit.z, white)
+    weighed = slope * fitting.weights(white, np.ones(fitting.whitening.blocks))
+    curvature = weighed.reshape(model.size, -1) @ slope.reshape(model.size, -1).T + np.eye(model.size)
+    scores = fitting.whitening.by_block(weighed * white)
+    blocks = scores.shape[-1]
+    inverse = np.linalg.inv(curvature)
+    covariance = inverse @ (scores @ scores.T) @ inverse * blocks / max(blocks - model.size, 1)
+    return np.sqrt(np.diag(covariance))[: len(model.limits)]
+
+
+def _difference(name: str, before: float, value: float, sd: float, freedom: int, needed: bool) -> ParameterDifference:
+    """`sd` is known by so many degrees of freedom."""
     reach, surely = (
-        float(student.ppf(p, k - 1)) * sd  # pyright: ignore[reportUnknownMemberType]
+        float(student.ppf(p, freedom)) * sd  # pyright: ignore[reportUnknownMemberType]
         for p in (0.95, 0.5 + _SURELY / 2)
     )
     car = Quantity(value, sd, value - reach, value + reach)
@@ -219,13 +234,10 @@ class _Linear:
         return np.zeros((0, len(z)))
 
     def parameters(self, z: FloatArray) -> dict[str, float]:
-        return {name: float(x[0]) for name, x in self.parameters_each(z[None]).items()}
-
-    def parameters_each(self, z: FloatArray) -> dict[str, FloatArray]:
-        """By name, (fold,), of coordinates (fold, size)."""
+        """By name, at coordinates `z` (size,)."""
         inside = np.clip(z, self.low, self.high)
         scales = zip(self.limits, _scales(self.limits), strict=True)
-        return {name: self.values[name] + inside[:, n] * scale for n, (name, scale) in enumerate(scales)}
+        return {name: float(self.values[name] + inside[n] * scale) for n, (name, scale) in enumerate(scales)}
 
 
 def _scales(limits: Limits) -> FloatArray:

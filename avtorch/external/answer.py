@@ -89,14 +89,16 @@ def with_simulator(
 
 
 def lag_and_gain(
-    logs: Sequence[Log], outputs: Sequence[Log], surrogate: GapPlant, found: GapPlant | None
+    logs: Sequence[Log], outputs: Sequence[Log], surrogate: GapPlant, found: Diagnosis
 ) -> list[ParameterDifference]:
     """T_L and K_L of the `surrogate`, with the effects that were `found`, fitted to the car's `logs`.
 
-    They differ as the simulator's own parameters do (`adjusted`), and by more than a controller notices.
+    They differ as the simulator's own parameters do (`adjusted`), by more than a controller notices, and where the
+    likelihood, another engine, finds them away to the same side: each has a weak place of its own, the one where an
+    effect's size trades with the gain, the other where a recorder colours the noise.
     """
     before = {name: float(getattr(surrogate, name)) for name in _MATERIAL}
-    car = surrogate if found is None else found
+    car = surrogate if found.plant is None else found.plant
 
     def drive(places: Sequence[Mapping[str, float]]) -> list[list[Log]]:
         others = [GapPlant(car.effects, T_L=values["T_L"], K_L=values["K_L"], sigma=0.0) for values in places]
@@ -107,10 +109,14 @@ def lag_and_gain(
         fitted = adjusted(Rollouts(logs, before, drive, most=100), limits)
     except InputError:  # a drive too short for blocks to be held out
         return []
-    return [
-        replace(p, own=False, differs=p.differs and abs(p.car.mean - p.simulator) > _MATERIAL[p.name] * p.simulator)
-        for p in fitted.parameters
-    ]
+    likely = {name: found.winner.moved.get(name, found.baseline[name]).mean for name in before}
+    return [replace(p, own=False, differs=p.differs and _noticed(p, likely[p.name])) for p in fitted.parameters]
+
+
+def _noticed(parameter: ParameterDifference, likely: float) -> bool:
+    least = _MATERIAL[parameter.name] * parameter.simulator
+    away = [x - parameter.simulator for x in (parameter.car.mean, likely)]
+    return min(away) > least or max(away) < -least
 
 
 def _parameters(found: Diagnosis, effect: str) -> dict[str, Quantity]:

@@ -187,7 +187,7 @@ class SimulatorBesideCar:
             offset_s=self.offsets,
             rollout=self.rollout,
             own_parameters=() if self.fitted is None else self.fitted.parameters,
-            lag_and_gain=lag_and_gain(self.logs, self.outputs, self.plant, found.plant),
+            lag_and_gain=lag_and_gain(self.logs, self.outputs, self.plant, found),
             rollouts=0 if self.fitted is None else self.fitted.rollouts,
             notes=tuple(getattr(self.simulator.of, "notes", ())),
         )
