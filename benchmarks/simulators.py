@@ -88,7 +88,11 @@ def _drawn(rng: np.random.Generator, number: int) -> dict[str, Any] | None:
             "natural_frequency_radps": rng.uniform(4.0, 9.0),
             "damping_ratio": rng.uniform(0.6, 1.1),
         },
-        "speed_dependent_gain": {"gain_slope": rng.uniform(-0.25, 0.25), "reference_speed_mps": speed},
+        # a smaller slope would be as good as none: missing, where the car has one
+        "speed_dependent_gain": {
+            "gain_slope": rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 0.25),
+            "reference_speed_mps": speed,
+        },
         "aerodynamic_drag": {
             "drag_per_m": rng.uniform(2e-4, 6e-4),
             "wind_mps": 0.0,
