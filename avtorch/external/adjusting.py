@@ -176,7 +176,10 @@ def _measured(record: AnalysisRecord, cars: Sequence[Log], outputs: Sequence[Log
         replace(log, **{name: getattr(out, name) if there else None for name, there in channels.items()})
         for log, out in zip(cars, outputs, strict=True)
     ]
-    return AnalysisRecord.for_budget(logs).measured
+    measured = AnalysisRecord.for_budget(logs).measured
+    if measured.shape != record.measured.shape:  # it stands where the car does not, and too little is left
+        raise InputError("logs: too little of them is driven by both car and simulator for its parameters to be fitted")
+    return measured
 
 
 @dataclass(frozen=True, eq=False)

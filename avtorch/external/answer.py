@@ -109,8 +109,11 @@ def lag_and_gain(
         fitted = adjusted(Rollouts(logs, before, drive, most=100), limits)
     except InputError:  # a drive too short for blocks to be held out
         return []
-    likely = {name: found.winner.moved.get(name, found.baseline[name]).mean for name in before}
-    return [replace(p, own=False, differs=p.differs and _noticed(p, likely[p.name])) for p in fitted.parameters]
+    likely = {**found.baseline, **found.winner.moved}  # which have lag and gain only where these were fitted
+    return [
+        replace(p, own=False, differs=p.differs and _noticed(p, likely.get(p.name, p.car).mean))
+        for p in fitted.parameters
+    ]
 
 
 def _noticed(parameter: ParameterDifference, likely: float) -> bool:
