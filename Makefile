@@ -64,9 +64,10 @@ $(VENV)/.installed-dev: $(VENV)/.torch pyproject.toml
 	$(PIP) --editable '.[dev]'
 	@touch $@ $(VENV)/.installed
 
-# what only the slow tests need, too heavy for `make test`
+# what only the slow tests need, too heavy for `make test`; those of the report also need the system's Chromium
+# (Debian: chromium-headless-shell) and are skipped without it
 $(VENV)/.installed-sumo: $(VENV)/.installed-dev
-	$(PIP) --editable '.[sumo]'
+	$(PIP) --editable '.[sumo,browser]'
 	@touch $@
 
 $(VENV)/.installed-docs: $(VENV)/.torch pyproject.toml

@@ -29,6 +29,7 @@ PACKAGES = (
     "avtorch.plots",
     "avtorch.paper",
     "avtorch.report",
+    "avtorch.fleet",
 )
 
 Documented = ast.Module | ast.ClassDef | ast.FunctionDef

@@ -22,6 +22,8 @@ SLOW = frozenset(
         "avtorch.experiment.prediction.ManoeuvrePrediction",
         "avtorch.experiment.information.information",
         "avtorch.experiment.next_experiment.next_experiment",
+        "avtorch.fleet.folder.read_rows",
+        "avtorch.fleet.run.run_fleet",
         "avtorch.follower.diagnose_follower.FollowerDiagnosis",
         "avtorch.follower.diagnose_follower.diagnose_follower",
         "avtorch.follower.identify.Identified",

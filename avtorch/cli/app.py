@@ -13,9 +13,11 @@ from cyclopts import App, CycloptsError, MissingArgumentError
 from avtorch.cli.blindtest import blindtest
 from avtorch.cli.check import check
 from avtorch.cli.check_simulator import check_simulator
+from avtorch.cli.command_line import given
 from avtorch.cli.compare import compare
 from avtorch.cli.diagnose import diagnose
 from avtorch.cli.estimate import estimate
+from avtorch.cli.fleet import fleet
 from avtorch.cli.one_thread import use_one_thread
 from avtorch.cli.out_folder import alone_in_out
 from avtorch.cli.paper import paper
@@ -34,7 +36,7 @@ app = App(
 )
 app.command(check)
 app.command(check_simulator)
-for _command in (run, estimate, diagnose, compare, stability, validate, blindtest, paper):
+for _command in (run, estimate, diagnose, compare, fleet, stability, validate, blindtest, paper):
     app.command(alone_in_out(_command))
 
 
@@ -55,7 +57,8 @@ def main(tokens: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0, 2 for bad input (one line on stderr), 130 when interrupted."""
     use_one_thread()
     try:
-        app(tokens, exit_on_error=False, print_error=False)
+        with given(sys.argv[1:] if tokens is None else tokens):
+            app(tokens, exit_on_error=False, print_error=False)
     except (InputError, CycloptsError) as fault:
         # one line, however many the parser's own message has
         message = _missing(fault) if isinstance(fault, MissingArgumentError) else str(fault)

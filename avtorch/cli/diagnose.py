@@ -7,12 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
 from rich.markup import escape
 
 from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, positive, seed_number
+from avtorch.cli.command_line import command_line
 from avtorch.cli.diagnosis_table import budget_table, diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.cli.follower import follow, refuse
 from avtorch.cli.pedals import FILES as PEDAL_FILES
@@ -27,6 +28,7 @@ from avtorch.numeral import numeral
 if TYPE_CHECKING:
     from avtorch.experiment import Limits
     from avtorch.io import Log
+    from avtorch.report import Origin
 
 TRACK = Group("Next experiment", sort_key=20)
 TESTED = Group("A simulator of your own", sort_key=19)
@@ -163,7 +165,7 @@ def diagnose(
         "road": road,
         "seconds": seconds,
     }
-    chosen = _effects(effects)
+    chosen = chosen_effects(effects)
     weights = _prior(prior or ())
     assumed = read_simulator("--baseline", baseline)
     if assumed is not None and (simulated or simulator is not None):
@@ -180,8 +182,9 @@ def diagnose(
         idle |= {option: not default for option, default in usual.items()}
         refuse(logs, **idle, **{option: value is not None for option, value in track.items()})
         source = {"map": map, "unit": unit, "stamp": stamp, "vehicle": vehicle, "event": event}
+        origin = _origin(logs, **source, law=law, effects=chosen, seed=seed)
         with talk.whole("Diagnosing") as done:
-            follow(talk, logs[0], out, source=source, law=law, effects=chosen, seed=seed, step=done)
+            follow(talk, logs[0], out, source=source, law=law, effects=chosen, seed=seed, step=done, origin=origin)
         return
     for option, given in (("--vehicle", vehicle), ("--law", law), ("--event", event)):
         if given is not None:
@@ -203,6 +206,26 @@ def diagnose(
         talk.notes(f"{drive.name}", noted)
         quality += [f"{Path(drive.name).name}: {note}" for note in noted]
 
+    origin = _origin(
+        [*logs, *([Path(baseline)] if baseline.endswith(".toml") else [])],
+        map=map,
+        unit=unit,
+        stamp=stamp,
+        baseline=baseline,
+        simulated=simulated,
+        simulator=simulator,
+        step=step,
+        adjust=adjust,
+        rollouts=rollouts,
+        prior=weights,
+        accel_kind=accel_kind,
+        budget=budget,
+        material=material,
+        effects=chosen,
+        pairs=pairs,
+        posterior=posterior,
+        seed=seed,
+    )
     from avtorch.gap.diagnose import diagnose as work
 
     try:
@@ -249,7 +272,7 @@ def diagnose(
         pedals = None if fit is None else fit.map
         written = [*found.write(staged), *write_table(ahead, staged)]
         written += write_exports(found.plant, staged, pedals=pedals)
-        written.append(write_report(found, staged, quality=quality, experiment=ahead))
+        written.append(write_report(found, staged, quality=quality, experiment=ahead, origin=origin))
         written += write_pedals(fit, staged)
     if talk.json:
         talk.done(out, found.to_dict())
@@ -274,6 +297,15 @@ _FILES = {
     ".xml": " (in that tool's terms)",
     ".html": " (to read)",
 }
+
+
+def _origin(paths: Sequence[Path], **settings: Any) -> Origin:
+    """How the answer is made, by the files as they are now; a log's mapping file is one of them."""
+    from avtorch.io.mapping import mapping_beside
+    from avtorch.report import Origin
+
+    beside = [place for place in (mapping_beside(path) for path in paths) if place is not None]
+    return Origin.of(command_line(), [*paths, *beside], settings)
 
 
 def _limits(drives: Sequence[Log], given: Mapping[str, float | None]) -> Limits:
@@ -301,7 +333,8 @@ def _known(option: str, name: str, more: Sequence[str] = ()) -> str:
     return name
 
 
-def _effects(text: str | None) -> list[str] | None:
+def chosen_effects(text: str | None) -> list[str] | None:
+    """The effects of `--effects`, None for all. Raises `InputError` for a name that is not known or comes twice."""
     if text is None:
         return None
     names = [_known("--effects", part.strip()) for part in text.split(",")]

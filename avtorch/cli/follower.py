@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 from rich.table import Table
@@ -14,6 +14,9 @@ from avtorch.cli.diagnosis_table import diagnosis_headline, diagnosis_notes
 from avtorch.cli.pedals import FILES as PEDAL_FILES
 from avtorch.cli.talk import Talk
 from avtorch.errors import InputError
+
+if TYPE_CHECKING:
+    from avtorch.report import Origin
 
 
 def refuse(logs: Sequence[Path], **given: object) -> None:
@@ -35,6 +38,7 @@ def follow(
     effects: Sequence[str] | None,
     seed: int,
     step: Callable[[str, int, int], None],
+    origin: Origin,
 ) -> None:
     """Diagnose the follower, write the answer and the page, and print a summary.
 
@@ -59,7 +63,7 @@ def follow(
     with answer_set(out, (*DIAGNOSIS_FILES, *PEDAL_FILES)) as staged:
         written = [*gap.write(staged), *write_exports(gap.plant, staged)]
         write_json(staged / "diagnosis.json", answer)
-        written.append(write_report(gap, staged, quality=noted, sections={"The loop": lines}))
+        written.append(write_report(gap, staged, quality=noted, sections={"The loop": lines}, origin=origin))
     if talk.json:
         talk.done(out, answer)
         return

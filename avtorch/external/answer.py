@@ -11,6 +11,7 @@ from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.external.adjusting import Rollouts, adjusted
 from avtorch.external.discrepancy import responses
+from avtorch.external.lateness import lateness
 from avtorch.external.surrogate import Surrogate
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
@@ -20,7 +21,7 @@ from avtorch.io import Log
 
 HORIZON_S = 10.0
 _FARTHEST = 4.0  # times as large or small, that lag and gain may be on the car
-_MATERIAL = {"T_L": 0.1, "K_L": 0.03}  # relative difference that a controller notices
+_MATERIAL = {"T_L": 0.1, "K_L": 0.03}  # difference that a controller notices, of how late the car answers and of K_L
 
 
 def rollout_errors(logs: Sequence[Log], simulated: Sequence[Log]) -> dict[str, float]:
@@ -95,7 +96,8 @@ def lag_and_gain(
 
     They differ as the simulator's own parameters do (`adjusted`), by more than a controller notices, and where the
     likelihood, another engine, finds them away to the same side: each has a weak place of its own, the one where an
-    effect's size trades with the gain, the other where a recorder colours the noise.
+    effect's size trades with the gain, the other where a recorder colours the noise. What a controller notices of a lag
+    is how much later the car answers, of all its lateness.
     """
     before = {name: float(getattr(surrogate, name)) for name in _MATERIAL}
     car = surrogate if found.plant is None else found.plant
@@ -110,14 +112,16 @@ def lag_and_gain(
     except InputError:  # a drive too short for blocks to be held out
         return []
     likely = {**found.baseline, **found.winner.moved}  # which have lag and gain only where these were fitted
+    speeds = [log.speed[log.usable].mean() for log in logs if log.speed is not None and log.usable.any()]
+    whole = {"T_L": lateness(surrogate, float(np.mean(speeds)) if speeds else 0.0), "K_L": before["K_L"]}
     return [
-        replace(p, own=False, differs=p.differs and _noticed(p, likely.get(p.name, p.car).mean))
+        replace(p, own=False, differs=p.differs and _noticed(p, likely.get(p.name, p.car).mean, whole[p.name]))
         for p in fitted.parameters
     ]
 
 
-def _noticed(parameter: ParameterDifference, likely: float) -> bool:
-    least = _MATERIAL[parameter.name] * parameter.simulator
+def _noticed(parameter: ParameterDifference, likely: float, whole: float) -> bool:
+    least = _MATERIAL[parameter.name] * whole
     away = [x - parameter.simulator for x in (parameter.car.mean, likely)]
     return min(away) > least or max(away) < -least
 
@@ -138,8 +142,7 @@ def _of_a_size(found: Diagnosis, effect: str, surrogate: Surrogate) -> bool:
     own = surrogate.plant.report()[effect]
     for key, car in _parameters(found, effect).items():
         if key in own:
-            small, large = sorted((abs(float(own[key])), abs(car.mean)))
-            return small > SAME_KIND * large
+            return abs(float(own[key])) > SAME_KIND * abs(car.mean)
     return False
 
 

@@ -17,12 +17,12 @@ import mmap
 import os
 import sys
 import zipfile
-from collections.abc import Iterable
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.child_process import answer, answers_to, limit_memory
 from avtorch.errors import InputError, listed, printable
 
 NEED = "an FMU of FMI 2 or 3 with co-simulation"
@@ -252,44 +252,25 @@ def serve(fmu: RunningFmu, requests: BinaryIO, out: BinaryIO, clock: memoryview[
             else:
                 shown = np.array(fmu.reset(**request))
         except Exception as fault:
-            _answer(out, {"error": fmu.why(fault)})
+            answer(out, {"error": fmu.why(fault)})
             return
         clock[0] = NOT_RUNNING
-        _answer(out, {"numbers": shown.size}, [shown])
-
-
-def _answer(out: BinaryIO, answer: dict[str, Any], arrays: Iterable[FloatArray] = ()) -> None:
-    out.write(json.dumps(answer).encode() + b"\n")
-    for array in arrays:
-        out.write(np.ascontiguousarray(array, dtype=np.float64).tobytes())
-    out.flush()
-
-
-def _limit_memory() -> None:
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
-    _, most = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY if most < 0 else min(MOST_MEMORY, most), most))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        answer(out, {"numbers": shown.size}, [shown])
 
 
 def main() -> None:
     """Serve one FMU until the standard input ends."""
-    _limit_memory()
-    # answers go where the output went; whatever an FMU prints goes nowhere
-    out = os.fdopen(os.dup(1), "wb")
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    limit_memory(MOST_MEMORY)
+    out = answers_to()
     path, where, folder, clock_file = sys.argv[1:]
     with open(clock_file, "r+b") as file:
         clock = memoryview(mmap.mmap(file.fileno(), 8)).cast("d")
     try:
         fmu = RunningFmu(path, where, folder)
     except InputError as fault:
-        _answer(out, {"refused": str(fault)})
+        answer(out, {"refused": str(fault)})
         return
-    _answer(out, fmu.listing())
+    answer(out, fmu.listing())
     serve(fmu, sys.stdin.buffer, out, clock)
 
 

@@ -26,7 +26,8 @@ from avtorch.inference.jerk import JerkDensity, JerkPoints, JerkStatistics, jerk
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.posterior import Posterior, nested_rhat
 from avtorch.inference.quadrature import Quadrature, integrate
-from avtorch.inference.sampler import SamplerSettings, sample
+from avtorch.inference.sampler import sample
+from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.inference.second_order import (
     PositionLagDensity,
     SpeedLagDensity,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Float
-from avtorch.inference.density import Density, ScoredDensity
+from avtorch.inference.density import Density, has_score
 from avtorch.inference.map import Mode
 from avtorch.inference.planes import lower_times, lower_transposed_times
 
@@ -74,7 +74,7 @@ def stiffness(density: Density, coordinates: Coordinates, *, radius: float = 3.0
 
 def score_of(density: Density, z: Float[Tensor, "*draw window d"]) -> Float[Tensor, "*draw window d"]:
     """Gradient of the log density, in closed form where there is one; shape of ``z``."""
-    if isinstance(density, ScoredDensity):
+    if has_score(density):
         with torch.no_grad():
             return density.score(z)
     z = z.detach().requires_grad_()

@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
-from avtorch.inference.density import Density, SelectableDensity
+from avtorch.inference.compiled import Compiled, Unavailable, compiled
+from avtorch.inference.density import Density, has_selection
 from avtorch.inference.other_modes import missed_mass
 from avtorch.inference.pareto import RELIABLE, pareto_k
 from avtorch.inference.planes import from_planes, lower_times, to_planes
@@ -108,6 +109,8 @@ class Exactness:
     def why(self, names: tuple[str, ...]) -> list[str]:
         """What is wrong with each window, ``""`` where the draws follow the density."""
         reasons, holds = [], self.holds()
+        if bool(holds.all()):
+            return [""] * len(holds)
         for w, (known, beyond) in enumerate(zip(self.known().tolist(), self.beyond().movedim(1, 0), strict=True)):
             if bool(holds[w]):
                 reasons.append("")
@@ -150,11 +153,14 @@ class Exactness:
         return cls(each[:, 0].clone(), a, b, c, d, e, f, g, h, i, each[:, 0].clone())
 
 
-def compare_with_exact(density: Density, z: Float[Tensor, "chain draw window parameter"]) -> Exactness:
-    """Compare draws ``z`` ``(chain, draw, window, parameter)`` with their density.
+def compare_with_exact(
+    density: Density, z: Float[Tensor, "chain draw window parameter"], *, eager: bool = False
+) -> Exactness:
+    """Compare draws ``z`` ``(chain, draw, window, parameter)`` with their density; ``eager`` without compiled loops.
 
     The first test takes few points compared with the draws; windows where it is inconclusive get about AGAIN times as
-    many, and those still undecided get AGAIN times more. Windows that pass are searched for other modes.
+    many, which is where a compiled density begins, and those still undecided get AGAIN times more. Windows that pass
+    are searched for other modes.
     """
     total = z.shape[0] * z.shape[1]
     points = min(1024, max(256, total // 8))
@@ -164,17 +170,19 @@ def compare_with_exact(density: Density, z: Float[Tensor, "chain draw window par
     everyone = torch.arange(z.shape[2])
 
     def chosen(where: Tensor) -> Tensor:
-        if isinstance(density, SelectableDensity):
+        if has_selection(density):
             return everyone[where]
         return everyone if bool(where.any()) else everyone[:0]
 
     moments = Moments.of(z)
-    found = weighed(density, moments, points)
+    if not eager and isinstance(compiled(density), Compiled):  # compiled points cost less than another call
+        points, *counts = counts
+    found = weighed(density, moments, points, eager=eager)
     for count in counts:
         # more points do not help where the ratios' tail is clearly heavy
         index = chosen(~(found.clear() if count == closer else found.clear() | found.sure()))
         if len(index):
-            found = found.put(index, weighed(_picked(density, index), moments.select(index), count))
+            found = found.put(index, weighed(_picked(density, index), moments.select(index), count, eager=eager))
     index = chosen(found.holds())
     if len(index):
         part = moments.select(index)
@@ -183,7 +191,7 @@ def compare_with_exact(density: Density, z: Float[Tensor, "chain draw window par
 
 
 def _picked(density: Density, index: Tensor) -> Density:
-    if isinstance(density, SelectableDensity) and len(index) < density.windows:
+    if has_selection(density) and len(index) < density.windows:
         return density.select(index)
     return density
 
@@ -237,14 +245,20 @@ class Moments(NamedTuple):
         return self if len(index) == len(self.mean) else Moments(*(x[index] for x in self))
 
 
-def weighed(density: Density, moments: Moments, points: int) -> Exactness:
+def weighed(density: Density, moments: Moments, points: int, *, eager: bool = False) -> Exactness:
     """Compare draws of these moments with their density: one call of its ``log_prob``, or a few for many windows."""
     mean, lower, share, mean_error, sd_error = moments
     base, log_proposal = proposal(points, mean.shape[-1])
     found = []
-    size = max(1, BLOCK // points) if isinstance(density, SelectableDensity) else len(mean)
+    size = max(1, BLOCK // points) if has_selection(density) else len(mean)
     for part in torch.arange(len(mean)).split(size):
-        found.append(_weighed(_picked(density, part), mean[part], lower[part], base, log_proposal))
+        chosen = _picked(density, part)
+        loops = Unavailable("not asked for") if eager else compiled(chosen)
+        if isinstance(loops, Unavailable):
+            found.append(_weighed(chosen, mean[part], lower[part], base, log_proposal))
+        else:
+            log_ratio, moments_of = loops.weighed(mean[part], lower[part], base, log_proposal, TAIL)
+            found.append((pareto_k(log_ratio), *moments_of))
     k, m, variance, tail, m_error, v_error, tail_error = (torch.cat(x) for x in zip(*found, strict=True))
     spread = variance.sqrt()
     # binomial error of the tail's share, for the mean's effective number of independent draws

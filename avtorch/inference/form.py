@@ -13,7 +13,7 @@ from avtorch.inference.density import Density
 from avtorch.inference.excitation import ExcitationRule
 from avtorch.inference.jerk import JerkDensity, JerkStatistics
 from avtorch.inference.priors import Prior, default_jerk_noise_prior
-from avtorch.inference.sampler import SamplerSettings
+from avtorch.inference.sampler_settings import SamplerSettings
 
 Rows = Mapping[str, Tensor]
 """One window: ``time`` ``(time,)`` [s] and ``usable`` and the measured columns, each ``(vehicle, time)``."""

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int, Real
+from avtorch.inference.exponential_form import ExponentialForm, terms_of
 from avtorch.inference.planes import as_planes, from_planes, to_planes
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
 from avtorch.vehicle.glvd import glvd_jerk
@@ -145,6 +146,8 @@ class JerkDensity:
         # residual sum of squares as a quadratic form in (1, 1/T, K/T), divided by two once here
         rows = ((s.jj, s.aj, -s.uj), (s.aj, s.aa, -s.au), (-s.uj, -s.au, s.uu))
         self._half_form = 0.5 * torch.stack([torch.stack(row, -1) for row in rows], -2)
+        # made when asked for: the prior that it was made with, and the form
+        self._form: tuple[Prior, ExponentialForm] | None = None
         if len(s.n) == 1:
             self._form_of_one = 2 * self._half_form[0]
             self._points_of_one = -s.n * torch.tensor([[0.0], [0.0], [1.0]], dtype=torch.float64)
@@ -171,6 +174,23 @@ class JerkDensity:
 
     def log_prob(self, z: Float[Tensor, "*draw window 3"]) -> Float[Tensor, "*draw window"]:
         return self.log_likelihood(z) + self.prior.log_prob(z)
+
+    def exponential_form(self) -> ExponentialForm | None:
+        """Minus :meth:`log_prob` in the form that a compiled walk takes; ``None`` for a prior that is not of it."""
+        return self._form_with(_LOG_SCALED, torch.zeros(3, dtype=torch.float64))
+
+    def _form_with(self, exponents: Tensor, offsets: Tensor) -> ExponentialForm | None:
+        if self._form is not None and self._form[0] is self.prior:
+            return self._form[1]
+        prior = terms_of(self.prior, self.windows)
+        if prior is None:
+            return None
+        n = self.statistics.n
+        linear = prior.linear + n[:, None] * prior.linear.new_tensor([0.0, 0.0, 1.0])
+        terms = replace(prior, constant=prior.constant + 0.5 * _LOG_2PI * n, linear=linear)
+        form = ExponentialForm(terms, exponents, offsets, 2 * self._half_form)
+        self._form = (self.prior, form)
+        return form
 
     def score(self, z: Float[Tensor, "*draw window 3"]) -> Float[Tensor, "*draw window 3"]:
         """Gradient of :meth:`log_prob` in ``z``, in closed form, parameter by parameter (see :func:`as_planes`)."""

@@ -11,7 +11,7 @@ from avtorch.inference.latent import LatentDensity, default_noise_prior, latent_
 from avtorch.inference.latent_excitation import latent_excitation
 from avtorch.inference.latent_window import LatentWindow
 from avtorch.inference.priors import Prior
-from avtorch.inference.sampler import SamplerSettings
+from avtorch.inference.sampler_settings import SamplerSettings
 
 #: Each step runs a filter over the rows for every chain, so there are fewer and longer chains. Some parameters are
 #: determined by little more than their prior, and their posteriors are so far from normal that importance sampling

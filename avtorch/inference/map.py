@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
-from avtorch.inference.density import Density, ScoredDensity
+from avtorch.inference.density import Density, ScoredDensity, has_score
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def _expand(
     z = z.detach()
     if from_values:
         potential, gradient, hessian = _from_values(density, z)
-    elif isinstance(density, ScoredDensity):
+    elif has_score(density):
         potential, gradient, hessian = _from_score(density, z)
     else:
         potential, gradient, hessian = _from_graph(density, z)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from avtorch.arrays import Float
 from avtorch.inference.coordinates import score_of
-from avtorch.inference.density import Density, SelectableDensity
+from avtorch.inference.density import Density, has_selection
 from avtorch.inference.map import find_mode
 from avtorch.inference.planes import lower_times, lower_transposed_times
 
@@ -47,10 +47,10 @@ def missed_mass(
     high = (w.square().sum(-1) > FAR**2) & (height[1:] > height[:1] - DEPTH)
     missed = mean.new_zeros(len(mean))
     index = high.any(0).nonzero().squeeze(-1)
-    if not len(index) or not (isinstance(density, SelectableDensity) or len(mean) == 1):
+    if not len(index) or not (has_selection(density) or len(mean) == 1):
         return missed
     best = height[1:].masked_fill(~high, -torch.inf).argmax(0)[index]
-    chosen = density.select(index) if isinstance(density, SelectableDensity) and len(index) < len(mean) else density
+    chosen = density.select(index) if has_selection(density) and len(index) < len(mean) else density
     other = find_mode(chosen, start=end[best, index])
     away = torch.linalg.solve_triangular(lower[index], (other.z - mean[index])[..., None], upper=False)[..., 0]
     volume = (other.scale.diagonal(dim1=-2, dim2=-1).abs().log() - lower[index].diagonal(dim1=-2, dim2=-1).log()).sum(

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
+from avtorch.inference.exponential_form import PotentialTerms, terms_of
 from avtorch.inference.planes import join_planes
 from avtorch.vehicle.broadcasting import broadcast_shape
 
@@ -68,6 +69,12 @@ class LogNormalPrior:
     def score(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
         return (self._log_median - z).mul_(self._precision)
 
+    def potential_terms(self, windows: int) -> PotentialTerms:
+        half = 0.5 * (self._precision * self._log_median.square()).sum()
+        constant = half + self.log_sd.log().sum() + 0.5 * len(self.median) * _LOG_2PI
+        linear, quadratic = -self._precision * self._log_median, self._precision.diag()
+        return PotentialTerms.of(windows, len(self.median), constant=constant, linear=linear, quadratic=quadratic)
+
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> LogNormalPrior:
         return self
 
@@ -101,6 +108,11 @@ class HalfNormalPrior:
 
     def score(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
         return (2 * z).exp_().mul_(self._minus_precision).add_(1)
+
+    def potential_terms(self, windows: int) -> PotentialTerms:
+        constant = self.scale.log().sum() - len(self.scale) * 0.5 * math.log(2 / math.pi)
+        square = -self._minus_precision
+        return PotentialTerms.of(windows, len(self.scale), constant=constant, linear=-1.0, own_square=square)
 
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> HalfNormalPrior:
         return self
@@ -143,6 +155,16 @@ class QuadrantNormal:
     def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
         value = z.exp()
         return 1 - value * (value - self.mean) / self.variance
+
+    def potential_terms(self, windows: int) -> PotentialTerms:
+        return PotentialTerms.of(
+            windows,
+            self.mean.shape[-1],
+            constant=0.5 / self.variance * self.mean.square().sum(-1) + self._log_mass,
+            linear=-1.0,
+            own_linear=-self.mean / self.variance,
+            own_square=1 / self.variance,
+        )
 
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> QuadrantNormal:
         return QuadrantNormal(self.mean[index], self.variance)
@@ -188,6 +210,13 @@ class LogSpaceNormal:
     def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
         return -torch.einsum("wji,wjk,...wk->...wi", self._inverse, self._inverse, z - self.mean_z)
 
+    def potential_terms(self, windows: int) -> PotentialTerms:
+        d, mean = self.mean_z.shape[-1], self.mean_z
+        precision = self._inverse.mT @ self._inverse
+        linear = -(precision @ mean[..., None])[..., 0]
+        constant = -0.5 * (linear * mean).sum(-1) + self._half_log_det + 0.5 * d * _LOG_2PI
+        return PotentialTerms.of(windows, d, constant=constant, linear=linear, quadratic=precision)
+
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> LogSpaceNormal:
         return LogSpaceNormal(self.mean_z[index], self.cov_z[index])
 
@@ -213,6 +242,10 @@ class Joint:
 
     def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
         return join_planes(self.actuation.score(z[..., :2]), self.noise.score(z[..., 2:]))
+
+    def potential_terms(self, windows: int) -> PotentialTerms | None:
+        first, rest = terms_of(self.actuation, windows), terms_of(self.noise, windows)
+        return None if first is None or rest is None else first.beside(rest)
 
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Joint:
         return Joint(self.actuation.select(index), self.noise.select(index))
@@ -242,6 +275,10 @@ class Switch:
 
     def score(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
         return torch.where(self.started[:, None], self.later.score(z), self.first.score(z))
+
+    def potential_terms(self, windows: int) -> PotentialTerms | None:
+        first, later = terms_of(self.first, windows), terms_of(self.later, windows)
+        return None if first is None or later is None else later.where(self.started, first)
 
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Prior:
         started = self.started[index]

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LRScheduler
 
 from avtorch.arrays import Bool, Float
 from avtorch.errors import InputError
-from avtorch.inference.coordinates import Coordinates, Whitening, stiffness
-from avtorch.inference.density import Density, ScoredDensity, SelectableDensity, SubsampledDensity, constrained
+from avtorch.inference.compiled import chosen
+from avtorch.inference.coordinates import Coordinates, stiffness
+from avtorch.inference.density import Density, SubsampledDensity, constrained, has_score, has_selection
 from avtorch.inference.exactness import Exactness, compare_with_exact
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.planes import empty_planes
 from avtorch.inference.posterior import Posterior, nested_rhat
-from avtorch.inference.sgld import SGLD, Noise
+from avtorch.inference.sampler_settings import SamplerSettings
+from avtorch.inference.sgld import SGLD
 
 #: Chains times windows sampled at once: enough to make the cost of a call negligible, few enough for the processor's
 #: cache.
@@ -35,86 +34,6 @@ PILOT = 8.0
 STUCK = 256.0
 #: Largest slope that a burn-in step follows, in whitened coordinates; within the posterior slopes are a few units.
 TAMED = 10.0
-
-MakeOptimizer = Callable[[list[Tensor], float, torch.Generator | None], Optimizer]
-
-
-@dataclass(frozen=True)
-class SamplerSettings:
-    """Settings of Algorithm 1. The space is whitened by the Laplace covariance at the mode, so one step fits every car.
-
-    A window whose posterior is skewed gets a shorter step and in proportion more of them (:func:`stiffness`), so that
-    every window gets about the same number of effective draws: a new car needs no tuning.
-
-    Attributes:
-        chains: chains per window.
-        draws: draws collected per chain, after burn-in and thinning.
-        burn_in: steps dropped at the start (the paper's ``c``).
-        thinning: steps per collected draw.
-        step: ``h`` in the whitened space. With averaged noise the autocorrelation of a Gaussian is ``1 - h/2`` a step.
-        noise: see :class:`SGLD`.
-        batch: points per minibatch, or ``None`` for the whole window.
-        spread: chains start this many posterior SDs around the mode; 0 starts them at the mode.
-        schedule: makes a learning-rate scheduler from the optimizer, or ``None`` for a constant step.
-        longest: maximum factor of steps for a skewed window; a low value saves time where a step is expensive, but then
-            the most skewed windows do not mix.
-        attempts: how often a window whose chains diverge, disagree or miss the density is run again with half the step.
-        whitening: ``"full"``, or for comparison ``"diagonal"`` or ``"none"`` (see :class:`Coordinates`).
-        optimizer: makes another optimizer than SGLD from ``(parameters, step, generator)``.
-        compare: compare the draws with the exact density (:mod:`avtorch.inference.exactness`), also with a minibatch, a
-            schedule or another optimizer. Set it to false only for a density too expensive to evaluate at some hundred
-            points; ``converged`` then means only that the chains agree with each other.
-
-    Raises:
-        InputError: naming the setting that is out of range.
-
-    Example:
-        >>> from avtorch.inference import SamplerSettings
-        >>> few_long = SamplerSettings(chains=4, draws=2000, burn_in=500)  # for `sample` or `SequentialInference`
-        >>> slower = few_long.slower(2.0)
-        >>> slower.step, slower.burn_in, slower.thinning
-        (2.0, 2000, 4)
-    """
-
-    chains: int = 1024
-    draws: int = 8
-    burn_in: int = 8
-    thinning: int = 2
-    step: float = 2.0
-    noise: Noise = "averaged"
-    batch: int | None = None
-    spread: float = 0.0
-    schedule: Callable[[Optimizer], LRScheduler] | None = None
-    longest: float = 64.0
-    attempts: int = 4
-    whitening: Whitening = "full"
-    optimizer: MakeOptimizer | None = None
-    compare: bool = True
-
-    def __post_init__(self) -> None:
-        for name, least in (("chains", 1), ("draws", 4), ("burn_in", 0), ("thinning", 1), ("attempts", 1)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name}: {getattr(self, name)} is less than {least}")
-        if not 0 < self.step < 4:
-            raise InputError(f"step: {self.step} is not in (0, 4), where the whitened step is stable")
-        if not 0 <= self.spread < float("inf"):
-            raise InputError(f"spread: {self.spread} is not a finite number of posterior SDs, 0 or more")
-        if self.batch is not None and self.batch < 1:
-            raise InputError(f"batch: {self.batch} is less than 1")
-        if not self.longest >= 1:
-            raise InputError(f"longest: {self.longest} is not 1 or more")
-        if self.whitening not in ("full", "diagonal", "none"):
-            raise InputError(f"whitening: {self.whitening!r} is none of 'full', 'diagonal', 'none'")
-
-    def slower(self, times: float) -> SamplerSettings:
-        """The same settings with ``times`` as many steps, for a step that is ``times`` shorter.
-
-        A posterior that is steep on one side is flat on the other, which chains reach even later: the burn-in grows
-        further.
-        """
-        times = min(times, self.longest)
-        burn_in = math.ceil(times * min(times, 5.0) * self.burn_in)
-        return replace(self, burn_in=burn_in, thinning=math.ceil(times * self.thinning))
 
 
 def sample(
@@ -171,7 +90,7 @@ def sample(
             values = constrained(density, z)
             draws[:, :, new] = values if len(new) == len(index) else values[:, :, fresh]
             if settings.compare:
-                found = found.put(index, compare_with_exact(part, z), fresh)
+                found = found.put(index, compare_with_exact(part, z, eager=settings.walk == "eager"), fresh)
         slowdown = 2 * slowdown
         again = diverged | unmixed
         if settings.compare:
@@ -243,7 +162,7 @@ def _longer(slowdown: Float[Tensor, "*window"]) -> Float[Tensor, "*window"]:
 
 def _batches(density: Density, index: Tensor, slowdown: Tensor, chains: int) -> list[Tensor]:
     """Windows to sample together: with equal numbers of steps, and not too many windows at once."""
-    if not isinstance(density, SelectableDensity):
+    if not has_selection(density):
         return [torch.arange(density.windows)]
     size = max(1, BLOCK // chains)
     times = _longer(slowdown[index])
@@ -259,7 +178,7 @@ def _batches(density: Density, index: Tensor, slowdown: Tensor, chains: int) -> 
 
 
 def _select(density: Density, index: Tensor) -> Density:
-    if len(index) == density.windows or not isinstance(density, SelectableDensity):
+    if len(index) == density.windows or not has_selection(density):
         return density
     return density.select(index)
 
@@ -308,6 +227,10 @@ def _walk(
     if settings.spread > 0:
         start = torch.randn(shape, dtype=w.dtype, generator=generator)
         w += settings.spread * slowdown.sqrt()[:, None] * start
+    loops = chosen(density, settings)
+    if loops is not None:
+        kept = loops.draws(coordinates, w, settings, TAMED, generator)
+        return coordinates, kept.transpose(0, 1)
     w.requires_grad_()
     if settings.optimizer is None:
         options = {"noise": settings.noise, "noise_dtype": torch.float32}
@@ -352,7 +275,7 @@ def _gradient(
 ) -> Callable[[], Tensor]:
     """``dU/dw`` at the present ``w``; for a density with its own score no graph is built."""
     state = w.detach()
-    if batch is None and isinstance(density, ScoredDensity):
+    if batch is None and has_score(density):
         scored = density
         return lambda: coordinates.pull_back(scored.score(coordinates.z(state))).neg_()
 

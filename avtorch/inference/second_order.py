@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int, Real
+from avtorch.inference.exponential_form import ExponentialForm
 from avtorch.inference.jerk import JerkDensity, JerkStatistics
 from avtorch.inference.planes import as_planes
 from avtorch.inference.priors import HalfNormalPrior, Joint, LogNormalPrior, Prior
@@ -125,6 +126,11 @@ class PositionLagDensity(JerkDensity):
         """``(1, 2 zeta/T, 1/T^2) / sigma``."""
         log_T, log_zeta, log_sigma = z.unbind(-1)
         return torch.stack([-log_sigma, math.log(2) + log_zeta - log_T - log_sigma, -2 * log_T - log_sigma], -1).exp()
+
+    def exponential_form(self) -> ExponentialForm | None:
+        """Minus :meth:`log_prob` in the form that a compiled walk takes; ``None`` for a prior that is not of it."""
+        exponents = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 1.0, -1.0], [-2.0, 0.0, -1.0]], dtype=torch.float64)
+        return self._form_with(exponents, torch.tensor([0.0, math.log(2), 0.0], dtype=torch.float64))
 
     def score(self, z: Float[Tensor, "*draw window 3"]) -> Float[Tensor, "*draw window 3"]:
         """Gradient of :meth:`log_prob` in ``z``, in closed form."""

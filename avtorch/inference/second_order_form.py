@@ -13,7 +13,7 @@ from avtorch.inference.excitation import ExcitationRule
 from avtorch.inference.form import Rows, WindowLikelihood
 from avtorch.inference.jerk import JerkStatistics
 from avtorch.inference.priors import Prior
-from avtorch.inference.sampler import SamplerSettings
+from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.inference.second_order import PositionLagDensity, SpeedLagDensity, default_accel_noise_prior
 
 

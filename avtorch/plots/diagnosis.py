@@ -1,8 +1,12 @@
-"""Drawings of a diagnosis: the gap over time, where it lies, its cause, how far it shrinks, the loop's stability."""
+"""Drawings of a diagnosis: the gap over time, where it lies, its cause, how far it shrinks, the loop's stability.
+
+Figures are as wide as a desk's page; with `narrow` as a phone, panels one above the other.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -22,33 +26,83 @@ _SECONDS = 25.0  # seconds of a drive in a picture
 _NAMES = {"accel": "acceleration [m/s²]", "speed": "speed [m/s]"}
 
 
-def budget_bars(ax: Axes, budget: Budget) -> Axes:
-    """The gap's budget: each part's share begins where the one before it ends; whiskers are central 90 % intervals."""
+def budget_bars(ax: Axes, budget: Budget, *, narrow: bool = False) -> Axes:
+    """The gap's budget: each part's share begins where the one before it ends; whiskers are central 90 % intervals.
+
+    `narrow`: names above their bars rather than beside them.
+    """
     named = [(p.name, p.share, BLUE if p.probability >= LIKELY else SKY) for p in budget.parts]
     rows = [*named, ("unexplained", budget.unexplained.share, ORANGE)]
     begun = 0.0
     for i, (_, share, colour) in enumerate(rows):
-        ax.barh(i, share.mean, left=begun, color=colour, height=0.62)
+        ax.barh(i, share.mean, left=begun, color=colour, height=_height(narrow))
         ax.plot([begun + share.q05, begun + share.q95], [i, i], color=BLACK, lw=1.0)
         ax.text(max(begun + share.q95, begun + share.mean) + 0.012, i, percent(share.mean), va="center", fontsize=9)
         if i:
             ax.plot([begun, begun], [i - 1, i], color=GREY, lw=0.6)
         begun += share.mean
-    ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+    _name_bars(ax, [name for name, _, _ in rows], narrow=narrow, down=True)
     ax.set(
         xlabel=f"share of the gap in held-out {budget.horizon_s:.3g} s rollouts",
-        xlim=(0, 1.12),
-        ylim=(len(rows) - 0.4, -0.6),
+        xlim=(0, 1.25 if narrow else 1.12),
+        ylim=(len(rows) - 0.4, -0.8 if narrow else -0.6),
     )
+    ax.set_xticks(_UP_TO_ONE)
     ax.xaxis.set_major_formatter(PercentFormatter(1.0, 0, " %"))
     ax.grid(axis="y", visible=False)
     return ax
 
 
-def gap_on_the_road(ax: Axes, found: Diagnosis, *, seconds: float = _SECONDS) -> Axes:
-    """Measured, simulated before and after the repair, over the stretch of the drive in which the effect does most.
+_UP_TO_ONE = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+
+
+def _height(narrow: bool) -> float:
+    """Of a bar in rows: a narrow picture has the bar's name above it."""
+    return 0.4 if narrow else 0.64
+
+
+def _name_bars(ax: Axes, names: Sequence[str], *, narrow: bool, down: bool) -> None:
+    """Names beside the bars, or in a `narrow` picture above them, where a long one costs the bars no width.
+
+    `down`: rows are counted from the top.
+    """
+    ax.set_yticks(range(len(names)), [] if narrow else names)
+    if narrow:
+        ax.tick_params(axis="y", length=0)
+        for i, name in enumerate(names):
+            ax.text(0.0, i + (-0.26 if down else 0.26), name, va="bottom", fontsize=9)
+
+
+@dataclass(frozen=True)
+class DriveStretch:
+    """The stretch of the drive in which the effect does most: `time` (row,) [s] from its log's start and `lines` by
+    label, each (row,), of the quantity that `axis` names with its unit.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.plots.diagnosis import DriveStretch
+        >>> DriveStretch("speed [m/s]", np.arange(2.0), {"measured": np.zeros(2)}).axis
+        'speed [m/s]'
+    """
+
+    axis: str
+    time: FloatArray = field(repr=False)
+    lines: Mapping[str, FloatArray] = field(repr=False)
+
+
+def stretch_of(found: Diagnosis, *, seconds: float = _SECONDS) -> DriveStretch:
+    """What was measured, and what is simulated before and after the repair, where the effect does most.
 
     The channel is the acceleration, unless only the speed shows it. Raises `InputError` where there are no traces.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, simulate
+        >>> from avtorch.gap import DeadTime, plant
+        >>> from avtorch.plots.diagnosis import stretch_of
+        >>> late = plant([DeadTime(0.4)], sigma=0.0)
+        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
+        >>> list(stretch_of(diagnose(log, effects=["dead_time"], pairs=False)).lines)
+        ['measured', 'baseline simulator', 'with dead_time']
     """
     traces = found.traces
     if traces is None:
@@ -58,23 +112,28 @@ def gap_on_the_road(ax: Axes, found: Diagnosis, *, seconds: float = _SECONDS) ->
     # unlike the speed, the acceleration shows an event at its own time
     k = 0 if shows[0] > 1.1 else int(np.argmax(shows))
     inside = _liveliest(traces.time, traces.stretch, np.abs(traces.before[k] - traces.after[k]), seconds)
-    time = traces.time[inside]
     offset = np.zeros(2)
     if traces.channels[k] == "speed":
         # a rollout begun at the measured speed
         offset = np.array([(traces.measured[k] - x[k])[inside][0] for x in (traces.before, traces.after)])
-    ax.plot(time, traces.measured[k][inside], color=BLACK, lw=1.2, label="measured")
-    ax.plot(time, traces.before[k][inside] + offset[0], color=VERMILLION, label="baseline simulator")
+    lines = {"measured": traces.measured[k][inside], "baseline simulator": traces.before[k][inside] + offset[0]}
     if found.winner.effects:
         named = found.verdict.names
         label = f"with {' and '.join(named)}" if len(named) < 3 else f"with all {len(named)} effects"
-        ax.plot(time, traces.after[k][inside] + offset[1], color=BLUE, label=label)
+        lines[label] = traces.after[k][inside] + offset[1]
+    return DriveStretch(_NAMES[traces.channels[k]], traces.time[inside], lines)
+
+
+def gap_on_the_road(ax: Axes, found: Diagnosis, *, seconds: float = _SECONDS) -> Axes:
+    """The lines of `stretch_of` over time. Raises `InputError` where there are no traces."""
+    stretch = stretch_of(found, seconds=seconds)
+    for (label, values), colour in zip(stretch.lines.items(), (BLACK, VERMILLION, BLUE), strict=False):
+        ax.plot(stretch.time, values, color=colour, lw=1.2 if colour == BLACK else None, label=label)
     ax.set(
         xlabel=time_label(found.log.epochs_s[0] if len(found.log.epochs_s) == 1 else 0.0),
-        ylabel=_NAMES[traces.channels[k]],
+        ylabel=stretch.axis,
     )
     ax.margins(x=0)
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, 1.14), ncols=3)
     return ax
 
 
@@ -93,11 +152,36 @@ def _liveliest(time: FloatArray, stretch: IntArray, size: FloatArray, seconds: f
     return best
 
 
-def where_it_lies(ax: Axes, found: Diagnosis, axis: Axis) -> Axes:
-    """Along `axis` (time, speed or command): the share of rows, the share of the effect's response, and the named
-    parts.
+@dataclass(frozen=True)
+class EffectHistogram:
+    """Along an axis: the shares of the rows and of the effect's response between `edges` (bin + 1,), each (bin,).
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.plots.diagnosis import EffectHistogram
+        >>> EffectHistogram(np.arange(3.0), np.array([0.5, 0.5]), np.array([0.1, 0.9])).edges.shape
+        (3,)
+    """
+
+    edges: FloatArray
+    rows: FloatArray = field(repr=False)
+    effect: FloatArray = field(repr=False)
+
+
+def histogram_of(found: Diagnosis, axis: Axis, *, bins: int = 30) -> EffectHistogram:
+    """Where along `axis` (time, speed or command) the drive and the effect's response are.
 
     Raises `InputError` where there are no traces or the log has no such signal.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, simulate
+        >>> from avtorch.gap import DeadTime, plant
+        >>> from avtorch.plots.diagnosis import histogram_of
+        >>> late = plant([DeadTime(0.4)], sigma=0.0)
+        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
+        >>> counts = histogram_of(diagnose(log, effects=["dead_time"], pairs=False), "command", bins=4)
+        >>> round(float(counts.rows.sum()), 6), round(float(counts.effect.sum()), 6)
+        (1.0, 1.0)
     """
     traces = found.traces
     if traces is None:
@@ -106,12 +190,22 @@ def where_it_lies(ax: Axes, found: Diagnosis, axis: Axis) -> Axes:
     if x is None:
         raise InputError(f"axis: found {axis!r}, needs time, command, or speed where it was measured")
     low, high = np.quantile(x, (0.002, 0.998))
-    edges = np.linspace(low, high if high > low else low + 1, 31)
+    edges = np.linspace(low, high if high > low else low + 1, bins + 1)
     rows, _ = np.histogram(x, edges)
     does, _ = np.histogram(x, edges, weights=traces.does)
-    ax.stairs(rows / max(rows.sum(), 1), edges, fill=True, color="#DDDDDD", label="the drive")
-    if does.sum() > 0:
-        ax.stairs(does / does.sum(), edges, color=BLUE, lw=1.6, label="the effect")
+    whole = does.sum()
+    return EffectHistogram(edges, rows / max(rows.sum(), 1), does / whole if whole > 0 else np.zeros(bins))
+
+
+def where_it_lies(ax: Axes, found: Diagnosis, axis: Axis) -> Axes:
+    """Along `axis` (time, speed or command): the shares of `histogram_of` and the named parts.
+
+    Raises `InputError` where there are no traces or the log has no such signal.
+    """
+    shares = histogram_of(found, axis)
+    ax.stairs(shares.rows, shares.edges, fill=True, facecolor="#DDDDDD", edgecolor=GREY, lw=0.8, label="the drive")
+    if shares.effect.any():
+        ax.stairs(shares.effect, shares.edges, color=BLUE, lw=1.6, label="the effect")
     for part in found.where:
         if part.axis == axis and not isinstance(part.begin, str) and not isinstance(part.end, str):
             away = found.log.epochs_s[0] if axis == "time" else 0.0
@@ -123,23 +217,29 @@ def where_it_lies(ax: Axes, found: Diagnosis, axis: Axis) -> Axes:
     return ax
 
 
-def probabilities(ax: Axes, found: Diagnosis, *, most: int = 7) -> Axes:
-    """One bar per candidate, the most probable first; the alias set in blue, the rest in grey."""
+def probabilities(ax: Axes, found: Diagnosis, *, most: int = 7, narrow: bool = False) -> Axes:
+    """One bar per candidate, the most probable first; the alias set in blue, the rest in grey.
+
+    `narrow`: names above their bars rather than beside them.
+    """
     some = list(found.candidates[:most])[::-1]
     colours = [BLUE if c.name in found.verdict.alias_set else "#BBBBBB" for c in some]
-    ax.barh(range(len(some)), [c.probability for c in some], color=colours, height=0.7)
-    ax.set_yticks(range(len(some)), [_label(c) for c in some])
+    ax.barh(range(len(some)), [c.probability for c in some], color=colours, height=_height(narrow))
+    _name_bars(ax, [_label(c, "" if narrow else "\n") for c in some], narrow=narrow, down=False)
     for i, c in enumerate(some):
         ax.text(c.probability + 0.01, i, f"{c.probability:.2f}", va="center", fontsize=9, color=BLACK)
-    ax.set(xlabel="probability", xlim=(0, 1.1))
+    ax.set_xticks(_UP_TO_ONE)
+    ax.set(xlabel="probability", xlim=(0, 1.2 if narrow else 1.1))
+    ax.set_ylim(-0.5, len(some) - (0.2 if narrow else 0.5))
     ax.grid(axis="y", visible=False)
     return ax
 
 
-def _label(candidate: Candidate) -> str:
-    """A hypothesis's name on at most two lines."""
+def _label(candidate: Candidate, end: str) -> str:
+    """A hypothesis's name, its two lines parted by `end` or on one."""
     count = len(candidate.effects)
-    return candidate.name.replace("+", " +\n") if count < 3 else f"the {count} effects\nof the budget"
+    gap = end or " "
+    return candidate.name.replace("+", f" +{gap}") if count < 3 else f"the {count} effects{gap}of the budget"
 
 
 _HORIZONS = ("0.5s", "2s", "10s", "whole")
@@ -197,55 +297,80 @@ def loop_gain(ax: Axes, chains: Mapping[str, tuple[Chain, dict]], *, colours: Ma
 
 
 @styled
-def budget_figure(found: Diagnosis) -> Figure:
+def budget_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     """The budget of the gap. Raises `InputError` where the diagnosis has none."""
     if found.budget is None:
         raise InputError("budget: the diagnosis has none to draw; its drives are too short to hold out blocks")
-    figure = Figure(figsize=(8.6, 1.0 + 0.36 * (len(found.budget.parts) + 1)), layout="constrained")
-    budget_bars(figure.add_subplot(), found.budget)
+    figure = _bars_figure(len(found.budget.parts) + 1, narrow)
+    budget_bars(figure.add_subplot(), found.budget, narrow=narrow)
     return figure
 
 
 @styled
-def road_figure(found: Diagnosis) -> Figure:
+def road_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     """The picture of the gap over time."""
-    figure = Figure(figsize=(8.6, 3.3), layout="constrained")
-    gap_on_the_road(figure.add_subplot(), found)
+    figure = Figure(figsize=(_NARROW, 3.6) if narrow else (_WIDE, 3.3), layout="constrained")
+    ax = gap_on_the_road(figure.add_subplot(), found)
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper left", ncols=1 if narrow else 3)
     return figure
 
 
 @styled
-def where_figure(found: Diagnosis) -> Figure:
+def where_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     """Where the gap lies, along every axis that the log has."""
     axes: list[Axis] = ["time", "command"]
     if found.traces is not None and found.traces.speed is not None:
         axes.insert(1, "speed")
-    figure = Figure(figsize=(8.6, 2.5), layout="constrained")
-    for i, axis in enumerate(axes):
-        ax = where_it_lies(figure.add_subplot(1, len(axes), i + 1), found, axis)
-        if i:
+    figure, panels = _panels(len(axes), 2.6, narrow)
+    for i, (ax, axis) in enumerate(zip(panels, axes, strict=True)):
+        where_it_lies(ax, found, axis)
+        if i and not narrow:
             ax.set_ylabel("")
-        else:
-            ax.legend(loc="upper left", fontsize=8)
+    _shared_legend(figure, panels, narrow)
     return figure
 
 
 @styled
-def which_figure(found: Diagnosis) -> Figure:
+def which_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     """Candidates and their probabilities."""
-    figure = Figure(figsize=(8.6, 0.9 + 0.36 * min(len(found.candidates), 7)), layout="constrained")
-    probabilities(figure.add_subplot(), found)
+    figure = _bars_figure(min(len(found.candidates), 7), narrow)
+    probabilities(figure.add_subplot(), found, narrow=narrow)
     return figure
 
 
 @styled
-def shrinkage_figure(found: Diagnosis) -> Figure:
+def shrinkage_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     """How far the gap shrinks, a panel per channel."""
     scores = found.shrinkage
     names = [] if scores is None else [w for w in ("accel", "speed") if f"rollout_rmse_{w}" in scores.by_metric]
-    figure = Figure(figsize=(8.6, 3.0), layout="constrained")
-    for i, channel in enumerate(names):
-        ax = shrinkage(figure.add_subplot(1, len(names), i + 1), found, channel)
-        if not i:
-            ax.legend(fontsize=8)
+    figure, panels = _panels(len(names), 3.2, narrow)
+    for ax, channel in zip(panels, names, strict=True):
+        shrinkage(ax, found, channel)
+    _shared_legend(figure, panels, narrow)
     return figure
+
+
+_WIDE, _NARROW = 8.6, 4.0
+"""Widths [in]: on a desk, and on a phone, where the letters stay as large."""
+
+
+def _bars_figure(rows: int, narrow: bool) -> Figure:
+    """For so many bars."""
+    return Figure(figsize=(_NARROW, 0.9 + 0.5 * rows) if narrow else (_WIDE, 0.9 + 0.36 * rows), layout="constrained")
+
+
+def _panels(count: int, height: float, narrow: bool) -> tuple[Figure, list[Axes]]:
+    """Panels of that height [in] side by side, or in a `narrow` figure one above the other."""
+    if narrow:
+        figure = Figure(figsize=(_NARROW, 0.6 + 0.8 * height * count), layout="constrained")
+        return figure, [figure.add_subplot(count, 1, i + 1) for i in range(count)]
+    figure = Figure(figsize=(_WIDE, height), layout="constrained")
+    return figure, [figure.add_subplot(1, count, i + 1) for i in range(count)]
+
+
+def _shared_legend(figure: Figure, panels: Sequence[Axes], narrow: bool) -> None:
+    """One legend above all panels, each label once."""
+    handles = {label: handle for ax in panels for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(
+        list(handles.values()), list(handles), loc="outside upper left", ncols=2 if narrow else max(1, len(handles))
+    )

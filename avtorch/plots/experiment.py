@@ -27,9 +27,9 @@ def expected_speed(ax: Axes, m: Manoeuvre) -> Axes:
 
 
 @styled
-def experiment_figure(experiment: Experiment) -> Figure:
-    """Command over speed, on one time axis."""
-    figure = Figure(figsize=(9, 4), layout="constrained")
+def experiment_figure(experiment: Experiment, *, narrow: bool = False) -> Figure:
+    """Command over speed, on one time axis; `narrow`: for a phone."""
+    figure = Figure(figsize=(4.0, 4.2) if narrow else (8.6, 4.0), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True)
     commands(top, experiment.manoeuvre)
     expected_speed(bottom, experiment.manoeuvre)

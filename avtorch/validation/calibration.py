@@ -24,7 +24,8 @@ from avtorch.inference.excitation import ExcitationRule
 from avtorch.inference.jerk import JerkDensity
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
 from avtorch.inference.quadrature import integrate
-from avtorch.inference.sampler import SamplerSettings, sample
+from avtorch.inference.sampler import sample
+from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.inference.sequential import Mode, SequentialInference
 from avtorch.validation.ranks import RankCalibration
 from avtorch.validation.simulation import Amplitude, statistics

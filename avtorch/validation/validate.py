@@ -15,7 +15,8 @@ from avtorch.errors import InputError
 from avtorch.inference.map import find_mode
 from avtorch.inference.posterior import Posterior
 from avtorch.inference.quadrature import Quadrature
-from avtorch.inference.sampler import SamplerSettings, sample
+from avtorch.inference.sampler import sample
+from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.io.log import Log
 from avtorch.validation.agreement import Agreement, agreement, between
 from avtorch.validation.agreement_verdict import AgreementVerdict, agreement_verdict

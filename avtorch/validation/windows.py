@@ -15,7 +15,7 @@ from avtorch.inference.form import Form, JerkForm
 from avtorch.inference.jerk import JerkDensity, JerkStatistics
 from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
-from avtorch.inference.sampler import SamplerSettings
+from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.io.clock import ROUNDING_S
 from avtorch.io.log import Log
 from avtorch.io.no_command import no_command

@@ -1,4 +1,4 @@
-"""avtorch's SGLD unmodified: ``sample`` with default settings, eager; any setting can be given by name."""
+"""avtorch's SGLD unmodified: ``sample`` with default settings; any setting can be given by name."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ class Runner:
         return Answer(np.exp(draws.transpose(1, 2, 0, 3)))
 
 
-def _adapted(s: Settings, key: jax.FloatArray, sums: jax.FloatArray) -> jax.FloatArray:
+def _adapted(s: Settings, key: jax.Array, sums: jax.Array) -> jax.Array:
     """Draws of ``z``, ``(chain, draw, 3)``, with window adaptation."""
     target = partial(log_density, sums=sums)
     center, scale = mode(sums) if s["mode"] else (prior_center(), 0.1 * jnp.eye(3))
@@ -57,11 +57,11 @@ def _adapted(s: Settings, key: jax.FloatArray, sums: jax.FloatArray) -> jax.Floa
     key_start, key_adapt, key_walk = jax.random.split(key, 3)
     starts = center + jax.random.normal(key_start, (s["chains"], 3)) @ scale.T
 
-    def adapted(key: jax.FloatArray, start: jax.FloatArray):
+    def adapted(key: jax.Array, start: jax.Array):
         (state, parameters), _ = adaptation.run(key, start, num_steps=s["warmup"])
         return state, parameters["step_size"], parameters["inverse_mass_matrix"]
 
-    def walk(key: jax.FloatArray, state, step_size: jax.FloatArray, inverse_mass: jax.FloatArray) -> jax.FloatArray:
+    def walk(key: jax.Array, state, step_size: jax.Array, inverse_mass: jax.Array) -> jax.Array:
         kernel = blackjax.nuts(target, step_size=step_size, inverse_mass_matrix=inverse_mass)
         return _scan(kernel, key, state, s)
 
@@ -76,7 +76,7 @@ def _adapted(s: Settings, key: jax.FloatArray, sums: jax.FloatArray) -> jax.Floa
     return jax.vmap(walk, in_axes=(0, None, None, None))(keys, state, step, mass)
 
 
-def _whitened(s: Settings, key: jax.FloatArray, sums: jax.FloatArray) -> jax.FloatArray:
+def _whitened(s: Settings, key: jax.Array, sums: jax.Array) -> jax.Array:
     """Draws of ``z``, ``(chain, draw, 3)``, in coordinates whitened at the mode, without adaptation."""
     center, scale = mode(sums)
     kernel = blackjax.nuts(lambda w: log_density(center + scale @ w, sums), s["step"], jnp.eye(3))
@@ -86,7 +86,7 @@ def _whitened(s: Settings, key: jax.FloatArray, sums: jax.FloatArray) -> jax.Flo
     return center + w @ scale.T
 
 
-def _scan(kernel, key: jax.FloatArray, state, s: Settings) -> jax.FloatArray:
+def _scan(kernel, key: jax.Array, state, s: Settings) -> jax.Array:
     def step(state, key):
         state, _ = kernel.step(key, state)
         return state, state.position

@@ -41,7 +41,7 @@ class Runner:
         return Answer(np.exp(draws.transpose(1, 2, 0, 3)))
 
 
-def _sample(s: Settings, key: jax.FloatArray, sums: jax.FloatArray) -> jax.FloatArray:
+def _sample(s: Settings, key: jax.Array, sums: jax.Array) -> jax.Array:
     """Draws of ``z``, ``(chain, draw, 3)``."""
     center, scale = mode(sums)
     if s["whitened"]:
@@ -51,11 +51,11 @@ def _sample(s: Settings, key: jax.FloatArray, sums: jax.FloatArray) -> jax.Float
     gradient = jax.vmap(jax.grad(lambda w: log_density(center + scale @ w, sums)))
     sgld = blackjax.sgld(lambda w, _: gradient(w))  # all chains are one position: one key a step
 
-    def move(w: jax.FloatArray, key: jax.FloatArray):
+    def move(w: jax.Array, key: jax.Array):
         # its step size is that of w + e grad + sqrt(2 e) noise
         return sgld.step(key, w, 0.0, 0.5 * s["step"]), None
 
-    def collect(w: jax.FloatArray, key: jax.FloatArray):
+    def collect(w: jax.Array, key: jax.Array):
         w, _ = jax.lax.scan(move, w, jax.random.split(key, s["thinning"]))
         return w, w
 

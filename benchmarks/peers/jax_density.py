@@ -9,14 +9,14 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jax import FloatArray
+from jax import Array
 
 from benchmarks.peers.problem import LOG_SD, MEDIAN, SIGMA_SCALE
 
 _LOG_2PI = math.log(2 * math.pi)
 
 
-def log_density(z: FloatArray, sums: FloatArray) -> FloatArray:
+def log_density(z: Array, sums: Array) -> Array:
     """Eq. 4 plus prior plus Jacobian at ``z = log(T_L, K_L, sigma)``, ``(3,)``; ``sums``: ``(7,)``."""
     n, jj, aj, uj, aa, au, uu = sums
     b, g = jnp.exp(-z[0]), jnp.exp(z[1] - z[0])
@@ -28,7 +28,7 @@ def log_density(z: FloatArray, sums: FloatArray) -> FloatArray:
     return likelihood + actuation + noise
 
 
-def initial(sums: FloatArray) -> FloatArray:
+def initial(sums: Array) -> Array:
     """Least squares where plausible, else the prior's centre: the start of the search for the mode."""
     n, jj, aj, uj, aa, au, uu = sums
     determinant = aa * uu - au**2
@@ -44,20 +44,20 @@ def initial(sums: FloatArray) -> FloatArray:
     return jnp.log(jnp.stack([lag, gain, jnp.clip(sigma, 1e-6, 1e6)]))
 
 
-def mode(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
+def mode(sums: Array) -> tuple[Array, Array]:
     """Damped Newton to the mode; returns it and a square root of the Laplace covariance, ``(3,)`` and ``(3, 3)``."""
 
-    def expand(z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def expand(z: Array) -> tuple[Array, Array, Array]:
         return -log_density(z, sums), -jax.grad(log_density)(z, sums), -jax.hessian(log_density)(z, sums)
 
-    def direction(gradient: FloatArray, hessian: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def direction(gradient: Array, hessian: Array) -> tuple[Array, Array]:
         values, basis = jnp.linalg.eigh(hessian)
         values = jnp.maximum(jnp.abs(values), 1e-6)
         projected = basis.T @ gradient
         step = -basis @ (projected / values)
         return step / jnp.maximum(jnp.abs(step).max(), 1.0), 0.5 * (projected**2 / values).sum()
 
-    def go_on(state: tuple) -> FloatArray:
+    def go_on(state: tuple) -> Array:
         k, _, _, _, gradient, hessian = state
         return (k < 60) & (direction(gradient, hessian)[1] > 1e-8)
 
@@ -79,12 +79,12 @@ def mode(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
 log_densities = jax.jit(jax.vmap(log_density, in_axes=(0, None)))
 
 
-def prior_center() -> FloatArray:
+def prior_center() -> Array:
     """A typical ``z`` of the prior, ``(3,)``."""
     return jnp.log(jnp.asarray([*MEDIAN, 0.5 * SIGMA_SCALE]))
 
 
-def stiffness(center: FloatArray, scale: FloatArray, sums: FloatArray, radius: float = 3.0) -> FloatArray:
+def stiffness(center: Array, scale: Array, sums: Array, radius: float = 3.0) -> Array:
     """How much steeper the whitened potential gets ``radius`` SDs out; avtorch divides its step by the same."""
     axes = radius * jnp.eye(3)
     probes = jnp.concatenate([axes, -axes])

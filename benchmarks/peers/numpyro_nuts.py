@@ -24,7 +24,7 @@ from benchmarks.peers.jax_density import mode, prior_center
 from benchmarks.peers.problem import LOG_SD, MEDIAN, NAMES, SIGMA_SCALE, FloatArray, Windows
 
 
-def model(sums: jax.FloatArray) -> None:
+def model(sums: jax.Array) -> None:
     """Priors as statements, Eq. 4 from the sums as a factor."""
     lag = numpyro.sample("T_L", dist.LogNormal(np.log(MEDIAN[0]), LOG_SD[0]))
     gain = numpyro.sample("K_L", dist.LogNormal(np.log(MEDIAN[1]), LOG_SD[1]))
@@ -35,7 +35,7 @@ def model(sums: jax.FloatArray) -> None:
     numpyro.factor("jerk", -0.5 * chi2 - n * (jnp.log(sigma) + 0.5 * np.log(2 * np.pi)))
 
 
-def potential(z: jax.FloatArray, sums: jax.FloatArray) -> jax.FloatArray:
+def potential(z: jax.Array, sums: jax.Array) -> jax.Array:
     """What NumPyro makes of the model, at its own unconstrained parameters, the logarithms ``(3,)``."""
     return potential_energy(model, (sums,), {}, dict(zip(NAMES, z, strict=True)))
 
@@ -53,11 +53,11 @@ class Runner:
         return Answer(np.exp(draws)[:, :, None])
 
 
-def _sample(s: Settings, key: jax.FloatArray, sums: jax.FloatArray) -> jax.FloatArray:
+def _sample(s: Settings, key: jax.Array, sums: jax.Array) -> jax.Array:
     """Draws of ``z``, ``(chain, draw, 3)``."""
     center, scale = mode(sums) if s["mode"] else (prior_center(), 0.1 * jnp.eye(3))
 
-    def chain(key: jax.FloatArray) -> jax.FloatArray:
+    def chain(key: jax.Array) -> jax.Array:
         key_start, key_walk = jax.random.split(key)
         kernel = NUTS(potential_fn=lambda z: potential(z, sums), dense_mass=True)
         start = center + scale @ jax.random.normal(key_start, (3,))

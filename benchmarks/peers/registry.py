@@ -13,7 +13,16 @@ _ALL = (
         "avtorch_sgld",
         fixed=True,
         batch={},
-        gets="`sample` with default settings, eager; sums, closed-form gradient",
+        gets="`sample` with default settings, its walk compiled where numba is installed; sums, closed-form gradient",
+    ),
+    Method(
+        "avtorch-eager",
+        "avtorch SGLD, eager torch",
+        "avtorch_sgld",
+        candidates=({"chains": 320, "walk": "eager"},),
+        scales="chains",
+        batch={"chains": 320, "walk": "eager"},
+        gets="chains for 2000 effective draws, every step by `SGLD(torch.optim.Optimizer)`",
     ),
     Method(
         "avtorch-matched",

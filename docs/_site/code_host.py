@@ -24,6 +24,7 @@ FIRST = (
     "monitoring",
     "diagnosis",
     "compare",
+    "fleet",
     "followers",
     "own-effect",
     "words",

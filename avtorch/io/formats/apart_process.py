@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import sys
 from collections.abc import Iterable
 from typing import BinaryIO
 
-import numpy as np
-
+from avtorch.child_process import answer, answers_to, limit_memory
 from avtorch.errors import InputError
 from avtorch.io.formats import kinds
 from avtorch.io.recording import Recording
@@ -25,18 +23,16 @@ MOST_MEMORY = 4 * 2**30
 
 def main() -> None:
     """Serve one recording until the standard input ends."""
-    _limit_memory()
-    # answers go where the output went; whatever a library prints goes nowhere
-    out = os.fdopen(os.dup(1), "wb")
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    limit_memory(MOST_MEMORY)
+    out = answers_to()
     kind = kinds.named(sys.argv[1])
     try:
         reader = importlib.import_module(f"avtorch.io.formats.{kind.reader}")
         recording: Recording = reader.open_file(sys.argv[2], kind)
     except InputError as fault:
-        _answer(out, {"error": str(fault)})
+        answer(out, {"error": str(fault)})
         return
-    _answer(
+    answer(
         out,
         {
             "form": recording.form,
@@ -54,11 +50,11 @@ def serve(recording: Recording, requests: Iterable[bytes], out: BinaryIO) -> Non
         try:
             channels = list(recording.read(json.loads(line)).values())
         except InputError as fault:
-            _answer(out, {"error": str(fault)})
+            answer(out, {"error": str(fault)})
             continue
         clocks = {id(channel.time): channel.time for channel in channels}
         place = {key: k for k, key in enumerate(clocks)}
-        _answer(
+        answer(
             out,
             {
                 "clocks": [len(clock) for clock in clocks.values()],
@@ -66,23 +62,6 @@ def serve(recording: Recording, requests: Iterable[bytes], out: BinaryIO) -> Non
             },
             [*clocks.values(), *(channel.values for channel in channels)],
         )
-
-
-def _answer(out: BinaryIO, answer: dict, arrays: Iterable[np.ndarray] = ()) -> None:
-    out.write(json.dumps(answer).encode() + b"\n")
-    for array in arrays:
-        out.write(np.ascontiguousarray(array, dtype=np.float64).tobytes())
-    out.flush()
-
-
-def _limit_memory() -> None:
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
-    _, most = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY if most < 0 else min(MOST_MEMORY, most), most))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 if __name__ == "__main__":

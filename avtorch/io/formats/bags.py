@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import os
 import weakref
-from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from avtorch.arrays import FloatArray
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.io.formats import kinds
 from avtorch.io.formats.bag_fields import numeric_fields, stamp_field
@@ -21,9 +17,9 @@ from avtorch.io.formats.bag_opening import open_bag
 from avtorch.io.formats.bag_types import LAYOUTS
 from avtorch.io.formats.kinds import Kind
 from avtorch.io.formats.library import guarded, library
-from avtorch.io.formats.listed import Listed, refuse_cells
+from avtorch.io.formats.listed import refuse_cells
+from avtorch.io.formats.topics import Piece, TopicRecording
 from avtorch.io.opening import place
-from avtorch.io.recording import Channel
 from avtorch.io.size import MOST_CELLS, MOST_COLUMNS
 
 _NEED = "an undamaged ROS bag with its index (`rosbag reindex` or `mcap recover` mends one that was cut off)"
@@ -44,35 +40,11 @@ class Topic:
         return sum(max(0, connection.msgcount) for connection in self.connections)
 
 
-class _Piece:
-    """What is read of one topic: columns of its fields, the times of recording, and the stamps."""
-
-    def __init__(self, topic: Topic, paths: Sequence[str]) -> None:
-        self.topic = topic
-        self.store: Any = None  # of the types, found by the first message
-        self.columns = [array("d") for _ in paths]
-        self.logged, self.stamped = array("d"), array("d")
-        self._take: Callable[[Any], tuple[Any, ...]] = attrgetter(paths[0], *paths)  # a tuple for one field, too
-        self._stamp = attrgetter(topic.stamp) if topic.stamp else None
-
-    def take(self, at: int, message: Any) -> None:
-        """The fields of a message that was recorded `at` [ns]."""
-        row = self._take(message)[1:]
-        if self._stamp is not None:
-            moment = self._stamp(message)
-            self.stamped.append((moment.sec * _NANO + moment.nanosec) / _NANO)
-        for column, value in zip(self.columns, row, strict=True):
-            column.append(value)
-        self.logged.append(at / _NANO)
-
-    def time(self) -> FloatArray:
-        stamped = len(self.stamped) > 0 and min(self.stamped) > 0
-        return np.array(self.stamped if stamped else self.logged, dtype=np.float64)
-
-
-class BagRecording(Listed):
+class BagRecording(TopicRecording):
     """A bag. Channels are ``/topic/field/sub``, every numeric field but arrays; their time is the stamp of the
     message's header or its own [s since 1970], and the time of recording where it has none or where it is not set."""
+
+    _topics: Mapping[str, Topic]
 
     def __init__(
         self,
@@ -83,27 +55,15 @@ class BagRecording(Listed):
         fields: Mapping[str, tuple[str, str]],
         remarks: Sequence[str],
     ) -> None:
-        super().__init__(source, kind.words, fields, {}, remarks)
-        self._reader, self._topics, self._fields = reader, topics, fields
+        super().__init__(source, kind.words, topics, fields, remarks)
+        self._reader = reader
         self._one = kind is kinds.ROS1
 
-    def _read(self, names: tuple[str, ...]) -> dict[str, Channel]:
-        asked: dict[str, list[str]] = {}
-        for name in names:
-            asked.setdefault(self._fields[name][0], []).append(name)
-        refuse_cells(self.source, sum(self._topics[topic].count * len(own) for topic, own in asked.items()))
-        pieces = {name: _Piece(self._topics[name], [self._fields[c][1] for c in own]) for name, own in asked.items()}
-        self._collect(pieces)
-        found: dict[str, Channel] = {}
-        for topic, piece in pieces.items():
-            time = piece.time()
-            for name, column in zip(asked[topic], piece.columns, strict=True):
-                found[name] = Channel(name, time, np.array(column, dtype=np.float64))
-        return {name: found[name] for name in names}
-
-    def _collect(self, pieces: Mapping[str, _Piece]) -> None:
-        """One pass over the messages of the topics of `pieces`, which take what they need of them."""
-        by_connection = {(c.topic, c.id): name for name, piece in pieces.items() for c in piece.topic.connections}
+    def _collect(self, paths: Mapping[str, Sequence[str]]) -> dict[str, Piece]:
+        pieces = {name: Piece(len(own)) for name, own in paths.items()}
+        takers = {name: _taker(self._topics[name], own, pieces[name]) for name, own in paths.items()}
+        stores: dict[str, Any] = {}  # of the types, found by a topic's first message
+        by_connection = {(c.topic, c.id): name for name in paths for c in self._topics[name].connections}
         name, samples = "", 0
 
         def where() -> str:
@@ -111,16 +71,16 @@ class BagRecording(Listed):
             return f"{self.source}{at}"
 
         with guarded(where, _NEED):
-            connections = [c for piece in pieces.values() for c in piece.topic.connections]
+            connections = [c for name in paths for c in self._topics[name].connections]
             for connection, at, raw in self._reader.messages(connections):
                 name = by_connection[connection.topic, connection.id]
-                piece = pieces[name]
-                if piece.store is None:
-                    piece.store = self._fitting(piece.topic, raw)
-                piece.take(at, self._decoded(piece.store, raw, piece.topic.type))
-                samples += len(piece.columns)
+                if name not in stores:
+                    stores[name] = self._fitting(self._topics[name], raw)
+                takers[name](self._decoded(stores[name], raw, self._topics[name].type), at)
+                samples += len(paths[name])
                 if samples > MOST_CELLS:
                     refuse_cells(self.source, samples)
+        return pieces
 
     def _fitting(self, topic: Topic, raw: bytes) -> Any:
         for store in topic.stores[:-1]:
@@ -133,6 +93,19 @@ class BagRecording(Listed):
 
     def _decoded(self, store: Any, raw: bytes, type_: str) -> Any:
         return store.deserialize_ros1(raw, type_) if self._one else store.deserialize_cdr(raw, type_)
+
+
+def _taker(topic: Topic, paths: Sequence[str], piece: Piece) -> Callable[[Any, int], None]:
+    """Puts a message that was recorded at a time [ns] into the piece."""
+    fields = attrgetter(paths[0], *paths)  # a tuple for one field, too
+    stamp = attrgetter(topic.stamp) if topic.stamp else None
+
+    def take(message: Any, at: int) -> None:
+        moment = None if stamp is None else stamp(message)
+        stamped = None if moment is None else (moment.sec * _NANO + moment.nanosec) / _NANO
+        piece.take(fields(message)[1:], at / _NANO, stamped)
+
+    return take
 
 
 def open_file(path: str | os.PathLike[str], kind: Kind) -> BagRecording:

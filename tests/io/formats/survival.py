@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from avtorch.child_process import limit_memory
 from avtorch.errors import InputError
 from avtorch.io.formats import apart_process, open_recording
 from avtorch.io.formats.recognise import kind_at
@@ -106,7 +107,7 @@ def _serve(path: Path, contents: Sequence[bytes], dbc: Sequence[Path] | None, an
     faulthandler.disable()
     os.environ["RUST_BACKTRACE"] = "0"
     try:
-        apart_process._limit_memory()
+        limit_memory(apart_process.MOST_MEMORY)
         for content in contents:
             path.write_bytes(content)
             os.write(answers, b"1" if _held(path, dbc) else b"0")

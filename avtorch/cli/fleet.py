@@ -1,0 +1,236 @@
+"""`avtorch fleet`: many logs at once, on this machine or on a cluster."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Group, Parameter
+from rich.markup import escape
+from rich.table import Table
+
+from avtorch.cli.arguments import (
+    OUTPUT,
+    Gains,
+    Json,
+    Quiet,
+    Seed,
+    TimeGap,
+    free_folder,
+    positive,
+    positive_pair,
+    seed_number,
+    three_gains,
+)
+from avtorch.cli.diagnose import chosen_effects
+from avtorch.cli.simulator import read_simulator
+from avtorch.cli.talk import Talk
+from avtorch.errors import InputError, quoted
+
+if TYPE_CHECKING:
+    from avtorch.fleet.cluster import Cluster
+    from avtorch.fleet.settings import Step
+
+CLUSTER = Group("Cluster", sort_key=8)
+SHOWN = 20
+"""Cars in the printed table; all of them are in the answer."""
+
+
+def fleet(
+    logs: list[str],
+    /,
+    *,
+    out: Annotated[Path, Parameter(name="--out", group=OUTPUT, help="Folder for the rows and the answer.")],
+    only: Annotated[
+        str | None, Parameter(help="Only these steps, STEP,STEP of check, estimate and diagnose; default: all.")
+    ] = None,
+    map: Annotated[
+        list[str] | None,
+        Parameter(negative=(), help="Name of a column in all logs, SIGNAL=COLUMN; repeatable."),
+    ] = None,
+    unit: Annotated[
+        list[str] | None, Parameter(negative=(), help="Unit of a column in all logs, SIGNAL=UNIT; repeatable.")
+    ] = None,
+    stamp: Annotated[
+        list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
+    ] = None,
+    window: Annotated[float, Parameter(help="Length of a window [s].")] = 2.0,
+    estimator: Annotated[
+        Literal["auto", "sgld", "importance", "map", "rls", "ekf", "ukf"],
+        Parameter(help="How a window's posterior is computed; see avtorch estimate --help."),
+    ] = "auto",
+    tau: TimeGap = 1.0,
+    gains: Gains = "1.5,1.5,-0.8",
+    accepted: Annotated[str, Parameter(help="T_L,K_L of the cars as they should be [s, -].")] = "0.3,1.0",
+    dead_time: Annotated[float | None, Parameter(help="Dead time of the cars [s]; default: inferred.")] = None,
+    target: Annotated[float, Parameter(help="A car with a lower P(string stable) comes first.")] = 0.9,
+    baseline: Annotated[
+        str, Parameter(help="Your simulator: glvd, effects such as dead_time=0.2, or a TOML file.")
+    ] = "glvd",
+    effects: Annotated[str | None, Parameter(help="Only these effects, NAME,NAME,...; default: all.")] = None,
+    pairs: Annotated[bool, Parameter(help="Look for several effects at once.")] = True,
+    budget: Annotated[float | None, Parameter(help="Time for the search of each diagnosis [s]; default: none.")] = None,
+    retry: Annotated[bool, Parameter(negative=(), help="Try logs again that failed in an earlier run.")] = False,
+    workers: Annotated[
+        int | None, Parameter(group=CLUSTER, help="Processes on this machine, one thread each; default: one a core.")
+    ] = None,
+    memory: Annotated[str, Parameter(group=CLUSTER, help="Most memory of each of them.")] = "2GiB",
+    scheduler: Annotated[
+        str | None,
+        Parameter(group=CLUSTER, help="Address of a running Dask scheduler, such as tcp://10.0.0.1:8786."),
+    ] = None,
+    seed: Seed = 0,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Check, estimate and diagnose the logs of many cars; which car to look at first.
+
+    Rows are written to --out as they come, as Parquet: checks, windows and diagnoses. Give the command again after an
+    interruption, or with more logs: it does what is missing. A log that fails has a row that says why.
+
+    Parameters
+    ----------
+    logs
+        Files, a glob in quotes, a folder with all below it, URLs such as s3://bucket/logs, or a manifest: a CSV file
+        with the columns log, car, and if wanted date and others.
+    """
+    steps = chosen_steps(only)
+    positive("--window", window, "s")
+    positive("--tau", tau, "s")
+    k = three_gains("--gains", gains)
+    sound = positive_pair("--accepted", accepted, "T_L,K_L", "0.3,1.0")
+    if budget is not None:
+        positive("--budget", budget, "s")
+    if workers is not None and workers < 1:
+        raise InputError(f"--workers: found {workers}, needs 1 or more")
+    if scheduler is not None and workers is not None:
+        raise InputError("--workers: found beside --scheduler, whose workers are its own; needs one of the two")
+    seed_number(seed)
+    free_folder(out)
+
+    from avtorch.fleet.cluster import memory_bytes, require_dask
+
+    require_dask()
+    memory_bytes(memory)
+    known = chosen_effects(effects)
+    # not for the default, which needs no torch
+    assumed = None if baseline == "glvd" else read_simulator("--baseline", baseline)
+
+    from avtorch.fleet import FleetSettings, find_logs, run_fleet
+
+    settings = FleetSettings(
+        steps=steps,
+        map=tuple(map or ()),
+        unit=tuple(unit or ()),
+        stamp=tuple(stamp or ()),
+        window=window,
+        estimator=estimator,
+        time_gap=tau,
+        gains=k,
+        accepted=sound,
+        dead_time=dead_time,
+        baseline="glvd" if assumed is None else assumed.to_toml(),
+        effects=None if known is None else tuple(known),
+        pairs=pairs,
+        budget_s=budget,
+        target=target,
+        seed=seed,
+    )
+    talk = Talk(json=json, quiet=quiet)
+    found = find_logs(logs, leave_out=out)
+    cars = len({log.car for log in found.logs})
+    talk.line(f"{_many(len(found.logs), 'log')} of {_many(cars, 'car')}, {_CAR_FROM[found.car_from]}")
+
+    def tell(cluster: Cluster) -> None:
+        if cluster.dashboard is not None:
+            talk.line(f"Dask's dashboard: {cluster.dashboard}")
+
+    try:
+        with talk.whole("Fleet") as step:
+            answer = run_fleet(
+                found,
+                out,
+                settings=settings,
+                workers=workers,
+                memory=memory,
+                scheduler=scheduler,
+                retry=retry,
+                progress=step,
+                connected_to=tell,
+            )
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"finished rows are kept in {out}: the same command does what is missing") from None
+    if talk.json:
+        talk.answer(answer)
+        return
+    _print(talk, answer)
+    talk.line(f"\nWritten to {out}: fleet.json and the rows in checks, windows and diagnoses (Parquet)")
+
+
+_CAR_FROM = {
+    "manifest": "named by the manifest",
+    "folder": "each named by the folder of its logs",
+    "file": "each named by its file, as all logs lie in one folder",
+}
+
+
+def chosen_steps(text: str | None) -> tuple[Step, ...]:
+    """The steps of `--only`. Raises `InputError` for others."""
+    from avtorch.fleet.settings import STEPS
+
+    if text is None:
+        return STEPS
+    names = {part.strip() for part in text.split(",")}
+    if not names <= set(STEPS):
+        raise InputError(f"--only: found {quoted(text)}, needs some of {', '.join(STEPS)}")
+    return tuple(step for step in STEPS if step in names)
+
+
+def _many(count: int, word: str) -> str:
+    return f"{count} {word}{'s' if count != 1 else ''}"
+
+
+def _print(talk: Talk, answer: dict[str, Any]) -> None:
+    """The first cars, in the order in which to look at them, and what failed."""
+    table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
+    for name in ("car", "why", "P", "T_L [s]", "K_L", "change", "simulator lacks", "logs"):
+        table.add_column(escape(name), justify="right" if name in ("P", "T_L [s]", "K_L", "logs") else "left")
+    for car in answer["cars"][:SHOWN]:
+        table.add_row(
+            escape(car["car"]),
+            car["reason"],
+            "" if car["p_string_stable"] is None else f"{car['p_string_stable']['now']:.2f}",
+            *("" if car[name] is None else f"{car[name]['mean']:.3f}" for name in ("T_L", "K_L")),
+            _change(car["change"]),
+            "" if car["gap"] is None else escape(", ".join(car["gap"]["verdict"])),
+            str(len(car["logs"])),
+            style=_STYLE.get(car["reason"]),
+        )
+    talk.out.print(table)
+    more = len(answer["cars"]) - SHOWN
+    if more > 0:
+        talk.line(f"... and {_many(more, 'more car')} in fleet.json")
+    errors = [
+        (log["log"], why) for car in answer["cars"] for log in car["logs"] for why in [*log["errors"].values()][:1]
+    ]
+    if errors:
+        talk.line("")
+    for place, why in errors[:5]:
+        talk.line(f"Failed: {why if place in why or os.path.basename(place) in why else f'{place}: {why}'}")
+    if len(errors) > 5:
+        talk.line(f"... and {_many(len(errors) - 5, 'more log')} failed, see fleet.json")
+    for note in answer["notes"]:
+        talk.line(note)
+    done = answer["work"]
+    talk.line(f"\n{_many(done['computed'], 'answer')} computed, {done['kept']} kept from earlier runs.")
+
+
+_STYLE = {"below target": "bold yellow", "failed": "red", "changed": "yellow", "no answer": "dim"}
+
+
+def _change(change: dict[str, Any] | None) -> str:
+    if change is None:
+        return ""
+    name, most = max(change.items(), key=lambda item: item[1]["in_sd"])
+    return f"{name} {most['difference']:+.2f} ({most['in_sd']:.1f} SD)"

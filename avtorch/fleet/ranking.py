@@ -1,0 +1,172 @@
+"""The fleet's first answer: cars in the order in which to look at them, each with its rows.
+
+A car below the target of P(string stable) comes first, then one with a log that failed, then one that differs from its
+own past, then the others by the gap of their simulator.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from statistics import fmean, pvariance
+from typing import Any
+
+from avtorch.fleet.folder import FleetFolder
+from avtorch.fleet.log_list import FleetLog, LogList
+from avtorch.fleet.rows import DATASETS, Row
+from avtorch.fleet.settings import FleetSettings, Step
+from avtorch.version import __version__
+
+SCHEMA = "avtorch.fleet/1"
+CHANGED = 3.0
+"""Standard deviations between drives from which a car is said to differ from its past."""
+
+REASONS = ("below target", "failed", "changed", "gap", "sound", "no answer")
+"""Why a car is where it is, in order."""
+
+_CHECK = ["status", "error"]
+_WINDOW = ["status", "error", "used", "end_s", "p_string_stable"]
+_WINDOW += [f"{name}_{part}" for name in ("T_L", "K_L") for part in ("mean", "sd", "q05", "q95")]
+_DIAGNOSIS = ["status", "error", "verdict", "causes", "gap_before", "gap_left", "gap_detected", "summary"]
+_DIAGNOSIS += [f"unexplained_{part}" for part in ("mean", "q05", "q95", "material")]
+
+
+def fleet_answer(found: LogList, folder: FleetFolder, settings: FleetSettings) -> dict[str, Any]:
+    """The object of `fleet.json`, from the rows in `folder`."""
+    of_car: dict[str, list[FleetLog]] = {}
+    for log in found.logs:
+        of_car.setdefault(log.car, []).append(log)
+    cars = [_car(car, sorted(logs, key=_when), folder, settings) for car, logs in of_car.items()]
+    cars.sort(key=_rank)
+    elsewhere = folder.others(list(found.logs))
+    notes = [f"The folder has rows of {elsewhere} more logs, which this call did not name."] if elsewhere else []
+    failed = sum(bool(log["errors"]) for car in cars for log in car["logs"])
+    answer = {
+        "schema": SCHEMA,
+        "version": __version__,
+        "car_from": found.car_from,
+        "steps": list(settings.steps),
+        "target": settings.target,
+        "logs": len(found.logs),
+        "failed_logs": failed,
+        "reasons": {reason: sum(car["reason"] == reason for car in cars) for reason in REASONS},
+        "cars": [{"rank": number, **car} for number, car in enumerate(cars, 1)],
+        "notes": notes,
+    }
+    return _plain(answer)
+
+
+def _plain(x: Any) -> Any:
+    """The same with null in place of numbers that JSON does not have."""
+    if isinstance(x, dict):
+        return {key: _plain(value) for key, value in x.items()}
+    if isinstance(x, list):
+        return [_plain(value) for value in x]
+    return None if isinstance(x, float) and not math.isfinite(x) else x
+
+
+def _car(car: str, logs: Sequence[FleetLog], folder: FleetFolder, settings: FleetSettings) -> dict[str, Any]:
+    """What the rows say of a car; `logs` in order of time."""
+    drives = [_log(log, folder, settings) for log in logs]
+    past = [d for d in (one.pop("actuation") for one in drives) if d is not None]
+    diagnosed = [d for d in (one.pop("diagnosis") for one in drives) if d is not None]
+    latest = past[-1] if past else None
+    found: dict[str, Any] = {"car": car, "reason": "no answer", "p_string_stable": None, "T_L": None, "K_L": None}
+    found |= {"change": None, "gap": None, "logs": drives}
+    if latest is not None:
+        lowest = min(one["lowest"] for one in past)
+        found["p_string_stable"] = {"now": latest["p_string_stable"], "lowest": lowest}
+        found |= {name: latest[name]["belief"] for name in ("T_L", "K_L")}
+        if len(past) > 1:
+            found["change"] = {name: _change([one[name] for one in past]) for name in ("T_L", "K_L")}
+    if diagnosed:
+        found["gap"] = diagnosed[-1]
+    found["reason"] = _reason(found, settings.target)
+    return found
+
+
+def _log(log: FleetLog, folder: FleetFolder, settings: FleetSettings) -> dict[str, Any]:
+    rows = {DATASETS[s]: folder.path(s, log).relative_to(folder.root).as_posix() for s in settings.steps}
+    out: dict[str, Any] = {"log": log.place, "date": log.date, "tags": dict(log.tags), "errors": {}}
+    out |= {"rows": rows, "actuation": None, "diagnosis": None}
+    wanted: dict[Step, list[str]] = {"check": _CHECK, "estimate": _WINDOW, "diagnose": _DIAGNOSIS}
+    for step in settings.steps:
+        read = folder.rows(step, log, wanted[step])
+        if not read or read[0]["status"] != "done":
+            out["errors"][step] = read[0]["error"] if read else "its rows are missing or damaged"
+        elif step == "estimate":
+            out["actuation"] = _actuation(read)
+        elif step == "diagnose":
+            out["diagnosis"] = _gap(read[0])
+    return out
+
+
+def _actuation(rows: Sequence[Row]) -> dict[str, Any] | None:
+    """T_L and K_L over the used windows of a log, and the last of them; None where there is none."""
+    used = [row for row in rows if row["used"]]
+    if not used:
+        return None
+    last = used[-1]
+    out: dict[str, Any] = {"p_string_stable": last["p_string_stable"]}
+    out["lowest"] = min(row["p_string_stable"] for row in used)
+    for name in ("T_L", "K_L"):
+        means = [row[f"{name}_mean"] for row in used]
+        # what a drive's mean may vary by: windows differ by noise and by what the model lacks, and are not independent
+        variance = pvariance(means) + fmean(row[f"{name}_sd"] ** 2 for row in used)
+        belief = {part: last[f"{name}_{part}"] for part in ("mean", "sd", "q05", "q95")}
+        out[name] = {"mean": fmean(means), "variance": variance, "belief": belief}
+    return out
+
+
+def _change(drives: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """The latest drive beside those before it; `in_sd`: by the standard deviation within drives and between them."""
+    *before, now = drives
+    past = fmean(one["mean"] for one in before)
+    variance = fmean(one["variance"] for one in before) + pvariance([one["mean"] for one in before]) + now["variance"]
+    difference = now["mean"] - past
+    in_sd = abs(difference) / math.sqrt(variance) if variance > 0 else 0.0
+    return {"past": past, "now": now["mean"], "difference": difference, "in_sd": in_sd}
+
+
+def _gap(row: Row) -> dict[str, Any]:
+    causes = [
+        {"name": c["name"], "probability": c["probability"]}
+        | {"share": None if c["share_mean"] is None else {p: c[f"share_{p}"] for p in ("mean", "q05", "q95")}}
+        for c in row["causes"] or ()
+    ]
+    unexplained = {part: row[f"unexplained_{part}"] for part in ("mean", "q05", "q95", "material")}
+    out = {"detected": row["gap_detected"], "before": row["gap_before"], "left": row["gap_left"]}
+    out |= {"verdict": row["verdict"], "causes": causes, "summary": row["summary"]}
+    return out | {"unexplained": None if unexplained["mean"] is None else unexplained}
+
+
+def _reason(car: dict[str, Any], target: float) -> str:
+    stable, change, gap = car["p_string_stable"], car["change"], car["gap"]
+    if stable is not None and stable["now"] < target:
+        return "below target"
+    if any(log["errors"] for log in car["logs"]):
+        return "failed"
+    if change is not None and max(one["in_sd"] for one in change.values()) >= CHANGED:
+        return "changed"
+    if gap is not None and gap["verdict"] != ["none"]:
+        return "gap"
+    return "sound" if stable is not None or gap is not None else "no answer"
+
+
+def _rank(car: dict[str, Any]) -> tuple[Any, ...]:
+    stable, change, gap = car["p_string_stable"], car["change"], car["gap"]
+    probability = 1.0 if stable is None else stable["now"]
+    changed = 0.0 if change is None else max(one["in_sd"] for one in change.values())
+    size = 0.0 if gap is None or gap["before"] is None else gap["before"]
+    order = {"below target": probability, "changed": -changed}.get(car["reason"], 0.0)
+    return REASONS.index(car["reason"]), order, -size, probability, car["car"]
+
+
+def _when(log: FleetLog) -> tuple[bool, datetime, str]:
+    """Dated logs by their date, after those without one; these by their names."""
+    if log.date is None:
+        return False, datetime.min.replace(tzinfo=UTC), os.path.basename(log.place)
+    date = datetime.fromisoformat(log.date)
+    return True, date if date.tzinfo is not None else date.replace(tzinfo=UTC), log.place

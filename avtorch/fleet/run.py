@@ -1,0 +1,175 @@
+"""A fleet: every log checked, estimated and diagnosed by a cluster, what is missing only."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from avtorch.errors import InputError
+from avtorch.fleet.cluster import Cluster, connected, require_dask
+from avtorch.fleet.fleet_progress import FleetProgress
+from avtorch.fleet.folder import FleetFolder, task_key
+from avtorch.fleet.log_list import FleetLog, LogList, find_logs
+from avtorch.fleet.places import content_hash, fetched
+from avtorch.fleet.ranking import fleet_answer
+from avtorch.fleet.rows import failure_rows
+from avtorch.fleet.settings import STEPS, FleetSettings
+from avtorch.fleet.task import Task
+from avtorch.fleet.work_off import worked_off
+from avtorch.io import sole_use, write_json
+
+FLEET = "fleet.json"
+READERS = 4
+"""Logs read at a time to find out whether they have changed."""
+
+
+def run_fleet(
+    logs: str | os.PathLike[str] | Iterable[str | os.PathLike[str]] | LogList,
+    out: str | os.PathLike[str],
+    *,
+    settings: FleetSettings | None = None,
+    workers: int | None = None,
+    memory: str = "2GiB",
+    scheduler: str | None = None,
+    retry: bool = False,
+    progress: Callable[[str, int, int], None] | None = None,
+    connected_to: Callable[[Cluster], None] | None = None,
+) -> dict[str, Any]:
+    """Check, estimate and diagnose each log of a fleet on a Dask cluster; write and return `out/fleet.json`.
+
+    Rows go to the Parquet datasets `checks`, `windows` and `diagnoses` in `out` as they come (`read_rows`). A later
+    call with the same `out` computes what is missing: new logs, logs whose content has changed, other settings, another
+    version of avtorch, and what had crashed. A log that cannot be used has a row that says why.
+
+    Args:
+        logs: what `find_logs` takes, or what it returns.
+        settings: what is done, with which options; default: all, as the commands do by default.
+        workers: processes of a cluster on this machine, one thread each (default: one a core); a script that begins
+            work needs `if __name__ == "__main__"`.
+        memory: at most for each of them; one that needs more is ended, and its log is tried again.
+        scheduler: the address of an existing cluster, which has avtorch installed and reads the logs at the same
+            places; `workers` and `memory` are then its own.
+        retry: try logs again that failed in an earlier call.
+        progress: called with (sentence, done, of), in milliseconds of work.
+        connected_to: called with the cluster once there is one.
+
+    Raises `InputError` for logs, settings or a cluster that cannot be used, where Dask is not installed, and for a
+    folder that cannot be written or that another process uses.
+
+    Example:
+        >>> from avtorch import GLVDPlant, Leader, simulate
+        >>> from avtorch.fleet import FleetSettings, run_fleet
+        >>> simulate(Leader.default(start=30.0, duration=20.0, dt=0.05), plant=GLVDPlant(0.4, 0.9)).log().write("a.csv")
+        >>> quick = FleetSettings(steps=("check", "estimate"), estimator="map")
+        >>> answer = run_fleet("a.csv", "out", settings=quick, workers=1)
+        >>> car = answer["cars"][0]
+        >>> car["car"], car["reason"], round(car["T_L"]["mean"], 1)
+        ('a', 'sound', 0.4)
+        >>> run_fleet("a.csv", "out", settings=quick)["work"]["computed"]  # nothing is missing
+        0
+    """
+    given = FleetSettings() if settings is None else settings
+    if scheduler is None and workers is not None and workers < 1:
+        raise InputError(f"workers: found {workers}, needs 1 or more")
+    require_dask()
+    given.refuse_unknown()
+    found = logs if isinstance(logs, LogList) else find_logs(logs, leave_out=out)
+    folder = FleetFolder(Path(out))
+    with sole_use(out, work="a fleet"):
+        plan = _plan(found.logs, folder, given, retry=retry, progress=progress)
+        if plan.tasks:
+            with connected(min(workers or _cores(), len(plan.tasks)), memory, scheduler) as cluster:
+                if connected_to is not None:
+                    connected_to(cluster)
+                _work(cluster, folder, plan, FleetProgress(progress, plan.tasks, plan.kept))
+        answer = fleet_answer(found, folder, given)
+        answer["notes"] += plan.notes
+        answer["work"] = {"kept": plan.kept, "computed": len(plan.tasks)}
+        write_json(Path(out) / FLEET, answer)
+    return answer
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """The `tasks` that are missing, with the log of each by its name; `kept`: number of answers that are there.
+
+    `notes`: a sentence on each log that cannot be read now, but could in an earlier call.
+    """
+
+    tasks: list[Task]
+    logs: dict[str, FleetLog]
+    kept: int
+    notes: list[str]
+
+
+def _plan(
+    logs: Sequence[FleetLog],
+    folder: FleetFolder,
+    settings: FleetSettings,
+    *,
+    retry: bool,
+    progress: Callable[[str, int, int], None] | None,
+) -> _Plan:
+    tasks: list[Task] = []
+    of: dict[str, FleetLog] = {}
+    unread: dict[str, str] = {}
+    kept = 0
+    with ThreadPoolExecutor(READERS) as pool:
+        for number, (log, content) in enumerate(zip(logs, pool.map(_content, logs), strict=True), 1):
+            if progress is not None:
+                progress("reading", number, len(logs))
+            for step in settings.steps:
+                if isinstance(content, InputError) and folder.has_answer(step, log):
+                    unread[log.place] = f"Not read this time, its earlier rows are kept: {content}"
+                    kept += 1
+                    continue
+                if isinstance(content, InputError):
+                    rows = failure_rows("crashed", str(content))  # a file that is not there may come
+                    folder.write(step, log, task_key(step, None, settings), rows, sha256=None, seconds=0.0)
+                    continue
+                sha256, size = content
+                key = task_key(step, sha256, settings)
+                status = folder.kept(step, log, key)
+                if status == "done" or (status == "failed" and not retry):
+                    kept += 1
+                    continue
+                name = f"{step}-{Path(log.file_name).stem}"
+                of[name] = log
+                tasks.append(Task(name, step, log.place, sha256, size, settings))
+    # what is soon done first, and the longest diagnoses before the short ones, which then fill the last gaps
+    tasks.sort(key=lambda task: (STEPS.index(task.step), -task.size))
+    return _Plan(tasks, of, kept, list(unread.values()))
+
+
+def _content(log: FleetLog) -> tuple[str, int] | InputError:
+    try:
+        with fetched(log.place) as local:
+            return content_hash(local)
+    except InputError as fault:
+        return fault
+
+
+def _work(cluster: Cluster, folder: FleetFolder, plan: _Plan, told: FleetProgress) -> None:
+    tasks = plan.tasks
+    if cluster.local:
+        # the next worker goes on where one was killed
+        kept = folder.checkpoints()
+        tasks = [replace(task, checkpoint=str(kept / checkpoint_name(task))) for task in tasks]
+    for task, outcome in worked_off(cluster, tasks):
+        log, key = plan.logs[task.name], task_key(task.step, task.sha256, task.settings)
+        status = folder.write(task.step, log, key, outcome.rows, sha256=task.sha256, seconds=outcome.seconds)
+        told.done(task.step, status, outcome.seconds)
+    folder.clear()
+
+
+def checkpoint_name(task: Task) -> str:
+    """Of the log and of all that its answer is computed from: a checkpoint is of no use to other settings."""
+    return f"{task.name}-{task_key(task.step, task.sha256, task.settings)[:12]}.state"
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

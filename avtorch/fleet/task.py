@@ -1,0 +1,144 @@
+"""The work on one log in one worker: a step of its answer, as rows; whatever goes wrong becomes a row that says why."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from avtorch.errors import InputError, printable
+from avtorch.fleet.places import content_hash, fetched
+from avtorch.fleet.rows import Row, check_rows, diagnosis_rows, failure_rows, window_rows
+from avtorch.fleet.settings import FleetSettings, Step
+from avtorch.io import Damaged, Log
+from avtorch.logcheck.check import check
+from avtorch.version import __version__
+
+
+@dataclass(frozen=True)
+class Task:
+    """A `step` for the log at `place` with this content; `size` [bytes]; a `name` that no other task of the run has.
+
+    `checkpoint`: a file that keeps what was finished, for a worker that comes after one that was killed; None where
+    workers share no disk with the caller.
+    """
+
+    name: str
+    step: Step
+    place: str
+    sha256: str
+    size: int
+    settings: FleetSettings
+    checkpoint: str | None = None
+    version: str = __version__
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The rows of a task, and how long it computed [s]."""
+
+    rows: list[Row]
+    seconds: float
+
+
+def work(task: Task) -> Outcome:
+    """Do a task. Raises nothing but what ends the process."""
+    begun = time.perf_counter()
+    try:
+        if task.version != __version__:
+            raise RuntimeError(f"this worker has avtorch {__version__}, needs {task.version}")
+        with fetched(task.place) as local:
+            try:
+                rows = [_named_by_its_place(row, task, local) for row in _rows(task, local)]
+            except Damaged:
+                raise  # of the checkpoint, not of the log
+            except InputError as fault:
+                rows = [_named_by_its_place(row, task, local) for row in failure_rows("failed", str(fault))]
+    except InputError as fault:
+        rows = failure_rows("crashed", str(fault))  # a store that could not be reached may be there tomorrow
+    except Exception as fault:
+        rows = failure_rows("crashed", printable(f"{type(fault).__name__}: {fault}", 400))
+    return Outcome(rows, time.perf_counter() - begun)
+
+
+def _named_by_its_place(row: Row, task: Task, local: Path) -> Row:
+    """Sentences on a copy from a store name where it is from."""
+    if row.get("error") is not None:
+        row["error"] = row["error"].replace(str(local), task.place)
+    return row
+
+
+def _rows(task: Task, local: Path) -> list[Row]:
+    if content_hash(local)[0] != task.sha256:
+        raise RuntimeError("the log was changed while the fleet ran; needs another run")
+    given = task.settings
+    read: dict[str, Any] = {name: getattr(given, name) or None for name in ("map", "unit", "stamp")}
+    mapped = any(read.values())
+    if task.step == "check":
+        return check_rows(check(Log.read(local, **read) if mapped else local))
+    drive, note = _commanded(Log.read(local, **read))
+    return _estimated(task, drive, note) if task.step == "estimate" else _diagnosed(task, drive, note)
+
+
+def _commanded(drive: Log) -> tuple[Log, str | None]:
+    """The drive with an `accel_cmd`, and a note on the map of its pedals where one made it."""
+    if drive.accel_cmd is not None or (not drive.pedals and drive.speed_cmd is None):
+        return drive, None
+    from avtorch.pedals import fit_pedals
+
+    fit = fit_pedals([drive])
+    by = " and ".join(fit.map.pedals)
+    return fit.map.commanded(drive), f"The log has no accel_cmd: a map of {by} and speed stands for it; K_L is 1 by it."
+
+
+def _estimated(task: Task, drive: Log, note: str | None) -> list[Row]:
+    from avtorch.decision.estimation import estimate
+    from avtorch.decision.settings import Setting
+
+    given = task.settings
+    with _checkpoint(task) as kept:
+        found = estimate(
+            drive,
+            given.window,
+            estimator=given.estimator,
+            setting=Setting(time_gap=given.time_gap, gains=given.gains, scenarios=1),
+            accepted=given.accepted,
+            dead_time=given.dead_time,
+            seed=given.seed,
+            checkpoint=kept,
+        )
+    return window_rows(found, note)
+
+
+def _diagnosed(task: Task, drive: Log, note: str | None) -> list[Row]:
+    from avtorch.gap.diagnose import diagnose
+    from avtorch.gap.simulator.plant import GapPlant
+
+    given = task.settings
+    with _checkpoint(task) as kept:
+        found = diagnose(
+            drive,
+            baseline=None if given.baseline == "glvd" else GapPlant.from_toml(given.baseline),
+            effects=given.effects,
+            pairs=given.pairs,
+            posterior=given.posterior,
+            budget_s=given.budget_s,
+            seed=given.seed,
+            checkpoint=kept,
+        )
+    return diagnosis_rows(found, note)
+
+
+@contextmanager
+def _checkpoint(task: Task) -> Iterator[Path | None]:
+    """The task's checkpoint; it is removed unless the process is killed within."""
+    path = None if task.checkpoint is None else Path(task.checkpoint)
+    try:
+        yield path
+    finally:
+        if path is not None:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)

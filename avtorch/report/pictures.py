@@ -1,0 +1,205 @@
+"""What each picture of a diagnosis shows: drawn for a desk and for a phone, told in words, and as numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from avtorch.experiment import Experiment
+from avtorch.gap.crossval.localisation import UNITS, Axis
+from avtorch.gap.result import sentences
+from avtorch.gap.result.diagnosis import Diagnosis, Shrinkage
+from avtorch.plots.diagnosis import (
+    budget_figure,
+    histogram_of,
+    road_figure,
+    shrinkage_figure,
+    stretch_of,
+    where_figure,
+    which_figure,
+)
+from avtorch.plots.experiment import experiment_figure
+from avtorch.report.entries import budget_table, candidate_table, measure_table
+from avtorch.report.picture import Picture, inline_svg
+from avtorch.report.table import Table, of_numbers
+
+_MOST = 60  # rows of a table behind a picture of lines
+
+
+def pictures(found: Diagnosis, experiment: Experiment | None = None) -> dict[str, Picture | None]:
+    """The pictures of a diagnosis and of the `experiment` to drive next, by name; None where there is nothing to draw.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, simulate
+        >>> from avtorch.gap import DeadTime, plant
+        >>> from avtorch.report.pictures import pictures
+        >>> late = plant([DeadTime(0.4)], sigma=0.0)
+        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
+        >>> drawn = pictures(diagnose(log, effects=["dead_time"], pairs=False))
+        >>> drawn["which"].says.split(":")[0], drawn["next"]
+        ('Bars of the probability of each hypothesis', None)
+    """
+    return {
+        "budget": _budget(found),
+        "road": _road(found),
+        "where": _where(found),
+        "which": _which(found),
+        "shrinkage": _shrinkage(found),
+        "next": None if experiment is None else _next(experiment),
+    }
+
+
+def _picture(
+    name: str,
+    draw: Callable[[bool], Figure],
+    says: str,
+    *tables: Table,
+    caption: str = "",
+    opened: bool = False,
+) -> Picture:
+    wide, narrow = (inline_svg(f"{name}-{kind}", draw(kind == "narrow"), says) for kind in ("wide", "narrow"))
+    return Picture(wide, narrow, says, caption, tables, opened)
+
+
+def _budget(found: Diagnosis) -> Picture | None:
+    budget = found.budget
+    if budget is None or not budget.parts:
+        return None
+    shares = [(part.name, part.share) for part in budget.parts] + [("unexplained", budget.unexplained.share)]
+    says = ", ".join(f"{name} {100 * share.mean:.0f} %" for name, share in shares)
+    return _picture(
+        "budget",
+        lambda narrow: budget_figure(found, narrow=narrow),
+        f"Bars of what each effect contributes to the gap: {says}.",
+        budget_table(budget),
+        caption=f"A share is what an effect takes off the squared error of held-out {budget.horizon_s:.3g} s rollouts, "
+        "above the noise floor and on top of the effects before it. Whiskers: 90 %.",
+        opened=True,
+    )
+
+
+def _road(found: Diagnosis) -> Picture | None:
+    if found.traces is None:
+        return None
+    stretch = stretch_of(found)
+    labels, lines = list(stretch.lines), list(stretch.lines.values())
+    errors = [f"{np.sqrt(np.mean((line - lines[0]) ** 2)):.2g}" for line in lines[1:]]
+    off = " and ".join(
+        f"{error} {_unit(stretch.axis)} {label}" for error, label in zip(errors, labels[1:], strict=True)
+    )
+    rows = _some(np.column_stack([stretch.time, *lines]))
+    table = of_numbers(
+        f"The {_quantity(stretch.axis)} in this stretch",
+        ("time [s]", *(f"{label} [{_unit(stretch.axis)}]" for label in labels)),
+        rows,
+        (".2f", *(".3f" for _ in labels)),
+    )
+    return _picture(
+        "road",
+        lambda narrow: road_figure(found, narrow=narrow),
+        f"Lines of {_quantity(stretch.axis)} over time, {stretch.time[0]:.0f} to {stretch.time[-1]:.0f} s: "
+        f"{', '.join(labels)}. RMS error: {off}.",
+        table,
+        caption=f"{_which_stretch(found)} All simulated lines are rollouts over the "
+        "whole drive: the simulator gets the logged commands and never the measured acceleration; its speed starts at "
+        "the measured one.",
+    )
+
+
+def _which_stretch(found: Diagnosis) -> str:
+    traces = found.traces
+    assert traces is not None
+    if (traces.before == traces.after).all():
+        return "The beginning of the drive; nothing was named that another stretch would show better."
+    return "The stretch of the drive in which the effect is strongest."
+
+
+def _where(found: Diagnosis) -> Picture | None:
+    traces = found.traces
+    # where nothing is missing no effect is named whose place could be drawn
+    if traces is None or not traces.does.any() or found.verdict.name == "none":
+        return None
+    axes: list[Axis] = ["time", "command"] if traces.speed is None else ["time", "speed", "command"]
+    tables = []
+    for axis in axes:
+        shares = histogram_of(found, axis, bins=15)
+        rows = [
+            (f"{a:.3g} to {b:.3g}", f"{100 * drive:.0f} %", f"{100 * effect:.0f} %")
+            for a, b, drive, effect in zip(shares.edges, shares.edges[1:], shares.rows, shares.effect, strict=False)
+        ]
+        columns = (f"{axis} [{UNITS[axis]}]", "share of the drive", "share of the effect")
+        tables.append(Table(f"Along {axis}", columns, tuple(rows), numeric=columns[1:]))
+    said = " ".join(sentences.where(found)) or "No part of the drive stands out."
+    return _picture(
+        "where",
+        lambda narrow: where_figure(found, narrow=narrow),
+        f"Histograms along {', '.join(axes)}: the share of the drive beside the share of the effect. {said}",
+        *tables,
+        caption="Where the blue line is above the grey ground, the effect acts more than its share of the drive.",
+    )
+
+
+def _which(found: Diagnosis) -> Picture:
+    bars = ", ".join(f"{c.name.replace('+', ' + ')} {sentences.number(c.probability)}" for c in found.candidates[:3])
+    return _picture(
+        "which",
+        lambda narrow: which_figure(found, narrow=narrow),
+        f"Bars of the probability of each hypothesis: {bars}.",
+        candidate_table(found),
+        caption="Blue, and bold in the table: the alias set, which this log cannot distinguish from the verdict. "
+        "Probabilities were calibrated on simulated drives. The nats behind them are raw log evidence, which is far "
+        "overconfident.",
+        opened=True,
+    )
+
+
+def _shrinkage(found: Diagnosis) -> Picture | None:
+    scores = found.shrinkage
+    if scores is None or not _over_horizons(scores):
+        return None
+    top = scores.by_metric[scores.metric]
+    return _picture(
+        "shrinkage",
+        lambda narrow: shrinkage_figure(found, narrow=narrow),
+        "Lines of the error over the length of the rollouts: baseline simulator, baseline with a black box, with the "
+        f"effect, noise floor. By the measure that decides, {top.before:.2g} without and {top.after:.2g} with the "
+        f"effect, of which {top.floor:.2g} is noise.",
+        measure_table(scores),
+        caption="Bold in the table: the measure that decides.",
+        opened=True,
+    )
+
+
+def _next(experiment: Experiment) -> Picture:
+    m = experiment.manoeuvre
+    rows = _some(np.column_stack([m.time, m.command, m.speed]))
+    columns = ("time [s]", "command [m/s²]", "expected speed [m/s]")
+    return _picture(
+        "next",
+        lambda narrow: experiment_figure(experiment, narrow=narrow),
+        f"Lines over {m.time[-1]:.0f} s: a command of {m.command.min():.2g} to {m.command.max():.2g} m/s² and the "
+        f"expected speed, {m.speed.min():.2g} to {m.speed.max():.2g} m/s.",
+        of_numbers(f"The manoeuvre {m.name}", columns, rows, (".1f", ".2f", ".1f")),
+        caption="The commands row by row are in manoeuvre.csv. A command holds until the next row; the speed is the "
+        "prediction of the most probable hypothesis. Use a level road if there is one.",
+    )
+
+
+def _over_horizons(shrinkage: Shrinkage) -> bool:
+    """Whether errors are known over several horizons, so that there is a line to draw."""
+    return len({metric.horizon_s for metric in shrinkage.by_metric.values()}) > 1
+
+
+def _some(rows: np.ndarray) -> Sequence[Sequence[float]]:
+    """At most `_MOST` of the rows, evenly spaced, the first among them."""
+    return rows[:: -(-len(rows) // _MOST)].tolist()
+
+
+def _quantity(label: str) -> str:
+    return label.partition(" [")[0]
+
+
+def _unit(label: str) -> str:
+    return label.partition("[")[2].rstrip("]")

@@ -1,0 +1,49 @@
+"""A table of the page: text in cells, each column with a title that also labels its cells on a phone."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+
+from avtorch.errors import InputError
+
+
+@dataclass(frozen=True)
+class Table:
+    """`columns` (column,) of titles; `rows` (row,) of as many cells, the first of which names its row.
+
+    `caption`: what the table shows. `numeric`: titles of the columns of numbers. `marked`: numbers of the rows in bold.
+    Raises `InputError` where a row has another number of cells than there are columns.
+
+    Example:
+        >>> from avtorch.report.table import Table
+        >>> Table("Speeds", ("car", "speed [m/s]"), (("ego", "12.5"),), numeric=("speed [m/s]",)).numeric
+        ('speed [m/s]',)
+    """
+
+    caption: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    numeric: Collection[str] = ()
+    marked: Collection[int] = ()
+
+    def __post_init__(self) -> None:
+        for i, row in enumerate(self.rows):
+            if len(row) != len(self.columns):
+                raise InputError(
+                    f"table {self.caption!r}: found {len(row)} cells in row {i}, needs {len(self.columns)}"
+                )
+
+
+def of_numbers(
+    caption: str, columns: Sequence[str], values: Iterable[Sequence[float]], formats: Sequence[str]
+) -> Table:
+    """A table of numbers alone: `values` (row, column), each column written by its format.
+
+    Example:
+        >>> from avtorch.report.table import of_numbers
+        >>> of_numbers("Speed", ("time [s]", "speed [m/s]"), [(0.0, 12.5)], (".1f", ".2f")).rows
+        (('0.0', '12.50'),)
+    """
+    rows = tuple(tuple(format(x, f) for x, f in zip(row, formats, strict=True)) for row in values)
+    return Table(caption, tuple(columns), rows, numeric=tuple(columns))

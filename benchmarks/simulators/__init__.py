@@ -1,0 +1,1 @@
+"""Blind cases of simulators that are not made of effects."""

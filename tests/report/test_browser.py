@@ -1,0 +1,99 @@
+"""The page in Chromium: nothing cut off, nothing requested, no violation that axe-core finds."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+
+from avtorch.experiment import Experiment
+from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.report import write_report
+
+sync_api = pytest.importorskip("playwright.sync_api")
+axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+
+PROGRAMS = ("chromium-headless-shell", "chromium", "google-chrome")
+PROGRAM = next((path for path in map(shutil.which, PROGRAMS) if path), None)
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(PROGRAM is None, reason="needs Chromium: Debian's chromium-headless-shell or chromium"),
+]
+
+CUT_OFF = """() => [...document.querySelectorAll("body *")]
+  .filter(e => !e.closest("svg") && !e.closest("thead") && !e.closest("caption"))
+  .filter(e => e.getBoundingClientRect().right > innerWidth + 0.5 || e.scrollWidth > e.clientWidth + 1 && e.clientWidth)
+  .map(e => e.tagName + " " + e.textContent.slice(0, 60))"""
+LETTERS_PX = """() => [...document.querySelectorAll("svg text")].filter(e => e.getClientRects().length)
+  .map(e => parseFloat(getComputedStyle(e).fontSize) * Math.hypot(e.getCTM().a, e.getCTM().b))"""
+OUTSIDE = """() => [...document.querySelectorAll("svg text")].filter(e => e.getClientRects().length).filter(e => {
+  const a = e.getBoundingClientRect(), b = e.closest("svg").getBoundingClientRect();
+  return a.left < b.left - 1 || a.right > b.right + 1 || a.top < b.top - 1 || a.bottom > b.bottom + 1;
+}).map(e => e.textContent)"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with sync_api.sync_playwright() as play:
+        # the sandbox needs rights that containers lack, and the page is our own
+        program = play.chromium.launch(executable_path=PROGRAM, args=["--no-sandbox"])
+        yield program
+        program.close()
+
+
+@pytest.fixture(scope="module")
+def path(found: Diagnosis, ahead: Experiment, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_report(found, tmp_path_factory.mktemp("page"), experiment=ahead, quality=["2 rows masked"])
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 780, 1280])
+def test_it_fits_and_is_accessible(browser: Any, path: Path, width: int, scheme: Literal["light", "dark"]) -> None:
+    page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
+    requests, complaints = [], []
+    page.on("request", lambda request: requests.append(request.url))
+    page.on("console", lambda message: complaints.append(message.text))
+    page.goto(path.as_uri())
+    page.evaluate("() => document.querySelectorAll('details').forEach(e => { e.open = true; })")
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= width
+    assert page.evaluate(CUT_OFF) == []
+    assert page.evaluate(OUTSIDE) == []
+    letters = page.evaluate(LETTERS_PX)
+    assert len(letters) > 30
+    assert min(letters) >= 9.0, "letters of a picture that a reader can read"
+    ground = page.evaluate("() => getComputedStyle(document.body).backgroundColor")
+    assert (sum(map(int, ground[4:-1].split(","))) < 150) == (scheme == "dark")
+    assert requests == [path.as_uri()]
+    assert complaints == []
+    judged = axe.Axe().run(page).response
+    assert [(fault["id"], [node["html"][:200] for node in fault["nodes"]]) for fault in judged["violations"]] == []
+    assert len(judged["passes"]) > 10
+    page.close()
+
+
+def test_every_table_behind_a_picture_opens_by_keyboard(browser: Any, path: Path) -> None:
+    page = browser.new_page(viewport={"width": 1280, "height": 800})
+    page.goto(path.as_uri())
+    count = page.locator("details").count()
+    before = page.evaluate("() => [...document.querySelectorAll('details')].map(e => e.open)")
+    for _ in range(count):
+        page.keyboard.press("Tab")
+        assert page.evaluate("() => document.activeElement.tagName") == "SUMMARY"
+        page.keyboard.press("Enter")
+    assert page.evaluate("() => [...document.querySelectorAll('details')].map(e => !e.open)") == before
+    page.close()
+
+
+def test_paper_is_light_and_shows_the_wide_pictures(browser: Any, path: Path) -> None:
+    page = browser.new_page(viewport={"width": 700, "height": 990}, color_scheme="dark")
+    page.goto(path.as_uri())
+    page.emulate_media(media="print", color_scheme="dark")
+    assert page.evaluate("() => getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    assert page.evaluate("() => getComputedStyle(document.querySelector('h1')).color") == "rgb(34, 34, 34)"
+    assert page.locator("svg >> visible=true").count() == 6
+    assert page.evaluate("() => document.documentElement.scrollWidth") <= 700
+    page.close()

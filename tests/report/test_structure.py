@@ -1,0 +1,108 @@
+"""What a screen reader and a keyboard need of the page: names, order, tables behind pictures."""
+
+from __future__ import annotations
+
+import re
+from itertools import pairwise
+
+import pytest
+
+from avtorch.experiment import Experiment
+from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.report import report_html
+from tests.report.tree import Element, read
+
+
+@pytest.fixture(scope="module")
+def text(found: Diagnosis, ahead: Experiment) -> str:
+    return report_html(found, experiment=ahead, quality=["2 rows masked"], sections={"The loop": ["It is closed."]})
+
+
+@pytest.fixture(scope="module")
+def page(text: str) -> Element:
+    return read(text)
+
+
+def test_every_picture_has_words_and_a_table(page: Element) -> None:
+    figures = list(page.all("figure"))
+    assert len(figures) == 6
+    for figure in figures:
+        wide, narrow = figure.all("svg")
+        for svg in (wide, narrow):
+            assert svg.attributes["role"] == "img"
+            assert len(svg.attributes["aria-label"]) > 40
+        assert wide.attributes["aria-label"] == narrow.attributes["aria-label"]
+        for details in figure.all("details"):
+            assert details.inside[0].tag == "summary"
+            assert details.inside[0].text()
+        assert any(
+            len(list(table.all("tr"))) > 1 for details in figure.all("details") for table in details.all("table")
+        )
+    assert len(list(page.all("svg"))) == 2 * len(figures), "no picture outside a figure"
+    assert not list(page.all("img"))
+
+
+def test_tables_have_captions_headers_and_labelled_cells(page: Element) -> None:
+    tables = list(page.all("table"))
+    assert len(tables) >= 8
+    for table in tables:
+        assert next(table.all("caption")).text()
+        columns = [th for th in table.all("th") if th.attributes["scope"] == "col"]
+        titles = [th.text() for th in columns]
+        assert all(titles)
+        for row in next(table.all("tbody")).all("tr"):
+            first, *others = row.inside
+            assert (first.tag, first.attributes["scope"], bool(first.text())) == ("th", "row", True)
+            assert [cell.attributes["data-column"] for cell in others] == titles[1:]
+        # a table shown as blocks on a phone remains one for a screen reader only by its roles
+        roles = {"table": "table", "thead": "rowgroup", "tbody": "rowgroup", "tr": "row", "td": "cell"}
+        for element in (table, *table.all(*roles)):
+            assert element.attributes["role"] == roles[element.tag]
+
+
+def test_headings_are_in_order_and_name_their_sections(page: Element) -> None:
+    levels = [int(heading.tag[1]) for heading in page.all("h1", "h2", "h3", "h4")]
+    assert levels[0] == 1
+    assert levels.count(1) == 1
+    assert all(after <= before + 1 for before, after in pairwise(levels))
+    ids = {element.attributes["id"] for element in page.all("h1", "h2")}
+    assert {section.attributes["aria-labelledby"] for section in page.all("section", "footer")} == ids
+
+
+def test_landmarks_and_language(page: Element) -> None:
+    assert [len(list(page.all(tag))) for tag in ("main", "footer")] == [1, 1]
+    assert next(page.all("html")).attributes["lang"] == "en"
+    assert next(page.all("title")).text()
+
+
+def test_ids_are_unique_and_every_reference_is_met(text: str, page: Element) -> None:
+    ids = [element.attributes["id"] for element in page.all() if "id" in element.attributes]
+    assert len(ids) == len(set(ids))
+    assert set(re.findall(r'(?:href="|url\()#([^")]+)', text)) <= set(ids)
+
+
+def test_it_requests_nothing(page: Element) -> None:
+    """No element that loads, no address in an attribute or a style but the page's own ids."""
+    assert not list(page.all("script", "link", "img", "iframe", "object", "embed", "image", "video", "audio"))
+    for element in page.all():
+        for name, value in element.attributes.items():
+            if not name.startswith("xmlns"):
+                assert "//" not in value, (element.tag, name)
+            if name in ("src", "href", "xlink:href"):
+                assert value.startswith("#")
+            assert not re.search(r"url\((?!#)", value)
+    (style,) = page.all("style")
+    assert not re.search(r"url\(|@import", style.text())
+    policy = next(x for x in page.all("meta") if x.attributes.get("http-equiv") == "Content-Security-Policy")
+    assert "default-src 'none'" in policy.attributes["content"]
+
+
+def test_pictures_take_every_colour_from_the_style(page: Element) -> None:
+    (style,) = page.all("style")
+    known = set(re.findall(r"--([\w-]+):", style.text()))
+    for svg in page.all("svg"):
+        for element in svg.all():
+            for name in ("style", "fill", "stroke"):
+                value = element.attributes.get(name, "")
+                assert not re.search(r"#[0-9a-fA-F]{3}|rgb", re.sub(r"url\(#[^)]*\)", "", value)), value
+                assert set(re.findall(r"var\(--([\w-]+)\)", value)) <= known
