@@ -118,6 +118,7 @@ def test_a_log_that_ends_every_worker_becomes_a_row_and_the_others_are_done(tmp_
 
 
 @pytest.mark.slow
+@pytest.mark.statistical
 def test_a_diagnosis_goes_on_from_what_a_killed_worker_had_finished(
     tmp_path: Path, scheduler: str, rotating_seed: int
 ) -> None:
