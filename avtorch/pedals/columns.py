@@ -93,6 +93,8 @@ class MapColumns:
             size = (len(knots) - 1) * width
             make = SIGN[name] * _summed(knots)
             accel = make @ factors[at : at + size].reshape(-1, width)
+            # the factors are not negative, yet by round-off a knot of a sum may fall below the one before
+            accel = SIGN[name] * np.maximum.accumulate(SIGN[name] * accel)
             spread = None if sd is None else _sd(make @ sd[:, at : at + size].reshape(len(sd), -1, width))
             pedals[name] = PedalTable(knots, accel, spread)
             at += size

@@ -79,3 +79,13 @@ def test_tables_that_are_no_map(knots: list, accel: list, told: str) -> None:
         PedalMap(np.array([0.0, 30.0]), np.zeros(2), {"throttle": PedalTable(np.array(knots), np.array(accel))})
     with pytest.raises(InputError, match="needs some of throttle, brake, torque, current"):
         PedalMap(np.array([0.0, 30.0]), np.zeros(2), {})
+
+
+def test_no_round_off_makes_a_map_turn_back() -> None:
+    """A saturation is a ramp of height zero; the same numbers summed in another order may differ in the last bit."""
+    rng = np.random.default_rng(0)
+    columns = MapColumns(np.array([0.0, 10.0, 20.0, 30.0]), {"throttle": np.sort(np.append(0.0, rng.uniform(0, 1, 8)))})
+    for _ in range(200):
+        factors = np.where(rng.uniform(size=columns.count) < 0.5, 0.0, rng.uniform(size=columns.count))
+        made = columns.map_of(factors, None, 0.3, 0.0)
+        assert (np.diff(made.pedals["throttle"].accel, axis=0) >= 0).all()
