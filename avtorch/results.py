@@ -88,6 +88,7 @@ def estimates_answer(estimates: Estimates) -> dict[str, Any]:
             "gains": setting.gains[0].tolist(),
             "dead_time_s": estimates.dead_time,
             "dead_time_inferred": None if estimates.inferred is None else estimates.inferred.to_dict(),
+            "late_channel": None if estimates.late is None else estimates.late.to_dict(),
             "accepted": dict(zip(("T_L", "K_L"), estimates.accepted, strict=True)),
         },
         "quality": estimates.quality.to_dict(),

@@ -30,6 +30,7 @@ from avtorch.errors import InputError
 
 if TYPE_CHECKING:
     from avtorch.decision.dead_time import InferredDeadTime
+    from avtorch.logcheck.late_channel import LateChannel
 
 
 def estimate(
@@ -71,6 +72,9 @@ def estimate(
         float | None,
         Parameter(help="Dead time of the car [s], if known; by default inferred where jerk is not measured."),
     ] = None,
+    align: Annotated[
+        bool, Parameter(help="Where accel and speed differ by a clock or a filter, put the late one on time.")
+    ] = True,
     resume: Annotated[bool, Parameter(help="Resume an interrupted run in --out, or start again.")] = True,
     seed: Seed = 0,
     json: Json = False,
@@ -116,7 +120,7 @@ def estimate(
         begin_anew(out, WINDOWS)
     options: dict[str, Any] = {"mode": mode} if estimator in PASSING_ON else {}
     options |= {"form": form, "setting": setting, "dead_time": dead_time, "seed": seed, "accepted": sound}
-    options |= {"estimator": estimator, "checkpoint": out / WINDOWS}
+    options |= {"estimator": estimator, "align": align, "checkpoint": out / WINDOWS}
     try:
         with talk.progress("Estimating") as step, finished_windows(out) as written:
             found = work(drive, window, progress=step, finished=written, **options)
@@ -143,7 +147,7 @@ def estimate(
     printed = answer | {key: from_start(answer[key], answer["epoch_s"]) for key in ("windows", "alerts")}
     talk.windows(printed["windows"])
     talk.summary(printed, estimates_note(answer))
-    for text in (dead_time_note(found.inferred), answer["estimator_note"]):
+    for text in (late_note(found.late), dead_time_note(found.inferred), answer["estimator_note"]):
         if text:
             talk.sentence(text)
     talk.done(out, answer)
@@ -164,6 +168,15 @@ def dead_time_note(inferred: InferredDeadTime | None) -> str:
     if inferred.seconds == 0.0:
         return f"No dead time is clear ({span}): T_L holds it. --dead-time sets one."
     return f"Dead time inferred, {inferred.seconds:.2f} s ({span}): T_L is the lag behind it. --dead-time sets another."
+
+
+def late_note(late: LateChannel | None) -> str:
+    """What was done about a late channel, in one sentence; empty where none is late."""
+    if late is None:
+        return ""
+    other = "speed" if late.name == "accel" else "accel"
+    done = f"{late.name} is moved by it" if late.recoverable else f"{late.name} is left out and {other} used alone"
+    return f"{late}: {done}. --no-align leaves both as they are."
 
 
 def estimates_note(answer: Mapping[str, Any]) -> str:

@@ -29,6 +29,7 @@ from avtorch.inference.stream import BeliefStream
 from avtorch.io.log import Log
 from avtorch.io.no_command import no_command
 from avtorch.io.quality import Quality, check
+from avtorch.logcheck.late_channel import LateChannel, late_channel, on_time
 
 Array = NDArray[Any]
 FormName = Literal["auto", "jerk", "latent"]
@@ -44,7 +45,8 @@ class Estimates:
     `windows` in the order of the log; `seconds_per_window` of computing; `form` "jerk" or "latent"; `quality` of the
     log, checked first; `setting` for which P(string stable) was computed, since a log does not contain its controller;
     `estimator` by name; `accepted` (T_L [s], K_L [-]) of a sound car, with which `accepted_change` compares;
-    `dead_time` [s] that commands were given, and what it was `inferred` from the log to be, where it was.
+    `dead_time` [s] that commands were given, and what it was `inferred` from the log to be, where it was; `late`: the
+    channel that was late and put on time.
 
     Example:
         >>> from avtorch import GLVDPlant, Leader, estimate, simulate
@@ -63,6 +65,7 @@ class Estimates:
     accepted: tuple[float, float] = (0.3, 1.0)
     dead_time: float = 0.0
     inferred: InferredDeadTime | None = None
+    late: LateChannel | None = None
 
     @property
     def excited_share(self) -> float:
@@ -95,6 +98,7 @@ def estimate(
     monitor: Monitor | None = None,
     accepted: tuple[float, float] = (0.3, 1.0),
     dead_time: float | None = 0.0,
+    align: bool = True,
     progress: Callable[[int, int], None] | None = None,
     finished: Callable[[WatchedWindow], None] | None = None,
     checkpoint: str | PathLike[str] | None = None,
@@ -123,6 +127,9 @@ def estimate(
     (`avtorch.decision.dead_time`) and takes none in the jerk form. Commands act that much later, and the first rows of
     a drive, whose commands are not in the log or were not obeyed, are masked. The default monitor computes its verdicts
     with it, and compares with `accepted` (T_L [s], K_L [-]).
+
+    `align`, in the latent form: where accel comes clearly later than the slope of speed or before it, the late channel
+    is moved; one behind a long filter is left out (`avtorch.logcheck.late_channel`).
 
     Raises `InputError` for a log without accel_cmd or without any row that counts, a form whose columns it lacks, a
     window longer than the log, or an estimator that is not known or cannot take the form;
@@ -155,6 +162,10 @@ def estimate(
         raise InputError(f"dead_time: found {dead_time:g} s, needs 0 or more and less than the window, {window:g} s")
     quality = check(log)
     begun = clock.perf_counter()
+    late, have = None, np.ones(log.rows, bool)
+    if align and isinstance(chosen, LatentForm) and (late := late_channel(log)) is not None:
+        log, have = on_time(log, late)
+        chosen = _form(log, "latent")
     inferred = None
     if dead_time is None:
         inferred = infer_dead_time(log, partial(_delayed, log)) if isinstance(chosen, LatentForm) else None
@@ -171,12 +182,12 @@ def estimate(
     options = {"estimator": estimator, "seed": seed, "check_units": False, **inference}
     watch = Watch(BeliefStream(window=window, form=chosen, gap=float("inf"), **options), monitor)
     command, known = _delayed(log, dead_time)
-    usable = torch.from_numpy(log.usable & known)
+    usable = torch.from_numpy(log.usable & known & have)
     signals = {name: torch.from_numpy(getattr(log, name)) for name in chosen.columns}
     signals["accel_cmd"] = torch.from_numpy(command)
     name = "jerk" if isinstance(chosen, JerkForm) else "latent"
     settings = {"window": window, "form": name, "delay": dead_time, "estimator": estimator, "seed": seed}
-    settings |= {"accepted": accepted, "mode": inference.get("mode")}
+    settings |= {"accepted": accepted, "mode": inference.get("mode"), "align": align}
     kept = KeptWindows(
         checkpoint, {} if checkpoint is None else estimated_work(log, settings, watch.state_dict(), setting, inference)
     )
@@ -199,7 +210,7 @@ def estimate(
     kept.remove()
     seconds = (clock.perf_counter() - begun) / max(len(windows), 1)
     T, K = (float(x[0]) for x in watch.monitor.accepted)
-    return Estimates(windows, seconds, name, quality, setting, estimator, (T, K), dead_time, inferred)
+    return Estimates(windows, seconds, name, quality, setting, estimator, (T, K), dead_time, inferred, late)
 
 
 def _fed(

@@ -130,7 +130,8 @@ class ExternalSimulator:
             first = not len(rollouts)  # by which it is told how long the others take
             if progress is not None and not first:
                 each = rollouts.seconds / len(rollouts)
-                progress(f"fitting its parameters, {each:.2g} s a drive", len(rollouts), self.most_rollouts)
+                many = f"{len(rollouts) + len(places)} of {self.most_rollouts} at most"
+                progress(f"fitting its parameters, drive {many}, {each:.2g} s each", len(rollouts), self.most_rollouts)
             if first and len(places) == 1:
                 return [self._driven(simulator, logs, progress)]
             return side_by_side(simulator, one, places, self.processes)

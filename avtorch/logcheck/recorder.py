@@ -7,6 +7,7 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.io.log import Log
 from avtorch.io.segments import stretches
+from avtorch.logcheck.late_channel import late_channel
 from avtorch.logcheck.order_of_events import WITHIN_S, lateness
 
 _CHANNELS = ("accel_cmd", "accel", "speed")
@@ -40,7 +41,9 @@ def recorder_notes(log: Log) -> list[str]:
             notes.append(f"{name} is rounded to {step:.3g} {_UNITS[name]}")
     parts = stretches(log.usable, log.segment)
     slope = _slope(log)
-    if slope is not None and log.accel is not None:
+    if (known := late_channel(log)) is not None:
+        notes.append(str(known))
+    elif slope is not None and log.accel is not None and log.accel_cmd is None:
         late = lateness(log.elapsed, parts, slope, log.accel)
         if late is not None and late.correlation >= _AGREE and abs(late.seconds) > 0.5 / log.rate_hz:
             order = "after" if late.seconds > 0 else "before"

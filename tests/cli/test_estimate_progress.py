@@ -71,3 +71,17 @@ def test_lines_name_the_stage_where_there_are_several(monkeypatch: pytest.Monkey
     out = io.StringIO()
     ProgressLines(Console(file=out), "Diagnosing")(250, 1000, "pairs")
     assert out.getvalue().splitlines() == ["Diagnosing: 25 %, about 60 s left (pairs)"]
+
+
+def test_what_comes_first_tells_its_own_time_and_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A simulator of 31 s, driven before any step of the diagnosis, made that seem to take half an hour."""
+    clock = iter([0.0, 0.1, 31.0, 51.0])
+    monkeypatch.setattr(progress_lines.time, "monotonic", lambda: next(clock))
+    out = io.StringIO()
+    lines = ProgressLines(Console(file=out), "Diagnosing")
+    for stage, done in (("driving the simulator, about 31 s", 0), ("simulator", 0), ("single effects", 200)):
+        lines(done, 1000, stage)
+    assert out.getvalue().splitlines() == [
+        "Diagnosing: driving the simulator, about 31 s",
+        "Diagnosing: 20 %, about 80 s left (single effects)",
+    ]
