@@ -11,7 +11,6 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
 
 import numpy as np
 from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
@@ -117,7 +116,7 @@ def adjusted(rollouts: Rollouts, limits: Limits, *, logs: Sequence[Log] | None =
     outputs = rollouts.at(values)
     held = fitting.hold_out(fit)
     needed = fitting.evidence(_as_it_is(record, cars, fitting, first), held).strength(len(limits)) > 0
-    errors = dict(zip(limits, (_errors(fitting, model, fit) * _scales(limits)).tolist(), strict=True))
+    errors = dict(zip(limits, (fitting.errors(fit)[: len(limits)] * _scales(limits)).tolist(), strict=True))
     found = tuple(
         _difference(name, before[name], values[name], errors[name], fitting.whitening.blocks - 1, needed)
         for name in limits
@@ -130,22 +129,8 @@ def _as_it_is(record: AnalysisRecord, cars: Sequence[Log], fitting: RobustFit, f
     plain = _Linear(record, _measured(record, cars, first), np.zeros((0, *record.measured.shape)), {}, {})
     if plain.size:
         return fitting.hold_out(_fitted(fitting, plain))
-    white = fitting.white(cast("Any", plain), np.zeros(0))
+    white = fitting.white(plain, np.zeros(0))
     return HeldOut(fitting.nats(white), np.zeros((0, 0)), white)
-
-
-def _errors(fitting: RobustFit, model: _Linear, fit: Fit) -> FloatArray:
-    """Standard errors (parameter,) of the coordinates by how much the blocks disagree (Liang and Zeger's sandwich)."""
-    own = cast("Any", model)
-    white = fitting.white(own, fit.z)
-    slope = fitting.slope(own, fit.z, white)
-    weighed = slope * fitting.weights(white, np.ones(fitting.whitening.blocks))
-    curvature = weighed.reshape(model.size, -1) @ slope.reshape(model.size, -1).T + np.eye(model.size)
-    scores = fitting.whitening.by_block(weighed * white)
-    blocks = scores.shape[-1]
-    inverse = np.linalg.inv(curvature)
-    covariance = inverse @ (scores @ scores.T) @ inverse * blocks / max(blocks - model.size, 1)
-    return np.sqrt(np.diag(covariance))[: len(model.limits)]
 
 
 def _difference(name: str, before: float, value: float, sd: float, freedom: int, needed: bool) -> ParameterDifference:
@@ -164,9 +149,8 @@ def _fitting(record: AnalysisRecord, model: _Linear) -> RobustFit:
     return RobustFit(NoiseWhitening.autoregressive(record, left_over(rough, _fitted(rough, model))))
 
 
-def _fitted(fitting: RobustFit, model: _Linear) -> Fit:
-    # what a fit asks of a model is there; that it is made of effects is not asked
-    return fitting.fit(cast("Any", model), np.zeros((1, model.size)), iterations=10)
+def _fitted(fitting: RobustFit, model: _Linear) -> Fit[_Linear]:
+    return fitting.fit(model, np.zeros((1, model.size)), iterations=10)
 
 
 def _measured(record: AnalysisRecord, cars: Sequence[Log], outputs: Sequence[Log]) -> FloatArray:
@@ -235,6 +219,10 @@ class _Linear:
 
     def traded(self, z: FloatArray) -> FloatArray:
         return np.zeros((0, len(z)))
+
+    def named(self, z: FloatArray) -> dict[str, FloatArray]:
+        """By name, at coordinates `z` (size,), each (1,)."""
+        return {name: np.array([value]) for name, value in self.parameters(z).items()}
 
     def parameters(self, z: FloatArray) -> dict[str, float]:
         """By name, at coordinates `z` (size,)."""

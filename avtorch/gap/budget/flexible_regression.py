@@ -11,13 +11,13 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.held_out_evidence import Evidence, agreement
-from avtorch.gap.budget.robust_fit import Fit, RobustFit
+from avtorch.gap.budget.robust_fit import Fit, M, RobustFit
 from avtorch.gap.likelihood.basis import lowpass
 
 _RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)  # of the columns' own sums of squares
 
 
-def columns(fit: Fit) -> FloatArray:
+def columns(fit: Fit[M]) -> FloatArray:
     """Smooth functions of the rollout's acceleration, commands, speed and time: (column, channel, row).
 
     A force shows in both channels, a fault of the accelerometer in its own alone.
@@ -65,7 +65,7 @@ def _forces(record: AnalysisRecord, a: FloatArray, speed: FloatArray, t: FloatAr
     return np.array([*plain, *rest, lowpass(u, 1.0, dt), lowpass(u, 3.0, dt), t, t**2], dtype=float)
 
 
-def left_over(fitting: RobustFit, fit: Fit) -> FloatArray:
+def left_over(fitting: RobustFit, fit: Fit[M]) -> FloatArray:
     """Residuals (channel, row) less the regression, fitted to all blocks."""
     residuals, shapes = fit.residuals, columns(fit)
     X, y, scale = _white(fitting, shapes, residuals)

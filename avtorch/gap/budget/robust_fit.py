@@ -9,11 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Generic
 
 import numpy as np
+from typing_extensions import TypeVar
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.budget.effect_model import LATENESS, EffectModel
+from avtorch.gap.budget.fitted_model import FittedModel
 from avtorch.gap.budget.held_out_evidence import Evidence, agreement
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 
@@ -24,12 +27,14 @@ _CLOSE = (1e-3, 1.0)  # where the place is known nearly
 _LONGEST = 1.0  # step of a coordinate [prior SD], then two and a half of it
 _STOP_NATS = 0.05
 
+M = TypeVar("M", bound=FittedModel, default=EffectModel)
+
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(Generic[M]):
     """A model at its best `z` (size,): it costs `nats` with the prior, `block_nats` (block,) without."""
 
-    model: EffectModel
+    model: M
     z: FloatArray
     nats: float
     block_nats: FloatArray
@@ -84,13 +89,13 @@ class RobustFit:
         """Cost (..., block) of white residuals (..., channel, counted)."""
         return self.half * np.log1p(self.whitening.by_block(white**2) / self.prior)
 
-    def white(self, model: EffectModel, z: FloatArray) -> FloatArray:
+    def white(self, model: FittedModel, z: FloatArray) -> FloatArray:
         """White residuals (..., channel, counted) at `z` (..., size)."""
         record = model.record
         response = model.simulate(z)
         return self.whitening(record.measured - np.broadcast_to(response, (*z.shape[:-1], *response.shape[-2:])))
 
-    def fit(self, model: EffectModel, starts: FloatArray, *, iterations: int = 8) -> Fit:
+    def fit(self, model: M, starts: FloatArray, *, iterations: int = 8) -> Fit[M]:
         """Gauss-Newton, from the best of `starts` (start, size)."""
         everything = np.ones(self.whitening.blocks)
         white = self.white(model, starts)
@@ -110,11 +115,27 @@ class RobustFit:
                 break
         return Fit(model, z, now, self.nats(at))
 
-    def slope(self, model: EffectModel, z: FloatArray, white: FloatArray) -> FloatArray:
+    def slope(self, model: FittedModel, z: FloatArray, white: FloatArray) -> FloatArray:
         """Derivatives (size, channel, counted) of the white response at `z`, where the white residuals are `white`."""
         return (white - self.white(model, z + _STEP * np.eye(model.size))) / _STEP
 
-    def hold_out(self, fit: Fit, *, iterations: int = 2) -> HeldOut:
+    def errors(self, fit: Fit[M]) -> FloatArray:
+        """Standard errors (size,) of the coordinates by how much the blocks disagree (Liang and Zeger's sandwich)."""
+        white = self.white(fit.model, fit.z)
+        slope = self.slope(fit.model, fit.z, white)
+        weighed, curvature = self._curvature(slope, white, np.ones(self.whitening.blocks))
+        scores = self.whitening.by_block(weighed * white)
+        blocks, inverse = scores.shape[-1], np.linalg.inv(curvature)
+        covariance = inverse @ (scores @ scores.T) @ inverse * blocks / max(blocks - len(fit.z), 1)
+        return np.sqrt(np.diag(covariance))
+
+    def _curvature(self, slope: FloatArray, white: FloatArray, of_blocks: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Weighed slopes (size, channel, counted), and the curvature (size, size) of the cost, prior included."""
+        weighed = slope * self.weights(white, of_blocks)
+        size = len(slope)
+        return weighed, weighed.reshape(size, -1) @ slope.reshape(size, -1).T + np.eye(size)
+
+    def hold_out(self, fit: Fit[M], *, iterations: int = 2) -> HeldOut:
         """Each fold held out, all folds at once.
 
         The folds' best places lie close to the fit, so its slopes serve all of them; what a step gains is the cost
@@ -180,7 +201,7 @@ class RobustFit:
 
     def _steps(
         self,
-        model: EffectModel,
+        model: FittedModel,
         z: FloatArray,
         white: FloatArray,
         slope: FloatArray,
@@ -192,9 +213,8 @@ class RobustFit:
         And one that leaves the lateness alone: where neither channel is late the likelihood has a crease, and slopes on
         one side of it say nothing of the other.
         """
-        weighed = (slope * self.weights(white, of_blocks)).reshape(model.size, -1)
-        curvature = weighed @ slope.reshape(model.size, -1).T + np.eye(model.size)
-        downhill = weighed @ white.ravel() - z
+        weighed, curvature = self._curvature(slope, white, of_blocks)
+        downhill = weighed.reshape(model.size, -1) @ white.ravel() - z
         every = np.ones(model.size, bool)
         tries = [(damping, every) for damping in dampings]
         if LATENESS in model.index:
