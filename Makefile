@@ -16,7 +16,7 @@ export MKL_NUM_THREADS ?= 1
 # Inputs of the fuzzer's nightly mode.
 FUZZ ?= 100000
 
-.PHONY: demo test test-all fuzz lint docs clean
+.PHONY: demo test test-all fuzz lint docs release clean
 
 demo: $(VENV)/.installed
 	$(BIN)/avtorch run --out out/demo
@@ -45,6 +45,10 @@ lint: $(VENV)/.installed-dev
 docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet --doctree-dir out/.doctrees docs out/docs
 	@echo "The pages are in $(CURDIR)/out/docs; begin with index.html"
+
+# wheel, source archive, SBOM and licences in dist/, tried in an environment without extras; some minutes
+release:
+	PYTHON=$(PYTHON) TORCH_INDEX=$(TORCH_INDEX) .ci/release
 
 clean:
 	rm -rf $(VENV) out build dist
