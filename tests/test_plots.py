@@ -115,6 +115,45 @@ def test_map_of_one_verdict_only() -> None:
     plots.verdict_map(axes(), [0.0, 1.0, 2.0], [0.0, 1.0], nowhere, nowhere, np.full((2, 3), np.inf))
 
 
+def test_the_legend_names_what_is_drawn() -> None:
+    stable = plots.verdict_map(axes(), [0.0, 1.0], [0.0, 1.0], np.ones((2, 2), bool), np.ones((2, 2), bool))
+    partly = plots.verdict_map(axes(), [0.0, 1.0], [0.0, 1.0], np.ones((2, 2), bool), np.eye(2, dtype=bool))
+    names = []
+    for beside in ((), (partly,)):
+        legend = plots.verdict_legend(stable, beside=beside).get_legend()
+        assert legend is not None
+        names.append([text.get_text() for text in legend.get_texts()])
+    assert names == [["string stable"], ["string stable", "stable, amplifies (lines: peak gain)"]]
+
+
+def test_labels_of_lines_are_not_cut_off() -> None:
+    figure = Figure(figsize=(4, 4), dpi=100)
+    ax = plots.setting_region(figure.subplots(), SETTING, T_range=(0.02, 2.2), K_range=(0.25, 1.3), points=101)
+    figure.canvas.draw()
+    frame = ax.get_window_extent()
+    labels = [text.get_window_extent() for text in ax.texts]
+    assert len(labels) >= 4
+    for box in labels:
+        assert frame.x0 < box.x0, box
+        assert box.x1 < frame.x1, box
+        assert frame.y0 < box.y0, box
+        assert box.y1 < frame.y1, box
+
+
+def test_a_probability_is_drawn_from_when_it_is_known() -> None:
+    """The window from 4 to 6 s has P 0, which nobody knows at 5 s; the action at 6 s has 0.8, and 8 s is the end."""
+    actions = [{"time_s": 6.0, "p_string_stable": 0.8}]
+    ax = plots.string_probability(axes(), WINDOWS, actions=actions)
+    x, p = (np.asarray(values, float) for values in ax.lines[0].get_data())
+    assert list(zip(x.tolist(), p.tolist(), strict=True)) == [
+        (2.0, 1.0),
+        (4.0, 1.0),
+        (6.0, 0.0),
+        (6.0, 0.8),
+        (8.0, 0.9),
+    ]
+
+
 def test_setting_region_is_that_of_the_effective_vehicle() -> None:
     # with the lower level's model right at (1.5, 0.5) that vehicle behaves as the target and is string stable
     right = {**SETTING, "T_hat": 1.5, "K_hat": 0.5}

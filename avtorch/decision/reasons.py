@@ -20,11 +20,14 @@ def sentences(
     predicted: Prediction,
     asked: Tensor,
     seconds: float,
+    required: float,
+    most_clipped: float,
 ) -> list[str]:
     """One sentence per scenario on the choice of a `Decision`; tensors are (scenario,).
 
     `p_deaf`: P(string stable) if the leader's acceleration is no longer received. `asked`: the driver is asked to set
-    the gap. `seconds` [s] of the past over which `predicted` was replayed.
+    the gap. `seconds` [s] of the past over which `predicted` was replayed. `required` P(string stable) and the share
+    `most_clipped` of commands are what a setting has to keep.
     """
     out = []
     for i, used in enumerate(strategies):
@@ -51,5 +54,6 @@ def sentences(
         if bool(sufficient[i]):
             out.append(f"least intrusive sufficient setting: {what} ({result})")
         else:
-            out.append(f"no setting of the grid is sufficient; the best one: {what} ({result})")
+            missed = f"keeps P(string stable) at {required:g} with {100 * most_clipped:g} % of commands clipped or less"
+            out.append(f"no setting of the grid {missed}; the best one: {what} ({result})")
     return out

@@ -210,6 +210,8 @@ class Strategist:
                 predicted=predicted,
                 asked=asked,
                 seconds=history.seconds,
+                required=self.required,
+                most_clipped=self.most_clipped,
             ),
             interim=interim,
             p_interim=self.probability(interim, T_L, K_L),

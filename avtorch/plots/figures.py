@@ -98,7 +98,9 @@ def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = N
     windows, answer = from_start(windows, epoch_s), _from_start(answer, epoch_s)
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     ax = figure.subplots()
-    string_probability(_events_of(ax, answer or {}), windows, target=target)
+    string_probability(
+        _events_of(ax, answer or {}), windows, target=target, actions=(answer or {}).get("actions") or ()
+    )
     for i, action in enumerate((answer or {}).get("actions") or []):
         names = " + ".join(str(s) for s in action["strategies"]) or "none"
         ax.annotate(f"strategy {names}", (action["time_s"], 0.04 + 0.09 * (i % 4)), (4, 0), textcoords="offset points",
@@ -139,7 +141,7 @@ def region_figure(
         setting_region(ax, setting, T_range=T_range, K_range=K_range, clouds=clouds, truth=truth)
         ax.set_title(title)
         ax.label_outer()
-    legend = verdict_legend(axes[0]).get_legend()
+    legend = verdict_legend(axes[0], beside=axes[1:]).get_legend()
     assert legend is not None
     handles = legend.legend_handles
     legend.remove()
@@ -180,7 +182,7 @@ def overview_figure(
     motion(axes[0], time, traces["accel"], quantity="accel")
     for ax, name in zip(axes[1:3], ("T_L", "K_L"), strict=True):
         belief_band(ax, answer["windows"], name, truth=(truth or {}).get(name), bounds=(bounds or {}).get(name))
-    string_probability(axes[3], answer["windows"], target=target)
+    string_probability(axes[3], answer["windows"], target=target, actions=answer["actions"])
     axes[3].set_xlabel("time [s]")
     _legend_above(figure, *axes)
     return figure

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.colors import ListedColormap
+from matplotlib.contour import ContourSet
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
 from avtorch.plots.style import AMPLIFIES, BLACK, BLUE, GREY, LABELS, ORANGE, PURPLE, STABLE, UNSTABLE, VERMILLION
 from avtorch.vehicle import LowerLevel, stability
+
+_LABEL_FROM_EDGE = 0.08
+"""Of an axis: a label nearer to its end would be cut off."""
 
 
 def verdict_map(
@@ -59,11 +64,24 @@ def verdict_map(
         )
         if levels:
             lines = ax.contour(x, y, gain, levels=levels, colors="#B07A1E", linewidths=0.7)
-            ax.clabel(lines, fmt=lambda g: f"{g:g}", fontsize=7)
+            ax.clabel(lines, fmt=lambda g: f"{g:g}", fontsize=7, manual=_inside(lines, x, y))
     ax.grid(False)
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(y[0], y[-1])
     return ax
+
+
+def _inside(lines: ContourSet, x: np.ndarray, y: np.ndarray) -> list[tuple[float, float]]:
+    """Where each line is labelled: halfway along what lies well inside the axes; nowhere if it keeps to an edge."""
+    low, high = np.array([x[0], y[0]], dtype=float), np.array([x[-1], y[-1]], dtype=float)
+    edge = _LABEL_FROM_EDGE * (high - low)
+    places = []
+    for segments in lines.allsegs:
+        points = np.concatenate(segments) if segments else np.zeros((0, 2))
+        points = points[((points > low + edge) & (points < high - edge)).all(1)]
+        if len(points):
+            places.append((float(points[len(points) // 2, 0]), float(points[len(points) // 2, 1])))
+    return places
 
 
 def region(ax: Axes, plane: stability.Region, *, point: tuple[float, float] | None = None) -> Axes:
@@ -166,8 +184,10 @@ def gain_curve(ax: Axes, omega: ArrayLike, gain: ArrayLike, *, peak: tuple[float
     return ax
 
 
-def verdict_legend(ax: Axes, *, extra: bool = True) -> Axes:
-    """Name the three colours of a verdict map, and whatever else the axes labels, below it.
+def verdict_legend(ax: Axes, *, extra: bool = True, beside: Sequence[Axes] = ()) -> Axes:
+    """Name the colours of the verdict map in `ax` and in those `beside` it, and whatever else `ax` labels, below it.
+
+    Axes without a map have all three named.
 
     Example:
         >>> from matplotlib.figure import Figure
@@ -175,10 +195,15 @@ def verdict_legend(ax: Axes, *, extra: bool = True) -> Axes:
         >>> [text.get_text() for text in verdict_legend(Figure().subplots()).get_legend().get_texts()]
         ['string stable', 'stable, amplifies (lines: peak gain)', 'unstable']
     """
+    maps = [c.get_array() for one in (ax, *beside) for c in one.collections if isinstance(c, QuadMesh)]
+    there = {int(kind) for drawn in maps for kind in np.unique(np.asarray(drawn))} or {0, 1, 2}
+    names = {
+        2: (STABLE, "string stable"),
+        1: (AMPLIFIES, "stable, amplifies (lines: peak gain)"),
+        0: (UNSTABLE, "unstable"),
+    }
     patches: list[Any] = [
-        Patch(facecolor=STABLE, edgecolor=GREY, label="string stable"),
-        Patch(facecolor=AMPLIFIES, edgecolor=GREY, label="stable, amplifies (lines: peak gain)"),
-        Patch(facecolor=UNSTABLE, edgecolor=GREY, label="unstable"),
+        Patch(facecolor=colour, edgecolor=GREY, label=name) for kind, (colour, name) in names.items() if kind in there
     ]
     if extra:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):

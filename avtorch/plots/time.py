@@ -91,8 +91,11 @@ def belief_band(
     return _span(ax, _ends(windows))
 
 
-def string_probability(ax: Axes, windows: Windows, *, target: float = 0.95) -> Axes:
-    """P(string stable) of the setting in force, over time.
+def string_probability(
+    ax: Axes, windows: Windows, *, target: float = 0.95, actions: Iterable[Mapping[str, Any]] = ()
+) -> Axes:
+    """P(string stable) of the setting in force, over time, as it could be known: from a window's end on (a dot, red
+    below the target), and from an action on that of the setting it chose.
 
     Example:
         >>> from matplotlib.figure import Figure
@@ -104,10 +107,17 @@ def string_probability(ax: Axes, windows: Windows, *, target: float = 0.95) -> A
         >>> string_probability(Figure().subplots(), windows).get_ylabel()
         'P(string stable) [-]'
     """
-    x = np.array([t for w in windows for t in (w["start_s"], w["end_s"])])
-    p = np.array([w["p_string_stable"] for w in windows for _ in range(2)])
-    ax.fill_between(x, p, color=SKY, alpha=0.25, linewidth=0)
-    ax.plot(x, p, color=BLUE)
+    ends = [(w["end_s"], w["p_string_stable"]) for w in windows]
+    chosen = [(a["time_s"], a["p_string_stable"]) for a in actions if a.get("p_string_stable") is not None]
+    known = sorted([*ends, *chosen], key=lambda each: each[0])  # an action comes after the window that led to it
+    if known:
+        x, p = (np.array(column, dtype=float) for column in zip(*known, strict=True))
+        ax.fill_between(x, p, step="post", color=SKY, alpha=0.25, linewidth=0)
+        ax.step(x, p, where="post", color=BLUE)
+        for below, colour, size in ((False, BLUE, 3), (True, VERMILLION, 6)):
+            some = [(t, value) for t, value in ends if (value < target) == below]
+            if some:
+                ax.plot(*zip(*some, strict=True), marker="o", markersize=size, linestyle="none", color=colour, zorder=3)
     ax.axhline(target, color=GREY, linestyle=":", linewidth=1.2)
     ax.text(
         1.0,

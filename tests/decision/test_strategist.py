@@ -138,7 +138,8 @@ def test_where_nothing_is_sufficient_it_is_said():
     only_gaps = Strategist(grid=Grid(allowed=frozenset({2}), time_gaps=(1.0, 1.6)))
     decision = decide([2.0], [0.4], strategist=only_gaps)
     assert decision.sufficient.tolist() == [False]
-    assert decision.why[0].startswith("no setting of the grid is sufficient")
+    keeps = "keeps P(string stable) at 0.95 with 5 % of commands clipped or less"
+    assert decision.why[0].startswith(f"no setting of the grid {keeps}; the best one: ")
     # A leader beyond the car's power clips everything: the lower level may not win by amplifying what is clipped.
     decision = decide([1.5], [0.6], limits=(-3.0, 2.0))
     assert decision.sufficient.tolist() == [False]
