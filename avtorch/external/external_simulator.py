@@ -20,6 +20,7 @@ from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log
+from avtorch.vehicle.plant import GLVDPlant
 
 Progress = Callable[[str, int, int], None]
 _MOST_PROCESSES = 64
@@ -60,6 +61,9 @@ class ExternalSimulator:
 
     def __post_init__(self) -> None:
         found: Any = self.of() if isinstance(self.of, type) and callable(getattr(self.of, "step", None)) else self.of
+        if isinstance(found, GapPlant | GLVDPlant):  # it has methods of these names, for closed loops
+            given = "baseline=plant" if isinstance(found, GapPlant) else 'baseline="T_L=0.3, K_L=1"'
+            raise InputError(f"simulator: found a plant of avtorch's own, which is a baseline itself: pass {given}")
         if isinstance(found, Log):
             found = (found,)
         elif isinstance(found, (list, tuple)) and found and all(isinstance(x, Log) for x in found):

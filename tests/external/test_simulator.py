@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from avtorch import ExternalSimulator, InputError, diagnose
+from avtorch import ExternalSimulator, GLVDPlant, InputError, diagnose
 from avtorch.external import check_simulator, load_simulator, wrap
 from avtorch.external.discrepancy import discrepancy
 from avtorch.external.drives import drives_of
 from avtorch.external.driving import driven_along
 from avtorch.external.surrogate import surrogate_of
+from avtorch.gap import DeadTime, plant
 from avtorch.io import Log
 
 
@@ -206,3 +207,9 @@ def test_an_attribute_called_drive_is_the_simulators_own() -> None:
         drive = 1.0
 
     assert driven_along(Driven(), lap(20)).rows == 20
+
+
+@pytest.mark.parametrize("own", [plant([DeadTime(0.2)]), GLVDPlant(0.3, 1.0)])
+def test_a_plant_of_avtorchs_own_is_a_baseline_itself(own: object) -> None:
+    with pytest.raises(InputError, match="a plant of avtorch's own, which is a baseline itself: pass baseline="):
+        ExternalSimulator(own)  # type: ignore[arg-type]
