@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -31,6 +31,20 @@ class Matrix(Protocol):
     def load(self) -> FloatArray:
         """The numbers, in that shape. Raises an error of the library where they are damaged."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """Numbers that are read already."""
+
+    values: Any
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.values.shape
+
+    def load(self) -> FloatArray:
+        return np.array(self.values, dtype=np.float64)
 
 
 Tree: TypeAlias = "Mapping[str, Matrix | Tree]"

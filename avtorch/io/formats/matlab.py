@@ -18,7 +18,8 @@ from avtorch.io.formats.kinds import Kind
 from avtorch.io.formats.library import guarded, library
 from avtorch.io.formats.listed import Listed, refuse_cells
 from avtorch.io.formats.mat_elements import check_elements
-from avtorch.io.formats.mat_tree import TIMES, Found, Matrix, Series, Tree, find_series, vector
+from avtorch.io.formats.mat_tables import tables
+from avtorch.io.formats.mat_tree import TIMES, Found, Loaded, Matrix, Series, Tree, find_series, vector
 from avtorch.io.formats.opened import opened
 from avtorch.io.opening import place, read_regular
 from avtorch.io.recording import Channel
@@ -34,7 +35,8 @@ class MatRecording(Listed):
     """A MAT file. Channels are vectors, by their path in structs as in ``log.speed``, columns as ``wheel(2)``.
 
     Their time is a vector of as many samples called time, t, timestamp or the like, in the same struct or around it,
-    in seconds unless its name says ms, us or ns. A struct of Time and Data is one channel.
+    in seconds unless its name says ms, us or ns. A struct of Time and Data is one channel. A table is read as
+    a struct, a timetable with its times.
     """
 
     def __init__(self, source: str, form: str, found: Found, remarks: Sequence[str]) -> None:
@@ -82,18 +84,6 @@ def _untimed(found: Found) -> list[str]:
 # version 5 --------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Loaded:
-    values: Any
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return self.values.shape
-
-    def load(self) -> FloatArray:
-        return np.array(self.values, dtype=np.float64)
-
-
 def _open_5(path: str | os.PathLike[str]) -> MatRecording:
     source = place(path)
     raw = read_regular(path, most=MOST_BYTES, need=_NEED)
@@ -109,16 +99,13 @@ def _open_5(path: str | os.PathLike[str]) -> MatRecording:
         content = loadmat(io.BytesIO(raw), struct_as_record=True, squeeze_me=False, chars_as_strings=True)
         objects: list[str] = []
         tree = _tree_5({k: v for k, v in content.items() if not k.startswith("__")}, "", objects, 0)
-        found = find_series(tree)
-    return MatRecording(source, "MAT 5", found, _untimed(found) + _objects(objects))
+        also, lost = _tables(path, objects)
+        found = find_series({**tree, **also})
+    return MatRecording(source, "MAT 5", found, _untimed(found) + lost)
 
 
-def _objects(objects: list[str]) -> list[str]:
-    return (
-        [f"tables, timeseries and other objects cannot be read, save them as structs: {listed(objects)}"]
-        if objects
-        else []
-    )
+def _tables(path: str | os.PathLike[str], objects: list[str]) -> tuple[dict[str, Tree], list[str]]:
+    return tables(path, [name for name in objects if "." in name]) if objects else ({}, [])
 
 
 def _tree_5(items: Any, path: str, objects: list[str], depth: int) -> Tree:
@@ -134,7 +121,7 @@ def _tree_5(items: Any, path: str, objects: list[str], depth: int) -> Tree:
                 here = name if len(flat) == 1 else f"{name}({k + 1})"
                 tree[here] = _tree_5({n: one[n] for n in kind.names}, full, objects, depth + 1)
         elif kind.names is None and kind.kind in _NUMBERS and isinstance(value, np.ndarray):
-            tree[str(name)] = _Loaded(value)
+            tree[str(name)] = Loaded(value)
     return tree
 
 
@@ -159,8 +146,9 @@ def _open_73(path: str | os.PathLike[str], kind: Kind) -> MatRecording:
             file = h5py.File(stream, "r")
             objects: list[str] = []
             tree = _tree_73(h5py, file, "", objects, 0, [0])
-            found = find_series(tree)
-        recording = MatRecording(source, "MAT 7.3", found, _untimed(found) + _objects(objects))
+            also, lost = _tables(path, objects)
+            found = find_series({**tree, **also})
+        recording = MatRecording(source, "MAT 7.3", found, _untimed(found) + lost)
     except BaseException:
         stream.close()
         raise

@@ -27,6 +27,7 @@ _MAGIC = (
     (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", kinds.XLS),
 )
 _HDF5 = b"\x89HDF\r\n\x1a\n"
+_USERBLOCK = 512  # MATLAB's header before it
 _BASE = re.compile(rb"^\s*base\s+(hex|dec)\b", re.I | re.M)
 _ASC_DATE = re.compile(rb"^(\s*//[^\n]*\n)*\s*date\s", re.I)
 _CANDUMP = re.compile(rb"^\s*\(\d+\.\d+\)\s+\S+\s+[0-9A-Fa-f]{1,8}#")
@@ -76,6 +77,8 @@ def _by_suffix(file: Path) -> Kind | None:
 
 
 def _by_content(head: bytes, suffix: str) -> Kind | None:
+    if head[_USERBLOCK:].startswith(_HDF5) and head.startswith(b"MATLAB"):  # whatever version the text before it names
+        return kinds.MAT73
     for magic, kind in _MAGIC:
         if head.startswith(magic):
             return kind
