@@ -139,7 +139,7 @@ def late_channel(log: Log) -> LateChannel | None:
         return None
     slopes, accels = _foretold(parts)
     fine = max(step, 0.01)
-    delays = fine * np.arange(-round(DELAY_S / fine), round(DELAY_S / fine) + 1)
+    delays = fine * np.arange(-round(DELAY_S / fine), round(DELAY_S / fine) + 1, dtype=np.float64)
     blocks = [
         block
         for part, slope, accel in zip(parts, slopes, accels, strict=True)
@@ -149,7 +149,7 @@ def late_channel(log: Log) -> LateChannel | None:
         return None
     accel_late, accel_smooth, speed_late, speed_smooth = (
         _Tried(seconds, *(np.array(column) for column in zip(*(block[i] for block in blocks), strict=True)))
-        for i, seconds in enumerate((delays, np.array(FILTER_S)) * 2)
+        for i, seconds in enumerate((delays, np.array(FILTER_S, dtype=np.float64)) * 2)
     )
     every = range(len(blocks))
 

@@ -33,7 +33,9 @@ def tables(path: str | os.PathLike[str], nested: list[str]) -> tuple[dict[str, T
             classes = {name: kind for name, (_, kind) in library.whosmat(os.fspath(path)).items()}
             wanted = [name for name, kind in classes.items() if kind in _TABLES]
             content = library.load_from_mat(os.fspath(path), variable_names=wanted) if wanted else {}
-            trees = {name: _columns(content[name]) for name in wanted if hasattr(content.get(name), "columns")}
+            trees: dict[str, Tree] = {
+                name: _columns(content[name]) for name in wanted if hasattr(content.get(name), "columns")
+            }
     except Exception as fault:  # what else the file holds is read all the same
         return {}, [f"its tables and other objects are left out, mat-io cannot read them: {reason(fault)}"]
     lost = [name for name, kind in classes.items() if kind not in _PLAIN and name not in trees]
