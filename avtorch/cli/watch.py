@@ -36,7 +36,7 @@ SOURCE = Group("Source", sort_key=7)
 
 
 def watch(
-    source: str,
+    source: Annotated[str, Parameter(allow_leading_hyphen=True)],
     /,
     *,
     follow: Annotated[
@@ -100,8 +100,8 @@ def watch(
     Parameters
     ----------
     source
-        - for standard input; a file of JSON lines or CSV; a recording (ROS 2 bag, MCAP, MDF, ...) or Parquet, which is
-        played back; or mqtt://HOST:PORT/TOPIC. A row has time, accel_cmd, accel or speed, and car where there are
+        A file of JSON lines or CSV, or - for standard input; a recording (ROS 2 bag, MCAP, MDF, ...) or Parquet, which
+        is played back; or mqtt://HOST:PORT/TOPIC. A row has time, accel_cmd, accel or speed, and car where there are
         several.
     """
     positive("--window", window, "s")
@@ -153,7 +153,9 @@ def watch(
             try:
                 watch_source(rows, monitor, [sink], stop=stop, kept=kept, observers=observers)
             finally:
-                for line in told(monitor, counts, kept):
+                # nothing is told of a watch that was refused before its first row
+                begun = counts.rows or counts.refused or sys.exc_info()[0] is None
+                for line in told(monitor, counts, kept) if begun else ():
                     talk.err.print(line, markup=False, highlight=False, soft_wrap=True)
 
 

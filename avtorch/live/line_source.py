@@ -6,7 +6,7 @@ import os
 import select
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -73,7 +73,7 @@ class StreamSource:
     def __init__(self, parser: LineParser, descriptor: int = 0) -> None:
         self.parser, self._descriptor = parser, descriptor
 
-    def batches(self, stop: Stop, start: int | None = None) -> Iterator[Batch]:
+    def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
         """As the contract; there is nothing to go back to, so `start` has no meaning."""
         lines = _Lines()
         while not stop.is_set:
@@ -96,7 +96,8 @@ class FileSource:
 
     def __init__(self, path: str | os.PathLike[str], parser: LineParser, *, follow: bool = False) -> None:
         self.path, self.parser, self.follow = Path(path), parser, follow
-        self._file = self._opened()
+        self._file: BinaryIO | None = None
+        self._seen()
 
     @property
     def name(self) -> str:
@@ -105,14 +106,16 @@ class FileSource:
     @property
     def identity(self) -> str | None:
         """The path and the file behind it: a file that takes its place is another."""
-        return f"{self.path.absolute()} {os.fstat(self._file.fileno()).st_ino}"
+        found = self._seen() if self._file is None else os.fstat(self._file.fileno())
+        return f"{self.path.absolute()} {found.st_ino}"
 
-    def batches(self, stop: Stop, start: int | None = None) -> Iterator[Batch]:
+    def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
         """As the contract; `start` in bytes."""
+        self._file = file = self._opened()
         try:
-            lines, anew = self._begun(start)
+            lines, anew = self._begun(file, start)
             while not stop.is_set:
-                chunk = self._file.read(CHUNK)
+                chunk = file.read(CHUNK)
                 if chunk:
                     batch = _batch(self.parser, lines.of(chunk), lines, seekable=True)
                     yield Batch(batch.rows, batch.position, anew, batch.arrived)
@@ -120,50 +123,61 @@ class FileSource:
                 elif not self.follow:
                     yield _batch(self.parser, lines.last(), lines, seekable=True)
                     return
-                elif self._replaced(lines.position):
+                elif self._replaced(file, lines.position):
                     yield _batch(self.parser, lines.last(), lines, seekable=True)
-                    self._file.close()
-                    self._file = self._opened()
+                    file.close()
+                    self._file = file = self._opened()
                     lines, anew = _Lines(), True
                 else:
                     yield Batch([], lines.position)
                     time.sleep(POLL_S)
         finally:
-            self._file.close()
+            file.close()
+            self._file = None
 
-    def _begun(self, start: int | None) -> tuple[_Lines, bool]:
+    def _begun(self, file: BinaryIO, start: int | None) -> tuple[_Lines, bool]:
         """Where to read from, and whether that is the start again of a file that was cut."""
-        size = os.fstat(self._file.fileno()).st_size
+        size = os.fstat(file.fileno()).st_size
         if start is None or start > size:
             return _Lines(), start is not None
-        first = self._file.readline(LONGEST)
+        first = file.readline(LONGEST)
         if start >= len(first):
             # a CSV's header, or what shows that it is JSON, is of every run
             before = self.parser.counts.to_dict()
             self.parser.row(first)
             self.parser.counts.load(before)
-            self._file.seek(start)
+            file.seek(start)
             return _Lines(start), False
-        self._file.seek(0)
+        file.seek(0)
         return _Lines(), False
 
-    def _replaced(self, position: int) -> bool:
+    def _replaced(self, file: BinaryIO, position: int) -> bool:
         """Whether the file was cut, or another has its name."""
         try:
             now = os.stat(self.path)
         except OSError:
             return False  # moved away, and its successor yet to come
-        mine = os.fstat(self._file.fileno())
+        mine = os.fstat(file.fileno())
         return (now.st_ino, now.st_dev) != (mine.st_ino, mine.st_dev) or mine.st_size < position
 
-    def _opened(self) -> BinaryIO:
+    def _seen(self) -> os.stat_result:
+        """Raises `InputError` where no file of rows is there."""
         try:
-            mode = os.stat(self.path).st_mode
-            if not stat.S_ISREG(mode):
-                raise InputError(f"{self.path}: is {kind_of(mode)}; a file of rows, or - for standard input, is needed")
-            return open(self.path, "rb")
+            found = os.stat(self.path)
         except (OSError, ValueError) as fault:
-            if isinstance(fault, InputError):
-                raise
-            why = fault.strerror if isinstance(fault, OSError) else printable(str(fault), 80)
-            raise InputError(f"{self.path}: cannot be read ({why}); a file of rows is needed") from None
+            raise self._unreadable(fault) from None
+        if not stat.S_ISREG(found.st_mode):
+            what = kind_of(found.st_mode)
+            raise InputError(f"{self.path}: is {what}; a file of rows, or - for standard input, is needed")
+        return found
+
+    def _opened(self) -> BinaryIO:
+        self._seen()
+        try:
+            return open(self.path, "rb")
+        except OSError as fault:
+            raise self._unreadable(fault) from None
+
+    def _unreadable(self, fault: OSError | ValueError) -> InputError:
+        why = fault.strerror if isinstance(fault, OSError) else printable(str(fault), 80)
+        return InputError(f"{self.path}: cannot be read ({why}); a file of rows is needed")

@@ -11,7 +11,7 @@ import importlib.util
 import ssl
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Any
 
@@ -121,7 +121,7 @@ class MqttSource:
         self._client.on_subscribe = self._on_subscribe
         self._client.on_message = self._on_message
 
-    def batches(self, stop: Stop, start: int | None = None) -> Iterator[Batch]:
+    def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
         """As the contract; a broker has no positions, so `start` has no meaning."""
         _connect(self._client, self.address)
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +66,7 @@ class PlayedLog:
         self._elapsed = np.asarray(log.elapsed, np.float64)
         self.identity = f"{Path(path).absolute()} {fingerprint([self._time, self._signals])}"
 
-    def batches(self, stop: Stop, start: int | None = None) -> Iterator[Batch]:
+    def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
         """As the contract; `start` in rows."""
         row, rows = start or 0, len(self._time)
         begun, first = time.monotonic(), float(self._elapsed[min(row, rows - 1)])

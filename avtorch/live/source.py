@@ -7,7 +7,7 @@ does not grow where the estimate is behind.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -88,7 +88,7 @@ class Source(Protocol):
         """What a position belongs to; None where the source cannot be read again."""
         ...
 
-    def batches(self, stop: Stop, start: int | None = None) -> Iterator[Batch]:
+    def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
         """Batches until the source ends or `stop` is set; empty ones while nothing comes. `start`: a position to read
         on from."""
         ...

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from typing import Protocol
 
 from avtorch.live.car import LiveCar
@@ -71,14 +72,15 @@ def watch_source(
     start = position
     whole = True  # no batch is half taken in
     try:
-        for batch in source.batches(stop, start):
-            if batch.anew and kept is not None:
-                kept.begin_anew(watch, source.identity)
-            position, whole = batch.position, False
-            tell(watch.take(batch))
-            whole = True
-            if kept is not None:
-                kept.keep(watch, position)
+        with closing(source.batches(stop, start)) as batches:
+            for batch in batches:
+                if batch.anew and kept is not None:
+                    kept.begin_anew(watch, source.identity)
+                position, whole = batch.position, False
+                tell(watch.take(batch))
+                whole = True
+                if kept is not None:
+                    kept.keep(watch, position)
         if kept is None and not stop.is_set:
             tell(watch.flush(time.monotonic()))
     finally:
