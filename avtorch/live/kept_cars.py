@@ -88,6 +88,11 @@ class KeptCars:
         self._begun = position if type(position) is int else None
         return self._begun
 
+    def begin(self, watch: LiveWatch) -> None:
+        """Name the source in the folder, so that a run killed before its first state is known to be of it, too."""
+        if not (self.folder / "source.json").exists():
+            self._record(watch, None)
+
     def begin_anew(self, watch: LiveWatch, identity: str | None) -> None:
         """Positions count from 0 again, in a source of another identity; all states are written."""
         self.identity, self._begun = identity, None

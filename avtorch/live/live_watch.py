@@ -93,7 +93,7 @@ class LiveWatch:
         if len(self.cars) >= self.settings.cars:
             self.counts.refuse("too many cars")
             return None
-        self._warm_up(form)
+        self.warm_up(form)
         car = self.cars[row.car] = LiveCar(row.car, signals, self.settings, self.counts)
         return car
 
@@ -105,7 +105,7 @@ class LiveWatch:
             car.refusal = None
         return answers
 
-    def _warm_up(self, form: Form) -> None:
+    def warm_up(self, form: Form) -> None:
         """Compile what the estimator needs before the first window depends on it, once a form."""
         if type(form) in self._warm:
             return

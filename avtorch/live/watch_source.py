@@ -55,6 +55,8 @@ def watch_source(
     """
     stop = Stop() if stop is None else stop
     position = None if kept is None else kept.restore(watch)
+    if kept is not None:
+        kept.begin(watch)
 
     def tell(answers: Sequence[Answer]) -> None:
         for answer in answers:

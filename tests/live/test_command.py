@@ -96,9 +96,6 @@ def test_a_followed_file_stopped_in_its_midst_and_gone_on_with(here: Path, numbe
         assert (here / "state" / "source.json").exists()
     with (here / "live.jsonl").open("ab") as stream:
         stream.write(text[half:])
-    # one that was killed before it wrote a state begins again, and its answers in a file of their own
-    if number == signal.SIGKILL and not (here / "state" / "source.json").exists():
-        (here / "out.jsonl").unlink()
     second = started(here, *arguments)
     until(lambda: written(15) or second.poll() is not None)
     second.send_signal(signal.SIGINT)
