@@ -21,6 +21,7 @@ import torch
 from avtorch import GLVDPlant, Leader, simulate
 from avtorch.live import Answer, Batch, Counts, LineParser, LiveSettings, LiveWatch, Row, Stop, watch_source
 from avtorch.live.car import LiveCar
+from avtorch.live.sink import line_of
 
 RATE_HZ = 100
 PERIOD_S = 0.01
@@ -51,8 +52,6 @@ class Paced:
         due.sort(key=lambda item: item[0])
         self._due, self._lines = np.array([item[0] for item in due]), [item[1] for item in due]
         self.begun = 0.0
-        self.cpu = 0.0
-        """CPU time that the sender itself took [s]."""
 
     def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
         """As the contract of a source; a batch has arrived when its first row was due."""
@@ -83,10 +82,14 @@ class Latencies:
 
 
 class Written:
-    """A sink that makes the lines and keeps none."""
+    """A sink that makes the lines and keeps none; `used` counts the excited windows, which alone cost a posterior."""
+
+    def __init__(self) -> None:
+        self.used = 0
 
     def write(self, answer: Answer) -> bool:
-        json.dumps(answer.entry)
+        line_of(answer)
+        self.used += answer.entry["used"]
         return True
 
     def flush(self) -> None: ...
@@ -109,13 +112,13 @@ def main() -> None:
     form = watch.settings.form_of({"accel_cmd", "accel", "speed", "jerk"})
     assert form is not None
     watch.warm_up(form)
-    latencies, cpu, begun = Latencies(), time.process_time(), time.monotonic()
-    watch_source(source, watch, [Written()], observers=[latencies])
+    latencies, written, cpu, begun = Latencies(), Written(), time.process_time(), time.monotonic()
+    watch_source(source, watch, [written], observers=[latencies])
     used, took = time.process_time() - cpu, time.monotonic() - begun
     # the last windows are closed early, at the end
     seconds = np.array(latencies.seconds[: -given.cars])
     print(f"{given.cars} cars at {RATE_HZ} Hz, {given.estimator}, {given.form}, windows of 2 s")
-    print(f"  {counts.rows} rows in {took:.1f} s, {counts.windows} windows, {sum(counts.refused.values())} left out")
+    print(f"  {counts.rows} rows in {took:.1f} s, {counts.windows} windows, {written.used} of them used")
     print(f"  CPU: {100 * used / took:.1f} % of one core, {100 * used / took / given.cars:.2f} % a car")
     shown = ", ".join(f"{name} {1e3 * np.quantile(seconds, q):.0f} ms" for name, q in (("p50", 0.5), ("p99", 0.99)))
     print(f"  answer after the end of its window: {shown}, longest {1e3 * seconds.max():.0f} ms")

@@ -51,6 +51,7 @@ class KeptCars:
         self._at: dict[str, int | None] = {}  # by car, the position that its file holds
         self._begun: int | None = None
         self._recorded = time.monotonic()
+        self._next = 0.0
 
     @property
     def same_source(self) -> bool:
@@ -101,6 +102,9 @@ class KeptCars:
     def keep(self, watch: LiveWatch, position: int | None) -> None:
         """Write the state of one car whose turn it is, if any, and the record now and then."""
         now = time.monotonic()
+        if now < self._next:
+            return
+        self._next = now + EVERY_S / max(200, 2 * len(watch.cars))  # so that each has its turn
         for car in watch.cars.values():
             if car.name not in self._written:
                 self._written[car.name] = now

@@ -61,7 +61,8 @@ class LineParser:
         if not line.strip():
             return None
         if self._json is None:
-            self._json = line.lstrip(b"\xef\xbb\xbf \t").startswith((b"{", b"["))
+            line = line.removeprefix(b"\xef\xbb\xbf")
+            self._json = line.lstrip().startswith((b"{", b"["))
         if len(line) > LONGEST:
             return self._refused("corrupt")
         return self._of_json(line, position, self.car) if self._json else self._of_csv(line, position)
@@ -83,7 +84,7 @@ class LineParser:
 
     def _of_json(self, text: bytes, position: int | None, car: str) -> Row | None:
         try:
-            found = json.loads(text)
+            found = json.loads(text.decode())  # of bytes it would look for the encoding first
         except (ValueError, RecursionError):
             return self._refused("corrupt")
         return self._of_object(found, position, car)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -55,11 +54,8 @@ class LiveWatch:
         self._setting = self.settings.setting()
         self._warm: set[type[Form]] = set()
 
-    def take(self, batch: Batch, finished: Callable[[LiveCar], object] | None = None) -> list[Answer]:
-        """Take in a batch; returns what is to be said, car by car in the order of their rows.
-
-        `finished` is called with each car that has closed a window.
-        """
+    def take(self, batch: Batch) -> list[Answer]:
+        """Take in a batch; returns what is to be said, in the order of the rows that ended the windows."""
         if batch.anew:
             for car in self.cars.values():
                 car.position = None
@@ -75,8 +71,6 @@ class LiveWatch:
             found = car.take(row, batch.arrived, self._setting)
             if found or car.refusal is not None:
                 answers += self._said(car, found)
-                if finished is not None:
-                    finished(car)
         return answers
 
     def flush(self, arrived: float) -> list[Answer]:

@@ -106,6 +106,12 @@ class MqttSource:
     A row without `car` is of the car named as its topic. With a `client_id` the broker keeps messages while the watch
     is not connected. Raises `InputError` where paho-mqtt is missing, and from `batches` for a broker that cannot be
     reached at the start or that refuses.
+
+    Example:
+        >>> from avtorch.live import Counts, LineParser, MqttAddress, MqttSource
+        >>> source = MqttSource(MqttAddress.of("mqtt://localhost/cars/+"), LineParser(Counts(), unit=["speed=km/h"]))
+        >>> source.name
+        'mqtt://localhost:1883/cars/+'
     """
 
     identity = None
@@ -159,13 +165,27 @@ class MqttSource:
             self._refused = printable(f"{codes[0]}", 80)
 
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
-        self._rows += self.parser.message(message.payload, car=message.topic)
+        try:
+            topic = message.topic
+        except UnicodeDecodeError:
+            self.parser.counts.refuse("corrupt")
+            return
+        self._rows += self.parser.message(message.payload, car=topic)
 
 
 class MqttSink:
     """Answers to a topic, one message each, at least once (QoS 1).
 
     Raises `InputError` where paho-mqtt is missing, the broker cannot be reached, or the topic has wildcards.
+
+    Example:
+        >>> from avtorch import InputError
+        >>> from avtorch.live import MqttAddress, MqttSink
+        >>> try:
+        ...     MqttSink(MqttAddress.of("mqtt://localhost/answers/#"))
+        ... except InputError as error:
+        ...     print(error)
+        mqtt://localhost:1883/answers/#: answers need one topic, without + and #
     """
 
     def __init__(self, address: MqttAddress, stop: Stop | None = None) -> None:

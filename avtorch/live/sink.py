@@ -46,7 +46,14 @@ def line_of(answer: Answer) -> str:
 
 
 class LineSink:
-    """Lines to an open text stream, standard output by default."""
+    """Lines to an open text stream, standard output by default.
+
+    Example:
+        >>> from avtorch.live import Answer, LineSink
+        >>> LineSink().write(Answer({"car": "red", "alerts": []}, "red", 1, None))
+        {"car": "red", "alerts": []}
+        True
+    """
 
     def __init__(self, stream: IO[str] | None = None) -> None:
         self._stream = sys.stdout if stream is None else stream
@@ -67,6 +74,15 @@ class FileSink(LineSink):
     not written again: a run that was killed and started again leaves the file of one that was not.
 
     Raises `InputError` where it cannot be written, or holds other lines.
+
+    Example:
+        >>> from avtorch.live import Answer, FileSink
+        >>> for number in (1, 2):  # the first run is killed behind window 1, the second begins again
+        ...     sink = FileSink("answers.jsonl", resume=True)
+        ...     print([sink.write(Answer({"car": "red", "window": n}, "red", n, None)) for n in range(1, number + 1)])
+        ...     sink.close()
+        [True]
+        [False, True]
     """
 
     def __init__(self, path: str | os.PathLike[str], *, resume: bool = False) -> None:
