@@ -18,13 +18,28 @@ from collections.abc import Generator
 import numpy as np
 import torch
 
-from avtorch import GLVDPlant, Leader, simulate
 from avtorch.live import Answer, Batch, Counts, LineParser, LiveSettings, LiveWatch, Row, Stop, watch_source
 from avtorch.live.car import LiveCar
 from avtorch.live.sink import line_of
+from avtorch.vehicle.glvd import glvd_rollout
 
 RATE_HZ = 100
 PERIOD_S = 0.01
+
+
+def driven(car: int, seconds: float, noise: torch.Generator) -> dict[str, torch.Tensor]:
+    """Columns (time,) of a car behind commands of two sines, so that every window is excited."""
+    time_s = torch.arange(round(seconds * RATE_HZ), dtype=torch.float64) / RATE_HZ
+    command = 1.5 * torch.sin(2.0 * time_s + car) + torch.sin(5.0 * time_s + 2.0 * car)
+    lag, gain = (torch.tensor([x], dtype=torch.float64) for x in (0.3 + 0.5 * (car % 2), 1.0 - 0.2 * (car % 2)))
+    later = glvd_rollout(torch.zeros(1, dtype=torch.float64), command[None], lag, gain, PERIOD_S)[0]
+    accel = torch.cat([torch.zeros(1, dtype=torch.float64), later[:-1]])
+    jerk = (gain * command - accel) / lag
+    measured = {"accel": accel, "speed": 20.0 + PERIOD_S * accel.cumsum(-1), "jerk": jerk}
+    sd = {"accel": 0.05, "speed": 0.02, "jerk": 0.1}
+    for name, values in measured.items():
+        measured[name] = values + sd[name] * torch.randn(values.shape, dtype=torch.float64, generator=noise)
+    return {"accel_cmd": command, **measured}
 
 
 class Paced:
@@ -34,16 +49,12 @@ class Paced:
 
     def __init__(self, parser: LineParser, cars: int, seconds: float, form: str, *, together: bool) -> None:
         self.parser = parser
-        ahead = Leader.default(start=60.0, duration=seconds, dt=1 / RATE_HZ)
         names = ("accel_cmd", "accel", "speed", *(("jerk",) if form == "jerk" else ()))
         due: list[tuple[float, bytes]] = []
         noise = torch.Generator().manual_seed(0)
         for car in range(cars):
-            run = simulate(ahead, plant=GLVDPlant(0.3 + 1.2 * (car % 2), 1.0 - 0.4 * (car % 2), sigma=0.1), seeds=[car])
-            columns = {name: getattr(run, name).flatten().clone() for name in names}
-            for name in ("accel", "speed"):
-                shape = columns[name].shape
-                columns[name] += 0.05 * torch.randn(shape, dtype=torch.float64, generator=noise)
+            drive = driven(car, seconds, noise)
+            columns = {name: drive[name] for name in names}
             begin = 0.0 if together else 2.0 * car / cars  # windows of 2 s end one after the other
             for i, row in enumerate(torch.stack(list(columns.values())).T.tolist()):
                 entry = {"car": f"car {car}", "time": round(i / RATE_HZ, 3)}
@@ -101,7 +112,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cars", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--estimator", default="map")
+    parser.add_argument("--estimator", default="auto")
     parser.add_argument("--form", default="jerk", choices=["jerk", "latent"])
     parser.add_argument("--together", action="store_true", help="all windows end at the same time")
     given = parser.parse_args()

@@ -69,9 +69,12 @@ def watch(
         Parameter(help="Likelihood: of measured jerk, or of noisy acceleration and speed."),
     ] = "auto",
     estimator: Annotated[
-        Literal["map", "sgld", "importance"],
-        Parameter(help="Posterior mode, SGLD or importance sampling."),
-    ] = "map",
+        Literal["auto", "map", "sgld", "importance"],
+        Parameter(
+            help="Posterior mode, SGLD or importance sampling; auto: the mode where jerk is measured, else importance "
+            "sampling."
+        ),
+    ] = "auto",
     mode: Annotated[
         Literal["lambda", "posterior", "forgetting"],
         Parameter(help="How a posterior becomes the next prior."),

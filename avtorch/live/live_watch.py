@@ -105,12 +105,12 @@ class LiveWatch:
             return
         self._warm.add(type(form))
         time = 0.02 * torch.arange(round(2.5 * self.settings.window / 0.02), dtype=torch.float64)
-        command = torch.sin(2.0 * time)
+        command = 3.0 * torch.sin(2.0 * time)
         # the exact answer of a car of lag 0.5 s to a sine, behind its transient
-        accel = 0.5 * (command - torch.cos(2.0 * time))
+        accel = 0.5 * (command - 3.0 * torch.cos(2.0 * time))
         noise = 0.05 * torch.randn(3, len(time), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
         rows = {"accel_cmd": command, "accel": accel + noise[0], "jerk": 2.0 * (command - accel) + noise[1]}
-        rows["speed"] = 20.0 - 0.25 * (torch.cos(2.0 * time) + torch.sin(2.0 * time)) + noise[2]
+        rows["speed"] = 20.0 - 0.75 * (torch.cos(2.0 * time) + torch.sin(2.0 * time)) + noise[2]
         needed = {name: rows[name] for name in form.columns}
         self.settings.watch("", form).feed(time, needed, self._setting)
 

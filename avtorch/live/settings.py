@@ -26,8 +26,8 @@ class LiveSettings:
     """Settings of a live watch, the same for all cars.
 
     `window` [s]; `form` "jerk" (measured jerk and accel), "latent", or "auto": "jerk" for a car whose first row has
-    both; `estimator`, and `mode` for `sgld` and `map`, as in `estimate`; `time_gap` [s] and `gains` (k_s [1/s²],
-    k_v [1/s], k_a [-]) of the controller; `accepted` (T_L [s], K_L [-]) of a sound car; `detectors`; `lateness` [s] by
+    both; `estimator` and `mode` as in `estimate`, "auto" being "map" for the jerk form and "importance" for the latent
+    one, whose modes are dear; `time_gap` [s] and `gains` (k_s [1/s²], k_v [1/s], k_a [-]) of the controller; `accepted` (T_L [s], K_L [-]) of a sound car; `detectors`; `lateness` [s] by
     which a row may come behind newer ones; `cars` at most; `check_units`: refuse columns that contradict each other;
     `seed`.
 
@@ -41,7 +41,7 @@ class LiveSettings:
 
     window: float = 2.0
     form: FormName = "auto"
-    estimator: str = "map"
+    estimator: str = "auto"
     mode: str = "lambda"
     time_gap: float = 1.0
     gains: tuple[float, float, float] = NOMINAL_GAINS
@@ -82,9 +82,12 @@ class LiveSettings:
         """A new watch of one car. Its seed follows from the car's name, and so not from the order of cars."""
         digest = hashlib.sha256(f"{self.seed}/{car}".encode()).digest()
         options: dict[str, Any] = {"seed": int.from_bytes(digest[:6], "big"), "check_units": self.check_units}
-        if self.estimator in ("sgld", "map", "importance"):
+        estimator = self.estimator
+        if estimator == "auto":
+            estimator = "map" if isinstance(form, JerkForm) else "importance"
+        if estimator in ("sgld", "map", "importance"):
             options["mode"] = self.mode
-        stream = BeliefStream(window=self.window, form=form, estimator=self.estimator, **options)
+        stream = BeliefStream(window=self.window, form=form, estimator=estimator, **options)
         return Watch(stream, Monitor(accepted=self.accepted, detectors=self.detectors))
 
     def to_dict(self) -> dict[str, str]:
