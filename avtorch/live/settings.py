@@ -27,9 +27,9 @@ class LiveSettings:
 
     `window` [s]; `form` "jerk" (measured jerk and accel), "latent", or "auto": "jerk" for a car whose first row has
     both; `estimator` and `mode` as in `estimate`, "auto" being "map" for the jerk form and "importance" for the latent
-    one, whose modes are dear; `time_gap` [s] and `gains` (k_s [1/s²], k_v [1/s], k_a [-]) of the controller; `accepted` (T_L [s], K_L [-]) of a sound car; `detectors`; `lateness` [s] by
-    which a row may come behind newer ones; `cars` at most; `check_units`: refuse columns that contradict each other;
-    `seed`.
+    one, whose modes are dear; `time_gap` [s] and `gains` (k_s [1/s²], k_v [1/s], k_a [-]) of the controller; `accepted`
+    (T_L [s], K_L [-]) of a sound car; `detectors`; `lateness` [s] by which a row may come behind newer ones; `cars` at
+    most; `check_units`: refuse columns that contradict each other; `seed`.
 
     Raises `InputError` for numbers out of range.
 
