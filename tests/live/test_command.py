@@ -106,6 +106,18 @@ def test_a_followed_file_stopped_in_its_midst_and_gone_on_with(here: Path, numbe
 
 
 @pytest.mark.slow
+def test_a_folder_of_states_is_of_one_watch_at_a_time(here: Path) -> None:
+    from avtorch.io import sole_use
+
+    with sole_use(here / "state", work="avtorch watch"):
+        second = started(here, "rows.jsonl", "--state", "state", "--out", "o.jsonl")
+        _, err = second.communicate(timeout=60)
+    assert second.returncode == 2
+    assert err.startswith(b"avtorch: state: in use by avtorch watch (pid ")
+    assert not (here / "o.jsonl").exists()
+
+
+@pytest.mark.slow
 def test_reading_pauses_where_answers_are_not_taken(here: Path) -> None:
     """A reader of the answers that stops: the watch stops reading, and its memory stays what it was."""
     process = started(here, "-", "--window", "0.5", stdin=subprocess.PIPE, stdout=subprocess.PIPE)
