@@ -108,6 +108,7 @@ def test_killed_it_writes_each_window_once(tmp_path: Path, monkeypatch: pytest.M
                 stream.write('{"car": "re')  # half a line
         sink.close()
         repeated += watch.counts.repeated
+        assert watch.counts.refused == {}, "rows read again are passed over, neither late nor doubled"
     assert repeated > 0, "a crash loses the states of the last batch"
     by_car: dict[str, list[str]] = {}
     for line in out.read_text().splitlines():
