@@ -69,7 +69,7 @@ $(VENV)/.installed-dev: $(VENV)/.torch pyproject.toml
 	@touch $@ $(VENV)/.installed
 
 # what only the slow tests need, too heavy for `make test`; those of the report also need the system's Chromium
-# (Debian: chromium-headless-shell) and are skipped without it
+# (Debian: chromium-headless-shell), those of MQTT a broker (Debian: mosquitto), and are skipped without them
 $(VENV)/.installed-sumo: $(VENV)/.installed-dev
 	$(PIP) --editable '.[sumo,browser]'
 	@touch $@

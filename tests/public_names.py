@@ -30,6 +30,7 @@ PACKAGES = (
     "avtorch.paper",
     "avtorch.report",
     "avtorch.fleet",
+    "avtorch.live",
 )
 
 Documented = ast.Module | ast.ClassDef | ast.FunctionDef

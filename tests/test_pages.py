@@ -11,7 +11,7 @@ import pytest
 from avtorch.cli import main
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-PAGES = ("diagnosis.md", "blindtest.md", "compare.md", "fleet.md", "followers.md", "paper.md")
+PAGES = ("diagnosis.md", "blindtest.md", "compare.md", "fleet.md", "followers.md", "paper.md", "watch.md")
 ALL = [DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))]
 CODE = [p.name for p in ALL[1:] if "```python" in p.read_text(encoding="utf-8") and p.name != "own-effect.md"]
 SLOW = ("blindtest.md", "diagnosis.md", "fleet.md")

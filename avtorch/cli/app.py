@@ -24,6 +24,7 @@ from avtorch.cli.paper import paper
 from avtorch.cli.run import run
 from avtorch.cli.stability import stability
 from avtorch.cli.validate import validate
+from avtorch.cli.watch import watch
 from avtorch.errors import InputError, printable
 from avtorch.version import __version__
 
@@ -36,6 +37,7 @@ app = App(
 )
 app.command(check)
 app.command(check_simulator)
+app.command(watch)
 for _command in (run, estimate, diagnose, compare, fleet, stability, validate, blindtest, paper):
     app.command(alone_in_out(_command))
 

@@ -105,6 +105,11 @@ class BeliefStream:
         self._driven: list[float | None] = [None] * vehicles  # when a driver was last in charge
         self._epoch: float | None = None  # the first row's time; the others are counted from it
 
+    @property
+    def closes_at(self) -> float | None:
+        """The end of the open window on the clock of the rows [s]; None where the next row begins one."""
+        return None if self._origin is None else self._end() + (self._epoch or 0.0)
+
     def feed(
         self,
         time: Tensor,

@@ -74,6 +74,17 @@ def test_neither_cuts_nor_saving_change_a_bit(drive, tmp_path_factory, cuts, sav
     assert_same(expected, windows)
 
 
+def test_the_end_of_the_open_window_is_known(drive):
+    stream = new(estimator="map", window=2.0)
+    assert stream.closes_at is None
+    time, columns = block(drive, slice(0, 250))
+    stream.feed(time + 1_700_000_000.0, columns)
+    # on the clock of the rows, whose float64 comes in steps of 2.4e-7 s
+    assert stream.closes_at == pytest.approx(1_700_000_000.0 + float(time[0]) + 4.0, abs=1e-6)
+    stream.flush()
+    assert stream.closes_at is None
+
+
 def test_sample_by_sample_equals_one_block(drive):
     expected = new().feed(*block(drive, slice(0, 450)))
     stream, windows = new(), []

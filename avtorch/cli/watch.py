@@ -1,0 +1,259 @@
+"""`avtorch watch`: cars monitored while they drive."""
+
+from __future__ import annotations
+
+import hashlib
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Group, Parameter
+
+from avtorch.cli.arguments import (
+    OUTPUT,
+    Gains,
+    Quiet,
+    Seed,
+    TimeGap,
+    free_folder,
+    not_negative,
+    positive,
+    positive_pair,
+    seed_number,
+    three_gains,
+    whole_number,
+)
+from avtorch.cli.talk import Talk
+from avtorch.errors import InputError, quoted
+
+if TYPE_CHECKING:
+    from avtorch.live import Counts, KeptCars, LineParser, LiveWatch, Sink, Source, Stop
+
+SOURCE = Group("Source", sort_key=7)
+
+
+def watch(
+    source: Annotated[str, Parameter(allow_leading_hyphen=True)],
+    /,
+    *,
+    follow: Annotated[
+        bool, Parameter(negative=(), group=SOURCE, help="Go on with what is written to the file later.")
+    ] = False,
+    rate: Annotated[
+        float | None,
+        Parameter(group=SOURCE, help="Play a recording this many times faster than recorded; default: at once."),
+    ] = None,
+    car: Annotated[
+        str | None, Parameter(group=SOURCE, help="Name of the car where rows have none; default: car, or the file's.")
+    ] = None,
+    map: Annotated[
+        list[str] | None,
+        Parameter(negative=(), group=SOURCE, help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
+    ] = None,
+    unit: Annotated[
+        list[str] | None,
+        Parameter(negative=(), group=SOURCE, help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable."),
+    ] = None,
+    lateness: Annotated[
+        float, Parameter(group=SOURCE, help="How far a row may come behind newer ones and still count [s].")
+    ] = 0.05,
+    cars: Annotated[
+        int, Parameter(group=SOURCE, converter=whole_number, help="Cars at most; rows of others are counted.")
+    ] = 1000,
+    window: Annotated[float, Parameter(help="Length of a window [s].")] = 2.0,
+    form: Annotated[
+        Literal["auto", "jerk", "latent"],
+        Parameter(help="Likelihood: of measured jerk, or of noisy acceleration and speed."),
+    ] = "auto",
+    estimator: Annotated[
+        Literal["auto", "map", "sgld", "importance"],
+        Parameter(
+            help="Posterior mode, SGLD or importance sampling; auto: the mode where jerk is measured, else importance "
+            "sampling."
+        ),
+    ] = "auto",
+    mode: Annotated[
+        Literal["lambda", "posterior", "forgetting"],
+        Parameter(help="How a posterior becomes the next prior."),
+    ] = "lambda",
+    tau: TimeGap = 1.0,
+    gains: Gains = "1.5,1.5,-0.8",
+    accepted: Annotated[str, Parameter(help="T_L,K_L of the cars as they should be [s, -].")] = "0.3,1.0",
+    seed: Seed = 0,
+    state: Annotated[
+        Path | None, Parameter(group=OUTPUT, help="Folder for the cars' states; the same command goes on from there.")
+    ] = None,
+    out: Annotated[
+        str | None,
+        Parameter(group=OUTPUT, help="File or mqtt://HOST:PORT/TOPIC for the answers; default: standard output."),
+    ] = None,
+    prometheus: Annotated[
+        str | None, Parameter(group=OUTPUT, help="[HOST:]PORT for metrics; the host is 127.0.0.1 by default.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Watch cars while they drive: belief, alerts and P(string stable) of every window, one line of JSON each.
+
+    Messages that are corrupt, doubled or too late are counted and left out; a count of them is printed on stderr at the
+    end. Ctrl-C ends the watch; with --state the same command goes on, to the bit.
+
+    Parameters
+    ----------
+    source
+        A file of JSON lines or CSV, or - for standard input; a recording (ROS 2 bag, MCAP, MDF, ...) or Parquet, which
+        is played back; or mqtt://HOST:PORT/TOPIC. A row has time, accel_cmd, accel or speed, and car where there are
+        several.
+    """
+    positive("--window", window, "s")
+    positive("--tau", tau, "s")
+    not_negative("--lateness", lateness, "s")
+    if rate is not None:
+        positive("--rate", rate)
+    k = three_gains("--gains", gains)
+    sound = positive_pair("--accepted", accepted, "T_L,K_L", "0.3,1.0")
+    seed_number(seed)
+    address = None if prometheus is None else host_and_port(prometheus)
+    if state is not None:
+        free_folder(state)
+
+    from avtorch.live import Counts, KeptCars, LineParser, LiveSettings, LiveWatch, Metrics, Stop, watch_source
+
+    settings = LiveSettings(
+        window=window,
+        form=form,
+        estimator=estimator,
+        mode=mode,
+        time_gap=tau,
+        gains=k,
+        accepted=sound,
+        lateness=lateness,
+        cars=cars,
+        seed=seed,
+    )
+    talk, counts, stop = Talk(json=False, quiet=quiet), Counts(), Stop()
+    monitor = LiveWatch(settings, counts)
+    parser = LineParser(counts, map=map, unit=unit, car=car or "car")
+    with ExitStack() as open_:
+        if state is not None:
+            from avtorch.io import sole_use
+
+            open_.enter_context(sole_use(state, work="avtorch watch"))
+        rows = _source(source, parser, follow=follow, rate=rate, car=car, map=map, unit=unit, state=state)
+        kept = None if state is None else KeptCars(state, rows.identity)
+        sink = _sink(out, kept, stop)
+        open_.callback(sink.close)
+        observers = []
+        if address is not None:
+            metrics = Metrics(monitor)
+            port = metrics.start(*address)
+            open_.callback(metrics.close)
+            observers.append(metrics)
+            talk.err.print(f"Metrics: http://{address[0]}:{port}/metrics", highlight=False)
+        with stopped_by_signals(stop):
+            try:
+                watch_source(rows, monitor, [sink], stop=stop, kept=kept, observers=observers)
+            finally:
+                # nothing is told of a watch that was refused before its first row
+                begun = counts.rows or counts.refused or sys.exc_info()[0] is None
+                for line in told(monitor, counts, kept) if begun else ():
+                    talk.err.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _source(
+    source: str,
+    parser: LineParser,
+    *,
+    follow: bool,
+    rate: float | None,
+    car: str | None,
+    map: list[str] | None,
+    unit: list[str] | None,
+    state: Path | None,
+) -> Source:
+    """What `SOURCE` names. Raises `InputError` for options that it has no use for."""
+    from avtorch.io.formats import is_recording
+    from avtorch.live import FileSource, MqttAddress, MqttSource, PlayedLog, StreamSource
+    from avtorch.live.mqtt import is_mqtt
+
+    played = source != "-" and not is_mqtt(source) and (is_recording(source) or source.endswith((".parquet", ".pq")))
+    if rate is not None and not played:
+        raise InputError("--rate: has a meaning for a recording alone, which is played back; leave it out")
+    if follow and (played or source == "-" or is_mqtt(source)):
+        raise InputError("--follow: has a meaning for a file of lines alone; leave it out")
+    if source == "-":
+        return StreamSource(parser, sys.stdin.fileno())
+    if is_mqtt(source):
+        # by its folder: the broker keeps for the next run what comes between two of them
+        name = None
+        if state is not None:
+            name = (
+                "avtorch-" + hashlib.sha256(str(state.absolute()).encode("utf-8", "surrogateescape")).hexdigest()[:16]
+            )
+        return MqttSource(MqttAddress.of(source), parser, client_id=name)
+    if played:
+        return PlayedLog(source, map=map, unit=unit, rate=rate, car=car)
+    return FileSource(source, parser, follow=follow)
+
+
+def _sink(out: str | None, kept: KeptCars | None, stop: Stop) -> Sink:
+    from avtorch.live import FileSink, LineSink, MqttAddress, MqttSink
+    from avtorch.live.mqtt import is_mqtt
+
+    if out is None:
+        return LineSink()
+    if is_mqtt(out):
+        return MqttSink(MqttAddress.of(out), stop)
+    return FileSink(out, resume=kept is not None and kept.same_source)
+
+
+def host_and_port(text: str) -> tuple[str, int]:
+    """The address of `--prometheus`. Raises `InputError` where it is none."""
+    host, _, port = text.rpartition(":")
+    if not port.isascii() or not port.isdecimal() or int(port) > 65535:
+        raise InputError(f"--prometheus: found {quoted(text)}, needs a port, or HOST:PORT, such as 9100")
+    return host or "127.0.0.1", int(port)
+
+
+@contextmanager
+def stopped_by_signals(stop: Stop) -> Iterator[None]:
+    """Within it the first Ctrl-C or SIGTERM sets `stop`, so that no window is left half done; a second interrupts."""
+    before = {}
+
+    def on(number: int, frame: object) -> None:
+        stop.set()
+        for each, handler in before.items():
+            signal.signal(each, handler)
+
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before[number] = signal.signal(number, on)
+    except ValueError:  # not in the main thread, where no signal arrives either
+        yield
+        return
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def told(monitor: LiveWatch, counts: Counts, kept: KeptCars | None) -> list[str]:
+    """What came of the watch, for people."""
+    from avtorch.live import REFUSED
+
+    cars = len(monitor.cars)
+    lines = [f"{counts.rows} rows of {cars} car{'s' * (cars != 1)}, {counts.windows} windows"]
+    if counts.alerts:
+        lines[0] += ", alerts: " + ", ".join(f"{name} {many}" for name, many in sorted(counts.alerts.items()))
+    if counts.reordered:
+        lines.append(f"{counts.reordered} rows were out of order and put in their place")
+    for kind, many in sorted(counts.refused.items(), key=lambda item: -item[1]):
+        lines.append(f"left out: {many} {kind} ({REFUSED.get(kind, kind)})")
+    if counts.repeated:
+        lines.append(f"{counts.repeated} windows had been written before")
+    if kept is not None:
+        lines.append(f"state kept in {kept.folder}: the same command goes on from there")
+    return lines

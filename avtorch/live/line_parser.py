@@ -1,0 +1,169 @@
+"""Rows of JSON lines and of CSV: one line at a time, and no line can stop the watch."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from avtorch.errors import InputError, printable
+from avtorch.io.mapping import Pairs, pairs
+from avtorch.io.units import to_si
+from avtorch.live.counts import Counts
+from avtorch.live.source import Row
+from avtorch.numeral import numeral
+
+SIGNALS = ("accel_cmd", "accel", "speed", "jerk", "engaged")
+"""Signals that a watch uses; a row needs `accel_cmd`, and `accel` or `speed`."""
+LONGEST = 2**20
+"""Bytes of a line; a longer one is corrupt."""
+_CAR = 200  # characters of a car's name
+
+
+class LineParser:
+    """Lines to rows, JSON or CSV as the first line shows.
+
+    A line of JSON is an object with `time` [s], the signals, and `car` where there are several. CSV begins with a
+    header of the same names. `map` names other columns and `unit` other units, as for `Log.read`; `car` is the name
+    where a row has none. What is no row is counted in `counts`.
+
+    Raises `InputError` for a mapping or unit that is not known.
+
+    Example:
+        >>> from avtorch.live import Counts, LineParser
+        >>> counts = Counts()
+        >>> parser = LineParser(counts, unit=["speed=km/h"])
+        >>> parser.row(b'{"car": "red", "time": 1.5, "accel_cmd": 0.2, "speed": 72}')
+        Row(car='red', time=1.5, signals={'accel_cmd': 0.2, 'speed': 20.0}, position=None)
+        >>> parser.row(b'{"car": "red", "time":'), counts.to_dict()["refused"]
+        (None, {'corrupt': 1})
+    """
+
+    def __init__(self, counts: Counts, *, map: Pairs = None, unit: Pairs = None, car: str = "car") -> None:
+        self.counts, self.car = counts, car
+        columns = pairs("map", map)
+        units = pairs("unit", unit)
+        for name in (*columns, *units):
+            if name not in (*SIGNALS, "time"):
+                raise InputError(f"map, unit: found {name}, needs time or one of {', '.join(SIGNALS)}")
+        self._time = columns.get("time", "time")
+        self._columns = [(name, columns.get(name, name)) for name in SIGNALS]
+        one = np.ones(1)
+        self._factors = {name: float(to_si(name, text)(one)[0]) for name, text in units.items()}
+        self._header: list[str] | None = None
+        self._json: bool | None = None
+
+    def row(self, line: bytes, position: int | None = None) -> Row | None:
+        """The row of a line; None for an empty line, a header, and what was counted as refused."""
+        if not line.strip():
+            return None
+        if self._json is None:
+            line = line.removeprefix(b"\xef\xbb\xbf")
+            self._json = line.lstrip().startswith((b"{", b"["))
+        if len(line) > LONGEST:
+            return self._refused("corrupt")
+        return self._of_json(line, position, self.car) if self._json else self._of_csv(line, position)
+
+    def message(self, payload: bytes, *, car: str) -> list[Row]:
+        """The rows of a message: an object, several in a list, or one a line; `car` names the car of those without."""
+        if len(payload) > LONGEST:
+            self._refused("corrupt")
+            return []
+        if not payload.lstrip().startswith(b"["):
+            rows = [self._of_json(line, None, car) for line in payload.splitlines() if line.strip()]
+            return [row for row in rows if row is not None]
+        try:
+            found = json.loads(payload)
+        except (ValueError, RecursionError):
+            self._refused("corrupt")
+            return []
+        return [row for one in found if (row := self._of_object(one, None, car)) is not None]
+
+    def _of_json(self, text: bytes, position: int | None, car: str) -> Row | None:
+        try:
+            found = json.loads(text.decode())  # of bytes it would look for the encoding first
+        except (ValueError, RecursionError):
+            return self._refused("corrupt")
+        return self._of_object(found, position, car)
+
+    def _of_object(self, found: Any, position: int | None, car: str) -> Row | None:
+        if type(found) is not dict:
+            return self._refused("corrupt")
+        car = found.get("car", car)
+        if type(car) is not str:
+            if type(car) is not int:
+                return self._refused("corrupt")
+            car = str(car)
+        time = found.get(self._time)
+        if time is None:
+            return self._refused("incomplete")
+        # as false as text: a number in quotation marks is one that somebody meant to be a word
+        if type(time) not in (float, int) or not -1e15 < time < 1e15:
+            return self._refused("implausible")
+        signals = {name: found[column] for name, column in self._columns if column in found}
+        return self._made(car, float(time), signals, position)
+
+    def _of_csv(self, line: bytes, position: int | None) -> Row | None:
+        try:
+            cells = [cell.strip() for cell in next(csv.reader([line.decode("utf-8-sig")]))]
+        except (UnicodeDecodeError, csv.Error, StopIteration):
+            return self._refused("corrupt")
+        if self._header is None:
+            self._header = self._checked(cells)
+            return None
+        if cells == self._header:  # of a file begun again
+            return None
+        if len(cells) != len(self._header):
+            return self._refused("corrupt")
+        found = dict(zip(self._header, cells, strict=True))
+        time = _number(found.get(self._time, ""))
+        if time is None:
+            return self._refused("incomplete")
+        if not isinstance(time, float) or not -1e15 < time < 1e15:
+            return self._refused("implausible")
+        signals = {name: _number(found[column]) for name, column in self._columns if column in found}
+        return self._made(found.get("car") or self.car, time, signals, position)
+
+    def _checked(self, cells: list[str]) -> list[str]:
+        names = {name for name, column in self._columns if column in cells}
+        if self._time not in cells or "accel_cmd" not in names or not names & {"accel", "speed"}:
+            found = printable(", ".join(cells), 120)
+            raise InputError(
+                f"the source's first line: found {found}; needs a JSON object, or a CSV header with time, accel_cmd, "
+                "and accel or speed (--map names other columns)"
+            )
+        return cells
+
+    def _made(self, car: str, time: float, signals: dict[str, Any], position: int | None) -> Row | None:
+        if not car or len(car) > _CAR:
+            return self._refused("corrupt")
+        if self._factors:
+            return self._scaled(Row(car, time, signals, position))
+        return Row(car, time, signals, position)
+
+    def _scaled(self, row: Row) -> Row | None:
+        factors = self._factors
+        try:
+            signals: Mapping[str, Any] = {
+                name: value * factors[name] if name in factors and value is not None else value
+                for name, value in row.signals.items()
+            }
+        except TypeError:
+            return self._refused("implausible")
+        return row._replace(time=row.time * factors.get("time", 1.0), signals=signals)
+
+    def _refused(self, kind: str) -> None:
+        self.counts.refuse(kind)
+
+
+def _number(text: str) -> float | str | None:
+    """A cell's number; None where it is empty, and the text itself where it is no number."""
+    if not text:
+        return None
+    try:
+        return numeral(text)
+    except ValueError:
+        return text

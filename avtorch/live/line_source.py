@@ -1,0 +1,203 @@
+"""Lines of standard input or of a file, which may go on growing."""
+
+from __future__ import annotations
+
+import os
+import select
+import stat
+import time
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from avtorch.errors import InputError, printable
+from avtorch.io.opening import kind_of
+from avtorch.live.line_parser import LONGEST, LineParser
+from avtorch.live.source import Batch, Row, Stop
+
+CHUNK = 2**16
+"""Bytes read at once."""
+POLL_S = 0.02
+"""How often a file is looked at for new lines [s]."""
+WAIT_S = 0.2
+"""How long standard input is waited for before the watch looks around [s]."""
+
+
+class _Lines:
+    """Bytes to whole lines, each with the position behind it; a line without an end is held to a bound."""
+
+    def __init__(self, position: int = 0) -> None:
+        self.position = position
+        self._rest = b""
+        self._skipping = False
+
+    def of(self, chunk: bytes) -> Iterator[tuple[bytes, int]]:
+        *lines, rest = (self._rest + chunk).split(b"\n")
+        for line in lines:
+            self.position += len(line) + 1
+            if self._skipping:
+                self._skipping = False  # the end of a line that was given up before
+                continue
+            yield line, self.position
+        if len(rest) > LONGEST:
+            self.position += len(rest)
+            if not self._skipping:
+                yield rest, self.position  # which is refused for its length
+            self._skipping, rest = True, b""
+        self._rest = rest
+
+    def last(self) -> Iterator[tuple[bytes, int]]:
+        """The last line, where no line end follows."""
+        rest, self._rest = self._rest, b""
+        if rest and not self._skipping:
+            self.position += len(rest)
+            yield rest, self.position
+
+
+def _batch(parser: LineParser, lines: Iterator[tuple[bytes, int]], at: _Lines, *, seekable: bool) -> Batch:
+    arrived = time.monotonic()
+    rows: list[Row] = []
+    for line, position in lines:
+        row = parser.row(line, position if seekable else None)
+        if row is not None:
+            rows.append(row)
+    return Batch(rows, at.position if seekable else None, arrived=arrived)
+
+
+class StreamSource:
+    """Lines of an open descriptor, standard input by default, until it ends.
+
+    Example:
+        >>> import os
+        >>> from avtorch.live import Counts, LineParser, Stop, StreamSource
+        >>> end, begin = os.pipe()
+        >>> _ = os.write(begin, b'{"time": 0.01, "accel_cmd": 0.5, "speed": 20.0}')
+        >>> os.close(begin)
+        >>> source = StreamSource(LineParser(Counts(), car="red"), end)
+        >>> [(row.car, row.time) for batch in source.batches(Stop()) for row in batch.rows]
+        [('red', 0.01)]
+        >>> os.close(end)
+    """
+
+    name = "standard input"
+    identity = None
+
+    def __init__(self, parser: LineParser, descriptor: int = 0) -> None:
+        self.parser, self._descriptor = parser, descriptor
+
+    def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
+        """As the contract; there is nothing to go back to, so `start` has no meaning."""
+        lines = _Lines()
+        while not stop.is_set:
+            # a descriptor that is read without waiting could not be stopped while it is silent
+            if not select.select([self._descriptor], [], [], WAIT_S)[0]:
+                yield Batch([])
+                continue
+            chunk = os.read(self._descriptor, CHUNK)
+            if not chunk:
+                yield _batch(self.parser, lines.last(), lines, seekable=False)
+                return
+            yield _batch(self.parser, lines.of(chunk), lines, seekable=False)
+
+
+class FileSource:
+    """Lines of a file; with `follow`, also those written to it later, and those of a file that takes its place.
+
+    Raises `InputError` where it cannot be read.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from avtorch.live import Counts, FileSource, LineParser, Stop
+        >>> _ = Path("rows.csv").write_text("car,time,accel_cmd,speed\\nred,0.01,0.5,20.0\\nred,0.02,0.5,20.0\\n")
+        >>> source = FileSource("rows.csv", LineParser(Counts()))
+        >>> [(row.time, row.position) for batch in source.batches(Stop()) for row in batch.rows]  # bytes behind the row
+        [(0.01, 43), (0.02, 61)]
+    """
+
+    def __init__(self, path: str | os.PathLike[str], parser: LineParser, *, follow: bool = False) -> None:
+        self.path, self.parser, self.follow = Path(path), parser, follow
+        self._file: BinaryIO | None = None
+        self._seen()
+
+    @property
+    def name(self) -> str:
+        return str(self.path)
+
+    @property
+    def identity(self) -> str | None:
+        """The path and the file behind it: a file that takes its place is another."""
+        found = self._seen() if self._file is None else os.fstat(self._file.fileno())
+        return f"{self.path.absolute()} {found.st_ino}"
+
+    def batches(self, stop: Stop, start: int | None = None) -> Generator[Batch, None, None]:
+        """As the contract; `start` in bytes."""
+        self._file = file = self._opened()
+        try:
+            lines, anew = self._begun(file, start)
+            while not stop.is_set:
+                chunk = file.read(CHUNK)
+                if chunk:
+                    batch = _batch(self.parser, lines.of(chunk), lines, seekable=True)
+                    yield Batch(batch.rows, batch.position, anew, batch.arrived)
+                    anew = False
+                elif not self.follow:
+                    yield _batch(self.parser, lines.last(), lines, seekable=True)
+                    return
+                elif self._replaced(file, lines.position):
+                    yield _batch(self.parser, lines.last(), lines, seekable=True)
+                    file.close()
+                    self._file = file = self._opened()
+                    lines, anew = _Lines(), True
+                else:
+                    yield Batch([], lines.position)
+                    time.sleep(POLL_S)
+        finally:
+            file.close()
+            self._file = None
+
+    def _begun(self, file: BinaryIO, start: int | None) -> tuple[_Lines, bool]:
+        """Where to read from, and whether that is the start again of a file that was cut."""
+        size = os.fstat(file.fileno()).st_size
+        if start is None or start > size:
+            return _Lines(), start is not None
+        first = file.readline(LONGEST)
+        if start >= len(first):
+            # a CSV's header, or what shows that it is JSON, is of every run
+            before = self.parser.counts.to_dict()
+            self.parser.row(first)
+            self.parser.counts.load(before)
+            file.seek(start)
+            return _Lines(start), False
+        file.seek(0)
+        return _Lines(), False
+
+    def _replaced(self, file: BinaryIO, position: int) -> bool:
+        """Whether the file was cut, or another has its name."""
+        try:
+            now = os.stat(self.path)
+        except OSError:
+            return False  # moved away, and its successor yet to come
+        mine = os.fstat(file.fileno())
+        return (now.st_ino, now.st_dev) != (mine.st_ino, mine.st_dev) or mine.st_size < position
+
+    def _seen(self) -> os.stat_result:
+        """Raises `InputError` where no file of rows is there."""
+        try:
+            found = os.stat(self.path)
+        except (OSError, ValueError) as fault:
+            raise self._unreadable(fault) from None
+        if not stat.S_ISREG(found.st_mode):
+            what = kind_of(found.st_mode)
+            raise InputError(f"{self.path}: is {what}; a file of rows, or - for standard input, is needed")
+        return found
+
+    def _opened(self) -> BinaryIO:
+        self._seen()
+        try:
+            return open(self.path, "rb")
+        except OSError as fault:
+            raise self._unreadable(fault) from None
+
+    def _unreadable(self, fault: OSError | ValueError) -> InputError:
+        why = fault.strerror if isinstance(fault, OSError) else printable(str(fault), 80)
+        return InputError(f"{self.path}: cannot be read ({why}); a file of rows is needed")

@@ -1,0 +1,201 @@
+"""Rows and answers by MQTT, through mosquitto."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from avtorch.errors import InputError
+from avtorch.live import Counts, LineParser, LiveWatch, MqttAddress, MqttSink, MqttSource, Stop, watch_source
+from tests.live.drives import fleet
+
+mqtt = pytest.importorskip("paho.mqtt.client")
+
+# Debian puts servers where a user's PATH does not look
+PROGRAM = shutil.which("mosquitto", path=os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin", "/usr/local/sbin"]))
+
+needs_broker = pytest.mark.skipif(PROGRAM is None, reason="needs a broker: Debian's mosquitto")
+
+
+@contextmanager
+def broker(port: int, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    config = folder / "mosquitto.conf"
+    config.write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\nmax_queued_messages 100000\n")
+    assert PROGRAM is not None
+    process = subprocess.Popen([PROGRAM, "-c", str(config)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        end = time.monotonic() + 20
+        while True:
+            try:
+                socket.create_connection(("127.0.0.1", port), timeout=1).close()
+                break
+            except OSError:
+                assert time.monotonic() < end, "the broker does not answer"
+                time.sleep(0.05)
+        yield process
+    finally:
+        process.terminate()
+        process.wait(20)
+
+
+@pytest.fixture
+def port(tmp_path: Path) -> Iterator[int]:
+    free = socket.socket()
+    free.bind(("127.0.0.1", 0))
+    number = free.getsockname()[1]
+    free.close()
+    with broker(number, tmp_path):
+        yield number
+
+
+def client(port: int) -> Any:
+    made = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
+    made.connect("127.0.0.1", port)
+    made.loop_start()
+    return made
+
+
+def until(what: Any) -> None:
+    end = time.monotonic() + 60
+    while not what():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+@needs_broker
+@pytest.mark.slow
+def test_rows_in_answers_out(port: int) -> None:
+    """Single rows, lists and lines; corrupt and doubled ones; a car named by its topic."""
+    counts, stop = Counts(), Stop()
+    watch = LiveWatch(counts=counts)
+    source = MqttSource(MqttAddress.of(f"mqtt://127.0.0.1:{port}/cars/+"), LineParser(counts))
+    sink = MqttSink(MqttAddress.of(f"mqtt://127.0.0.1:{port}/answers"), stop)
+    heard: list[dict[str, Any]] = []
+    other = client(port)
+    other.on_message = lambda client, data, message: heard.append(json.loads(message.payload))
+    other.subscribe("answers", qos=1)
+    # the watch turns its loops in the main thread of a program; here beside the test
+    work = threading.Thread(target=watch_source, args=(source, watch, [sink]), kwargs={"stop": stop})
+    work.start()
+    rows = fleet(6.2)
+    until(lambda: counts.rows == 0 and (other.publish("cars/x", b"{", qos=1), counts.refused["corrupt"])[1])
+    corrupt = counts.refused["corrupt"]
+    for i, row in enumerate(rows[:300]):
+        other.publish("cars/single", json.dumps(row), qos=1)
+        if i % 100 == 0:
+            other.publish("cars/single", json.dumps(row), qos=1)
+    other.publish("cars/list", json.dumps(rows[300:600]), qos=1)
+    other.publish("cars/lines", "\n".join(json.dumps(row) for row in rows[600:]), qos=1)
+    unnamed = {key: value for key, value in rows[0].items() if key != "car"}
+    other.publish("cars/purple", json.dumps(unnamed), qos=1)
+    until(lambda: counts.rows >= len(rows) + 1 and len(heard) >= 9)
+    stop.set()
+    work.join(20)
+    sink.close()
+    other.loop_stop()
+    assert sink.unsent == 0
+    assert set(watch.cars) == {"red", "blue", "green", "cars/purple"}
+    assert counts.rows == len(rows) + 1
+    assert counts.refused["doubled"] == 3
+    assert counts.refused["corrupt"] >= corrupt
+    assert sorted((e["car"], e["window"]) for e in heard) == [
+        (car, n) for car in ("blue", "green", "red") for n in (1, 2, 3)
+    ]
+
+
+@needs_broker
+@pytest.mark.slow
+def test_it_survives_the_brokers_restart(tmp_path: Path) -> None:
+    free = socket.socket()
+    free.bind(("127.0.0.1", 0))
+    port = free.getsockname()[1]
+    free.close()
+    counts, stop = Counts(), Stop()
+    watch = LiveWatch(counts=counts)
+    source = MqttSource(MqttAddress.of(f"mqtt://127.0.0.1:{port}/cars"), LineParser(counts))
+    work = threading.Thread(target=watch_source, args=(source, watch, []), kwargs={"stop": stop})
+    rows = fleet(2.0)
+
+    def sent(row: dict[str, Any]) -> bool:
+        before = counts.rows
+        with_it = client(port)
+        with_it.publish("cars", json.dumps(row), qos=1).wait_for_publish(10)
+        time.sleep(0.1)
+        with_it.disconnect()
+        with_it.loop_stop()
+        return counts.rows > before
+
+    with broker(port, tmp_path):
+        work.start()
+        until(lambda: sent(rows[0]))
+    with broker(port, tmp_path):
+        until(lambda: sent(rows[3]))
+    stop.set()
+    work.join(20)
+    assert not work.is_alive()
+    assert source.reconnects >= 1
+
+
+@needs_broker
+@pytest.mark.slow
+def test_the_broker_keeps_what_comes_between_two_runs(port: int, tmp_path: Path) -> None:
+    """By the command, with a state: messages sent while it was not there are not lost."""
+    rows = fleet(8.0)
+    half = len(rows) // 2
+    command = [sys.executable, "-m", "avtorch.cli", "watch", f"mqtt://127.0.0.1:{port}/cars", "--state", "state"]
+    command += ["--out", "out.jsonl"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    out = tmp_path / "out.jsonl"
+
+    def written(least: int) -> bool:
+        return out.exists() and out.read_bytes().count(b"\n") >= least
+
+    other = client(port)
+    first = subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE)
+    # until it has subscribed nothing is kept for it; a row that comes twice is counted and changes nothing
+    until(
+        lambda: (other.publish("cars", json.dumps(rows[0]), qos=1), time.sleep(0.3), (tmp_path / "state").exists())[2]
+    )
+    time.sleep(2.0)
+    other.publish("cars", json.dumps(rows[:half]), qos=1)
+    until(lambda: written(3))
+    first.terminate()
+    _, err = first.communicate(timeout=60)
+    assert first.returncode == 0, err
+    other.publish("cars", json.dumps(rows[half:]), qos=1).wait_for_publish(10)
+    second = subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE)
+    until(lambda: written(9))
+    second.terminate()
+    _, err = second.communicate(timeout=60)
+    other.loop_stop()
+    assert f"{len(rows)} rows of 3 cars, 9 windows" in err.decode()
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["mqtt://", "mqtt:///topic", "mqtt://host:port/topic", "mqtt://host:70000/topic", "mqtt://host", "http://h/t"],
+)
+def test_addresses_that_are_none_are_refused(url: str) -> None:
+    with pytest.raises(InputError, match=r"needs mqtt://HOST:PORT/TOPIC"):
+        MqttAddress.of(url)
+
+
+def test_an_address_does_not_tell_its_password() -> None:
+    address = MqttAddress.of("mqtts://me:secret@broker.example/a/b#c")
+    assert (address.user, address.password, address.port, address.topic) == ("me", "secret", 8883, "a/b#c")
+    assert "secret" not in address.name
+    with pytest.raises(InputError) as fault:
+        MqttAddress.of("mqtt://me:secret@broker.example")
+    assert "secret" not in str(fault.value)

@@ -1,0 +1,172 @@
+"""A watch that is stopped, or killed, and started again goes on to the bit."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from avtorch.errors import InputError
+from avtorch.live import (
+    Counts,
+    FileSink,
+    FileSource,
+    KeptCars,
+    LineParser,
+    LineSink,
+    LiveSettings,
+    LiveWatch,
+    Stop,
+    watch_source,
+)
+from avtorch.live import kept_cars as kept_cars_module
+from tests.live.drives import fleet, lines
+
+CHUNK = 997  # bytes, so that batches end in the middle of rows and windows
+
+
+@pytest.fixture(autouse=True)
+def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avtorch.live.line_source.CHUNK", CHUNK)
+
+
+def begin(folder: Path, settings: LiveSettings, *, follow: bool = False) -> tuple[LiveWatch, FileSource, KeptCars]:
+    counts = Counts()
+    watch = LiveWatch(settings, counts)
+    source = FileSource(folder / "rows.jsonl", LineParser(counts), follow=follow)
+    return watch, source, KeptCars(folder / "state", source.identity)
+
+
+class Interrupted(Exception):
+    pass
+
+
+class EndsAfter:
+    """An observer that ends the watch after so many windows: as Ctrl-C does, or as a crash."""
+
+    def __init__(self, many: int, stop: Stop | None = None) -> None:
+        self.left, self.stop = many, stop
+
+    def answered(self, answer, car, seconds) -> None:
+        self.left -= 1
+        if self.left == 0:
+            if self.stop is None:
+                raise Interrupted
+            self.stop.set()
+
+
+def uncut(folder: Path, settings: LiveSettings) -> list[str]:
+    counts, told = Counts(), io.StringIO()
+    watch = LiveWatch(settings, counts)
+    kept = KeptCars(folder / "other_state")
+    watch_source(FileSource(folder / "rows.jsonl", LineParser(counts)), watch, [LineSink(told)], kept=kept)
+    return told.getvalue().splitlines()
+
+
+SETTINGS = {
+    "map": LiveSettings(),
+    "sgld": LiveSettings(estimator="sgld"),
+    "latent": LiveSettings(form="latent", mode="posterior"),
+}
+
+
+@pytest.mark.parametrize("which", SETTINGS)
+def test_stopped_again_and_again_it_writes_what_an_uncut_one_writes(tmp_path: Path, which: str) -> None:
+    (tmp_path / "rows.jsonl").write_bytes(lines(fleet(8.0)))
+    settings, out = SETTINGS[which], tmp_path / "out.jsonl"
+    total, starts = 0, 0
+    while total < 9:
+        watch, source, kept = begin(tmp_path, settings)
+        stop = Stop()
+        sink = FileSink(out, resume=kept.same_source)
+        watch_source(source, watch, [sink], stop=stop, kept=kept, observers=[EndsAfter(1, stop)])
+        sink.close()
+        total, starts = watch.counts.windows, starts + 1
+        assert watch.counts.repeated == 0
+    assert starts >= 3
+    assert out.read_text().splitlines() == uncut(tmp_path, settings)
+    assert watch.counts.refused == {}
+
+
+def test_killed_it_writes_each_window_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """States are written at any time before a crash; here after every batch, of the car whose turn it is."""
+    monkeypatch.setattr(kept_cars_module, "EVERY_S", 0.0)
+    monkeypatch.setattr("avtorch.live.line_source.CHUNK", 10 * CHUNK)  # a batch costs two files
+    (tmp_path / "rows.jsonl").write_bytes(lines(fleet(12.0)))
+    out = tmp_path / "out.jsonl"
+    repeated = 0
+    for crash in (3, 5, 6, 100):
+        watch, source, kept = begin(tmp_path, SETTINGS["map"])
+        sink = FileSink(out, resume=kept.same_source)
+        try:
+            watch_source(source, watch, [sink], kept=kept, observers=[EndsAfter(crash)])
+        except Interrupted:
+            with out.open("a") as stream:
+                stream.write('{"car": "re')  # half a line
+        sink.close()
+        repeated += watch.counts.repeated
+        assert watch.counts.refused == {}, "rows read again are passed over, neither late nor doubled"
+    assert repeated > 0, "a crash loses the states of the last batch"
+    by_car: dict[str, list[str]] = {}
+    for line in out.read_text().splitlines():
+        by_car.setdefault(json.loads(line)["car"], []).append(line)
+    plain: dict[str, list[str]] = {}
+    for line in uncut(tmp_path, SETTINGS["map"]):
+        plain.setdefault(json.loads(line)["car"], []).append(line)
+    assert by_car == plain
+
+
+def test_a_file_is_followed_cut_and_replaced(tmp_path: Path) -> None:
+    """Half a line, the rest of it, then another file of the same name."""
+    text = lines(fleet(8.0))
+    half = text.index(b"\n", len(text) // 2) - 30
+    path = tmp_path / "rows.jsonl"
+    path.write_bytes(text[:half])
+    watch, source, _ = begin(tmp_path, SETTINGS["map"], follow=True)
+    rows, quiet, step, stop = [], 0, 0, Stop()
+    for batch in source.batches(stop):
+        rows += batch.rows
+        quiet = 0 if batch.rows else quiet + 1
+        if quiet < 2:
+            continue
+        quiet, step = 0, step + 1
+        if step == 1:
+            assert len(rows) == text[:half].count(b"\n")
+            with path.open("ab") as stream:
+                stream.write(text[half:])
+        elif step == 2:
+            assert len(rows) == text.count(b"\n")
+            (tmp_path / "new").write_bytes(text[:1000])
+            (tmp_path / "new").replace(path)
+        elif step == 3:
+            assert len(rows) == text.count(b"\n") + text[:1000].count(b"\n")
+            stop.set()
+    assert step == 3
+    assert not watch.counts.refused
+
+
+def test_states_of_other_settings_and_damaged_ones_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "rows.jsonl").write_bytes(lines(fleet(4.0)))
+    watch, source, kept = begin(tmp_path, SETTINGS["map"])
+    watch_source(source, watch, [], kept=kept)
+    shutil.copytree(tmp_path / "state", tmp_path / "whole")
+    watch, source, kept = begin(tmp_path, LiveSettings(window=3.0))
+    with pytest.raises(InputError, match=r"source.json: was begun with window 2.0, not 3.0; use the same"):
+        kept.restore(watch)
+    car = next(iter((tmp_path / "state").glob("*.car")))
+    content = bytearray(car.read_bytes())
+    content[-100] ^= 1
+    car.write_bytes(content)
+    watch, source, kept = begin(tmp_path, SETTINGS["map"])
+    with pytest.raises(InputError, match=rf"{car.name}: is damaged"):
+        kept.restore(watch)
+
+
+def test_a_file_of_something_else_is_not_written_to(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine\n")
+    with pytest.raises(InputError, match="line 1: is no answer of avtorch watch"):
+        FileSink(tmp_path / "notes.txt")
+    assert (tmp_path / "notes.txt").read_text() == "mine\n"
