@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,12 +12,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.inference.map import find_mode
 from avtorch.inference.posterior import Posterior
 from avtorch.inference.quadrature import Quadrature
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings
+from avtorch.inference.units import shown_unit
 from avtorch.io.log import Log
 from avtorch.validation.agreement import Agreement, agreement, between
 from avtorch.validation.agreement_verdict import AgreementVerdict, agreement_verdict
@@ -44,8 +47,8 @@ BLOCK = 50
 NUTS_SHARE = 20
 
 
-@dataclass(frozen=True)
-class Validation:
+@dataclass(frozen=True, repr=False)
+class Validation(Displayed):
     """The result of `validate`; W windows and P parameters, named by ``windows.names``.
 
     Attributes:
@@ -96,6 +99,28 @@ class Validation:
         """Names of the parameters."""
         return self.windows.names
 
+    def overview(self) -> Card:
+        """The verdict, and how far SGLD lies from the reference."""
+        word = "agrees" if self.verdict.agree else "disagrees"
+        title = f"Validation of SGLD on {len(self.windows)} windows of {self.windows.name}: it {word}"
+        return Card(title, (f"{self.verdict.why} Against {self.reference}:",), self.summary())
+
+    def summary(self) -> Frame:
+        """A row a parameter: over the windows compared, the 95 % quantile of the distance of the means [SD of the
+        reference], the range of the ratio of SDs that holds 95 %, the largest R-hat and the median ESS."""
+        found = self.agreement
+        return Frame(
+            {
+                "parameter": list(self.names),
+                "unit": [shown_unit(name) for name in self.names],
+                "mean_difference_sd_p95": found.mean_difference.abs().nanquantile(0.95, 0).tolist(),
+                "sd_ratio_p025": found.sd_ratio.nanquantile(0.025, 0).tolist(),
+                "sd_ratio_p975": found.sd_ratio.nanquantile(0.975, 0).tolist(),
+                "rhat_max": found.rhat.nan_to_num(nan=-math.inf).amax(0).tolist(),
+                "ess_bulk_median": found.ess_bulk.nanquantile(0.5, 0).tolist(),
+            }
+        )
+
     def coverage(self, level: float = 0.9) -> dict[str, Tensor]:
         """Coverage of the central interval of SGLD, ``(P,)`` each.
 
@@ -130,14 +155,12 @@ class Validation:
 
     def to_arviz(self) -> dict[str, InferenceData]:
         """The draws of "sgld", "nuts" and, where it was run, "quadrature" (as independent draws) for ArviZ."""
-        from avtorch.inference.arviz_export import to_arviz
-
-        found = {"sgld": to_arviz(self.sgld), "nuts": to_arviz(self.nuts)}
+        found = {"sgld": self.sgld.to_arviz(), "nuts": self.nuts.to_arviz()}
         named = {"window": self.nuts_index.numpy()}
         found["nuts"].assign_coords(named, inplace=True)  # pyright: ignore[reportCallIssue]
         exact = self.quadrature_draws()
         if exact is not None:
-            found["quadrature"] = to_arviz(exact)
+            found["quadrature"] = exact.to_arviz()
         return found
 
 
