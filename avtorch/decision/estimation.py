@@ -88,7 +88,8 @@ class Estimates(Displayed):
         if self.late is not None:
             lines.append(str(self.late))
         alarmed = [w for w in self.windows if w.report.names()]
-        lines.append(f"{len(alarmed)} windows with alerts. The belief after the last window:")
+        count = f"{len(alarmed)} window{'' if len(alarmed) == 1 else 's'}"
+        lines.append(f"Alerts in {count}. The belief after the last window:")
         return Card(title, tuple(lines), self.summary(), most=9)
 
     def summary(self) -> Frame:

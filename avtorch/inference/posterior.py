@@ -42,11 +42,8 @@ class Posterior(Displayed):
         >>> posterior = Posterior(("T_L",), (0.1 * log_lag - 1).exp(), converged=torch.tensor([True]))
         >>> round(posterior.mean.item(), 2), round(posterior.quantile(0.95).item(), 2), posterior.ess_bulk.item() > 1000
         (0.37, 0.43, True)
-        >>> posterior
+        >>> print(str(posterior.overview()).splitlines()[0])
         Posterior of T_L: 8 chains of 500 draws, 1 window
-        1 of 1 windows converged.
-        window  parameter  unit    mean       sd     q05     q95   rhat  ess_bulk  ess_tail
-             0  T_L        s     0.3693  0.03698  0.3108  0.4329  1.001      3849      5209
     """
 
     names: tuple[str, ...]
