@@ -20,7 +20,7 @@ from avtorch.inference.quadrature import Quadrature
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings
 from avtorch.inference.units import shown_unit
-from avtorch.io.log import Log
+from avtorch.io.source import LogSource, as_log
 from avtorch.validation.agreement import Agreement, agreement, between
 from avtorch.validation.agreement_verdict import AgreementVerdict, agreement_verdict
 from avtorch.validation.exact import exact_draws
@@ -173,7 +173,7 @@ def check_installed() -> None:
 
 
 def validate(
-    source: Log | Windows,
+    source: LogSource | Windows,
     *,
     window: float = 2.0,
     windows: int | None = None,
@@ -186,7 +186,7 @@ def validate(
     """SGLD, quadrature and NUTS over the same windows, each under the first prior and on its own.
 
     Args:
-        source: a log, or windows made by `synthetic_windows` and its like.
+        source: a log (a `Log`, a path or a data frame), or windows made by `synthetic_windows` and its like.
         window: length of a log's windows [s].
         windows: at most so many windows of a log, evenly spread; all by default.
         settings: of SGLD; by default those that every command uses for the form.
@@ -209,8 +209,8 @@ def validate(
     check_installed()
     if nuts_windows is not None and nuts_windows < 1:
         raise InputError(f"nuts_windows: found {nuts_windows}, needs 1 or more")
-    if isinstance(source, Log):
-        source = windows_of_log(source, window=window, count=windows)
+    if not isinstance(source, Windows):
+        source = windows_of_log(as_log(source, argument="source"), window=window, count=windows)
     settings = source.sampler if settings is None else settings
     if settings.chains == 1 and settings.draws < 8:
         raise InputError(f"draws: found {settings.draws} of a single chain, needs 8 or more")
