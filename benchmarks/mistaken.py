@@ -20,11 +20,9 @@ def row(name: str) -> str:
     found = diagnose(log, pairs=False)
     without = diagnose(log, effects=[other for other in EFFECTS if other != name], pairs=False)
     best = found.winner.log_evidence if found.verdict.name == name else evidence(found, name)
-    rivals = sorted(
-        (c for c in without.candidates if c.log_evidence is not None and c.name != "none"),
-        key=lambda c: -c.log_evidence,
-    )
-    next_best = [f"{c.name} ({c.log_evidence - best:+.0f})" for c in rivals[:2]] if best is not None else []
+    rivals = {c.name: c.log_evidence for c in without.candidates if c.log_evidence is not None and c.name != "none"}
+    nearest = sorted(rivals, key=lambda name: -rivals[name])[:2]
+    next_best = [] if best is None else [f"{other} ({rivals[other] - best:+.0f})" for other in nearest]
     base = found.baseline
     cells = (
         name,

@@ -56,10 +56,10 @@ class Block(Displayed):
 
     def extent(self) -> str:
         """Rows, seconds and cars in words."""
-        rows, drives = self.time.shape[-1], self.speed[..., 0].numel() if self.time.shape[-1] else 0
+        rows, dims = self.time.shape[-1], self.speed.shape[:-1]
         seconds = float(self.time[-1] - self.time[0]) if rows else 0.0
-        dims = " x ".join(map(str, self.speed.shape[:-1]))
-        return f"{rows} rows, {seconds:.4g} s, {drives} drive{'' if drives == 1 else 's'} ({dims})"
+        drives = "1 drive" if dims.numel() == 1 else f"{dims.numel()} drives ({' x '.join(map(str, dims))})"
+        return f"{rows} rows, {seconds:.4g} s, {drives}"
 
     def overview(self) -> Card:
         """Its extent, collisions, and the range of the main signals over all drives."""

@@ -6,12 +6,25 @@ import html.parser
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 import torch
 
-from avtorch import BeliefStream, ClosedLoop, GLVDPlant, Leader, Log, Supervisor, check, compare, diagnose, estimate
+from avtorch import (
+    BeliefStream,
+    ClosedLoop,
+    Estimates,
+    GLVDPlant,
+    Leader,
+    Log,
+    Supervisor,
+    check,
+    compare,
+    diagnose,
+    estimate,
+)
 from avtorch import simulate as drive
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
@@ -55,13 +68,18 @@ def posterior(windows: int = 3) -> Posterior:
     return Posterior(("T_L", "K_L"), log_draws.exp(), converged, why)
 
 
+@cache
+def estimated(log: Log) -> Estimates:
+    return estimate(log, estimator="map")
+
+
 MADE: dict[str, Callable[[Log], Displayed]] = {
     "posterior": lambda log: posterior(),
     "log": lambda log: log,
     "check": lambda log: check(log),
-    "estimates": lambda log: estimate(log, estimator="map"),
-    "window": lambda log: estimate(log, estimator="map").windows[0],
-    "belief": lambda log: estimate(log, estimator="map").windows[0].window.belief,
+    "estimates": lambda log: estimated(log),
+    "window": lambda log: estimated(log).windows[0],
+    "belief": lambda log: estimated(log).windows[0].window.belief,
     "diagnosis": lambda log: diagnose(log, effects=["dead_time"], pairs=False),
     "comparison": lambda log: compare(log, log, effects=[]),
     "trajectory": lambda log: drive(Leader.constant(speed=20.0, duration=3.0), vehicles=2),
@@ -69,6 +87,90 @@ MADE: dict[str, Callable[[Log], Displayed]] = {
         ClosedLoop(Leader.default(start=50.0, duration=4.0, dt=0.05)), stream=BeliefStream(estimator="map")
     ).run(4.0),
 }
+
+
+def quadrature() -> Displayed:
+    from avtorch.inference import integrate
+    from avtorch.validation import synthetic_windows
+
+    return integrate(synthetic_windows(2, seed=1).density, nodes=25)
+
+
+def what_to_set() -> Displayed:
+    from avtorch.remedy import what_to_set
+
+    return what_to_set(plant(T_L=1.5, K_L=0.5), {"T_L": np.full(20, 1.5), "K_L": np.full(20, 0.5)})
+
+
+def experiment() -> Displayed:
+    from avtorch.experiment import Experiment, Information, library
+
+    return Experiment(library()[0], ("one", "other"), Information(0.6, 0.95, 4.0), entropy=0.69, every={})
+
+
+class Mine:
+    """A simulator of a lag alone."""
+
+    def reset(self, *, speed: float, accel: float) -> None:
+        self.speed, self.accel = speed, accel
+
+    def step(self, accel_cmd: float, dt: float) -> tuple[float, float]:
+        before = self.accel
+        self.accel = accel_cmd + float(np.exp(-dt / 0.4)) * (before - accel_cmd)
+        self.speed += dt * (before + self.accel) / 2
+        return self.accel, self.speed
+
+
+def simulator_check() -> Displayed:
+    from avtorch.external import check_simulator
+
+    return check_simulator(Mine())
+
+
+def simulator_comparison() -> Displayed:
+    from avtorch import compare_simulators
+
+    log = drive(Leader.default(start=30.0, duration=60.0, dt=0.1), plant=plant(T_L=0.5)).log()
+    return compare_simulators(log, "T_L=0.5", "T_L=0.2, K_L=0.9")
+
+
+def follower() -> Displayed:
+    from avtorch import LinearController
+    from avtorch.follower import diagnose_follower
+
+    car = LinearController(gains=(0.2, 0.6, 0.0), time_gap=1.5)
+    log = drive(Leader.default(start=50.0, duration=45.0, dt=0.1), car).log()
+    return diagnose_follower(log.to_dataframe(), law="constant_time_gap", cause=False)
+
+
+def validation() -> Displayed:
+    pytest.importorskip("pyro")
+    from avtorch.inference import SamplerSettings
+    from avtorch.validation import NutsSettings, synthetic_windows, validate
+
+    quick = {"settings": SamplerSettings(chains=64), "nuts": NutsSettings(1, 20, 10), "nuts_windows": 1}
+    return validate(synthetic_windows(1, seed=1), **quick)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (quadrature, "Quadrature of T_L, K_L, sigma: 2 windows"),
+        (what_to_set, "What to set"),
+        (experiment, "It separates one, other: 0.6 of 0.69 nats expected."),
+        (simulator_check, "Simulator"),
+        pytest.param(simulator_comparison, "The first simulator is nearer to the car", marks=pytest.mark.slow),
+        pytest.param(follower, "under the law constant_time_gap", marks=pytest.mark.slow),
+        pytest.param(validation, "Validation of SGLD on 1 windows", marks=pytest.mark.slow),
+    ],
+)
+def test_rarer_answers_do_so_too(make: Callable[[], Displayed], says: str) -> None:
+    found = make()
+    assert says in repr(found)
+    assert len(repr(found).splitlines()) <= 15
+    assert "tensor(" not in repr(found)
+    assert "array(" not in repr(found)
+    assert says in Balanced(found._repr_html_()).text
 
 
 @pytest.mark.parametrize("kind", MADE)
