@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from html import escape
+from textwrap import wrap
 
 from avtorch.display.frame import Frame
 from avtorch.errors import printable
 
-_LINE = 300  # characters of a sentence
+WIDTH = 100
+"""Characters of a line of sentences."""
+_SENTENCE = 600  # characters
 
 
 @dataclass(frozen=True)
@@ -32,13 +35,14 @@ class Card:
     def __str__(self) -> str:
         """As a console shows it."""
         table = [] if self.table is None or not len(self.table) else self.table.lines(self.most)
-        return "\n".join([*(printable(line, _LINE) for line in (self.title, *self.lines)), *table])
+        sentences = (printable(line, _SENTENCE) for line in (self.title, *self.lines))
+        return "\n".join([*(part for line in sentences for part in wrap(line, WIDTH)), *table])
 
     def html(self) -> str:
         """As a notebook shows it; every text escaped."""
-        lines = "".join(f"<div>{escape(printable(line, _LINE))}</div>" for line in self.lines)
+        lines = "".join(f"<div>{escape(printable(line, _SENTENCE))}</div>" for line in self.lines)
         table = "" if self.table is None or not len(self.table) else self.table.html(self.most)
-        return f"<div><strong>{escape(printable(self.title, _LINE))}</strong>{lines}{table}</div>"
+        return f"<div><strong>{escape(printable(self.title, _SENTENCE))}</strong>{lines}{table}</div>"
 
 
 class Displayed:

@@ -102,7 +102,8 @@ class Validation(Displayed):
     def overview(self) -> Card:
         """The verdict, and how far SGLD lies from the reference."""
         word = "agrees" if self.verdict.agree else "disagrees"
-        title = f"Validation of SGLD on {len(self.windows)} windows of {self.windows.name}: it {word}"
+        count = f"{len(self.windows)} window{'' if len(self.windows) == 1 else 's'}"
+        title = f"Validation of SGLD on {count} of {self.windows.name}: it {word}"
         return Card(title, (f"{self.verdict.why} Against {self.reference}:",), self.summary())
 
     def summary(self) -> Frame:

@@ -161,13 +161,13 @@ def validation() -> Displayed:
         (simulator_check, "Simulator"),
         pytest.param(simulator_comparison, "The first simulator is nearer to the car", marks=pytest.mark.slow),
         pytest.param(follower, "under the law constant_time_gap", marks=pytest.mark.slow),
-        pytest.param(validation, "Validation of SGLD on 1 windows", marks=pytest.mark.slow),
+        pytest.param(validation, "Validation of SGLD on 1 window of", marks=pytest.mark.slow),
     ],
 )
 def test_rarer_answers_do_so_too(make: Callable[[], Displayed], says: str) -> None:
     found = make()
-    assert says in repr(found)
-    assert len(repr(found).splitlines()) <= 15
+    assert says in " ".join(repr(found).split())
+    assert len(repr(found).splitlines()) <= 17
     assert "tensor(" not in repr(found)
     assert "array(" not in repr(found)
     assert says in Balanced(found._repr_html_()).text
@@ -178,12 +178,11 @@ def test_every_answer_is_a_few_lines_without_a_tensor(kind: str, log: Log) -> No
     found = MADE[kind](log)
     lines = repr(found).splitlines()
     assert 2 <= len(lines) <= 17
-    # the longest line of a comparison or a diagnosis is a sentence
-    assert max(map(len, lines)) <= 300
+    assert max(map(len, lines)) <= 100
     assert "tensor(" not in repr(found)
     assert "array(" not in repr(found)
     page = Balanced(found._repr_html_())
-    assert lines[0] in page.text
+    assert found.overview().title in page.text
     assert len(found._repr_html_()) < 6000
 
 
