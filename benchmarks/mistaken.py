@@ -26,7 +26,7 @@ def row(name: str) -> str:
     base = found.baseline
     cells = (
         name,
-        named(found),
+        "itself" if found.verdict.alias_set == (name,) else named(found),
         "" if best is None else f"{best:.0f}",
         f"{base['T_L'].mean:.2f}, {base['K_L'].mean:.2f}",
         named(without),
