@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
-from avtorch.inference.estimators.importance import AGAINST_SGLD
 from avtorch.vehicle import performance, stability
 
 if TYPE_CHECKING:
@@ -71,6 +70,9 @@ def estimates_answer(estimates: Estimates) -> dict[str, Any]:
 
     Times are on the log's own clock; `epoch_s` is its first row's.
     """
+    # imported here: no other answer needs the estimators, which take a tenth of a second
+    from avtorch.inference.estimators.importance import AGAINST_SGLD
+
     setting = estimates.setting
     return {
         "schema": "avtorch.estimates/1",

@@ -16,6 +16,7 @@ PACKAGES = (
     "avtorch.inference.estimators",
     "avtorch.decision",
     "avtorch.validation",
+    "avtorch.display",
     "avtorch.io",
     "avtorch.pedals",
     "avtorch.gap",

@@ -66,6 +66,19 @@ def test_estimate_imports_no_more_than_it_needs(tmp_path: Path) -> None:
     assert done.stdout.split() == []
 
 
+@pytest.mark.slow
+def test_stability_imports_no_estimator(tmp_path: Path) -> None:
+    """torch and Matplotlib are nine tenths of the command's processor time; nothing else may add to it."""
+    heavy = ("avtorch.inference", "avtorch.gap", "avtorch.decision", "pandas", "pyarrow", "scipy", "sympy")
+    tokens = ["stability", "--out", str(tmp_path / "out"), "--quiet"]
+    code = (
+        f"import sys; from avtorch.cli.app import main; assert main({tokens!r}) == 0;"
+        f"print(*[m for m in {heavy!r} if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
 def test_pictures_as_type_checkers_see_them_are_those_that_are_loaded() -> None:
     tree = ast.parse(Path(avtorch.plots.__file__).read_text(encoding="utf-8"))
     block = next(n for n in tree.body if isinstance(n, ast.If))

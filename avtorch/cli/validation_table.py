@@ -11,9 +11,8 @@ from rich.table import Table
 
 def validation_table(answer: Mapping[str, Any]) -> Table:
     """One row per parameter: distance of SGLD from the reference over the windows; the last row has the aims."""
-    from avtorch.inference.arviz_export import UNITS
+    from avtorch.inference.units import shown_unit
 
-    units = {name: unit.replace("^2", "²").replace("^3", "³").replace("sqrt(s)", "√s") for name, unit in UNITS.items()}
     summary = answer["summary"]
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     for name in ("", "mean error [SD]", "SD ratio", "W1 [SD]", "90 % covers", "exact", "ESS"):
@@ -22,7 +21,7 @@ def validation_table(answer: Mapping[str, Any]) -> Table:
     for key in ("T_L", "K_L", "sigma"):
         name = summary["sigma_is"] if key == "sigma" else key
         table.add_row(
-            escape(f"{name} [{'-' if units[name] == '1' else units[name]}]"),
+            escape(f"{name} [{shown_unit(name)}]"),
             f"{summary['mean_difference_sd_p95'][key]:.3f}",
             f"{summary['sd_ratio_p025'][key]:.3f}-{summary['sd_ratio_p975'][key]:.3f}",
             f"{summary['w1_sd_p95'][key]:.3f}",

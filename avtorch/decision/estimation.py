@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
 from statistics import fmean
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -22,14 +22,22 @@ from avtorch.decision.kept_windows import KeptWindows, Place, estimated_work
 from avtorch.decision.monitor import Monitor
 from avtorch.decision.settings import Setting
 from avtorch.decision.watch import Watch, WatchedWindow
+from avtorch.decision.window_frame import window_frame
+from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.inference.form import Form, JerkForm
 from avtorch.inference.latent_form import LatentForm
 from avtorch.inference.stream import BeliefStream
 from avtorch.io.log import Log
+from avtorch.io.mapping import Pairs
 from avtorch.io.no_command import no_command
 from avtorch.io.quality import Quality, check
+from avtorch.io.source import LogSource, as_log
 from avtorch.logcheck.late_channel import LateChannel, late_channel, on_time
+
+if TYPE_CHECKING:
+    import pandas
+    from arviz import InferenceData
 
 Array = NDArray[Any]
 FormName = Literal["auto", "jerk", "latent"]
@@ -38,8 +46,8 @@ LEAST_ROWS = 10
 """Rows a window must span: fewer do not determine three parameters and their noise."""
 
 
-@dataclass(frozen=True)
-class Estimates:
+@dataclass(frozen=True, repr=False)
+class Estimates(Displayed):
     """The result of `estimate`.
 
     `windows` in the order of the log; `seconds_per_window` of computing; `form` "jerk" or "latent"; `quality` of the
@@ -54,6 +62,8 @@ class Estimates:
         >>> estimates = estimate(run.log(), estimator="map")
         >>> len(estimates.windows), estimates.form, estimates.excited_share
         (2, 'jerk', 1.0)
+        >>> [f"{row['parameter']} {row['mean']:.1f} {row['unit']}" for row in estimates.summary().rows()][:2]
+        ['T_L 0.5 s', 'K_L 0.9 -']
     """
 
     windows: list[WatchedWindow]
@@ -66,6 +76,43 @@ class Estimates:
     dead_time: float = 0.0
     inferred: InferredDeadTime | None = None
     late: LateChannel | None = None
+
+    def overview(self) -> Card:
+        """How many windows were used, by what, and the belief after the last."""
+        first, last = self.windows[0].window, self.windows[-1].window
+        title = f"Estimates in {len(self.windows)} windows from {first.start_s:g} to {last.end_s:g} s"
+        lines = [
+            f"{self.form} form by {self.estimator}; {100 * self.excited_share:.0f} % of the windows excited; dead time "
+            f"{self.dead_time:g} s{' (inferred)' if self.inferred is not None else ''}."
+        ]
+        if self.late is not None:
+            lines.append(str(self.late))
+        alarmed = [w for w in self.windows if w.report.names()]
+        count = f"{len(alarmed)} window{'' if len(alarmed) == 1 else 's'}"
+        lines.append(f"Alerts in {count}. The belief after the last window:")
+        return Card(title, tuple(lines), self.summary(), most=9)
+
+    def summary(self) -> Frame:
+        """The belief after the last window, which carries all before it: mean, sd, the 5 and 95 % quantiles."""
+        whole = self.windows[-1].window.belief.summary().columns
+        return Frame({name: values for name, values in whole.items() if name not in ("vehicle", "used")})
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """A row a window: bounds [s], rows, figures of each parameter, P(string stable), alerts.
+
+        Needs ``pip install 'avtorch[pandas]'``.
+        """
+        columns = window_frame(self.windows).columns
+        return Frame({name: values for name, values in columns.items() if name != "scenario"}).to_dataframe()
+
+    def to_arviz(self, *, window: int = -1) -> InferenceData:
+        """The draws after a `window`, the last by default, as one chain. Needs ``pip install 'avtorch[arviz]'``.
+
+        Raises `InputError` for a window that is not there, and for one that comes without draws from a checkpoint.
+        """
+        if not -len(self.windows) <= window < len(self.windows):
+            raise InputError(f"window: found {window}, needs a number below {len(self.windows)}")
+        return self.windows[window].window.belief.to_arviz()
 
     @property
     def excited_share(self) -> float:
@@ -89,9 +136,11 @@ class Estimates:
 
 
 def estimate(
-    log: Log,
+    log: LogSource,
     window: float = 2.0,
     *,
+    map: Pairs = None,
+    unit: Pairs = None,
     form: FormName = "auto",
     estimator: str = "auto",
     setting: Setting | None = None,
@@ -106,6 +155,9 @@ def estimate(
     **inference: Any,
 ) -> Estimates:
     """The belief in (T_L, K_L) over a log, one posterior per `window` [s], each the prior of the next.
+
+    `log`: a `Log`, a path or a data frame; `map`, `unit`: names and units of the columns of what is read here, as
+    `Log.read` takes them.
 
     `form`: "jerk" needs measured jerk and accel (Eq. 4); "latent" takes accel and/or speed with their noise;
     "auto" is "jerk" where the log has both. Windows lie on a grid that starts afresh with each segment of the log; the
@@ -142,6 +194,7 @@ def estimate(
         >>> [round(window.belief.stat(name)["mean"], 1) for name in ("T_L", "K_L")]
         [0.5, 0.9]
     """
+    log = as_log(log, map=map, unit=unit)
     if log.accel_cmd is None:
         raise no_command(log, "; T_L and K_L need the demanded acceleration")
     if not log.usable.any():

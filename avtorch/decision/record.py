@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from avtorch.decision.settings import Setting
 from avtorch.decision.watch import WatchedWindow
+from avtorch.decision.window_frame import window_frame
+from avtorch.display import Card, Displayed, Frame
 from avtorch.vehicle.block import Block
+
+if TYPE_CHECKING:
+    import pandas
 
 
 @dataclass(frozen=True)
@@ -51,8 +57,8 @@ class Action:
     driver_delay_s: float = 0.0
 
 
-@dataclass(frozen=True)
-class SupervisedRun:
+@dataclass(frozen=True, repr=False)
+class SupervisedRun(Displayed):
     """A supervised run: `rows` (scenario, time), `windows`, and per scenario its `alerts` and `actions`.
 
     Example:
@@ -67,3 +73,31 @@ class SupervisedRun:
     windows: list[WatchedWindow]
     alerts: list[list[Alert]]
     actions: list[list[Action]]
+
+    def overview(self) -> Card:
+        """What was driven, what was seen and done in the first scenario, and the first scenarios in figures."""
+        title = f"Supervised run: {self.rows.extent()}; {len(self.windows)} windows"
+        lines = []
+        if self.alerts and self.alerts[0]:
+            first = self.alerts[0][0]
+            lines.append(f"First alert: {first.time_s:g} s, {first.detector}: {first.why}")
+        if self.actions and self.actions[0]:
+            done = self.actions[0][0]
+            lines.append(
+                f"First action: {done.time_s:g} s, strategies {', '.join(map(str, done.strategies))}: {done.why}"
+            )
+        rows = [
+            {
+                "scenario": i,
+                "alerts": len(alerts),
+                "actions": len(actions),
+                "least spacing [m]": float(self.rows.spacing[i].min()),
+                "collided": bool(self.rows.collided[i]),
+            }
+            for i, (alerts, actions) in enumerate(zip(self.alerts, self.actions, strict=True))
+        ]
+        return Card(title, tuple(lines), Frame.of_rows(rows))
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """A row a window and scenario (of samples: `rows.to_dataframe()`). Needs ``pip install 'avtorch[pandas]'``."""
+        return window_frame(self.windows).to_dataframe()

@@ -10,12 +10,13 @@ from torch import Tensor
 
 from avtorch.decision.monitor import Monitor, MonitorReport
 from avtorch.decision.settings import Setting
+from avtorch.display import Card, Displayed
 from avtorch.errors import InputError
 from avtorch.inference.stream import BeliefStream, Window
 
 
-@dataclass(frozen=True)
-class WatchedWindow:
+@dataclass(frozen=True, repr=False)
+class WatchedWindow(Displayed):
     """A window's belief and the monitor's report on it under the `setting` in force.
 
     Example:
@@ -29,6 +30,13 @@ class WatchedWindow:
     window: Window
     report: MonitorReport
     setting: Setting
+
+    def overview(self) -> Card:
+        """The window, and the monitor's alerts in the first scenario."""
+        below = self.window.overview()
+        alerts = [self.report.why(name) for name in self.report.names()]
+        lines = (*below.lines, *(alerts or ["No alert."]))
+        return Card(below.title, lines, below.table, below.most)
 
 
 class Watch:

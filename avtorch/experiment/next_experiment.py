@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from avtorch.display import Card, Displayed
 from avtorch.errors import InputError
 from avtorch.experiment.information import Information, information
 from avtorch.experiment.limits import Limits
@@ -28,8 +29,8 @@ _SURE = 12.0
 _FAINT = 0.1  # share of the entropy
 
 
-@dataclass(frozen=True, eq=False)
-class Experiment:
+@dataclass(frozen=True, eq=False, repr=False)
+class Experiment(Displayed):
     """Drive `manoeuvre` next: it `separates` those causes.
 
     `information`: its expected information; `entropy` [nats]: of the cause before it. `every`: the same for all
@@ -52,6 +53,13 @@ class Experiment:
     unresolved: tuple[str, ...] = ()
     why: str = ""
     limits: Limits = field(default_factory=Limits)
+
+    def overview(self) -> Card:
+        """The manoeuvre, what it separates, and what it is expected to tell."""
+        made, told = self.manoeuvre, self.information
+        line = f"It separates {', '.join(self.separates)}: {told.nats:.2g} of {self.entropy:.2g} nats expected."
+        title = f"Next experiment: {made.name}, {float(made.time[-1]):.3g} s from {float(made.speed[0]):.3g} m/s"
+        return Card(title, (line, *([self.why] if self.why else [])))
 
     def to_dict(self) -> dict[str, Any]:
         """The object `next_experiment` of `diagnosis.json`."""

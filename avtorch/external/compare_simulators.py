@@ -25,25 +25,29 @@ from avtorch.gap.compare import LEVEL
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.result.diagnosis import LogFacts
 from avtorch.gap.simulator.plant import GapPlant, plant
-from avtorch.io import Log
+from avtorch.io import Log, LogSource, as_logs
+from avtorch.io.mapping import Pairs
 
 Progress = Callable[[str, int, int], None]
 _CHANNELS = ("accel", "speed")
 
 
 def compare_simulators(
-    logs: Log | Sequence[Log],
+    logs: LogSource | Sequence[LogSource],
     first: ExternalSimulator | GapPlant | str | PathLike[str],
     second: ExternalSimulator | GapPlant | str | PathLike[str],
     *,
+    map: Pairs = None,
+    unit: Pairs = None,
     level: float = LEVEL,
     progress: Progress | None = None,
 ) -> SimulatorComparison:
     """Which of two simulators is nearer to the car that drove `logs`, and by what.
 
-    `first`, `second`: each a simulator that is not avtorch's own (`ExternalSimulator`: its output, an object with
-    `reset` and `step`, an FMU), a plant, or one as text (`"dead_time=0.2, T_L=0.4"`) or TOML. `level`: how often two
-    that are equally near may be told apart. `progress(what, done, of)` is called at each step.
+    `logs`: one log or several, each a `Log`, a path or a data frame; `map`, `unit`: as `Log.read` takes them, for what
+    is read here. `first`, `second`: each a simulator that is not avtorch's own (`ExternalSimulator`: its output, an
+    object with `reset` and `step`, an FMU), a plant, or one as text (`"dead_time=0.2, T_L=0.4"`) or TOML. `level`: how
+    often two that are equally near may be told apart. `progress(what, done, of)` is called at each step.
 
     Raises `InputError` for a level out of range, logs with less than five blocks of 4 s of usable driving, simulators
     without a channel of the logs, and as `ExternalSimulator.beside`.
@@ -68,7 +72,7 @@ def compare_simulators(
     """
     if not 0 < level < 1:
         raise InputError(f"level: found {level}, needs a number between 0 and 1")
-    each = [logs] if isinstance(logs, Log) else list(logs)
+    each = as_logs(logs, map=map, unit=unit)
     given = [_driven(x) for x in (first, second)]
     rolled = [simulator.outputs(each, progress) for simulator, _ in given]
     cars = _scored(each, [outputs for outputs, _ in rolled])

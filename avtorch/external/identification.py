@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.external.driving import driven_along
 from avtorch.external.simulator import Simulator
@@ -28,8 +29,8 @@ _ENOUGH = 0.005  # of the response: an integrator of the simulator's own leaves 
 _SWEEP_S, _SWEEP_HZ = 20.0, (0.05, 1.5)
 
 
-@dataclass(frozen=True)
-class SimulatorCheck:
+@dataclass(frozen=True, repr=False)
+class SimulatorCheck(Displayed):
     """What a simulator called `name` does, as a chain of effects (`surrogate`), and the `output` it was found from.
 
     Example:
@@ -53,6 +54,12 @@ class SimulatorCheck:
     name: str
     surrogate: Surrogate
     output: Log
+
+    def overview(self) -> Card:
+        """The chain of effects that answers as it does."""
+        rows = [{"parameter": name, "unit": unit_of(name), "value": value} for name, value in self.values.items()]
+        line = f"That is all but {100 * self.left:.1f} % of its response."
+        return Card(f"Simulator {self.name}, as a chain of effects", (line,), Frame.of_rows(rows))
 
     @property
     def values(self) -> dict[str, float]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from avtorch.display import Card, Displayed, Frame
 from avtorch.external.surrogate import Surrogate
 from avtorch.gap.quantity import Quantity, unit_of, words_of
 from avtorch.gap.result.diagnosis import LogFacts
@@ -93,8 +94,8 @@ class Difference:
         return f"{self.name} ({_values(self.first)} in the first, {_values(self.second)} in the second)"
 
 
-@dataclass(frozen=True)
-class SimulatorComparison:
+@dataclass(frozen=True, repr=False)
+class SimulatorComparison(Displayed):
     """`errors` by metric: root mean squares over rollouts of `horizon_s` [s]. `ratio`: the second's error relative to
     the first's, the geometric mean over the metrics. `p_first`, `p_second`: probability that it is nearer, by 1 % of
     its error at least, from the spread between `blocks` blocks of the drives. `differences`: what matters most first.
@@ -121,6 +122,14 @@ class SimulatorComparison:
     blocks: int
     horizon_s: float
     differences: tuple[Difference, ...]
+
+    def overview(self) -> Card:
+        """Which one is nearer, and the errors of both."""
+        rows = [
+            {"error": metric, "first": e.first.mean, "second": e.second.mean, "ratio": e.ratio.mean}
+            for metric, e in self.errors.items()
+        ]
+        return Card("Comparison of two simulators", (self.why,), Frame.of_rows(rows))
 
     @property
     def nearer(self) -> Which | None:

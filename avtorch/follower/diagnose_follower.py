@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from avtorch.arrays import FloatArray
+from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.follower.closed_loop import LoopErrors, keeps_speed, loop_errors
 from avtorch.follower.followed import Followed, car_of, followed, seen_in
@@ -22,17 +23,18 @@ from avtorch.follower.laws import LAWS, FollowerMeasurements, HeadwayLaw, law_na
 from avtorch.follower.loop_stability import LoopStability, loop_stability
 from avtorch.gap.diagnose import diagnose
 from avtorch.gap.likelihood.record import Record
-from avtorch.gap.quantity import Quantity
+from avtorch.gap.quantity import Quantity, frame_of
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.effect import delay_effect, delay_key
-from avtorch.io import Log
+from avtorch.io import Log, LogSource, as_log
+from avtorch.io.mapping import Pairs
 
 _LEAST_S = 40.0
 _LOWEST, _HIGHEST = -8.0, 5.0  # bounds of a command [m/s²]; no car is sent more
 
 
-@dataclass(frozen=True, eq=False)
-class FollowerDiagnosis:
+@dataclass(frozen=True, eq=False, repr=False)
+class FollowerDiagnosis(Displayed):
     """The diagnosis of one follower under one `law`.
 
     - `parameters` of law, lag `T_L` and `delay_s` by name; `lag_with_delay_s`, and at the median speed `headway_s`
@@ -64,6 +66,18 @@ class FollowerDiagnosis:
     diagnosis: Diagnosis | None
     conditional: tuple[str, ...]
 
+    def overview(self) -> Card:
+        """The law, string stability at the usual speed, the cause where it was sought, and the parameters."""
+        usual = self.usual
+        lines = [f"P(string stable) {usual.p_string_stable:.2f} at {usual.speed:.3g} m/s."]
+        if self.diagnosis is not None:
+            lines.append(self.diagnosis.overview().title)
+        return Card(f"Follower {self.name} under the law {self.law.name}", tuple(lines), self.summary(), most=9)
+
+    def summary(self) -> Frame:
+        """A row a parameter of law, lag and delay: unit, mean, sd, the 5 and 95 % quantiles."""
+        return frame_of(self.parameters)
+
     @property
     def usual(self) -> LoopStability:
         """At the median speed."""
@@ -91,8 +105,10 @@ class FollowerDiagnosis:
 
 
 def diagnose_follower(
-    log: Log,
+    log: LogSource,
     *,
+    map: Pairs = None,
+    unit: Pairs = None,
     law: str | None = None,
     cause: bool = True,
     effects: Sequence[str] | None = None,
@@ -101,6 +117,7 @@ def diagnose_follower(
 ) -> FollowerDiagnosis:
     """Time gap, gains, lag with delay, string stability, gap and cause of a car-following `log`.
 
+    `log`: a `Log`, a path or a data frame; `map`, `unit`: as `Log.read` takes them, for what is read here.
     `law`: `constant_time_gap` or `intelligent_driver`; default: the one that predicts held-out data better.
     `cause` False: stop at the loop. `effects`, `progress`: as `avtorch.diagnose` has them.
 
@@ -116,6 +133,7 @@ def diagnose_follower(
         >>> round(found.parameters["time_gap_s"].mean, 1)
         1.5
     """
+    log = as_log(log, map=map, unit=unit, following=True)
     laws = list(LAWS.values()) if law is None else [law_named(law)]
     plain = followed(log, laws[0])
     record = plain.record

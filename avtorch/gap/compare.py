@@ -40,7 +40,8 @@ from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
 from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.simulator.plant import GapPlant, plant
-from avtorch.io import Log
+from avtorch.io import Log, LogSource, as_logs
+from avtorch.io.mapping import Pairs
 
 Simulator = GapPlant | str | PathLike[str] | None
 
@@ -51,9 +52,11 @@ _CAR = ("T_L", "K_L")
 
 
 def compare(
-    before: Log | Sequence[Log],
-    after: Log | Sequence[Log],
+    before: LogSource | Sequence[LogSource],
+    after: LogSource | Sequence[LogSource],
     *,
+    map: Pairs = None,
+    unit: Pairs = None,
     baseline: Simulator | BlackBoxSimulator = None,
     baseline_after: Simulator = None,
     level: float = LEVEL,
@@ -61,6 +64,9 @@ def compare(
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Comparison:
     """What changed from the drives `before` to those `after`.
+
+    `before`, `after`: each a `Log`, a path or a data frame, or several; `map`, `unit`: names and units of the columns
+    of those that are read here, as `Log.read` takes them.
 
     `baseline`: the simulator with which both are compared (`baseline_after`: another one for the second set), with its
     own `T_L` and `K_L`; default: bare GLVD fitted to the drives before. Its effects keep their values in the fits of
@@ -85,7 +91,7 @@ def compare(
     """
     if not 0 < level < 1:
         raise InputError(f"level: found {level}, needs a number between 0 and 1")
-    sides = [[x] if isinstance(x, Log) else list(x) for x in (before, after)]
+    sides = [as_logs(x, map=map, unit=unit, argument=name) for x, name in ((before, "before"), (after, "after"))]
     kinds = _kinds(effects)
     if isinstance(baseline, BlackBoxSimulator):
         if baseline_after is not None:

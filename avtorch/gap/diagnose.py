@@ -42,7 +42,8 @@ from avtorch.gap.selection.verdict import Candidate, verdict_of
 from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.whole_progress import WholeProgress
-from avtorch.io import Log
+from avtorch.io import LogSource, as_logs
+from avtorch.io.mapping import Pairs
 
 # Probability of an unknown cause after the best single effect, from which held-out blocks decide without any pair: in
 # 36 simulated logs pairs brought it below a half from 0.98 at most; behind most ordinary recorders it is above 0.99.
@@ -54,8 +55,10 @@ _NO_PAIRS = (
 
 
 def diagnose(
-    logs: Log | Sequence[Log],
+    logs: LogSource | Sequence[LogSource],
     *,
+    map: Pairs = None,
+    unit: Pairs = None,
     baseline: GapPlant | BlackBoxSimulator | str | PathLike[str] | None = None,
     prior: Mapping[str, float] | None = None,
     accel_kind: Literal["kinematic", "specific-force"] | None = None,
@@ -73,7 +76,10 @@ def diagnose(
     The likelihood's verdict holds where it names something. Where it is `unknown`, effects are selected on held-out
     blocks under noise of any spectrum: any number of them.
 
-    Args: `baseline`: the user's simulator (default: bare GLVD); its effects keep their values, `T_L` and `K_L` are
+    Args: `logs`: one log or several, each a `Log`, a path or a data frame; `map`, `unit`: names and units of the
+    columns of those that are read here, as `Log.read` takes them.
+
+    `baseline`: the user's simulator (default: bare GLVD); its effects keep their values, `T_L` and `K_L` are
     fitted. One that is not made of effects comes as an `avtorch.ExternalSimulator`. `prior`: weights over causes, see
     `model_probabilities`. `effects`: those to test, by name or class (default: all registered). `pairs`: also test
     several at once. `posterior` of the verdict's parameters: by SGLD, or Laplace's approximation. `material`: share of
@@ -97,7 +103,7 @@ def diagnose(
         ('sensor_bias', 0.0)
     """
     told, progress = progress, None if progress is None else WholeProgress(progress)
-    each = [logs] if isinstance(logs, Log) else list(logs)
+    each = as_logs(logs, map=map, unit=unit)
     if accel_kind is not None:
         if accel_kind not in ("kinematic", "specific-force"):
             raise InputError(f"accel_kind: found {accel_kind!r}, needs 'kinematic' or 'specific-force'")

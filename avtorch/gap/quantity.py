@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from avtorch.display import Frame
 from avtorch.errors import InputError
 
 _NORMAL_Q95 = 1.6448536269514722
@@ -81,6 +82,12 @@ class Quantity:
     def to_dict(self) -> dict[str, float]:
         """The quantity as JSON: mean, sd, q05, q95."""
         return asdict(self)
+
+
+def frame_of(quantities: Mapping[str, Quantity]) -> Frame:
+    """A row a parameter: its unit, mean, sd and the 5 and 95 % quantiles."""
+    columns = {key: [getattr(q, key) for q in quantities.values()] for key in ("mean", "sd", "q05", "q95")}
+    return Frame({"parameter": list(quantities), "unit": [unit_of(key) for key in quantities], **columns})
 
 
 def unit_of(key: str) -> str:

@@ -1,60 +1,54 @@
-"""Posteriors as ArviZ data, for its plots and diagnostics. Needs the extra ``arviz``, so import it by its path."""
+"""Draws as ArviZ data, for its plots and diagnostics. Needs the extra ``arviz``, which is imported when it is used."""
 
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
+from numpy.typing import NDArray
+
+from avtorch.deprecation import deprecated
 from avtorch.errors import InputError
-from avtorch.inference.posterior import Posterior
+from avtorch.inference.units import UNITS as UNITS
 
 if TYPE_CHECKING:
     from arviz import InferenceData
 
-#: Units of the parameters of either form; names not listed carry none.
-UNITS = {
-    "T_L": "s",
-    "K_L": "1",
-    "sigma": "m/s^3",
-    "process_noise": "m/s^2/sqrt(s)",
-    "road_noise": "m/s/sqrt(s)",
-    "speed_noise": "m/s",
-    "accel_noise": "m/s^2",
-    "coloured_sd": "m/s^2",
-    "coloured_time": "s",
-}
 
+def inference_data(
+    draws: Mapping[str, NDArray],
+    dims: Sequence[str],
+    *,
+    units: Mapping[str, str],
+    attributes: Mapping[str, Any],
+) -> InferenceData:
+    """Draws by parameter, each of the shape that ``dims`` names, as ``arviz.InferenceData``.
 
-def to_arviz(posterior: Posterior, *, window: int | None = None) -> InferenceData:
-    """The draws as ``arviz.InferenceData``: one variable a parameter, with its unit in ``attrs["units"]``.
-
-    Dimensions are ``(chain, draw, window)``, or ``(chain, draw)`` if one ``window`` is asked for. Which windows
-    converged is in the group's ``attrs["converged"]``, as 0 or 1, beside the ``pareto_k`` of each. ArviZ 1.x has
-    ``xarray.DataTree`` in place of ``InferenceData``: ``DataTree.from_dict({"posterior": to_arviz(p).posterior})``
-    carries over.
+    A unit goes to the variable's ``attrs["units"]``. ArviZ 1.x has ``xarray.DataTree`` in place of ``InferenceData``:
+    ``DataTree.from_dict({"posterior": data.posterior})`` carries over.
 
     Raises:
-        InputError: for a window that the posterior does not have.
+        InputError: where ArviZ is not installed, or there are no draws.
     """
-    import xarray
-
+    if not all(x.size for x in draws.values()) or not draws:
+        raise InputError("draws: found none; to_arviz needs posterior draws")
     with warnings.catch_warnings():
         # ArviZ 0.23 announces its successor on import
         warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major refactor", FutureWarning)
-        import arviz
+        try:
+            import arviz
+            import xarray
+        except ImportError:
+            raise InputError("arviz: not installed; to_arviz needs pip install 'avtorch[arviz]'") from None
+    variables = {name: (dims, x, {"units": units[name]} if name in units else {}) for name, x in draws.items()}
+    sizes = zip(dims, next(iter(draws.values())).shape, strict=True)
+    coords = {dim: range(size) for dim, size in sizes}
+    attrs = {"inference_library": "avtorch", **attributes}
+    return arviz.InferenceData(posterior=xarray.Dataset(variables, coords=coords, attrs=attrs))
 
-    chains, draws, windows, _ = posterior.draws.shape
-    if window is not None and not 0 <= window < windows:
-        raise InputError(f"window: {window} is not in 0 to {windows - 1}")
-    kept = slice(None) if window is None else window
-    dims = ("chain", "draw", "window") if window is None else ("chain", "draw")
-    sizes = dict(zip(dims, (chains, draws, windows), strict=False))
-    variables = {
-        name: (dims, posterior[name][..., kept].numpy(), {"units": UNITS[name]} if name in UNITS else {})
-        for name in posterior.names
-    }
-    flags = posterior.converged[kept].int().reshape(-1).tolist()
-    k = posterior.pareto_k[kept].reshape(-1).tolist()
-    attributes = {"converged": flags, "pareto_k": k, "inference_library": "avtorch"}
-    data = xarray.Dataset(variables, coords={dim: range(size) for dim, size in sizes.items()}, attrs=attributes)
-    return arviz.InferenceData(posterior=data)
+
+def to_arviz(posterior: Any, *, window: int | None = None) -> InferenceData:
+    """Deprecated: write ``posterior.to_arviz(window=window)``."""
+    deprecated("arviz_export.to_arviz(posterior)", "posterior.to_arviz()", until="0.3")
+    return posterior.to_arviz(window=window)

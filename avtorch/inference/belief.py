@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
+from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.inference.posterior import sorted_quantile
 from avtorch.inference.priors import Prior
 from avtorch.inference.state import shaped_as
+from avtorch.inference.units import UNITS, shown_unit
+
+if TYPE_CHECKING:
+    import pandas
+    from arviz import InferenceData
 
 Z90 = 1.6448536269514722
 """The standard normal's 95 % quantile: 90 % lie within this many SDs."""
@@ -49,8 +55,8 @@ class Summary(NamedTuple):
         return cls(mean, mean * sd_z.square().expm1().sqrt(), low, high, draws.exp())
 
 
-@dataclass(frozen=True)
-class Belief:
+@dataclass(frozen=True, repr=False)
+class Belief(Displayed):
     """The belief about every vehicle after a window.
 
     Attributes:
@@ -78,6 +84,53 @@ class Belief:
     draws: Float[Tensor, "draw vehicle parameter"]
     excited: Bool[Tensor, " vehicle"]
     converged: Bool[Tensor, " vehicle"]
+
+    def overview(self) -> Card:
+        """How many vehicles, how many of them the window updated, and the parameters of the first."""
+        vehicles = len(self.excited)
+        used = int((self.excited & self.converged).sum())
+        if vehicles == 1:
+            line = "The last window updated it." if used else "The last window was not used; it is the belief before."
+        else:
+            line = f"The last window updated {used} of {vehicles}; the others keep the belief before it."
+        title = f"Belief about {vehicles} vehicle{'' if vehicles == 1 else 's'}: {', '.join(self.names)}"
+        left_out = ("used",) if vehicles > 1 else ("used", "vehicle")
+        table = {key: values for key, values in self.summary().columns.items() if key not in left_out}
+        return Card(title, (line,), Frame(table), most=2 * len(self.names))
+
+    def summary(self) -> Frame:
+        """A row a vehicle and parameter: mean, sd, the 5 and 95 % quantiles; `used`: the window updated it."""
+        vehicles, count = len(self.excited), len(self.names)
+        return Frame(
+            {
+                "vehicle": [v for v in range(vehicles) for _ in self.names],
+                "parameter": list(self.names) * vehicles,
+                "unit": [shown_unit(name) for name in self.names] * vehicles,
+                **{key: getattr(self, key).flatten().tolist() for key in ("mean", "sd", "q05", "q95")},
+                "used": (self.excited & self.converged).repeat_interleave(count).tolist(),
+            }
+        )
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """The draws, a row a draw and vehicle, a column a parameter. Needs ``pip install 'avtorch[pandas]'``."""
+        draws, vehicles, _ = self.draws.shape
+        index = {
+            "draw": torch.arange(draws).repeat_interleave(vehicles).numpy(),
+            "vehicle": torch.arange(vehicles).repeat(draws).numpy(),
+        }
+        columns = {name: self.draws[..., i].flatten().numpy() for i, name in enumerate(self.names)}
+        return Frame(index | columns).to_dataframe()
+
+    def to_arviz(self) -> InferenceData:
+        """The draws as one chain, variables ``(chain, draw, vehicle)``. Needs ``pip install 'avtorch[arviz]'``.
+
+        The draws of a belief are independent or thinned: R-hat of one chain says nothing, see :meth:`Posterior.rhat`.
+        """
+        from avtorch.inference.arviz_export import inference_data
+
+        draws = {name: self.draws[..., i].unsqueeze(0).numpy() for i, name in enumerate(self.names)}
+        attributes = {"used": (self.excited & self.converged).int().tolist()}
+        return inference_data(draws, ("chain", "draw", "vehicle"), units=UNITS, attributes=attributes)
 
     def stat(self, name: str, vehicle: int = 0) -> dict[str, float]:
         """``{"mean", "sd", "q05", "q95"}`` of one parameter of one vehicle."""

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float
+from avtorch.display import Card, Displayed, Frame
+from avtorch.errors import InputError
 from avtorch.inference.exactness import Exactness
+from avtorch.inference.units import UNITS, shown_unit
+
+if TYPE_CHECKING:
+    import pandas
+    from arviz import InferenceData
+
+SHOWN = 2
+"""Windows whose parameters a posterior shows of itself."""
 
 
-@dataclass(frozen=True)
-class Posterior:
+@dataclass(frozen=True, repr=False)
+class Posterior(Displayed):
     """Draws of positive parameters for every window.
 
     Attributes:
@@ -31,6 +42,8 @@ class Posterior:
         >>> posterior = Posterior(("T_L",), (0.1 * log_lag - 1).exp(), converged=torch.tensor([True]))
         >>> round(posterior.mean.item(), 2), round(posterior.quantile(0.95).item(), 2), posterior.ess_bulk.item() > 1000
         (0.37, 0.43, True)
+        >>> print(str(posterior.overview()).splitlines()[0])
+        Posterior of T_L: 8 chains of 500 draws, 1 window
     """
 
     names: tuple[str, ...]
@@ -38,6 +51,65 @@ class Posterior:
     converged: Bool[Tensor, " window"]
     why: tuple[str, ...] = ()
     exactness: Exactness | None = None
+
+    def overview(self) -> Card:
+        """Its size, whether it converged, and the parameters of the first windows."""
+        chains, draws, windows, _ = self.draws.shape
+        some = "window" if windows == 1 else "windows"
+        title = f"Posterior of {', '.join(self.names)}: {chains} chains of {draws} draws, {windows} {some}"
+        good = int(self.converged.sum())
+        reason = next((f" {reason}" for reason in self.why if reason), "")
+        lines = [f"{good} of {windows} windows converged.{reason}"]
+        if windows > SHOWN:
+            lines.append(f"The first {SHOWN} windows; summary() has all:")
+        first = slice(0, SHOWN)
+        part = Posterior(self.names, self.draws[:, :, first], self.converged[first])
+        table = {name: values for name, values in part.summary().columns.items() if name != "converged"}
+        return Card(title, tuple(lines), Frame(table), most=SHOWN * len(self.names))
+
+    def summary(self) -> Frame:
+        """A row a window and parameter: mean, sd, the 5 and 95 % quantiles, nested R-hat, effective draws."""
+        windows = self.draws.shape[2]
+        stats = {"mean": self.mean, "sd": self.sd, "q05": self.quantile(0.05), "q95": self.quantile(0.95)}
+        stats |= {"rhat": self.rhat, "ess_bulk": self.ess_bulk, "ess_tail": self.ess_tail}
+        return Frame(
+            {
+                "window": [w for w in range(windows) for _ in self.names],
+                "parameter": list(self.names) * windows,
+                "unit": [shown_unit(name) for name in self.names] * windows,
+                **{key: values.flatten().tolist() for key, values in stats.items()},
+                "converged": self.converged.repeat_interleave(len(self.names)).tolist(),
+            }
+        )
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """The draws, a row a chain, draw and window, a column a parameter. Needs ``pip install 'avtorch[pandas]'``."""
+        chains, draws, windows, _ = self.draws.shape
+        place = torch.cartesian_prod(torch.arange(chains), torch.arange(draws), torch.arange(windows)).reshape(-1, 3)
+        index = {dim: place[:, i].numpy() for i, dim in enumerate(("chain", "draw", "window"))}
+        return Frame(index | {name: self[name].flatten().numpy() for name in self.names}).to_dataframe()
+
+    def to_arviz(self, *, window: int | None = None) -> InferenceData:
+        """The draws as ``arviz.InferenceData``: one variable a parameter, with its unit in ``attrs["units"]``.
+
+        Dimensions are ``(chain, draw, window)``, or ``(chain, draw)`` if one ``window`` is asked for. Which windows
+        converged is in the group's ``attrs["converged"]``, as 0 or 1, beside the ``pareto_k`` of each. Needs ``pip
+        install 'avtorch[arviz]'``.
+
+        Raises:
+            InputError: for a window that the posterior does not have, and where ArviZ is not installed.
+        """
+        from avtorch.inference.arviz_export import inference_data
+
+        windows = self.draws.shape[2]
+        if window is not None and not 0 <= window < windows:
+            raise InputError(f"window: {window} is not in 0 to {windows - 1}")
+        kept = slice(None) if window is None else window
+        dims = ("chain", "draw", "window") if window is None else ("chain", "draw")
+        flags = self.converged[kept].int().reshape(-1).tolist()
+        attributes = {"converged": flags, "pareto_k": self.pareto_k[kept].reshape(-1).tolist()}
+        draws = {name: self[name][..., kept].numpy() for name in self.names}
+        return inference_data(draws, dims, units=UNITS, attributes=attributes)
 
     def __getitem__(self, name: str) -> Float[Tensor, "chain draw window"]:
         """Draws of one parameter, shape ``(chain, draw, window)``."""

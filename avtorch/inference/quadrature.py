@@ -13,9 +13,11 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float
+from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.inference.density import Density
 from avtorch.inference.map import Mode, find_mode
+from avtorch.inference.units import shown_unit
 
 #: Initial half width of the grid in SDs, the growth of a side that still has mass, and how often it may grow.
 REACH, GROWTH, ROUNDS = 7.0, 1.3, 12
@@ -28,8 +30,8 @@ COARSE = 21
 BLOCK = 2**20
 
 
-@dataclass(frozen=True)
-class Quadrature:
+@dataclass(frozen=True, repr=False)
+class Quadrature(Displayed):
     """Posterior of every window, from one-dimensional marginals that a grid over the other parameters gave.
 
     Attributes:
@@ -64,6 +66,26 @@ class Quadrature:
     converged: Bool[Tensor, " window"]
     nodes: Float[Tensor, "window parameter node"]
     mass: Float[Tensor, "window parameter node"]
+
+    def overview(self) -> Card:
+        """Its size, whether it converged, and the parameters of the first windows."""
+        windows = len(self.converged)
+        title = f"Quadrature of {', '.join(self.names)}: {windows} window{'' if windows == 1 else 's'}"
+        line = f"{int(self.converged.sum())} of {windows} converged; largest error {float(self.error.max()):.2g}."
+        return Card(title, (line,), self.summary(), most=2 * len(self.names))
+
+    def summary(self) -> Frame:
+        """A row a window and parameter: mean, sd and the 5 and 95 % quantiles."""
+        windows = len(self.converged)
+        stats = {"mean": self.mean, "sd": self.sd, "q05": self.quantile(0.05), "q95": self.quantile(0.95)}
+        return Frame(
+            {
+                "window": [w for w in range(windows) for _ in self.names],
+                "parameter": list(self.names) * windows,
+                "unit": [shown_unit(name) for name in self.names] * windows,
+                **{key: values.flatten().tolist() for key, values in stats.items()},
+            }
+        )
 
     def cdf(self, values: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window parameter"]:
         """Posterior probability of a parameter below ``values`` ``(..., window, parameter)``, in their own units.

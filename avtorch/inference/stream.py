@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Real
+from avtorch.display import Card, Displayed
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief
 from avtorch.inference.estimators.choose import make_estimator
@@ -25,8 +26,8 @@ from avtorch.io.engagement import settled_rows
 _LONGEST_S = 1e6  # up to this distance from the first row, times keep its resolution
 
 
-@dataclass(frozen=True)
-class Window:
+@dataclass(frozen=True, repr=False)
+class Window(Displayed):
     """One window of every vehicle, and the belief after it.
 
     Attributes:
@@ -48,6 +49,14 @@ class Window:
     end_s: float
     n: Real[Tensor, " vehicle"]
     belief: Belief
+
+    def overview(self) -> Card:
+        """Its bounds, its rows and the belief after it."""
+        least, most = int(self.n.min()), int(self.n.max())
+        rows = f"{most} rows" if least == most else f"{least} to {most} rows"
+        below = self.belief.overview()
+        title = f"Window {self.start_s:g} to {self.end_s:g} s, {rows}; {below.title[0].lower()}{below.title[1:]}"
+        return Card(title, below.lines, below.table, below.most)
 
 
 class BeliefStream:

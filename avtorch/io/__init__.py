@@ -23,16 +23,20 @@ from avtorch.io.quality import Gap, Quality, check
 from avtorch.io.raw_leader import RawLeader
 from avtorch.io.recordings import read_leader
 from avtorch.io.sealed import Damaged, Sealed, read_sealed, read_sealed_bytes, write_sealed
+from avtorch.io.source import LogSource, as_log, as_logs
 
 __all__ = [
     "STANDSTILL_MPS",
     "Damaged",
     "Gap",
     "Log",
+    "LogSource",
     "Quality",
     "RawLeader",
     "Sealed",
     "answer_set",
+    "as_log",
+    "as_logs",
     "atomic",
     "check",
     "fingerprint",

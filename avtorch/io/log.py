@@ -8,24 +8,30 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
+from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError, quoted
 from avtorch.io.assemble import assemble
 from avtorch.io.atomic import atomic
 from avtorch.io.clock import since_start
+from avtorch.io.dataframe import DataFrame, frame_table
 from avtorch.io.engagement import settled_rows
 from avtorch.io.formats import is_recording, open_recording
-from avtorch.io.mapping import PEDALS, SIGNALS, Pairs, SignalMap, pairs, read_mapping
+from avtorch.io.mapping import PEDALS, SIGNALS, Pairs, SignalMap, given_mapping, pairs, read_mapping
 from avtorch.io.merged import Arrivals, merged
 from avtorch.io.opening import place
 from avtorch.io.segments import median_step, stretches
 from avtorch.io.tables import Table, read_table
+from avtorch.io.units import SI
 from avtorch.io.validity import check_units
+
+if TYPE_CHECKING:
+    import pandas
 
 STANDSTILL_MPS = 0.3
 """Below this speed GLVD does not hold; such rows are masked.
@@ -42,8 +48,8 @@ Example:
 AccelKind = Literal["kinematic", "specific-force"]
 
 
-@dataclass(frozen=True, eq=False)
-class Log:
+@dataclass(frozen=True, eq=False, repr=False)
+class Log(Displayed):
     """A drive. Every signal is ``(time,)``, float64, in SI units, or None where the log does not have it.
 
     ``time`` [s], on the recorder's own clock (``elapsed``: from the log's start); ``accel_cmd`` [m/s^2], the command
@@ -151,6 +157,25 @@ class Log:
         return cls._of(table, SignalMap(unit=pairs("unit", unit)), folder=Path(), following=following)
 
     @classmethod
+    def from_dataframe(
+        cls,
+        frame: DataFrame,
+        *,
+        name: str = "DataFrame",
+        map: Pairs = None,
+        unit: Pairs = None,
+        stamp: Pairs = None,
+        state: Pairs = None,
+        following: bool = False,
+    ) -> Log:
+        """A log from a data frame of pandas, Polars, pyarrow or DuckDB, checked as a file is; options as in `read`.
+
+        A named index is a column; an index of times without a name is ``time`` (`avtorch.io.dataframe`).
+        """
+        mapping = given_mapping(SignalMap(), map=map, unit=unit, stamp=stamp, state=state)
+        return cls._of(frame_table(frame, name), mapping, folder=Path(), following=following)
+
+    @classmethod
     def _of(
         cls, table: Table, mapping: SignalMap, *, folder: Path, following: bool, arrived: Arrivals | None = None
     ) -> Log:
@@ -193,6 +218,28 @@ class Log:
         with atomic(path) as stream:
             stream.write(",".join(columns) + "\n")
             stream.writelines(",".join(row) + "\n" for row in zip(*cells, strict=True))
+
+    def overview(self) -> Card:
+        """Rows, seconds, rate, usable share, and the range of every signal."""
+        parts = len(self.segments())
+        title = f"Log {self.name}: {self.rows} rows, {self.seconds:.4g} s at {self.rate_hz:.4g} Hz"
+        lines = [f"{100 * float(self.usable.mean()):.0f} % of the rows usable", *self.remarks[:2]]
+        if self.ignored:
+            lines.append(f"Columns not used: {', '.join(self.ignored[:6])}{' and more' if self.ignored[6:] else ''}")
+        signals = {name: getattr(self, name) for name in SI if name != "time" and getattr(self, name) is not None}
+        table = Frame(
+            {
+                "signal": list(signals),
+                "unit": [SI[name] for name in signals],
+                **{how: [float(getattr(x, how)()) for x in signals.values()] for how in ("min", "mean", "max")},
+            }
+        )
+        return Card(f"{title}, {parts} segment{'' if parts == 1 else 's'}", tuple(lines), table, most=len(SI))
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """A row a sample, a column a signal, in SI units. Needs ``pip install 'avtorch[pandas]'``."""
+        columns = {name: getattr(self, name) for name in SIGNALS if getattr(self, name) is not None}
+        return Frame(columns).to_dataframe()
 
     @property
     def rows(self) -> int:

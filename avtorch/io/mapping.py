@@ -61,6 +61,13 @@ def read_mapping(
     """
     beside = mapping_beside(path)
     stated = SignalMap() if beside is None else _read_toml(beside)
+    return given_mapping(stated, map=map, unit=unit, stamp=stamp, state=state)
+
+
+def given_mapping(
+    stated: SignalMap, *, map: Pairs = None, unit: Pairs = None, stamp: Pairs = None, state: Pairs = None
+) -> SignalMap:
+    """The mapping that arguments give, on top of what a file `stated`. Raises InputError as `read_mapping` does."""
     return SignalMap(
         column=_distinct({**stated.column, **pairs("map", map)}),
         unit={**stated.unit, **_units(pairs("unit", unit), "")},

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from itertools import accumulate
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from avtorch.errors import InputError, printable, quoted
+from avtorch.io.arrow_cells import Cells, cells_of, joined, scalar_checks
 from avtorch.io.parquet_footer import uncompressed_sizes
 from avtorch.io.size import MOST_CELLS, MOST_COLUMNS
 
 _BATCH = 65536  # rows decoded at once
 _CELL_BYTES, _PAGE_BYTES = 64, 2**22  # bytes per uncompressed cell, and per column besides
-_TEXT = 100  # bytes of the longest text that can be a number
-
-Cells = Sequence[Any] | NDArray
 
 
 def read_parquet(
@@ -64,7 +59,7 @@ def _read(
             kind = kind.value_type
         if pa.types.is_string(kind) or pa.types.is_large_string(kind):
             texts.append(names[i])
-        elif not any(check(kind) for check in _scalar_checks()):
+        elif not any(check(kind) for check in scalar_checks()):
             what = printable(str(kind), 40)
             raise InputError(f"{source}: column {quoted(names[i])}: holds {what}; numbers are needed")
     file = pq.ParquetFile(pa.BufferReader(raw), read_dictionary=texts, metadata=metadata)
@@ -75,18 +70,11 @@ def _read(
             raise InputError(f"{source}: damaged Parquet file (more rows than the {metadata.num_rows} it declares)")
         for i in kept:
             column = batch.column(batch.schema.get_field_index(names[i]))
-            pieces[i].append(_cells(column, f"{source}: column {quoted(names[i])}"))
+            pieces[i].append(cells_of(column, f"{source}: column {quoted(names[i])}"))
         rows += batch.num_rows
     if kept and rows != metadata.num_rows:
         raise InputError(f"{source}: damaged Parquet file ({rows} rows where it declares {metadata.num_rows})")
-    return names, tuple(_joined(pieces[i]) if i in pieces else None for i in range(len(names)))
-
-
-def _scalar_checks() -> Iterator[Callable[[Any], bool]]:
-    from pyarrow import types
-
-    yield from (types.is_integer, types.is_floating, types.is_boolean, types.is_decimal, types.is_null)
-    yield from (types.is_timestamp, types.is_duration)
+    return names, tuple(joined(pieces[i]) if i in pieces else None for i in range(len(names)))
 
 
 def _refuse_size(raw: bytes, metadata: Any, source: str, kept: Sequence[str]) -> None:
@@ -112,39 +100,3 @@ def _refuse_size(raw: bytes, metadata: Any, source: str, kept: Sequence[str]) ->
             f"{source}: takes {claimed:,} bytes uncompressed for {metadata.num_rows:,} rows of {len(kept)} columns; "
             f"needs {most:,} at most"
         )
-
-
-def _cells(column: Any, where: str) -> Cells:
-    """The cells of one batch of a column."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    if pa.types.is_dictionary(column.type):
-        if pa.types.is_string(column.type.value_type) or pa.types.is_large_string(column.type.value_type):
-            lengths = pc.binary_length(column.dictionary)  # pyright: ignore[reportAttributeAccessIssue]
-            longest = max((n or 0 for n in lengths.to_pylist()), default=0)
-            if longest > _TEXT:
-                raise InputError(f"{where}: holds texts of {longest:,} bytes; numbers are needed")
-        column = column.dictionary_decode()
-    kind = column.type
-    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
-        return _seconds(column)
-    if column.null_count == 0 and (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-        return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
-    # text, booleans, decimals and empty cells go through the same careful reading as a CSV
-    return column.to_pylist()
-
-
-def _joined(pieces: list[Cells]) -> Cells:
-    arrays = [piece for piece in pieces if isinstance(piece, np.ndarray)]
-    if len(arrays) == len(pieces):
-        return np.concatenate(arrays) if arrays else np.empty(0)
-    return [cell for piece in pieces for cell in piece]
-
-
-def _seconds(column: Any) -> Sequence[Any]:
-    """A Parquet time stamp brings its own unit: seconds since its epoch, the same for every column of the file."""
-    import pyarrow as pa
-
-    ticks = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[column.type.unit]
-    return [None if x is None else x / ticks for x in column.cast(pa.int64()).to_pylist()]

@@ -51,6 +51,12 @@ _UNITS: dict[str, dict[str, float]] = {
     "speed_cmd": _SPEED,
 }
 SIGNALS_WITH_UNIT = tuple(_UNITS)
+SI = {
+    **{"time": "s", "accel_cmd": "m/s²", "accel": "m/s²", "speed": "m/s", "jerk": "m/s³", "spacing": "m"},
+    **{"lead_speed": "m/s", "lead_accel": "m/s²", "grade": "-", "throttle": "-", "brake": "-", "torque": "Nm"},
+    **{"current": "A", "speed_cmd": "m/s"},
+}
+"""The unit in which a log holds each signal; a brake may be a pressure [Pa] instead of a share."""
 
 
 def to_si(signal: str, unit: str) -> Callable[[NDArray], NDArray]:

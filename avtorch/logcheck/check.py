@@ -7,14 +7,17 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
+from avtorch.io.dataframe import DataFrame, frame_table, is_dataframe
 from avtorch.io.following import read_following
 from avtorch.io.formats import is_recording, open_recording
 from avtorch.io.log import Log
-from avtorch.io.mapping import mapping_beside
+from avtorch.io.mapping import Pairs, mapping_beside
 from avtorch.io.opening import place
 from avtorch.io.quality import Quality
 from avtorch.io.quality import check as check_quality
+from avtorch.io.source import LogSource, as_log
 from avtorch.io.tables import read_table
 from avtorch.logcheck.candidates import table_of
 from avtorch.logcheck.duration import duration_note
@@ -22,8 +25,8 @@ from avtorch.logcheck.proposal import Proposal, propose
 from avtorch.logcheck.recorder import excitation_notes, recorder_notes
 
 
-@dataclass(frozen=True)
-class LogCheck:
+@dataclass(frozen=True, repr=False)
+class LogCheck(Displayed):
     """A log's `source` and `form`; the `proposal` of how to read it (None: it was read as its mapping says, or was no
     file); the `log` and its `quality`, None where it cannot be read, and then the `fault`; notes on the `recorder` and
     on the `excitation`. `follows`: the log is of cars that follow, without commands.
@@ -55,6 +58,24 @@ class LogCheck:
     excitation: tuple[str, ...]
     follows: bool = False
 
+    def overview(self) -> Card:
+        """Whether it can be read, the first notes, and the columns proposed."""
+        what = "can be read" if self.fault is None else "cannot be read"
+        notes = [self.fault] if self.fault is not None else []
+        proposal = self.proposal
+        rows = [
+            {"signal": name, "column": one.column, "unit": one.unit, "reason": one.reason}
+            for name, one in (proposal.signals if proposal is not None else {}).items()
+        ]
+        if proposal is not None:
+            notes += proposal.doubts[:2]
+        notes += self.notes[:4]
+        rest = len(self.notes) - 4
+        if rest > 0:
+            notes.append(f"And {rest} more note{'' if rest == 1 else 's'} in .notes.")
+        table = Frame.of_rows(rows) if rows else None
+        return Card(f"Check of {self.source} ({self.form}): it {what}", tuple(notes), table, most=9)
+
     @property
     def notes(self) -> tuple[str, ...]:
         """All that was seen, in sentences."""
@@ -78,12 +99,12 @@ class LogCheck:
         }
 
 
-def check(log: Log | str | os.PathLike[str]) -> LogCheck:
+def check(log: LogSource, *, map: Pairs = None, unit: Pairs = None) -> LogCheck:
     """Check a log before anything is estimated from it.
 
-    Of a file without a mapping beside it, names and units of its columns are proposed, and it is read as proposed. A
-    file with one is read as that says. Raises `InputError` for what is no table of text, no Parquet file and no
-    recording of a known format.
+    Of a file without a mapping beside it, and of a data frame, names and units of the columns are proposed, and it is
+    read as proposed. A file with one is read as that says, and either with `map` or `unit` as these say. Raises
+    `InputError` for what is no table of text, no Parquet file and no recording of a known format.
 
     Example:
         >>> import avtorch
@@ -93,26 +114,43 @@ def check(log: Log | str | os.PathLike[str]) -> LogCheck:
         (True, None)
     """
     if isinstance(log, Log):
-        return _seen(log.name, "a log in memory", None, log)
+        return _seen(log.name, "a log in memory", None, as_log(log, map=map, unit=unit))
+    if is_dataframe(log):
+        frame = frame_table(log)  # pyright: ignore[reportArgumentType]
+        return _read(log, frame.form, None if map or unit else propose(frame), map, unit)
+    if not isinstance(log, (str, os.PathLike)):
+        return _seen("", "", None, as_log(log))
+    if map or unit:
+        return _read(log, "a file", None, map, unit)
     table = table_of(open_recording(log)) if is_recording(log) else read_table(log)
     if mapping_beside(log) is not None:
         return _read(log, table.form, None)
     return _read(log, table.form, propose(table))
 
 
-def _read(path: str | os.PathLike[str], form: str, proposal: Proposal | None) -> LogCheck:
+def _read(
+    given: str | os.PathLike[str] | DataFrame,
+    form: str,
+    proposal: Proposal | None,
+    map: Pairs = None,
+    unit: Pairs = None,
+) -> LogCheck:
+    path = given if isinstance(given, (str, os.PathLike)) else None
+    source = "DataFrame" if path is None else place(Path(path))
     try:
         if proposal is None:
-            read = Log.read(path)
+            read = as_log(given, map=map, unit=unit)
         else:
             leader = "accel_cmd" not in proposal.signals and {"spacing", "lead_speed"} <= set(proposal.signals)
-            read = Log.read(path, **proposal.options, following=leader)
+            reader = Log.from_dataframe if path is None else Log.read
+            read = reader(given, **proposal.options, following=leader)  # pyright: ignore[reportArgumentType]
     except InputError as fault:
-        platoon = None if proposal is None or "accel_cmd" in proposal.signals else _platoon(path)
+        unknown = proposal is not None and "accel_cmd" not in proposal.signals
+        platoon = _platoon(path) if unknown and path is not None else None
         if platoon is not None:
-            return replace(_seen(place(Path(path)), form, None, platoon), follows=True)
-        return LogCheck(place(Path(path)), form, proposal, None, None, str(fault), (), ())
-    return _seen(place(Path(path)), form, proposal, read)
+            return replace(_seen(source, form, None, platoon), follows=True)
+        return LogCheck(source, form, proposal, None, None, str(fault), (), ())
+    return _seen(source, form, proposal, read)
 
 
 def _platoon(path: str | os.PathLike[str]) -> Log | None:

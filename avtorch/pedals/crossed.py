@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from avtorch.io import Log
+from avtorch.io import Log, LogSource, as_logs
 from avtorch.pedals.fit_map import fit_drive
 from avtorch.pedals.pedal_drive import PedalDrive
 
 FOLDS = 5
 
 
-def crossed(logs: Log | Sequence[Log]) -> list[Log]:
+def crossed(logs: LogSource | Sequence[LogSource]) -> list[Log]:
     """The same drives with `accel_cmd` (row,), in each block of some ten seconds by the map of the other folds' blocks.
 
     What is scored on these commands, such as a budget of the gap, is then scored on a map that was held out. Raises
@@ -31,7 +31,7 @@ def crossed(logs: Log | Sequence[Log]) -> list[Log]:
         >>> bool(np.corrcoef(crossed(log)[0].accel_cmd, fit_pedals(log).map.commanded(log).accel_cmd)[0, 1] > 0.95)
         True
     """
-    each = [logs] if isinstance(logs, Log) else list(logs)
+    each = as_logs(logs)
     drive = PedalDrive.of(each)
     whole = fit_drive(drive, errors=False).map
     commands = [whole.commanded(log).accel_cmd for log in each]

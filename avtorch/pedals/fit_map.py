@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from avtorch.arrays import BoolArray
-from avtorch.io import Log
+from avtorch.io import LogSource
 from avtorch.pedals.columns import MapColumns
 from avtorch.pedals.fitting import Fitting, PedalFit
 from avtorch.pedals.loop_fitting import LoopFitting
 from avtorch.pedals.pedal_drive import PedalDrive
 
 
-def fit_pedals(logs: Log | Sequence[Log]) -> PedalFit:
+def fit_pedals(logs: LogSource | Sequence[LogSource]) -> PedalFit:
     """The map of the pedals of a drive, or of several drives of one car.
 
     Logs without pedals are fitted by their `speed_cmd`. Raises `InputError` for logs without speed or without a pedal

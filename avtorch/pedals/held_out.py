@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
-from avtorch.io import Log
+from avtorch.io import LogSource
 from avtorch.pedals.crossed import FOLDS
 from avtorch.pedals.fit_map import fit_drive
 from avtorch.pedals.lag_search import lag_of
@@ -60,7 +60,7 @@ class HeldOut:
         return gain > 2 * error
 
 
-def held_out(logs: Log | Sequence[Log]) -> HeldOut:
+def held_out(logs: LogSource | Sequence[LogSource]) -> HeldOut:
     """Scores maps that are fitted without a fifth of the blocks on that fifth, each in its turn.
 
     Raises `InputError` as `fit_pedals` does.

@@ -9,7 +9,7 @@ import numpy as np
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.errors import InputError
-from avtorch.io import Log
+from avtorch.io import Log, LogSource, as_logs
 from avtorch.io.mapping import PEDALS
 from avtorch.pedals.speed_loop import ERROR, RATE, inputs_of, jumps
 
@@ -82,10 +82,10 @@ class PedalDrive:
         return np.concatenate(found)
 
     @classmethod
-    def of(cls, logs: Log | Sequence[Log]) -> PedalDrive:
+    def of(cls, logs: LogSource | Sequence[LogSource]) -> PedalDrive:
         """Raises `InputError` for logs without pedals or a commanded speed, or without speed, and for drives too short
         for four blocks."""
-        each = [logs] if isinstance(logs, Log) else list(logs)
+        each = as_logs(logs)
         names = _inputs(each)
         usable = sum(float(log.usable.sum()) / log.rate_hz for log in each)
         length = BLOCK_S if usable >= _BLOCKS * BLOCK_S else SHORT_BLOCK_S

@@ -21,6 +21,7 @@ from avtorch.arrays import FloatArray
 from avtorch.decision import Setting
 from avtorch.decision.algorithm2 import ACCEPTED_CHANGE
 from avtorch.decision.grid import GAINS_GRID, Grid
+from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.gap import GapPlant
 from avtorch.gap.result.diagnosis import Diagnosis
@@ -34,8 +35,8 @@ STEP_MPS2 = 0.5
 _BLOCK = 32  # settings evaluated at a time
 
 
-@dataclass(frozen=True, eq=False)
-class WhatToSet:
+@dataclass(frozen=True, eq=False, repr=False)
+class WhatToSet(Displayed):
     """`p_now`, `p_then`: P(string stable) with the setting in force and with the one to `set`.
 
     `peak_now`, `peak_then`: median peak gain [-] at the worst of speeds and pedals, inf where disturbances grow, and in
@@ -69,6 +70,17 @@ class WhatToSet:
     clipped: float
     why: str
     notes: tuple[str, ...] = ()
+
+    def overview(self) -> Card:
+        """What to set and why; P(string stable) and peak gain with each setting."""
+        table = Frame(
+            {
+                "": ["simulator as it was", "setting in force", "setting to use"],
+                "P(string stable)": [self.p_assumed, self.p_now, self.p_then],
+                "peak gain [-]": [self.peak_assumed, self.peak_now, self.peak_then],
+            }
+        )
+        return Card("What to set", (self.why,), table)
 
     def to_dict(self) -> dict[str, Any]:
         """As plain numbers; a peak gain that is infinite is null."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,13 +12,15 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.inference.map import find_mode
 from avtorch.inference.posterior import Posterior
 from avtorch.inference.quadrature import Quadrature
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings
-from avtorch.io.log import Log
+from avtorch.inference.units import shown_unit
+from avtorch.io.source import LogSource, as_log
 from avtorch.validation.agreement import Agreement, agreement, between
 from avtorch.validation.agreement_verdict import AgreementVerdict, agreement_verdict
 from avtorch.validation.exact import exact_draws
@@ -44,8 +47,8 @@ BLOCK = 50
 NUTS_SHARE = 20
 
 
-@dataclass(frozen=True)
-class Validation:
+@dataclass(frozen=True, repr=False)
+class Validation(Displayed):
     """The result of `validate`; W windows and P parameters, named by ``windows.names``.
 
     Attributes:
@@ -96,6 +99,29 @@ class Validation:
         """Names of the parameters."""
         return self.windows.names
 
+    def overview(self) -> Card:
+        """The verdict, and how far SGLD lies from the reference."""
+        word = "agrees" if self.verdict.agree else "disagrees"
+        count = f"{len(self.windows)} window{'' if len(self.windows) == 1 else 's'}"
+        title = f"Validation of SGLD on {count} of {self.windows.name}: it {word}"
+        return Card(title, (f"{self.verdict.why} Against {self.reference}:",), self.summary())
+
+    def summary(self) -> Frame:
+        """A row a parameter: over the windows compared, the 95 % quantile of the distance of the means [SD of the
+        reference], the range of the ratio of SDs that holds 95 %, the largest R-hat and the median ESS."""
+        found = self.agreement
+        return Frame(
+            {
+                "parameter": list(self.names),
+                "unit": [shown_unit(name) for name in self.names],
+                "mean_difference_sd_p95": found.mean_difference.abs().nanquantile(0.95, 0).tolist(),
+                "sd_ratio_p025": found.sd_ratio.nanquantile(0.025, 0).tolist(),
+                "sd_ratio_p975": found.sd_ratio.nanquantile(0.975, 0).tolist(),
+                "rhat_max": found.rhat.nan_to_num(nan=-math.inf).amax(0).tolist(),
+                "ess_bulk_median": found.ess_bulk.nanquantile(0.5, 0).tolist(),
+            }
+        )
+
     def coverage(self, level: float = 0.9) -> dict[str, Tensor]:
         """Coverage of the central interval of SGLD, ``(P,)`` each.
 
@@ -130,14 +156,12 @@ class Validation:
 
     def to_arviz(self) -> dict[str, InferenceData]:
         """The draws of "sgld", "nuts" and, where it was run, "quadrature" (as independent draws) for ArviZ."""
-        from avtorch.inference.arviz_export import to_arviz
-
-        found = {"sgld": to_arviz(self.sgld), "nuts": to_arviz(self.nuts)}
+        found = {"sgld": self.sgld.to_arviz(), "nuts": self.nuts.to_arviz()}
         named = {"window": self.nuts_index.numpy()}
         found["nuts"].assign_coords(named, inplace=True)  # pyright: ignore[reportCallIssue]
         exact = self.quadrature_draws()
         if exact is not None:
-            found["quadrature"] = to_arviz(exact)
+            found["quadrature"] = exact.to_arviz()
         return found
 
 
@@ -150,7 +174,7 @@ def check_installed() -> None:
 
 
 def validate(
-    source: Log | Windows,
+    source: LogSource | Windows,
     *,
     window: float = 2.0,
     windows: int | None = None,
@@ -163,7 +187,7 @@ def validate(
     """SGLD, quadrature and NUTS over the same windows, each under the first prior and on its own.
 
     Args:
-        source: a log, or windows made by `synthetic_windows` and its like.
+        source: a log (a `Log`, a path or a data frame), or windows made by `synthetic_windows` and its like.
         window: length of a log's windows [s].
         windows: at most so many windows of a log, evenly spread; all by default.
         settings: of SGLD; by default those that every command uses for the form.
@@ -186,8 +210,8 @@ def validate(
     check_installed()
     if nuts_windows is not None and nuts_windows < 1:
         raise InputError(f"nuts_windows: found {nuts_windows}, needs 1 or more")
-    if isinstance(source, Log):
-        source = windows_of_log(source, window=window, count=windows)
+    if not isinstance(source, Windows):
+        source = windows_of_log(as_log(source, argument="source"), window=window, count=windows)
     settings = source.sampler if settings is None else settings
     if settings.chains == 1 and settings.draws < 8:
         raise InputError(f"draws: found {settings.draws} of a single chain, needs 8 or more")

@@ -27,6 +27,8 @@ FIRST = (
     "fleet",
     "followers",
     "own-effect",
+    "effects",
+    "coming-from",
     "words",
     "reference",
 )
@@ -37,6 +39,7 @@ OUTSIDE = {"": "readme.md", "notebooks/": "notebooks.md"}
 TREE = "\n\n```{{toctree}}\n:hidden:\n:glob:\n\n{}\n```\n"
 TREES = {
     "index": TREE.format("\n".join([*FIRST, "*"])),
+    "effects": TREE.format("effects/*"),
     "reference": TREE.format(f"{FOLDER}/commands\n{FOLDER}/avtorch*"),
 }
 

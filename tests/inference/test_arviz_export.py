@@ -7,8 +7,9 @@ import torch
 
 from avtorch.errors import InputError
 from avtorch.inference import JerkDensity, Posterior, SamplerSettings, sample
-from avtorch.inference.arviz_export import UNITS, to_arviz
+from avtorch.inference.arviz_export import to_arviz
 from avtorch.inference.latent import NOISE_PRIOR
+from avtorch.inference.units import UNITS
 
 pytest.importorskip("arviz")
 
@@ -20,7 +21,7 @@ def posterior(make_windows) -> Posterior:
 
 
 def test_all_windows(posterior: Posterior) -> None:
-    group = to_arviz(posterior).posterior
+    group = posterior.to_arviz().posterior
     assert list(group.data_vars) == ["T_L", "K_L", "sigma"]
     for name in posterior.names:
         assert group[name].dims == ("chain", "draw", "window")
@@ -31,7 +32,7 @@ def test_all_windows(posterior: Posterior) -> None:
 
 
 def test_one_window(posterior: Posterior) -> None:
-    group = to_arviz(posterior, window=1).posterior
+    group = posterior.to_arviz(window=1).posterior
     assert group["K_L"].dims == ("chain", "draw")
     assert torch.equal(torch.from_numpy(group["K_L"].values), posterior["K_L"][..., 1])
     assert group.attrs["converged"] == [1]
@@ -40,7 +41,7 @@ def test_one_window(posterior: Posterior) -> None:
 def test_arviz_summary_reads_the_same(posterior: Posterior) -> None:
     import arviz
 
-    summary = arviz.summary(to_arviz(posterior), round_to="none")
+    summary = arviz.summary(posterior.to_arviz(), round_to="none")
     assert summary.loc["T_L[1]", "mean"] == pytest.approx(float(posterior.mean[1, 0]), rel=1e-12)
     # ArviZ pools over all draws as we do, up to n or n - 1
     assert summary.loc["K_L[0]", "sd"] == pytest.approx(float(posterior.sd[0, 1]), rel=2 / 400)
@@ -53,7 +54,7 @@ def test_it_survives_a_file(posterior: Posterior, tmp_path) -> None:
     import arviz
 
     path = str(tmp_path / "posterior.nc")
-    to_arviz(posterior).to_netcdf(path)
+    posterior.to_arviz().to_netcdf(path)
     again = arviz.from_netcdf(path).posterior
     assert again["sigma"].attrs["units"] == "m/s^3"
     assert torch.equal(torch.from_numpy(again["sigma"].values), posterior["sigma"])
@@ -62,7 +63,7 @@ def test_it_survives_a_file(posterior: Posterior, tmp_path) -> None:
 def test_every_parameter_has_a_unit_and_strangers_none() -> None:
     assert set(UNITS) == {"T_L", "K_L", "sigma", *NOISE_PRIOR}
     strange = Posterior(("tau",), torch.ones(1, 4, 1, 1, dtype=torch.float64), torch.tensor([False]))
-    group = to_arviz(strange).posterior
+    group = strange.to_arviz().posterior
     assert "units" not in group["tau"].attrs
     assert group.attrs["converged"] == [0]
 
@@ -70,4 +71,11 @@ def test_every_parameter_has_a_unit_and_strangers_none() -> None:
 @pytest.mark.parametrize("window", [-1, 2])
 def test_window_out_of_range(posterior: Posterior, window: int) -> None:
     with pytest.raises(InputError, match=f"window: {window}"):
-        to_arviz(posterior, window=window)
+        posterior.to_arviz(window=window)
+
+
+def test_the_function_of_old_still_works_and_says_what_to_write(posterior: Posterior) -> None:
+    with pytest.warns(DeprecationWarning, match=r"write posterior.to_arviz\(\); avtorch 0.3 no longer has it") as seen:
+        group = to_arviz(posterior, window=0).posterior
+    assert group["T_L"].dims == ("chain", "draw")
+    assert seen[0].filename == __file__

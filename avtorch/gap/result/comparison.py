@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from avtorch.display import Card, Displayed, Frame
 from avtorch.gap.change.change_cause import ChangeCause
-from avtorch.gap.quantity import Quantity
+from avtorch.gap.quantity import Quantity, unit_of
 from avtorch.gap.result.diagnosis import LogFacts
+
+if TYPE_CHECKING:
+    import pandas
 
 SimulatorChange = Literal["closer", "farther", "inconclusive"]
 Explanation = Literal["lag and gain", "not lag and gain", "not distinguishable"]
@@ -61,8 +65,8 @@ class DeadTimeTest:
         }
 
 
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Displayed):
     """`car`: `T_L` [s] and `K_L` fitted to each set of drives; `gap`: rollout errors of the simulator, by metric, over
     `horizon_s` [s]: 10 s, or less where the longest stretch of either set is shorter.
 
@@ -84,6 +88,27 @@ class Comparison:
     dead_time_test: DeadTimeTest | None = None
     cause: ChangeCause | None = None
     horizon_s: float = 10.0
+
+    def overview(self) -> Card:
+        """What has changed, in a sentence or two, and what was measured before and after."""
+        answer = "the car has changed" if self.changed else "no change of T_L and K_L is detected"
+        table = {name: values for name, values in self.summary().columns.items() if name != "sd"}
+        return Card(
+            f"Comparison of two sets of drives: {answer} (p = {self.p_value:.2g})", (self.why,), Frame(table), 9
+        )
+
+    def summary(self) -> Frame:
+        """A row a parameter or error and `side`: before, after, and their ratio; mean, sd, 5 and 95 % quantiles."""
+        rows: list[dict[str, object]] = []
+        for name, moved in (*self.car.items(), *self.gap.items()):
+            unit = {"rollout_rmse_accel": "m/s²", "rollout_rmse_speed": "m/s"}.get(name) or unit_of(name)
+            for side, q in (("before", moved.before), ("after", moved.after), ("ratio", moved.ratio)):
+                rows.append({"parameter": name, "side": side, "unit": "-" if side == "ratio" else unit, **q.to_dict()})
+        return Frame.of_rows(rows)
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """`summary` as a data frame. Needs ``pip install 'avtorch[pandas]'``."""
+        return self.summary().to_dataframe()
 
     def to_dict(self) -> dict[str, Any]:
         """The object of `comparison.json`, schema `avtorch.comparison/1`."""

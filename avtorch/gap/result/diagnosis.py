@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -10,13 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.gap.budget.parts import Budget
 from avtorch.gap.crossval.gap_closed import MetricShrinkage, Shrinkage
 from avtorch.gap.crossval.localisation import Location
-from avtorch.gap.quantity import Quantity, unit_of
+from avtorch.gap.quantity import Quantity, frame_of, unit_of
 from avtorch.gap.result import sentences
 from avtorch.gap.result.gap_size import GapSize
 from avtorch.gap.result.log_facts import LogFacts
@@ -36,9 +37,11 @@ from avtorch.gap.selection.verdict import (
 )
 from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.gap.simulator.plant import GapPlant
+from avtorch.inference.posterior import effective_sample_size, nested_rhat, normal_scores
 from avtorch.io import answer_set, atomic, write_json
 
 if TYPE_CHECKING:
+    import pandas
     from arviz import InferenceData
 
 __all__ = [
@@ -71,7 +74,7 @@ DIAGNOSIS_FILES = (
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Diagnosis:
+class Diagnosis(Displayed):
     """What the simulator lacks, according to a log; `str()` states it in a few sentences.
 
     - `candidates`: the hypotheses as `listed_candidates` orders them, whatever the order given
@@ -160,8 +163,42 @@ class Diagnosis:
         lines += [*sentences.moved(self), *sentences.gap(self), *sentences.shrinkage(self), *sentences.to_set(self)]
         return "\n".join([*lines, *sentences.to_drive(self), *sentences.remains(self), *self.notes])
 
-    def __repr__(self) -> str:
-        return f"<Diagnosis of {self.log.name}: {sentences.headline(self)}>"
+    def overview(self) -> Card:
+        """The verdict, what the gap is, and the parameters of the car as diagnosed; `str()` has all sentences."""
+        gap = sentences.gap(self)[:1]
+        return Card(f"Diagnosis of {self.log.name}: {sentences.headline(self)}", tuple(gap), self.summary())
+
+    def summary(self) -> Frame:
+        """Parameters of `plant`, or of `simulator` where nothing was named: unit, mean, sd, 5 and 95 % quantiles.
+
+        Where `posterior="sgld"` made draws: their nested R-hat and effective numbers, too.
+        """
+        draws = self.belief if self.belief else self.assumed
+        values = {name: Quantity.of_draws(x) for name, x in (draws or {}).items()} or dict(self.baseline)
+        columns = dict(frame_of(values).columns)
+        if self.draws:
+            chains = [self.draws.get(name, self.draws.get(name.rpartition(".")[2])) for name in values]
+            tensors = [None if x is None else torch.as_tensor(np.asarray(x, float)) for x in chains]
+            columns["rhat"] = [None if x is None else float(nested_rhat(x)) for x in tensors]
+            columns["ess_bulk"] = [
+                None if x is None else float(effective_sample_size(normal_scores(x))) for x in tensors
+            ]
+        return Frame(columns)
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """A row a hypothesis, the most probable first: its probability, log evidence over none, whether it is the
+        verdict or an alias of it. Needs ``pip install 'avtorch[pandas]'``."""
+        rows = [
+            {
+                "hypothesis": c.name,
+                "probability": c.probability,
+                "log_evidence": c.log_evidence,
+                "verdict": c.name == self.verdict.name,
+                "alias": c.name in self.verdict.alias_set,
+            }
+            for c in self.candidates
+        ]
+        return Frame.of_rows(rows).to_dataframe()
 
     @property
     def winner(self) -> Candidate:
@@ -232,21 +269,13 @@ class Diagnosis:
 
         Needs `pip install 'avtorch[arviz]'`. Raises `InputError` where there are no draws.
         """
+        from avtorch.inference.arviz_export import inference_data
+
         if not self.draws:
             raise InputError(
                 f"draws: the diagnosis has none for {self.verdict.name}; only effects have posterior draws"
             )
-        with warnings.catch_warnings():
-            # ArviZ 0.23 announces its successor on import
-            warnings.filterwarnings("ignore", r"\s*ArviZ is undergoing a major refactor", FutureWarning)
-            try:
-                import arviz
-                import xarray
-            except ImportError:
-                raise InputError("arviz: not installed; to_arviz needs pip install 'avtorch[arviz]'") from None
-        dims = ("chain", "draw")
-        variables = {name: (dims, np.asarray(x), {"units": unit_of(name)}) for name, x in self.draws.items()}
-        sizes = zip(dims, next(iter(variables.values()))[1].shape, strict=True)
-        attributes = {"inference_library": "avtorch", "candidate": self.verdict.name, "log": self.log.name}
-        data = xarray.Dataset(variables, coords={dim: range(size) for dim, size in sizes}, attrs=attributes)
-        return arviz.InferenceData(posterior=data)
+        draws = {name: np.asarray(x) for name, x in self.draws.items()}
+        units = {name: unit_of(name) for name in draws}
+        attributes = {"candidate": self.verdict.name, "log": self.log.name}
+        return inference_data(draws, ("chain", "draw"), units=units, attributes=attributes)

@@ -1,0 +1,99 @@
+"""Data frames of other libraries as tables, by Arrow's protocol or by the older one for the interchange of data frames.
+
+pyarrow reads both, and is a dependency already: no library of data frames is imported here, and any that speaks one of
+the two will do (pandas, Polars, DuckDB, cuDF, Ibis, Modin).
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from avtorch.errors import InputError, printable, quoted
+from avtorch.io.arrow_cells import cells_of, scalar_checks
+from avtorch.io.tables import Table
+
+_INDEX = "__index_level_0__"  # pandas' own name for an index without one
+
+
+class ArrowFrame(Protocol):
+    """A frame with Arrow's PyCapsule interface: pandas from 2.2, Polars from 1.3, pyarrow, DuckDB."""
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object: ...
+
+
+class InterchangeFrame(Protocol):
+    """A frame with the interchange protocol of the Consortium for Python Data API Standards."""
+
+    def __dataframe__(self, nan_as_null: bool = False, allow_copy: bool = True) -> Any: ...
+
+
+DataFrame = ArrowFrame | InterchangeFrame
+"""A data frame of any library that speaks one of the two protocols."""
+
+
+def is_dataframe(given: object) -> bool:
+    """Whether it speaks one of the two protocols."""
+    return not isinstance(given, type) and (hasattr(given, "__arrow_c_stream__") or hasattr(given, "__dataframe__"))
+
+
+def frame_table(frame: DataFrame, source: str = "DataFrame") -> Table:
+    """The columns of a data frame, cells not yet parsed as numbers; `source` names it in messages.
+
+    An index with a name is a column of that name. An index of times without a name is the column ``time`` where there
+    is none. Times become seconds since their epoch. Columns that hold neither numbers nor texts are not read.
+
+    Raises InputError where the frame cannot be turned into Arrow columns.
+
+    Example:
+        >>> import pyarrow as pa
+        >>> from avtorch.io.dataframe import frame_table
+        >>> frame_table(pa.table({"time": [0.0, 0.1], "accel_cmd": [0.5, 0.6]})).names
+        ('time', 'accel_cmd')
+    """
+    import pyarrow as pa
+
+    try:
+        table: Any = pa.table(frame) if hasattr(frame, "__arrow_c_stream__") else _interchanged(frame)
+    except (pa.ArrowException, TypeError, ValueError, RuntimeError, NotImplementedError) as fault:
+        reason = str(fault).splitlines()[0] if str(fault) else type(fault).__name__
+        raise InputError(f"{source}: no columns of numbers can be read from it ({printable(reason, 120)})") from None
+    names = list(table.column_names)
+    if _INDEX in names and "time" not in names and _is_time(table.column(_INDEX).type):
+        names[names.index(_INDEX)] = "time"
+    cells = [
+        _cells(table.column(i), f"{source}: column {quoted(str(name))}") if _readable(table.column(i).type) else None
+        for i, name in enumerate(names)
+    ]
+    kept = [i for i, column in enumerate(cells) if column is not None]
+    return Table(
+        source, tuple(str(names[i]) for i in kept), tuple(cells[i] for i in kept), form=f"a {type(frame).__name__}"
+    )
+
+
+def _interchanged(frame: DataFrame) -> Any:
+    from pyarrow import interchange
+
+    return interchange.from_dataframe(frame)
+
+
+def _is_time(kind: Any) -> bool:
+    from pyarrow import types
+
+    return types.is_timestamp(kind) or types.is_duration(kind)
+
+
+def _readable(kind: Any) -> bool:
+    from pyarrow import types
+
+    if types.is_dictionary(kind):
+        kind = kind.value_type
+    texts = (types.is_string, types.is_large_string, *filter(None, (getattr(types, "is_string_view", None),)))
+    return any(check(kind) for check in (*texts, *scalar_checks()))
+
+
+def _cells(column: Any, where: str) -> Any:
+    """A whole column: its chunks behind one another."""
+    import pyarrow as pa
+
+    joined = column.combine_chunks()
+    return cells_of(pa.concat_arrays(joined.chunks) if isinstance(joined, pa.ChunkedArray) else joined, where)
