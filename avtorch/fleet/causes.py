@@ -21,7 +21,11 @@ Diagnosed = Mapping[str, Any]
 def car_causes(drives: Sequence[Diagnosed]) -> tuple[list[str], list[str]]:
     """The causes that a car has by most of its drives, and those that it may have instead of them."""
     return tuple(  # type: ignore[return-value]
-        sorted(name for name in {n for d in drives for n in d[key]} if 2 * sum(name in d[key] for d in drives) > len(drives))
+        sorted(
+            name
+            for name in {n for d in drives for n in d[key]}
+            if 2 * sum(name in d[key] for d in drives) > len(drives)
+        )
         for key in ("named", "alike")
     )
 

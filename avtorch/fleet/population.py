@@ -1,4 +1,4 @@
-"""The cars of a fleet partially pooled: their model's T_L and K_L, each car's belief, and how far it is from the others.
+"""The cars of a fleet partially pooled: their T_L and K_L, each car's belief, and how far it is from the others.
 
 Logarithms of T_L and K_L are pooled, each by itself: the rows of a window have no covariance of the two.
 """

@@ -1,8 +1,8 @@
 """How far each car is from its siblings, by what is predicted of it from all the others alone.
 
-The mean over cars has a normal belief in closed form once the spreads are given, so each car can be left out exactly, at
-every point of a grid over the spreads. That a car is itself among those that tell the spread would hide the very car
-that is looked for.
+The mean over cars has a normal belief in closed form once the spreads are given, so each car can be left out exactly,
+at every point of a grid over the spreads. A car that counted among those that tell the spread would widen it and so
+hide itself.
 """
 
 from __future__ import annotations
