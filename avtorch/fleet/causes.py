@@ -20,14 +20,12 @@ Diagnosed = Mapping[str, Any]
 
 def car_causes(drives: Sequence[Diagnosed]) -> tuple[list[str], list[str]]:
     """The causes that a car has by most of its drives, and those that it may have instead of them."""
-    return tuple(  # type: ignore[return-value]
-        sorted(
-            name
-            for name in {n for d in drives for n in d[key]}
-            if 2 * sum(name in d[key] for d in drives) > len(drives)
-        )
-        for key in ("named", "alike")
-    )
+    return _mostly(drives, "named"), _mostly(drives, "alike")
+
+
+def _mostly(drives: Sequence[Diagnosed], key: str) -> list[str]:
+    names = {name for drive in drives for name in drive[key]}
+    return sorted(name for name in names if 2 * sum(name in drive[key] for drive in drives) > len(drives))
 
 
 def fleet_causes(cars: Mapping[str, tuple[Sequence[str], Sequence[str]]]) -> list[dict[str, Any]]:

@@ -11,13 +11,27 @@ from avtorch.report.table import Table
 Answer = Mapping[str, Any]
 """The object of `fleet.json`."""
 
-COLUMNS = ("rank", "car", "why", "P(string stable)", "T_L [s]", "K_L", "own past", "siblings", "simulator lacks", "logs")
+COLUMNS = (
+    "rank",
+    "car",
+    "why",
+    "P(string stable)",
+    "T_L [s]",
+    "K_L",
+    "own past",
+    "siblings",
+    "simulator lacks",
+    "logs",
+)
 """Of the ranking."""
 
 NUMERIC = ("rank", "P(string stable)", "logs")
 
 FAILED = 100
 """Logs without an answer that the page names; all of them are in fleet.json."""
+
+APART = 0.05
+"""Expected share of false ones among the cars that are said to differ from their siblings, as in fleet.json."""
 
 _UNITS = {"T_L": " s", "K_L": ""}
 
@@ -30,7 +44,7 @@ def ranking_row(car: Answer) -> tuple[str, ...]:
         str(car["rank"]),
         car["car"],
         car["reason"],
-        "" if stable is None else f"{stable['now']:.2f}",
+        "" if stable is None else f"{stable['now']:.3f}",
         *("" if car[name] is None else _interval(car[name], "mean") for name in ("T_L", "K_L")),
         _change(car["change"]),
         _siblings(car["siblings"]),
@@ -56,7 +70,8 @@ def _siblings(beside: Mapping[str, Any] | None) -> str:
     if beside is None:
         return ""
     name = min(_UNITS, key=lambda n: beside[n]["tail"])
-    return f"{name} {beside[name]['ratio']:.2f} times typical (tail {_small(beside[name]['tail'])})"
+    tail = f"tail {_small(beside[name]['tail'])}"
+    return tail if beside["q_value"] > APART else f"{name} {beside[name]['ratio']:.2f} times typical, {tail}"
 
 
 def _small(p: float) -> str:
@@ -79,7 +94,9 @@ def population_table(answer: Answer) -> Table | None:
             {"T_L": "T_L [s]", "K_L": "K_L"}[name],
             _interval(common[name]["typical"], "median"),
             _percent(common[name]["between"]),
-            "not told apart: no car has two drives" if common[name]["within"] is None else _percent(common[name]["within"]),
+            "not told apart: no car has two drives"
+            if common[name]["within"] is None
+            else _percent(common[name]["within"]),
         )
         for name in _UNITS
     )
@@ -112,12 +129,6 @@ def cause_table(answer: Answer) -> Table | None:
 def _some(cars: Sequence[str], most: int = 5) -> str:
     more = f" and {len(cars) - most} more" if len(cars) > most else ""
     return ", ".join(cars[:most]) + more
-
-
-def reason_table(answer: Answer) -> Table:
-    """Number of cars by why they are where they are."""
-    rows = tuple((reason, str(count)) for reason, count in answer["reasons"].items() if count)
-    return Table("Cars by why they are ranked so", ("why", "cars"), rows, numeric=("cars",))
 
 
 def stability_table(answer: Answer) -> Table:
