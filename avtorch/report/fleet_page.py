@@ -1,5 +1,5 @@
-"""The page of a fleet: which cars to look at first, and what is the model's or one car's. It loads nothing, and all text
-from logs is escaped."""
+"""The page of a fleet: which cars to look at first, and what is the model's or one car's. It loads nothing, and all
+text from logs is escaped."""
 
 from __future__ import annotations
 
