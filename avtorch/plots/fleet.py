@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter, ScalarFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
 from avtorch.plots.style import BLACK, BLUE, GREY, LABELS, ORANGE, VERMILLION, styled
 
@@ -18,7 +18,11 @@ FEW = 60
 NAMED = 8
 """Cars whose rank is written beside them."""
 
-BINS = 36
+BINS = 30
+"""Of the lag and of the gain, for more cars."""
+
+LARGEST = 40.0
+"""Area of the largest square [pt²]."""
 
 Car = Mapping[str, Any]
 
@@ -30,6 +34,7 @@ def actuation_of_cars(ax: Axes, cars: Sequence[Car]) -> Axes:
     spread = points[:, 0].max() / max(points[:, 0].min(), 1e-6) > 4
     if spread:
         ax.set_xscale("log")
+        ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
         ax.xaxis.set_major_formatter(ScalarFormatter())
         ax.xaxis.set_minor_formatter(NullFormatter())
     kinds = {"below target": (VERMILLION, "v"), "unlike siblings": (ORANGE, "D"), "changed": (ORANGE, "s")}
@@ -42,27 +47,29 @@ def actuation_of_cars(ax: Axes, cars: Sequence[Car]) -> Axes:
             these = points[[one == (colour, marker) for one in told]]
             ax.plot(these[:, 0], these[:, 1], ls="", marker=marker, color=colour, ms=5)
     else:
-        for colour in (BLUE, ORANGE, VERMILLION):
-            _squares(ax, points, np.array([one[0] == colour for one in told]), colour, logarithmic=spread)
+        _squares(ax, points, [colour for colour, _ in told], logarithmic=spread)
     first = [i for i, car in enumerate(known) if car["reason"] in kinds][:NAMED]
-    for i in first:
+    for i in first if len(known) <= FEW else ():
         ax.annotate(str(known[i]["rank"]), points[i], xytext=(4, 4), textcoords="offset points", fontsize=9)
     ax.set(xlabel=LABELS["T_L"], ylabel=LABELS["K_L"])
     return ax
 
 
-def _squares(ax: Axes, points: np.ndarray, which: np.ndarray, colour: str, *, logarithmic: bool) -> None:
-    """The cars `which` are counted by bins of all cars' extent."""
-    if not which.any():
-        return
+def _squares(ax: Axes, points: np.ndarray, told: Sequence[str], *, logarithmic: bool) -> None:
+    """A square in each bin with the area of its cars; within it one of those below the target, or else set apart."""
     x = np.log(points[:, 0]) if logarithmic else points[:, 0]
     edges = [np.linspace(values.min(), values.max() + 1e-9, BINS + 1) for values in (x, points[:, 1])]
-    counts, *_ = np.histogram2d(x[which], points[which, 1], bins=edges)
-    columns, rows = np.nonzero(counts)
     middle = [0.5 * (edge[1:] + edge[:-1]) for edge in edges]
-    at = np.exp(middle[0][columns]) if logarithmic else middle[0][columns]
-    size = 3.0 + 40.0 * counts[columns, rows] / max(1.0, counts.max())
-    ax.scatter(at, middle[1][rows], s=size, marker="s", color=colour, linewidths=0)
+    most = 0.0
+    for colour in (BLUE, ORANGE, VERMILLION):
+        # of all cars, then of the kind alone, on one scale
+        which = np.array([colour in (BLUE, one) for one in told])
+        counts, *_ = np.histogram2d(x[which], points[which, 1], bins=edges)
+        most = max(most, counts.max())
+        columns, rows = np.nonzero(counts)
+        at = np.exp(middle[0][columns]) if logarithmic else middle[0][columns]
+        size = np.maximum(2.0, LARGEST * counts[columns, rows] / most)
+        ax.scatter(at, middle[1][rows], s=size, marker="s", color=colour, linewidths=0)
 
 
 def stability_of_cars(ax: Axes, cars: Sequence[Car], target: float) -> Axes:

@@ -50,10 +50,6 @@ function line(row) {
       a.href = link;
       a.textContent = row[i];
       cell.append(a);
-    } else if (i === 1) {
-      const span = document.createElement("span");
-      span.textContent = row[i];
-      cell.append(span);
     } else {
       cell.textContent = row[i];
     }

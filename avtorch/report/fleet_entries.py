@@ -41,8 +41,8 @@ def ranking_row(car: Answer) -> tuple[str, ...]:
     stable, gap = car["p_string_stable"], car["gap"]
     lacks = "" if gap is None else ", ".join(gap["verdict"])
     return (
-        str(car["rank"]),
         car["car"],
+        str(car["rank"]),
         car["reason"],
         "" if stable is None else f"{stable['now']:.3f}",
         *("" if car[name] is None else _interval(car[name], "mean") for name in ("T_L", "K_L")),
