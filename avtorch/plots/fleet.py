@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
-from avtorch.plots.style import BLACK, BLUE, GREY, LABELS, ORANGE, VERMILLION, styled
+from avtorch.plots.style import BLACK, BLUE, GREY, ORANGE, VERMILLION, styled
 
 FEW = 60
 """Cars that are drawn one by one, each with its intervals."""
@@ -51,7 +51,7 @@ def actuation_of_cars(ax: Axes, cars: Sequence[Car]) -> Axes:
     first = [i for i, car in enumerate(known) if car["reason"] in kinds][:NAMED]
     for i in first if len(known) <= FEW else ():
         ax.annotate(str(known[i]["rank"]), points[i], xytext=(4, 4), textcoords="offset points", fontsize=9)
-    ax.set(xlabel=LABELS["T_L"], ylabel=LABELS["K_L"])
+    ax.set(xlabel="actuation lag T_L [s]", ylabel="actuation gain K_L")
     return ax
 
 

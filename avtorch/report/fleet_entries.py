@@ -12,8 +12,8 @@ Answer = Mapping[str, Any]
 """The object of `fleet.json`."""
 
 COLUMNS = (
-    "rank",
     "car",
+    "rank",
     "why",
     "P(string stable)",
     "T_L [s]",

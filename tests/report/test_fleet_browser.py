@@ -1,4 +1,4 @@
-"""The page of a fleet in Chromium: it fits, it requests nothing, its table is searched and sorted, and works without."""
+"""The page of a fleet in Chromium: it fits, requests nothing, its table is searched and sorted, and works without."""
 
 from __future__ import annotations
 
@@ -59,6 +59,10 @@ def test_cars_are_found_sorted_and_turned_over(browser: Any, path: Path) -> None
     first = page.locator("#ranking tbody tr").first.locator("th")
     seen = page.locator("#seen")
     assert seen.text_content() == "Cars 1 to 100 of 250"
+    first_cells = page.locator("#ranking tbody tr").first.locator("th, td")
+    titles = page.locator("#ranking thead th").all_text_contents()
+    shown = dict(zip(titles, first_cells.all_text_contents(), strict=True))
+    assert (shown["car"], shown["rank"], shown["logs"]) == ("car 1", "1", "1")
     page.click("#on")
     page.click("#on")
     assert (seen.text_content(), first.text_content()) == ("Cars 201 to 250 of 250", "car 201")

@@ -47,6 +47,16 @@ def test_it_says_which_cars_whose_causes_and_what_failed(text: str, page: Elemen
     assert text.count("times typical") == 2, "of the car that is unlike its siblings alone, in HTML and for the script"
     assert "avtorch fleet logs --out out" in text
     assert len(ranking(page)) == 10
+    (table,) = (t for t in page.all("table") if t.attributes.get("id") == "ranking")
+    titles = [th.text() for th in next(table.all("thead")).all("th")]
+    first = [cell.text() for cell in ranking(page)[0].inside]
+    shown = dict(zip(titles, first, strict=True))
+    assert (shown["car"], shown["rank"], shown["why"], shown["simulator lacks"]) == (
+        "car 1",
+        "1",
+        "below target",
+        "late",
+    )
     (svg, other) = page.all("svg")
     assert svg.attributes["aria-label"] == other.attributes["aria-label"]
     assert "9 are below the target" in svg.attributes["aria-label"]
