@@ -187,8 +187,8 @@ def _picture(answer: Answer) -> Picture | None:
     each = "each with its 90 % intervals" if len(known) <= FEW else "a square's area is its number of cars"
     ranks = "; numbers are ranks" if len(known) <= FEW else ""
     caption = (
-        f"Left: cars by lag and gain, {each}; red: below the target, orange: unlike its siblings or its own past, "
-        f"blue: the others{ranks}. Right: the share of cars up to each P(string stable)."
+        f"First: cars by lag and gain, {each}; red: below the target, orange: unlike its siblings or its own past, "
+        f"blue: the others{ranks}. Second: the share of cars up to each P(string stable)."
     )
     wide, narrow = (
         inline_svg(f"fleet-{kind}", fleet_figure(answer, narrow=kind == "narrow"), says) for kind in ("wide", "narrow")
