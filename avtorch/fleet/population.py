@@ -69,7 +69,7 @@ def population(cars: Mapping[str, Sequence[Drive]], seed: int = 0) -> tuple[dict
         return None, {}
     import torch
 
-    from avtorch.fleet.siblings import tails
+    from avtorch.fleet.siblings import left_out
     from avtorch.inference import SamplerSettings, sample
 
     margin = _margin(cars, names)
@@ -90,7 +90,7 @@ def population(cars: Mapping[str, Sequence[Drive]], seed: int = 0) -> tuple[dict
         common[name] = {"typical": _interval(draws[:, 0].exp()), "between": spreads["between"]}
         common[name] |= {"within": spreads.get("within"), "converged": bool(posterior.converged[i])}
         common[name]["why"] = "" if posterior.converged[i] else posterior.why[i]
-    own = tails(margin)
+    others, own = left_out(margin)
     means, sds = _pooled(margin, posterior.flat[::16], few.repeated)
     apart = _q_values((2 * own.amin(0)).clamp(max=1.0).tolist())
     beside: dict[str, Any] = {}
@@ -98,10 +98,9 @@ def population(cars: Mapping[str, Sequence[Drive]], seed: int = 0) -> tuple[dict
         beside[name] = {"q_value": apart[c]}
         for i, quantity in enumerate(QUANTITIES):
             mean, sd = float(means[i, c]), float(sds[i, c])
-            middle = common[quantity]["typical"]["median"]
             beside[name][quantity] = {
                 "pooled": {"median": math.exp(mean), "q05": math.exp(mean - _Z * sd), "q95": math.exp(mean + _Z * sd)},
-                "ratio": math.exp(mean) / middle,
+                "ratio": math.exp(mean - float(others[i, c])),
                 "tail": float(own[i, c]),
             }
     return common, beside

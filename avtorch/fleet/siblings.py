@@ -27,28 +27,32 @@ _OUTSIDE = 1e-9
 """Share of a belief that a grid that is drawn in may leave outside at either end."""
 
 
-def tails(margin: PopulationMargin) -> Tensor:
-    """Two-sided tail probability of each car's own estimate under what its siblings predict, `(quantity, car)`."""
-    found = [_tails(margin.select(torch.tensor([i]))) for i in range(margin.windows)]
-    return torch.stack(found)
+def left_out(margin: PopulationMargin) -> tuple[Tensor, Tensor]:
+    """Of each car what its siblings predict, and the two-sided tail probability of its own drives under it.
+
+    Both `(quantity, car)`; the prediction is the mean of the logarithm.
+    """
+    found = [_left_out(margin.select(torch.tensor([i]))) for i in range(margin.windows)]
+    return torch.stack([mean for mean, _ in found]), torch.stack([tail for _, tail in found])
 
 
-def _tails(margin: PopulationMargin) -> Tensor:
+def _left_out(margin: PopulationMargin) -> tuple[Tensor, Tensor]:
     between, within = (torch.linspace(*WIDEST, n, dtype=torch.float64) for n in GRID)
     if not margin.repeated:
         within = torch.full((1,), -math.inf, dtype=torch.float64)
     for _ in range(NARROWINGS):
-        weight, _ = _grid(margin, between, within)
+        weight, *_ = _grid(margin, between, within)
         between = _narrowed(between, weight.sum(1))
         within = _narrowed(within, weight.sum(0)) if margin.repeated else within
-    weight, below = _grid(margin, between, within)
+    weight, below, centre = _grid(margin, between, within)
     share, over = (weight * below).sum((0, 1)), (weight * (1 - below)).sum((0, 1))
-    return (2 * torch.minimum(share, over)).clamp(0.0, 1.0)
+    return (weight * centre).sum((0, 1)), (2 * torch.minimum(share, over)).clamp(0.0, 1.0)
 
 
-def _grid(margin: PopulationMargin, between: Tensor, within: Tensor) -> tuple[Tensor, Tensor]:
-    """`(between, within, car)`: belief in each point without the car, and probability of an estimate below its own."""
-    log_weight, below = [], []
+def _grid(margin: PopulationMargin, between: Tensor, within: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`(between, within, car)`: belief in each point without the car, probability of an estimate below its own, and the
+    mean over the other cars."""
+    log_weight, below, centres = [], [], []
     for spread in within:
         mean, precision, left = (x[0] for x in margin.of_cars(spread.exp()[None]))
         variance = between.exp().square()[:, None] + 1 / precision
@@ -64,9 +68,11 @@ def _grid(margin: PopulationMargin, between: Tensor, within: Tensor) -> tuple[Te
         if margin.repeated:
             prior = prior + 2 * spread - 2 / SPREAD * spread.exp()
         log_weight.append(evidence + prior)
+        centres.append(centre)
         below.append(torch.special.ndtr((mean - centre) / (variance + 1 / total).sqrt()))
     log_weight = torch.stack(log_weight, 1)
-    return log_weight.flatten(0, 1).softmax(0).unflatten(0, log_weight.shape[:2]), torch.stack(below, 1)
+    weight = log_weight.flatten(0, 1).softmax(0).unflatten(0, log_weight.shape[:2])
+    return weight, torch.stack(below, 1), torch.stack(centres, 1)
 
 
 def _narrowed(grid: Tensor, weight: Tensor) -> Tensor:

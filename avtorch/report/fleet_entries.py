@@ -71,7 +71,7 @@ def _siblings(beside: Mapping[str, Any] | None) -> str:
         return ""
     name = min(_UNITS, key=lambda n: beside[n]["tail"])
     tail = f"tail {_small(beside[name]['tail'])}"
-    return tail if beside["q_value"] > APART else f"{name} {beside[name]['ratio']:.2f} times typical, {tail}"
+    return tail if beside["q_value"] > APART else f"{name} {beside[name]['ratio']:.2f} times theirs, {tail}"
 
 
 def _small(p: float) -> str:

@@ -43,8 +43,8 @@ def test_it_says_which_cars_whose_causes_and_what_failed(text: str, page: Elemen
     ]
     for words in ("Of the model, in nearly all cars: late.", "Of single cars: steep.", "1 car of 10 differs"):
         assert words in text
-    assert "T_L 1.80 times typical, tail 1e-05" in text
-    assert text.count("times typical") == 2, "of the car that is unlike its siblings alone, in HTML and for the script"
+    assert "T_L 1.80 times theirs, tail 1e-05" in text
+    assert text.count("times theirs") == 2, "of the car that is unlike its siblings alone, in HTML and for the script"
     assert "avtorch fleet logs --out out" in text
     assert len(ranking(page)) == 10
     (table,) = (t for t in page.all("table") if t.attributes.get("id") == "ranking")
