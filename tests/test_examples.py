@@ -46,6 +46,7 @@ SLOW = frozenset(
         "avtorch.plots.posterior_figures.validation_figures",
         "avtorch.plots.signatures.signature_figure",
         "avtorch.remedy.what_to_set.setting_for",
+        "avtorch.report.fleet_page.write_fleet_page",
         "avtorch.report.page.report_html",
         "avtorch.report.page.write_report",
         "avtorch.validation.validate.Validation",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -23,6 +24,7 @@ from avtorch.cli.arguments import (
     seed_number,
     three_gains,
 )
+from avtorch.cli.command_line import command_line
 from avtorch.cli.diagnose import chosen_effects
 from avtorch.cli.simulator import read_simulator
 from avtorch.cli.talk import Talk
@@ -71,6 +73,9 @@ def fleet(
     effects: Annotated[str | None, Parameter(help="Only these effects, NAME,NAME,...; default: all.")] = None,
     pairs: Annotated[bool, Parameter(help="Look for several effects at once.")] = True,
     budget: Annotated[float | None, Parameter(help="Time for the search of each diagnosis [s]; default: none.")] = None,
+    reports: Annotated[
+        bool, Parameter(negative=(), group=OUTPUT, help="Write the report of each diagnosed log, and link to it.")
+    ] = False,
     retry: Annotated[bool, Parameter(negative=(), help="Try logs again that failed in an earlier run.")] = False,
     workers: Annotated[
         int | None, Parameter(group=CLUSTER, help="Processes on this machine, one thread each; default: one a core.")
@@ -86,7 +91,8 @@ def fleet(
 ) -> None:
     """Check, estimate and diagnose the logs of many cars; which car to look at first.
 
-    Rows are written to --out as they come, as Parquet: checks, windows and diagnoses. Give the command again after an
+    The answer is fleet.html, a page for any browser, and fleet.json. Rows are written to --out as they come, as
+    Parquet: checks, windows and diagnoses. Give the command again after an
     interruption, or with more logs: it does what is missing. A log that fails has a row that says why.
 
     Parameters
@@ -118,6 +124,11 @@ def fleet(
     assumed = None if baseline == "glvd" else read_simulator("--baseline", baseline)
 
     from avtorch.fleet import FleetSettings, find_logs, run_fleet
+    from avtorch.report import Origin, write_fleet_page
+
+    page = None
+    if reports:
+        from avtorch.report import report_html as page
 
     settings = FleetSettings(
         steps=steps,
@@ -156,16 +167,18 @@ def fleet(
                 memory=memory,
                 scheduler=scheduler,
                 retry=retry,
+                report=page,
                 progress=step,
                 connected_to=tell,
             )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"finished rows are kept in {out}: the same command does what is missing") from None
+    write_fleet_page(answer, out, origin=Origin.of(command_line(), settings=asdict(settings)))
     if talk.json:
         talk.answer(answer)
         return
     _print(talk, answer)
-    talk.line(f"\nWritten to {out}: fleet.json and the rows in checks, windows and diagnoses (Parquet)")
+    talk.line(f"\nWritten to {out}: fleet.html, fleet.json and the rows in checks, windows and diagnoses (Parquet)")
 
 
 _CAR_FROM = {
@@ -226,7 +239,8 @@ def _print(talk: Talk, answer: dict[str, Any]) -> None:
     talk.line(f"\n{_many(done['computed'], 'answer')} computed, {done['kept']} kept from earlier runs.")
 
 
-_STYLE = {"below target": "bold yellow", "failed": "red", "changed": "yellow", "no answer": "dim"}
+_STYLE = {"below target": "bold yellow", "failed": "red", "changed": "yellow", "unlike siblings": "yellow"}
+_STYLE |= {"no answer": "dim"}
 
 
 def _change(change: dict[str, Any] | None) -> str:

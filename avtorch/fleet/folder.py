@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
     import os
 
     import pyarrow as pa
+
+REPORTS = "reports"
+"""Below it, the reports of diagnosed logs."""
 
 UNFINISHED = "unfinished"
 """Below it, what killed or interrupted tasks had finished; removed once all is done."""
@@ -47,6 +51,14 @@ class FleetFolder:
         """Where the rows of a log are."""
         return self.root / DATASETS[step] / log.file_name
 
+    def report(self, log: FleetLog) -> Path:
+        """Where the report of a log is, if one was written: `reports/CAR/LOG/report.html`."""
+        return self._report(log.car, log)
+
+    def _report(self, car: str, log: FleetLog) -> Path:
+        name = re.sub(r"[^A-Za-z0-9_.-]+", "_", car)[:60].strip(".") or "car"
+        return self.root / REPORTS / name / log.file_name.removesuffix(".parquet") / "report.html"
+
     def checkpoints(self) -> Path:
         """The folder of checkpoints, made if it is missing."""
         place = self.root / UNFINISHED
@@ -66,6 +78,10 @@ class FleetFolder:
             rows = self.rows(step, log)
             if not rows:
                 return None
+            before, now = self._report(rows[0]["car"], log), self.report(log)
+            if step == "diagnose" and before != now and before.is_file():
+                now.parent.mkdir(parents=True, exist_ok=True)
+                before.replace(now)
             self._write(step, log, key, [row | label_of(log) for row in rows], status)
         return status
 
@@ -74,17 +90,36 @@ class FleetFolder:
         return marks_of(self.path(step, log)).get(STATUS) == b"done"
 
     def write(
-        self, step: Step, log: FleetLog, key: str, rows: list[Row], *, sha256: str | None, seconds: float
+        self,
+        step: Step,
+        log: FleetLog,
+        key: str,
+        rows: list[Row],
+        *,
+        sha256: str | None,
+        seconds: float,
+        report: str | None = None,
     ) -> Status:
-        """Write the rows of a log in place of earlier ones; returns their status.
+        """Write the rows of a log in place of earlier ones, with the `report` of a diagnosis; returns their status.
 
         Raises `InputError` where that cannot be done.
         """
         known = label_of(log) | {"sha256": sha256, "version": __version__, "seconds": seconds}
         full = labelled(rows, known)
         status: Status = full[0]["status"]
+        if step == "diagnose":
+            self._write_report(log, report)
         self._write(step, log, key, full, status)
         return status
+
+    def _write_report(self, log: FleetLog, report: str | None) -> None:
+        """In place of an earlier one, which was of another answer."""
+        if report is None:
+            self.report(log).unlink(missing_ok=True)
+            return
+        self.report(log).parent.mkdir(parents=True, exist_ok=True)
+        with atomic(self.report(log)) as stream:
+            stream.write(report)
 
     def _write(self, step: Step, log: FleetLog, key: str, rows: list[Row], status: Status) -> None:
         import pyarrow as pa

@@ -1,7 +1,7 @@
 """The fleet's first answer: cars in the order in which to look at them, each with its rows.
 
 A car below the target of P(string stable) comes first, then one with a log that failed, then one that differs from its
-own past, then the others by the gap of their simulator.
+own past, then one that differs from its siblings, then the others by the gap of their simulator.
 """
 
 from __future__ import annotations
@@ -13,8 +13,10 @@ from datetime import UTC, datetime
 from statistics import fmean, pvariance
 from typing import Any
 
+from avtorch.fleet.causes import car_causes, fleet_causes
 from avtorch.fleet.folder import FleetFolder
 from avtorch.fleet.log_list import FleetLog, LogList
+from avtorch.fleet.population import APART, drive_belief, population
 from avtorch.fleet.rows import DATASETS, Row
 from avtorch.fleet.settings import FleetSettings, Step
 from avtorch.version import __version__
@@ -23,7 +25,7 @@ SCHEMA = "avtorch.fleet/1"
 CHANGED = 3.0
 """Standard deviations between drives from which a car is said to differ from its past."""
 
-REASONS = ("below target", "failed", "changed", "gap", "sound", "no answer")
+REASONS = ("below target", "failed", "changed", "unlike siblings", "gap", "sound", "no answer")
 """Why a car is where it is, in order."""
 
 _CHECK = ["status", "error"]
@@ -39,6 +41,11 @@ def fleet_answer(found: LogList, folder: FleetFolder, settings: FleetSettings) -
     for log in found.logs:
         of_car.setdefault(log.car, []).append(log)
     cars = [_car(car, sorted(logs, key=_when), folder, settings) for car, logs in of_car.items()]
+    common, beside = population({car["car"]: car.pop("beliefs") for car in cars}, settings.seed)
+    causes = fleet_causes({car["car"]: car_causes(drives) for car in cars if (drives := car.pop("diagnosed"))})
+    for car in cars:
+        car["siblings"] = beside.get(car["car"])
+        car["reason"] = _reason(car, settings.target)
     cars.sort(key=_rank)
     elsewhere = folder.others(list(found.logs))
     notes = [f"The folder has rows of {elsewhere} more logs, which this call did not name."] if elsewhere else []
@@ -52,6 +59,8 @@ def fleet_answer(found: LogList, folder: FleetFolder, settings: FleetSettings) -
         "logs": len(found.logs),
         "failed_logs": failed,
         "reasons": {reason: sum(car["reason"] == reason for car in cars) for reason in REASONS},
+        "population": common,
+        "causes": causes,
         "cars": [{"rank": number, **car} for number, car in enumerate(cars, 1)],
         "notes": notes,
     }
@@ -74,7 +83,9 @@ def _car(car: str, logs: Sequence[FleetLog], folder: FleetFolder, settings: Flee
     diagnosed = [d for d in (one.pop("diagnosis") for one in drives) if d is not None]
     latest = past[-1] if past else None
     found: dict[str, Any] = {"car": car, "reason": "no answer", "p_string_stable": None, "T_L": None, "K_L": None}
-    found |= {"change": None, "gap": None, "logs": drives}
+    found |= {"change": None, "siblings": None, "gap": None, "logs": drives}
+    found["beliefs"] = [one["log"] for one in past if one["log"] is not None]
+    found["diagnosed"] = [{"named": _named(one), "alike": one.pop("alike")} for one in diagnosed]
     if latest is not None:
         lowest = min(one["lowest"] for one in past)
         found["p_string_stable"] = {"now": latest["p_string_stable"], "lowest": lowest}
@@ -83,14 +94,16 @@ def _car(car: str, logs: Sequence[FleetLog], folder: FleetFolder, settings: Flee
             found["change"] = {name: _change([one[name] for one in past]) for name in ("T_L", "K_L")}
     if diagnosed:
         found["gap"] = diagnosed[-1]
-    found["reason"] = _reason(found, settings.target)
     return found
 
 
 def _log(log: FleetLog, folder: FleetFolder, settings: FleetSettings) -> dict[str, Any]:
     rows = {DATASETS[s]: folder.path(s, log).relative_to(folder.root).as_posix() for s in settings.steps}
     out: dict[str, Any] = {"log": log.place, "date": log.date, "tags": dict(log.tags), "errors": {}}
-    out |= {"rows": rows, "actuation": None, "diagnosis": None}
+    report = folder.report(log)
+    there = "diagnose" in settings.steps and report.is_file()
+    out |= {"rows": rows, "report": report.relative_to(folder.root).as_posix() if there else None}
+    out |= {"actuation": None, "diagnosis": None}
     wanted: dict[Step, list[str]] = {"check": _CHECK, "estimate": _WINDOW, "diagnose": _DIAGNOSIS}
     for step in settings.steps:
         read = folder.rows(step, log, wanted[step])
@@ -109,7 +122,7 @@ def _actuation(rows: Sequence[Row]) -> dict[str, Any] | None:
     if not used:
         return None
     last = used[-1]
-    out: dict[str, Any] = {"p_string_stable": last["p_string_stable"]}
+    out: dict[str, Any] = {"p_string_stable": last["p_string_stable"], "log": drive_belief(used)}
     out["lowest"] = min(row["p_string_stable"] for row in used)
     for name in ("T_L", "K_L"):
         means = [row[f"{name}_mean"] for row in used]
@@ -136,10 +149,16 @@ def _gap(row: Row) -> dict[str, Any]:
         | {"share": None if c["share_mean"] is None else {p: c[f"share_{p}"] for p in ("mean", "q05", "q95")}}
         for c in row["causes"] or ()
     ]
+    alike = sorted({name for c in row["causes"] or () for name in c.get("alias_set") or ()})
     unexplained = {part: row[f"unexplained_{part}"] for part in ("mean", "q05", "q95", "material")}
     out = {"detected": row["gap_detected"], "before": row["gap_before"], "left": row["gap_left"]}
-    out |= {"verdict": row["verdict"], "causes": causes, "summary": row["summary"]}
+    out |= {"verdict": row["verdict"], "causes": causes, "summary": row["summary"], "alike": alike}
     return out | {"unexplained": None if unexplained["mean"] is None else unexplained}
+
+
+def _named(gap: dict[str, Any]) -> list[str]:
+    """The causes of a diagnosis; `unknown` is one that has no name yet."""
+    return sorted({*gap["verdict"], *(cause["name"] for cause in gap["causes"])} - {"none"})
 
 
 def _reason(car: dict[str, Any], target: float) -> str:
@@ -150,6 +169,8 @@ def _reason(car: dict[str, Any], target: float) -> str:
         return "failed"
     if change is not None and max(one["in_sd"] for one in change.values()) >= CHANGED:
         return "changed"
+    if car["siblings"] is not None and car["siblings"]["q_value"] <= APART:
+        return "unlike siblings"
     if gap is not None and gap["verdict"] != ["none"]:
         return "gap"
     return "sound" if stable is not None or gap is not None else "no answer"
@@ -160,7 +181,8 @@ def _rank(car: dict[str, Any]) -> tuple[Any, ...]:
     probability = 1.0 if stable is None else stable["now"]
     changed = 0.0 if change is None else max(one["in_sd"] for one in change.values())
     size = 0.0 if gap is None or gap["before"] is None else gap["before"]
-    order = {"below target": probability, "changed": -changed}.get(car["reason"], 0.0)
+    apart = 1.0 if car["siblings"] is None else min(car["siblings"][name]["tail"] for name in ("T_L", "K_L"))
+    order = {"below target": probability, "changed": -changed, "unlike siblings": apart}.get(car["reason"], 0.0)
     return REASONS.index(car["reason"]), order, -size, probability, car["car"]
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from avtorch.errors import InputError
 from avtorch.fleet.cluster import Cluster, connected, require_dask
@@ -21,6 +21,9 @@ from avtorch.fleet.settings import STEPS, FleetSettings
 from avtorch.fleet.task import Task
 from avtorch.fleet.work_off import worked_off
 from avtorch.io import sole_use, write_json
+
+if TYPE_CHECKING:
+    from avtorch.gap.result.diagnosis import Diagnosis
 
 FLEET = "fleet.json"
 READERS = 4
@@ -36,6 +39,7 @@ def run_fleet(
     memory: str = "2GiB",
     scheduler: str | None = None,
     retry: bool = False,
+    report: Callable[[Diagnosis], str] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
     connected_to: Callable[[Cluster], None] | None = None,
 ) -> dict[str, Any]:
@@ -54,6 +58,8 @@ def run_fleet(
         scheduler: the address of an existing cluster, which has avtorch installed and reads the logs at the same
             places; `workers` and `memory` are then its own.
         retry: try logs again that failed in an earlier call.
+        report: makes the page of a diagnosis, such as `avtorch.report.report_html`; it is written beside the rows, and
+            a diagnosis of an earlier call that has none is computed again. Workers need to be able to import it.
         progress: called with (sentence, done, of), in milliseconds of work.
         connected_to: called with the cluster once there is one.
 
@@ -80,7 +86,7 @@ def run_fleet(
     found = logs if isinstance(logs, LogList) else find_logs(logs, leave_out=out)
     folder = FleetFolder(Path(out))
     with sole_use(out, work="a fleet"):
-        plan = _plan(found.logs, folder, given, retry=retry, progress=progress)
+        plan = _plan(found.logs, folder, given, retry=retry, report=report, progress=progress)
         if plan.tasks:
             with connected(min(workers or _cores(), len(plan.tasks)), memory, scheduler) as cluster:
                 if connected_to is not None:
@@ -112,6 +118,7 @@ def _plan(
     settings: FleetSettings,
     *,
     retry: bool,
+    report: Callable[[Diagnosis], str] | None,
     progress: Callable[[str, int, int], None] | None,
 ) -> _Plan:
     tasks: list[Task] = []
@@ -134,12 +141,14 @@ def _plan(
                 sha256, size = content
                 key = task_key(step, sha256, settings)
                 status = folder.kept(step, log, key)
+                if status == "done" and step == "diagnose" and report is not None and not folder.report(log).is_file():
+                    status = None
                 if status == "done" or (status == "failed" and not retry):
                     kept += 1
                     continue
                 name = f"{step}-{Path(log.file_name).stem}"
                 of[name] = log
-                tasks.append(Task(name, step, log.place, sha256, size, settings))
+                tasks.append(Task(name, step, log.place, sha256, size, settings, report=report))
     # what is soon done first, and the longest diagnoses before the short ones, which then fill the last gaps
     tasks.sort(key=lambda task: (STEPS.index(task.step), -task.size))
     return _Plan(tasks, of, kept, list(unread.values()))
@@ -161,7 +170,8 @@ def _work(cluster: Cluster, folder: FleetFolder, plan: _Plan, told: FleetProgres
         tasks = [replace(task, checkpoint=str(kept / checkpoint_name(task))) for task in tasks]
     for task, outcome in worked_off(cluster, tasks):
         log, key = plan.logs[task.name], task_key(task.step, task.sha256, task.settings)
-        status = folder.write(task.step, log, key, outcome.rows, sha256=task.sha256, seconds=outcome.seconds)
+        about = {"sha256": task.sha256, "seconds": outcome.seconds, "report": outcome.report}
+        status = folder.write(task.step, log, key, outcome.rows, **about)
         told.done(task.step, status, outcome.seconds)
     folder.clear()
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from avtorch.errors import InputError, printable
 from avtorch.fleet.places import content_hash, fetched
@@ -17,13 +17,17 @@ from avtorch.io import Damaged, Log
 from avtorch.logcheck.check import check
 from avtorch.version import __version__
 
+if TYPE_CHECKING:
+    from avtorch.gap.result.diagnosis import Diagnosis
+
 
 @dataclass(frozen=True)
 class Task:
     """A `step` for the log at `place` with this content; `size` [bytes]; a `name` that no other task of the run has.
 
     `checkpoint`: a file that keeps what was finished, for a worker that comes after one that was killed; None where
-    workers share no disk with the caller.
+    workers share no disk with the caller. `report`: makes the page of a diagnosis, where one is wanted; a function that
+    the worker can import.
     """
 
     name: str
@@ -33,26 +37,30 @@ class Task:
     size: int
     settings: FleetSettings
     checkpoint: str | None = None
+    report: Callable[[Diagnosis], str] | None = None
     version: str = __version__
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The rows of a task, and how long it computed [s]."""
+    """The rows of a task, how long it computed [s], and the page of its diagnosis, where one was wanted."""
 
     rows: list[Row]
     seconds: float
+    report: str | None = None
 
 
 def work(task: Task) -> Outcome:
     """Do a task. Raises nothing but what ends the process."""
     begun = time.perf_counter()
+    page = None
     try:
         if task.version != __version__:
             raise RuntimeError(f"this worker has avtorch {__version__}, needs {task.version}")
         with fetched(task.place) as local:
             try:
-                rows = [_named_by_its_place(row, task, local) for row in _rows(task, local)]
+                found, page = _rows(task, local)
+                rows = [_named_by_its_place(row, task, local) for row in found]
             except Damaged:
                 raise  # of the checkpoint, not of the log
             except InputError as fault:
@@ -61,7 +69,7 @@ def work(task: Task) -> Outcome:
         rows = failure_rows("crashed", str(fault))  # a store that could not be reached may be there tomorrow
     except Exception as fault:
         rows = failure_rows("crashed", printable(f"{type(fault).__name__}: {fault}", 400))
-    return Outcome(rows, time.perf_counter() - begun)
+    return Outcome(rows, time.perf_counter() - begun, page)
 
 
 def _named_by_its_place(row: Row, task: Task, local: Path) -> Row:
@@ -71,16 +79,16 @@ def _named_by_its_place(row: Row, task: Task, local: Path) -> Row:
     return row
 
 
-def _rows(task: Task, local: Path) -> list[Row]:
+def _rows(task: Task, local: Path) -> tuple[list[Row], str | None]:
     if content_hash(local)[0] != task.sha256:
         raise RuntimeError("the log was changed while the fleet ran; needs another run")
     given = task.settings
     read: dict[str, Any] = {name: getattr(given, name) or None for name in ("map", "unit", "stamp")}
     mapped = any(read.values())
     if task.step == "check":
-        return check_rows(check(Log.read(local, **read) if mapped else local))
+        return check_rows(check(Log.read(local, **read) if mapped else local)), None
     drive, note = _commanded(Log.read(local, **read))
-    return _estimated(task, drive, note) if task.step == "estimate" else _diagnosed(task, drive, note)
+    return (_estimated(task, drive, note), None) if task.step == "estimate" else _diagnosed(task, drive, note)
 
 
 def _commanded(drive: Log) -> tuple[Log, str | None]:
@@ -113,7 +121,7 @@ def _estimated(task: Task, drive: Log, note: str | None) -> list[Row]:
     return window_rows(found, note)
 
 
-def _diagnosed(task: Task, drive: Log, note: str | None) -> list[Row]:
+def _diagnosed(task: Task, drive: Log, note: str | None) -> tuple[list[Row], str | None]:
     from avtorch.gap.diagnose import diagnose
     from avtorch.gap.simulator.plant import GapPlant
 
@@ -129,7 +137,7 @@ def _diagnosed(task: Task, drive: Log, note: str | None) -> list[Row]:
             seed=given.seed,
             checkpoint=kept,
         )
-    return diagnosis_rows(found, note)
+    return diagnosis_rows(found, note), None if task.report is None else task.report(found)
 
 
 @contextmanager

@@ -24,6 +24,7 @@ from avtorch.inference.excitation import ExcitationRule
 from avtorch.inference.form import Form, JerkForm, WindowLikelihood
 from avtorch.inference.jerk import JerkDensity, JerkPoints, JerkStatistics, jerk_log_likelihood
 from avtorch.inference.map import Mode, find_mode
+from avtorch.inference.population import PopulationDensity, PopulationMargin
 from avtorch.inference.posterior import Posterior, nested_rhat
 from avtorch.inference.quadrature import Quadrature, integrate
 from avtorch.inference.sampler import sample
@@ -57,6 +58,8 @@ __all__ = [
     "JerkPoints",
     "JerkStatistics",
     "Mode",
+    "PopulationDensity",
+    "PopulationMargin",
     "PositionLagDensity",
     "PositionLagForm",
     "Posterior",

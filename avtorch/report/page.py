@@ -4,21 +4,16 @@ escaped."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.resources import files
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
-from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
-
-from avtorch.errors import printable
 from avtorch.experiment import Experiment
 from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.io import atomic
 from avtorch.report.entries import budget_table, measure_table, percent, place_table, setting_table
-from avtorch.report.origin import Origin, versions
+from avtorch.report.house import page_of
+from avtorch.report.origin import Origin
 from avtorch.report.pictures import pictures
 
 
@@ -45,12 +40,9 @@ def report_html(
         >>> "dead_time" in page, page.rstrip().endswith("</html>")
         (True, True)
     """
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, finalize=_seen, trim_blocks=True, lstrip_blocks=True
-    )
-    template = environment.from_string(_text("template.html"))
-    return template.render(
-        style=Markup(_text("style.css")),
+    return page_of(
+        "diagnosis.html",
+        origin=origin,
         found=found,
         log=found.log,
         headline=sentences.headline(found),
@@ -77,19 +69,8 @@ def report_html(
         next_experiment=sentences.to_drive(found),
         notes=list(found.notes),
         quality=list(quality),
-        origin=origin or Origin(),
-        versions=versions(),
         pictures=pictures(found, experiment),
     )
-
-
-def _text(name: str) -> str:
-    return files("avtorch.report").joinpath(name).read_text(encoding="utf-8")
-
-
-def _seen(value: Any) -> Any:
-    """Text of a page, its control characters escaped; markup of our own, the pictures, as it is."""
-    return value if isinstance(value, Markup) or not isinstance(value, str) else printable(value)
 
 
 def write_report(

@@ -40,6 +40,10 @@ def test_cars_are_printed_in_their_order_with_what_failed(
     assert "6 answers computed, 0 kept from earlier runs." in told.out
     assert told.err == ""
     assert json.loads((here / "out" / "fleet.json").read_text())["schema"] == "avtorch.fleet/1"
+    assert "Written to out: fleet.html, fleet.json" in told.out
+    page = (here / "out" / "fleet.html").read_text(encoding="utf-8")
+    assert "1 of 2 estimated cars is below the target" in page
+    assert "avtorch fleet logs --out out" in page
     assert main([*command, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["work"] == {"kept": 6, "computed": 0}
     assert main([*command, "--quiet"]) == 0

@@ -38,8 +38,11 @@ class Fleet:
             self.folder.write(step, log, "key", rows, sha256="0", seconds=0.0)  # type: ignore[arg-type]
         return log
 
+    def answer(self) -> dict[str, Any]:
+        return fleet_answer(LogList(tuple(self.logs), "file"), self.folder, SETTINGS)
+
     def cars(self) -> list[dict[str, Any]]:
-        return fleet_answer(LogList(tuple(self.logs), "file"), self.folder, SETTINGS)["cars"]
+        return self.answer()["cars"]
 
 
 @pytest.fixture
@@ -103,3 +106,27 @@ def test_rows_that_went_missing_are_said(fleet: Fleet) -> None:
     fleet.folder.path("estimate", log).unlink()
     (car,) = fleet.cars()
     assert (car["reason"], car["logs"][0]["errors"]) == ("failed", {"estimate": "its rows are missing or damaged"})
+
+
+def test_a_car_unlike_its_siblings_comes_after_those_that_changed(fleet: Fleet) -> None:
+    # drives of many cars tell how far those of one differ, the changed one's among them
+    for _ in range(2):
+        for number in range(12):
+            fleet.drive(f"car {number}", [window(0.30 + 0.003 * number, 1.0)] * 3)
+        fleet.drive("odd", [window(0.6, 1.0)] * 3)
+    fleet.drive("changed", [window(0.3, 1.0)])
+    fleet.drive("changed", [window(0.42, 1.0)])
+    cars = fleet.cars()
+    assert [(car["car"], car["reason"]) for car in cars[:2]] == [("changed", "changed"), ("odd", "unlike siblings")]
+    assert {car["reason"] for car in cars[2:]} == {"sound"}
+    assert cars[1]["siblings"]["T_L"]["tail"] < 1e-3 < cars[2]["siblings"]["T_L"]["tail"]
+
+
+def test_causes_are_those_of_the_cars_diagnoses(fleet: Fleet) -> None:
+    late = {"name": "late", "alias_set": ["late", "slow"], "probability": 0.9, "parameters": []}
+    for number in range(6):
+        fleet.drive(f"car {number}", [window(0.3, 1.0)], diagnosis("late", 2.0) | {"causes": [late]})
+    answer = fleet.answer()
+    (cause,) = answer["causes"]
+    assert (cause["name"], cause["cars"], cause["verdict"]) == ("late", 6, "the model's")
+    assert "alike" not in answer["cars"][0]["gap"]

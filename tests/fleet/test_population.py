@@ -1,0 +1,138 @@
+"""Cars beside their siblings: each left out exactly, one that differs found, and none where all are alike."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from scipy import stats
+
+from avtorch.fleet.causes import car_causes, fleet_causes
+from avtorch.fleet.population import APART, SAMPLED, drive_belief, population
+from avtorch.fleet.siblings import left_out
+from avtorch.inference import PopulationMargin, sample
+from tests.bars import BAR
+
+F64 = torch.float64
+
+
+def drives_of(*lags: float, sd: float = 0.03) -> list[dict[str, tuple[float, float]]]:
+    return [{"T_L": (math.log(lag), sd), "K_L": (0.0, sd)} for lag in lags]
+
+
+def test_a_drive_is_known_by_what_its_windows_differ_by_or_by_their_posteriors() -> None:
+    def rows(*lags: float, sd: float) -> list[dict[str, Any]]:
+        return [{"T_L_mean": lag, "T_L_sd": sd * lag, "K_L_mean": 1.0, "K_L_sd": sd} for lag in lags]
+
+    alike = drive_belief(rows(0.4, 0.4, 0.4, 0.4, sd=0.1))
+    assert alike is not None
+    # a log-normal's logarithm has the variance log(1 + cv²)
+    assert alike["T_L"] == pytest.approx((math.log(0.4) - math.log1p(0.01) / 2, math.sqrt(math.log1p(0.01) / 4)))
+    apart = drive_belief(rows(0.3, 0.5, sd=0.001))
+    assert apart is not None
+    assert apart["T_L"][1] == pytest.approx(math.log(0.5 / 0.3) / 2)  # SD of two over the root of two
+    assert drive_belief([{"T_L_mean": 0.4, "T_L_sd": None, "K_L_mean": 1.0, "K_L_sd": 0.1}]) is None
+    assert drive_belief([]) is None
+
+
+def test_the_car_that_differs_is_found_and_drawn_in() -> None:
+    cars = {f"car {i}": drives_of(*(0.30 + 0.005 * i + 0.003 * k for k in range(2))) for i in range(9)}
+    cars["odd"] = drives_of(0.62, 0.6)
+    cars["idle"] = []
+    common, beside = population(cars)
+    assert common is not None
+    assert (common["cars"], common["drives"], common["T_L"]["converged"]) == (10, 20, True)
+    assert set(beside) == set(cars) - {"idle"}
+    assert beside["odd"]["q_value"] < APART < min(one["q_value"] for car, one in beside.items() if car != "odd")
+    odd = beside["odd"]["T_L"]
+    assert common["T_L"]["typical"]["median"] < odd["pooled"]["median"] < 0.61
+    # the other nine have a geometric mean of about 0.32, which the odd one does not move
+    assert odd["ratio"] == pytest.approx(odd["pooled"]["median"] / 0.321, rel=0.01)
+    assert beside["odd"]["K_L"]["tail"] > 0.1
+    assert population(cars) == (common, beside), "the same seed, the same answer"
+
+
+def test_two_cars_have_no_siblings() -> None:
+    assert population({"red": drives_of(0.3), "blue": drives_of(0.6), "idle": []}) == (None, {})
+
+
+def test_without_a_second_drive_of_any_car_its_spread_is_not_told() -> None:
+    common, _ = population({str(i): drives_of(0.3 + 0.02 * i) for i in range(5)})
+    assert common is not None
+    assert common["T_L"]["within"] is None
+    assert common["T_L"]["between"]["q05"] > 0
+
+
+@pytest.mark.statistical
+def test_a_car_left_out_is_predicted_as_if_it_were_not_there(rotating_seed: int) -> None:
+    g = torch.Generator().manual_seed(rotating_seed)
+    car = torch.tensor([0, 0, 1, 1, 2, 2, 3, 4, 5, 5])
+    sd = 0.04 + 0.04 * torch.rand(1, 10, generator=g, dtype=F64)
+    y = (0.15 * torch.randn(6, generator=g, dtype=F64))[car] + sd * torch.randn(1, 10, generator=g, dtype=F64)
+    full = PopulationMargin(y, sd, car)
+    others = PopulationMargin(y[:, 2:], sd[:, 2:], car[2:] - 1)
+    walked = sample(others, generator=g)
+    mean, between, within = (walked.draws[..., 0, i] for i in range(3))
+    own, precision, _ = (x[..., 0] for x in full.of_cars(within[..., None]))
+    below = torch.special.ndtr((own[..., 0] - mean) / (between.square() + 1 / precision[..., 0]).sqrt()).mean(1)
+    others, tail = left_out(full)
+    expected = 2 * float(torch.minimum(below.mean(), 1 - below.mean()))
+    chains = mean.mean(1)
+    # 0.03 SDs of the mean for the step of SGLD
+    assert abs(float(others[0, 0] - chains.mean())) < BAR * float(chains.std()) / len(chains) ** 0.5 + 0.03 * float(
+        mean.std()
+    )
+    # 0.02 for the step of SGLD
+    assert abs(float(tail[0, 0]) - expected) < BAR * 2 * float(below.std()) / len(below) ** 0.5 + 0.02
+
+
+@pytest.mark.statistical
+def test_tails_of_alike_cars_are_uniform(rotating_seed: int) -> None:
+    g = torch.Generator().manual_seed(rotating_seed)
+    count = 1500
+    sd = torch.full((1, count), 0.05, dtype=F64)
+    y = torch.randn(1, count, generator=g, dtype=F64) * math.hypot(0.1, 0.05) - 1
+    found = left_out(PopulationMargin(y, sd, torch.arange(count)))[1][0]
+    for level in (0.02, 0.1, 0.5):
+        error = (level * (1 - level) / count) ** 0.5
+        assert abs(float((found < level).double().mean()) - level) < BAR * error
+
+
+@pytest.mark.slow
+def test_of_a_large_fleet_some_cars_tell_the_spread_and_all_are_compared() -> None:
+    g = torch.Generator().manual_seed(0)
+    lags = (0.1 * torch.randn(3 * SAMPLED, generator=g) - 1).exp().tolist()
+    common, beside = population({str(i): drives_of(lag, sd=0.02) for i, lag in enumerate(lags)})
+    assert common is not None
+    assert (common["cars"], common["sampled_cars"], len(beside)) == (3 * SAMPLED, SAMPLED, 3 * SAMPLED)
+    # 0.1 and the drives' own spread, to 5 % by 200 cars, which are five standard errors here
+    assert common["T_L"]["between"]["median"] == pytest.approx(0.1, rel=0.25)
+
+
+def test_causes_are_the_model_s_or_single_cars_by_the_share_of_cars() -> None:
+    cars: dict[str, Any] = {str(i): (["late"] + (["steep"] if i == 0 else []), []) for i in range(10)}
+    for i in range(4):
+        cars[str(i)] = ([*cars[str(i)][0], "loose"], [])
+    found = {one["name"]: one for one in fleet_causes(cars)}
+    assert {name: one["verdict"] for name, one in found.items()} == {
+        "late": "the model's",
+        "loose": "not decided",
+        "steep": "single cars'",
+    }
+    assert list(found) == ["late", "loose", "steep"]
+    assert (found["steep"]["of"], found["late"]["of"]) == (["0"], None)
+    assert found["late"]["share"]["mean"] == pytest.approx(10.5 / 11)
+    assert found["late"]["share"]["q05"] == pytest.approx(stats.beta(10.5, 0.5).ppf(0.05))
+    # four cars with it are too few to say so of all
+    assert fleet_causes({str(i): (["late"], []) for i in range(4)})[0]["verdict"] == "not decided"
+    # one car names it, but the logs of the others cannot tell theirs from it
+    alike = {"0": (["steep"], []), **{str(i): (["heavy"], ["heavy", "steep"]) for i in range(1, 10)}}
+    assert {one["name"]: one["verdict"] for one in fleet_causes(alike)}["steep"] == "not decided"
+
+
+def test_a_car_has_what_most_of_its_drives_name() -> None:
+    drives = [{"named": ["late"], "alike": ["late", "slow"]}, {"named": ["late", "steep"], "alike": []}]
+    drives.append({"named": [], "alike": ["slow"]})
+    assert car_causes(drives) == (["late"], ["slow"])
