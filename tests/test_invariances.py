@@ -293,7 +293,7 @@ def test_no_computation_reads_the_recorders_clock() -> None:
     """`Log.time` is for people and files; all else takes `elapsed`. These may show or keep stamps."""
     shown = {
         "blindtest/oracle_budget.py", "decision/estimation.py", "gap/likelihood/record.py", "io/quality.py",
-        "trial/folder.py", "trial/rivals/random_guess.py", "validation/windows.py",
+        "live/played_log.py", "trial/folder.py", "trial/rivals/random_guess.py", "validation/windows.py",
     }  # fmt: skip
     package = Path(avtorch.__file__).parent
     found = {

@@ -8,9 +8,13 @@ from collections.abc import Iterator
 import pytest
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def scheduler() -> Iterator[str]:
-    """The address of a scheduler with one worker, a thread of this process."""
+    """The address of a scheduler with one worker, a thread of this process.
+
+    It ends with its module: it draws from Python's own random numbers now and then, which Hypothesis takes for a strategy
+    that does.
+    """
     from distributed import LocalCluster
 
     with LocalCluster(
