@@ -12,8 +12,8 @@ import pytest
 def scheduler() -> Iterator[str]:
     """The address of a scheduler with one worker, a thread of this process.
 
-    It ends with its module: it draws from Python's own random numbers now and then, which Hypothesis takes for a strategy
-    that does.
+    It ends with its module: now and then it draws from Python's own random numbers, which Hypothesis takes for a
+    strategy that does.
     """
     from distributed import LocalCluster
 
