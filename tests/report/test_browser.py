@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -12,28 +11,15 @@ import pytest
 from avtorch.experiment import Experiment
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.report import write_report
+from tests.report.in_chromium import CUT_OFF, LETTERS_PX, OUTSIDE, PROGRAM
 
 sync_api = pytest.importorskip("playwright.sync_api")
 axe = pytest.importorskip("axe_playwright_python.sync_playwright")
-
-PROGRAMS = ("chromium-headless-shell", "chromium", "google-chrome")
-PROGRAM = next((path for path in map(shutil.which, PROGRAMS) if path), None)
 
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(PROGRAM is None, reason="needs Chromium: Debian's chromium-headless-shell or chromium"),
 ]
-
-CUT_OFF = """() => [...document.querySelectorAll("body *")]
-  .filter(e => !e.closest("svg") && !e.closest("thead") && !e.closest("caption"))
-  .filter(e => e.getBoundingClientRect().right > innerWidth + 0.5 || e.scrollWidth > e.clientWidth + 1 && e.clientWidth)
-  .map(e => e.tagName + " " + e.textContent.slice(0, 60))"""
-LETTERS_PX = """() => [...document.querySelectorAll("svg text")].filter(e => e.getClientRects().length)
-  .map(e => parseFloat(getComputedStyle(e).fontSize) * Math.hypot(e.getCTM().a, e.getCTM().b))"""
-OUTSIDE = """() => [...document.querySelectorAll("svg text")].filter(e => e.getClientRects().length).filter(e => {
-  const a = e.getBoundingClientRect(), b = e.closest("svg").getBoundingClientRect();
-  return a.left < b.left - 1 || a.right > b.right + 1 || a.top < b.top - 1 || a.bottom > b.bottom + 1;
-}).map(e => e.textContent)"""
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,10 @@ import pytest
 from avtorch.report import write_fleet_page
 from tests.report.conftest import HOSTILE
 from tests.report.fleets import answer_of
-from tests.report.test_browser import CUT_OFF, OUTSIDE, PROGRAM, axe, sync_api
+from tests.report.in_chromium import CUT_OFF, OUTSIDE, PROGRAM
+
+sync_api = pytest.importorskip("playwright.sync_api")
+axe = pytest.importorskip("axe_playwright_python.sync_playwright")
 
 pytestmark = [
     pytest.mark.slow,
