@@ -25,7 +25,7 @@ def driven(names: list[str], seed: int, car: Car, *, strength: float = 2.0, onse
 def off(replay: Replay, names: list[str]) -> tuple[float, float]:
     """RMS of the difference in acceleration and in the change of speed, over moving rows.
 
-    Each stretch of driving begins anew: where a car comes to rest within a row, up to a row of the acceleration is missed,
+    Each stretch begins anew: where a car comes to rest within a row, up to a row of the acceleration is missed,
     and that stays in the speed.
     """
     run, response = replay.run, replay.response(names)
