@@ -21,11 +21,13 @@ from avtorch.plots.diagnosis import (
     which_figure,
 )
 from avtorch.plots.experiment import experiment_figure
+from avtorch.plots.whole_drive import DriveTime, drive_figure, drive_time
 from avtorch.report.entries import budget_table, candidate_table, measure_table
 from avtorch.report.picture import Picture, inline_svg
 from avtorch.report.table import Table, of_numbers
 
 _MOST = 60  # rows of a table behind a picture of lines
+_PARTS = 12  # of the drive, rows of its table
 
 
 def pictures(found: Diagnosis, experiment: Experiment | None = None) -> dict[str, Picture | None]:
@@ -43,6 +45,7 @@ def pictures(found: Diagnosis, experiment: Experiment | None = None) -> dict[str
     """
     return {
         "budget": _budget(found),
+        "drive": _drive(found),
         "road": _road(found),
         "where": _where(found),
         "which": _which(found),
@@ -78,6 +81,52 @@ def _budget(found: Diagnosis) -> Picture | None:
         "above the noise floor and on top of the effects before it. Whiskers: 90 %.",
         opened=True,
     )
+
+
+def _drive(found: Diagnosis) -> Picture | None:
+    traces = found.traces
+    if traces is None or len(traces.time) < _PARTS:
+        return None
+    axis = drive_time(found)
+    columns = ["part of the drive [s]", "command, least to greatest [m/s²]"]
+    for name in traces.channels:
+        unit = "m/s²" if name == "accel" else "m/s"
+        columns += [f"{name} [{unit}]", f"{name}, error without [{unit}]", f"{name}, error with [{unit}]"]
+    rows = []
+    for part in np.array_split(np.arange(len(axis.along)), _PARTS):
+        command = traces.command[part]
+        cells = [
+            f"{axis.along[part[0]]:.0f} to {axis.along[part[-1]]:.0f}",
+            f"{command.min():.2f} to {command.max():.2f}",
+        ]
+        for k in range(len(traces.channels)):
+            wholes = (traces.measured[k], *((traces.measured - x)[k] for x in (traces.before, traces.after)))
+            sizes = [np.std(x[part]) for x in wholes]
+            cells += [f"{size:.3f}" for size in sizes]
+        rows.append(tuple(cells))
+    named = " and that with what was named" if found.winner.effects else ""
+    return _picture(
+        "drive",
+        lambda narrow: drive_figure(found, narrow=narrow),
+        f"Lines over the whole drive, {axis.along[0]:.0f} to {axis.along[-1]:.0f} s: the command, the measured "
+        f"{' and '.join(traces.channels)}, the baseline simulator{named}.{_marked(axis)}",
+        Table("The drive in parts: standard deviation of each signal, and of the error", tuple(columns), tuple(rows)),
+        caption="Of each short interval the least and the greatest value. Simulated lines are rollouts from the logged "
+        f"commands; in each stretch a speed begins at the measured one.{_marked(axis)}",
+    )
+
+
+def _marked(axis: DriveTime) -> str:
+    told = []
+    if axis.unused:
+        seconds = sum(end - begin for begin, end in axis.unused)
+        many = f"{len(axis.unused)} stretch{'es' if len(axis.unused) > 1 else ''} of together {seconds:.0f} s"
+        told.append(f" Grey ground: {many} that did not count (driver, standstill or a gap).")
+    if len(axis.begins) > 1:
+        told.append(f" {len(axis.begins)} logs, one behind the other.")
+    if axis.onset is not None:
+        told.append(f" Dashed: the onset, at {axis.onset:.1f} s.")
+    return "".join(told)
 
 
 def _road(found: Diagnosis) -> Picture | None:

@@ -1,0 +1,152 @@
+"""The whole drive at a glance: command, response, the simulator before and after, what did not count, the onset.
+
+Long drives are drawn by envelopes: of each short interval the least and the greatest value, so that no peak is lost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from avtorch.arrays import FloatArray, IntArray
+from avtorch.errors import InputError
+from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.plots.style import BLACK, BLUE, GREY, VERMILLION, styled
+
+_WIDE, _NARROW = (8.6, 260), (4.0, 120)
+"""Width [in] and intervals of a line, on a desk and on a phone."""
+_LABELS = {"accel": "acceleration [m/s²]", "speed": "speed [m/s]"}
+_BEYOND = 0.3  # of the measured range: how far beyond it a rollout is followed, whose speed may drift without end
+_LOGS_APART = 0.02  # of the whole, between two logs
+
+
+@dataclass(frozen=True)
+class DriveTime:
+    """Where the rows of a diagnosis lie on one axis: `along` (row,) [s], several logs one behind the other; `begins` of
+    the logs on it [s]; `unused`: spans between counted rows [s]; `onset` on it [s], where an effect sets in.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, simulate
+        >>> from avtorch.gap import DeadTime, plant
+        >>> from avtorch.plots.whole_drive import drive_time
+        >>> late = plant([DeadTime(0.4)], sigma=0.0)
+        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
+        >>> drive_time(diagnose(log, effects=["dead_time"], pairs=False)).begins
+        (0.0,)
+    """
+
+    along: FloatArray
+    begins: tuple[float, ...]
+    unused: tuple[tuple[float, float], ...]
+    onset: float | None
+
+
+def drive_time(found: Diagnosis) -> DriveTime:
+    """The axis of the whole drive. Raises `InputError` where there are no traces."""
+    traces = found.traces
+    if traces is None:
+        raise InputError("traces: the diagnosis has none to draw")
+    time, new = traces.time, np.flatnonzero(np.diff(traces.time) < 0) + 1
+    number = np.zeros(len(time), int)
+    number[new] = 1
+    number = np.cumsum(number)
+    apart = _LOGS_APART * float(sum(time[number == n].max() for n in np.unique(number)))
+    begins = [0.0]
+    for n in range(int(number[-1])):
+        begins.append(begins[-1] + float(time[number == n].max()) + apart)
+    along = time + np.array(begins)[number]
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    ends = np.flatnonzero((np.diff(traces.stretch) != 0) & (np.diff(along) > 2 * step) & (np.diff(number) == 0))
+    unused = tuple((float(along[i]), float(along[i + 1])) for i in ends)
+    onset = found.onset_from_start_s
+    if onset is not None:
+        onset += begins[min(found.onset_log, len(begins) - 1)]
+    return DriveTime(along, tuple(begins), unused, onset)
+
+
+def envelope(time: FloatArray, values: FloatArray, stretch: IntArray, intervals: int) -> tuple[FloatArray, FloatArray]:
+    """`values` (row,) over `time` as a line of at most two points for each of `intervals`, its least and its greatest
+    value in the order in which they come; broken by NaN between stretches.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.plots.whole_drive import envelope
+        >>> time = np.arange(8.0)
+        >>> envelope(time, np.array([0, 3, 1, 0, 0, 0, -2, 0.0]), np.zeros(8, int), 2)[1].tolist()
+        [0.0, 3.0, 0.0, -2.0]
+    """
+    length = (time[-1] - time[0]) / intervals if len(time) > 1 else 1.0
+    cell = np.minimum((time - time[0]) / max(length, 1e-12), intervals - 1).astype(int)
+    x: list[float] = []
+    y: list[float] = []
+    cuts = np.flatnonzero((np.diff(cell) != 0) | (np.diff(stretch) != 0)) + 1
+    for rows in np.split(np.arange(len(time)), cuts):
+        if x and stretch[rows[0]] != stretch[rows[0] - 1]:
+            x.append(float(time[rows[0]]))
+            y.append(np.nan)
+        ends = sorted({int(rows[values[rows].argmin()]), int(rows[values[rows].argmax()])})
+        x += time[ends].tolist()
+        y += values[ends].tolist()
+    return np.array(x), np.array(y)
+
+
+@styled
+def drive_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
+    """The whole drive, a panel a channel, the command with the acceleration or in a panel of its own.
+
+    A rollout's speed begins at the measured one in each stretch. Raises `InputError` where there are no traces.
+    """
+    axis, traces = drive_time(found), found.traces
+    assert traces is not None
+    names = list(traces.channels)
+    panels = names if "accel" in names else ["command", *names]
+    width, intervals = _NARROW if narrow else _WIDE
+    figure = Figure(figsize=(width, 0.8 + 1.9 * len(panels)), layout="constrained")
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, name in zip(axes, panels, strict=True):
+        _shade(ax, axis)
+        if name in ("command", "accel"):
+            ax.plot(
+                *envelope(axis.along, traces.command, traces.stretch, intervals), color=GREY, lw=0.9, label="command"
+            )
+        if name == "command":
+            ax.set_ylabel("command [m/s²]")
+            continue
+        _channel(ax, found, axis, names.index(name), intervals)
+    axes[-1].set_xlabel("time [s]" if len(axis.begins) == 1 else "time, one log behind the other [s]")
+    axes[-1].set_xlim(float(axis.along[0]), float(axis.along[-1]))
+    handles = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(list(handles.values()), list(handles), loc="outside upper left", ncols=2 if narrow else 3)
+    return figure
+
+
+def _shade(ax: Axes, axis: DriveTime) -> None:
+    for i, (begin, end) in enumerate(axis.unused):
+        ax.axvspan(begin, end, color="#DDDDDD", lw=0, zorder=0, label="not counted" if i == 0 else None)
+    for begin in axis.begins[1:]:
+        ax.axvline(begin, color=GREY, lw=0.8, ls=":", label="next log" if begin == axis.begins[1] else None)
+    if axis.onset is not None:
+        ax.axvline(axis.onset, color=BLACK, lw=1.0, ls="--", label="onset")
+
+
+def _channel(ax: Axes, found: Diagnosis, axis: DriveTime, k: int, intervals: int) -> None:
+    traces = found.traces
+    assert traces is not None
+    measured = traces.measured[k]
+    lines = {"measured": (measured, BLACK), "baseline simulator": (traces.before[k], VERMILLION)}
+    if found.winner.effects:
+        lines["with what was named"] = (traces.after[k], BLUE)
+    for label, (values, colour) in lines.items():
+        own = values
+        if traces.channels[k] == "speed":
+            firsts = np.concatenate([[0], np.flatnonzero(np.diff(traces.stretch) != 0) + 1])
+            of = np.searchsorted(firsts, np.arange(len(own)), side="right") - 1
+            own = own + (measured - own)[firsts][of]
+        ax.plot(*envelope(axis.along, own, traces.stretch, intervals), color=colour, lw=0.9, label=label)
+    low, high = float(measured.min()), float(measured.max())
+    reach = _BEYOND * max(high - low, 1e-3)
+    ax.set_ylim(low - reach, high + reach)
+    ax.set_ylabel(_LABELS[traces.channels[k]])
