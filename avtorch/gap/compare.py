@@ -24,7 +24,7 @@ from scipy.stats import f as fisher  # pyright: ignore[reportMissingTypeStubs]
 from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
-from avtorch.errors import InputError, quoted
+from avtorch.errors import InputError
 from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.change.change_cause import ChangeCause, cause_of_change
 from avtorch.gap.change.two_sides import FEWEST_BLOCKS, TwoSides
@@ -38,7 +38,8 @@ from avtorch.gap.result.diagnosis import LogFacts
 from avtorch.gap.result.traces import rolled_out
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
-from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
+from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.effect_choice import chosen_effects
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log, LogSource, as_logs
 from avtorch.io.mapping import Pairs
@@ -92,7 +93,7 @@ def compare(
     if not 0 < level < 1:
         raise InputError(f"level: found {level}, needs a number between 0 and 1")
     sides = [as_logs(x, map=map, unit=unit, argument=name) for x, name in ((before, "before"), (after, "after"))]
-    kinds = _kinds(effects)
+    kinds = chosen_effects(effects)
     if isinstance(baseline, BlackBoxSimulator):
         if baseline_after is not None:
             raise InputError("baseline_after: found beside a simulator that is no plant, needs compare_simulators")
@@ -149,21 +150,6 @@ def compare(
         cause=cause,
         horizon_s=horizon,
     )
-
-
-def _kinds(effects: Sequence[str | type[Effect]] | None) -> list[type[Effect]]:
-    if effects is None:
-        return list(EFFECTS.values())
-    if isinstance(effects, str):
-        raise InputError(f"effects: found {quoted(effects)}, needs a list of names or classes")
-    kinds: list[type[Effect]] = []
-    given: list[object] = list(effects)
-    for effect in given:
-        kind = effect_class(effect) if isinstance(effect, str) else effect
-        if not (isinstance(kind, type) and issubclass(kind, Effect)):
-            raise InputError(f"effects: found {quoted(repr(effect))}, needs names or classes of effects")
-        kinds.append(kind)
-    return kinds
 
 
 def _cause(

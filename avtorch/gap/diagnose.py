@@ -39,7 +39,8 @@ from avtorch.gap.selection.given_dead_time import given_dead_time
 from avtorch.gap.selection.model_probabilities import favourite, model_probabilities
 from avtorch.gap.selection.plausibility import implausible
 from avtorch.gap.selection.verdict import Candidate, verdict_of
-from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
+from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.effect_choice import chosen_effects
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.whole_progress import WholeProgress
 from avtorch.io import LogSource, as_logs
@@ -131,7 +132,7 @@ def diagnose(
     measured, read = each, [with_sensor_noise(log) for log in each]
     each, noise_added = [log for log, _ in read], dict.fromkeys(note for _, note in read if note)
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
-    kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
+    kinds = chosen_effects(effects)
     race = Search(
         each,
         base,

@@ -26,7 +26,8 @@ from avtorch.gap.budget.selection_step import Selection, Step
 from avtorch.gap.budget.share_order import energies, gap_is_there, largest_first, taken_off
 from avtorch.gap.budget.slow_disturbance import slow_disturbance
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.simulator.effect import EFFECTS, Effect, effect_class
+from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.effect_choice import chosen_effects
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log
 
@@ -63,7 +64,7 @@ def gap_budget(
     if not 0 < material < 1:
         raise InputError(f"material: found {material}, needs a share between 0 and 1")
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
-    kinds = [e if isinstance(e, type) else effect_class(e) for e in (EFFECTS.values() if effects is None else effects)]
+    kinds = chosen_effects(effects)
     selection = select(AnalysisRecord.for_budget(each), base, kinds, progress=progress)
     selection = largest_first(selection, material, seed=seed)
     budget = budget_of(selection, material=material, seed=seed, epoch_s=each[0].epoch_s)

@@ -1,0 +1,36 @@
+"""Every function that takes effects refuses what names none, before it works."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from tests.gap.records import log_of
+
+import avtorch
+from avtorch.errors import InputError
+from avtorch.gap import EFFECTS, SensorBias, gap_budget
+from avtorch.gap.simulator.effect_choice import chosen_effects
+from avtorch.io import Log
+
+
+@pytest.mark.parametrize("asks", [avtorch.diagnose, gap_budget])
+@pytest.mark.parametrize(
+    ("effects", "message"),
+    [
+        ("sensor_bias", "effects: found 'sensor_bias', needs a list of names or classes"),
+        ("", "effects: found '', needs a list of names or classes"),
+        (["sensor_bais"], "effect: found 'sensor_bais', needs an effect's name; perhaps sensor_bias"),
+        ([3], "effects: found '3', needs names or classes of effects"),
+        ([Log], "effects: found .*, needs names or classes of effects"),
+        (["sensor_bias", SensorBias], "effects: found sensor_bias twice, needs each effect once"),
+    ],
+)
+def test_effects_that_are_none(asks: Callable[..., object], effects: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        asks(log_of(seconds=20.0), effects=effects)
+
+
+def test_effects_by_name_and_by_class() -> None:
+    assert chosen_effects(["dead_time", SensorBias]) == [EFFECTS["dead_time"], SensorBias]
+    assert chosen_effects(None) == list(EFFECTS.values())
