@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from tests.gap.records import log_of
 
 import avtorch
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, SensorBias, gap_budget
 from avtorch.gap.simulator.effect_choice import chosen_effects
 from avtorch.io import Log
+from tests.gap.records import log_of
 
 
 @pytest.mark.parametrize("asks", [avtorch.diagnose, gap_budget])
