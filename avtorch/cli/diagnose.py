@@ -280,7 +280,7 @@ def diagnose(
     talk.out.print(*diagnosis_headline(found), sep="\n")
     talk.out.print()
     if found.budget is not None and (found.budget.parts or found.budget.chance):
-        talk.out.print(budget_table(found.budget))
+        talk.out.print(budget_table(found.budget, found.log.epochs_s[0]))
         talk.out.print()
     talk.out.print(diagnosis_table(found))
     talk.out.print()

@@ -32,8 +32,8 @@ def diagnosis_headline(found: Diagnosis) -> list[str]:
     return [*lines, *map(escape, tested(found)), *map(escape, budget(found)), f"[dim]{escape(found.verdict.why)}[/]"]
 
 
-def budget_table(budget: Budget) -> Table:
-    """One row per part of the gap, what chance decides, and what is unexplained."""
+def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
+    """One row per part of the gap, what chance decides, and what is unexplained; times count from `epoch_s`."""
     from avtorch.gap.budget.parts import percent
     from avtorch.gap.result.sentences import number
 
@@ -56,7 +56,9 @@ def budget_table(budget: Budget) -> Table:
         table.add_row(escape(part.name), "     noise", number(part.probability), parameters, style="bold")
     rest = budget.unexplained
     style = "yellow" if rest.material else "dim"
-    table.add_row("unexplained", f"{percent(rest.share.mean):>10} {bar(rest.share.mean)}", "", "", style=style)
+    table.add_row(
+        "unexplained", f"{percent(rest.share.mean):>10} {bar(rest.share.mean)}", "", rest.places(epoch_s), style=style
+    )
     return table
 
 

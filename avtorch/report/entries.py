@@ -29,8 +29,8 @@ _METRICS = {
 _IMPLAUSIBLE = "physically implausible"
 
 
-def budget_table(budget: Budget) -> Table:
-    """What each cause contributes to the gap."""
+def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
+    """What each cause contributes to the gap; times count from `epoch_s`."""
     columns = ("effect", "share of the gap (90 %)", "probability", "parameters (90 %)", "alike in these drives")
     rows = []
     for part in budget.parts:
@@ -41,7 +41,7 @@ def budget_table(budget: Budget) -> Table:
         parameters = _parameters(part.parameters or {}) + ([] if part.plausible else [_IMPLAUSIBLE])
         share = "by chance, part of the noise"
         rows.append((part.name, share, sentences.number(part.probability), "; ".join(parameters), ""))
-    rows.append(("unexplained", percent(budget.unexplained.share), "", "", ""))
+    rows.append(("unexplained", percent(budget.unexplained.share), "", budget.unexplained.places(epoch_s), ""))
     return Table("The gap's budget", columns, tuple(rows), numeric=("probability",))
 
 

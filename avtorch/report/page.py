@@ -40,6 +40,7 @@ def report_html(
         >>> "dead_time" in page, page.rstrip().endswith("</html>")
         (True, True)
     """
+    budget = found.budget
     return page_of(
         "diagnosis.html",
         origin=origin,
@@ -60,7 +61,7 @@ def report_html(
         where=sentences.where(found),
         places=place_table(found),
         gap=[*sentences.gap(found), *sentences.moved(found), *sentences.remains(found)],
-        budget=None if found.budget is None or not found.budget.chance else budget_table(found.budget),
+        budget=budget_table(budget, found.log.epochs_s[0]) if budget and budget.chance else None,
         shrinkage=sentences.shrinkage(found),
         measures=None if found.shrinkage is None else measure_table(found.shrinkage),
         placebo=_placebo(found),

@@ -76,7 +76,7 @@ def _budget(found: Diagnosis) -> Picture | None:
         "budget",
         lambda narrow: budget_figure(found, narrow=narrow),
         f"Bars of what each effect contributes to the gap: {says}.",
-        budget_table(budget),
+        budget_table(budget, found.log.epochs_s[0]),
         caption=f"A share is what an effect takes off the squared error of held-out {budget.horizon_s:.3g} s rollouts, "
         "above the noise floor and on top of the effects before it. Whiskers: 90 %.",
         opened=True,

@@ -19,6 +19,7 @@ from avtorch.gap.budget.given_effects import given_effects
 from avtorch.gap.budget.parts import LIKELY, MATERIAL, Budget, ChancePart, Part
 from avtorch.gap.budget.selection_step import Selection
 from avtorch.gap.budget.share_order import largest_first
+from avtorch.gap.budget.unexplained_places import placed
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.selection.plausibility import implausible
@@ -79,7 +80,9 @@ def account(
     selection = select(record, base, kinds, begun=begun, most=most, progress=progress)
     selection = largest_first(selection, material, seed=seed)
     budget = budget_of(selection, epoch_s=epoch, **options)
-    budget = replace(budget, chance=_all_chance(selection, base, kinds, candidates, verdict, winner, budget))
+    rest = placed(budget.unexplained, selection, kinds, epoch_s=epoch)
+    chance = _all_chance(selection, base, kinds, candidates, verdict, winner, budget)
+    budget = replace(budget, unexplained=rest, chance=chance)
     held_out = tuple(_spread(candidates, budget, kinds))
     return Account(budget, selection, held_out, _verdict(budget, verdict), held_out=True)
 

@@ -25,6 +25,7 @@ from avtorch.gap.budget.rollout_energy import horizon
 from avtorch.gap.budget.selection_step import Selection, Step
 from avtorch.gap.budget.share_order import energies, gap_is_there, largest_first, taken_off
 from avtorch.gap.budget.slow_disturbance import slow_disturbance
+from avtorch.gap.budget.unexplained_places import placed
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.effect_choice import chosen_effects
@@ -68,7 +69,8 @@ def gap_budget(
     selection = select(AnalysisRecord.for_budget(each), base, kinds, progress=progress)
     selection = largest_first(selection, material, seed=seed)
     budget = budget_of(selection, material=material, seed=seed, epoch_s=each[0].epoch_s)
-    return replace(budget, chance=by_chance(selection, base, kinds))
+    rest = placed(budget.unexplained, selection, kinds, epoch_s=each[0].epoch_s)
+    return replace(budget, unexplained=rest, chance=by_chance(selection, base, kinds))
 
 
 def by_chance(selection: Selection, base: GapPlant, kinds: Sequence[type[Effect]]) -> tuple[ChancePart, ...]:

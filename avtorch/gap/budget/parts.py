@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from avtorch.gap.crossval.localisation import Location
 from avtorch.gap.quantity import Quantity
 
 HORIZON_S = 10.0
@@ -87,7 +88,9 @@ class ChancePart:
 class Unexplained:
     """The share that is reproducible and that no cause explains.
 
-    `material`: surely more than a user cares for; `probability`: that it is more.
+    `material`: surely more than a user cares for; `probability`: that it is more. Where it is material, `where` holds
+    the parts of the drive that it lies in, if any in particular, and `resembles` the effect that promises to explain
+    much of it but is not certain enough to be named.
 
     Example:
         >>> from avtorch.gap import Unexplained
@@ -99,14 +102,21 @@ class Unexplained:
     share: Quantity
     material: bool
     probability: float = 0.0
+    where: tuple[Location, ...] = ()
     resembles: str | None = None
+
+    def places(self, epoch_s: float = 0.0) -> str:
+        """Where it lies and what it resembles, in words; empty where nothing was found. Times count from `epoch_s`."""
+        where = ", ".join(part.words(epoch_s) for part in self.where)
+        alike = "" if self.resembles is None else f"most like {self.resembles}"
+        return "; ".join(x for x in (where, alike) if x)
 
     def to_dict(self) -> dict[str, Any]:
         return {
             "share": _interval(self.share),
             "material": self.material,
             "probability": self.probability,
-            "where": [],
+            "where": [part.to_dict() for part in self.where],
             "resembles": self.resembles,
         }
 

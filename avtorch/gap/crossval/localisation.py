@@ -19,9 +19,12 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.crossval.attribution import RowAttribution
 
 _MOST = 0.95  # share of the cause's effect that a part holds
-_PLAINLY = 0.6  # largest share of the rows since the onset that a part may cover
 _BAND = 0.9  # share of the power
-_RATE = 0.05  # false-discovery rate
+
+PLAINLY = 0.6
+"""Largest share of the rows since the onset that a part may cover."""
+RATE = 0.05
+"""False-discovery rate."""
 
 Axis = Literal["time", "speed", "command", "frequency", "signal"]
 
@@ -43,6 +46,16 @@ class Location:
     share: float
     q_value: float
 
+    def words(self, epoch_s: float = 0.0) -> str:
+        """The part as a phrase; times count from `epoch_s`, the log's start on its own clock."""
+        if isinstance(self.begin, str) or isinstance(self.end, str):
+            return "in the car's motion" if self.begin == "actuation" else "in the accelerometer's reading"
+        if self.axis == "time":
+            return f"from {self.begin - epoch_s:.1f} to {self.end - epoch_s:.1f} s after the log's start"
+        at, unit = "frequencies" if self.axis == "frequency" else f"{self.axis}s", UNITS[self.axis]
+        ends = f"from {self.begin:.2g} to {self.end:.2g}" if self.begin else f"below {self.end:.2g}"
+        return f"at {at} {ends} {unit}"
+
     def to_dict(self) -> dict[str, Any]:
         """An entry of `where` in `diagnosis.json`."""
         part = {"axis": self.axis, "from": self.begin, "to": self.end}
@@ -55,7 +68,7 @@ def localise(attribution: RowAttribution, *, onset_s: float | None, lag: float) 
     q_values = _q_values([gain - attribution.paid for *_, gain in parts])
     parts = [(axis, *_stamps(attribution, axis, a, b), share, gain) for axis, a, b, share, gain in parts]
     named = [Location(axis, a, b, share, q) for (axis, a, b, share, _), q in zip(parts, q_values, strict=True)]
-    return tuple(sorted((w for w in named if w.q_value <= _RATE), key=lambda w: w.q_value))
+    return tuple(sorted((w for w in named if w.q_value <= RATE), key=lambda w: w.q_value))
 
 
 def _stamps(
@@ -95,7 +108,7 @@ def _stretches(attribution: RowAttribution, onset_s: float | None, lag: float) -
     for axis, x in axes:
         # weighted by size, not by square, or the edges of the active region would be lost
         low, high = shortest(x, np.sqrt(does), _MOST)
-        if ((x >= low) & (x <= high))[since].mean() <= _PLAINLY:
+        if ((x >= low) & (x <= high))[since].mean() <= PLAINLY:
             part = _part(attribution, axis, x, low, high, does)
             yield part if axis != "command" else (axis, *_own_ends(x, low, high, record.command), *part[3:])
 

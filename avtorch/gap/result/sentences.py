@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from avtorch.gap.budget.parts import Budget
 from avtorch.gap.crossval.gap_closed import Shrinkage
-from avtorch.gap.crossval.localisation import UNITS, Location
+from avtorch.gap.crossval.localisation import Location
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.gap_size import GapSize
 from avtorch.gap.result.log_facts import LogFacts
@@ -176,20 +176,9 @@ def where(found: Findings) -> list[str]:
     """Where the gap lies, apart from an onset."""
     places = []
     for part in found.where:
-        if part.axis == "time" and found.onset_s is not None:
-            continue  # stated by the sentence on the onset
-        if part.axis == "signal":
-            if part.share >= 0.5:
-                places.append("in the car's motion" if part.begin == "actuation" else "in the accelerometer's reading")
-        elif not isinstance(part.begin, str) and not isinstance(part.end, str):
-            begin, end = part.begin, part.end
-            if part.axis == "time":
-                begin, end = (t - found.log.epochs_s[0] for t in (begin, end))
-                places.append(f"from {begin:.1f} to {end:.1f} s after the log's start")
-                continue
-            at, unit = "frequencies" if part.axis == "frequency" else f"{part.axis}s", UNITS[part.axis]
-            ends = f"from {part.begin:.2g} to {part.end:.2g}" if part.begin else f"below {part.end:.2g}"
-            places.append(f"at {at} {ends} {unit}")
+        stated = part.axis == "time" and found.onset_s is not None  # by the sentence on the onset
+        if not stated and (part.axis != "signal" or part.share >= 0.5):
+            places.append(part.words(found.log.epochs_s[0]))
     return [f"The gap lies {', '.join(places)}."] if places else []
 
 
