@@ -16,6 +16,7 @@ from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.forward_selection import MOST_PARTS, baseline_noise, select
 from avtorch.gap.budget.gap_budget import budget_of, by_chance
 from avtorch.gap.budget.given_effects import given_effects
+from avtorch.gap.budget.likely_parts import likely_parts
 from avtorch.gap.budget.parts import LIKELY, MATERIAL, Budget, ChancePart, Part
 from avtorch.gap.budget.selection_step import Selection
 from avtorch.gap.budget.share_order import largest_first
@@ -78,7 +79,7 @@ def account(
         budget = _by_likelihood(budget, candidates, verdict, named, winner)
         return Account(budget, selection, tuple(candidates), _verdict(budget, verdict), held_out=False)
     selection = select(record, base, kinds, begun=begun, most=most, progress=progress)
-    selection = largest_first(selection, material, seed=seed)
+    selection = likely_parts(selection, material, seed=seed)
     budget = budget_of(selection, epoch_s=epoch, **options)
     rest = placed(budget.unexplained, selection, kinds, epoch_s=epoch)
     chance = _all_chance(selection, base, kinds, candidates, verdict, winner, budget)

@@ -58,8 +58,8 @@ def enter(fitting: RobustFit, now: Step, test: ScoreTest, candidates: Sequence[C
         if fit.model.at_limit(fit.z, name):
             continue
         held = fitting.hold_out(fit)
-        tried.append(Step(fit, held, name, fitting.evidence(now.held, held).strength()))
-    tried = [step for step in tried if step.strength > 0]
+        tried.append(Step(fit, held, name, fitting.evidence(now.held, held)))
+    tried = [step for step in tried if step.evidence.of_entry > 0]
     if not tried:
         return None
     best = min(tried, key=cost)

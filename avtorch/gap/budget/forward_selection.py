@@ -4,8 +4,8 @@ An effect enters if the blocks that were held out agree on it as surely as one e
 (`held_out_evidence`): while several are missing, each hides the others, and none would pass a stricter test. Of the
 effects that explain the same, as far as the blocks can tell, the simplest is added, and the others are its aliases; so
 is one that explains most of the same with far fewer parameters. Once one has entered, each of those before it has to
-hold its place without it. Then each may be exchanged for another (`exchange`); at the end each has to pass as the best
-of all that were tried.
+hold its place without it. Then each may be exchanged for another (`exchange`). Which of them are likely enough to be
+named is decided at the end, once the gap is known (`likely_parts`).
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from avtorch.gap.budget.entry import candidates_for, enter
 from avtorch.gap.budget.exchange import exchanged
 from avtorch.gap.budget.flexible_regression import left_over
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
+from avtorch.gap.budget.redundancy import without_the_redundant
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
-from avtorch.gap.budget.selection_step import Selection, Step, one_by_one, without_effects
+from avtorch.gap.budget.selection_step import Selection, Step, one_by_one
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant
 
@@ -56,13 +57,13 @@ def select(
         if step is None:
             break
         entered[step.fit.model.names[-1]] = step
-        now, _ = _without_the_redundant(fitting, step, tried=1, spared=step.entered)
+        now, _ = without_the_redundant(fitting, step, spared=step.entered)
     if len(now.fit.model.names) > 1:
         now, others = exchanged(fitting, now, kinds, progress)
         entered |= others
-    now, strengths = _without_the_redundant(fitting, now, tried=len(kinds))
+    now, evidence = without_the_redundant(fitting, now)
     aliases = {name: entered[name].aliases for name in now.fit.model.names}
-    return Selection(fitting, (bare, *one_by_one(fitting, now, strengths, aliases)))
+    return Selection(fitting, (bare, *one_by_one(fitting, now, evidence, aliases)), len(kinds))
 
 
 def _observable(kind: type[Effect], record: AnalysisRecord) -> bool:
@@ -89,19 +90,3 @@ def baseline_noise(record: AnalysisRecord, base: GapPlant) -> tuple[RobustFit, F
         fitting = RobustFit(NoiseWhitening.autoregressive(record, left_over(fitting, fit)))
         fit = fitting.fit(bare, np.concatenate([fit.z[None], starts]), iterations=12)
     return fitting, fit
-
-
-def _without_the_redundant(
-    fitting: RobustFit, step: Step, *, tried: int, spared: str | None = None
-) -> tuple[Step, dict[str, float]]:
-    """The model without effects that do not hold their place, weakest first, and the strength of each that does."""
-    while True:
-        without: dict[str, Step] = {}
-        for name in step.fit.model.names:
-            if name != spared:
-                fit = without_effects(fitting, step.fit, [name])
-                held = fitting.hold_out(fit)
-                without[name] = Step(fit, held, strength=fitting.evidence(held, step.held).strength(tried))
-        if not without or min(s.strength for s in without.values()) > 0:
-            return step, {name: s.strength for name, s in without.items()}
-        step = min(without.values(), key=lambda s: s.strength)

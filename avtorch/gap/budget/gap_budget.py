@@ -7,23 +7,23 @@ time could predict: what a regression on these leaves of held-out blocks, once t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 
 import numpy as np
-from scipy.special import ndtr
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.flexible_regression import left_over
 from avtorch.gap.budget.forward_selection import select
+from avtorch.gap.budget.likely_parts import likely_parts, probabilities
 from avtorch.gap.budget.parts import MATERIAL, Budget, ChancePart, ChannelError, Part, Unexplained
 from avtorch.gap.budget.repaired_model import lag_and_gain, parameters_of
 from avtorch.gap.budget.rollout_energy import horizon
 from avtorch.gap.budget.selection_step import Selection, Step
-from avtorch.gap.budget.share_order import energies, gap_is_there, largest_first, taken_off
+from avtorch.gap.budget.share_order import energies, gap_is_there, taken_off
 from avtorch.gap.budget.slow_disturbance import slow_disturbance
 from avtorch.gap.budget.unexplained_places import placed
 from avtorch.gap.quantity import Quantity
@@ -67,7 +67,7 @@ def gap_budget(
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = chosen_effects(effects)
     selection = select(AnalysisRecord.for_budget(each), base, kinds, progress=progress)
-    selection = largest_first(selection, material, seed=seed)
+    selection = likely_parts(selection, material, seed=seed)
     budget = budget_of(selection, material=material, seed=seed, epoch_s=each[0].epoch_s)
     rest = placed(budget.unexplained, selection, kinds, epoch_s=each[0].epoch_s)
     return replace(budget, unexplained=rest, chance=by_chance(selection, base, kinds))
@@ -104,8 +104,9 @@ def budget_of(
     total = np.maximum(taken.sum(0) + rest, 1e-12)
     shares = taken / total
     unexplained = 1.0 - shares.sum(0)
+    sure = probabilities(selection, energy)
     parts = tuple(
-        _part(selection, step, _quantity(share), float(np.sqrt(energy[number + 1, 0])), epoch_s)
+        _part(selection, step, sure, _quantity(share), float(np.sqrt(energy[number + 1, 0])), epoch_s)
         for number, (step, share) in enumerate(zip(selection.steps[1:], shares, strict=False))
     )
     likely = float((unexplained[1:] > material).mean()) if there else 0.0
@@ -126,15 +127,16 @@ def budget_of(
     )
 
 
-def _part(selection: Selection, step: Step, share: Quantity, after: float, epoch_s: float) -> Part:
+def _part(
+    selection: Selection, step: Step, sure: Mapping[str, float], share: Quantity, after: float, epoch_s: float
+) -> Part:
     assert step.entered is not None
     model, z = selection.last.fit.model, selection.last.fit.z
     onset = model.onsets.get(step.entered)
     return Part(
         name=step.entered,
         alias_set=step.aliases,
-        # on another drive its gain would scatter by one standard error
-        probability=float(ndtr(step.strength)),
+        probability=sure[step.entered],
         share=share,
         after=after,
         parameters=parameters_of(selection, step.entered),

@@ -19,6 +19,7 @@ from avtorch.arrays import FloatArray
 FALSE_ALARMS = 0.02
 """Share of models without anything left to find in which a wrong effect may enter, whatever the number tried."""
 _LEAST_FREEDOM = 1.0
+_MUCH, _LEEWAY = 25.0, 0.6  # nats, from which an effect may enter with so many errors less
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,19 @@ class Evidence:
         reached = -float(special.ndtri(max(beyond, 1e-300)))
         by_ratio = (self.nats + np.log(level)) / np.sqrt(2 * max(abs(self.nats), 1.0))
         return min(reached + float(special.ndtri(level)), float(by_ratio))
+
+    @property
+    def of_entry(self) -> float:
+        """`strength` of one model, with some leeway where much is gained.
+
+        With a dozen blocks, two or three of which excite an effect, Student's law rejects nearly all. What enters is
+        judged at the end by all its figures (`part_odds`).
+        """
+        return self.strength() + (_LEEWAY if self.nats > _MUCH else 0.0)
+
+
+NOTHING = Evidence(0.0, 0.0, _LEAST_FREEDOM)
+"""No evidence either way."""
 
 
 def agreement(score: FloatArray, size: FloatArray) -> tuple[float, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
+from avtorch.gap.budget.held_out_evidence import NOTHING, Evidence
 from avtorch.gap.budget.robust_fit import Fit, HeldOut, RobustFit
 
 _REFITTING = 5  # iterations after a model has lost an effect
@@ -12,21 +13,22 @@ _REFITTING = 5  # iterations after a model has lost an effect
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A model, the effect that `entered` last, its `strength` (`Evidence.strength`) and its `aliases` by name."""
+    """A model, the effect that `entered` last, its `evidence` over the model without it, and its `aliases` by name."""
 
     fit: Fit
     held: HeldOut
     entered: str | None = None
-    strength: float = 0.0
+    evidence: Evidence = NOTHING
     aliases: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """`steps` from the bare baseline on; each has one effect more than the one before it."""
+    """`steps` from the bare baseline on, each with one effect more than the one before; `tried`: how many there were."""
 
     fitting: RobustFit
     steps: tuple[Step, ...]
+    tried: int = 1
 
     @property
     def last(self) -> Step:
@@ -34,14 +36,14 @@ class Selection:
 
 
 def one_by_one(
-    fitting: RobustFit, last: Step, strengths: Mapping[str, float], aliases: Mapping[str, tuple[str, ...]]
+    fitting: RobustFit, last: Step, evidence: Mapping[str, Evidence], aliases: Mapping[str, tuple[str, ...]]
 ) -> tuple[Step, ...]:
     """Steps up to `last` whose models grow by one effect each."""
     steps, names = [], last.fit.model.names
     for count, name in enumerate(names, start=1):
         fit = without_effects(fitting, last.fit, names[count:])
         held = last.held if fit is last.fit else fitting.hold_out(fit)
-        steps.append(Step(fit, held, name, strengths.get(name, 0.0), aliases.get(name, (name,))))
+        steps.append(Step(fit, held, name, evidence.get(name, NOTHING), aliases.get(name, (name,))))
     return tuple(steps)
 
 

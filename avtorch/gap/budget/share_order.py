@@ -59,7 +59,7 @@ def largest_first(selection: Selection, material: float = MATERIAL, *, seed: int
         steps.append(replace(entered[name], fit=now.fit, held=now.held))
         now = without[name]
         without = _without_each(selection, now)
-    return Selection(selection.fitting, (bare, *reversed(steps)))
+    return replace(selection, steps=(bare, *reversed(steps)))
 
 
 def _without_each(selection: Selection, step: Step) -> Mapping[str, Step]:

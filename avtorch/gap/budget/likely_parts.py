@@ -1,0 +1,44 @@
+"""The effects of a selection that are parts of the gap, and likely enough to be named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from avtorch.arrays import FloatArray
+from avtorch.gap.budget.part_odds import PartOdds
+from avtorch.gap.budget.parts import LIKELY, MATERIAL
+from avtorch.gap.budget.redundancy import without_the_redundant
+from avtorch.gap.budget.selection_step import Selection, Step, one_by_one, without_effects
+from avtorch.gap.budget.share_order import energies, largest_first
+
+
+def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int = 0) -> Selection:
+    """The selection's parts in the order of what they take off the gap, without those less likely there than not.
+
+    The least likely goes first; what its going does to the others is looked at anew.
+    """
+    selection = largest_first(selection, material, seed=seed)
+    while len(selection.steps) > 1:
+        each = probabilities(selection, energies(selection, seed)[-1])
+        unlikeliest = min(each, key=each.__getitem__)
+        if each[unlikeliest] >= LIKELY:
+            break
+        selection = largest_first(_without(selection, unlikeliest), material, seed=seed)
+    return selection
+
+
+def probabilities(selection: Selection, energy: FloatArray) -> dict[str, float]:
+    """That each effect is there, by name; `energy` (model, draw) as `energies` gives it."""
+    odds, gap = PartOdds.read(), float(energy[0, 0]) - 1.0
+    blocks, tried = selection.fitting.whitening.record.blocks, selection.tried
+    return {
+        str(s.entered): odds.probability(s.evidence, blocks=blocks, gap=gap, tried=tried) for s in selection.steps[1:]
+    }
+
+
+def _without(selection: Selection, name: str) -> Selection:
+    fitting = selection.fitting
+    fit = without_effects(fitting, selection.last.fit, [name])
+    last, evidence = without_the_redundant(fitting, Step(fit, fitting.hold_out(fit)))
+    aliases = {str(s.entered): s.aliases for s in selection.steps[1:]}
+    return replace(selection, steps=(selection.steps[0], *one_by_one(fitting, last, evidence, aliases)))

@@ -1,0 +1,26 @@
+"""Effects that the others of a model do without, by the blocks that were held out."""
+
+from __future__ import annotations
+
+from avtorch.gap.budget.held_out_evidence import Evidence
+from avtorch.gap.budget.robust_fit import RobustFit
+from avtorch.gap.budget.selection_step import Step, without_effects
+
+
+def without_the_redundant(
+    fitting: RobustFit, step: Step, *, spared: str | None = None
+) -> tuple[Step, dict[str, Evidence]]:
+    """The model without effects that do not hold their place, weakest first, and the evidence for each that does."""
+    while True:
+        without = {name: _without(fitting, step, name) for name in step.fit.model.names if name != spared}
+        weakest = min(without.values(), key=lambda s: s.evidence.of_entry, default=None)
+        if weakest is None or weakest.evidence.of_entry > 0:
+            return step, {name: s.evidence for name, s in without.items()}
+        step = weakest
+
+
+def _without(fitting: RobustFit, step: Step, name: str) -> Step:
+    """`step` without an effect, with the evidence for that one."""
+    fit = without_effects(fitting, step.fit, [name])
+    held = fitting.hold_out(fit)
+    return Step(fit, held, evidence=fitting.evidence(held, step.held))

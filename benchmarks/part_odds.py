@@ -1,0 +1,177 @@
+"""Fit the odds of the budget's parts to simulated cases, and write them with their provenance.
+
+``python -m benchmarks.part_odds --seed 20261125 --cases 240 --kept out/part_odds [--recorder ordinary] [--write]``
+
+Draws cases of the blind test's reference vehicle, selects effects on their held-out blocks, and keeps the figures of
+each part of the gap in `--kept`, one line a case (some ten seconds of processor time); a second call goes on where the
+first ended. It prints how the odds do on cases that were left out, beside Student's law alone. `--write` fits them to
+all the cases in `--kept`, of both recorders, and writes `avtorch/gap/budget/part_odds.json`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+from collections import Counter
+from collections.abc import Sequence
+from datetime import date
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import log_expit, ndtr
+
+from avtorch.arrays import BoolArray, FloatArray, IntArray
+from avtorch.blindtest import draw_case
+from avtorch.blindtest.cases import Recording
+from avtorch.gap import plant
+from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.forward_selection import select
+from avtorch.gap.budget.held_out_evidence import Evidence
+from avtorch.gap.budget.part_odds import PATH, SCHEMA, PartOdds, figures
+from avtorch.gap.budget.share_order import energies, largest_first
+from avtorch.gap.simulator.effect_choice import chosen_effects
+from avtorch.io import write_json
+
+MIX = {"none": 0.3, "single": 0.4, "pair": 0.2, "several": 0.1}
+_RIDGE = 0.5  # of the weights but the constant, as two parts would have it
+_FOLDS = 10
+_DIGITS = 3
+
+
+def case_figures(index: int, seed: int, recorder: Recording) -> dict[str, Any]:
+    """The parts that are selected on one drawn case, with their evidence, and whether each is there."""
+    case = draw_case(index, seed, mix=MIX, recorder=recorder)
+    record = AnalysisRecord.for_budget([case.log()])
+    selection = largest_first(select(record, plant([]), chosen_effects(None)))
+    truth = case.truth()
+    return {
+        "case": index,
+        "seed": seed,
+        "recorder": recorder,
+        "kind": truth["kind"],
+        "tier": truth["tier"],
+        "names": truth["names"],
+        "blocks": record.blocks,
+        "tried": selection.tried,
+        "gap": float(energies(selection, 0)[-1][0, 0]) - 1.0,
+        "parts": [
+            {
+                "name": step.entered,
+                "there": bool({step.entered, *step.aliases} & set(truth["names"])),
+                "nats": step.evidence.nats,
+                "errors": step.evidence.errors,
+                "freedom": step.evidence.freedom,
+            }
+            for step in selection.steps[1:]
+        ],
+    }
+
+
+def collect(folder: Path, seed: int, cases: int, recorder: Recording) -> None:
+    """Keep the figures of `cases` cases in `folder`; those that are there already are not drawn again."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{recorder}_{seed}.jsonl"
+    done = len(path.read_text(encoding="utf-8").splitlines()) if path.exists() else 0
+    with path.open("a", encoding="utf-8") as lines:
+        for index in range(done, cases):
+            lines.write(json.dumps(case_figures(index, seed, recorder)) + "\n")
+            lines.flush()
+            print(f"{recorder}: case {index + 1} of {cases}", flush=True)
+
+
+def kept(folder: Path) -> list[dict[str, Any]]:
+    """All cases in `folder`."""
+    paths = sorted(folder.glob("*.jsonl"))
+    return [json.loads(line) for path in paths for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def table(cases: Sequence[dict[str, Any]]) -> tuple[FloatArray, FloatArray, BoolArray, IntArray, FloatArray]:
+    """Of all parts: figures (part, 5), log effects tried, whether it is there, its case, what Student's law says."""
+    rows, tried, there, of, strict = [], [], [], [], []
+    for number, case in enumerate(cases):
+        for part in case["parts"]:
+            evidence = Evidence(part["nats"], part["errors"], part["freedom"])
+            rows.append(figures(evidence, case["blocks"], case["gap"]))
+            there.append(part["there"])
+            of.append(number)
+            tried.append(np.log(case["tried"]))
+            strict.append(ndtr(evidence.strength(case["tried"])))
+    return np.array(rows), np.array(tried), np.array(there), np.array(of), np.array(strict)
+
+
+def fit(rows: FloatArray, tried: FloatArray, there: BoolArray) -> PartOdds:
+    """The weights that make `there` likeliest."""
+    sign = np.where(there, 1.0, -1.0)
+
+    def cost(w: FloatArray) -> float:
+        return float(-log_expit(sign * (rows @ w - tried)).sum() + 0.5 * _RIDGE * (w[1:] ** 2).sum())
+
+    best = minimize(cost, np.zeros(rows.shape[1]), method="BFGS").x
+    return PartOdds(*(float(f"{w:.{_DIGITS}g}") for w in best))
+
+
+def left_out(rows: FloatArray, tried: FloatArray, there: BoolArray, of: IntArray) -> FloatArray:
+    """Each part's probability, by a fit to the other cases."""
+    fold = np.random.default_rng(0).integers(0, _FOLDS, of.max() + 1)[of]
+    probability = np.zeros(len(rows))
+    for k in range(_FOLDS):
+        odds, own = fit(rows[fold != k], tried[fold != k], there[fold != k]), fold == k
+        probability[own] = np.exp(log_expit(rows[own] @ odds.weights - tried[own]))
+    return probability
+
+
+def scores(probability: FloatArray, there: BoolArray, of: IntArray, cases: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Log loss and calibration error of probabilities, and what is named with them."""
+    p = np.clip(probability, 0.005, 0.995)  # as few cases would allow
+    tenth = np.minimum((10 * p).astype(int), 9)
+    error = sum(abs(p[tenth == k].mean() - there[tenth == k].mean()) * (tenth == k).mean() for k in set(tenth))
+    named = p >= 0.5
+    none = [number for number, case in enumerate(cases) if case["kind"] == "none"]
+    return {
+        "log_loss": round(float(-np.where(there, np.log(p), np.log(1 - p)).mean()), 3),
+        "calibration_error": round(float(error), 3),
+        "named": int(named.sum()),
+        "of_them_there": round(float(there[named].mean()), 3),
+        "there_and_named": round(float(there[named].sum() / there.sum()), 3),
+        "without_a_cause": len(none),
+        "of_them_accused": len(set(of[named].tolist()) & set(none)),
+    }
+
+
+def main() -> None:
+    """Collect, print, and write where asked to."""
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--cases", type=int, required=True)
+    parser.add_argument("--kept", type=Path, required=True)
+    parser.add_argument("--recorder", choices=get_args(Recording), default="ordinary")
+    parser.add_argument("--write", action="store_true")
+    args = parser.parse_args()
+    collect(args.kept, args.seed, args.cases, args.recorder)
+    cases = kept(args.kept)
+    rows, tried, there, of, strict = table(cases)
+    by_odds = scores(left_out(rows, tried, there, of), there, of, cases)
+    by_law = scores(strict, there, of, cases)
+    print(f"{len(rows)} parts of {len(cases)} cases")
+    for key in by_odds:
+        print(f"{key:20} {by_odds[key]:8} by the odds (cases left out) {by_law[key]:8} by Student's law")
+    if args.write:
+        odds, counts = fit(rows, tried, there), Counter((case["recorder"], case["seed"]) for case in cases)
+        commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
+        provenance = {
+            "made_by": "python -m benchmarks.part_odds --write",
+            "cases": [{"recorder": r, "seed": s, "cases": n, "mix": MIX} for (r, s), n in sorted(counts.items())],
+            "parts": len(rows),
+            "date": date.today().isoformat(),
+            "commit": commit.stdout.strip(),
+            "left_out": by_odds,
+            "students_law": by_law,
+        }
+        write_json(PATH, {"schema": SCHEMA, "weights": vars(odds), "provenance": provenance})
+
+
+if __name__ == "__main__":
+    main()
