@@ -24,7 +24,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """`steps` from the bare baseline on, each with one effect more than the one before; `tried`: how many there were."""
+    """`steps` from the bare baseline on, each with one effect more than the one before; `tried`: of how many."""
 
     fitting: RobustFit
     steps: tuple[Step, ...]
