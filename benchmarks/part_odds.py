@@ -89,12 +89,12 @@ def kept(folder: Path) -> list[dict[str, Any]]:
 
 
 def table(cases: Sequence[dict[str, Any]]) -> tuple[FloatArray, FloatArray, BoolArray, IntArray, FloatArray]:
-    """Of all parts: figures (part, 5), log effects tried, whether it is there, its case, what Student's law says."""
+    """Of all parts: figures (part, 3), log effects tried, whether it is there, its case, what Student's law says."""
     rows, tried, there, of, strict = [], [], [], [], []
     for number, case in enumerate(cases):
         for part in case["parts"]:
             evidence = Evidence(part["nats"], part["errors"], part["freedom"])
-            rows.append(figures(evidence, case["blocks"], case["gap"]))
+            rows.append(figures(evidence))
             there.append(part["there"])
             of.append(number)
             tried.append(np.log(case["tried"]))
@@ -102,15 +102,15 @@ def table(cases: Sequence[dict[str, Any]]) -> tuple[FloatArray, FloatArray, Bool
     return np.array(rows), np.array(tried), np.array(there), np.array(of), np.array(strict)
 
 
-def fit(rows: FloatArray, tried: FloatArray, there: BoolArray) -> PartOdds:
-    """The weights that make `there` likeliest."""
+def fit(rows: FloatArray, tried: FloatArray, there: BoolArray, empty: float = 0.5) -> PartOdds:
+    """The weights that make `there` likeliest; `empty` as it is."""
     sign = np.where(there, 1.0, -1.0)
 
     def cost(w: FloatArray) -> float:
         return float(-log_expit(sign * (rows @ w - tried)).sum() + 0.5 * _RIDGE * (w[1:] ** 2).sum())
 
     best = minimize(cost, np.zeros(rows.shape[1]), method="BFGS").x
-    return PartOdds(*(float(f"{w:.{_DIGITS}g}") for w in best))
+    return PartOdds(*(float(f"{w:.{_DIGITS}g}") for w in [*best, empty]))
 
 
 def left_out(rows: FloatArray, tried: FloatArray, there: BoolArray, of: IntArray) -> FloatArray:
@@ -121,6 +121,12 @@ def left_out(rows: FloatArray, tried: FloatArray, there: BoolArray, of: IntArray
         odds, own = fit(rows[fold != k], tried[fold != k], there[fold != k]), fold == k
         probability[own] = np.exp(log_expit(rows[own] @ odds.weights - tried[own]))
     return probability
+
+
+def without_a_cause(cases: Sequence[dict[str, Any]], named: IntArray) -> float:
+    """Share of the cases of which no part is named that have no cause; `named`: numbers of the others."""
+    empty = [case["kind"] == "none" for number, case in enumerate(cases) if number not in set(named.tolist())]
+    return (sum(empty) + 0.5) / (len(empty) + 1.0)
 
 
 def scores(probability: FloatArray, there: BoolArray, of: IntArray, cases: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -159,7 +165,8 @@ def main() -> None:
     for key in by_odds:
         print(f"{key:20} {by_odds[key]:8} by the odds (cases left out) {by_law[key]:8} by Student's law")
     if args.write:
-        odds, counts = fit(rows, tried, there), Counter((case["recorder"], case["seed"]) for case in cases)
+        empty = without_a_cause(cases, of[left_out(rows, tried, there, of) >= 0.5])
+        odds, counts = fit(rows, tried, there, empty), Counter((case["recorder"], case["seed"]) for case in cases)
         commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
         provenance = {
             "made_by": "python -m benchmarks.part_odds --write",
@@ -170,7 +177,7 @@ def main() -> None:
             "left_out": by_odds,
             "students_law": by_law,
         }
-        write_json(PATH, {"schema": SCHEMA, "weights": vars(odds), "provenance": provenance})
+        write_json(PATH, {"schema": SCHEMA, "constants": vars(odds), "provenance": provenance})
 
 
 if __name__ == "__main__":

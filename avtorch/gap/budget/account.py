@@ -17,6 +17,7 @@ from avtorch.gap.budget.forward_selection import MOST_PARTS, baseline_noise, sel
 from avtorch.gap.budget.gap_budget import budget_of, by_chance
 from avtorch.gap.budget.given_effects import given_effects
 from avtorch.gap.budget.likely_parts import likely_parts
+from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.budget.parts import LIKELY, MATERIAL, Budget, ChancePart, Part
 from avtorch.gap.budget.selection_step import Selection
 from avtorch.gap.budget.share_order import largest_first
@@ -231,15 +232,21 @@ def _spread(candidates: Sequence[Candidate], budget: Budget, kinds: Sequence[typ
 
     The likelihood cannot say how probable a hypothesis is whose noise does not hold; what it left to `unknown` goes to
     the parts that held-out blocks select, as far as these are sure, and to `unknown` as far as something material is
-    left besides.
+    left besides. Where they select nothing, some drives have a cause that they are too short or too calm to show; each
+    effect by itself is as likely to be that.
     """
     free = math.fsum(c.probability for c in candidates if c.name in ALWAYS)
     left = budget.unexplained.probability
     name, sure = candidate_name(budget.names), min((p.probability for p in budget.parts), default=0.0)
-    shares = {"unknown": free * left, "none": free * (1 - left)}
+    empty = PartOdds.read().empty
+    hidden = [c.name for c in candidates if len(c.effects) == 1 and c.name not in ALWAYS]
+    shares = {"unknown": free * left, "none": free * (1 - left) * (empty if hidden else 1.0)}
     if budget.names:
         sure = min(p.probability for p in (*budget.parts, *budget.chance) if p.name in budget.names)
         shares = {"unknown": free * ((1 - sure) + sure * left), "none": 0.0, name: free * sure * (1 - left)}
+    else:
+        each = free * (1 - left) * (1 - empty) / max(len(hidden), 1)
+        shares |= {c.name: c.probability + each for c in candidates if c.name in hidden}
     out = [replace(c, probability=shares.get(c.name, c.probability)) for c in candidates if c.name != name]
     if budget.names:
         before = next((c for c in candidates if c.name == name), None)

@@ -104,7 +104,7 @@ def budget_of(
     total = np.maximum(taken.sum(0) + rest, 1e-12)
     shares = taken / total
     unexplained = 1.0 - shares.sum(0)
-    sure = probabilities(selection, energy)
+    sure = probabilities(selection)
     parts = tuple(
         _part(selection, step, sure, _quantity(share), float(np.sqrt(energy[number + 1, 0])), epoch_s)
         for number, (step, share) in enumerate(zip(selection.steps[1:], shares, strict=False))

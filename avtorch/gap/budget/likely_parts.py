@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from avtorch.arrays import FloatArray
 from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.budget.parts import LIKELY, MATERIAL
 from avtorch.gap.budget.redundancy import without_the_redundant
 from avtorch.gap.budget.selection_step import Selection, Step, one_by_one, without_effects
-from avtorch.gap.budget.share_order import energies, largest_first
+from avtorch.gap.budget.share_order import largest_first
 
 
 def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int = 0) -> Selection:
@@ -19,7 +18,7 @@ def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int 
     """
     selection = largest_first(selection, material, seed=seed)
     while len(selection.steps) > 1:
-        each = probabilities(selection, energies(selection, seed)[-1])
+        each = probabilities(selection)
         unlikeliest = min(each, key=each.__getitem__)
         if each[unlikeliest] >= LIKELY:
             break
@@ -27,13 +26,10 @@ def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int 
     return selection
 
 
-def probabilities(selection: Selection, energy: FloatArray) -> dict[str, float]:
-    """That each effect is there, by name; `energy` (model, draw) as `energies` gives it."""
-    odds, gap = PartOdds.read(), float(energy[0, 0]) - 1.0
-    blocks, tried = selection.fitting.whitening.record.blocks, selection.tried
-    return {
-        str(s.entered): odds.probability(s.evidence, blocks=blocks, gap=gap, tried=tried) for s in selection.steps[1:]
-    }
+def probabilities(selection: Selection) -> dict[str, float]:
+    """That each effect is there, by name."""
+    odds = PartOdds.read()
+    return {str(s.entered): odds.probability(s.evidence, selection.tried) for s in selection.steps[1:]}
 
 
 def _without(selection: Selection, name: str) -> Selection:
