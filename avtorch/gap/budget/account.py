@@ -82,7 +82,7 @@ def account(
     selection = select(record, base, kinds, begun=begun, most=most, progress=progress)
     selection = likely_parts(selection, material, seed=seed)
     budget = budget_of(selection, epoch_s=epoch, **options)
-    rest = placed(budget.unexplained, selection, kinds, epoch_s=epoch)
+    rest = placed(budget.unexplained, selection, epoch_s=epoch)
     chance = _all_chance(selection, base, kinds, candidates, verdict, winner, budget)
     budget = replace(budget, unexplained=rest, chance=chance)
     held_out = tuple(_spread(candidates, budget, kinds))

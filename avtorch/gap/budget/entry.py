@@ -7,11 +7,12 @@ same with far fewer parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.budget.score_test import Candidate, ScoreTest
 from avtorch.gap.budget.selection_step import Step, complexity, cost
@@ -25,6 +26,17 @@ _FITTED = 9  # effects that are fitted, those of which a score test promises mos
 _SCREENING = 3  # iterations of these fits
 _SCREENED = 5  # effects that are held out, of those fitted
 _ONSET_NATS = 6.0  # that an onset must gain
+
+
+def observable(kinds: Iterable[type[Effect]], record: AnalysisRecord) -> list[type[Effect]]:
+    """Those of `kinds` that predict something, and something that `record` measures."""
+
+    def seen(kind: type[Effect]) -> bool:
+        if kind.random or (kind.needs_speed and not record.has_speed):
+            return False
+        return kind.place != "sensor" or len(record.channels) == 2
+
+    return [kind for kind in kinds if seen(kind)]
 
 
 def candidates_for(

@@ -16,7 +16,7 @@ import numpy as np
 
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.effect_model import LATENESS, EffectModel
-from avtorch.gap.budget.entry import candidates_for, enter
+from avtorch.gap.budget.entry import candidates_for, enter, observable
 from avtorch.gap.budget.exchange import exchanged
 from avtorch.gap.budget.flexible_regression import left_over
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
@@ -44,7 +44,7 @@ def select(
 
     At `most` so many, with every step on the way. `begun`: a selection of the same record, which is continued.
     """
-    kinds = [k for k in kinds if not k.random and _observable(k, record)]
+    kinds = observable(kinds, record)
     if begun is None:
         fitting, start = baseline_noise(record, base)
         begun = Selection(fitting, (Step(start, fitting.hold_out(start)),))
@@ -64,12 +64,6 @@ def select(
     now, evidence = without_the_redundant(fitting, now)
     aliases = {name: entered[name].aliases for name in now.fit.model.names}
     return Selection(fitting, (bare, *one_by_one(fitting, now, evidence, aliases)), len(kinds))
-
-
-def _observable(kind: type[Effect], record: AnalysisRecord) -> bool:
-    if kind.needs_speed and not record.has_speed:
-        return False
-    return kind.place != "sensor" or len(record.channels) == 2
 
 
 def baseline_noise(record: AnalysisRecord, base: GapPlant) -> tuple[RobustFit, Fit]:

@@ -69,7 +69,7 @@ def gap_budget(
     selection = select(AnalysisRecord.for_budget(each), base, kinds, progress=progress)
     selection = likely_parts(selection, material, seed=seed)
     budget = budget_of(selection, material=material, seed=seed, epoch_s=each[0].epoch_s)
-    rest = placed(budget.unexplained, selection, kinds, epoch_s=each[0].epoch_s)
+    rest = placed(budget.unexplained, selection, epoch_s=each[0].epoch_s)
     return replace(budget, unexplained=rest, chance=by_chance(selection, base, kinds))
 
 

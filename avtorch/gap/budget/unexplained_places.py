@@ -1,14 +1,14 @@
 """Where the unexplained part of a gap lies, and which effect it resembles.
 
 What a regression without physics predicts of held-out blocks is reproducible (`flexible_regression`). On each axis the
-part named is the shortest stretch that holds nearly all of it, if clearly fewer rows lie there, and if the blocks agree
+part named is the shortest stretch that holds most of it, if clearly fewer rows lie there, and if the blocks agree
 that the prediction holds within it. The effect it resembles is the one of which a score test at the selected model
-promises most; it did not enter, so it is a hint for whoever looks, and no cause.
+promises most, of all that are registered; it did not enter, or was not asked for, so it is a hint for whoever looks and
+no cause.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from scipy.special import stdtr
 from scipy.stats import false_discovery_control
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.budget.entry import candidates_for
+from avtorch.gap.budget.entry import candidates_for, observable
 from avtorch.gap.budget.flexible_regression import predicted_residuals
 from avtorch.gap.budget.held_out_evidence import agreement
 from avtorch.gap.budget.parts import Unexplained
@@ -24,16 +24,15 @@ from avtorch.gap.budget.rollout_energy import held_out_residuals
 from avtorch.gap.budget.selection_step import Selection
 from avtorch.gap.crossval.localisation import PLAINLY, RATE, Axis, Location, shortest
 from avtorch.gap.likelihood.basis import lowpass
-from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.effect import EFFECTS
 
-_MOST = 0.9  # share of what is predicted that a part holds
+_MOST = 0.8  # share of the energy predicted that a part holds; some of it is always spread thinly
 _MUCH = 0.5  # of what the regression gains, from which an effect resembles it
+_NEARLY = 0.8  # of the best effect's promise, from which a simpler one takes its place
 
 
-def placed(
-    rest: Unexplained, selection: Selection, kinds: Sequence[type[Effect]], *, epoch_s: float = 0.0
-) -> Unexplained:
-    """`rest` with its places and the effect it resembles among `kinds`; as it is where nothing material is left.
+def placed(rest: Unexplained, selection: Selection, *, epoch_s: float = 0.0) -> Unexplained:
+    """`rest` with its places and the effect it resembles; as it is where nothing material is left.
 
     `epoch_s`: the first log's start on its own clock.
     """
@@ -47,7 +46,7 @@ def placed(
     white = fitting.whitening(residuals)
     gain = float((fitting.nats(white) - fitting.nats(white - fitting.whitening(predicted))).sum())
     where = _places(selection, white, predicted, epoch_s)
-    return replace(rest, where=where, resembles=_resembling(selection, kinds, gain))
+    return replace(rest, where=where, resembles=_resembling(selection, gain))
 
 
 def _places(selection: Selection, white: FloatArray, predicted: FloatArray, epoch_s: float) -> tuple[Location, ...]:
@@ -56,7 +55,7 @@ def _places(selection: Selection, white: FloatArray, predicted: FloatArray, epoc
     found = whitening(predicted)
     score, size = white * found, found**2
     does = np.zeros(record.rows)
-    does[whitening.order] = np.sqrt(size.sum(0))
+    does[whitening.order] = size.sum(0)
     lag = float(fit.model.values(fit.z)["T_L"])
     axes: list[tuple[Axis, FloatArray]] = [("command", lowpass(record.command, lag, record.dt))]
     if record.has_speed:
@@ -81,9 +80,13 @@ def _places(selection: Selection, white: FloatArray, predicted: FloatArray, epoc
     return tuple(sorted(sure, key=lambda part: part.q_value))
 
 
-def _resembling(selection: Selection, kinds: Sequence[type[Effect]], gain: float) -> str | None:
+def _resembling(selection: Selection, gain: float) -> str | None:
     """The effect not selected that promises most, if that is much of the `gain` [nats]."""
-    plain = [kind for kind in kinds if not kind.random]
-    candidates = candidates_for(selection.fitting, selection.last, plain, None, "")[1]
-    best = candidates[0] if candidates else None
-    return best.model.names[-1] if best is not None and best.promise >= _MUCH * max(gain, 0.0) else None
+    kinds = observable(EFFECTS.values(), selection.fitting.whitening.record)
+    candidates = candidates_for(selection.fitting, selection.last, kinds, None, "")[1]
+    best = max((c.promise for c in candidates), default=0.0)
+    if best < _MUCH * max(gain, 1.0):
+        return None
+    # a free course of the road follows whatever is simpler too
+    simplest = min((c for c in candidates if c.promise >= _NEARLY * best), key=lambda c: c.model.size)
+    return simplest.model.names[-1]

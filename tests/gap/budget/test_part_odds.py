@@ -1,0 +1,74 @@
+"""Probabilities of parts follow their evidence, and the file in use is one that the script can make."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.special import expit
+
+from avtorch.gap.budget.held_out_evidence import Evidence
+from avtorch.gap.budget.part_odds import PATH, SCHEMA, PartOdds, figures
+from benchmarks.part_odds import fit, left_out, scores, without_a_cause
+
+ODDS = PartOdds.read()
+
+
+def test_more_evidence_is_more_probable() -> None:
+    each = [ODDS.probability(Evidence(nats, errors, 8.0), 22) for nats, errors in ((2, 1), (20, 3), (80, 8), (800, 40))]
+    assert each == sorted(each)
+    assert each[0] < 0.1 < 0.9 < each[-1] < 1.0
+
+
+def test_of_many_tried_one_is_more_often_wrong() -> None:
+    evidence = Evidence(20.0, 4.0, 8.0)
+    one, many = (ODDS.probability(evidence, tried) for tried in (1, 20))
+    assert one / (1 - one) == pytest.approx(20 * many / (1 - many))
+
+
+def test_no_evidence_is_no_error() -> None:
+    assert 0.0 < ODDS.probability(Evidence(-50.0, -3.0, 1.0), 22) < 0.05
+
+
+def test_the_file_names_its_cases() -> None:
+    document = json.loads(PATH.read_text(encoding="utf-8"))
+    assert document["schema"] == SCHEMA
+    made = document["provenance"]
+    assert {entry["recorder"] for entry in made["cases"]} == {"ideal", "ordinary"}
+    assert made["left_out"]["log_loss"] < made["students_law"]["log_loss"]
+
+
+@pytest.mark.statistical
+def test_the_fit_finds_the_odds_that_made_the_parts(rotating_seed: int) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    parts = 4000
+    rows = np.array([figures(Evidence(x, y, 8.0)) for x, y in np.exp(rng.normal((3.0, 1.5), 1.0, (parts, 2)))])
+    tried = np.full(parts, np.log(20.0))
+    wanted = np.array([-1.0, 0.8, 0.8])
+    odds = rows @ wanted - tried
+    there = rng.random(parts) < expit(odds)
+    found = fit(rows, tried, there)
+    weight = expit(odds) * expit(-odds)
+    covariance = np.linalg.inv((rows * weight[:, None]).T @ rows)
+    far = found.weights - wanted
+    # chi-square of three degrees of freedom, one in 10,000; rounding to three digits and the ridge are far smaller
+    assert far @ np.linalg.solve(covariance, far) < 21.1
+
+
+def test_figures_of_a_small_set() -> None:
+    cases = [{"kind": "none"}, {"kind": "none"}, {"kind": "single"}, {"kind": "single"}]
+    there, of = np.array([False, True, True]), np.array([1, 2, 3])
+    found = scores(np.array([0.6, 0.9, 0.2]), there, of, cases)
+    assert found["named"] == 2
+    assert found["of_them_there"] == 0.5
+    assert found["there_and_named"] == 0.5
+    assert (found["without_a_cause"], found["of_them_accused"]) == (2, 1)
+    # named in cases 1 and 2; of 0 and 3 one has none
+    assert without_a_cause(cases, np.array([1, 2])) == pytest.approx(1.5 / 3)
+
+
+def test_a_part_is_never_judged_by_its_own_case() -> None:
+    rows = np.array([figures(Evidence(20.0, 4.0, 8.0))] * 40)
+    there, of = np.arange(40) % 2 == 0, np.arange(40) // 2
+    assert left_out(rows, np.zeros(40), there, of) == pytest.approx(0.5, abs=0.05)  # every case has one of each
