@@ -30,7 +30,7 @@ from avtorch.gap import plant
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.forward_selection import select
 from avtorch.gap.budget.held_out_evidence import Evidence
-from avtorch.gap.budget.part_odds import PATH, SCHEMA, PartOdds, figures
+from avtorch.gap.budget.part_odds import PATH, SCHEMA, PartOdds, by_agreement, figures
 from avtorch.gap.budget.share_order import energies, largest_first
 from avtorch.gap.simulator.effect_choice import chosen_effects
 from avtorch.io import write_json
@@ -88,9 +88,11 @@ def kept(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for path in paths for line in path.read_text(encoding="utf-8").splitlines()]
 
 
-def table(cases: Sequence[dict[str, Any]]) -> tuple[FloatArray, FloatArray, BoolArray, IntArray, FloatArray]:
-    """Of all parts: figures (part, 3), log effects tried, whether it is there, its case, what Student's law says."""
-    rows, tried, there, of, strict = [], [], [], [], []
+def table(
+    cases: Sequence[dict[str, Any]],
+) -> tuple[FloatArray, FloatArray, BoolArray, IntArray, FloatArray, FloatArray]:
+    """Of all parts: figures (part, 3), log effects tried, whether there, its case, `by_agreement`, Student's law."""
+    rows, tried, there, of, agreed, strict = [], [], [], [], [], []
     for number, case in enumerate(cases):
         for part in case["parts"]:
             evidence = Evidence(part["nats"], part["errors"], part["freedom"])
@@ -98,8 +100,9 @@ def table(cases: Sequence[dict[str, Any]]) -> tuple[FloatArray, FloatArray, Bool
             there.append(part["there"])
             of.append(number)
             tried.append(np.log(case["tried"]))
+            agreed.append(by_agreement(evidence, case["tried"]))
             strict.append(ndtr(evidence.strength(case["tried"])))
-    return np.array(rows), np.array(tried), np.array(there), np.array(of), np.array(strict)
+    return np.array(rows), np.array(tried), np.array(there), np.array(of), np.array(agreed), np.array(strict)
 
 
 def fit(rows: FloatArray, tried: FloatArray, there: BoolArray, empty: float = 0.5) -> PartOdds:
@@ -113,14 +116,14 @@ def fit(rows: FloatArray, tried: FloatArray, there: BoolArray, empty: float = 0.
     return PartOdds(*(float(f"{w:.{_DIGITS}g}") for w in [*best, empty]))
 
 
-def left_out(rows: FloatArray, tried: FloatArray, there: BoolArray, of: IntArray) -> FloatArray:
-    """Each part's probability, by a fit to the other cases."""
+def left_out(rows: FloatArray, tried: FloatArray, there: BoolArray, of: IntArray, agreed: FloatArray) -> FloatArray:
+    """Each part's probability, by a fit to the other cases; none above what is `agreed` on (`by_agreement`)."""
     fold = np.random.default_rng(0).integers(0, _FOLDS, of.max() + 1)[of]
     probability = np.zeros(len(rows))
     for k in range(_FOLDS):
         odds, own = fit(rows[fold != k], tried[fold != k], there[fold != k]), fold == k
         probability[own] = np.exp(log_expit(rows[own] @ odds.weights - tried[own]))
-    return probability
+    return np.minimum(probability, agreed)
 
 
 def without_a_cause(cases: Sequence[dict[str, Any]], named: IntArray) -> float:
@@ -158,14 +161,15 @@ def main() -> None:
     args = parser.parse_args()
     collect(args.kept, args.seed, args.cases, args.recorder)
     cases = kept(args.kept)
-    rows, tried, there, of, strict = table(cases)
-    by_odds = scores(left_out(rows, tried, there, of), there, of, cases)
+    rows, tried, there, of, agreed, strict = table(cases)
+    probability = left_out(rows, tried, there, of, agreed)
+    by_odds = scores(probability, there, of, cases)
     by_law = scores(strict, there, of, cases)
     print(f"{len(rows)} parts of {len(cases)} cases")
     for key in by_odds:
         print(f"{key:20} {by_odds[key]:8} by the odds (cases left out) {by_law[key]:8} by Student's law")
     if args.write:
-        empty = without_a_cause(cases, of[left_out(rows, tried, there, of) >= 0.5])
+        empty = without_a_cause(cases, of[probability >= 0.5])
         odds, counts = fit(rows, tried, there, empty), Counter((case["recorder"], case["seed"]) for case in cases)
         commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
         provenance = {

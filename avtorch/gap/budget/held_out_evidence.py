@@ -19,7 +19,9 @@ from avtorch.arrays import FloatArray
 FALSE_ALARMS = 0.02
 """Share of models without anything left to find in which a wrong effect may enter, whatever the number tried."""
 _LEAST_FREEDOM = 1.0
-_MUCH, _LEEWAY = 25.0, 0.6  # nats, from which an effect may enter with so many errors less
+_LEEWAY = 0.6  # standard errors, by which an effect that gains much may fall short and enter
+MUCH = 25.0
+"""Nats from which an effect gains much."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Evidence:
         With a dozen blocks, two or three of which excite an effect, Student's law rejects nearly all. What enters is
         judged at the end by all its figures (`part_odds`).
         """
-        return self.strength() + (_LEEWAY if self.nats > _MUCH else 0.0)
+        return self.strength() + (_LEEWAY if self.nats > MUCH else 0.0)
 
 
 NOTHING = Evidence(0.0, 0.0, _LEAST_FREEDOM)

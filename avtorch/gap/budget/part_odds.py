@@ -3,7 +3,8 @@
 What Student's law for the blocks that excite it says of it is too sure where many do, and far too doubtful where two or
 three do, as in a drive of a minute. So a logistic regression is fitted to simulated drives behind ideal and ordinary
 recorders, on two figures: how much held-out blocks gain by the effect, and how well they agree on its size. Wrong
-effects have as many chances as are tried, so the odds are in inverse proportion to that.
+effects have as many chances as are tried, so the odds are in inverse proportion to that. Nothing is surer than Student's
+law has it for the best of as many, but where much is gained: each e-fold of nats then counts for one standard error.
 ``python -m benchmarks.part_odds`` writes its weights, with their provenance, to `part_odds.json` beside this module.
 """
 
@@ -17,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import expit
+from scipy.special import expit, ndtr
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.budget.held_out_evidence import Evidence
+from avtorch.gap.budget.held_out_evidence import MUCH, Evidence
 
 SCHEMA = "avtorch.part-odds/1"
 PATH = Path(__file__).with_name("part_odds.json")
@@ -58,12 +59,18 @@ class PartOdds:
     def probability(self, evidence: Evidence, tried: int) -> float:
         """That the effect is there, the best of as many as were `tried`."""
         odds = figures(evidence) @ self.weights - np.log(max(tried, 1))
-        return float(np.clip(expit(odds), 1 - _SUREST, _SUREST))
+        return float(np.clip(min(expit(odds), by_agreement(evidence, tried)), 1 - _SUREST, _SUREST))
 
 
 def figures(evidence: Evidence) -> FloatArray:
     """What the log odds are linear in (3,), the constant first."""
     return np.array([1.0, np.log(max(evidence.nats, 1.0)), np.log(max(evidence.errors, _LEAST_ERRORS))])
+
+
+def by_agreement(evidence: Evidence, tried: int) -> float:
+    """As sure as blocks that agree may make of the best of as many as were `tried`."""
+    much = np.log(max(evidence.nats, MUCH) / MUCH)
+    return float(ndtr(evidence.strength(tried) + much))
 
 
 @cache

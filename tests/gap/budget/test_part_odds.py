@@ -9,7 +9,7 @@ import pytest
 from scipy.special import expit
 
 from avtorch.gap.budget.held_out_evidence import Evidence
-from avtorch.gap.budget.part_odds import PATH, SCHEMA, PartOdds, figures
+from avtorch.gap.budget.part_odds import PATH, SCHEMA, PartOdds, by_agreement, figures
 from benchmarks.part_odds import fit, left_out, scores, without_a_cause
 
 ODDS = PartOdds.read()
@@ -22,9 +22,18 @@ def test_more_evidence_is_more_probable() -> None:
 
 
 def test_of_many_tried_one_is_more_often_wrong() -> None:
-    evidence = Evidence(20.0, 4.0, 8.0)
+    evidence = Evidence(20.0, 40.0, 80.0)
     one, many = (ODDS.probability(evidence, tried) for tried in (1, 20))
     assert one / (1 - one) == pytest.approx(20 * many / (1 - many))
+
+
+def test_agreement_of_few_blocks_is_no_surer_than_students_law_unless_much_is_gained() -> None:
+    """Of 100 drives of a minute without a cause, three effects tried, seven got one that gained 10 to 25 nats."""
+    alarm, plain = Evidence(16.5, 2.8, 6.5), Evidence(120.6, 4.76, 2.0)
+    assert ODDS.probability(alarm, 3) == pytest.approx(by_agreement(alarm, 3))
+    assert alarm.strength(3) < 0
+    assert plain.strength(22) < 0
+    assert ODDS.probability(plain, 22) > 0.5
 
 
 def test_no_evidence_is_no_error() -> None:
@@ -71,4 +80,6 @@ def test_figures_of_a_small_set() -> None:
 def test_a_part_is_never_judged_by_its_own_case() -> None:
     rows = np.array([figures(Evidence(20.0, 4.0, 8.0))] * 40)
     there, of = np.arange(40) % 2 == 0, np.arange(40) // 2
-    assert left_out(rows, np.zeros(40), there, of) == pytest.approx(0.5, abs=0.05)  # every case has one of each
+    assert left_out(rows, np.zeros(40), there, of, np.ones(40)) == pytest.approx(
+        0.5, abs=0.05
+    )  # one of each in every case
