@@ -13,6 +13,7 @@ from cyclopts import Group, Parameter
 from rich.markup import escape
 
 from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, positive, seed_number
+from avtorch.cli.browser import Open, show
 from avtorch.cli.command_line import command_line
 from avtorch.cli.diagnosis_table import budget_table, diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.cli.follower import follow, refuse
@@ -135,6 +136,7 @@ def diagnose(
     road: Annotated[float | None, Parameter(group=TRACK, help="Length of the road [m]; default: 2000.")] = None,
     seconds: Annotated[float | None, Parameter(group=TRACK, help="Duration [s]; default: 60.")] = None,
     seed: Seed = 0,
+    open_page: Open = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -185,6 +187,8 @@ def diagnose(
         origin = _origin(logs, **source, law=law, effects=chosen, seed=seed)
         with talk.whole("Diagnosing") as done:
             follow(talk, logs[0], out, source=source, law=law, effects=chosen, seed=seed, step=done, origin=origin)
+        if open_page:
+            show(out / "report.html", talk)
         return
     for option, given in (("--vehicle", vehicle), ("--law", law), ("--event", event)):
         if given is not None:
@@ -274,12 +278,14 @@ def diagnose(
         written += write_exports(found.plant, staged, pedals=pedals)
         written.append(write_report(found, staged, quality=quality, experiment=ahead, origin=origin))
         written += write_pedals(fit, staged)
+    if open_page:
+        show(out / "report.html", talk)
     if talk.json:
         talk.done(out, found.to_dict())
         return
     talk.out.print(*diagnosis_headline(found), sep="\n")
     talk.out.print()
-    if found.budget is not None and (found.budget.parts or found.budget.chance):
+    if found.budget is not None and found.budget.says_something:
         talk.out.print(budget_table(found.budget, found.log.epochs_s[0]))
         talk.out.print()
     talk.out.print(diagnosis_table(found))

@@ -24,6 +24,7 @@ from avtorch.cli.arguments import (
     seed_number,
     three_gains,
 )
+from avtorch.cli.browser import Open, show
 from avtorch.cli.command_line import command_line
 from avtorch.cli.diagnose import chosen_effects
 from avtorch.cli.simulator import read_simulator
@@ -86,6 +87,7 @@ def fleet(
         Parameter(group=CLUSTER, help="Address of a running Dask scheduler, such as tcp://10.0.0.1:8786."),
     ] = None,
     seed: Seed = 0,
+    open_page: Open = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -173,7 +175,9 @@ def fleet(
             )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"finished rows are kept in {out}: the same command does what is missing") from None
-    write_fleet_page(answer, out, origin=Origin.of(command_line(), settings=asdict(settings)))
+    page_path = write_fleet_page(answer, out, origin=Origin.of(command_line(), settings=asdict(settings)))
+    if open_page:
+        show(page_path, talk)
     if talk.json:
         talk.answer(answer)
         return

@@ -8,6 +8,7 @@ from os import PathLike
 from pathlib import Path
 
 from avtorch.experiment import Experiment
+from avtorch.gap.budget.parts import Budget
 from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.io import atomic
@@ -61,7 +62,7 @@ def report_html(
         where=sentences.where(found),
         places=place_table(found),
         gap=[*sentences.gap(found), *sentences.moved(found), *sentences.remains(found)],
-        budget=budget_table(budget, found.log.epochs_s[0]) if budget and budget.chance else None,
+        budget=budget_table(budget, found.log.epochs_s[0]) if budget and _apart(budget) else None,
         shrinkage=sentences.shrinkage(found),
         measures=None if found.shrinkage is None else measure_table(found.shrinkage),
         placebo=_placebo(found),
@@ -72,6 +73,11 @@ def report_html(
         quality=list(quality),
         pictures=pictures(found, experiment),
     )
+
+
+def _apart(budget: Budget) -> bool:
+    """Whether the budget's table says what the table behind its picture does not, or there is no picture."""
+    return bool(budget.chance) or (not budget.parts and budget.says_something)
 
 
 def write_report(

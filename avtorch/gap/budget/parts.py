@@ -182,6 +182,11 @@ class Budget:
         return tuple(x.name for x in (*self.parts, *self.chance) if x.probability >= LIKELY)
 
     @property
+    def says_something(self) -> bool:
+        """Whether there is more to tell than that nothing material is missing."""
+        return bool(self.parts or self.chance or self.unexplained.material)
+
+    @property
     def verdict(self) -> tuple[str, ...]:
         """`names`; without any `("unknown",)` where something material is reproducible, else `("none",)`."""
         return self.names or (("unknown",) if self.unexplained.material else ("none",))
