@@ -1,6 +1,6 @@
 """Fit the odds of the budget's parts to simulated cases, and write them with their provenance.
 
-``python -m benchmarks.part_odds --seed 20261125 --cases 240 --kept out/part_odds [--recorder ordinary] [--write]``
+``python -m benchmarks.part_odds --seed 20261125 --cases 240 --kept out/part_odds [--recorder ideal] [--signals speed]``
 
 Draws cases of the blind test's reference vehicle, selects effects on their held-out blocks, and keeps the figures of
 each part of the gap in `--kept`, one line a case (some ten seconds of processor time); a second call goes on where the
@@ -25,7 +25,7 @@ from scipy.special import log_expit, ndtr
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
 from avtorch.blindtest import draw_case
-from avtorch.blindtest.cases import Recording
+from avtorch.blindtest.cases import SIGNALS, Recording
 from avtorch.gap import plant
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.forward_selection import select
@@ -41,16 +41,17 @@ _FOLDS = 10
 _DIGITS = 3
 
 
-def case_figures(index: int, seed: int, recorder: Recording) -> dict[str, Any]:
+def case_figures(index: int, seed: int, recorder: Recording, signals: Sequence[str]) -> dict[str, Any]:
     """The parts that are selected on one drawn case, with their evidence, and whether each is there."""
-    case = draw_case(index, seed, mix=MIX, recorder=recorder)
-    record = AnalysisRecord.for_budget([case.log()])
+    case = draw_case(index, seed, mix=MIX, recorder=recorder, signals=signals)
+    record = AnalysisRecord.for_budget([case.log(signals=signals)])
     selection = largest_first(select(record, plant([]), chosen_effects(None)))
     truth = case.truth()
     return {
         "case": index,
         "seed": seed,
         "recorder": recorder,
+        "signals": list(signals),
         "kind": truth["kind"],
         "tier": truth["tier"],
         "names": truth["names"],
@@ -70,14 +71,14 @@ def case_figures(index: int, seed: int, recorder: Recording) -> dict[str, Any]:
     }
 
 
-def collect(folder: Path, seed: int, cases: int, recorder: Recording) -> None:
+def collect(folder: Path, seed: int, cases: int, recorder: Recording, signals: Sequence[str]) -> None:
     """Keep the figures of `cases` cases in `folder`; those that are there already are not drawn again."""
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{recorder}_{seed}.jsonl"
+    path = folder / f"{recorder}_{'_'.join(signals)}_{seed}.jsonl"
     done = len(path.read_text(encoding="utf-8").splitlines()) if path.exists() else 0
     with path.open("a", encoding="utf-8") as lines:
         for index in range(done, cases):
-            lines.write(json.dumps(case_figures(index, seed, recorder)) + "\n")
+            lines.write(json.dumps(case_figures(index, seed, recorder, signals)) + "\n")
             lines.flush()
             print(f"{recorder}: case {index + 1} of {cases}", flush=True)
 
@@ -96,7 +97,7 @@ def table(
     for number, case in enumerate(cases):
         for part in case["parts"]:
             evidence = Evidence(part["nats"], part["errors"], part["freedom"])
-            rows.append(figures(evidence))
+            rows.append(figures(evidence, len(case["signals"])))
             there.append(part["there"])
             of.append(number)
             tried.append(np.log(case["tried"]))
@@ -157,9 +158,10 @@ def main() -> None:
     parser.add_argument("--cases", type=int, required=True)
     parser.add_argument("--kept", type=Path, required=True)
     parser.add_argument("--recorder", choices=get_args(Recording), default="ordinary")
+    parser.add_argument("--signals", nargs="+", choices=SIGNALS, default=SIGNALS)
     parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
-    collect(args.kept, args.seed, args.cases, args.recorder)
+    collect(args.kept, args.seed, args.cases, args.recorder, args.signals)
     cases = kept(args.kept)
     rows, tried, there, of, agreed, strict = table(cases)
     probability = left_out(rows, tried, there, of, agreed)
@@ -170,11 +172,17 @@ def main() -> None:
         print(f"{key:20} {by_odds[key]:8} by the odds (cases left out) {by_law[key]:8} by Student's law")
     if args.write:
         empty = without_a_cause(cases, of[probability >= 0.5])
-        odds, counts = fit(rows, tried, there, empty), Counter((case["recorder"], case["seed"]) for case in cases)
+        odds, counts = (
+            fit(rows, tried, there, empty),
+            Counter((c["recorder"], " ".join(c["signals"]), c["seed"]) for c in cases),
+        )
         commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
         provenance = {
             "made_by": "python -m benchmarks.part_odds --write",
-            "cases": [{"recorder": r, "seed": s, "cases": n, "mix": MIX} for (r, s), n in sorted(counts.items())],
+            "cases": [
+                {"recorder": r, "signals": w, "seed": s, "cases": n, "mix": MIX}
+                for (r, w, s), n in sorted(counts.items())
+            ],
             "parts": len(rows),
             "date": date.today().isoformat(),
             "commit": commit.stdout.strip(),

@@ -28,8 +28,11 @@ def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int 
 
 def probabilities(selection: Selection) -> dict[str, float]:
     """That each effect is there, by name."""
-    odds = PartOdds.read()
-    return {str(s.entered): odds.probability(s.evidence, selection.tried) for s in selection.steps[1:]}
+    odds, channels = PartOdds.read(), len(selection.fitting.whitening.record.channels)
+    return {
+        str(s.entered): odds.probability(s.evidence, channels=channels, tried=selection.tried)
+        for s in selection.steps[1:]
+    }
 
 
 def _without(selection: Selection, name: str) -> Selection:
