@@ -224,7 +224,7 @@ def test_an_interrupted_run_is_resumed(tmp_path: Path, capsys: pytest.CaptureFix
     write_fleet(tmp_path / "logs", cars)
     out = tmp_path / "out"
     command = ["fleet", str(tmp_path / "logs"), "--out", str(out), "--only", "check,estimate", "--dead-time", "0"]
-    # On a loaded machine the work must wait for this process, which is to interrupt it, and not this process for the work.
+    # on a loaded machine the work must wait for this process, which is to interrupt it
     process = subprocess.Popen(
         ["nice", "-n", "10", sys.executable, "-m", "avtorch.cli", *command, "--workers", "2"],
         env=ENVIRONMENT,
