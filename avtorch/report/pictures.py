@@ -112,8 +112,23 @@ def _drive(found: Diagnosis) -> Picture | None:
         f"{' and '.join(traces.channels)}, the baseline simulator{named}.{_marked(axis)}",
         Table("The drive in parts: standard deviation of each signal, and of the error", tuple(columns), tuple(rows)),
         caption="Of each short interval the least and the greatest value. Simulated lines are rollouts from the logged "
-        f"commands; in each stretch a speed begins at the measured one.{_marked(axis)}",
+        f"commands; in each stretch a speed begins at the measured one.{_marked(axis)}{_fit(found)}",
     )
+
+
+def _fit(found: Diagnosis) -> str:
+    """How well the rollouts fit, channel by channel."""
+    traces = found.traces
+    assert traces is not None
+    told = []
+    for name, before, after in zip(traces.channels, traces.fit(traces.before), traces.fit(traces.after), strict=True):
+        if np.isfinite(before):
+            word = {"accel": "acceleration"}.get(name, name)
+            named = f", {after:.0f} % with it" if found.winner.effects else ""
+            told.append(f"{word} {before:.0f} %{' without what was named' if named else ''}{named}")
+    if not told:
+        return ""
+    return f" Fit over the whole drive (100 % is exact, 0 % no better than the mean): {'; '.join(told)}."
 
 
 def _marked(axis: DriveTime) -> str:

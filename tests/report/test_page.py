@@ -32,6 +32,15 @@ def test_a_hostile_name_is_text(found: Diagnosis) -> None:
     assert "&lt;script&gt;" in text
 
 
+def test_the_fit_is_told_in_per_cent(found: Diagnosis) -> None:
+    traces = found.traces
+    assert traces is not None
+    before, after = (traces.fit(x)[0] for x in (traces.before, traces.after))
+    text = " ".join(report_html(found).split())
+    name = {"accel": "acceleration"}.get(traces.channels[0], traces.channels[0])
+    assert f"0 % no better than the mean): {name} {before:.0f} % without what was named, {after:.0f} % with it" in text
+
+
 def test_answers_with_fewer_entries(found: Diagnosis) -> None:
     bare = replace(found, traces=None, shrinkage=None, setting=None, where=(), notes=("<b>note</b>",), complete=False)
     text = report_html(bare)

@@ -34,6 +34,17 @@ class Traces:
         """Measured speed, (row,); None where it was not measured."""
         return self.measured[self.channels.index("speed")] if "speed" in self.channels else None
 
+    def fit(self, simulated: FloatArray) -> FloatArray:
+        """Fit [%] of `simulated` (channel, row), such as `before` or `after`, to what was measured: (channel,).
+
+        100 (1 - |y - y_sim| / |y - mean(y)|), the fit by normalised root mean square error of system identification
+        (Ljung, System Identification, 2nd ed., 1999): 100 is exact, 0 no better than the mean, less is worse than it.
+        NaN for a channel that stands still.
+        """
+        error = np.linalg.norm(self.measured - simulated, axis=1)
+        spread = np.linalg.norm(self.measured - self.measured.mean(axis=1, keepdims=True), axis=1)
+        return 100 * (1 - np.divide(error, spread, out=np.full_like(error, np.nan), where=spread > 0))
+
 
 def rolled_out(record: Record, simulator: GapPlant) -> FloatArray:
     """Rollouts (channel, counted, group) of a simulator over the whole drives of a record."""
