@@ -171,8 +171,9 @@ def _advice(signal: str, names: Iterable[str]) -> str:
     # a column that is a signal already goes by its own name: a measured `accel` is no command
     plain = {name.strip().lower(): name for name in names if name not in SIGNALS and len(name) <= _NAME}
     close = difflib.get_close_matches(signal, plain, n=1, cutoff=0.75)
-    name = quoted(plain[close[0]]) if close else "NAME"
-    return f"columns: {listed(names)}; `--map {signal}={name}` if it goes by another name"
+    name = plain[close[0]] if close else "NAME"
+    shell = f"--map {signal}={quoted(name) if close else name}"
+    return f"columns: {listed(names)}; `{shell}` or `map={ {signal: name} }` if it goes by another name"
 
 
 def _place(table: Table, signal: str, column: str, rows: NDArray | None = None) -> Callable[[int], str]:

@@ -109,7 +109,9 @@ def test_a_bad_optional_signal(tmp_path, signal, value, what):
 def test_a_missing_column_is_named_with_a_way_out(tmp_path, column):
     columns = {("Time " if k == "time" else k.upper()) if k == column else k: v for k, v in GOOD.items()}
     near = "Time " if column == "time" else column.upper()
-    refused(write(tmp_path / "lap.csv", columns), f"column '{column}' is missing", f"--map {column}='{near}'")
+    path = write(tmp_path / "lap.csv", columns)
+    refused(path, f"column '{column}' is missing", f"--map {column}='{near}'", f"map={{'{column}': '{near}'}}")
+    assert len(Log.read(path, map={column: near}).time) > 0  # the advice works
 
 
 def test_no_signal_is_advised_in_place_of_another(tmp_path):

@@ -53,7 +53,8 @@ def refused(read: Callable[[], object], *words: str) -> str:
         read()
     said = str(fault.value)
     assert said.isprintable(), said
-    assert len(said) < 500, said
+    without_folder = re.sub(r"^/\S*/", "", said)  # whose length is that of a place for tests
+    assert len(without_folder) < 500, said
     for word in words:
         assert word in said, said
     return said
