@@ -11,6 +11,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from avtorch.cli.arguments import OUTPUT, Json, Quiet, free_folder
+from avtorch.cli.browser import Open, show
+from avtorch.cli.command_line import origin_of
 from avtorch.cli.simulator import read_simulator
 from avtorch.cli.simulators_table import simulators_table
 from avtorch.cli.talk import Talk
@@ -21,7 +23,9 @@ if TYPE_CHECKING:
     from avtorch.external import SimulatorComparison
     from avtorch.gap.result.comparison import Change, Comparison
     from avtorch.io import Log
+    from avtorch.report import Origin
 
+PAGE = "comparison.html"
 _ROWS = {
     "T_L": "lag T_L [s]",
     "K_L": "gain K_L [-]",
@@ -57,7 +61,9 @@ def compare(
     baseline_after: Annotated[
         str | None, Parameter(help="The simulator that AFTER is compared with; default: the same.")
     ] = None,
-    out: Annotated[Path | None, Parameter(name="--out", group=OUTPUT, help="Folder for comparison.json.")] = None,
+    out: Annotated[
+        Path | None, Parameter(name="--out", group=OUTPUT, help="Folder for comparison.html and .json.")
+    ] = None,
     map: Annotated[
         list[str] | None,
         Parameter(negative=(), help="Name of a column, SIGNAL=COLUMN, such as accel=ACC_X; repeatable."),
@@ -65,6 +71,7 @@ def compare(
     unit: Annotated[
         list[str] | None, Parameter(negative=(), help="Unit of a column, SIGNAL=UNIT, such as speed=km/h; repeatable.")
     ] = None,
+    open_page: Open = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -81,6 +88,8 @@ def compare(
     """
     if out is not None:
         free_folder(out)
+    elif open_page:
+        raise InputError("--open: found without --out; needs a folder for the page")
     two = [*(simulator or ()), *(simulated or ())]
     if after is None:
         if not two:
@@ -91,7 +100,15 @@ def compare(
             raise InputError(f"--simulator, --simulated: found {len(two)} beside one log, needs two")
         if baseline != "glvd" or baseline_after is not None:
             raise InputError("--baseline: found beside --simulator or --simulated, needs a plant as --simulator")
-        _nearer(before, simulator or (), simulated or (), step, out, map, unit, Talk(json=json, quiet=quiet))
+        talk = Talk(json=json, quiet=quiet)
+        log = _log(before, map, unit, talk)
+        found = _nearer(talk, before, log, simulator or (), simulated or (), step)
+        files = [before, *_files([*two])]
+        origin = origin_of(files, map=map, unit=unit, simulator=simulator, simulated=simulated, step=step)
+        _answer(talk, found, simulators_table(found), out, [log], origin, open_page)
+        if not talk.json:
+            for which in (x for x in (found.first, found.second) if x.notes):
+                talk.notes(which.name, which.notes)
         return
     if len(simulator or ()) > 1:
         raise InputError(f"--simulator: found {len(two)} beside two logs, needs one, or one log")
@@ -110,31 +127,34 @@ def compare(
     own = simulator_of(simulated or (), (simulator or (None,))[0], step, drives, adjust=(), rollouts=None, processes=1)
     with talk.steps("Comparing") as step_done:
         comparison = work(*logs, baseline=own or base, baseline_after=other, progress=step_done)
-    _answer(talk, comparison, _table(comparison), out)
+    origin = origin_of(
+        [before, after, *_files([*two, baseline, baseline_after or ""])],
+        map=map,
+        unit=unit,
+        simulator=simulator,
+        simulated=simulated,
+        step=step,
+        baseline=[baseline, baseline_after],
+    )
+    _answer(talk, comparison, _table(comparison), out, logs, origin, open_page)
 
 
 def _nearer(
-    path: Path,
-    simulator: Sequence[str],
-    simulated: Sequence[str],
-    step: float | None,
-    out: Path | None,
-    map: list[str] | None,
-    unit: list[str] | None,
-    talk: Talk,
-) -> None:
+    talk: Talk, path: Path, log: Log, simulator: Sequence[str], simulated: Sequence[str], step: float | None
+) -> SimulatorComparison:
     """Two simulators and a log."""
-    log = _log(path, map, unit, talk)
     first, second = simulators_of(simulator, simulated, step, path, log)
 
     from avtorch.external import compare_simulators
 
     with talk.steps("Comparing") as step_done:
-        found = compare_simulators(log, first, second, progress=step_done)
-    _answer(talk, found, simulators_table(found), out)
-    if not talk.json:
-        for which in (x for x in (found.first, found.second) if x.notes):
-            talk.notes(which.name, which.notes)
+        return compare_simulators(log, first, second, progress=step_done)
+
+
+def _files(sources: Sequence[str]) -> list[Path]:
+    """Those of a simulator's sources that are files: a module or a list of effects is none."""
+    names = [source.rpartition(":")[0] if ".py:" in source else source for source in sources]
+    return [Path(name) for name in names if name and Path(name).is_file()]
 
 
 def _log(path: Path, map: list[str] | None, unit: list[str] | None, talk: Talk) -> Log:
@@ -149,12 +169,26 @@ def _log(path: Path, map: list[str] | None, unit: list[str] | None, talk: Talk) 
     return log
 
 
-def _answer(talk: Talk, found: Comparison | SimulatorComparison, table: Table, out: Path | None) -> None:
-    from avtorch.io import answer_set, write_json
+def _answer(
+    talk: Talk,
+    found: Comparison | SimulatorComparison,
+    table: Table,
+    out: Path | None,
+    logs: Sequence[Log],
+    origin: Origin,
+    open_page: bool,
+) -> None:
+    from avtorch.io import answer_set, check, write_json
 
     if out is not None:
-        with answer_set(out, ("comparison.json",)) as staged:
+        from avtorch.report import write_comparison_page
+
+        notes = [f"{log.name}: {note}" for log in logs for note in check(log).notes]
+        with answer_set(out, ("comparison.json", PAGE)) as staged:
+            write_comparison_page(found, staged, notes=notes, origin=origin)
             write_json(staged / "comparison.json", found.to_dict())
+        if open_page:
+            show(out / PAGE, talk)
     if talk.json:
         talk.answer(found.to_dict())
         return
@@ -162,7 +196,7 @@ def _answer(talk: Talk, found: Comparison | SimulatorComparison, table: Table, o
     talk.out.print()
     talk.out.print(table)
     if out is not None:
-        talk.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: comparison.json", soft_wrap=True)
+        talk.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {PAGE}, comparison.json", soft_wrap=True)
 
 
 def _table(comparison: Comparison) -> Table:

@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Group, Parameter
 from rich.markup import escape
 
 from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, positive, seed_number
 from avtorch.cli.browser import Open, show
-from avtorch.cli.command_line import command_line
+from avtorch.cli.command_line import origin_of
 from avtorch.cli.diagnosis_table import budget_table, diagnosis_headline, diagnosis_notes, diagnosis_table
 from avtorch.cli.follower import follow, refuse
 from avtorch.cli.pedals import FILES as PEDAL_FILES
@@ -29,7 +29,6 @@ from avtorch.numeral import numeral
 if TYPE_CHECKING:
     from avtorch.experiment import Limits
     from avtorch.io import Log
-    from avtorch.report import Origin
 
 TRACK = Group("Next experiment", sort_key=20)
 TESTED = Group("A simulator of your own", sort_key=19)
@@ -184,7 +183,7 @@ def diagnose(
         idle |= {option: not default for option, default in usual.items()}
         refuse(logs, **idle, **{option: value is not None for option, value in track.items()})
         source = {"map": map, "unit": unit, "stamp": stamp, "vehicle": vehicle, "event": event}
-        origin = _origin(logs, **source, law=law, effects=chosen, seed=seed)
+        origin = origin_of(logs, **source, law=law, effects=chosen, seed=seed)
         with talk.whole("Diagnosing") as done:
             follow(talk, logs[0], out, source=source, law=law, effects=chosen, seed=seed, step=done, origin=origin)
         if open_page:
@@ -210,7 +209,7 @@ def diagnose(
         talk.notes(f"{drive.name}", noted)
         quality += [f"{Path(drive.name).name}: {note}" for note in noted]
 
-    origin = _origin(
+    origin = origin_of(
         [*logs, *([Path(baseline)] if baseline.endswith(".toml") else [])],
         map=map,
         unit=unit,
@@ -303,15 +302,6 @@ _FILES = {
     ".xml": " (in that tool's terms)",
     ".html": " (to read)",
 }
-
-
-def _origin(paths: Sequence[Path], **settings: Any) -> Origin:
-    """How the answer is made, by the files as they are now; a log's mapping file is one of them."""
-    from avtorch.io.mapping import mapping_beside
-    from avtorch.report import Origin
-
-    beside = [place for place in (mapping_beside(path) for path in paths) if place is not None]
-    return Origin.of(command_line(), [*paths, *beside], settings)
 
 
 def _limits(drives: Sequence[Log], given: Mapping[str, float | None]) -> Limits:

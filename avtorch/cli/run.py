@@ -23,18 +23,22 @@ from avtorch.cli.arguments import (
     seed_number,
     whole_number,
 )
+from avtorch.cli.browser import Open, show
+from avtorch.cli.command_line import origin_of
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.errors import InputError
 
 if TYPE_CHECKING:
     from avtorch.decision.record import SupervisedRun
     from avtorch.decision.strategist import Strategist
+    from avtorch.report import Origin
     from avtorch.vehicle import Block, ClosedLoop, Leader
 
 DURATION_S = 80.0
 HEALTHY = (0.3, 1.0)
 BOUNDS = {"T_L": (0.1, 0.4), "K_L": (0.7, 1.0)}
 """The vehicle before the change, and what the controller was designed for (paper, Table 1)."""
+PAGE = "run.html"
 
 
 def run(
@@ -62,6 +66,7 @@ def run(
     limits: Annotated[str, Parameter(help="Least and greatest command MIN,MAX [m/s²].")] = "-6,4",
     seed: Seed = 0,
     out: Out,
+    open_page: Open = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -115,7 +120,20 @@ def run(
     from avtorch.results import run_answer
 
     answer = run_answer(acting, alone, change=(change_at, T, K), time_gap=float(supervisor.default.time_gap[0]))
-    _write(out, answer, acting, alone, acts=strategy != "none", vehicle=(T, K), change_at=change_at)
+    origin = origin_of(
+        [] if leader is None else [leader],
+        leader={"vehicle": vehicle, "event": event, "duration": seconds},
+        change=[change_at, T, K],
+        window=window,
+        noise=noise,
+        limits=[low, high],
+        controller=controller,
+        strategy=strategy,
+        seed=seed,
+    )
+    _write(out, answer, acting, alone, acts=strategy != "none", vehicle=(T, K), change_at=change_at, origin=origin)
+    if open_page:
+        show(out / PAGE, talk)
     talk.windows(answer["windows"])
     talk.story(answer)
     talk.done(out, answer)
@@ -175,8 +193,11 @@ def _write(
     acts: bool,
     vehicle: tuple[float, float],
     change_at: float,
+    origin: Origin,
 ) -> None:
     from avtorch import plots
+    from avtorch.report import write_run_page
+    from avtorch.report.run_page import Regions
 
     time, rows = acting.rows.time, acting.rows
     traces: dict[str, dict[str, Any]] = {}
@@ -195,7 +216,12 @@ def _write(
         "probability.png": lambda: plots.probability_figure(answer["windows"], answer=answer),
         "region.png": lambda: plots.region_figure(settings, clouds, truth=vehicle),
     }
-    write_answer(out, "run.json", answer, pictures)
+    regions = Regions(settings, clouds)
+
+    def page(staged: Path) -> None:
+        write_run_page(answer, time, traces, folder=staged, truth=truth, bounds=BOUNDS, regions=regions, origin=origin)
+
+    write_answer(out, "run.json", answer, pictures, more=page, also=(PAGE,))
 
 
 def _moments(acting: SupervisedRun, change_at: float) -> tuple[list[tuple[str, dict[str, Any]]], dict[str, Any]]:

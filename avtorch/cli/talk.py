@@ -219,7 +219,9 @@ class Talk:
         if self.json:
             self.answer(answer)
             return
-        names = ", ".join(sorted(p.name for p in out.iterdir() if p.suffix in (".json", ".png") and p.is_file()))
+        names = ", ".join(
+            sorted(p.name for p in out.iterdir() if p.suffix in (".html", ".json", ".png") and p.is_file())
+        )
         self.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {escape(names)}", soft_wrap=True)
 
 

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from avtorch.cli.arguments import Json, Out, Quiet, Seed, free_folder, not_negative, positive, seed_number, whole_number
+from avtorch.cli.browser import Open, show
+from avtorch.cli.command_line import origin_of
 from avtorch.cli.talk import Talk, write_answer
 from avtorch.cli.validation_table import validation_notes, validation_table
 from avtorch.errors import InputError
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
 
 #: NetCDF for ArviZ.
 EXPORTS = ("sgld.nc", "nuts.nc", "quadrature.nc")
+
+PAGE = "validation.html"
 
 #: Synthetic windows if no number is given.
 SYNTHETIC = 200
@@ -55,6 +59,7 @@ def validate(
         list[str] | None, Parameter(negative=(), help="Own time column of a signal, SIGNAL=COLUMN; repeatable.")
     ] = None,
     seed: Seed = 0,
+    open_page: Open = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -101,13 +106,20 @@ def validate(
     with talk.progress("Validating") as step:
         found = work(source, settings=settings, nuts_windows=nuts_windows, seed=seed, progress=step)
     answer = validation_answer(found)
+    given_settings = {"map": map, "unit": unit, "stamp": stamp, "window": window, "windows": windows, **given}
+    more = {"spread": spread, "nuts_windows": nuts_windows, "synthetic": synthetic, "seed": seed}
+    origin = origin_of([] if log is None else [log], **given_settings, **more)
 
     from avtorch import plots
+    from avtorch.report import write_validation_page
 
     groups = found.to_arviz()
-    with answer_set(out, ("validation.json", *plots.VALIDATION_PICTURES, *EXPORTS)) as staged:
+    with answer_set(out, ("validation.json", PAGE, *plots.VALIDATION_PICTURES, *EXPORTS)) as staged:
         export(staged, groups)
+        write_validation_page(found, staged, origin=origin)
         write_answer(staged, "validation.json", answer, plots.validation_figures(found))
+    if open_page:
+        show(out / PAGE, talk)
     talk.out.print(validation_table(answer))
     for note in validation_notes(answer):
         talk.out.print(note, style="dim", markup=False)

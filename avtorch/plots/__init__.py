@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from avtorch.plots.posterior_figures import VALIDATION_PICTURES, validation_figures
     from avtorch.plots.posteriors import agreement_scatter, exact_density, joint_cloud, marginals
     from avtorch.plots.ranks import ecdf_difference, ecdf_of, pooled_rank_counts, rank_band, rank_plot
+    from avtorch.plots.ratios import ratio_figure, ratio_whiskers
     from avtorch.plots.signatures import effect_signature, signature_figure
     from avtorch.plots.style import STYLE, save, show
     from avtorch.plots.time import belief_band, data_quality, events, motion, string_probability
@@ -90,6 +91,10 @@ _HOME = {
         "pooled_rank_counts",
         "rank_band",
         "rank_plot",
+    ),
+    "avtorch.plots.ratios": (
+        "ratio_figure",
+        "ratio_whiskers",
     ),
     "avtorch.plots.signatures": (
         "effect_signature",
@@ -149,6 +154,8 @@ __all__ = [
     "probability_figure",
     "rank_band",
     "rank_plot",
+    "ratio_figure",
+    "ratio_whiskers",
     "region",
     "region_figure",
     "save",

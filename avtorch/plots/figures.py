@@ -1,4 +1,7 @@
-"""The pictures that the commands write, each a figure put together from drawings."""
+"""The pictures that the commands write, each a figure put together from drawings.
+
+Figures are as wide as a desk's page; with `narrow` as a phone, panels one above the other.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +24,11 @@ from avtorch.vehicle import stability
 Motion = Mapping[str, Mapping[str, ArrayLike]]
 """Traces of a run: `{"speed": {"leader": ..., "without action": ..., "with action": ...}, "accel": {...}, ...}`."""
 
+_WIDE, _NARROW = 9.0, 4.0  # inches
+
 
 @styled
-def motion_figure(answer: Mapping[str, Any], time: ArrayLike, traces: Motion) -> Figure:
+def motion_figure(answer: Mapping[str, Any], time: ArrayLike, traces: Motion, *, narrow: bool = False) -> Figure:
     """Speeds [m/s], accelerations [m/s²] and spacings [m] of a run with and without action, over `time` (time,) [s].
 
     Example:
@@ -34,12 +39,12 @@ def motion_figure(answer: Mapping[str, Any], time: ArrayLike, traces: Motion) ->
         >>> len(motion_figure({"change": {"time_s": 4.0}}, time, traces).axes)
         2
     """
-    figure = Figure(figsize=(9, 2.3 * len(traces) + 0.6), layout="constrained")
+    figure = Figure(figsize=(_width(narrow), 2.3 * len(traces) + 0.6), layout="constrained")
     axes = figure.subplots(len(traces), 1, sharex=True, squeeze=False)[:, 0]
     for ax, (quantity, named) in zip(axes, traces.items(), strict=True):
         motion(_events_of(ax, answer), time, named, quantity=quantity)
     axes[-1].set_xlabel("time [s]")
-    _legend_above(figure, axes[0])
+    _legend_above(figure, axes[0], narrow=narrow)
     return figure
 
 
@@ -51,6 +56,7 @@ def belief_figure(
     truth: Mapping[str, Steps] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     log: Log | None = None,
+    narrow: bool = False,
 ) -> Figure:
     """Posterior bands of T_L and K_L over time; with a `log`, the quality of its rows below them.
 
@@ -68,7 +74,7 @@ def belief_figure(
     epoch_s = log.epoch_s if log is not None else (answer or {}).get("epoch_s", 0.0)
     recorded, windows, answer = windows, from_start(windows, epoch_s), _from_start(answer, epoch_s)
     rows = 2 + (log is not None)
-    figure = Figure(figsize=(9, 5.8 if log is None else 6.8), layout="constrained")
+    figure = Figure(figsize=(_width(narrow), 5.8 if log is None else 6.8), layout="constrained")
     heights = [3, 3, 1.3][:rows]
     axes = figure.subplots(rows, 1, sharex=True, height_ratios=heights)
     for ax, name in zip(axes, ("T_L", "K_L"), strict=False):
@@ -77,12 +83,14 @@ def belief_figure(
     if log is not None:
         data_quality(axes[-1], log, recorded)
     axes[-1].set_xlabel(time_label(epoch_s))
-    _legend_above(figure, *axes[:2])
+    _legend_above(figure, *axes[:2], narrow=narrow)
     return figure
 
 
 @styled
-def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = None, target: float = 0.95) -> Figure:
+def probability_figure(
+    windows: Windows, *, answer: Mapping[str, Any] | None = None, target: float = 0.95, narrow: bool = False
+) -> Figure:
     """P(string stable) over time, with alerts and actions; each action is labelled with the setting it chose.
 
     Example:
@@ -96,7 +104,7 @@ def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = N
     """
     epoch_s = (answer or {}).get("epoch_s", 0.0)
     windows, answer = from_start(windows, epoch_s), _from_start(answer, epoch_s)
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    figure = Figure(figsize=(_width(narrow), 3.6), layout="constrained")
     ax = figure.subplots()
     string_probability(
         _events_of(ax, answer or {}), windows, target=target, actions=(answer or {}).get("actions") or ()
@@ -106,7 +114,7 @@ def probability_figure(windows: Windows, *, answer: Mapping[str, Any] | None = N
         ax.annotate(f"strategy {names}", (action["time_s"], 0.04 + 0.09 * (i % 4)), (4, 0), textcoords="offset points",
                     color=GREEN, fontsize=9)  # fmt: skip
     ax.set_xlabel(time_label(epoch_s))
-    _legend_above(figure, ax)
+    _legend_above(figure, ax, narrow=narrow)
     return figure
 
 
@@ -116,10 +124,13 @@ def region_figure(
     clouds: Mapping[str, tuple[ArrayLike, ArrayLike]],
     *,
     truth: tuple[float, float] | None = None,
+    narrow: bool = False,
+    points: int = 401,
 ) -> Figure:
     """The posterior cloud in the stability region of each named setting, side by side on the same axes.
 
-    `clouds`: draws of T_L [s] and K_L [-], (draw,) each, by name; `truth`: the two of the true vehicle.
+    `clouds`: draws of T_L [s] and K_L [-], (draw,) each, by name; `truth`: the two of the true vehicle; `points` of
+    the map on each axis.
 
     Example:
         >>> import numpy as np
@@ -135,17 +146,25 @@ def region_figure(
     # a few far draws of a broad belief must not squeeze the rest into a corner
     T_range = (0.02, max(1.0, 1.25 * float(np.quantile(t, 0.99)), 1.25 * (truth[0] if truth else 0.0)))
     K_range = (min(0.25, 0.8 * float(np.quantile(k, 0.01))), max(1.3, 1.15 * float(np.quantile(k, 0.99))))
-    figure = Figure(figsize=(4.9 * len(settings) + 0.4, 5.2), layout="constrained")
-    axes = figure.subplots(1, len(settings), sharey=True, squeeze=False)[0]
+    count = len(settings)
+    size = (_NARROW, 3.9 * count + 0.8) if narrow else (4.9 * count + 0.4, 5.2)
+    figure = Figure(figsize=size, layout="constrained")
+    shape = (count, 1) if narrow else (1, count)
+    axes = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False).ravel()
     for ax, (title, setting) in zip(axes, settings, strict=True):
-        setting_region(ax, setting, T_range=T_range, K_range=K_range, clouds=clouds, truth=truth)
+        setting_region(ax, setting, T_range=T_range, K_range=K_range, clouds=clouds, truth=truth, points=points)
         ax.set_title(title)
         ax.label_outer()
     legend = verdict_legend(axes[0], beside=axes[1:]).get_legend()
     assert legend is not None
     handles = legend.legend_handles
     legend.remove()
-    figure.legend(handles=[h for h in handles if h is not None], loc="outside lower center", ncols=3, fontsize=8.5)
+    figure.legend(
+        handles=[h for h in handles if h is not None],
+        loc="outside lower center",
+        ncols=1 if narrow else 3,
+        fontsize=8.5,
+    )
     return figure
 
 
@@ -158,6 +177,7 @@ def overview_figure(
     truth: Mapping[str, Steps] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     target: float = 0.95,
+    narrow: bool = False,
 ) -> Figure:
     """A run at one glance: acceleration, belief about lag and gain, P(string stable).
 
@@ -175,7 +195,7 @@ def overview_figure(
         >>> len(overview_figure(answer, log.elapsed, traces).axes)
         4
     """
-    figure = Figure(figsize=(9, 8.4), layout="constrained")
+    figure = Figure(figsize=(_width(narrow), 8.4), layout="constrained")
     axes = figure.subplots(4, 1, sharex=True)
     for ax in axes:
         _events_of(ax, answer)
@@ -184,7 +204,7 @@ def overview_figure(
         belief_band(ax, answer["windows"], name, truth=(truth or {}).get(name), bounds=(bounds or {}).get(name))
     string_probability(axes[3], answer["windows"], target=target, actions=answer["actions"])
     axes[3].set_xlabel("time [s]")
-    _legend_above(figure, *axes)
+    _legend_above(figure, *axes, narrow=narrow)
     return figure
 
 
@@ -246,7 +266,12 @@ def _events_of(ax: Axes, answer: Mapping[str, Any]) -> Axes:
     return events(ax, change_s=change, alerts=alerts, actions=answer.get("actions") or ())
 
 
-def _legend_above(figure: Figure, *axes: Axes) -> None:
+def _width(narrow: bool) -> float:
+    """Of a figure [in]."""
+    return _NARROW if narrow else _WIDE
+
+
+def _legend_above(figure: Figure, *axes: Axes, narrow: bool) -> None:
     """One legend for the figure, each name once, the events last."""
     found: dict[str, Any] = {}
     for ax in axes:
@@ -254,4 +279,6 @@ def _legend_above(figure: Figure, *axes: Axes) -> None:
             found.setdefault(label, handle)
     last = ("vehicle changes", "alert", "action")
     names = [n for n in found if n not in last] + [n for n in last if n in found]
-    figure.legend([found[n] for n in names], names, loc="outside upper center", ncols=min(len(names), 4))
+    figure.legend(
+        [found[n] for n in names], names, loc="outside upper center", ncols=min(len(names), 2 if narrow else 4)
+    )

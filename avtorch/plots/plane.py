@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.collections import QuadMesh
-from matplotlib.colors import ListedColormap
 from matplotlib.contour import ContourSet
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -18,6 +16,8 @@ from numpy.typing import ArrayLike
 from avtorch.plots.style import AMPLIFIES, BLACK, BLUE, GREY, LABELS, ORANGE, PURPLE, STABLE, UNSTABLE, VERMILLION
 from avtorch.vehicle import LowerLevel, stability
 
+_VERDICT = ("_unstable", "_amplifies", "_string stable")
+"""Labels of a map's areas; legends leave out what begins with an underscore."""
 _LABEL_FROM_EDGE = 0.08
 """Of an axis: a label nearer to its end would be cut off."""
 
@@ -39,17 +39,14 @@ def verdict_map(
         [0.0, 1.0]
     """
     x, y, local, string = (np.asarray(v) for v in (x, y, local, string))
-    kind = np.where(string, 2, np.where(local, 1, 0))
-    ax.pcolormesh(
-        x,
-        y,
-        kind,
-        cmap=ListedColormap([UNSTABLE, AMPLIFIES, STABLE]),
-        vmin=-0.5,
-        vmax=2.5,
-        shading="nearest",
-        rasterized=True,
-    )
+    # areas and no raster: a page that loads nothing shows no image, and areas take its colours
+    local = local | string
+    if not local.all():
+        ax.axvspan(x[0], x[-1], color=UNSTABLE, linewidth=0, zorder=0, label=_VERDICT[0])
+    if (local & ~string).any():
+        ax.contourf(x, y, local.astype(float), levels=[0.5, 1.5], colors=AMPLIFIES, zorder=0.5).set_label(_VERDICT[1])
+    if string.any():
+        ax.contourf(x, y, string.astype(float), levels=[0.5, 1.5], colors=STABLE, zorder=0.6).set_label(_VERDICT[2])
     for mask, style in ((string, "-"), (local, "--")):
         if mask.any() and not mask.all():
             ax.contour(x, y, mask.astype(float), levels=[0.5], colors=BLACK, linewidths=1.1, linestyles=style)
@@ -195,8 +192,8 @@ def verdict_legend(ax: Axes, *, extra: bool = True, beside: Sequence[Axes] = ())
         >>> [text.get_text() for text in verdict_legend(Figure().subplots()).get_legend().get_texts()]
         ['string stable', 'stable, amplifies (lines: peak gain)', 'unstable']
     """
-    maps = [c.get_array() for one in (ax, *beside) for c in one.collections if isinstance(c, QuadMesh)]
-    there = {int(kind) for drawn in maps for kind in np.unique(np.asarray(drawn))} or {0, 1, 2}
+    labels = {str(drawn.get_label()) for one in (ax, *beside) for drawn in (*one.collections, *one.patches)}
+    there = {kind for kind, label in enumerate(_VERDICT) if label in labels} or {0, 1, 2}
     names = {
         2: (STABLE, "string stable"),
         1: (AMPLIFIES, "stable, amplifies (lines: peak gain)"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable
 from typing import Literal
 
@@ -25,6 +26,8 @@ POINTS, MOST = 100, 200
 #: Groups that SGLD's chains are joined into for the rank plots, and their bins.
 GROUPS, BINS = 4, 10
 
+_NARROW = 4.0  # inches
+
 METHOD = {"nuts": "NUTS", "quadrature": "quadrature"}
 Place = Literal["outside upper center", "outside lower center"]
 
@@ -39,8 +42,10 @@ Example:
 """
 
 
-def validation_figures(validation: Validation) -> dict[str, Callable[[], Figure]]:
+def validation_figures(validation: Validation, *, narrow: bool = False) -> dict[str, Callable[[], Figure]]:
     """The figures of a validation, by the name of the file that each is for; a figure is made when called.
+
+    `narrow`: for a phone, panels one above the other.
 
     Example:
         >>> from avtorch.inference import SamplerSettings
@@ -53,41 +58,39 @@ def validation_figures(validation: Validation) -> dict[str, Callable[[], Figure]
     """
     chosen = ChosenWindows(validation)
     figures: dict[str, Callable[[], Figure]] = {
-        "marginals.png": lambda: marginals_figure(chosen),
-        "joint.png": lambda: joint_figure(chosen),
-        "ranks.png": lambda: ranks_figure(chosen),
-        "agreement.png": lambda: agreement_figure(validation),
+        "marginals.png": lambda: marginals_figure(chosen, narrow=narrow),
+        "joint.png": lambda: joint_figure(chosen, narrow=narrow),
+        "ranks.png": lambda: ranks_figure(chosen, narrow=narrow),
+        "agreement.png": lambda: agreement_figure(validation, narrow=narrow),
     }
     if validation.quadrature is not None:
-        figures["ecdf.png"] = lambda: ecdf_figure(validation)
+        figures["ecdf.png"] = lambda: ecdf_figure(validation, narrow=narrow)
     return figures
 
 
 @styled
-def marginals_figure(chosen: ChosenWindows) -> Figure:
+def marginals_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
     """Exact marginals with the histograms of SGLD and NUTS; a row a window, a column a parameter."""
     found, names = chosen.validation, chosen.validation.names
-    figure = Figure(figsize=(_wide(names) * len(names) + 0.3, 2.3 * len(chosen.windows) + 0.9), layout="constrained")
-    axes = figure.subplots(len(chosen.windows), len(names), squeeze=False)
+    figure, axes = _panels(len(chosen.windows), len(names), (_wide(names), 2.3), narrow=narrow)
     for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
         for name, ax in zip(names, line, strict=True):
             other = None if window.nuts is None else found.nuts[name][..., window.nuts].numpy()
             own = found.sgld[name][..., window.number].numpy()
             marginals(ax, name, own, other, found.quadrature, window.number, truth=chosen.truth(window, name))
-            if row < len(axes) - 1:
+            if row < len(axes) - 1 and not narrow:
                 ax.set_xlabel("")
         line[0].set_title(window.title)
         line[0].set_ylabel("density")
-    _legend(figure, axes)
+    _legend(figure, axes, narrow=narrow)
     return figure
 
 
 @styled
-def joint_figure(chosen: ChosenWindows) -> Figure:
+def joint_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
     """Clouds of lag and gain within the 50 and 90 % regions of exact draws and of NUTS; a panel a window."""
     found = chosen.validation
-    figure = Figure(figsize=(3.9 * len(chosen.windows) + 0.3, 4.6), layout="constrained")
-    axes = figure.subplots(1, len(chosen.windows), squeeze=False)
+    figure, axes = _panels(1, len(chosen.windows), (3.9, 3.7), narrow=narrow)
     for i, (window, ax) in enumerate(zip(chosen.windows, axes[0], strict=True)):
         references = {} if chosen.exact is None else {"exact": (chosen.exact, i)}
         if window.nuts is not None:
@@ -96,22 +99,21 @@ def joint_figure(chosen: ChosenWindows) -> Figure:
         truth = None if lag is None or gain is None else (lag, gain)
         joint_cloud(ax, found.sgld, window.number, references=references, truth=truth)
         ax.set_title("\n".join(t for t in (window.title, ax.get_title("left")) if t))
-        if i:
+        if i and not narrow:
             ax.set_ylabel("")
-    _legend(figure, axes)
+    _legend(figure, axes, narrow=narrow)
     return figure
 
 
 @styled
-def ranks_figure(chosen: ChosenWindows) -> Figure:
+def ranks_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
     """Ranks of groups of SGLD's chains, of NUTS and of exact draws in their common pool; a row a window."""
     found, names = chosen.validation, chosen.validation.names
     groups = min(GROUPS, found.sgld.draws.shape[0])
     rows = groups + 2
-    figure = Figure(
-        figsize=(_wide(names) * len(names) + 1.4, (0.33 * rows + 0.6) * len(chosen.windows) + 0.9), layout="constrained"
+    figure, axes = _panels(
+        len(chosen.windows), len(names), (_wide(names), 0.33 * rows + 0.6), beside=1.4, narrow=narrow
     )
-    axes = figure.subplots(len(chosen.windows), len(names), squeeze=False)
     reference = sampling_diagnostics(found.nuts) if len(found.nuts_index) else None
     for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
         for i, (name, ax) in enumerate(zip(names, line, strict=True)):
@@ -125,30 +127,29 @@ def ranks_figure(chosen: ChosenWindows) -> Figure:
             if chosen.exact is not None:
                 drawn["exact"] = chosen.exact[name][..., row].numpy()
             rank_plot(ax, pooled_rank_counts(drawn, bins=BINS), effective=worth)
-            if row == len(axes) - 1:
+            if row == len(axes) - 1 or narrow:
                 ax.set_xlabel(f"rank of {short(name)} [-]")
-            if i:
+            if i and not narrow:
                 ax.set_yticklabels([])
         line[0].set_title(window.title)
-    figure.suptitle(
-        "Ranks of each group in the pool of all draws, as shares: bars are relative to the count expected, grey is\n"
+    _title(
+        figure,
+        "Ranks of each group in the pool of all draws, as shares: bars are relative to the count expected, grey is "
         "the band that holds all bars of a panel with 95 % probability, ± its half width (by effective sample sizes)",
-        fontsize=9.5,
-        color=BLACK,
+        narrow,
     )
     return figure
 
 
 @styled
-def ecdf_figure(validation: Validation) -> Figure:
+def ecdf_figure(validation: Validation, *, narrow: bool = False) -> Figure:
     """Exact probabilities below the draws: their ECDF less the uniform one, a line a window, for SGLD and for NUTS."""
     exact, names = validation.quadrature, validation.names
     assert exact is not None
     arms = [("SGLD", validation.sgld, torch.arange(len(exact.mean)), validation.agreement.ess_bulk)]
     if len(validation.nuts_index):
         arms.append(("NUTS", validation.nuts, validation.nuts_index, sampling_diagnostics(validation.nuts).ess_bulk))
-    figure = Figure(figsize=(_wide(names) * len(names) + 0.5, 2.7 * len(arms) + 0.8), layout="constrained")
-    axes = figure.subplots(len(arms), len(names), squeeze=False, sharex=True, sharey="row")
+    figure, axes = _panels(len(arms), len(names), (_wide(names), 2.7), beside=0.5, sharey="row", narrow=narrow)
     for line, (method, posterior, index, worth) in zip(axes, arms, strict=True):
         sound = (posterior.converged & exact.converged[index]).nonzero().squeeze(-1)
         taken = sound[torch.linspace(0, len(sound) - 1, min(MOST, len(sound))).long()]
@@ -173,24 +174,23 @@ def ecdf_figure(validation: Validation) -> Figure:
         line[0].set_ylabel("ECDF less uniform [-]")
     for ax in axes[-1]:
         ax.set_xlabel("exact probability below a draw [-]")
-    for ax in axes.flat:
+    for ax in axes.flat if not narrow else ():
         ax.label_outer()
-    figure.suptitle(
+    _title(
+        figure,
         "One line per converged window, dashed where it leaves its own 95 % band (1 in 20 at most by chance);"
         " grey: the band at the median effective sample size",
-        fontsize=9.5,
-        color=BLACK,
+        narrow,
     )
     return figure
 
 
 @styled
-def agreement_figure(validation: Validation) -> Figure:
+def agreement_figure(validation: Validation, *, narrow: bool = False) -> Figure:
     """Differences of mean and ratios of SD of every window over the width of its posterior, with the limits."""
     names, found, index = validation.names, validation.agreement, validation.compared
     width, sound = relative_width(validation, index), converged(validation, index)
-    figure = Figure(figsize=(_wide(names) * len(names) + 0.4, 6.4), layout="constrained")
-    axes = figure.subplots(2, len(names), squeeze=False, sharey="row")
+    figure, axes = _panels(2, len(names), (_wide(names), 2.75), beside=0.4, sharey="row", narrow=narrow)
     measures = [
         ("difference of means [posterior SD]", found.mean_difference, found.mean_error, 0.0, MEAN_TOLERANCE),
         ("ratio of SDs [-]", found.sd_ratio, found.sd_error, 1.0, SD_TOLERANCE),
@@ -212,14 +212,14 @@ def agreement_figure(validation: Validation) -> Figure:
             ax.set_xlabel(f"SD of {short(name)} [% of its mean]" if len(names) <= 3 else "SD [% of mean]")
         line[0].set_ylabel(label)
     v = validation.verdict
-    figure.suptitle(
+    _title(
+        figure,
         f"SGLD against {METHOD[validation.reference]}: {100 * v.share:.1f} % of {len(index)} windows within all limits"
         f" (95 % interval {100 * v.low:.1f} to {100 * v.high:.1f} %;"
         f" exact draws would be at {100 * v.share_if_exact:.1f} %)",
-        fontsize=10,
-        color=BLACK,
+        narrow,
     )
-    _legend(figure, axes, where="outside lower center")
+    _legend(figure, axes, where="outside lower center", narrow=narrow)
     return figure
 
 
@@ -272,16 +272,41 @@ def _wide(names: tuple[str, ...]) -> float:
     return 3.4 if len(names) <= 3 else 2.6
 
 
+def _panels(
+    rows: int,
+    columns: int,
+    panel: tuple[float, float],
+    *,
+    beside: float = 0.3,
+    sharey: Literal["row"] | bool = False,
+    narrow: bool = False,
+) -> tuple[Figure, np.ndarray]:
+    """A figure and its axes (row, column), each of a `panel`'s width and height [in]; `narrow`: all in one column."""
+    wide, high = panel
+    if narrow:
+        figure = Figure(figsize=(_NARROW, high * rows * columns + 1.4), layout="constrained")
+        return figure, figure.subplots(rows * columns, 1, squeeze=False).reshape(rows, columns)
+    figure = Figure(figsize=(wide * columns + beside, high * rows + 0.9), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, sharey=sharey)
+
+
+def _title(figure: Figure, text: str, narrow: bool) -> None:
+    """Above all panels, in lines as long as these are wide."""
+    letters = round((9.0 if narrow else 11.0) * figure.get_figwidth())
+    figure.suptitle("\n".join(textwrap.wrap(text, letters)), fontsize=9.5, color=BLACK)
+
+
 def _legend(
     figure: Figure,
     axes: np.ndarray,
     *,
     where: Literal["outside upper center", "outside lower center"] = "outside upper center",
+    narrow: bool = False,
 ) -> None:
     """One legend for all axes, each name once, above or below them."""
     found: dict = {}
     for ax in axes.flat:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             found.setdefault(label, handle)
-    columns = min(len(found), 6)
+    columns = 1 if narrow else min(len(found), 6)
     figure.legend(list(found.values()), list(found), loc=where, ncols=columns)

@@ -1,4 +1,4 @@
-"""Pages that a reader opens anywhere: the report of a diagnosis, and the page of a fleet.
+"""Pages that a reader opens anywhere: the report of a diagnosis, and a page of every other answer.
 
 Names are loaded when first used: the page of a fleet that was only checked needs neither torch nor matplotlib.
 """
@@ -9,16 +9,38 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from avtorch.report.comparison_page import comparison_html, write_comparison_page
+    from avtorch.report.estimates_page import estimates_html, write_estimates_page
     from avtorch.report.fleet_page import fleet_html, write_fleet_page
     from avtorch.report.origin import Origin
     from avtorch.report.page import report_html, write_report
+    from avtorch.report.run_page import run_html, write_run_page
+    from avtorch.report.validation_page import validation_html, write_validation_page
 
-__all__ = ["Origin", "fleet_html", "report_html", "write_fleet_page", "write_report"]
+__all__ = [
+    "Origin",
+    "comparison_html",
+    "estimates_html",
+    "fleet_html",
+    "report_html",
+    "run_html",
+    "validation_html",
+    "write_comparison_page",
+    "write_estimates_page",
+    "write_fleet_page",
+    "write_report",
+    "write_run_page",
+    "write_validation_page",
+]
 
-_HOME = {"Origin": "origin", "fleet_html": "fleet_page", "write_fleet_page": "fleet_page"}
+_HOME = {"Origin": "origin", "report_html": "page", "write_report": "page"} | {
+    name: f"{kind}_page"
+    for kind in ("comparison", "estimates", "fleet", "run", "validation")
+    for name in (f"{kind}_html", f"write_{kind}_page")
+}
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"avtorch.report.{_HOME.get(name, 'page')}"), name)
+    return getattr(import_module(f"avtorch.report.{_HOME[name]}"), name)

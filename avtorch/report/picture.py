@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import matplotlib as mpl
@@ -12,7 +13,19 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from avtorch.errors import printable
-from avtorch.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILLION
+from avtorch.plots.style import (
+    AMPLIFIES,
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    STABLE,
+    UNSTABLE,
+    VERMILLION,
+)
 from avtorch.report.table import Table
 
 _COLOURS = {
@@ -24,6 +37,13 @@ _COLOURS = {
     ORANGE: "p-orange",
     SKY: "p-sky",
     GREY: "p-grey",
+    GREEN: "p-green",
+    PURPLE: "p-purple",
+    STABLE: "p-stable",
+    AMPLIFIES: "p-amplifies",
+    UNSTABLE: "p-unstable",
+    "#B07A1E": "p-contour",
+    "#DCDCDC": "p-fill",
     "#BBBBBB": "p-bar",
     "#DDDDDD": "p-fill",
     "#E6E6E6": "p-grid",
@@ -51,6 +71,21 @@ class Picture:
     caption: str = ""
     tables: tuple[Table, ...] = ()
     opened: bool = False
+
+
+def picture_of(
+    name: str, draw: Callable[[bool], Figure], says: str, *tables: Table, caption: str = "", opened: bool = False
+) -> Picture:
+    """What `draw` makes of False, for a desk, and of True, for a phone.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.report.picture import picture_of
+        >>> picture_of("empty", lambda narrow: Figure(figsize=(1, 1)), "Nothing.").says
+        'Nothing.'
+    """
+    wide, narrow = (inline_svg(f"{name}-{kind}", draw(kind == "narrow"), says) for kind in ("wide", "narrow"))
+    return Picture(wide, narrow, says, caption, tables, opened)
 
 
 def inline_svg(name: str, figure: Figure, says: str) -> Markup:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from avtorch.experiment import Experiment
 from avtorch.gap.crossval.localisation import UNITS, Axis
@@ -23,7 +22,7 @@ from avtorch.plots.diagnosis import (
 from avtorch.plots.experiment import experiment_figure
 from avtorch.plots.whole_drive import DriveTime, drive_figure, drive_time
 from avtorch.report.entries import budget_table, candidate_table, measure_table
-from avtorch.report.picture import Picture, inline_svg
+from avtorch.report.picture import Picture, picture_of
 from avtorch.report.table import Table, of_numbers
 
 _MOST = 60  # rows of a table behind a picture of lines
@@ -54,25 +53,13 @@ def pictures(found: Diagnosis, experiment: Experiment | None = None) -> dict[str
     }
 
 
-def _picture(
-    name: str,
-    draw: Callable[[bool], Figure],
-    says: str,
-    *tables: Table,
-    caption: str = "",
-    opened: bool = False,
-) -> Picture:
-    wide, narrow = (inline_svg(f"{name}-{kind}", draw(kind == "narrow"), says) for kind in ("wide", "narrow"))
-    return Picture(wide, narrow, says, caption, tables, opened)
-
-
 def _budget(found: Diagnosis) -> Picture | None:
     budget = found.budget
     if budget is None or not budget.parts:
         return None
     shares = [(part.name, part.share) for part in budget.parts] + [("unexplained", budget.unexplained.share)]
     says = ", ".join(f"{name} {100 * share.mean:.0f} %" for name, share in shares)
-    return _picture(
+    return picture_of(
         "budget",
         lambda narrow: budget_figure(found, narrow=narrow),
         f"Bars of what each effect contributes to the gap: {says}.",
@@ -105,7 +92,7 @@ def _drive(found: Diagnosis) -> Picture | None:
             cells += [f"{size:.3f}" for size in sizes]
         rows.append(tuple(cells))
     named = " and that with what was named" if found.winner.effects else ""
-    return _picture(
+    return picture_of(
         "drive",
         lambda narrow: drive_figure(found, narrow=narrow),
         f"Lines over the whole drive, {axis.along[0]:.0f} to {axis.along[-1]:.0f} s: the command, the measured "
@@ -160,7 +147,7 @@ def _road(found: Diagnosis) -> Picture | None:
         rows,
         (".2f", *(".3f" for _ in labels)),
     )
-    return _picture(
+    return picture_of(
         "road",
         lambda narrow: road_figure(found, narrow=narrow),
         f"Lines of {_quantity(stretch.axis)} over time, {stretch.time[0]:.0f} to {stretch.time[-1]:.0f} s: "
@@ -196,7 +183,7 @@ def _where(found: Diagnosis) -> Picture | None:
         columns = (f"{axis} [{UNITS[axis]}]", "share of the drive", "share of the effect")
         tables.append(Table(f"Along {axis}", columns, tuple(rows), numeric=columns[1:]))
     said = " ".join(sentences.where(found)) or "No part of the drive stands out."
-    return _picture(
+    return picture_of(
         "where",
         lambda narrow: where_figure(found, narrow=narrow),
         f"Histograms along {', '.join(axes)}: the share of the drive beside the share of the effect. {said}",
@@ -207,7 +194,7 @@ def _where(found: Diagnosis) -> Picture | None:
 
 def _which(found: Diagnosis) -> Picture:
     bars = ", ".join(f"{c.name.replace('+', ' + ')} {sentences.number(c.probability)}" for c in found.candidates[:3])
-    return _picture(
+    return picture_of(
         "which",
         lambda narrow: which_figure(found, narrow=narrow),
         f"Bars of the probability of each hypothesis: {bars}.",
@@ -224,7 +211,7 @@ def _shrinkage(found: Diagnosis) -> Picture | None:
     if scores is None or not _over_horizons(scores):
         return None
     top = scores.by_metric[scores.metric]
-    return _picture(
+    return picture_of(
         "shrinkage",
         lambda narrow: shrinkage_figure(found, narrow=narrow),
         "Lines of the error over the length of the rollouts: baseline simulator, baseline with a black box, with the "
@@ -240,7 +227,7 @@ def _next(experiment: Experiment) -> Picture:
     m = experiment.manoeuvre
     rows = _some(np.column_stack([m.time, m.command, m.speed]))
     columns = ("time [s]", "command [m/s²]", "expected speed [m/s]")
-    return _picture(
+    return picture_of(
         "next",
         lambda narrow: experiment_figure(experiment, narrow=narrow),
         f"Lines over {m.time[-1]:.0f} s: a command of {m.command.min():.2g} to {m.command.max():.2g} m/s² and the "

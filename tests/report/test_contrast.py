@@ -8,7 +8,9 @@ from importlib.resources import files
 import pytest
 
 TEXT = ("ink", "soft", "blue", "green", "amber")
-LINES = ("p-blue", "p-vermillion", "p-orange", "p-sky", "p-grey", "p-bar")
+LINES = ("p-blue", "p-vermillion", "p-orange", "p-sky", "p-grey", "p-bar", "p-green", "p-purple", "p-contour")
+AREAS = ("p-stable", "p-amplifies", "p-unstable")
+"""Of a map; the lines between them tell them apart."""
 DECORATION = {"line", "p-fill", "p-grid"}
 """Rules of tables, the grid, and a ground whose outline is p-grey."""
 
@@ -43,12 +45,15 @@ def test_the_measure_itself() -> None:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_contrast_is_enough(scheme: str) -> None:
     colours = palettes()[scheme]
-    assert {"back", "paper", *TEXT, *LINES, *DECORATION} == set(colours)
+    assert {"back", "paper", *TEXT, *LINES, *AREAS, *DECORATION} == set(colours)
     for ground in ("paper", "back"):
         for name in TEXT:
             assert contrast(colours[name], colours[ground]) >= 4.5, (name, ground)
     for name in LINES:
         assert contrast(colours[name], colours["paper"]) >= 3.0, name
+    for area in AREAS:
+        assert contrast(colours["ink"], colours[area]) >= 4.5, area
+    assert contrast(colours["p-contour"], colours["p-amplifies"]) >= 4.5, "labels of the peak gain"
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -1,0 +1,63 @@
+"""Ratios with their intervals beside one: what has changed, which of two is nearer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+
+from avtorch.gap.quantity import Quantity
+from avtorch.plots.style import BLACK, BLUE, GREY, styled
+
+_WIDE, _NARROW = 8.6, 4.0  # inches
+
+
+def ratio_whiskers(ax: Axes, ratios: Mapping[str, Quantity], *, narrow: bool = False) -> Axes:
+    """A dot and its central 90 % for each of `ratios`, blue where one lies outside; `narrow`: names above them.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.gap.quantity import Quantity
+        >>> from avtorch.plots import ratio_whiskers
+        >>> ax = ratio_whiskers(Figure().subplots(), {"lag T_L [s]": Quantity(1.5, 0.1, 1.3, 1.7)})
+        >>> [label.get_text() for label in ax.get_yticklabels()]
+        ['lag T_L [s]']
+    """
+    for row, q in enumerate(ratios.values()):
+        colour = GREY if q.q05 <= 1 <= q.q95 else BLUE
+        ax.plot([q.q05, q.q95], [row, row], color=colour, linewidth=2.5)
+        ax.plot(q.mean, row, marker="o", markersize=8, color=colour)
+        ax.annotate(f"{q.mean:.2f}", (q.mean, row), (0, 8), textcoords="offset points", ha="center", fontsize=9)
+    ax.axvline(1.0, color=BLACK, linestyle="--", linewidth=1.1, zorder=1)
+    ax.set_yticks(range(len(ratios)), [] if narrow else list(ratios))
+    if narrow:
+        for row, name in enumerate(ratios):
+            ax.annotate(name, (0, row), (0, -14), xycoords=("axes fraction", "data"), textcoords="offset points")
+    ax.set_ylim(len(ratios) - (0.2 if narrow else 0.5), -0.7)
+    ax.set_xscale("log")
+    ends = [1.0, *(end for q in ratios.values() for end in (q.q05, q.q95) if end > 0)]
+    ax.set_xlim(min(*ends, 0.9) / 1.06, max(*ends, 1.1) * 1.06)
+    # decades are too far apart for ratios near one
+    ax.xaxis.set_major_locator(MaxNLocator(5 if narrow else 8))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.3g}"))
+    ax.grid(False, axis="y")
+    return ax
+
+
+@styled
+def ratio_figure(ratios: Mapping[str, Quantity], what: str = "ratio", *, narrow: bool = False) -> Figure:
+    """`ratio_whiskers` under the label `what`.
+
+    Example:
+        >>> from avtorch.gap.quantity import Quantity
+        >>> from avtorch.plots import ratio_figure
+        >>> len(ratio_figure({"lag T_L [s]": Quantity(1.5, 0.1, 1.3, 1.7)}, "after / before").axes)
+        1
+    """
+    height = 0.9 + (0.72 if narrow else 0.5) * len(ratios)
+    figure = Figure(figsize=(_NARROW if narrow else _WIDE, height), layout="constrained")
+    ratio_whiskers(figure.add_subplot(), ratios, narrow=narrow).set_xlabel(what)
+    return figure

@@ -1,0 +1,161 @@
+"""The page of an estimate: lag and gain window by window, alerts, P(string stable)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from avtorch.errors import InputError
+from avtorch.io.clock import from_start
+from avtorch.plots.figures import belief_figure, probability_figure
+from avtorch.report.answer_page import AnswerPage, Section, Tone, answer_html, written
+from avtorch.report.estimates_sentences import dead_time_note, estimates_note, late_note
+from avtorch.report.origin import Origin
+from avtorch.report.picture import Picture, picture_of
+from avtorch.report.window_table import alert_table, window_table
+from avtorch.results import estimates_answer
+
+if TYPE_CHECKING:
+    from avtorch.decision.estimation import Estimates
+    from avtorch.io import Log
+
+TARGET = 0.95
+"""P(string stable) below which a setting is to be changed."""
+
+
+def estimates_html(
+    found: Estimates, log: Log, *, notes: Iterable[str] = (), origin: Origin | None = None, name: str | None = None
+) -> str:
+    """The page of the estimate `found` on `log`, as text; `notes`: on the data, beside those of its check.
+
+    Raises `InputError` where no window was estimated.
+
+    Example:
+        >>> from avtorch import Leader, estimate, simulate
+        >>> from avtorch.report import estimates_html
+        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
+        >>> page = estimates_html(estimate(log, estimator="map"), log)
+        >>> "P(string stable)" in page, page.rstrip().endswith("</html>")
+        (True, True)
+    """
+    answer = estimates_answer(found)
+    epoch_s = answer["epoch_s"]
+    windows, alerts = (from_start(answer[key], epoch_s) for key in ("windows", "alerts"))
+    if not windows:
+        raise InputError("found: has no windows, needs the estimate of a log")
+    facts = f"{name or log.name} · {len(windows)} windows of {windows[0]['end_s'] - windows[0]['start_s']:g} s"
+    told = (estimates_note(answer), *_stability(windows, answer["assumed"]))
+    more = (late_note(found.late), dead_time_note(found.inferred))
+    page = AnswerPage(
+        "Estimate",
+        facts,
+        Section(_headline(windows), (*told, *(text for text in more if text)), (_belief(answer, log),)),
+        (
+            Section("String stability", pictures=(_probability(answer),)),
+            Section("Alerts", () if alerts else ("None.",), tables=(alert_table(alerts),) if alerts else ()),
+            Section("Windows", folded=(window_table(windows),)),
+            Section("The data", items=(*found.quality.notes, *notes)),
+            Section("Method and limits", items=_method(answer)),
+        ),
+        _tone(windows),
+    )
+    return answer_html(page, origin=origin)
+
+
+def write_estimates_page(
+    found: Estimates,
+    log: Log,
+    folder: str | PathLike[str],
+    *,
+    notes: Iterable[str] = (),
+    origin: Origin | None = None,
+    name: str | None = None,
+) -> Path:
+    """Write `estimates.html` into `folder`; returns its path. Raises `InputError` where it cannot be written.
+
+    Example:
+        >>> from avtorch import Leader, estimate, simulate
+        >>> from avtorch.report import write_estimates_page
+        >>> log = simulate(Leader.default(start=50.0, duration=4.0, dt=0.02)).log()
+        >>> write_estimates_page(estimate(log, estimator="map"), log, "out").name
+        'estimates.html'
+    """
+    return written(estimates_html(found, log, notes=notes, origin=origin, name=name), folder, "estimates.html")
+
+
+def _headline(windows: Sequence[Mapping[str, Any]]) -> str:
+    used = [w for w in windows if w["used"]]
+    if not used:
+        return "No window could be used: lag and gain are not known"
+    last = used[-1]
+    lag, gain = (f"{last[n]['mean']:.3g}{unit} ({last[n]['q05']:.2g} to {last[n]['q95']:.2g})" for n, unit in _SHOWN)
+    return f"Lag T_L {lag}, gain K_L {gain}"
+
+
+_SHOWN = (("T_L", " s"), ("K_L", ""))
+
+
+def _stability(windows: Sequence[Mapping[str, Any]], assumed: Mapping[str, Any]) -> tuple[str, ...]:
+    if not any(w["used"] for w in windows):
+        return ()
+    last, least = windows[-1], min(windows, key=lambda w: w["p_string_stable"])
+    gains = ", ".join(f"{k:g}" for k in assumed["gains"])
+    lowest = f"; the lowest was {least['p_string_stable']:.2f} at {least['end_s']:.0f} s" if least is not last else ""
+    return (
+        f"With a time gap of {assumed['time_gap_s']:g} s and gains {gains}, P(string stable) is "
+        f"{last['p_string_stable']:.2f} after the last window{lowest}.",
+    )
+
+
+def _tone(windows: Sequence[Mapping[str, Any]]) -> Tone:
+    if not any(w["used"] for w in windows):
+        return "amber"
+    return "green" if windows[-1]["p_string_stable"] >= TARGET else "amber"
+
+
+def _belief(answer: Mapping[str, Any], log: Log) -> Picture:
+    windows = from_start(answer["windows"], answer["epoch_s"])
+    ends = {
+        n: [f(w[n]["mean"] for w in windows if w["used"] or not any(x["used"] for x in windows)) for f in (min, max)]
+        for n in ("T_L", "K_L")
+    }
+    says = (
+        f"Bands of lag and gain over {windows[-1]['end_s']:.0f} s, 90 % and mean of each window: T_L from "
+        f"{ends['T_L'][0]:.2f} to {ends['T_L'][1]:.2f} s, K_L from {ends['K_L'][0]:.2f} to {ends['K_L'][1]:.2f}. Below "
+        "them: which rows of the log served."
+    )
+    return picture_of(
+        "belief",
+        lambda narrow: belief_figure(answer["windows"], answer=answer, log=log, narrow=narrow),
+        says,
+        caption="Grey: a window that excited too little, or did not converge; the belief before it is carried over.",
+    )
+
+
+def _probability(answer: Mapping[str, Any]) -> Picture:
+    values = [w["p_string_stable"] for w in answer["windows"]]
+    below = sum(p < TARGET for p in values)
+    return picture_of(
+        "probability",
+        lambda narrow: probability_figure(answer["windows"], answer=answer, target=TARGET, narrow=narrow),
+        f"P(string stable) over time, {min(values):.2f} to {max(values):.2f}; below {TARGET:g} after {below} of "
+        f"{len(values)} windows.",
+        caption="Known at the end of each window: a dot, red below the target.",
+    )
+
+
+def _method(answer: Mapping[str, Any]) -> tuple[str, ...]:
+    assumed = answer["assumed"]
+    form = {"jerk": "the measured jerk", "latent": "noisy acceleration and speed"}[answer["form"]]
+    found = [
+        f"da/dt = -a/T_L + K_L/T_L u + noise; the likelihood is that of {form}, each window's posterior is the next "
+        f"one's prior, by the estimator {answer['estimator']}.",
+        f"Commands take effect after a dead time of {assumed['dead_time_s']:g} s.",
+        "The log does not hold its controller: P(string stable) is that of the linear one with the gap and gains "
+        "above, for small motions.",
+        f"Alerts of accepted_change compare with T_L {assumed['accepted']['T_L']:g} s and K_L "
+        f"{assumed['accepted']['K_L']:g}, a car as it should be.",
+    ]
+    return (*found, answer["estimator_note"]) if answer["estimator_note"] else tuple(found)

@@ -1,0 +1,55 @@
+"""Tables of what a watch saw: its windows, its alerts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from avtorch.report.table import Table
+
+MOST = 500
+"""Windows that a table shows, evenly spaced: a day of them would make a page of megabytes."""
+
+
+def window_table(windows: Sequence[Mapping[str, Any]]) -> Table:
+    """A row a window, in the form of an answer: bounds [s], rows, T_L and K_L with 90 %, P(string stable), remarks.
+
+    Example:
+        >>> from avtorch.report.window_table import window_table
+        >>> belief = {"mean": 0.5, "q05": 0.4, "q95": 0.6}
+        >>> window = {"start_s": 0.0, "end_s": 2.0, "n": 200, "T_L": belief, "K_L": belief, "p_string_stable": 0.9}
+        >>> window_table([window | {"used": False, "excited": False, "alerts": []}]).rows
+        (('0 to 2', '200', '0.500 (0.40 to 0.60)', '0.500 (0.40 to 0.60)', '0.90', 'not excited'),)
+    """
+    columns = ("time [s]", "rows", "T_L [s] (90 %)", "K_L (90 %)", "P(string stable)", "remarks")
+    step = -(-len(windows) // MOST) if windows else 1
+    rows = tuple(_row(w) for w in windows[::step])
+    some = f"Every {step} windows" if step > 1 else "The windows"
+    return Table(some, columns, rows, numeric=("rows", "P(string stable)"))
+
+
+def alert_table(alerts: Sequence[Mapping[str, Any]]) -> Table:
+    """The first alert of each detector, and how many windows raised it: one that nobody answers comes again.
+
+    Example:
+        >>> from avtorch.report.window_table import alert_table
+        >>> alert_table([{"time_s": t, "detector": "stability", "why": "P is 0.1"} for t in (2.0, 4.0)]).rows
+        (('2.0', 'stability', 'P is 0.1', '2'),)
+    """
+    first: dict[str, Mapping[str, Any]] = {}
+    for alert in alerts:
+        first.setdefault(alert["detector"], alert)
+    rows = [
+        (f"{a['time_s']:.1f}", name, a["why"], str(sum(x["detector"] == name for x in alerts)))
+        for name, a in first.items()
+    ]
+    columns = ("first at [s]", "detector", "why", "windows")
+    return Table("Alerts, each detector's first", columns, tuple(rows), numeric=("windows",))
+
+
+def _row(w: Mapping[str, Any]) -> tuple[str, ...]:
+    own = [f"{w[n]['mean']:.3f} ({w[n]['q05']:.2f} to {w[n]['q95']:.2f})" for n in ("T_L", "K_L")]
+    unused = "not converged" if w["excited"] else "not excited"
+    remarks = ", ".join(w["alerts"]) if w["alerts"] else "" if w["used"] else unused
+    span = f"{w['start_s']:.4g} to {w['end_s']:.4g}"
+    return (span, str(w["n"]), *own, f"{w['p_string_stable']:.2f}", remarks)
