@@ -236,15 +236,20 @@ def test_shown_in_a_script_a_figure_is_a_file(tmp_path: Path, capsys: pytest.Cap
 def test_shown_in_a_notebook_a_figure_is_below_its_cell(
     kernel: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shown: list[tuple[bytes, int]] = []
+    shown: list[tuple[bytes, int, str]] = []
     shell = SimpleNamespace(kernel=None) if kernel else SimpleNamespace()
     monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
-    display = SimpleNamespace(Image=lambda data, width: (data, width), display=shown.append)
+    display = SimpleNamespace(Image=lambda data, width, alt: (data, width, alt), display=shown.append)
     monkeypatch.setitem(sys.modules, "IPython.display", display)
-    plots.show(Figure(figsize=(6, 3)), tmp_path / "a.png")
+    figure = Figure(figsize=(6, 3))
+    ax = figure.subplots()
+    ax.plot([0, 1], [20, 19], label="leader")
+    ax.set(xlabel="time [s]", ylabel="speed [m/s]", title="a slow-down")
+    plots.show(figure, tmp_path / "a.png")
     # a terminal's shell shows no pictures
     assert (tmp_path / "a.png").exists() is not kernel
-    assert [(data[:4], width) for data, width in shown] == ([(b"\x89PNG", 600)] if kernel else [])
+    told = "Figure. a slow-down: speed [m/s] over time [s], with leader."
+    assert [(data[:4], *others) for data, *others in shown] == ([(b"\x89PNG", 600, told)] if kernel else [])
 
 
 def test_save_refuses_a_folder(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from avtorch.decision.settings import Setting
 from avtorch.decision.watch import Watch, WatchedWindow
 from avtorch.decision.window_frame import window_frame
 from avtorch.display import Card, Displayed, Frame
+from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.inference.form import Form, JerkForm
 from avtorch.inference.latent_form import LatentForm
@@ -135,6 +136,7 @@ class Estimates(Displayed):
         return math.sqrt(sum(((s["mean"] - centre) / s["sd"]) ** 2 for s in stats) / (len(stats) - 1))
 
 
+@shows_progress
 def estimate(
     log: LogSource,
     window: float = 2.0,
@@ -148,7 +150,7 @@ def estimate(
     accepted: tuple[float, float] = (0.3, 1.0),
     dead_time: float | None = 0.0,
     align: bool = True,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | bool | None = None,
     finished: Callable[[WatchedWindow], None] | None = None,
     checkpoint: str | PathLike[str] | None = None,
     seed: int = 0,
@@ -162,8 +164,8 @@ def estimate(
     `form`: "jerk" needs measured jerk and accel (Eq. 4); "latent" takes accel and/or speed with their noise;
     "auto" is "jerk" where the log has both. Windows lie on a grid that starts afresh with each segment of the log; the
     last of a segment may be short. Rows at standstill, with `engaged` 0 and in the 2 s after a return to `engaged` are
-    masked; nothing is filtered through them. `progress(done, of)` is called with rows, `finished` with each window as
-    it is done.
+    masked; nothing is filtered through them. `progress(done, of)` is called with rows (True is a bar, False
+    none, and None a bar in a notebook only), `finished` with each window as it is done.
 
     `checkpoint`, with the default monitor only: a file that an interrupted call leaves, and from which one with the
     same log and options continues, to the same result to the bit; windows finished before the interruption come without
@@ -194,6 +196,7 @@ def estimate(
         >>> [round(window.belief.stat(name)["mean"], 1) for name in ("T_L", "K_L")]
         [0.5, 0.9]
     """
+    step = called(progress)
     log = as_log(log, map=map, unit=unit)
     if log.accel_cmd is None:
         raise no_command(log, "; T_L and K_L need the demanded acceleration")
@@ -254,8 +257,8 @@ def estimate(
             windows += seen
             for w in seen:
                 tell(w)
-            if progress is not None:
-                progress(place.row, log.rows)
+            if step is not None:
+                step(place.row, log.rows)
     except BaseException:
         with suppress(InputError):  # report the first failure
             kept.write()

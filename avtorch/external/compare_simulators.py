@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from avtorch.arrays import FloatArray
+from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.external.by_what import differences
 from avtorch.external.driven_plant import DrivenPlant
@@ -32,6 +33,7 @@ Progress = Callable[[str, int, int], None]
 _CHANNELS = ("accel", "speed")
 
 
+@shows_progress
 def compare_simulators(
     logs: LogSource | Sequence[LogSource],
     first: ExternalSimulator | GapPlant | str | PathLike[str],
@@ -40,14 +42,15 @@ def compare_simulators(
     map: Pairs = None,
     unit: Pairs = None,
     level: float = LEVEL,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> SimulatorComparison:
     """Which of two simulators is nearer to the car that drove `logs`, and by what.
 
     `logs`: one log or several, each a `Log`, a path or a data frame; `map`, `unit`: as `Log.read` takes them, for what
     is read here. `first`, `second`: each a simulator that is not avtorch's own (`ExternalSimulator`: its output, an
     object with `reset` and `step`, an FMU), a plant, or one as text (`"dead_time=0.2, T_L=0.4"`) or TOML. `level`: how
-    often two that are equally near may be told apart. `progress(what, done, of)` is called at each step.
+    often two that are equally near may be told apart. `progress(what, done, of)` is called at each step; or
+    True, False, None, as in `avtorch.diagnose`.
 
     Raises `InputError` for a level out of range, logs with less than five blocks of 4 s of usable driving, simulators
     without a channel of the logs, and as `ExternalSimulator.beside`.
@@ -74,10 +77,11 @@ def compare_simulators(
         raise InputError(f"level: found {level}, needs a number between 0 and 1")
     each = as_logs(logs, map=map, unit=unit)
     given = [_driven(x) for x in (first, second)]
-    rolled = [simulator.outputs(each, progress) for simulator, _ in given]
+    steps = called(progress)
+    rolled = [simulator.outputs(each, steps) for simulator, _ in given]
     cars = _scored(each, [outputs for outputs, _ in rolled])
     surrogates = [
-        surrogate_of(outputs, progress=progress) if own is None else Surrogate(own, {})
+        surrogate_of(outputs, progress=steps) if own is None else Surrogate(own, {})
         for (_, own), (outputs, _) in zip(given, rolled, strict=True)
     ]
     scored = ScoredBlocks.of(Record.of(cars))

@@ -15,6 +15,7 @@ import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.display import Card, Displayed, Frame
+from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.follower.closed_loop import LoopErrors, keeps_speed, loop_errors
 from avtorch.follower.followed import Followed, car_of, followed, seen_in
@@ -104,6 +105,7 @@ class FollowerDiagnosis(Displayed):
         return ({} if self.diagnosis is None else self.diagnosis.to_dict()) | {"follower": follower}
 
 
+@shows_progress
 def diagnose_follower(
     log: LogSource,
     *,
@@ -113,7 +115,7 @@ def diagnose_follower(
     cause: bool = True,
     effects: Sequence[str] | None = None,
     seed: int = 0,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Callable[[str, int, int], None] | bool | None = None,
 ) -> FollowerDiagnosis:
     """Time gap, gains, lag with delay, string stability, gap and cause of a car-following `log`.
 
@@ -134,6 +136,7 @@ def diagnose_follower(
         1.5
     """
     log = as_log(log, map=map, unit=unit, following=True)
+    steps = called(progress)
     laws = list(LAWS.values()) if law is None else [law_named(law)]
     plain = followed(log, laws[0])
     record = plain.record
@@ -144,8 +147,8 @@ def diagnose_follower(
     halves = _halves(record)
     tried: dict[str, tuple[LoopErrors, Identified]] = {}
     for i, own in enumerate(laws):
-        if progress is not None:
-            progress("laws", i, len(laws))
+        if steps is not None:
+            steps("laws", i, len(laws))
         tried[own.name] = _crossed(followed(log, own), halves)
     best = min(tried, key=lambda name: tried[name][0].speed)
     chosen, first = LAWS[best], tried[best][1]
@@ -163,7 +166,7 @@ def diagnose_follower(
         loops={name: errors for name, (errors, _) in tried.items()} | {"without_delay": bare},
         keeps_speed=keeps,
         stability=tuple(loop_stability(chosen, draws, speeds.tolist())),
-        diagnosis=_cause(log, first, halves[1], effects, seed, progress) if cause else None,
+        diagnosis=_cause(log, first, halves[1], effects, seed, steps) if cause else None,
         conditional=_conditional(chosen, tried[best][0].speed, keeps),
     )
 
@@ -204,14 +207,14 @@ def _cause(
     half: Record,
     effects: Sequence[str] | None,
     seed: int,
-    progress: Callable[[str, int, int], None] | None,
+    steps: Callable[[str, int, int], None] | None,
 ) -> Diagnosis:
     """The diagnosis of the test half, with the law's commands, starting from the lag and delay of the other half."""
     law = tensors({k.removeprefix("law."): v for k, v in first.values.items() if k.startswith("law.")})
     sent = first.candidate.law.command(law, seen_in(log)).numpy()
     begin = first.candidate.on(half).row(0)
     late = replace(log, accel=None, accel_cmd=np.clip(sent, _LOWEST, _HIGHEST))[begin : log.rows]
-    return diagnose(late, baseline=car_of(first.values), effects=effects, seed=seed, progress=progress)
+    return diagnose(late, baseline=car_of(first.values), effects=effects, seed=seed, progress=steps or False)
 
 
 def _parameters(law: HeadwayLaw, draws: Mapping[str, FloatArray], speed: float) -> dict[str, Quantity]:

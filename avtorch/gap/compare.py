@@ -24,6 +24,7 @@ from scipy.stats import f as fisher  # pyright: ignore[reportMissingTypeStubs]
 from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
+from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.change.change_cause import ChangeCause, cause_of_change
@@ -52,6 +53,7 @@ _DRAWS = 2000
 _CAR = ("T_L", "K_L")
 
 
+@shows_progress
 def compare(
     before: LogSource | Sequence[LogSource],
     after: LogSource | Sequence[LogSource],
@@ -62,7 +64,7 @@ def compare(
     baseline_after: Simulator = None,
     level: float = LEVEL,
     effects: Sequence[str | type[Effect]] | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Callable[[str, int, int], None] | bool | None = None,
 ) -> Comparison:
     """What changed from the drives `before` to those `after`.
 
@@ -75,7 +77,7 @@ def compare(
     `avtorch.compare_simulators`). `level`: significance level of a difference between the drives. `effects`:
     candidates, by name or class, for the cause of a change, beside T_L, K_L and dead time (default: all registered;
     none: `[]`).
-    `progress(what, done, of)` is called at every hypothesis.
+    `progress(what, done, of)` is called at every hypothesis; or True, False, None, as in `diagnose`.
 
     Raises `InputError` for logs that cannot be diagnosed or hold less than five blocks of 4 s of usable driving,
     channels that differ, an unknown effect, or a level out of range.
@@ -90,6 +92,7 @@ def compare(
         >>> found.cause.names
         ('K_L',)
     """
+    told = called(progress)
     if not 0 < level < 1:
         raise InputError(f"level: found {level}, needs a number between 0 and 1")
     sides = [as_logs(x, map=map, unit=unit, argument=name) for x, name in ((before, "before"), (after, "after"))]
@@ -97,13 +100,13 @@ def compare(
     if isinstance(baseline, BlackBoxSimulator):
         if baseline_after is not None:
             raise InputError("baseline_after: found beside a simulator that is no plant, needs compare_simulators")
-        beside = baseline.beside([*sides[0], *sides[1]], progress)
+        beside = baseline.beside([*sides[0], *sides[1]], told)
         sides = [list(beside.logs[: len(sides[0])]), list(beside.logs[len(sides[0]) :])]
         baseline = beside.plant
     given = [baseline, baseline if baseline_after is None else baseline_after]
     plants = [b if isinstance(b, GapPlant) else plant([], baseline=b) for b in given]
-    if progress is not None:
-        progress("lag and gain of both drives", 0, 2)
+    if told is not None:
+        told("lag and gain of both drives", 0, 2)
     fitted = [_Side.of(logs, plants[0], name) for logs, name in zip(sides, ("before", "after"), strict=True)]
     one, two = fitted
     if one.found.hypothesis.record.channels != two.found.hypothesis.record.channels:
@@ -131,7 +134,7 @@ def compare(
     gap = _gaps(fitted, simulators, horizon, same=same)
     simulator = _simulator_change(gap)
     changed = p_value < level
-    cause = None if same else _cause(sides, plants[0], kinds, progress)
+    cause = None if same else _cause(sides, plants[0], kinds, told)
     dead_time_test = (
         compare_explanations(*(DeadTimeFit.of(x.search.fits, x.found) for x in fitted), level=level)
         if changed

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.budget.account import account, divisible, restated
@@ -55,6 +56,7 @@ _NO_PAIRS = (
 )
 
 
+@shows_progress
 def diagnose(
     logs: LogSource | Sequence[LogSource],
     *,
@@ -69,7 +71,7 @@ def diagnose(
     budget_s: float | None = None,
     material: float = MATERIAL,
     seed: int = 0,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Callable[[str, int, int], None] | bool | None = None,
     checkpoint: str | PathLike[str] | None = None,
 ) -> Diagnosis:
     """Name what `baseline` lacks on these drives of one car, and how much of the gap each effect contributes.
@@ -87,9 +89,9 @@ def diagnose(
     the gap from which something counts. `budget_s`: after this time no new hypothesis is fitted; where that cuts the
     search short, `complete` is False and the verdict provisional: `scope` lists what was tested, and the verdict is
     distinguished only from that. `accel_kind`: whether `accel` is dv/dt or an accelerometer's reading (default: as the
-    logs state). `progress(what, done, of)` is called at each step, with `done` of `of` in the whole diagnosis.
-    `checkpoint`: a file that stores fits; a later search of the same logs with the same settings continues from it, to
-    the same answer.
+    logs state). `progress(what, done, of)` is called at each step, with `done` of `of` in the whole diagnosis;
+    True is a bar, False none, and None a bar in a notebook only. `checkpoint`: a file that stores fits; a later
+    search of the same logs with the same settings continues from it, to the same answer.
 
     Raises `InputError` for a log without `accel_cmd`, without 10 s of usable driving, for wrong arguments, or for a
     `checkpoint` that is damaged or belongs to other logs or settings.
@@ -103,7 +105,8 @@ def diagnose(
         >>> found.verdict.name, round(found.probability("dead_time"), 2)
         ('sensor_bias', 0.0)
     """
-    told, progress = progress, None if progress is None else WholeProgress(progress)
+    told = called(progress)
+    stages = None if told is None else WholeProgress(told)
     each = as_logs(logs, map=map, unit=unit)
     if accel_kind is not None:
         if accel_kind not in ("kinematic", "specific-force"):
@@ -114,7 +117,7 @@ def diagnose(
     if not 0 < material < 1:
         raise InputError(f"material: found {material}, needs a share between 0 and 1")
     if isinstance(baseline, BlackBoxSimulator):
-        beside = baseline.beside(each, progress)
+        beside = baseline.beside(each, stages)
         found = diagnose(
             beside.logs,
             baseline=beside.plant,
@@ -125,7 +128,7 @@ def diagnose(
             budget_s=budget_s,
             material=material,
             seed=seed,
-            progress=told,
+            progress=told or False,
             checkpoint=checkpoint,
         )
         return beside.told(found)
@@ -140,7 +143,7 @@ def diagnose(
         pairs=pairs,
         lost=(lambda singles, record: _unknown(singles, record, prior) > _LOST) if divisible(measured) else None,
         budget_s=budget_s,
-        progress=progress,
+        progress=stages,
         checkpoint=checkpoint,
     ).run()
     top = favourite(race.found)
@@ -171,7 +174,7 @@ def diagnose(
         material=material,
         most=(MOST_PARTS if pairs else 1) if race.complete else 0,
         seed=seed,
-        progress=progress,
+        progress=stages,
     )
     if accounted is not None:
         candidates, verdict = list(accounted.candidates), accounted.verdict
@@ -207,7 +210,7 @@ def diagnose(
     onset = None if verdict.name == "none" or selected is not None else _onset(winner or top, race)
     alike = {part for name in verdict.alias_set for part in name.split("+")}
     # where nothing is named, no effect closes anything
-    held = cross_validate(race, winner, alike=sorted(alike), progress=progress) if named and winner else None
+    held = cross_validate(race, winner, alike=sorted(alike), progress=stages) if named and winner else None
     attribution = RowAttribution.of(race, winner or top)
     simulator = repaired(race.none, base)
     car, beliefs = None, belief(race.none)

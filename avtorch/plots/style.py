@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import io
 import os
-import sys
 from collections.abc import Callable
 from functools import wraps
-from importlib import import_module
 from pathlib import Path
 from typing import Any, ParamSpec
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
+from avtorch.display.notebook import notebook_display
 from avtorch.io import atomic
 
 BLUE, VERMILLION, GREEN, ORANGE, SKY, PURPLE = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9", "#A6407E"
@@ -133,14 +132,26 @@ def show(figure: Figure, path: str | os.PathLike[str]) -> None:
         >>> show(Figure(figsize=(1, 1)), "empty.png")  # in a notebook the picture itself
         picture: empty.png
     """
-    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    # the shell of a terminal has no kernel and shows no pictures
-    if shell is None or not hasattr(shell, "kernel"):
+    display = notebook_display()
+    if display is None:
         print(f"picture: {save(figure, path)}")
         return
-    display = import_module("IPython.display")
     # the file's pixels at the figure's size, so that it is sharp on any screen
-    display.display(display.Image(_png(figure), width=round(figure.get_figwidth() * STYLE["figure.dpi"])))
+    width = round(figure.get_figwidth() * STYLE["figure.dpi"])
+    display.display(display.Image(_png(figure), width=width, alt=_alternative(figure)))
+
+
+def _alternative(figure: Figure) -> str:
+    """What is drawn over what, for readers who do not see it: titles, labels and legends of the axes."""
+    parts = []
+    for ax in figure.axes:
+        # an axes that shares its label has none of its own
+        over = [text for text in (ax.get_ylabel(), ax.get_xlabel()) if text]
+        what = ": ".join(text for text in (ax.get_title(loc="left") or ax.get_title(), " over ".join(over)) if text)
+        names = [label for label in ax.get_legend_handles_labels()[1] if label]
+        if what:
+            parts.append(" ".join(f"{what}{', with ' if names else ''}{', '.join(names)}.".split()))
+    return " ".join(["Figure.", *parts])
 
 
 def _png(figure: Figure) -> bytes:

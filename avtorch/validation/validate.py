@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from avtorch.display import Card, Displayed, Frame
+from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.inference.map import find_mode
 from avtorch.inference.posterior import Posterior
@@ -173,6 +174,7 @@ def check_installed() -> None:
         raise InputError(f"{', '.join(missing)}: {verb} not installed; needs pip install 'avtorch[validate]'")
 
 
+@shows_progress
 def validate(
     source: LogSource | Windows,
     *,
@@ -182,7 +184,7 @@ def validate(
     nuts_windows: int | None = None,
     nuts: NutsSettings | None = None,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Validation:
     """SGLD, quadrature and NUTS over the same windows, each under the first prior and on its own.
 
@@ -194,7 +196,7 @@ def validate(
         nuts_windows: on how many windows, evenly spread, NUTS is run: three, or one in the latent form, where it costs
             minutes.
         nuts: its chains and draws; by default those of `NutsSettings`, and fewer in the latent form.
-        progress: called with (done, of).
+        progress: called with (done, of); or True for a bar, False for none, None for a bar in a notebook only.
 
     Raises:
         InputError: if ArviZ or Pyro is missing, for ``nuts_windows`` below 1, or for a log that cannot be used.
@@ -220,7 +222,7 @@ def validate(
     if nuts_windows is None:
         nuts_windows = LATENT_NUTS_WINDOWS if latent else NUTS_WINDOWS
     chosen = torch.linspace(0, len(source) - 1, min(nuts_windows, len(source))).round().long()
-    count = _ProgressCount(progress, len(source) + NUTS_SHARE * len(chosen))
+    count = _ProgressCount(called(progress), len(source) + NUTS_SHARE * len(chosen))
     generator = torch.Generator().manual_seed(seed)
     blocks = [_block(source.select(i), settings, generator, count) for i in torch.arange(len(source)).split(BLOCK)]
     sgld = join_draws([b.sgld for b in blocks])

@@ -14,6 +14,7 @@ from os import PathLike
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.flexible_regression import left_over
@@ -35,6 +36,7 @@ from avtorch.io import Log
 _SURELY = 0.95  # share of the draws that find more unexplained than is material
 
 
+@shows_progress
 def gap_budget(
     logs: Log | Sequence[Log],
     *,
@@ -42,13 +44,14 @@ def gap_budget(
     effects: Sequence[str | type[Effect]] | None = None,
     material: float = MATERIAL,
     seed: int = 0,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Callable[[str, int, int], None] | bool | None = None,
 ) -> Budget:
     """The budget of the gap between `baseline` (default: bare GLVD) and the car of these drives.
 
     Args: `effects`: candidates by name or class (default: all registered); of the random ones, which predict nothing,
     only a slow force is looked for. `material`: share of the gap, or of the response, below which a cause is not a
-    part. `seed`: of the drawing of blocks for the intervals. `progress(what, done, of)` is called at each effect tried.
+    part. `seed`: of the drawing of blocks for the intervals. `progress(what, done, of)` is called at each effect
+    tried; or True, False, None, as in `avtorch.diagnose`.
 
     Raises `InputError` for a log without `accel_cmd`, for logs with less than six seconds that count (blocks
     are then of one second; six of four seconds or more are better), or for wrong arguments.
@@ -66,7 +69,7 @@ def gap_budget(
         raise InputError(f"material: found {material}, needs a share between 0 and 1")
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = chosen_effects(effects)
-    selection = select(AnalysisRecord.for_budget(each), base, kinds, progress=progress)
+    selection = select(AnalysisRecord.for_budget(each), base, kinds, progress=called(progress))
     selection = likely_parts(selection, material, seed=seed)
     budget = budget_of(selection, material=material, seed=seed, epoch_s=each[0].epoch_s)
     rest = placed(budget.unexplained, selection, epoch_s=each[0].epoch_s)

@@ -1,0 +1,93 @@
+"""How far a long call is: a bar below a notebook's cell or on a terminal, gone when the call ends.
+
+Example:
+    >>> from avtorch import GLVDPlant, Leader, estimate, simulate
+    >>> run = simulate(Leader.default(start=50.0, duration=2.0, dt=0.02), plant=GLVDPlant(0.5, 0.9))
+    >>> found = estimate(run.log(), progress=True)  # no bar: it takes less than a second
+    >>> len(found.windows)
+    1
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+from avtorch.display.bars import Bar, NoBar, bar_here
+from avtorch.display.notebook import notebook_display
+
+AFTER_S = 1.0
+"""A work that takes less shows no bar [s]."""
+_EVERY_S = 0.2
+
+P = ParamSpec("P")
+R = TypeVar("R")
+Steps = TypeVar("Steps", bound=Callable[..., None])
+
+_shown: ContextVar[bool] = ContextVar("avtorch_progress_bar", default=False)
+
+
+class _Steps:
+    """Called with (done, of), or (what, done, of) where there are stages; shows them on a bar now and then."""
+
+    def __init__(self, title: str, bar: Bar) -> None:
+        self._title, self._bar = title, bar
+        self._begun, self._last = time.monotonic(), 0.0
+
+    def __call__(self, *told: Any) -> None:
+        *stage, done, of = told
+        now = time.monotonic()
+        if now - self._begun < AFTER_S or now - self._last < _EVERY_S:
+            return
+        self._last = now
+        text = ": ".join([self._title, *stage])
+        if 0 < done < of:
+            text += f", about {(now - self._begun) * (of - done) / done:.0f} s left"
+        self._bar.show(text, min(done / of, 1.0) if of > 0 else 0.0)
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[Callable[..., None]]:
+    """A bar for a work of your own; yields a function of (done, of), or of (what, done, of) where there are stages.
+
+    It stands below the cell in a notebook, and on standard error where that is a terminal. Elsewhere, within another
+    bar and in the first second there is none. At the end it is gone.
+
+    Example:
+        >>> from avtorch.display import progress_bar
+        >>> with progress_bar("driving") as step:
+        ...     for lap in range(3):
+        ...         step(f"lap {lap + 1}", lap, 3)
+        >>> print("driven")
+        driven
+    """
+    bar = NoBar() if _shown.get() else bar_here()
+    token = _shown.set(True)
+    try:
+        yield _Steps(title, bar)
+    finally:
+        _shown.reset(token)
+        bar.close()
+
+
+def shows_progress(function: Callable[P, R]) -> Callable[P, R]:
+    """Gives `function` the bar that its keyword `progress` asks for: True, or None in a notebook."""
+
+    @wraps(function)
+    def inner(*args: P.args, **kwargs: P.kwargs) -> R:
+        asked = kwargs.get("progress")
+        if asked is True or (asked is None and notebook_display() is not None):
+            with progress_bar(function.__name__.replace("_", " ")) as step:
+                return function(*args, **{**kwargs, "progress": step})  # type: ignore[arg-type]
+        return function(*args, **kwargs)
+
+    return inner
+
+
+def called(progress: Steps | bool | None) -> Steps | None:
+    """`progress` of a function behind `shows_progress`, where it is a callback; otherwise None."""
+    return None if isinstance(progress, bool) else progress

@@ -1,0 +1,146 @@
+"""The bar of a long call: where it stands, what it says, that it goes, and who may ask for it."""
+
+from __future__ import annotations
+
+import io
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+import avtorch
+from avtorch.display import progress, progress_bar, show
+from avtorch.follower import diagnose_follower
+from avtorch.gap import gap_budget
+
+
+class Output:
+    """Of a cell; `seen` is what it held, in order."""
+
+    def __init__(self, data: dict[str, str]) -> None:
+        self.seen = [data]
+
+    def update(self, data: dict[str, str], raw: bool) -> None:
+        assert raw
+        self.seen.append(data)
+
+
+@pytest.fixture
+def outputs(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What a notebook displays; bars at once and at each step."""
+    found: list[Any] = []
+
+    def display(data: Any, raw: bool = False, display_id: bool = False) -> Output:
+        assert raw == display_id
+        found.append(Output(data))
+        return found[-1]
+
+    kernel = SimpleNamespace(kernel=None)
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: kernel))
+    monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(display=display))
+    at_once(monkeypatch)
+    return found
+
+
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "AFTER_S", 0.0)
+    monkeypatch.setattr(progress, "_EVERY_S", 0.0)
+
+
+def log(seconds: float = 14.0) -> avtorch.Log:
+    return avtorch.simulate(avtorch.Leader.default(start=50.0, duration=seconds, dt=0.05)).log()
+
+
+def test_in_a_notebook_the_bar_moves_and_leaves_an_empty_output(outputs: list[Output]) -> None:
+    with progress_bar("a <b>") as step:
+        step("first", 0, 4)
+        step("second", 1, 4)
+    (output,) = outputs
+    html = [data["text/html"] for data in output.seen]
+    assert "<progress" in html[0]
+    assert "a &lt;b&gt;: first" in html[0]
+    assert 'value="0.250"' in html[1]
+    assert " s left" in html[1]
+    assert output.seen[-1] == {"text/html": "", "text/plain": ""}
+
+
+def test_a_bar_goes_when_the_work_fails(outputs: list[Output]) -> None:
+    def work() -> None:
+        with progress_bar("work") as step:
+            step(1, 2)
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        work()
+    assert outputs[0].seen[-1]["text/html"] == ""
+
+
+def test_a_bar_within_a_bar_is_not_shown(outputs: list[Output]) -> None:
+    with progress_bar("outer") as outer, progress_bar("inner") as inner:
+        outer(1, 2)
+        inner(1, 2)
+    assert len(outputs) == 1
+    assert "outer" in outputs[0].seen[0]["text/html"]
+
+
+def test_what_is_quick_shows_no_bar(outputs: list[Output], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "AFTER_S", 60.0)
+    with progress_bar("quick") as step:
+        step(1, 2)
+    assert outputs == []
+
+
+@pytest.mark.parametrize(("asked", "bars"), [(None, 1), (True, 1), (False, 0), (lambda done, of: None, 0)])
+def test_who_asks_for_a_bar_in_a_notebook(asked: Any, bars: int, outputs: list[Output]) -> None:
+    avtorch.estimate(log(), progress=asked)
+    assert len(outputs) == bars
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+@pytest.mark.parametrize("asked", [None, True])
+def test_in_a_terminal_only_where_it_is_asked_for(
+    asked: bool | None, terminal: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_once(monkeypatch)
+    stream = io.StringIO()
+    monkeypatch.setattr(stream, "isatty", lambda: terminal)
+    monkeypatch.setattr(sys, "stderr", stream)
+    avtorch.estimate(log(), progress=asked)
+    assert ("estimate" in stream.getvalue()) is (terminal and asked is True)
+
+
+def test_a_diagnosis_tells_the_stages_of_the_whole(outputs: list[Output]) -> None:
+    avtorch.diagnose(log(), effects=["sensor_bias"], pairs=False)
+    assert len(outputs) == 1
+    assert outputs[0].seen[0]["text/plain"].endswith("diagnose: single effects")
+
+
+@pytest.mark.parametrize(
+    "long",
+    [
+        avtorch.compare,
+        avtorch.compare_simulators,
+        avtorch.diagnose,
+        avtorch.estimate,
+        avtorch.validate,
+        diagnose_follower,
+        gap_budget,
+    ],
+)
+def test_long_calls_offer_a_bar(long: Any) -> None:
+    assert long.__code__ is progress.shows_progress(lambda: None).__code__
+
+
+def test_an_answer_is_displayed_in_a_notebook_and_printed_elsewhere(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    show("an answer")
+    assert capsys.readouterr().out == "an answer\n"
+    shown: list[Any] = []
+    kernel = SimpleNamespace(kernel=None)
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: kernel))
+    monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(display=shown.append))
+    show("an answer", 2)
+    assert shown == ["an answer", 2]
+    assert capsys.readouterr().out == ""
