@@ -13,7 +13,9 @@ from avtorch.cli import main
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGES = ("diagnosis.md", "blindtest.md", "compare.md", "fleet.md", "followers.md", "paper.md", "watch.md")
 ALL = [DOCS.parent / "README.md", *sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("effects/*.md"))]
-CODE = [p.name for p in ALL[1:] if "```python" in p.read_text(encoding="utf-8") and p.name != "own-effect.md"]
+# with tests of their own: tests/gap/simulator/test_own_effect_page.py, tests/test_tutorial.py
+ELSEWHERE = ("own-effect.md", "tutorial.md")
+CODE = [p.name for p in ALL[1:] if "```python" in p.read_text(encoding="utf-8") and p.name not in ELSEWHERE]
 SLOW = ("blindtest.md", "coming-from.md", "diagnosis.md", "fleet.md")
 COMMANDS = {"diagnosis.md": "diagnose", "followers.md": "diagnose"}
 

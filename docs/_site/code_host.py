@@ -1,8 +1,7 @@
 """Pages are written for a code host, as plain Markdown with relative links. Here the site learns to follow them.
 
 A link to a file of `../avtorch` leads to its listing on the site, a link to a package to its page of the reference, and
-one to `../README.md` or `../notebooks/README.md` to the copy made here. Which pages there are, and in what order, is
-said here too.
+one to `../README.md` or `../notebooks/README.md` to the copy made here.
 """
 
 from __future__ import annotations
@@ -13,35 +12,13 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import reference
+from navigation import trees
 from reference import FOLDER
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
-# Pages that are not named here follow, in the order of the alphabet.
-FIRST = (
-    "Start here <built/readme>",
-    "built/notebooks",
-    "monitoring",
-    "diagnosis",
-    "compare",
-    "fleet",
-    "followers",
-    "own-effect",
-    "effects",
-    "coming-from",
-    "words",
-    "reference",
-)
-
 # Pages that lie outside: their folder beside the root, and what they are called here.
 OUTSIDE = {"": "readme.md", "notebooks/": "notebooks.md"}
-
-TREE = "\n\n```{{toctree}}\n:hidden:\n:glob:\n\n{}\n```\n"
-TREES = {
-    "index": TREE.format("\n".join([*FIRST, "*"])),
-    "effects": TREE.format("effects/*"),
-    "reference": TREE.format(f"{FOLDER}/commands\n{FOLDER}/avtorch*"),
-}
 
 LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#)([^)#\s]+)")
 
@@ -63,7 +40,8 @@ def read(app: Sphinx, docname: str, content: list[str]) -> None:
     if app.env.doc2path(docname).suffix != ".md":
         return
     up = "../" * docname.count("/")
-    content[0] = LINK.sub(lambda m: on_site(m[1], up), content[0]) + TREES.get(docname, "")
+    below = trees(docname, content[0], lambda link: on_site(link, up))
+    content[0] = LINK.sub(lambda m: on_site(m[1], up), content[0]) + below
 
 
 def on_site(link: str, up: str) -> str:
