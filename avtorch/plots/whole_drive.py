@@ -5,7 +5,8 @@ Long drives are drawn by envelopes: of each short interval the least and the gre
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,6 +19,7 @@ from avtorch.plots.style import BLACK, BLUE, GREY, VERMILLION, styled
 
 _WIDE, _NARROW = (8.6, 260), (4.0, 120)
 """Width [in] and intervals of a line, on a desk and on a phone."""
+_COLOURS = {"command": GREY, "measured": BLACK, "baseline simulator": VERMILLION, "with what was named": BLUE}
 _LABELS = {"accel": "acceleration [m/s²]", "speed": "speed [m/s]"}
 _BEYOND = 0.3  # of the measured range: how far beyond it a rollout is followed, whose speed may drift without end
 _LOGS_APART = 0.02  # of the whole, between two logs
@@ -93,29 +95,69 @@ def envelope(time: FloatArray, values: FloatArray, stretch: IntArray, intervals:
     return np.array(x), np.array(y)
 
 
+@dataclass(frozen=True)
+class DrivePanel:
+    """A panel of the whole drive: what its axis shows, and its lines (row,) by label.
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.plots.whole_drive import DrivePanel
+        >>> list(DrivePanel("speed [m/s]", {"measured": np.zeros(2)}).lines)
+        ['measured']
+    """
+
+    label: str
+    lines: Mapping[str, FloatArray] = field(repr=False)
+
+
+def drive_panels(found: Diagnosis) -> list[DrivePanel]:
+    """What was measured and simulated over the whole drive, a panel a channel, the command with the acceleration or in
+    a panel of its own; a rollout's speed begins at the measured one in each stretch.
+
+    Raises `InputError` where there are no traces.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, simulate
+        >>> from avtorch.gap import DeadTime, plant
+        >>> from avtorch.plots.whole_drive import drive_panels
+        >>> late = plant([DeadTime(0.4)], sigma=0.0)
+        >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
+        >>> [panel.label for panel in drive_panels(diagnose(log, effects=["dead_time"], pairs=False))]
+        ['speed [m/s]', 'acceleration [m/s²]']
+    """
+    traces = found.traces
+    if traces is None:
+        raise InputError("traces: the diagnosis has none to draw")
+    firsts = np.concatenate([[0], np.flatnonzero(np.diff(traces.stretch) != 0) + 1])
+    of = np.searchsorted(firsts, np.arange(len(traces.time)), side="right") - 1
+    panels = [] if "accel" in traces.channels else [DrivePanel("command [m/s²]", {"command": traces.command})]
+    for name, measured, before, after in zip(
+        traces.channels, traces.measured, traces.before, traces.after, strict=True
+    ):
+        lines = {"command": traces.command} if name == "accel" else {}
+        lines |= {"measured": measured, "baseline simulator": before}
+        if found.winner.effects:
+            lines["with what was named"] = after
+        if name == "speed":
+            lines = {label: values + (measured - values)[firsts][of] for label, values in lines.items()}
+        panels.append(DrivePanel(_LABELS[name], lines))
+    return panels
+
+
 @styled
 def drive_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     """The whole drive, a panel a channel, the command with the acceleration or in a panel of its own.
 
     A rollout's speed begins at the measured one in each stretch. Raises `InputError` where there are no traces.
     """
-    axis, traces = drive_time(found), found.traces
+    axis, panels, traces = drive_time(found), drive_panels(found), found.traces
     assert traces is not None
-    names = list(traces.channels)
-    panels = names if "accel" in names else ["command", *names]
     width, intervals = _NARROW if narrow else _WIDE
     figure = Figure(figsize=(width, 0.8 + 1.9 * len(panels)), layout="constrained")
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-    for ax, name in zip(axes, panels, strict=True):
+    for ax, panel in zip(axes, panels, strict=True):
         _shade(ax, axis)
-        if name in ("command", "accel"):
-            ax.plot(
-                *envelope(axis.along, traces.command, traces.stretch, intervals), color=GREY, lw=0.9, label="command"
-            )
-        if name == "command":
-            ax.set_ylabel("command [m/s²]")
-            continue
-        _channel(ax, found, axis, names.index(name), intervals)
+        _channel(ax, axis, traces.stretch, panel, intervals)
     axes[-1].set_xlabel("time [s]" if len(axis.begins) == 1 else "time, one log behind the other [s]")
     axes[-1].set_xlim(float(axis.along[0]), float(axis.along[-1]))
     handles = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
@@ -132,21 +174,12 @@ def _shade(ax: Axes, axis: DriveTime) -> None:
         ax.axvline(axis.onset, color=BLACK, lw=1.0, ls="--", label="onset")
 
 
-def _channel(ax: Axes, found: Diagnosis, axis: DriveTime, k: int, intervals: int) -> None:
-    traces = found.traces
-    assert traces is not None
-    measured = traces.measured[k]
-    lines = {"measured": (measured, BLACK), "baseline simulator": (traces.before[k], VERMILLION)}
-    if found.winner.effects:
-        lines["with what was named"] = (traces.after[k], BLUE)
-    for label, (values, colour) in lines.items():
-        own = values
-        if traces.channels[k] == "speed":
-            firsts = np.concatenate([[0], np.flatnonzero(np.diff(traces.stretch) != 0) + 1])
-            of = np.searchsorted(firsts, np.arange(len(own)), side="right") - 1
-            own = own + (measured - own)[firsts][of]
-        ax.plot(*envelope(axis.along, own, traces.stretch, intervals), color=colour, lw=0.9, label=label)
-    low, high = float(measured.min()), float(measured.max())
-    reach = _BEYOND * max(high - low, 1e-3)
-    ax.set_ylim(low - reach, high + reach)
-    ax.set_ylabel(_LABELS[traces.channels[k]])
+def _channel(ax: Axes, axis: DriveTime, stretch: IntArray, panel: DrivePanel, intervals: int) -> None:
+    for label, values in panel.lines.items():
+        ax.plot(*envelope(axis.along, values, stretch, intervals), color=_COLOURS[label], lw=0.9, label=label)
+    ax.set_ylabel(panel.label)
+    measured = panel.lines.get("measured")
+    if measured is not None:
+        low, high = float(measured.min()), float(measured.max())
+        reach = _BEYOND * max(high - low, 1e-3)
+        ax.set_ylim(low - reach, high + reach)

@@ -26,6 +26,8 @@ from avtorch.plots.style import (
     UNSTABLE,
     VERMILLION,
 )
+from avtorch.report.compact import compact
+from avtorch.report.curves import Rows, curves_json, named_lines
 from avtorch.report.table import Table
 
 _COLOURS = {
@@ -74,9 +76,15 @@ class Picture:
 
 
 def picture_of(
-    name: str, draw: Callable[[bool], Figure], says: str, *tables: Table, caption: str = "", opened: bool = False
+    name: str,
+    draw: Callable[[bool], Figure],
+    says: str,
+    *tables: Table,
+    caption: str = "",
+    opened: bool = False,
+    rows: Rows | None = None,
 ) -> Picture:
-    """What `draw` makes of False, for a desk, and of True, for a phone.
+    """What `draw` makes of False, for a desk, and of True, for a phone; `rows`: finer than the drawing.
 
     Example:
         >>> from matplotlib.figure import Figure
@@ -84,15 +92,18 @@ def picture_of(
         >>> picture_of("empty", lambda narrow: Figure(figsize=(1, 1)), "Nothing.").says
         'Nothing.'
     """
-    wide, narrow = (inline_svg(f"{name}-{kind}", draw(kind == "narrow"), says) for kind in ("wide", "narrow"))
+    # one copy of the rows serves both
+    wide = inline_svg(f"{name}-wide", draw(False), says, rows)
+    narrow = inline_svg(f"{name}-narrow", draw(True), says)
     return Picture(wide, narrow, says, caption, tables, opened)
 
 
-def inline_svg(name: str, figure: Figure, says: str) -> Markup:
+def inline_svg(name: str, figure: Figure, says: str, rows: Rows | None = None) -> Markup:
     """A figure as SVG for the page: text as text, no date, equal for equal figures.
 
     `name` begins its ids and is the page's only one; `says` is its text alternative. A colour of the house's palette
-    becomes the style's variable.
+    becomes the style's variable. Lines can be read and made larger where the page runs its script, by `rows` where
+    these are given.
 
     Example:
         >>> from matplotlib.figure import Figure
@@ -101,6 +112,7 @@ def inline_svg(name: str, figure: Figure, says: str) -> Markup:
         Markup('<svg class="picture" role="img" aria-label="Nothing." vi')
     """
     stream = io.StringIO()
+    lines = named_lines(figure)
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "avtorch"}):
         # no ground of its own: the page's paper shows through
         figure.savefig(
@@ -115,13 +127,8 @@ def inline_svg(name: str, figure: Figure, says: str) -> Markup:
     text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", text, flags=re.DOTALL)
     text = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", text)
     text = re.sub(r"((?:fill|stroke): )(#[0-9a-f]{6})", lambda m: m[1] + _VARIABLES.get(m[2], m[2]), text)
-    # hundredths of a point are finer than any screen
-    text = re.sub(r'\b(?:d|transform|x|y|width|height)="[^"]*"', _rounded, text)
-    text = re.sub(r"\n\s*", "\n", text)
+    opening = Markup('<svg class="picture" role="img" aria-label="{}" {}').format(printable(says), Markup(view[0]))
+    if lines:
+        opening += Markup(' data-curves="{}"').format(printable(curves_json(figure, lines, name, rows)))
     # matplotlib escapes what it writes
-    opening = Markup('<svg class="picture" role="img" aria-label="{}" {}>').format(printable(says), Markup(view[0]))
-    return opening + Markup(text)
-
-
-def _rounded(attribute: re.Match[str]) -> str:
-    return re.sub(r"-?\d+\.\d{3,}", lambda m: f"{float(m[0]):.2f}".rstrip("0").rstrip("."), attribute[0])
+    return opening + Markup(">") + Markup(compact(text))

@@ -20,7 +20,8 @@ from avtorch.plots.diagnosis import (
     which_figure,
 )
 from avtorch.plots.experiment import experiment_figure
-from avtorch.plots.whole_drive import DriveTime, drive_figure, drive_time
+from avtorch.plots.whole_drive import DriveTime, drive_figure, drive_panels, drive_time
+from avtorch.report.curves import Rows
 from avtorch.report.entries import budget_table, candidate_table, measure_table
 from avtorch.report.picture import Picture, picture_of
 from avtorch.report.table import Table, of_numbers
@@ -100,6 +101,7 @@ def _drive(found: Diagnosis) -> Picture | None:
         Table("The drive in parts: standard deviation of each signal, and of the error", tuple(columns), tuple(rows)),
         caption="Of each short interval the least and the greatest value. Simulated lines are rollouts from the logged "
         f"commands; in each stretch a speed begins at the measured one.{_marked(axis)}{_fit(found)}",
+        rows=Rows(axis.along, traces.stretch, [panel.lines for panel in drive_panels(found)]),
     )
 
 
