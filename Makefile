@@ -1,5 +1,5 @@
 # Two commands on a fresh machine: `make demo` and `make test`. `make test-all` adds the slow tests,
-# `make fuzz` tries 100,000 damaged inputs (about half an hour).
+# `make fuzz` tries 100,000 damaged inputs (about half an hour), `make soak` drives 100 simulated cars for a week.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -15,8 +15,10 @@ export MKL_NUM_THREADS ?= 1
 
 # Inputs of the fuzzer's nightly mode.
 FUZZ ?= 100000
+# Options of the soak: --cars, --hours (simulated), --minutes (of this machine), --folder.
+SOAK ?= --cars 100 --hours 168
 
-.PHONY: demo test test-all fuzz lint docs release clean
+.PHONY: demo test test-all fuzz soak lint docs release clean
 
 demo: $(VENV)/.installed
 	$(BIN)/avtorch run --out out/demo
@@ -35,6 +37,10 @@ fuzz: $(VENV)/.installed-dev
 	status=0; for which in "not parquet" parquet; do \
 	  AVTORCH_FUZZ=$(FUZZ) $(BIN)/python -m pytest tests/fuzz -k "$$which" $(PYTEST_ARGS) || status=1; \
 	done; exit $$status
+
+# Ctrl-C ends it; the same command goes on from there. Exit code 1 where an answer, a count or memory is wrong.
+soak: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.soak $(SOAK)
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

@@ -165,6 +165,21 @@ class Setting:
         T_e, K_e = self.effective(T_L, K_L)
         return stability.p_locally_stable(T_e, K_e, self.time_gap, self.gains, dead_time=_per_draw(dead_time))
 
+    def p_locally_and_string_stable(
+        self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0, link_delay: Number = 0.0
+    ) -> tuple[Tensor, Tensor]:
+        """Both probabilities at once, arguments as in `p_string_stable`."""
+        T_e, K_e = self.effective(T_L, K_L)
+        return stability.p_locally_and_string_stable(
+            T_e,
+            K_e,
+            self.time_gap,
+            self.gains,
+            dead_time=_per_draw(dead_time),
+            feedforward=self.feedforward,
+            feedforward_delay=link_delay,
+        )
+
     def peak_gain(self, T_L: Number, K_L: Number, *, dead_time: Number = 0.0, link_delay: Number = 0.0) -> Tensor:
         """Peak gain (scenario,) at one plant per scenario, through (T_e, K_e): the score of a choice at the true
         plant."""

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
 from avtorch.inference.density import Density, ScoredDensity, has_score
+from avtorch.inference.exponential_form import ExponentialForm, has_form, outdated
+from avtorch.inference.newton import FLAT, as_tensors, ascend
 
 
 @dataclass(frozen=True)
@@ -90,12 +92,37 @@ def find_mode(
         True
     """
     z = (density.initial() if start is None else start).detach().clone()
+    form = None if from_values else _form(density, z)
+    if form is not None:
+        z, potential, gradient, hessian = as_tensors(*ascend(form, z, iterations, tolerance))
+    else:
+        z, potential, gradient, hessian = _search(density, z, iterations, tolerance, from_values)
+    eigenvalues, basis = torch.linalg.eigh(hessian)
+    decrement = 0.5 * (torch.einsum("wij,wi->wj", basis, gradient).square() / eigenvalues.abs().clamp_min(FLAT)).sum(-1)
+    converged = (eigenvalues > 0).all(-1) & (decrement < 1e-4) & potential.isfinite()
+    root = basis * eigenvalues.abs().clamp_min(FLAT).rsqrt().unsqueeze(-2)
+    # its triangular form without squaring it, which would lose half the digits of a narrow posterior
+    scale = torch.linalg.qr(root.mT).R.mT
+    return Mode(z, scale, -potential, converged)
+
+
+def _form(density: Density, z: Tensor) -> ExponentialForm | None:
+    """The density in closed form, where it has one and the search runs in NumPy."""
+    if z.device.type != "cpu" or z.dtype != torch.float64 or not has_form(density):
+        return None
+    return None if outdated(density, "exponential_form") else density.exponential_form()
+
+
+def _search(
+    density: Density, z: Tensor, iterations: int, tolerance: float, from_values: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Where the search from ``z`` ends, and potential, gradient and Hessian there."""
     damping = torch.ones(z.shape[0], dtype=z.dtype)
     potential, gradient, hessian = _expand(density, z, from_values)
     for _ in range(iterations):
         eigenvalues, basis = torch.linalg.eigh(hessian)
         # the floor keeps a flat direction from becoming an endless step
-        curvature = eigenvalues.abs().clamp_min(1e-6)
+        curvature = eigenvalues.abs().clamp_min(FLAT)
         projected = torch.einsum("wij,wi->wj", basis, gradient)
         decrement = 0.5 * (projected.square() / curvature).sum(-1)
         if bool((decrement < tolerance).all()):
@@ -110,13 +137,7 @@ def find_mode(
         gradient = torch.where(better[:, None], new_gradient, gradient)
         hessian = torch.where(better[:, None, None], new_hessian, hessian)
         damping = torch.where(better, (2 * damping).clamp_max(1.0), 0.25 * damping)
-    eigenvalues, basis = torch.linalg.eigh(hessian)
-    decrement = 0.5 * (torch.einsum("wij,wi->wj", basis, gradient).square() / eigenvalues.abs().clamp_min(1e-6)).sum(-1)
-    converged = (eigenvalues > 0).all(-1) & (decrement < 1e-4) & potential.isfinite()
-    root = basis * eigenvalues.abs().clamp_min(1e-6).rsqrt().unsqueeze(-2)
-    # its triangular form without squaring it, which would lose half the digits of a narrow posterior
-    scale = torch.linalg.qr(root.mT).R.mT
-    return Mode(z, scale, -potential, converged)
+    return z, potential, gradient, hessian
 
 
 def _expand(

@@ -12,6 +12,7 @@ Example:
 from avtorch.vehicle.stability.belief import (
     Interval,
     StabilityBelief,
+    p_locally_and_string_stable,
     p_locally_stable,
     p_string_stable,
     stability_belief,
@@ -49,6 +50,7 @@ __all__ = [
     "gain",
     "local_conditions",
     "local_stable",
+    "p_locally_and_string_stable",
     "p_locally_stable",
     "p_string_stable",
     "peak_frequency",
