@@ -133,7 +133,7 @@ def test_files_and_words(
     assert told.err == ""
     assert "drive.csv" in told.out
     assert "other.csv" in told.out
-    assert "The simulator lacks dead_time (probability 0.93): the command acts after a" in told.out
+    assert "The simulator lacks this (probability 0.93): commands act" in told.out
     assert "T_L 0.52 → 0.31 s, K_L 1.02 → 0.99" in told.out
     assert "diagnosis.json, plant.toml (the repaired simulator)" in told.out
     written = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
@@ -448,13 +448,14 @@ def test_headline_for_each_kind_of_verdict(logs: list[Log]) -> None:
         return lines("\n".join(diagnosis_headline(answer(logs, (Candidate(name, p), *others)))), 200)[0]
 
     assert said("none") == "The simulator lacks nothing that this log shows (probability over 0.99)."
-    assert said("dead_time", 0.9).startswith("The simulator lacks dead_time (")
+    late = "the command acts after a delay (dead_time)"
+    assert said("dead_time", 0.9) == f"The simulator lacks this (probability over 0.99): {late}."
     unsure = (Candidate("dead_time", 0.6), Candidate("gust", 0.4), Candidate("none", 0.0), Candidate("unknown", 0.0))
-    assert diagnosis_headline(answer(logs, unsure))[0].startswith("[bold cyan]Probably the simulator lacks dead_time")
+    assert diagnosis_headline(answer(logs, unsure))[0].startswith("[bold cyan]Probably the simulator lacks this")
     assert said("unknown").startswith("The cause is not among the effects known here")
     assert said("dead_time+gust") == (
-        "The simulator lacks dead_time and gust (probability over 0.99): "
-        "the command acts after a delay, and wind and road push the car at random, for seconds."
+        f"The simulator lacks this (probability over 0.99): {late}, "
+        "and wind and road push the car at random, for seconds (gust)."
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from avtorch.gap.crossval.localisation import Location
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.simulator.cause_words import named_cause
 
 HORIZON_S = 10.0
 """Of the rollouts whose errors a budget divides [s]."""
@@ -156,8 +157,8 @@ class Budget:
         >>> part = budget.parts[0]
         >>> part.name, round(part.parameters["resistance_mps2"].mean, 1), budget.verdict
         ('constant_resistance', 0.2, ('constant_resistance',))
-        >>> print(budget)
-        Chiefly constant_resistance (100 % of the gap); the rest of the error is noise.
+        >>> print(str(budget).partition(";")[0])
+        Chiefly the car is slowed by 0.2 m/s² at every speed (constant_resistance, 100 % of the gap)
         >>> speed = budget.by_channel["speed"]
         >>> speed.before > 3 * speed.left
         True
@@ -203,15 +204,15 @@ class Budget:
             return found
         named = [p for p in self.parts if p.probability >= LIKELY]
         large = [p for p in named if p.share.mean >= self.material] or named[:1]
-        small = [p.name for p in named if p not in large]
-        words = [f"{p.name} ({percent(p.share.mean)} of the gap)" for p in large]
+        small = [_words(p) for p in named if p not in large]
+        words = [_words(p, f"{percent(p.share.mean)} of the gap") for p in large]
         lines = [f"Chiefly {', then '.join(words)}"] if words else []
         if small:
             lines.append(f"{listing(small)} with under {percent(self.material)}{' each' if small[1:] else ''}")
         if self.unexplained.share.mean >= 0.005 and named:
             lines.append(f"{percent(self.unexplained.share.mean)} is reproducible and no known effect explains it")
-        by_chance = [c.name for c in self.chance if c.probability >= LIKELY]
-        noise = "noise" if not by_chance else f"noise, in part by {' and '.join(by_chance)}"
+        by_chance = [_words(c) for c in self.chance if c.probability >= LIKELY]
+        noise = "noise" if not by_chance else f"noise, in part this: {' and '.join(by_chance)}"
         lines.append(f"the rest of the error is {noise}")
         text = "; ".join(lines) + "."
         return text[0].upper() + text[1:]
@@ -231,6 +232,13 @@ class Budget:
             "unexplained": self.unexplained.to_dict(),
             "material": self.material,
         }
+
+
+def _words(part: Part | ChancePart, behind: str = "") -> str:
+    """A cause in words; by its name alone where its parameters are not those of such an effect."""
+    if not part.plausible:
+        return f"{part.name} ({behind})" if behind else part.name
+    return named_cause(part.name, {key: q.mean for key, q in (part.parameters or {}).items()}, behind)
 
 
 def listing(names: Sequence[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -10,6 +11,9 @@ from avtorch.gap.simulator.effect import Effect, fixed, register
 from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
+
+_FAST = 30.0
+"""Speed [m/s] at which its size is told."""
 
 
 @register
@@ -46,6 +50,11 @@ class AerodynamicDrag(Effect):
         ),
         Parameter("wind_mps", "m/s", None, -4.0, 4.0, "real", reported=False),
     )
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        force = values["drag_per_m"] * _FAST**2
+        return f"air resistance slows the car by {force:.2g} m/s² at {_FAST:.0f} m/s"
 
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         air = row.speed + tensor(self.wind_mps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -48,6 +49,10 @@ class Backlash(Effect):
             "half_width_mps2", "m/s²", 0.0, 0.02, 0.3, possible=(0.0, 1.0), beyond="no driveline has that much play"
         ),
     )
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        return f"a play of {2 * values['half_width_mps2']:.2g} m/s² is crossed whenever the command turns back"
 
     def start(self, x: Tensor, row: EffectContext) -> Tensor:
         return x

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +12,9 @@ from avtorch.gap.simulator.effect import Effect, fixed, register
 from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
 from avtorch.vehicle.arguments import Number, tensor
+
+_ALIKE = 0.05
+"""Difference of a ratio from 1 that is not worth a word."""
 
 
 @register
@@ -47,6 +51,16 @@ class BrakeThrottleAsymmetry(Effect):
             "brake_lag_ratio", "-", 1.0, 1.3, 3.0, possible=(0.1, 10.0), beyond="brakes and engine differ by less"
         ),
     )
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        gain, lag = values["brake_gain_ratio"], values["brake_lag_ratio"]
+        told = []
+        if abs(gain - 1) >= _ALIKE:
+            told.append("weaker" if gain < 1 else "stronger")
+        if abs(lag - 1) >= _ALIKE or not told:
+            told.append("quicker" if lag < 1 else "slower")
+        return f"the brake is {' and '.join(told)} than the throttle"
 
     def apply(self, x: Tensor, row: EffectContext) -> tuple[Tensor, Tensor]:
         braking = x < 0

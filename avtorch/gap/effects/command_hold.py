@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +51,10 @@ class CommandHold(Effect):
             "hold_fraction", "-", 0.0, 0.02, 0.2, "unit", possible=(0.0, 0.6), beyond="no link loses so many messages"
         ),
     )
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        return f"{100 * values['hold_fraction']:.2g} % of the commands are lost and the last one is held"
 
     def start(self, x: Tensor, row: EffectContext) -> Tensor:
         return x

@@ -53,6 +53,10 @@ class ConstantResistance(Effect):
         ),
     )
 
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        return f"the car is slowed by {values['resistance_mps2']:.2g} m/s² at every speed"
+
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         force = -tensor(self.resistance_mps2)
         if row.measured_speed is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -41,6 +42,10 @@ class DeadBand(Effect):
     parameters = (
         Parameter("half_width_mps2", "m/s²", 0.0, 0.02, 0.3, possible=(0.0, 1.0), beyond="no pedal ignores that much"),
     )
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        return f"commands of less than {values['half_width_mps2']:.2g} m/s² do nothing"
 
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         width = tensor(self.half_width_mps2)

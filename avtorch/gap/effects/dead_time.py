@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,6 +48,10 @@ class DeadTime(Effect):
     role = "delay"
     starts = fixed(delay_s=(0.03, 0.07, 0.13, 0.22, 0.35, 0.55))
     parameters = (Parameter("delay_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.5), beyond="no command is that late"),)
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        return f"commands act {values['delay_s']:.2g} s late"
 
     def start(self, x: Tensor, row: EffectContext) -> list[Tensor]:
         return [x]

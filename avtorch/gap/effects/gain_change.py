@@ -67,6 +67,11 @@ class GainChange(Effect):
         Domain("latest_s", -1e12, 1e12, "s"),
     )
 
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        ratio = values["gain_ratio"]
+        return f"the gain {'falls' if ratio < 1 else 'rises'} to {100 * ratio:.0f} % during the drive"
+
     def __post_init__(self) -> None:
         if not self.earliest_s < self.latest_s:
             raise InputError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,6 +69,10 @@ class GearShift(Effect):
         Parameter("gear_ratio", "-", None, 1.3, 1.8, reported=False),
     )
     settings = (Domain("speeds", 0.1, 150.0, "m/s", most=16, rising=True),)
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        return f"upshifts interrupt the drive torque for {values['duration_s']:.2g} s"
 
     def start(self, x: Tensor, row: EffectContext) -> list[tuple[Tensor, Tensor, Tensor]]:
         """State of each shift: speed one row ago, whether above, start of the last interruption."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,6 +54,10 @@ class Gust(Effect):
             "time_constant_s", "s", None, 1.0, 5.0, possible=(0.2, 60.0), beyond="gusts have other time constants"
         ),
     )
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        return f"wind and road push the car at random by {values['sd_mps2']:.2g} m/s²"
 
     def start(self, x: Tensor, row: EffectContext) -> Any:
         return None

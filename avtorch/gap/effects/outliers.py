@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -57,6 +58,10 @@ class Outliers(Effect):
         Parameter("scale", "sigma", None, 5.0, 10.0, possible=(2.0, 1000.0), beyond="outliers are not of that size"),
     )
     settings = (Domain("noise_sd", 0.0, 100.0, "m/s²"),)
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        return f"{100 * values['fraction']:.2g} % of the accelerometer's samples are far off"
 
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         if row.normal is None:

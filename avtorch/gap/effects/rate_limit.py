@@ -53,6 +53,10 @@ class RateLimit(Effect):
         ),
     )
 
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        return f"the acceleration changes by at most {values['jerk_max_mps3']:.2g} m/s³"
+
     def apply(self, x: Tensor, row: EffectContext) -> tuple[float, float]:
         return 1.0, 1.0  # the limit is applied in the actuator, see `actuator.py`
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Self
@@ -65,6 +66,10 @@ class RoadGrade(Integrated):
         Domain("knots", 4, 4096, whole=True),
         Domain("knot_m", 10.0, 10_000.0, "m"),
     )
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        return f"the road has slopes of {100 * values['grade_rms']:.2g} % RMS that the log does not record"
 
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         position = row.position

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -58,6 +60,12 @@ class Saturation(Effect):
             beyond="no brakes saturate there",
         ),
     )
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        ends = {"drive gives": values["accel_max_mps2"], "brakes give": values["accel_min_mps2"]}
+        told = [f"the {who} at most {abs(end):.2g} m/s²" for who, end in ends.items() if math.isfinite(end)]
+        return " and ".join(told) or cls.meaning
 
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         # clipped before the gain, with limits divided by it, so that a command within them is unchanged to the last bit

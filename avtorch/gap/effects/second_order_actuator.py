@@ -19,6 +19,10 @@ from avtorch.vehicle.arguments import Number, tensor
 _DAMPED = 0.85  # damping ratio limit: a fit has an error of about 0.1
 
 
+_NO_OVERSHOOT = 0.8
+"""Damping from which a step overshoots by less than 2 %."""
+
+
 @register
 @dataclass(frozen=True)
 class SecondOrderActuator(Effect):
@@ -64,6 +68,11 @@ class SecondOrderActuator(Effect):
         Parameter("damping_ratio", "-", None, 0.2, 0.9, possible=(0.03, 5.0), beyond="no actuator has that damping"),
     )
     settings = (Domain("natural_frequency_radps", 1e-3, 1e5, "rad/s"), Domain("damping_ratio", 1e-3, 1e3))
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        ends = "overshoots" if values["damping_ratio"] < _NO_OVERSHOOT else "has inertia"
+        return f"the actuator {ends} with a natural frequency of {values['natural_frequency_radps']:.2g} rad/s"
 
     def apply(self, x: Tensor, row: EffectContext) -> tuple[float, Tensor]:
         return 1.0, tensor(self.lag_ratio)  # the second derivative is integrated in the actuator, see `actuator.py`

@@ -53,6 +53,11 @@ class SensorBias(Effect):
         ),
     )
 
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        bias = values["bias_mps2"]
+        return f"the accelerometer reads {abs(bias):.2g} m/s² too {'high' if bias > 0 else 'low'}"
+
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         return x + tensor(self.bias_mps2)
 

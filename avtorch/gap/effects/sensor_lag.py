@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,6 +46,10 @@ class SensorLag(Effect):
     reading = fixed(lag="lag_s")
     starts = fixed(lag_s=(0.03, 0.1, 0.2, 0.4))
     parameters = (Parameter("lag_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.0), beyond="no accelerometer is so slow"),)
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        return f"the accelerometer lags by {values['lag_s']:.2g} s"
 
     def start(self, x: Tensor, row: EffectContext) -> Any:
         return x, x, None

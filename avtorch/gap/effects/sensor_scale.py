@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -41,6 +42,11 @@ class SensorScale(Effect):
     parameters = (
         Parameter("scale", "-", 1.0, 0.83, 1.2, possible=(0.5, 2.0), beyond="no accelerometer has that scale error"),
     )
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        scale = values["scale"]
+        return f"the accelerometer shows {abs(100 * (scale - 1)):.2g} % too {'much' if scale > 1 else 'little'}"
 
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         return tensor(self.scale) * x

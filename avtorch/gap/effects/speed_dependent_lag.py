@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -52,6 +53,10 @@ class SpeedDependentLag(Effect):
         Parameter("pivot", "-", None, 0.6, 1 / 0.6, reported=False, of_onset=True),
     )
     settings = (Domain("mean_speed", 0.1, 150.0, "m/s"),)
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        return f"the actuator is slower the {'faster' if values['lag_slope'] > 0 else 'slower'} the car is"
 
     def apply(self, x: Tensor, row: EffectContext) -> tuple[float, Tensor]:
         away = row.speed / (tensor(self.mean_speed) * tensor(self.pivot)) - 1

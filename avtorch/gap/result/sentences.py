@@ -14,6 +14,7 @@ from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
 from avtorch.gap.search.fitted_model import Scope
 from avtorch.gap.selection.verdict import Candidate, Verdict, meanings
+from avtorch.gap.simulator.cause_words import named_cause
 from avtorch.io.clock import clock_words
 
 SURE = 0.9
@@ -99,13 +100,28 @@ def _verdict(found: Findings) -> str:
 
 def _lacks(found: Findings, p: str) -> str:
     """That the simulator lacks the verdict's effects, `p` as words."""
-    verdict, odd = found.verdict, found.winner.implausible
-    meaning = meanings(verdict.name)
-    # an implausible fit is not described by the effect's usual meaning
-    rest = ", but as fitted that is physically implausible." if odd else f": {meaning}." if meaning else "."
-    share = found.winner.probability
-    who = "The" if share >= SURE else "Probably the" if share >= 0.5 else "Perhaps the"
-    return f"{who} simulator lacks {' and '.join(verdict.names)} ({p}){rest}"
+    verdict, winner = found.verdict, found.winner
+    who = "The" if winner.probability >= SURE else "Probably the" if winner.probability >= 0.5 else "Perhaps the"
+    names = " and ".join(verdict.names)
+    if winner.implausible:  # the fit is not described by the effects' usual meaning
+        return f"{who} simulator lacks {names} ({p}), but as fitted that is physically implausible."
+    causes = [_cause(found, name) for name in verdict.names]
+    if any(words == name for name, words in zip(verdict.names, causes, strict=True)):
+        meaning = meanings(verdict.name)
+        return f"{who} simulator lacks {names} ({p}){f': {meaning}' if meaning else ''}."
+    return f"{who} simulator lacks this ({p}): {', and '.join(causes)}."
+
+
+def _cause(found: Findings, name: str) -> str:
+    """One of the verdict's effects in words, at the parameters of the budget or else of the fit."""
+    parts = [] if found.budget is None else [*found.budget.parts, *found.budget.chance]
+    of_budget = next((part.parameters for part in parts if part.name == name), None)
+    fitted = {
+        key.rpartition(".")[2]: q
+        for key, q in found.winner.parameters.items()
+        if "." not in key or key.startswith(f"{name}.")
+    }
+    return named_cause(name, {key: q.mean for key, q in (of_budget or fitted).items()})
 
 
 def tested(found: Findings) -> list[str]:

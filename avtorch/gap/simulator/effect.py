@@ -29,6 +29,7 @@ The defaults suit an ordinary effect:
 | cross-validation        | `of_the_drive`                                         | parameters are the car's        |
 | linearisation           | `linear`, `one_sided`                                  | proportional to the command     |
 | delay                   | `shift`, `role`                                        | none                            |
+| answers in words        | `in_words`                                             | its name                        |
 | exports, plots          | `accel_limits`, `export_loss`, `pictured`                | not exported; plotted at 12 m/s |
 """
 
@@ -255,6 +256,16 @@ class Effect:
     def own_search(cls) -> SearchedAs | None:
         """`searched_as`, only if this very class declares it: a derived class is a user's own effect."""
         return vars(cls).get("searched_as")
+
+    @classmethod
+    def in_words(cls, values: Mapping[str, float]) -> str:
+        """What it does to the car, as a clause, at `values` of its parameters under the answer's names."""
+        return cls.meaning
+
+    @classmethod
+    def brings_words(cls) -> bool:
+        """Whether it has a clause of its own; else it is called by its name."""
+        return cls.in_words.__func__ is not Effect.in_words.__func__
 
     def coordinates(self) -> tuple[Parameter, ...]:
         """The parameters of a fit: `parameters`, unless settings of this instance affect them."""

@@ -244,12 +244,14 @@ def test_verdict_and_candidates_agree_or_are_refused() -> None:
 def test_printed_it_reports_its_result() -> None:
     found = diagnosis(candidates(dead_time=0.8, unknown=0.1, none=0.1), onset_s=12.0, notes=("Mind the gap.",))
     told = str(found).splitlines()
-    assert told[0].startswith("Probably the simulator lacks dead_time (probability 0.80)")
+    assert told[0] == (
+        "Probably the simulator lacks this (probability 0.80): the command acts after a delay (dead_time)."
+    )
     assert found.verdict.why in told
     assert "Onset: at 12.0 s of the log's time." in told
     assert told[-1] == "Mind the gap."
     assert "dead_time" in repr(found)
-    assert "Probably the simulator lacks dead_time" in repr(found).splitlines()[0]
+    assert "Probably the simulator lacks this" in repr(found).splitlines()[0]
     assert len(repr(found).splitlines()) <= 10
 
 
