@@ -18,7 +18,7 @@ FUZZ ?= 100000
 # Options of the soak: --cars, --hours (simulated), --minutes (of this machine), --folder.
 SOAK ?= --cars 100 --hours 168
 
-.PHONY: demo test test-all fuzz soak lint docs release clean
+.PHONY: demo test test-all fuzz soak lint docs notebooks release clean
 
 demo: $(VENV)/.installed
 	$(BIN)/avtorch run --out out/demo
@@ -51,6 +51,11 @@ lint: $(VENV)/.installed-dev
 docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet --doctree-dir out/.doctrees docs out/docs
 	@echo "The pages are in $(CURDIR)/out/docs; begin with index.html"
+
+# executes each notebook that differs from its source (NOTEBOOKS=--all: every one; NOTEBOOKS=4: that one) and writes its
+# pair, the .ipynb beside it, which the pages show; the fifth needs recordings, AVTORCH_DATA
+notebooks: $(VENV)/.installed-dev
+	$(BIN)/python -m notebooks.pairing $(NOTEBOOKS)
 
 # wheel, source archive, SBOM and licences in dist/, tried in an environment without extras; some minutes
 release:

@@ -14,14 +14,16 @@ copyright = author
 version = release = avtorch.__version__
 
 extensions = [
-    "myst_parser",
+    # Markdown, and notebooks
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "cyclopts.ext.sphinx",
-    # in _site: pages made from the packages, pages as a code host shows them, formulas without a script
+    # in _site: pages made from the packages, pages as a code host shows them, notebooks, formulas without a script
     "reference",
     "code_host",
+    "notebook_pages",
     "mathml",
 ]
 exclude_patterns = ["_site"]
@@ -31,6 +33,9 @@ myst_heading_anchors = 4
 myst_enable_extensions = ["dollarmath"]
 myst_url_schemes = {"http": None, "https": None, "mailto": None, "source": {"url": "{{path}}"}}
 highlight_language = "none"
+
+# Notebooks are kept with their outputs (`make notebooks`).
+nb_execution_mode = "off"
 
 # Docstrings: prose with `names` in single backticks, "Args:" blocks, LaTeX in math roles.
 default_role = "py:obj"

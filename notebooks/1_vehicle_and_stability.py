@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 import avtorch
 from avtorch import plots, stability
+from avtorch.display import show
 
 mpl.rcParams.update(plots.STYLE)
 OUT = Path("out/notebooks/1_vehicle_and_stability")
@@ -207,6 +208,7 @@ print(f"lag 0.3 s and dead time 0.4 s: peak gain {peak_04:.4f}; lag 0.7 s instea
 # %%
 drive = avtorch.simulate(avtorch.Leader.default(start=48.0), plant=avtorch.GLVDPlant(*WORN, sigma=0.3), duration=4.0)
 belief = avtorch.estimate(drive.log(), window=2.0).windows[-1].window.belief
+show(belief)
 T_L, K_L = belief.draws[:, 0, 0], belief.draws[:, 0, 1]
 mean = (float(T_L.mean()), float(K_L.mean()))
 gaps = torch.linspace(1.0, 4.0, 301, dtype=torch.float64)

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 import avtorch
 from avtorch import plots
+from avtorch.display import show
 from avtorch.inference import JerkPoints, find_mode, integrate, sample
 
 mpl.rcParams.update(plots.STYLE)
@@ -96,7 +97,8 @@ for i, name in enumerate(density.names):
 
 # %%
 posterior = sample(density, generator=torch.Generator().manual_seed(1))
-print(tuple(posterior.draws.shape), "(chain, draw, window, parameter), converged:", bool(posterior.converged[0]))
+show(posterior)
+print(tuple(posterior.draws.shape), "(chain, draw, window, parameter)")
 
 # %% [markdown]
 # ## Two references

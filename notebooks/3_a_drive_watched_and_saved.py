@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 import avtorch
 from avtorch import plots
 from avtorch.decision import Strategist
+from avtorch.display import show
 from avtorch.results import run_answer
 
 mpl.rcParams.update(plots.STYLE)
@@ -43,6 +44,7 @@ def change(loop: avtorch.ClosedLoop) -> None:
 
 supervisor = avtorch.Supervisor(fresh(), window=2.0, strategist=Strategist())
 saved = supervisor.run(SECONDS, events=[(CHANGE_S, change)])
+show(saved)
 
 events = [(a.time_s, f"alert, {a.detector}: {a.why}") for a in saved.alerts[0]]
 events += [(a.time_s, f"action, strategies {a.strategies}: {a.why}") for a in saved.actions[0]]

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 import avtorch
 from avtorch import plots
 from avtorch.blindtest import Recorded, draw_cases, simulate
+from avtorch.display import show
 from avtorch.experiment import Limits, next_experiment
 from avtorch.gap import plant
 from avtorch.plots import diagnosis as over_diagnosis
@@ -32,7 +33,7 @@ OUT = Path("out/notebooks/4_diagnosing_a_gap")
 # %%
 case = next(draw_cases(1, 2026, mix={"single": 1.0}, tiers=["medium"], seconds=60.0))
 log = case.log()
-print(f"{log.rows} rows, {log.rate_hz:.0f} Hz, {case.drive.manoeuvre}")
+show(log)
 
 figure = Figure(figsize=(9, 3.4), layout="constrained")
 ax = figure.subplots()
@@ -51,6 +52,9 @@ plots.show(figure, OUT / "log.png")
 
 # %%
 found = avtorch.diagnose(log)
+show(found)
+
+# %%
 print(found)
 print()
 for candidate in found.candidates[:6]:
@@ -59,14 +63,16 @@ for candidate in found.candidates[:6]:
 plots.show(over_diagnosis.which_figure(found), OUT / "which.png")
 
 # %% [markdown]
-# Printed, a diagnosis reports its verdict. In the picture, blue bars are the hypotheses that this log cannot
-# distinguish. `unknown` means that the cause is not in the table. It is always a hypothesis, and where it comes first
-# the diagnosis names no effect.
+# Shown, a diagnosis is its verdict and the car's parameters; printed, it is all that was found. In the picture, blue
+# bars are the hypotheses that this log cannot distinguish. `unknown` means that the cause is not in the table. It is
+# always a hypothesis, and where it comes first the diagnosis names no effect.
 #
 # ## Where the gap lies, and how far it shrinks
 
 # %%
 plots.show(over_diagnosis.road_figure(found), OUT / "road.png")
+
+# %%
 plots.show(over_diagnosis.where_figure(found), OUT / "where.png")
 
 # %% [markdown]
@@ -102,7 +108,7 @@ if ahead is None:
     print("one hypothesis is left")
     both = found
 else:
-    print(ahead.why)
+    show(ahead)
     m = ahead.manoeuvre
     rate = case.drive.rate_hz
     times = np.arange(0.0, m.time[-1], 1 / rate)

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 import avtorch
 from avtorch import plots
 from avtorch.decision import Grid, Setting, Strategist, SupervisedRun
+from avtorch.display import show
 from avtorch.gap import EFFECTS, Effect, EffectContext, Parameter, SimulatorInput, plant
 from avtorch.plots import diagnosis as over_diagnosis
 from avtorch.plots import effect_signature
@@ -76,7 +77,7 @@ print(f"neutral against none: {error:.1e} m/s²; bent against none: {float((bent
 car = plant([PedalMap(0.4)], baseline="T_L=0.4, K_L=0.9", sigma=0.1)
 run = avtorch.simulate(avtorch.Leader.default(start=48.0), plant=car, duration=60.0)
 found = avtorch.diagnose(run.log(), effects=[*EFFECTS.values(), PedalMap], pairs=False)
-print(found.verdict.why)
+show(found)
 q = found.winner.parameters.get("curve")
 print("true curve 0.4;", "not named" if q is None else f"found {q.mean:.3f} ({q.q05:.3f} to {q.q95:.3f})")
 plots.show(over_diagnosis.which_figure(found), OUT / "which.png")

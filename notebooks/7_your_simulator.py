@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 import avtorch
 from avtorch import ExternalSimulator, Log, plots
+from avtorch.display import show
 from avtorch.external import check_simulator, wrap
 from avtorch.external.driving import driven_along
 from avtorch.plots import diagnosis as over_diagnosis
@@ -60,7 +61,7 @@ class Simulator:
 
 # %%
 check = check_simulator(Simulator())
-print(check)
+show(check)
 
 figure = Figure(figsize=(9, 3.0), layout="constrained")
 ax = figure.subplots()
@@ -109,7 +110,7 @@ print(f"after {time[-1]:.0f} s the simulator is {before.speed[-1] - true.speed[-
 
 # %%
 found = avtorch.diagnose(log, baseline=ExternalSimulator(Simulator))
-print(found)
+show(found)
 plots.show(over_diagnosis.which_figure(found), OUT / "which.png")
 
 # %% [markdown]

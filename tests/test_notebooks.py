@@ -144,6 +144,29 @@ def your_simulator(names: Names) -> None:
     assert names["errors"]["wrapped"] < 0.1 * names["errors"]["as it was"]
 
 
+def log_to_repaired_simulator(names: Names) -> None:
+    found, advice, compared = names["found"], names["advice"], names["compared"]
+    proposal = names["found_in_log"].proposal
+    assert proposal.map == {"time": "t_ms", "accel_cmd": "AccReq_mps2", "accel": "IMU_Ax_g", "speed": "VehSpd_kph"}
+    assert names["drift"] > 10
+    assert found.baseline["T_L"].mean == pytest.approx(1.2, abs=0.1)  # lag and gain alone, refitted
+    assert found.baseline["K_L"].mean == pytest.approx(1.2, abs=0.1)
+    shares = {part.name: part.share.mean for part in found.budget.parts}
+    assert set(shares) == set(names["LACKS"])
+    assert shares["constant_resistance"] > 0.9
+    for part in found.budget.parts:
+        for parameter, true in names["LACKS"][part.name].items():
+            assert part.parameters[parameter].mean == pytest.approx(true, rel=0.05)
+    assert names["bench"] == pytest.approx(1.0, abs=1e-9)
+    assert advice.p_now < 0.05
+    assert advice.peak_now > 1.2
+    assert advice.sufficient
+    assert compared.nearer == "second"
+    assert {d.name for d in compared.differences if d.brings_nearer} == set(shares)
+    before, after = names["errors"].values()
+    assert after < 0.1 * before
+
+
 CLAIMS: dict[str, Callable[[Names], None]] = {
     "1_vehicle_and_stability": vehicle_and_stability,
     "2_sgld_nuts_quadrature": sgld_nuts_quadrature,
@@ -151,6 +174,7 @@ CLAIMS: dict[str, Callable[[Names], None]] = {
     "4_diagnosing_a_gap": diagnosing_a_gap,
     "6_your_own": your_own,
     "7_your_simulator": your_simulator,
+    "8_log_to_repaired_simulator": log_to_repaired_simulator,
 }
 
 

@@ -15,7 +15,8 @@ def notebook_display() -> ModuleType | None:
 
 
 def show(*answers: object) -> None:
-    """Display answers below the cell in a notebook, as if each were a cell's last line; elsewhere print them.
+    """Display answers below the cell in a notebook, as if each were a cell's last line; elsewhere print what a
+    console would.
 
     Example:
         >>> from avtorch import Leader, simulate
@@ -27,6 +28,6 @@ def show(*answers: object) -> None:
     display = notebook_display()
     for answer in answers:
         if display is None:
-            print(answer)
+            print(answer if isinstance(answer, str) else repr(answer))
         else:
             display.display(answer)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -151,7 +152,8 @@ def _alternative(figure: Figure) -> str:
         names = [label for label in ax.get_legend_handles_labels()[1] if label]
         if what:
             parts.append(" ".join(f"{what}{', with ' if names else ''}{', '.join(names)}.".split()))
-    return " ".join(["Figure.", *parts])
+    # as words, not as formulas
+    return re.sub(r"[$\\{}]", "", " ".join(["Figure.", *parts]))
 
 
 def _png(figure: Figure) -> bytes:

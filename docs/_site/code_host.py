@@ -1,7 +1,7 @@
 """Pages are written for a code host, as plain Markdown with relative links. Here the site learns to follow them.
 
 A link to a file of `../avtorch` leads to its listing on the site, a link to a package to its page of the reference, and
-one to `../README.md` or `../notebooks/README.md` to the copy made here.
+one to `../README.md` or `../notebooks/README.md` to the copy made here, one to a notebook to its page.
 """
 
 from __future__ import annotations
@@ -48,6 +48,9 @@ def on_site(link: str, up: str) -> str:
     readme = re.fullmatch(r"(?:\.\./)+(notebooks/)?README\.md(#.*)?", link)
     if readme:
         return f"{up}{FOLDER}/{OUTSIDE[readme[1] or '']}{readme[2] or ''}"
+    notebook = re.fullmatch(r"(?:\.\./)+(notebooks/\w+\.ipynb)", link)
+    if notebook:
+        return f"{up}{FOLDER}/{notebook[1]}"
     found = re.fullmatch(r"(?:\.\./)+(avtorch(?:/\w+)*)(/|\.py)?", link)
     if not found:
         return link

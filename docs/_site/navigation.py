@@ -13,6 +13,7 @@ from reference import FOLDER
 TREE = "\n\n```{{toctree}}\n:hidden:\n:glob:\n{}\n{}\n```\n"
 BELOW = {
     "effects": TREE.format("", "effects/*"),
+    f"{FOLDER}/notebooks": TREE.format("", "notebooks/*"),
     "reference": TREE.format("", f"{FOLDER}/commands\n{FOLDER}/avtorch*"),
 }
 
