@@ -155,7 +155,7 @@ def region_figure(
         setting_region(ax, setting, T_range=T_range, K_range=K_range, clouds=clouds, truth=truth, points=points)
         ax.set_title(title)
         ax.label_outer()
-    legend = verdict_legend(axes[0], beside=axes[1:]).get_legend()
+    legend = verdict_legend(axes[0], beside=list(axes[1:])).get_legend()
     assert legend is not None
     handles = legend.legend_handles
     legend.remove()

@@ -12,6 +12,7 @@ from matplotlib.contour import ContourSet
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
+from torch import Tensor
 
 from avtorch.plots.style import AMPLIFIES, BLACK, BLUE, GREY, LABELS, ORANGE, PURPLE, STABLE, UNSTABLE, VERMILLION
 from avtorch.vehicle import LowerLevel, stability
@@ -128,14 +129,14 @@ def setting_region(
     """
     T = torch.linspace(*T_range, points, dtype=torch.float64)
     K = torch.linspace(*K_range, points, dtype=torch.float64)
-    lower = LowerLevel(setting["T_hat"], setting["K_hat"], setting.get("T_d", 0.3), setting.get("K_d", 1.0))
-    effective = lower.effective(T[None, :], K[:, None])
-    law = (*effective, setting["time_gap_s"], setting["gains"])
+    law = loop_of(setting, T[None, :], K[:, None])
     verdict_map(ax, T, K, stability.local_stable(*law), stability.string_stable(*law), stability.peak_gain(*law))
-    colours = [GREY, PURPLE, BLUE]
+    # by shape as well as by colour: in grey they are the same
+    looks = [(GREY, "^", 2), (PURPLE, "x", 3), (BLUE, ".", 3)]
     named = list((clouds or {}).items())
-    for (name, (t, k)), colour in zip(named, colours[-len(named) :] if len(named) > 1 else [BLUE], strict=False):
-        ax.plot(np.asarray(t), np.asarray(k), ".", color=colour, markersize=3, alpha=0.35, label=name, zorder=3)
+    for (name, (t, k)), (colour, marker, size) in zip(named, looks[-len(named) :], strict=False):
+        look = {"marker": marker, "markersize": size, "color": colour, "alpha": 0.4}
+        ax.plot(np.asarray(t), np.asarray(k), linestyle="none", label=name, zorder=3, **look)
     if truth is not None:
         ax.plot(
             *truth,
@@ -150,6 +151,13 @@ def setting_region(
     ax.set_xlabel(LABELS["T_L"])
     ax.set_ylabel(LABELS["K_L"])
     return ax
+
+
+def loop_of(setting: Mapping[str, Any], T: Tensor, K: Tensor) -> tuple[Tensor, Tensor, float, Sequence[float]]:
+    """What `avtorch.stability` takes of vehicles `T` [s], `K` [-] (...,) under a setting in the form of an answer:
+    lag and gain behind the lower level, time gap [s], gains."""
+    lower = LowerLevel(setting["T_hat"], setting["K_hat"], setting.get("T_d", 0.3), setting.get("K_d", 1.0))
+    return (*lower.effective(T, K), setting["time_gap_s"], setting["gains"])
 
 
 def gain_curve(ax: Axes, omega: ArrayLike, gain: ArrayLike, *, peak: tuple[float, float] | None = None) -> Axes:
@@ -208,7 +216,7 @@ def verdict_legend(ax: Axes, *, extra: bool = True, beside: Sequence[Axes] = ())
                 proxy = Line2D(
                     [], [], color=handle.get_color(), marker=handle.get_marker(), linestyle="none", label=label
                 )
-                proxy.set_markersize(8)
+                proxy.set_markersize(6 if handle.get_marker() == "x" else 8)
                 patches.append(proxy)
     ax.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=8.5)
     return ax

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from avtorch.gap.quantity import Quantity
 from avtorch.plots.style import BLACK, BLUE, GREY, styled
@@ -29,18 +29,29 @@ def ratio_whiskers(ax: Axes, ratios: Mapping[str, Quantity], *, narrow: bool = F
         colour = GREY if q.q05 <= 1 <= q.q95 else BLUE
         ax.plot([q.q05, q.q95], [row, row], color=colour, linewidth=2.5)
         ax.plot(q.mean, row, marker="o", markersize=8, color=colour)
-        ax.annotate(f"{q.mean:.2f}", (q.mean, row), (0, 8), textcoords="offset points", ha="center", fontsize=9)
+        ax.annotate(f"{q.mean:.3g}", (q.mean, row), (0, 8), textcoords="offset points", ha="center", fontsize=9)
     ax.axvline(1.0, color=BLACK, linestyle="--", linewidth=1.1, zorder=1)
     ax.set_yticks(range(len(ratios)), [] if narrow else list(ratios))
     if narrow:
         for row, name in enumerate(ratios):
-            ax.annotate(name, (0, row), (0, -14), xycoords=("axes fraction", "data"), textcoords="offset points")
+            # on paper of its own, where the line of one crosses it
+            ax.annotate(
+                name,
+                (0, row),
+                (3, -14),
+                xycoords=("axes fraction", "data"),
+                textcoords="offset points",
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1},
+            )
     ax.set_ylim(len(ratios) - (0.2 if narrow else 0.5), -0.7)
     ax.set_xscale("log")
     ends = [1.0, *(end for q in ratios.values() for end in (q.q05, q.q95) if end > 0)]
-    ax.set_xlim(min(*ends, 0.9) / 1.06, max(*ends, 1.1) * 1.06)
-    # decades are too far apart for ratios near one
-    ax.xaxis.set_major_locator(MaxNLocator(5 if narrow else 8))
+    low, high = min(*ends, 0.9), max(*ends, 1.1)
+    pad = (high / low) ** 0.05
+    ax.set_xlim(low / pad, high * pad)
+    # decades are too far apart for ratios near one, even steps too close for ratios of a hundred
+    even = high / low < (5 if narrow else 8)
+    ax.xaxis.set_major_locator(MaxNLocator(5 if narrow else 8) if even else LogLocator(10, (1, 2, 5), numticks=20))
     ax.xaxis.set_minor_locator(NullLocator())
     ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.3g}"))
     ax.grid(False, axis="y")

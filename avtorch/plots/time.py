@@ -73,7 +73,7 @@ def belief_band(
     """
     if bounds is not None:
         ax.axhspan(
-            *bounds, facecolor="none", edgecolor="#DCDCDC", hatch="////", linewidth=0, zorder=0, label="design bounds"
+            *bounds, facecolor="none", edgecolor="#BBBBBB", hatch="////", linewidth=0, zorder=0, label="design bounds"
         )
     for used, colour, label in ((True, BLUE, "90 % interval"), (False, GREY, "carried over (window not used)")):
         x, low = _staircase(windows, name, "q05", used)
@@ -118,17 +118,8 @@ def string_probability(
             some = [(t, value) for t, value in ends if (value < target) == below]
             if some:
                 ax.plot(*zip(*some, strict=True), marker="o", markersize=size, linestyle="none", color=colour, zorder=3)
-    ax.axhline(target, color=GREY, linestyle=":", linewidth=1.2)
-    ax.text(
-        1.0,
-        target - 0.02,
-        f"target {target:g} ",
-        transform=ax.get_yaxis_transform(),
-        ha="right",
-        va="top",
-        color=GREY,
-        fontsize=8,
-    )
+    # in the legend: beside its line a label would lie over dots and alerts
+    ax.axhline(target, color=GREY, linestyle=(0, (1, 1.5)), linewidth=1.2, label=f"target {target:g}")
     ax.set_ylim(-0.02, 1.05)
     ax.set_ylabel("P(string stable) [-]")
     return _span(ax, _ends(windows))

@@ -1,10 +1,11 @@
-"""The same drawing in fewer letters: paths by their steps, short styles, no ids that nothing refers to."""
+"""The same drawing in fewer letters: paths by their steps, short styles, no ids that nothing refers to, no point within
+a straight line along an axis."""
 
 from __future__ import annotations
 
 import re
 
-_LETTERS = "DejaVu Sans, Verdana, sans-serif"
+_MARKERS = re.compile(r"<g([^>]*)>\n?((?:<use [^>]*/>\n){2,})</g>")
 _KEPT = re.compile(r"panel-|line-\d+-")
 """Ids that the script of the page looks for."""
 
@@ -19,12 +20,14 @@ def compact(text: str) -> str:
         >>> compact('<g id="xtick_1"><path d="M 1.004 2 L 3 2.5 L 4 2 " style="fill: none; stroke: red"/></g>')
         '<g class="xtick"><path d="M1 2l2 .5 1-.5" style="fill:none;stroke:red"/></g>'
     """
+    text = re.sub(r' transform="rotate\(-?0 [^"]*\)"', "", text)
     text = re.sub(r'\bd="([^"]*)"', lambda m: f'd="{_path(m[1])}"', text)
     text = re.sub(r'\b(?:transform|x|y|width|height)="[^"]*"', _rounded, text)
     met = set(re.findall(r'(?:url\(#|href="#)([^")]+)', text))
     text = re.sub(r' id="([^"]*)"', lambda m: _named(m[1], met), text)
     text = re.sub(r'\bstyle="([^"]*)"', lambda m: f'style="{_style(m[1])}"', text)
-    return re.sub(r"\n\s*", "\n", text).replace("<g>\n", "<g>").replace("\n</g>", "</g>")
+    text = _MARKERS.sub(_shared, re.sub(r"\n\s*", "\n", text))
+    return text.replace("<g>\n", "<g>").replace("\n</g>", "</g>")
 
 
 def _path(path: str) -> str:
@@ -32,21 +35,57 @@ def _path(path: str) -> str:
     tokens = path.split()
     if set(re.findall("[A-Za-z]", path)) - set("MLz"):
         return re.sub(r" ?([A-Za-z]) ?", r"\1", _rounded_text(" ".join(tokens)))
-    words, at, drawing, i = [], (0, 0), False, 0
-    while i < len(tokens):
-        command = tokens[i]
+    words, at, drawing = [], (0, 0), False
+    for command, point in _straightened(tokens):
         if command == "z":
             words.append("z")
-            drawing, i = False, i + 1
+        elif command == "M":
+            words.append(f"M{_joined(*point)}")
+        else:
+            step = _joined(point[0] - at[0], point[1] - at[1])
+            words.append(("" if step[0] == "-" else " ") + step if drawing else f"l{step}")
+        drawing, at = command == "L", at if command == "z" else point
+    return "".join(words)
+
+
+def _straightened(tokens: list[str]) -> list[tuple[str, tuple[int, int]]]:
+    """Commands with their points in hundredths, without what repeats a point and what lies between two others on a line
+    along an axis: outlines of areas on a grid are full of them."""
+    kept: list[tuple[str, tuple[int, int]]] = []
+    i = 0
+    while i < len(tokens):
+        if tokens[i] == "z":
+            kept.append(("z", (0, 0)))
+            i += 1
             continue
         x, y = (round(100 * float(v)) for v in tokens[i + 1 : i + 3])
-        if command == "M":
-            words.append(f"M{_joined(x, y)}")
-        else:
-            step = _joined(x - at[0], y - at[1])
-            words.append(("" if step[0] == "-" else " ") + step if drawing else f"l{step}")
-        drawing, at, i = command == "L", (x, y), i + 3
-    return "".join(words)
+        if tokens[i] == "L":
+            while (
+                len(kept) > 1
+                and kept[-1][0] == "L"
+                and kept[-2][0] != "z"
+                and _within(kept[-2][1], kept[-1][1], (x, y))
+            ):
+                kept.pop()
+        kept.append((tokens[i], (x, y)))
+        i += 3
+    return kept
+
+
+def _within(a: tuple[int, int], b: tuple[int, int], c: tuple[int, int]) -> bool:
+    """Whether b lies between the others on a line along an axis: where the line turns back it ends in a spike."""
+    if a[0] == b[0] == c[0]:
+        return a[1] <= b[1] <= c[1] or a[1] >= b[1] >= c[1]
+    return a[1] == b[1] == c[1] and (a[0] <= b[0] <= c[0] or a[0] >= b[0] >= c[0])
+
+
+def _shared(group: re.Match[str]) -> str:
+    """What all markers of a group look like is said once, by the group."""
+    styles = set(re.findall(r' style="[^"]*"', group[2]))
+    if len(styles) != 1 or "style=" in group[1]:
+        return group[0]
+    (style,) = styles
+    return f"<g{group[1]}{style}>\n{group[2].replace(style, '')}</g>"
 
 
 def _joined(x: int, y: int) -> str:
@@ -77,6 +116,7 @@ def _named(name: str, met: set[str]) -> str:
 
 
 def _style(style: str) -> str:
-    style = re.sub(r"(font: [^;]*?px )[^;]*", rf"\g<1>{_LETTERS}", style)
-    style = re.sub(r"(font-family: )[^;]*", rf"\g<1>{_LETTERS}", style)
+    # which font, the page's style says; the short form does not hold without one
+    style = re.sub(r"(font: [^;]*?px )[^;]*", r"\g<1>DejaVu Sans, Verdana, sans-serif", style)
+    style = re.sub(r" ?font-family: [^;]*;?", "", style)
     return re.sub(r"([:;,]) ", r"\1", style)

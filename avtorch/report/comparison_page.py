@@ -81,13 +81,15 @@ def _of_drives(found: Comparison, notes: Sequence[str]) -> AnswerPage:
         (name, *(_told(q) for q in (m.before, m.after, m.ratio))) for name, m in zip(names, moved.values(), strict=True)
     )
     table = Table("Before and after", columns, rows, numeric=columns[1:])
-    picture = _ratios("after / before", {n: m.ratio for n, m in zip(names, moved.values(), strict=True)}, table)
+    ratios = {n: m.ratio for n, m in zip(names, moved.values(), strict=True)}
+    none = "An interval that crosses the dashed line cannot be told from no change."
+    picture = _ratios("after / before", ratios, table, none)
     return AnswerPage(
         "Comparison",
-        f"{_facts(found.before)}; after: {_facts(found.after)}",
+        f"before: {_facts(found.before)}; after: {_facts(found.after)}",
         Section(f"{car}; {said}", (found.why,), (picture,)),
         (
-            _cause(found.cause),
+            _cause(found.cause, found.why),
             Section("The data", items=tuple(notes)),
             Section(
                 "Method and limits",
@@ -107,33 +109,43 @@ def _facts(log: LogFacts) -> str:
     return f"{log.name}, {log.seconds:.0f} s"
 
 
-def _cause(cause: ChangeCause | None) -> Section:
+def _cause(cause: ChangeCause | None, told: str) -> Section:
+    """What the sentences `told` above do not say of it."""
     if cause is None:
         return Section("What has changed")
-    columns = ("what", "probability", "change (90 %)", "alike in these drives")
-    rows = tuple(
-        (
-            f"{'less ' if part.less else ''}{part.name}",
-            f"{part.probability:.2f}",
-            "; ".join(_parameter(key, q) for key, q in part.parameters.items()),
-            ", ".join(name for name in part.alias_set if name != part.name),
-        )
-        for part in cause.parts
-    )
+    lines = () if cause.why in told else (cause.why,)
+    columns = ("what", "probability", *_SIDES, "alike in these drives")
+    rows = []
+    for part in cause.parts:
+        sides = {side: "" for side in _SIDES}
+        for key, q in part.parameters.items():
+            side = next((s for s in ("before", "after") if key.startswith(s)), "change")
+            word = "" if key.startswith(side) else f"{words_of(key)} "
+            sides[f"{side} (90 %)"] += f"{'; ' if sides[f'{side} (90 %)'] else ''}{word}{_told(q)}{_unit(key)}"
+        alike = ", ".join(name for name in part.alias_set if name != part.name) or "nothing"
+        name = f"{'less ' if part.less else ''}{part.name}"
+        rows.append((name, f"{part.probability:.2f}", *sides.values(), alike))
     if rows:
-        return Section("What has changed", (cause.why,), tables=(Table("Parts of the change", columns, rows),))
+        table = Table("Parts of the change", columns, tuple(rows), numeric=("probability",))
+        return Section("What has changed", lines, tables=(table,))
     from avtorch.gap.change.change_cause import detectable_text
 
     least = tuple(
         f"Least change of {name} that would show: {detectable_text(name, x)}." for name, x in cause.detectable.items()
     )
-    return Section("What has changed", (cause.why,), items=least)
+    return Section("What has changed", lines, items=least)
+
+
+_SIDES = ("before (90 %)", "after (90 %)", "change (90 %)")
 
 
 # two simulators ----------------------------------------------------------------------------------------------------
 def _of_simulators(found: SimulatorComparison, notes: Sequence[str]) -> AnswerPage:
     nearer = found.nearer
-    title = "These drives cannot tell which simulator is nearer" if nearer is None else f"The {nearer} one is nearer"
+    title = "These drives cannot tell which simulator is nearer"
+    if nearer is not None:
+        which = found.first if nearer == "first" else found.second
+        title = f"The {nearer} simulator is nearer to the car: {which.name}"
     names = [_ROWS[name].format(horizon=f"{found.horizon_s:.3g}") for name in found.errors]
     columns = ("", "first (90 %)", "second (90 %)", "second / first (90 %)")
     rows = [
@@ -143,7 +155,10 @@ def _of_simulators(found: SimulatorComparison, notes: Sequence[str]) -> AnswerPa
     rows.append(("both, geometric mean", "", "", _told(found.ratio)))
     table = Table("Errors of the two", columns, tuple(rows), numeric=columns[1:])
     ratios = {n: e.ratio for n, e in zip(names, found.errors.values(), strict=True)}
-    picture = _ratios("second / first", ratios | {"both": found.ratio}, table)
+    equal = (
+        "An interval that crosses the dashed line cannot be told from equal errors; right of it the first is nearer."
+    )
+    picture = _ratios("error of the second / of the first", ratios | {"both": found.ratio}, table, equal)
     what = tuple(
         (
             ", ".join(d.parts),
@@ -178,28 +193,24 @@ def _of_simulators(found: SimulatorComparison, notes: Sequence[str]) -> AnswerPa
 def _side(values: Mapping[str, float] | None) -> str:
     if values is None:
         return "none"
-    return ", ".join(f"{x:.3g}{_unit(key)}" for key, x in values.items())
+    return ", ".join(f"{words_of(key)} {x:.3g}{_unit(key)}" for key, x in values.items())
 
 
 # both --------------------------------------------------------------------------------------------------------------
-def _ratios(what: str, ratios: Mapping[str, Quantity], table: Table) -> Picture:
+def _ratios(what: str, ratios: Mapping[str, Quantity], table: Table, caption: str) -> Picture:
     told = "; ".join(f"{name} {_told(q)}" for name, q in ratios.items())
     return picture_of(
         "ratios",
         lambda narrow: ratio_figure(ratios, what, narrow=narrow),
         f"Ratios {what} with their 90 % intervals, beside one: {told}.",
         table,
-        caption="An interval that crosses the dashed line cannot be told from no change.",
+        caption=caption,
         opened=True,
     )
 
 
 def _told(q: Quantity) -> str:
     return f"{q.mean:.3g} ({q.q05:.3g} to {q.q95:.3g})"
-
-
-def _parameter(key: str, q: Quantity) -> str:
-    return f"{words_of(key)} {_told(q)}{_unit(key)}"
 
 
 def _unit(key: str) -> str:

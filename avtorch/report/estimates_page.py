@@ -11,10 +11,10 @@ from avtorch.errors import InputError
 from avtorch.io.clock import from_start
 from avtorch.plots.figures import belief_figure, probability_figure
 from avtorch.report.answer_page import AnswerPage, Section, Tone, answer_html, written
-from avtorch.report.estimates_sentences import dead_time_note, estimates_note, late_note
+from avtorch.report.estimates_sentences import dead_time_note, estimates_note, late_note, unexplained
 from avtorch.report.origin import Origin
 from avtorch.report.picture import Picture, picture_of
-from avtorch.report.window_table import alert_table, window_table
+from avtorch.report.window_table import alert_table, probability_table, window_table
 from avtorch.results import estimates_answer
 
 if TYPE_CHECKING:
@@ -46,20 +46,20 @@ def estimates_html(
     if not windows:
         raise InputError("found: has no windows, needs the estimate of a log")
     facts = f"{name or log.name} · {len(windows)} windows of {windows[0]['end_s'] - windows[0]['start_s']:g} s"
+    spread = answer["spread_over_sd"]
     told = (estimates_note(answer), *_stability(windows, answer["assumed"]))
     more = (late_note(found.late), dead_time_note(found.inferred))
     page = AnswerPage(
         "Estimate",
         facts,
-        Section(_headline(windows), (*told, *(text for text in more if text)), (_belief(answer, log),)),
+        Section(_headline(windows, spread), (*told, *(text for text in more if text)), (_belief(answer, log),)),
         (
             Section("String stability", pictures=(_probability(answer),)),
             Section("Alerts", () if alerts else ("None.",), tables=(alert_table(alerts),) if alerts else ()),
-            Section("Windows", folded=(window_table(windows),)),
             Section("The data", items=(*found.quality.notes, *notes)),
             Section("Method and limits", items=_method(answer)),
         ),
-        _tone(windows),
+        _tone(windows, spread),
     )
     return answer_html(page, origin=origin)
 
@@ -85,16 +85,22 @@ def write_estimates_page(
     return written(estimates_html(found, log, notes=notes, origin=origin, name=name), folder, "estimates.html")
 
 
-def _headline(windows: Sequence[Mapping[str, Any]]) -> str:
+_UNITS = {"T_L": " s", "K_L": ""}
+
+
+def _headline(windows: Sequence[Mapping[str, Any]], spread_over_sd: Mapping[str, float | None]) -> str:
     used = [w for w in windows if w["used"]]
     if not used:
         return "No window could be used: lag and gain are not known"
+    if unexplained(spread_over_sd):
+        ends = {n: (f(w[n]["mean"] for w in used) for f in (min, max)) for n in ("T_L", "K_L")}
+        told = ", ".join(f"{n} {low:.2f} to {high:.2f}{_UNITS[n]}" for n, (low, high) in ends.items())
+        return f"One lag and one gain do not explain this log: {told} by window"
     last = used[-1]
-    lag, gain = (f"{last[n]['mean']:.3g}{unit} ({last[n]['q05']:.2g} to {last[n]['q95']:.2g})" for n, unit in _SHOWN)
+    lag, gain = (
+        f"{last[n]['mean']:.3f}{unit} (90 % {last[n]['q05']:.3f} to {last[n]['q95']:.3f})" for n, unit in _UNITS.items()
+    )
     return f"Lag T_L {lag}, gain K_L {gain}"
-
-
-_SHOWN = (("T_L", " s"), ("K_L", ""))
 
 
 def _stability(windows: Sequence[Mapping[str, Any]], assumed: Mapping[str, Any]) -> tuple[str, ...]:
@@ -109,8 +115,8 @@ def _stability(windows: Sequence[Mapping[str, Any]], assumed: Mapping[str, Any])
     )
 
 
-def _tone(windows: Sequence[Mapping[str, Any]]) -> Tone:
-    if not any(w["used"] for w in windows):
+def _tone(windows: Sequence[Mapping[str, Any]], spread_over_sd: Mapping[str, float | None]) -> Tone:
+    if unexplained(spread_over_sd) or not any(w["used"] for w in windows):
         return "amber"
     return "green" if windows[-1]["p_string_stable"] >= TARGET else "amber"
 
@@ -130,6 +136,7 @@ def _belief(answer: Mapping[str, Any], log: Log) -> Picture:
         "belief",
         lambda narrow: belief_figure(answer["windows"], answer=answer, log=log, narrow=narrow),
         says,
+        window_table(windows),
         caption="Grey: a window that excited too little, or did not converge; the belief before it is carried over.",
     )
 
@@ -142,7 +149,8 @@ def _probability(answer: Mapping[str, Any]) -> Picture:
         lambda narrow: probability_figure(answer["windows"], answer=answer, target=TARGET, narrow=narrow),
         f"P(string stable) over time, {min(values):.2f} to {max(values):.2f}; below {TARGET:g} after {below} of "
         f"{len(values)} windows.",
-        caption="Known at the end of each window: a dot, red below the target.",
+        probability_table(from_start(answer["windows"], answer["epoch_s"])),
+        caption="Known at the end of each window: a dot, larger and red below the target.",
     )
 
 

@@ -13,6 +13,11 @@ UNEXPLAINED = 1.5
 """`Estimates.spread_ratio` above which a single lag and gain do not describe the log."""
 
 
+def unexplained(spread_over_sd: Mapping[str, float | None]) -> bool:
+    """Whether estimates scatter by more than their intervals allow, from window to window."""
+    return any((x or 0.0) > UNEXPLAINED for x in spread_over_sd.values())
+
+
 def dead_time_note(inferred: InferredDeadTime | None) -> str:
     """What the log says of the dead time, in one sentence; empty where it was not inferred."""
     if inferred is None:
@@ -50,7 +55,7 @@ def estimates_note(answer: Mapping[str, Any]) -> str:
     text = ", ".join(f"{name} {last[name]['mean']:.3f} ± {last[name]['sd']:.3f}" for name in ("T_L", "K_L"))
     spread = [f"{name} {x:.1f}" for name, x in answer["spread_over_sd"].items() if x is not None]
     more = f" Spread from window to window over posterior SD: {', '.join(spread)}." if spread else ""
-    if any((x or 0.0) > UNEXPLAINED for x in answer["spread_over_sd"].values()):
+    if unexplained(answer["spread_over_sd"]):
         more += " Lag and gain alone do not explain this log, or they changed: find the cause with avtorch diagnose."
     elif all("accepted_change" in w["alerts"] for w in used):
         more += (

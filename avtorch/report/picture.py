@@ -52,6 +52,7 @@ _COLOURS = {
 }
 """Colours of the drawings by the style's name for them."""
 
+_PX_A_POINT = 1.5
 _VARIABLES = {colour.lower(): f"var(--{name})" for colour, name in _COLOURS.items()}
 
 
@@ -130,5 +131,7 @@ def inline_svg(name: str, figure: Figure, says: str, rows: Rows | None = None) -
     opening = Markup('<svg class="picture" role="img" aria-label="{}" {}').format(printable(says), Markup(view[0]))
     if lines:
         opening += Markup(' data-curves="{}"').format(printable(curves_json(figure, lines, name, rows)))
+    # letters are of one size on a desk, whatever the width of the figure
+    opening += Markup(' style="max-width: {}px">').format(round(_PX_A_POINT * 72 * figure.get_figwidth()))
     # matplotlib escapes what it writes
-    return opening + Markup(">") + Markup(compact(text))
+    return opening + Markup(compact(text))

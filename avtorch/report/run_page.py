@@ -4,20 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 
+from avtorch.arrays import FloatArray
 from avtorch.plots.figures import Motion, motion_figure, overview_figure, region_figure
+from avtorch.plots.plane import loop_of
 from avtorch.plots.time import Steps
 from avtorch.report.answer_page import AnswerPage, Section, Tone, answer_html, written
 from avtorch.report.origin import Origin
 from avtorch.report.picture import Picture, picture_of
-from avtorch.report.table import Table
+from avtorch.report.table import Table, of_numbers
 from avtorch.report.window_table import window_table
+from avtorch.vehicle import stability
 
 _MEASURES = {
     "speed_rms_ratio": "speed RMS, follower / leader [-]",
@@ -28,8 +33,16 @@ _MEASURES = {
     "clipped_share": "share of commands clipped [-]",
     "throughput_vph": "throughput at equilibrium [1/h]",
 }
+_QUANTITIES = {"speed": ("speed", "m/s"), "accel": ("acceleration", "m/s²"), "spacing": ("spacing", "m")}
+_STRATEGIES = {
+    1: "the lower level",
+    2: "the time gap",
+    3: "the gains",
+    4: "the leader's acceleration fed forward",
+}
 _MOST = 40  # rows of the story
-_DOTS, _POINTS = 150, 201  # draws of a cloud, points of a map's axis: more would make a page of megabytes
+_ROWS = 50  # of the table behind the motion
+_DOTS, _POINTS = 150, 301  # draws of a cloud, points of a map's axis: more would make a page of megabytes
 
 
 @dataclass(frozen=True)
@@ -53,8 +66,9 @@ def run_html(
     regions: Regions | None = None,
     origin: Origin | None = None,
 ) -> str:
-    """The page of a run as text; arguments as of `avtorch.plots.overview_figure`, whose `truth` says what T_L [s] and
-    K_L are from the change on.
+    """The page of a run as text; arguments as of `avtorch.plots.overview_figure`.
+
+    `truth`: T_L [s] and K_L of the vehicle, the last of each from the change on.
 
     Example:
         >>> from avtorch import Leader, estimate, simulate
@@ -68,36 +82,38 @@ def run_html(
         >>> "No alert was raised" in page
         True
     """
-    change = answer["change"]
     overview = picture_of(
         "overview",
         lambda narrow: overview_figure(answer, time, traces, truth=truth, bounds=bounds, narrow=narrow),
         f"Four lines over time: acceleration, the belief about lag and about gain, and P(string stable), which "
         f"{_at_the_end(answer)}.",
+        window_table(answer["windows"]),
         caption="Blue: avtorch's belief, or the run with its actions. Dashed: the truth. Hatched: the bounds the "
         "controller was designed for.",
     )
     motion = picture_of(
         "motion",
         lambda narrow: motion_figure(answer, time, traces, narrow=narrow),
-        f"Lines of {', '.join(traces)} over time: {', '.join(dict.fromkeys(n for q in traces.values() for n in q))}.",
+        f"Lines of {', '.join(_QUANTITIES.get(q, (q, ''))[0] for q in traces)} over time: "
+        f"{', '.join(dict.fromkeys(n for q in traces.values() for n in q))}.",
+        _motion_table(time, traces),
     )
     story = _story(answer)
     page = AnswerPage(
         "Run",
-        f"T_L {change['T_L']:g} s and K_L {change['K_L']:g} from {change['time_s']:g} s on",
+        f"simulated drive of {answer['windows'][-1]['end_s']:g} s",
         Section(_headline(answer), _lead(answer), (overview,), (_performance(answer),)),
         (
             Section("What happened", tables=(story,), items=_hidden(answer, story)),
             Section("The motion", pictures=(motion,)),
-            Section("Beliefs and stability regions", pictures=() if regions is None else (_regions(regions, truth),)),
-            Section("Windows", folded=(window_table(answer["windows"]),)),
+            Section("Beliefs and stability regions", pictures=_regions(regions, truth)),
             Section(
                 "Method and limits",
                 items=(
                     "The drive without action has the same leader, the same noise, and the setting it began with.",
                     "P(string stable) is that of the setting in force, for small motions, under the belief then.",
-                    "Strategies: 1 the lower level, 2 the time gap as well, 3 the gains as well (Algorithm 2).",
+                    "The strategies are those of the paper's Algorithm 2, in its order: the lower level, the time gap, "
+                    "the gains.",
                 ),
             ),
         ),
@@ -129,27 +145,32 @@ def _headline(answer: Mapping[str, Any]) -> str:
     change, actions = answer["change"]["time_s"], answer["actions"]
     after = [a for a in actions if a["time_s"] >= change]
     if after:
-        return f"The change was answered {after[0]['time_s'] - change:.1f} s later, by {_strategies(after[0])}"
+        return f"The change was answered {after[0]['time_s'] - change:.1f} s later, by {_means(after[0])}"
     seen = [a for a in answer["alerts"] if a["time_s"] >= change]
     if seen:
         return f"The change was seen {seen[0]['time_s'] - change:.1f} s later; nothing was done about it"
     return "No alert was raised after the change"
 
 
-def _strategies(action: Mapping[str, Any]) -> str:
-    names = " and ".join(map(str, action["strategies"]))
-    if not names:
-        return "no strategy"
-    return f"{'strategies' if len(action['strategies']) > 1 else 'strategy'} {names}"
+def _means(action: Mapping[str, Any]) -> str:
+    """What an action changes, in words."""
+    named = [_STRATEGIES[n] for n in action["strategies"]] or ["the setting it began with"]
+    return " and ".join([", ".join(named[:-1]), named[-1]] if len(named) > 1 else named)
 
 
 def _lead(answer: Mapping[str, Any]) -> tuple[str, ...]:
-    change = answer["change"]
+    change, both = answer["change"], answer["performance"]
     said = [
-        f"At {change['time_s']:g} s the lag T_L becomes {change['T_L']:g} s and the gain K_L {change['K_L']:g}.",
-        f"P(string stable) {_at_the_end(answer)}.",
+        f"At {change['time_s']:g} s the lag T_L becomes {change['T_L']:g} s and the gain K_L {change['K_L']:g}. "
+        f"P(string stable) {_at_the_end(answer)}."
     ]
-    hit = [s.replace("_", " ") for s, run in answer["performance"].items() if (run.get("min_spacing_m") or 0.0) < 0]
+    with_, without = (both[side].get("speed_rms_ratio") for side in ("with_action", "without_action"))
+    if answer["actions"] and with_ is not None and without is not None:
+        said.append(
+            f"The RMS of the follower's speed over that of its leader's is {with_:.2f} with action, {without:.2f} "
+            "without; above 1 disturbances grow towards the traffic behind."
+        )
+    hit = [s.replace("_", " ") for s, run in both.items() if (run.get("min_spacing_m") or 0.0) < 0]
     if hit:
         said.append(f"Collision {' and '.join(hit)}: everything after it, figures included, is not physical.")
     return tuple(said)
@@ -170,13 +191,28 @@ def _tone(answer: Mapping[str, Any]) -> Tone:
 
 def _performance(answer: Mapping[str, Any]) -> Table:
     both = answer["performance"]
-    columns = ("measure", "without action", "with action")
+    sides = ("without_action", "with_action") if answer["actions"] else ("with_action",)
+    columns = ("measure", *(side.replace("_", " ") if answer["actions"] else "value" for side in sides))
     rows = tuple(
-        (words, *(_number(both[side][key]) for side in ("without_action", "with_action")))
+        (words, *(_number(both[side][key]) for side in sides))
         for key, words in _MEASURES.items()
-        if all(key in both[side] for side in ("without_action", "with_action"))
+        if all(key in both[side] for side in sides)
     )
-    return Table("The drive without and with action", columns, rows, numeric=columns[1:])
+    caption = "The drive without and with action" if answer["actions"] else "The drive, without action"
+    return Table(caption, columns, rows, numeric=columns[1:])
+
+
+def _motion_table(time: ArrayLike, traces: Motion) -> Table:
+    """The lines of the motion at `_ROWS` times at most."""
+    lines = {
+        f"{_QUANTITIES.get(q, (q, ''))[0]}, {name} [{_QUANTITIES.get(q, (q, '-'))[1]}]": np.asarray(values)
+        for q, named in traces.items()
+        for name, values in named.items()
+    }
+    some = np.column_stack([np.asarray(time), *lines.values()])
+    # evenly spaced from the first row on, so that the times are round
+    some = some[:: -(-len(some) // _ROWS)]
+    return of_numbers("The motion", ("time [s]", *lines), some.tolist(), (".1f", *(".2f" for _ in lines)))
 
 
 def _number(value: float | None) -> str:
@@ -187,30 +223,77 @@ def _story(answer: Mapping[str, Any]) -> Table:
     change = answer["change"]
     lines = [
         (change["time_s"], "change", f"the vehicle changes to T_L {change['T_L']:g} s, K_L {change['K_L']:g}"),
-        *((a["time_s"], "alert", f"{a['detector']}: {a['why']}") for a in answer["alerts"]),
+        *((a["time_s"], "alert", f"{a['detector']}: {a['why']}{_again(more)}") for a, more in _begun(answer)),
     ]
     for a in answer["actions"]:
         gain = "" if a["peak_gain_true"] is None else f"; true peak gain {a['peak_gain_true']:.4f}"
-        lines.append((a["time_s"], "action", f"{_strategies(a)}: {a['why']}{gain}"))
+        lines.append((a["time_s"], "action", f"{_means(a)}: {a['why']}{gain}"))
     # the sort is stable: an action stays behind the alert of the same time that it answers
     rows = tuple((f"{time:.1f}", kind, text) for time, kind, text in sorted(lines, key=lambda line: line[0])[:_MOST])
-    marked = {i for i, row in enumerate(rows) if row[1] == "action"}
-    return Table("Events in order", ("time [s]", "what", "why"), rows, marked=marked)
+    return Table("Events in order", ("time [s]", "what", "why"), rows)
+
+
+def _begun(answer: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], int]]:
+    """The alerts that begin or lead to an action, each with the number of windows in which it goes on unanswered."""
+    ends = [w["end_s"] for w in answer["windows"]]
+    before = dict(pairwise(ends))
+    answered = {a["time_s"] for a in answer["actions"]}
+    begun: list[tuple[Mapping[str, Any], int]] = []
+    last: dict[tuple[str, float], int] = {}  # place among them, by detector and the time at which it comes next
+    for alert in answer["alerts"]:
+        name, time = alert["detector"], alert["time_s"]
+        place = last.get((name, time))
+        if place is None or time in answered:
+            place = len(begun)
+            begun.append((alert, 0))
+        else:
+            begun[place] = (begun[place][0], begun[place][1] + 1)
+        if time in before and time not in answered:
+            last[name, before[time]] = place
+    return begun
+
+
+def _again(more: int) -> str:
+    return f" (and in {more} more window{'s' * (more > 1)})" if more else ""
 
 
 def _hidden(answer: Mapping[str, Any], story: Table) -> tuple[str, ...]:
-    more = 1 + len(answer["alerts"]) + len(answer["actions"]) - len(story.rows)
+    more = 1 + len(_begun(answer)) + len(answer["actions"]) - len(story.rows)
     return (f"{more} more in run.json.",) if more else ()
 
 
-def _regions(regions: Regions, truth: Mapping[str, Steps] | None) -> Picture:
+def _regions(regions: Regions | None, truth: Mapping[str, Steps] | None) -> tuple[Picture, ...]:
+    if regions is None:
+        return ()
     now = None if truth is None else (float(truth["T_L"][-1][1]), float(truth["K_L"][-1][1]))
     names = ", ".join(name for name, _ in regions.settings)
     clouds = {name: (np.asarray(T)[:_DOTS], np.asarray(K)[:_DOTS]) for name, (T, K) in regions.clouds.items()}
-    return picture_of(
+    drawn = picture_of(
         "region",
         lambda narrow: region_figure(regions.settings, clouds, truth=now, narrow=narrow, points=_POINTS),
         f"Maps over lag and gain of where the loop is locally and string stable, one for each setting ({names}), with "
         f"{' and '.join(regions.clouds)}.",
+        _shares(regions, now),
         caption="A dot is a draw of the belief. String stable is what lies in the blue.",
     )
+    return (drawn,)
+
+
+def _shares(regions: Regions, now: tuple[float, float] | None) -> Table:
+    """Of each belief, T_L and K_L, and the share that is string stable under each setting."""
+    columns = ("vehicle", "T_L [s] (90 %)", "K_L (90 %)", *(f"string stable {name}" for name, _ in regions.settings))
+    rows = []
+    for name, (T, K) in regions.clouds.items():
+        some = [np.asarray(values, dtype=float) for values in (T, K)]
+        told = [f"{x.mean():.3f} ({np.quantile(x, 0.05):.2f} to {np.quantile(x, 0.95):.2f})" for x in some]
+        rows.append((name, *told, *(f"{100 * _stable(setting, *some):.0f} %" for _, setting in regions.settings)))
+    if now is not None:
+        one = [np.array([x]) for x in now]
+        held = ("yes" if _stable(setting, *one) else "no" for _, setting in regions.settings)
+        rows.append(("truth", f"{now[0]:g}", f"{now[1]:g}", *held))
+    return Table("The beliefs, and the share of each that is string stable", columns, tuple(rows))
+
+
+def _stable(setting: Mapping[str, Any], T: FloatArray, K: FloatArray) -> float:
+    verdict = stability.string_stable(*loop_of(setting, torch.from_numpy(T), torch.from_numpy(K)))
+    return float(verdict.double().mean())

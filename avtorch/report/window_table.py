@@ -22,10 +22,23 @@ def window_table(windows: Sequence[Mapping[str, Any]]) -> Table:
         (('0 to 2', '200', '0.500 (0.40 to 0.60)', '0.500 (0.40 to 0.60)', '0.90', 'not excited'),)
     """
     columns = ("time [s]", "rows", "T_L [s] (90 %)", "K_L (90 %)", "P(string stable)", "remarks")
-    step = -(-len(windows) // MOST) if windows else 1
+    step = _step(windows)
     rows = tuple(_row(w) for w in windows[::step])
-    some = f"Every {step} windows" if step > 1 else "The windows"
-    return Table(some, columns, rows, numeric=("rows", "P(string stable)"))
+    return Table(f"Lag and gain, {_which(step)}", columns, rows, numeric=("rows", "P(string stable)"))
+
+
+def probability_table(windows: Sequence[Mapping[str, Any]]) -> Table:
+    """P(string stable) when each window ended, and the alerts then.
+
+    Example:
+        >>> from avtorch.report.window_table import probability_table
+        >>> probability_table([{"end_s": 2.0, "p_string_stable": 0.9, "alerts": ["stability"]}]).rows
+        (('2', '0.90', 'stability'),)
+    """
+    step = _step(windows)
+    rows = tuple((_seconds(w["end_s"]), f"{w['p_string_stable']:.2f}", ", ".join(w["alerts"])) for w in windows[::step])
+    columns = ("known at [s]", "P(string stable)", "alerts")
+    return Table(f"P(string stable), {_which(step)}", columns, rows, numeric=columns[1:2])
 
 
 def alert_table(alerts: Sequence[Mapping[str, Any]]) -> Table:
@@ -47,9 +60,21 @@ def alert_table(alerts: Sequence[Mapping[str, Any]]) -> Table:
     return Table("Alerts, each detector's first", columns, tuple(rows), numeric=("windows",))
 
 
+def _step(windows: Sequence[Mapping[str, Any]]) -> int:
+    return max(1, -(-len(windows) // MOST))
+
+
+def _which(step: int) -> str:
+    return f"one of {step} windows" if step > 1 else "window by window"
+
+
 def _row(w: Mapping[str, Any]) -> tuple[str, ...]:
     own = [f"{w[n]['mean']:.3f} ({w[n]['q05']:.2f} to {w[n]['q95']:.2f})" for n in ("T_L", "K_L")]
     unused = "not converged" if w["excited"] else "not excited"
     remarks = ", ".join(w["alerts"]) if w["alerts"] else "" if w["used"] else unused
-    span = f"{w['start_s']:.4g} to {w['end_s']:.4g}"
+    span = f"{_seconds(w['start_s'])} to {_seconds(w['end_s'])}"
     return (span, str(w["n"]), *own, f"{w['p_string_stable']:.2f}", remarks)
+
+
+def _seconds(time: float) -> str:
+    return f"{time:.2f}".rstrip("0").rstrip(".")

@@ -27,6 +27,8 @@ import avtorch.gap.compare
 import avtorch.paper
 import avtorch.plots.style
 import avtorch.report
+import avtorch.report.comparison_page
+import avtorch.report.validation_page
 import avtorch.results
 import avtorch.trial.work
 import avtorch.validation
@@ -136,6 +138,7 @@ def comparison(c: Command) -> None:
     c.lines = {of: ["compare", log, log] for of in ("old", "new")}
     told = lambda *_, **__: SimpleNamespace(why=c.of, car={}, gap={}, cause=None, to_dict=lambda: {"why": c.of})  # noqa: E731
     c.stand_in(avtorch.gap.compare, "compare", told)
+    c.stand_in(avtorch.report.comparison_page, "comparison_html", lambda *_, **__: f"page of {c.of}")
 
 
 class Netcdf:
@@ -164,6 +167,7 @@ def validate(c: Command) -> None:
     c.stand_in(sys.modules["avtorch.validation.validate"], "check_installed", lambda: None)
     c.stand_in(avtorch.validation, "validate", lambda *_, **__: told)
     c.stand_in(avtorch.results, "validation_answer", lambda _: {"verdict": "agree", "why": c.of})
+    c.stand_in(avtorch.report.validation_page, "validation_html", lambda *_, **__: f"page of {c.of}")
     c.stand_in(avtorch.plots, "validation_figures", lambda _: {x: lambda x=x: f"{x} of {c.of}" for x in pictures[c.of]})
     for name in ("validation_table", "validation_notes"):
         c.stand_in(sys.modules["avtorch.cli.validate"], name, lambda _: "")
