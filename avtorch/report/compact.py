@@ -27,7 +27,9 @@ def compact(text: str) -> str:
     text = re.sub(r' id="([^"]*)"', lambda m: _named(m[1], met), text)
     text = re.sub(r'\bstyle="([^"]*)"', lambda m: f'style="{_style(m[1])}"', text)
     text = _MARKERS.sub(_shared, re.sub(r"\n\s*", "\n", text))
-    return text.replace("<g>\n", "<g>").replace("\n</g>", "</g>")
+    text = text.replace("<g>\n", "<g>").replace("\n</g>", "</g>")
+    # a browser would give the space between two letters a size of its own
+    return text.replace("\n<tspan", "<tspan").replace("</tspan>\n", "</tspan>")
 
 
 def _path(path: str) -> str:

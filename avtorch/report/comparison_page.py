@@ -76,7 +76,7 @@ def _of_drives(found: Comparison, notes: Sequence[str]) -> AnswerPage:
     car = "The car has changed" if found.changed else "No change of T_L and K_L is detected"
     moved = {**found.car, **found.gap}
     names = [_ROWS.get(name, name).format(horizon=f"{found.horizon_s:.3g}") for name in moved]
-    columns = ("", "before (90 %)", "after (90 %)", "after / before (90 %)")
+    columns = ("quantity", "before (90 %)", "after (90 %)", "after / before (90 %)")
     rows = tuple(
         (name, *(_told(q) for q in (m.before, m.after, m.ratio))) for name, m in zip(names, moved.values(), strict=True)
     )
@@ -147,7 +147,7 @@ def _of_simulators(found: SimulatorComparison, notes: Sequence[str]) -> AnswerPa
         which = found.first if nearer == "first" else found.second
         title = f"The {nearer} simulator is nearer to the car: {which.name}"
     names = [_ROWS[name].format(horizon=f"{found.horizon_s:.3g}") for name in found.errors]
-    columns = ("", "first (90 %)", "second (90 %)", "second / first (90 %)")
+    columns = ("error", "first (90 %)", "second (90 %)", "second / first (90 %)")
     rows = [
         (name, *(_told(q) for q in (e.first, e.second, e.ratio)))
         for name, e in zip(names, found.errors.values(), strict=True)

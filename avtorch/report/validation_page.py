@@ -90,7 +90,7 @@ def _table(answer: Mapping[str, Any]) -> Table:
     """A row a parameter: distance of SGLD from the reference over the windows; the last row has the aims."""
     summary = answer["summary"]
     exact = summary.get("coverage_90_quadrature")
-    columns = ["", "mean error [SD]", "SD ratio", "W1 [SD]", "90 % covers", "ESS"]
+    columns = ["parameter", "mean error [SD]", "SD ratio", "W1 [SD]", "90 % covers", "ESS"]
     if exact is not None:
         columns.insert(5, "exact covers")
     rows = []
