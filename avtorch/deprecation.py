@@ -44,13 +44,17 @@ def renamed(*, until: str, **names: str) -> Callable[[Callable[P, R]], Callable[
     """
 
     def with_old_names(function: Callable[P, R]) -> Callable[P, R]:
+        name = function.__qualname__
+        # a constructor is called by its class
+        called_as = name.removesuffix(".__init__") if name.endswith(".__init__") else function.__name__
+
         @wraps(function)
         def called(*args: P.args, **kwargs: P.kwargs) -> R:
             for old, new in names.items():
                 if old in kwargs:
                     if new in kwargs:
                         raise InputError(f"{old}: given beside {new}, its new name; needs {new} alone")
-                    deprecated(f"{function.__name__}({old}=...)", f"{new}=...", until=until)
+                    deprecated(f"{called_as}({old}=...)", f"{new}=...", until=until)
                     kwargs[new] = kwargs.pop(old)
             return function(*args, **kwargs)
 

@@ -20,10 +20,12 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "cyclopts.ext.sphinx",
-    # in _site: pages made from the packages, pages as a code host shows them, notebooks, formulas without a script
+    # in _site: pages made from the packages, pages as a code host shows them, notebooks, pictures drawn by a page's own
+    # code, formulas without a script
     "reference",
     "code_host",
     "notebook_pages",
+    "gallery",
     "mathml",
 ]
 exclude_patterns = ["_site"]

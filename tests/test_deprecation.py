@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
 
 import pytest
+from matplotlib.figure import Figure
 
+from avtorch import MPC
 from avtorch.deprecation import renamed
 from avtorch.errors import InputError
+from avtorch.plots import string_probability
+from tests.public_names import every
 
 
 @renamed(until="0.3", log="logs")
@@ -33,3 +38,31 @@ def test_both_are_one_too_many() -> None:
 
 def test_help_shows_the_new_name_alone() -> None:
     assert list(inspect.signature(rows).parameters) == ["logs", "most"]
+
+
+def test_a_constructor_is_called_by_its_class() -> None:
+    with pytest.warns(DeprecationWarning, match=r"^MPC\(T=...\) is deprecated, write T_hat=..."):
+        mpc = MPC(T=0.4)  # type: ignore[call-arg]
+    assert mpc.T_hat == 0.4
+    with pytest.warns(DeprecationWarning, match="write MPC.T_hat"):
+        assert mpc.T == 0.4
+
+
+def test_a_drawing_takes_the_old_name() -> None:
+    with pytest.warns(DeprecationWarning, match="target=...") as seen:
+        ax = string_probability(Figure().subplots(), [], target=0.9)  # type: ignore[call-arg]
+    assert seen[0].filename == __file__
+    assert "target 0.9" in ax.get_legend_handles_labels()[1]
+
+
+def test_what_takes_a_log_calls_it_so() -> None:
+    """One word for one thing: `log`, `logs` for one or several, or the two sides of a comparison."""
+    taking = [
+        argument.arg
+        for public in every()
+        if isinstance(public.node, ast.FunctionDef) and public.module != "avtorch.io.source"
+        for argument in (*public.node.args.args, *public.node.args.kwonlyargs)
+        if argument.annotation is not None and "LogSource" in ast.unparse(argument.annotation)
+    ]
+    assert len(taking) > 8
+    assert set(taking) == {"log", "logs", "before", "after"}

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from avtorch.arrays import FloatArray
+from avtorch.deprecation import renamed
 from avtorch.errors import InputError, listed, printable, quoted
 from avtorch.external.fmu_child import FmuProcess
 from avtorch.external.fmu_variables import SIGNALS, STARTS, Variable, ports
@@ -29,7 +30,7 @@ _OTHER_START = 1e-6  # m/s or m/s², beyond which an FMU begins elsewhere than i
 class FmuSimulator:
     """An FMU that takes a demanded acceleration and answers with acceleration and speed; a `Simulator`.
 
-    `names`: the FMU's variables by signal: `accel_cmd`, `accel`, `speed`, and `speed0`, `accel0` for the start of a
+    `map`: the FMU's variables by signal: `accel_cmd`, `accel`, `speed`, and `speed0`, `accel0` for the start of a
     drive; `unit`: units by signal, where the FMU states none or a wrong one. Both may stand in a TOML file, in the
     tables `[fmu]` and `[fmu.unit]`: the one beside the FMU (`car.toml` beside `car.fmu`), overruled by the one that
     `mapping` names. A signal without a name is the variable that has the signal's own name, or the only one that it can
@@ -43,7 +44,7 @@ class FmuSimulator:
     of the log's step, none longer than its own.
 
     It runs in a process of its own. A crash, an error, an answer that is not finite, or a step that takes longer than
-    `step_seconds` (120 s to begin a drive) ends that process and is an InputError that names the simulated time; the
+    `timeout_s` (120 s to begin a drive) ends that process and is an InputError that names the simulated time; the
     next `reset` starts another. `close`, or leaving a `with` block, ends it for good.
 
     Raises InputError for what is no FMU with co-simulation for this machine, for a signal that is not found or may be
@@ -60,17 +61,18 @@ class FmuSimulator:
         20.0
     """
 
+    @renamed(until="0.3", names="map", step_seconds="timeout_s")
     def __init__(
         self,
         path: str | os.PathLike[str],
         *,
-        names: Mapping[str, str] | None = None,
+        map: Mapping[str, str] | None = None,
         unit: Mapping[str, str] | None = None,
         mapping: str | os.PathLike[str] | None = None,
-        step_seconds: float = 10.0,
+        timeout_s: float = 10.0,
     ) -> None:
-        if not (isinstance(step_seconds, int | float) and 0 < step_seconds <= 86400):
-            raise InputError(f"step_seconds: found {step_seconds!r}, needs a number of seconds up to 86400")
+        if not (isinstance(timeout_s, int | float) and 0 < timeout_s <= 86400):
+            raise InputError(f"timeout_s: found {timeout_s!r}, needs a number of seconds up to 86400")
         self.path = Path(path)
         source = place(path)
         refuse_missing(source, _FMU)
@@ -78,8 +80,8 @@ class FmuSimulator:
             what = "is no regular file" if self.path.exists() else "no such file"
             raise InputError(f"{source}: {what}; an FMU is needed")
         told = _told(self.path, mapping)
-        wanted = told[0] | _known("names", names, (*SIGNALS, *STARTS)), told[1] | _known("unit", unit, SIGNALS)
-        self._shared = _Shared(self.path, float(step_seconds))
+        wanted = told[0] | _known("map", map, (*SIGNALS, *STARTS)), told[1] | _known("unit", unit, SIGNALS)
+        self._shared = _Shared(self.path, float(timeout_s))
         self._listing = self._shared.process().listing
         try:
             self._ports = ports(source, self._listing, *wanted)
@@ -262,8 +264,8 @@ class FmuSimulator:
 class _Shared:
     """The process of an FMU, begun again after it has failed, and the drive that it runs."""
 
-    def __init__(self, path: Path, step_seconds: float) -> None:
-        self._source, self._path, self._seconds = place(path), path.absolute(), step_seconds
+    def __init__(self, path: Path, timeout_s: float) -> None:
+        self._source, self._path, self._seconds = place(path), path.absolute(), timeout_s
         self._process: FmuProcess | None = None
         self._closed = False
         self.drive: object | None = None

@@ -32,7 +32,7 @@ OPENING_SECONDS = 120.0
 class FmuProcess:
     """An FMU in a process of its own, with its `listing` of variables. Raises InputError where it cannot be opened."""
 
-    def __init__(self, path: Path, source: str, step_seconds: float) -> None:
+    def __init__(self, path: Path, source: str, timeout_s: float) -> None:
         self.source = source
         folder = tempfile.TemporaryDirectory(prefix="avtorch_fmu_", ignore_cleanup_errors=True)
         clock = Path(folder.name, "clock")
@@ -66,7 +66,7 @@ class FmuProcess:
             self.listing: dict[str, Any] = self._answer()
             if "refused" in self.listing:
                 raise InputError(self.listing["refused"])
-        self._seconds = step_seconds
+        self._seconds = timeout_s
 
     @property
     def alive(self) -> bool:
@@ -110,7 +110,7 @@ class FmuProcess:
 
     def _ended(self) -> InputError:
         if self._watch.late:
-            more = "" if self._watch.seconds == OPENING_SECONDS else "; a longer step_seconds gives it more"
+            more = "" if self._watch.seconds == OPENING_SECONDS else "; a longer timeout_s gives it more"
             return self._failed(f"it does not answer within {self._watch.seconds:g} s{more}")
         _kill(self._process)
         code = self._process.wait()

@@ -118,7 +118,7 @@ def _recognised(source: str, signal: str, able: list[Variable]) -> tuple[Variabl
         if len(candidates) == 1:
             return candidates[0], how
     kind = "input" if signal == "accel_cmd" else "output"
-    needs = f'names={{{signal!r}: ...}} or a line {signal} = "..." below [fmu] in its TOML file'
+    needs = f'map={{{signal!r}: ...}} or a line {signal} = "..." below [fmu] in its TOML file'
     if not able:
         raise InputError(f"{source}: has no real {kind} for {signal}; an FMU with one is needed")
     raise InputError(f"{source}: {signal} may be several of its {kind}s, or none: {_names(able)}; needs {needs}")

@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from avtorch.deprecation import renamed
 from avtorch.io import Log
 from avtorch.io.clock import from_start, time_label
 from avtorch.plots.plane import gain_curve, region, setting_region, verdict_legend
@@ -87,9 +88,10 @@ def belief_figure(
     return figure
 
 
+@renamed(until="0.3", target="required")
 @styled
 def probability_figure(
-    windows: Windows, *, answer: Mapping[str, Any] | None = None, target: float = 0.95, narrow: bool = False
+    windows: Windows, *, answer: Mapping[str, Any] | None = None, required: float = 0.95, narrow: bool = False
 ) -> Figure:
     """P(string stable) over time, with alerts and actions; each action is labelled with the setting it chose.
 
@@ -107,7 +109,7 @@ def probability_figure(
     figure = Figure(figsize=(_width(narrow), 3.6), layout="constrained")
     ax = figure.subplots()
     string_probability(
-        _events_of(ax, answer or {}), windows, target=target, actions=(answer or {}).get("actions") or ()
+        _events_of(ax, answer or {}), windows, required=required, actions=(answer or {}).get("actions") or ()
     )
     for i, action in enumerate((answer or {}).get("actions") or []):
         names = " + ".join(str(s) for s in action["strategies"]) or "none"
@@ -168,6 +170,7 @@ def region_figure(
     return figure
 
 
+@renamed(until="0.3", target="required")
 @styled
 def overview_figure(
     answer: Mapping[str, Any],
@@ -176,7 +179,7 @@ def overview_figure(
     *,
     truth: Mapping[str, Steps] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
-    target: float = 0.95,
+    required: float = 0.95,
     narrow: bool = False,
 ) -> Figure:
     """A run at one glance: acceleration, belief about lag and gain, P(string stable).
@@ -202,7 +205,7 @@ def overview_figure(
     motion(axes[0], time, traces["accel"], quantity="accel")
     for ax, name in zip(axes[1:3], ("T_L", "K_L"), strict=True):
         belief_band(ax, answer["windows"], name, truth=(truth or {}).get(name), bounds=(bounds or {}).get(name))
-    string_probability(axes[3], answer["windows"], target=target, actions=answer["actions"])
+    string_probability(axes[3], answer["windows"], required=required, actions=answer["actions"])
     axes[3].set_xlabel("time [s]")
     _legend_above(figure, *axes, narrow=narrow)
     return figure

@@ -308,5 +308,6 @@ def _legend(
     for ax in axes.flat:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             found.setdefault(label, handle)
-    columns = 1 if narrow else min(len(found), 6)
+    column = 0.5 + 0.085 * max(map(len, found), default=0)  # inches, in the size of a legend's letters
+    columns = 1 if narrow else max(1, min(len(found), 6, int(figure.get_figwidth() / column)))
     figure.legend(list(found.values()), list(found), loc=where, ncols=columns)

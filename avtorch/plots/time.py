@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
+from avtorch.deprecation import renamed
 from avtorch.io import Log
 from avtorch.io.clock import from_start
 from avtorch.plots.style import BLACK, BLUE, GREEN, GREY, LABELS, ORANGE, SKY, VERMILLION
@@ -91,11 +92,12 @@ def belief_band(
     return _span(ax, _ends(windows))
 
 
+@renamed(until="0.3", target="required")
 def string_probability(
-    ax: Axes, windows: Windows, *, target: float = 0.95, actions: Iterable[Mapping[str, Any]] = ()
+    ax: Axes, windows: Windows, *, required: float = 0.95, actions: Iterable[Mapping[str, Any]] = ()
 ) -> Axes:
     """P(string stable) of the setting in force, over time, as it could be known: from a window's end on (a dot, red
-    below the target), and from an action on that of the setting it chose.
+    below `required`), and from an action on that of the setting it chose.
 
     Example:
         >>> from matplotlib.figure import Figure
@@ -115,11 +117,11 @@ def string_probability(
         ax.fill_between(x, p, step="post", color=SKY, alpha=0.25, linewidth=0)
         ax.step(x, p, where="post", color=BLUE)
         for below, colour, size in ((False, BLUE, 3), (True, VERMILLION, 6)):
-            some = [(t, value) for t, value in ends if (value < target) == below]
+            some = [(t, value) for t, value in ends if (value < required) == below]
             if some:
                 ax.plot(*zip(*some, strict=True), marker="o", markersize=size, linestyle="none", color=colour, zorder=3)
     # in the legend: beside its line a label would lie over dots and alerts
-    ax.axhline(target, color=GREY, linestyle=(0, (1, 1.5)), linewidth=1.2, label=f"target {target:g}")
+    ax.axhline(required, color=GREY, linestyle=(0, (1, 1.5)), linewidth=1.2, label=f"target {required:g}")
     ax.set_ylim(-0.02, 1.05)
     ax.set_ylabel("P(string stable) [-]")
     return _span(ax, _ends(windows))

@@ -146,7 +146,7 @@ def _probability(answer: Mapping[str, Any]) -> Picture:
     below = sum(p < TARGET for p in values)
     return picture_of(
         "probability",
-        lambda narrow: probability_figure(answer["windows"], answer=answer, target=TARGET, narrow=narrow),
+        lambda narrow: probability_figure(answer["windows"], answer=answer, required=TARGET, narrow=narrow),
         f"P(string stable) over time, {min(values):.2f} to {max(values):.2f}; below {TARGET:g} after {below} of "
         f"{len(values)} windows.",
         probability_table(from_start(answer["windows"], answer["epoch_s"])),

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from avtorch.deprecation import renamed
 from avtorch.display import Card, Displayed, Frame
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
@@ -174,9 +175,10 @@ def check_installed() -> None:
         raise InputError(f"{', '.join(missing)}: {verb} not installed; needs pip install 'avtorch[validate]'")
 
 
+@renamed(until="0.3", source="log")
 @shows_progress
 def validate(
-    source: LogSource | Windows,
+    log: LogSource | Windows,
     *,
     window: float = 2.0,
     windows: int | None = None,
@@ -189,7 +191,7 @@ def validate(
     """SGLD, quadrature and NUTS over the same windows, each under the first prior and on its own.
 
     Args:
-        source: a log (a `Log`, a path or a data frame), or windows made by `synthetic_windows` and its like.
+        log: a log (a `Log`, a path or a data frame), or windows made by `synthetic_windows` and its like.
         window: length of a log's windows [s].
         windows: at most so many windows of a log, evenly spread; all by default.
         settings: of SGLD; by default those that every command uses for the form.
@@ -212,8 +214,7 @@ def validate(
     check_installed()
     if nuts_windows is not None and nuts_windows < 1:
         raise InputError(f"nuts_windows: found {nuts_windows}, needs 1 or more")
-    if not isinstance(source, Windows):
-        source = windows_of_log(as_log(source, argument="source"), window=window, count=windows)
+    source = log if isinstance(log, Windows) else windows_of_log(as_log(log), window=window, count=windows)
     settings = source.sampler if settings is None else settings
     if settings.chains == 1 and settings.draws < 8:
         raise InputError(f"draws: found {settings.draws} of a single chain, needs 8 or more")

@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Float
+from avtorch.deprecation import deprecated, renamed
 from avtorch.errors import InputError
 from avtorch.vehicle.arguments import checked
 from avtorch.vehicle.broadcasting import broadcast
@@ -44,7 +45,7 @@ class MPC:
         standstill: [m].
         horizon, step: [s]; 4 s at 0.2 s by default: several times the loop's slowest time constant, in steps shorter
             than the actuator's lag.
-        T, K: internal model of the actuator, [s] and [-].
+        T_hat, K_hat: internal model of the actuator, [s] and [-].
         accel_min, accel_max: the box [m/s²].
         weights: (q_s [1/m²], q_v [s²/m²], q_a [s⁴/m²], r [s⁴/m²]); the default puts a spacing error of 1 m, a speed
             difference of 1 m/s and a demand of 1 m/s² level.
@@ -58,6 +59,7 @@ class MPC:
         True
     """
 
+    @renamed(until="0.3", T="T_hat", K="K_hat")
     def __init__(
         self,
         *,
@@ -65,16 +67,16 @@ class MPC:
         standstill: float = 5.0,
         horizon: float = 4.0,
         step: float = 0.2,
-        T: float = 0.3,
-        K: float = 1.0,
+        T_hat: float = 0.3,
+        K_hat: float = 1.0,
         accel_min: float = -6.0,
         accel_max: float = 4.0,
         weights: Sequence[float] = (1.0, 1.0, 0.0, 1.0),
     ) -> None:
         self.time_gap = float(checked("time_gap", time_gap, unit="s", least=0.0))
         self.standstill = float(checked("standstill", standstill, unit="m", least=0.0))
-        lag = float(checked("T", T, unit="s", above=0.0))
-        gain = float(checked("K", K, above=0.0))
+        lag = float(checked("T_hat", T_hat, unit="s", above=0.0))
+        gain = float(checked("K_hat", K_hat, above=0.0))
         self.step = float(checked("step", step, unit="s", above=0.0))
         moves = round(float(checked("horizon", horizon, unit="s", above=0.0)) / self.step)
         if moves < 1 or abs(moves * self.step - horizon) > 1e-9:
@@ -85,12 +87,24 @@ class MPC:
         if q.shape != (4,) or float(q[3]) <= 0:
             raise InputError(f"weights: found {tuple(weights)!r}, needs q_s, q_v, q_a >= 0 and r > 0")
         self.accel_min, self.accel_max = float(accel_min), float(accel_max)
-        self.T, self.K, self.horizon, self.weights = lag, gain, horizon, tuple(float(x) for x in q)
+        self.T_hat, self.K_hat, self.horizon, self.weights = lag, gain, horizon, tuple(float(x) for x in q)
         self.ramp: TimeGap | None = None
         self._condense(moves, q)
 
+    @property
+    def T(self) -> float:
+        """`T_hat`, until 0.3."""
+        deprecated("MPC.T", "MPC.T_hat", until="0.3")
+        return self.T_hat
+
+    @property
+    def K(self) -> float:
+        """`K_hat`, until 0.3."""
+        deprecated("MPC.K", "MPC.K_hat", until="0.3")
+        return self.K_hat
+
     def _condense(self, moves: int, q: Float[Tensor, "4"]) -> None:
-        tau, T, K, h = self.time_gap, self.T, self.K, self.step
+        tau, T, K, h = self.time_gap, self.T_hat, self.K_hat, self.step
         drift = torch.tensor([[0, 1, -tau, 0], [0, 0, -1, 0], [0, 0, -1 / T, K / T], [0, 0, 0, 0]], dtype=torch.float64)
         held = torch.matrix_exp(drift * h)
         A, B = held[:3, :3], held[:3, 3]
@@ -202,8 +216,8 @@ class MPC:
             standstill=self.standstill,
             horizon=self.horizon,
             step=self.step,
-            T=self.T,
-            K=self.K,
+            T_hat=self.T_hat,
+            K_hat=self.K_hat,
             accel_min=self.accel_min,
             accel_max=self.accel_max,
             weights=self.weights,

@@ -47,7 +47,7 @@ class Build:
         return fmus.packed(self.folder / "car.fmu", xml, self.compiled[fmi], fmus.BINARIES[fmi])
 
     def open(self, path: Path, **arguments: Any) -> FmuSimulator:
-        arguments = {"names": {"speed0": "v0", "accel0": "a0"}, **arguments}
+        arguments = {"map": {"speed0": "v0", "accel0": "a0"}, **arguments}
         self.opened.append(FmuSimulator(path, **arguments))
         return self.opened[-1]
 
@@ -145,7 +145,7 @@ def test_of_several_inputs_the_one_that_fits_is_taken(build: Build, name: str, u
 
 def test_several_that_may_be_meant_are_listed(build: Build) -> None:
     with pytest.raises(
-        InputError, match=r"accel may be several .*: y1 \[m/s2\], y2 \[m/s\], drag \[m/s2\]; needs names="
+        InputError, match=r"accel may be several .*: y1 \[m/s2\], y2 \[m/s\], drag \[m/s2\]; needs map="
     ):
         build.open(build.fmu(given=ambiguous()))
 
@@ -154,12 +154,12 @@ def test_several_that_may_be_meant_are_listed(build: Build) -> None:
 def test_a_name_that_is_given_decides(build: Build, way: str) -> None:
     path, names = build.fmu(given=ambiguous()), {"accel": "y1", "speed0": "v0", "accel0": "a0"}
     text = "[map]\naccel = 'ACC_X'\n[fmu]\n" + "".join(f"{k} = '{v}'\n" for k, v in names.items())
-    arguments: dict[str, Any] = {"names": names}
+    arguments: dict[str, Any] = {"map": names}
     if way == "beside":
-        arguments = {"names": None}
+        arguments = {"map": None}
         path.with_suffix(".toml").write_text(text)
     if way == "mapping":
-        arguments = {"names": None, "mapping": build.folder / "lap.toml"}
+        arguments = {"map": None, "mapping": build.folder / "lap.toml"}
         arguments["mapping"].write_text(text)
         path.with_suffix(".toml").write_text("[fmu]\naccel = 'y2'\n")  # overruled
     np.testing.assert_allclose(
@@ -179,12 +179,12 @@ def test_a_log_is_read_beside_the_names_of_an_fmu(tmp_path: Path) -> None:
         ({"accel_cmd": "a"}, r"accel_cmd = 'a': its causality is output; an input is needed"),
         ({"speed0": "v"}, r"speed0 = 'v': its causality is output"),
         ({"accel": "v", "speed": "v"}, r"variable 'v' is both accel and speed"),
-        ({"jerk": "v"}, r"names jerk: not known"),
+        ({"jerk": "v"}, r"map jerk: not known"),
     ],
 )
 def test_a_name_that_does_not_fit_is_refused(build: Build, names: dict[str, str], text: str) -> None:
     with pytest.raises(InputError, match=text):
-        build.open(build.fmu(), names=names)
+        build.open(build.fmu(), map=names)
 
 
 @pytest.mark.parametrize(
@@ -207,13 +207,13 @@ def test_a_mapping_file_that_is_wrong_is_refused(build: Build, text: str, messag
 def test_an_fmu_without_a_speed_is_refused(build: Build) -> None:
     given = fmus.variables()
     given["v"]["causality"] = "local"
-    with pytest.raises(InputError, match=r"speed may be several of its outputs, or none: a; needs names="):
+    with pytest.raises(InputError, match=r"speed may be several of its outputs, or none: a; needs map="):
         build.open(build.fmu(given=given))
 
 
 # start -------------------------------------------------------------------------------------------------------------
 def test_a_start_that_cannot_be_set_is_the_fmus_own_and_told(build: Build) -> None:
-    car = build.open(build.fmu(), names={"accel0": "a0"})
+    car = build.open(build.fmu(), map={"accel0": "a0"})
     np.testing.assert_allclose(driven(car), expected(speed=fmus.START["v0"]), **CLOSE)
     assert "speed0: cannot be set; a drive begins at the FMU's own" in car.notes
     assert "speed: the FMU begins at 3 m/s, the drive at 20 m/s" in car.notes
@@ -225,7 +225,7 @@ def test_outputs_with_start_values_are_started_by_them(build: Build, fmi: int) -
     given = fmus.variables(units={"v": "km/h"})
     for name in ("a", "v"):
         given[name] |= {"initial": "exact", "start": 0.0}
-    car = build.open(build.fmu(fmi, given), names={}).with_parameters({"speed_scale": 3.6})
+    car = build.open(build.fmu(fmi, given), map={}).with_parameters({"speed_scale": 3.6})
     np.testing.assert_allclose(driven(car), expected(), **CLOSE)
     assert "speed0: variable 'v' (its start value), in km/h" in car.notes
 
@@ -327,7 +327,7 @@ def test_a_failure_names_its_time_and_the_next_drive_is_a_new_one(
     build: Build, fmi: int, fault: int, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(build.folder))
-    car = build.open(build.fmu(fmi), step_seconds=0.4)
+    car = build.open(build.fmu(fmi), timeout_s=0.4)
     bad = car.with_parameters({"fault": fault})
     with pytest.raises(InputError, match=rf"car\.fmu: in the step that begins at 1 s of the drive: {what}"):
         driven(bad)

@@ -26,7 +26,7 @@ def independent(mpc: MPC, x: np.ndarray) -> np.ndarray:
         for move in u:
             for _ in range(fine):
                 # midpoint rule over exact actuator steps
-                after = a * np.exp(-h / mpc.T) + mpc.K * move * (1 - np.exp(-h / mpc.T))
+                after = a * np.exp(-h / mpc.T_hat) + mpc.K_hat * move * (1 - np.exp(-h / mpc.T_hat))
                 mid = 0.5 * (a + after)
                 ds, dv, a = ds + h * (dv - 0.5 * h * mid - mpc.time_gap * mid), dv - h * mid, after
             out += [np.sqrt(mpc.weights[0]) * ds, np.sqrt(mpc.weights[1]) * dv, np.sqrt(mpc.weights[2]) * a]
@@ -50,7 +50,7 @@ STATES = [
 
 
 def test_plan_against_an_independent_solver():
-    mpc = MPC(weights=(1.0, 0.5, 0.2, 1.0), T=0.5, K=0.8)
+    mpc = MPC(weights=(1.0, 0.5, 0.2, 1.0), T_hat=0.5, K_hat=0.8)
     plans = mpc.plan(torch.tensor(STATES, dtype=F64))
     assert ((plans == mpc.accel_min) | (plans == mpc.accel_max)).any(-1).sum() >= 3, "no state meets the box"
     for x, plan in zip(STATES, plans, strict=True):
@@ -73,7 +73,7 @@ def test_both_solvers_and_the_optimality_conditions_agree(fresh_seed):
 
 
 def test_equivalent_gains_are_the_differences_of_the_law():
-    mpc = MPC(time_gap=1.4, T=0.4, K=0.9)
+    mpc = MPC(time_gap=1.4, T_hat=0.4, K_hat=0.9)
     at = {"spacing": 1.4 * 20 + 5, "speed": 20.0, "accel": 0.0, "lead_speed": 20.0}
 
     def law(**change: float) -> float:
@@ -136,8 +136,8 @@ def test_cost_of_a_step_is_far_below_the_tick():
         ("horizon", 0.0),
         ("horizon", 1.03),
         ("step", -0.2),
-        ("T", 0.0),
-        ("K", 0.0),
+        ("T_hat", 0.0),
+        ("K_hat", 0.0),
         ("accel_min", 5.0),
         ("weights", (1.0, 1.0, 0.0)),
         ("weights", (1.0, 1.0, 0.0, 0.0)),
