@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 
 import yaml
@@ -22,3 +23,11 @@ def test_the_citation_names_this_version_and_its_paper() -> None:
 
 def test_the_version_is_semantic() -> None:
     assert re.fullmatch(r"\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?", avtorch.__version__)
+
+
+def test_the_source_archive_holds_what_its_readme_links_to() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    held = {path.strip("/") for path in project["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]}
+    links = re.findall(r"\]\(([^)#:]+)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert {link.split("/")[0] for link in links} <= held
+    assert all((ROOT / path).exists() for path in held)
