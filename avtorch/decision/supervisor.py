@@ -14,6 +14,7 @@ from avtorch.decision.replay import History
 from avtorch.decision.settings import Setting
 from avtorch.decision.strategist import Strategist
 from avtorch.decision.watch import Watch, WatchedWindow
+from avtorch.display.progress import asks_for_bar, called, progress_bar
 from avtorch.errors import InputError
 from avtorch.inference.form import JerkForm
 from avtorch.inference.latent_form import LatentForm
@@ -122,12 +123,25 @@ class Supervisor:
         duration: float,
         *,
         events: Sequence[tuple[float, Callable[[ClosedLoop], None]]] = (),
-        progress: Callable[[float], None] | None = None,
+        progress: Callable[[float], None] | bool | None = None,
     ) -> SupervisedRun:
         """Advance by `duration` [s]. `events` are `(time [s], change)`: `change(loop)` is called at that time.
 
-        `progress(seconds done)` is called after each window. Raises `InputError` for less than one step.
+        `progress(seconds done)` is called after each window; or True, False, None, as in `avtorch.diagnose`. Raises
+        `InputError` for less than one step.
         """
+        if not asks_for_bar(progress):
+            return self._run(duration, events, called(progress))
+        begun = self.loop.time
+        with progress_bar("drive") as step:
+            return self._run(duration, events, lambda time: step(time - begun, duration))
+
+    def _run(
+        self,
+        duration: float,
+        events: Sequence[tuple[float, Callable[[ClosedLoop], None]]],
+        progress: Callable[[float], None] | None,
+    ) -> SupervisedRun:
         loop, n = self.loop, self.loop.scenarios
         if not 0.5 * loop.dt < duration < float("inf"):
             raise InputError(f"duration: found {duration:g} s, needs at least one step of {loop.dt:g} s")

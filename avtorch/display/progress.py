@@ -74,13 +74,17 @@ def progress_bar(title: str) -> Iterator[Callable[..., None]]:
         bar.close()
 
 
+def asks_for_bar(progress: object) -> bool:
+    """Whether `progress` of a long call means a bar here: True does, and None in a notebook."""
+    return progress is True or (progress is None and notebook_display() is not None)
+
+
 def shows_progress(function: Callable[P, R]) -> Callable[P, R]:
-    """Gives `function` the bar that its keyword `progress` asks for: True, or None in a notebook."""
+    """Gives `function` the bar that its keyword `progress` asks for (see `asks_for_bar`)."""
 
     @wraps(function)
     def inner(*args: P.args, **kwargs: P.kwargs) -> R:
-        asked = kwargs.get("progress")
-        if asked is True or (asked is None and notebook_display() is not None):
+        if asks_for_bar(kwargs.get("progress")):
             with progress_bar(function.__name__.replace("_", " ")) as step:
                 return function(*args, **{**kwargs, "progress": step})  # type: ignore[arg-type]
         return function(*args, **kwargs)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from avtorch.display import Card, Displayed
+from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.experiment.information import Information, information
 from avtorch.experiment.limits import Limits
@@ -78,11 +79,19 @@ class Experiment(Displayed):
         }
 
 
-def next_experiment(found: Diagnosis, limits: Limits | None = None, *, seed: int = 0) -> Experiment | None:
+@shows_progress
+def next_experiment(
+    found: Diagnosis,
+    limits: Limits | None = None,
+    *,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | bool | None = None,
+) -> Experiment | None:
     """The library manoeuvre that distinguishes the diagnosis' `contenders`; None where there is nothing to distinguish.
 
     Start it at its first expected speed, on a level road if there is one. `limits` default to what the car did in the
-    log (`Limits.of_log`). Raises `InputError` where the limits allow no manoeuvre at all.
+    log (`Limits.of_log`). `progress(done, of)` is called with the hypotheses and manoeuvres; or True, False, None, as
+    in `avtorch.diagnose`. Raises `InputError` where the limits allow no manoeuvre at all.
 
     Example:
         >>> from avtorch import Leader, diagnose, simulate
@@ -106,8 +115,16 @@ def next_experiment(found: Diagnosis, limits: Limits | None = None, *, seed: int
     weights = np.array([max(found.probability(r.name), 1e-3) for r in rivals])
     weights = weights / weights.sum()
     entropy = float(-(weights * np.log(weights)).sum())
-    predictions = [ManoeuvrePrediction.of(r, offers, channels, group, _DRAWS) for r in rivals]
-    expected = [information(predictions, i, weights.tolist(), seed=seed) for i in range(len(offers))]
+    step, of = called(progress), len(rivals) + len(offers)
+    predictions, expected = [], []
+    for rival in rivals:
+        predictions.append(ManoeuvrePrediction.of(rival, offers, channels, group, _DRAWS))
+        if step is not None:
+            step(len(predictions), of)
+    for i in range(len(offers)):
+        expected.append(information(predictions, i, weights.tolist(), seed=seed))
+        if step is not None:
+            step(len(rivals) + i + 1, of)
     best = _chosen(offers, expected)
     names = tuple(r.name for r in rivals)
     unresolved = tuple(n for n in found.verdict.alias_set if n not in names and n != "unknown")

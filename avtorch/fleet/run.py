@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.fleet.cluster import Cluster, connected, require_dask
 from avtorch.fleet.fleet_progress import FleetProgress
@@ -30,6 +31,7 @@ READERS = 4
 """Logs read at a time to find out whether they have changed."""
 
 
+@shows_progress
 def run_fleet(
     logs: str | os.PathLike[str] | Iterable[str | os.PathLike[str]] | LogList,
     out: str | os.PathLike[str],
@@ -40,7 +42,7 @@ def run_fleet(
     scheduler: str | None = None,
     retry: bool = False,
     report: Callable[[Diagnosis], str] | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Callable[[str, int, int], None] | bool | None = None,
     connected_to: Callable[[Cluster], None] | None = None,
 ) -> dict[str, Any]:
     """Check, estimate and diagnose each log of a fleet on a Dask cluster; write and return `out/fleet.json`.
@@ -60,7 +62,8 @@ def run_fleet(
         retry: try logs again that failed in an earlier call.
         report: makes the page of a diagnosis, such as `avtorch.report.report_html`; it is written beside the rows, and
             a diagnosis of an earlier call that has none is computed again. Workers need to be able to import it.
-        progress: called with (sentence, done, of), in milliseconds of work.
+        progress: called with (sentence, done, of), in milliseconds of work; or True, False, None, as in
+            `avtorch.diagnose`.
         connected_to: called with the cluster once there is one.
 
     Raises `InputError` for logs, settings or a cluster that cannot be used, where Dask is not installed, and for a
@@ -78,6 +81,7 @@ def run_fleet(
         >>> run_fleet("a.csv", "out", settings=quick)["work"]["computed"]  # nothing is missing
         0
     """
+    steps = called(progress)
     given = FleetSettings() if settings is None else settings
     if scheduler is None and workers is not None and workers < 1:
         raise InputError(f"workers: found {workers}, needs 1 or more")
@@ -86,12 +90,12 @@ def run_fleet(
     found = logs if isinstance(logs, LogList) else find_logs(logs, leave_out=out)
     folder = FleetFolder(Path(out))
     with sole_use(out, work="a fleet"):
-        plan = _plan(found.logs, folder, given, retry=retry, report=report, progress=progress)
+        plan = _plan(found.logs, folder, given, retry=retry, report=report, progress=steps)
         if plan.tasks:
             with connected(min(workers or _cores(), len(plan.tasks)), memory, scheduler) as cluster:
                 if connected_to is not None:
                     connected_to(cluster)
-                _work(cluster, folder, plan, FleetProgress(progress, plan.tasks, plan.kept))
+                _work(cluster, folder, plan, FleetProgress(steps, plan.tasks, plan.kept))
         answer = fleet_answer(found, folder, given)
         answer["notes"] += plan.notes
         answer["work"] = {"kept": plan.kept, "computed": len(plan.tasks)}

@@ -116,6 +116,7 @@ def _estimated(task: Task, drive: Log, note: str | None) -> list[Row]:
             accepted=given.accepted,
             dead_time=given.dead_time,
             seed=given.seed,
+            progress=False,  # the fleet's own tells of it
             checkpoint=kept,
         )
     return window_rows(found, note)
@@ -135,6 +136,7 @@ def _diagnosed(task: Task, drive: Log, note: str | None) -> tuple[list[Row], str
             posterior=given.posterior,
             budget_s=given.budget_s,
             seed=given.seed,
+            progress=False,
             checkpoint=kept,
         )
     return diagnosis_rows(found, note), None if task.report is None else task.report(found)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.paper.estimation import estimation
 from avtorch.paper.gains import gains
@@ -83,19 +84,20 @@ class Reproduction:
         }
 
 
+@shows_progress
 def reproduce(
     names: Sequence[str] | None = None,
     *,
     leaders: Leaders | None = None,
     seeds: int = SEEDS,
     seed: int = 0,
-    progress: Callable[[float, float], None] | None = None,
+    progress: Callable[[float, float], None] | bool | None = None,
 ) -> Reproduction:
     """Run the experiments `names` (default: all), each with `seeds` noises; results are equal bit for bit for equal
     `seed`.
 
-    `leaders`: default the embedded US06. `progress(done, of)`. Raises `InputError` for an unknown name, or fewer than
-    two seeds, which an interval needs.
+    `leaders`: default the embedded US06. `progress(done, of)`, or True, False, None, as in `avtorch.diagnose`. Raises
+    `InputError` for an unknown name, or fewer than two seeds, which an interval needs.
 
     Example:
         >>> from avtorch.paper import reproduce
@@ -103,6 +105,7 @@ def reproduce(
         >>> {row.verdict for row in found.rows} <= {"same", "better", "not reproduced"}
         True
     """
+    step = called(progress)
     chosen = list(EXPERIMENTS) if names is None else [n for n in EXPERIMENTS if n in names]
     for name in names or ():
         if name not in EXPERIMENTS:
@@ -114,8 +117,8 @@ def reproduce(
     for name in chosen:
 
         def report_share(share: float, begun: float = done, cost: float = _COST[name]) -> None:
-            if progress is not None:
-                progress(begun + share * cost, whole)
+            if step is not None:
+                step(begun + share * cost, whole)
 
         found[name] = EXPERIMENTS[name](ahead, seeds=seeds, seed=seed, progress=report_share)
         done += _COST[name]

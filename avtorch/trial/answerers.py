@@ -23,7 +23,7 @@ def avtorch(log: Log) -> dict[str, Any]:
     """
     from avtorch.gap.diagnose import diagnose
 
-    return diagnose(log, posterior="laplace").to_dict()
+    return diagnose(log, posterior="laplace", progress=False).to_dict()
 
 
 RIVALS: dict[str, Answerer] = {

@@ -11,8 +11,11 @@ import pytest
 
 import avtorch
 from avtorch.display import progress, progress_bar, show
+from avtorch.experiment import next_experiment
+from avtorch.fleet import run_fleet
 from avtorch.follower import diagnose_follower
 from avtorch.gap import gap_budget
+from avtorch.paper import reproduce
 
 
 class Output:
@@ -126,10 +129,25 @@ def test_a_diagnosis_tells_the_stages_of_the_whole(outputs: list[Output]) -> Non
         avtorch.validate,
         diagnose_follower,
         gap_budget,
+        next_experiment,
+        reproduce,
+        run_fleet,
     ],
 )
 def test_long_calls_offer_a_bar(long: Any) -> None:
     assert long.__code__ is progress.shows_progress(lambda: None).__code__
+
+
+def test_a_drive_under_a_supervisor_shows_one_too(outputs: list[Output]) -> None:
+    loop = avtorch.ClosedLoop(avtorch.Leader.default(), plant=avtorch.GLVDPlant(0.3, 1.0), seeds=[0])
+    supervisor = avtorch.Supervisor(loop)
+    supervisor.run(2.0)
+    supervisor.run(4.0)  # goes on where the first ended
+    assert len(outputs) == 2
+    shares = [data["text/plain"].split()[0] for data in outputs[1].seen[:-1]]
+    assert shares == ["50%", "100%"]
+    supervisor.run(2.0, progress=False)
+    assert len(outputs) == 2
 
 
 def test_an_answer_is_displayed_in_a_notebook_and_printed_elsewhere(
