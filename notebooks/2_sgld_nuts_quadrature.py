@@ -135,8 +135,8 @@ for i, name in enumerate(density.names):
 
 # %% [markdown]
 # Grey is exact, blue is SGLD, the dashed line NUTS, the dotted one the truth. The three lie on top of each other, and
-# the table shows how closely: means within a few hundredths of an SD, widths within a few per cent. That is the Monte
-# Carlo error of so many draws; NUTS has the fewest.
+# the table shows how closely: means within a few hundredths of an SD, widths within a few per cent, NUTS's within ten.
+# That is the Monte Carlo error of so many draws; NUTS has the fewest, and of sigma they count as a quarter.
 #
 # ## The price of a step
 #

@@ -79,4 +79,4 @@ def texts(output: NotebookNode) -> list[str]:
     """All that an output says in words."""
     if output.output_type == "stream":
         return [output.text]
-    return [content for kind, content in output.get("data", {}).items() if kind.startswith("text/")]
+    return [content for kind, content in sorted(output.get("data", {}).items()) if kind.startswith("text/")]
