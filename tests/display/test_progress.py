@@ -135,7 +135,10 @@ def test_a_diagnosis_tells_the_stages_of_the_whole(outputs: list[Output]) -> Non
     ],
 )
 def test_long_calls_offer_a_bar(long: Any) -> None:
-    assert long.__code__ is progress.shows_progress(lambda: None).__code__
+    layers = [long]
+    while hasattr(layers[-1], "__wrapped__"):  # an argument's old name may be a layer of its own
+        layers.append(layers[-1].__wrapped__)
+    assert progress.shows_progress(lambda: None).__code__ in [layer.__code__ for layer in layers]
 
 
 def test_a_drive_under_a_supervisor_shows_one_too(outputs: list[Output]) -> None:
