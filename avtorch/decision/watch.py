@@ -82,8 +82,9 @@ class Watch:
 
     def _watch(self, window: Window, setting: Setting) -> WatchedWindow:
         belief = window.belief
-        T_L, K_L = (belief.draws[..., i].mT for i in range(2))
-        used = belief.excited & belief.converged
+        # decisions are made on the processor, wherever the belief is
+        T_L, K_L = (belief.draws[..., i].mT.cpu() for i in range(2))
+        used = (belief.excited & belief.converged).cpu()
         return WatchedWindow(window, self.monitor.update(T_L, K_L, used, setting), setting)
 
     def state_dict(self) -> dict[str, Any]:

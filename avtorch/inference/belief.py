@@ -11,6 +11,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float, Int
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
+from avtorch.inference.device import Device
 from avtorch.inference.posterior import sorted_quantile
 from avtorch.inference.priors import Prior
 from avtorch.inference.state import shaped_as
@@ -49,7 +50,7 @@ class Summary(NamedTuple):
         sd_z = cov_z.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
         mean = (mean_z + 0.5 * sd_z.square()).exp()
         values, basis = torch.linalg.eigh(cov_z)  # a known parameter has no spread, and no Cholesky factor
-        noise = torch.randn(kept, *mean_z.shape, generator=generator, dtype=mean_z.dtype)
+        noise = torch.randn(kept, *mean_z.shape, generator=generator, dtype=mean_z.dtype, device=mean_z.device)
         draws = mean_z + torch.einsum("vij,kvj->kvi", basis * values.clamp_min(0.0).sqrt().unsqueeze(-2), noise)
         low, high = (mean_z - Z90 * sd_z).exp(), (mean_z + Z90 * sd_z).exp()
         return cls(mean, mean * sd_z.square().expm1().sqrt(), low, high, draws.exp())
@@ -118,7 +119,7 @@ class Belief(Displayed):
             "draw": torch.arange(draws).repeat_interleave(vehicles).numpy(),
             "vehicle": torch.arange(vehicles).repeat(draws).numpy(),
         }
-        columns = {name: self.draws[..., i].flatten().numpy() for i, name in enumerate(self.names)}
+        columns = {name: self.draws[..., i].flatten().cpu().numpy() for i, name in enumerate(self.names)}
         return Frame(index | columns).to_dataframe()
 
     def to_arviz(self) -> InferenceData:
@@ -128,7 +129,7 @@ class Belief(Displayed):
         """
         from avtorch.inference.arviz_export import inference_data
 
-        draws = {name: self.draws[..., i].unsqueeze(0).numpy() for i, name in enumerate(self.names)}
+        draws = {name: self.draws[..., i].unsqueeze(0).cpu().numpy() for i, name in enumerate(self.names)}
         attributes = {"used": (self.excited & self.converged).int().tolist()}
         return inference_data(draws, ("chain", "draw", "vehicle"), units=UNITS, attributes=attributes)
 
@@ -160,9 +161,9 @@ class Belief(Displayed):
         return replace(self, excited=excited, converged=torch.ones_like(excited))
 
     def state_dict(self) -> dict[str, Any]:
-        """Plain tensors and names."""
+        """Plain tensors, on the processor, and names."""
         keys = ("mean", "sd", "q05", "q95", "draws", "excited", "converged")
-        return {"names": list(self.names), **{key: getattr(self, key) for key in keys}}
+        return {"names": list(self.names), **{key: getattr(self, key).cpu() for key in keys}}
 
     def taken_from(self, state: dict[str, Any]) -> Belief:
         """The inverse of :meth:`state_dict`, for the same parameters, vehicles and draws; other entries are ignored.
@@ -179,7 +180,12 @@ class Belief(Displayed):
             raise InputError("state: holds a parameter or a standard deviation below 0")
         if bool((read["q05"] > read["q95"]).any()):
             raise InputError("state: q05: lies above q95")
-        return Belief(self.names, **read)
+        return Belief(self.names, **read).to(self.mean.device)
+
+    def to(self, device: Device) -> Belief:
+        """The same on another device."""
+        keys = ("mean", "sd", "q05", "q95", "draws", "excited", "converged")
+        return Belief(self.names, **{key: getattr(self, key).to(device) for key in keys})
 
     @classmethod
     def of_prior(cls, names: tuple[str, ...], prior: Prior, kept: int, vehicles: int, g: torch.Generator) -> Belief:
@@ -187,5 +193,5 @@ class Belief(Displayed):
         draws = prior.sample(kept, vehicles, generator=g).exp()
         ordered = draws.sort(0).values
         quantiles = (sorted_quantile(ordered, 0.05), sorted_quantile(ordered, 0.95))
-        never = torch.zeros(vehicles, dtype=torch.bool)
+        never = torch.zeros(vehicles, dtype=torch.bool, device=draws.device)
         return cls(names, draws.mean(0), draws.std(0), *quantiles, draws, excited=never, converged=~never)

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from avtorch.arrays import Float
 from avtorch.errors import InputError
+from avtorch.inference.device import check_generator
 from avtorch.inference.jerk import JerkDensity
 from avtorch.inference.posterior import Posterior
 
@@ -89,6 +91,7 @@ def sample_conjugate(
     for name, value in (("draws", draws), ("proposals", proposals)):
         if value < 2:
             raise InputError(f"{name}: {value} is less than 2")
+    check_generator(generator, density.statistics.n.device)
     proposal = _NormalInverseGamma.of(density, generator)
     coefficients, variance = proposal.sample(proposals, generator)
     inside = (coefficients > 0).all(-1)
@@ -113,8 +116,8 @@ def sample_conjugate(
 def _systematic(weight: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
     """Indices ``(count, window)`` into ``weight`` ``(proposal, window)``: evenly spaced in the cumulated weight."""
     cumulated = weight.cumsum(0).T.contiguous()
-    offset = torch.rand(len(cumulated), 1, generator=generator, dtype=weight.dtype)
-    at = (torch.arange(count, dtype=weight.dtype) + offset) / count * cumulated[:, -1:]
+    offset = torch.rand(len(cumulated), 1, generator=generator, dtype=weight.dtype, device=weight.device)
+    at = (torch.arange(count, dtype=weight.dtype, device=weight.device) + offset) / count * cumulated[:, -1:]
     return torch.searchsorted(cumulated, at, right=True).clamp_max(len(weight) - 1).T
 
 
@@ -159,7 +162,8 @@ class _NormalInverseGamma:
         # the public Gamma distribution takes no generator; this is the routine it calls
         gamma = torch._standard_gamma(self.shape.expand(count, -1).contiguous(), generator=generator)  # pyright: ignore[reportPrivateImportUsage]
         variance = self.rate / gamma
-        noise = torch.randn(count, *self.center.shape, generator=generator, dtype=self.center.dtype)
+        like: dict[str, Any] = {"dtype": self.center.dtype, "device": self.center.device}
+        noise = torch.randn(count, *self.center.shape, generator=generator, **like)
         lower = torch.linalg.cholesky(self.precision)
         spread = torch.linalg.solve_triangular(lower.mT, noise.permute(1, 2, 0), upper=True).permute(2, 0, 1)
         return self.center + variance.sqrt().unsqueeze(-1) * spread, variance

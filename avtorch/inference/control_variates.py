@@ -112,4 +112,4 @@ def gradients_by_point(
         return density.log_prob_minibatch(place, index).sum()
 
     by_point = vmap(grad(estimate), in_dims=(None, 0), out_dims=1, chunk_size=max(1, CHUNK // z.numel()))
-    return by_point(z.detach(), torch.arange(density.points)[:, None])
+    return by_point(z.detach(), torch.arange(density.points, device=z.device)[:, None])

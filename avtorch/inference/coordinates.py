@@ -65,7 +65,7 @@ def stiffness(density: Density, coordinates: Coordinates, *, radius: float = 3.0
     window's step by this keeps ``step x curvature`` what it is at the mode of a Gaussian.
     """
     d = coordinates.mode.shape[-1]
-    axes = radius * torch.eye(d, dtype=coordinates.mode.dtype)
+    axes = radius * torch.eye(d, dtype=coordinates.mode.dtype, device=coordinates.mode.device)
     probes = torch.cat([axes, -axes])[:, None, :].expand(-1, len(coordinates.mode), d)
     gradient = -coordinates.pull_back(score_of(density, coordinates.z(probes)))
     slope = (gradient * probes).sum(-1) / radius**2

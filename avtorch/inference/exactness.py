@@ -146,9 +146,9 @@ class Exactness:
         return replace(self, **parts)
 
     @classmethod
-    def unknown(cls, windows: int, parameters: int) -> Exactness:
-        """NaN throughout: nothing is known of any window."""
-        each = torch.full((windows, parameters), torch.nan, dtype=torch.float64)
+    def unknown(cls, z: Float[Tensor, "window parameter"]) -> Exactness:
+        """NaN throughout, in the shape of ``z`` ``(window, parameter)``: nothing is known of any window."""
+        each = torch.full_like(z, torch.nan, dtype=torch.float64)
         a, b, c, d, e, f, g, h, i = (each.clone() for _ in range(9))
         return cls(each[:, 0].clone(), a, b, c, d, e, f, g, h, i, each[:, 0].clone())
 
@@ -167,7 +167,7 @@ def compare_with_exact(
     closer = min(AGAIN * points, max(4 * points, total))
     # few draws mean that the density is expensive
     counts = (closer, AGAIN * closer) if total >= 4096 else (closer,)
-    everyone = torch.arange(z.shape[2])
+    everyone = torch.arange(z.shape[2], device=z.device)
 
     def chosen(where: Tensor) -> Tensor:
         if has_selection(density):
@@ -248,10 +248,10 @@ class Moments(NamedTuple):
 def weighed(density: Density, moments: Moments, points: int, *, eager: bool = False) -> Exactness:
     """Compare draws of these moments with their density: one call of its ``log_prob``, or a few for many windows."""
     mean, lower, share, mean_error, sd_error = moments
-    base, log_proposal = proposal(points, mean.shape[-1])
+    base, log_proposal = (x.to(mean.device) for x in proposal(points, mean.shape[-1]))
     found = []
     size = max(1, BLOCK // points) if has_selection(density) else len(mean)
-    for part in torch.arange(len(mean)).split(size):
+    for part in torch.arange(len(mean), device=mean.device).split(size):
         chosen = _picked(density, part)
         loops = Unavailable("not asked for") if eager else compiled(chosen)
         if isinstance(loops, Unavailable):
@@ -299,7 +299,7 @@ def log_density(density: Density, z: Float[Tensor, "point window parameter"]) ->
         return value.masked_fill(value.isnan(), -torch.inf)
     except ValueError:
         if len(z) == 1:
-            return torch.full(z.shape[:2], -torch.inf, dtype=z.dtype)
+            return z.new_full(z.shape[:2], -torch.inf)
         half = len(z) // 2
         return torch.cat([log_density(density, z[:half]), log_density(density, z[half:])])
 

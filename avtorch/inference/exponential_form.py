@@ -45,10 +45,12 @@ class PotentialTerms:
         own_linear: Tensor | float = 0.0,
         own_square: Tensor | float = 0.0,
     ) -> PotentialTerms:
-        """Each term expanded to all windows; those left out are zero."""
+        """Each term expanded to all windows, on the device of those that are tensors; those left out are zero."""
+        given = (constant, linear, quadratic, own_linear, own_square)
+        device = next((term.device for term in given if isinstance(term, Tensor)), None)
 
         def full(value: Tensor | float, *shape: int) -> Tensor:
-            return torch.as_tensor(value, dtype=torch.float64).expand(windows, *shape)
+            return torch.as_tensor(value, dtype=torch.float64, device=device).expand(windows, *shape)
 
         vectors = full(own_linear, d), full(own_square, d)
         return cls(full(constant), full(linear, d), full(quadratic, d, d), *vectors)

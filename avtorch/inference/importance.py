@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -19,6 +19,7 @@ from torch import Tensor
 from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
 from avtorch.inference.density import Density
+from avtorch.inference.device import check_generator
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.pareto import pareto_k, reliable
 
@@ -104,12 +105,15 @@ class WeightedDraws:
     def equal(self, count: int, generator: torch.Generator) -> Float[Tensor, "count window parameter"]:
         """``count`` equally weighted draws of ``z``, by systematic resampling; a heavy draw comes more than once."""
         # in random order, so that any leading stretch is a sample
-        return _picked(self.z, self.systematic(count, generator)[torch.randperm(count, generator=generator)])
+        return _picked(
+            self.z, self.systematic(count, generator)[torch.randperm(count, generator=generator, device=self.z.device)]
+        )
 
     def systematic(self, count: int, generator: torch.Generator | None) -> Int[Tensor, "count window"]:
         """Which draw each of ``count`` equally weighted ones is, by systematic resampling."""
-        begin = torch.rand(self.z.shape[1], 1, generator=generator, dtype=self.z.dtype)
-        at = (torch.arange(count, dtype=self.z.dtype) + begin) / count
+        like: dict[str, Any] = {"dtype": self.z.dtype, "device": self.z.device}
+        begin = torch.rand(self.z.shape[1], 1, generator=generator, **like)
+        at = (torch.arange(count, **like) + begin) / count
         return torch.searchsorted(self.weight.cumsum(0).mT.contiguous(), at).clamp_max(len(self.z) - 1).mT
 
 
@@ -131,9 +135,10 @@ class _Mixture:
         root = settings.width * root
         self.parts.append((mean, root))
         self.logs.append(mean.new_empty(0, len(mean)))
-        normal = torch.randn(settings.draws // 2, *mean.shape, generator=generator, dtype=mean.dtype)
+        like: dict[str, Any] = {"dtype": mean.dtype, "device": mean.device}
+        normal = torch.randn(settings.draws // 2, *mean.shape, generator=generator, **like)
         normal = torch.cat([normal, -normal])  # antithetic: the mean of a symmetric part is free of error
-        chi = torch.randn(len(normal), len(mean), settings.degrees, generator=generator, dtype=mean.dtype)
+        chi = torch.randn(len(normal), len(mean), settings.degrees, generator=generator, **like)
         stretch = (settings.degrees / chi.square().sum(-1)).sqrt()
         return mean + stretch[..., None] * torch.einsum("wij,nwj->nwi", root, normal)
 
@@ -183,6 +188,7 @@ def weighted_draws(
     settings = ImportanceSettings() if settings is None else settings
     nearby = approximated(density)
     mode = find_mode(nearby, from_values=True, tolerance=5e-5) if mode is None else mode
+    check_generator(generator, mode.z.device)
     mean, root = mode.z, mode.scale
     if nearby is density:
         return _adapted(density, settings, mean, root, generator)
@@ -236,7 +242,7 @@ def _adapted(
 
 def _tempered(log_ratio: Tensor, least: float = 40.0) -> Tensor:
     """Weights flattened by a power until ``least`` of them count: few draws do not determine a covariance."""
-    power = torch.ones(log_ratio.shape[1], dtype=log_ratio.dtype)
+    power = torch.ones_like(log_ratio[0])
     for _ in range(6):
         weight = (power * log_ratio).nan_to_num(nan=-torch.inf, neginf=-torch.inf).softmax(0)
         power = torch.where(1 / weight.square().sum(0) < least, 0.6 * power, power)

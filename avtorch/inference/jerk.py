@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int, Real
+from avtorch.inference.device import Device
 from avtorch.inference.exponential_form import ExponentialForm, terms_of
 from avtorch.inference.planes import as_planes, from_planes, to_planes
-from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior
+from avtorch.inference.priors import Joint, Prior, default_actuation_prior, default_jerk_noise_prior, prior_on
 from avtorch.vehicle.glvd import glvd_jerk
 
 _LOG_2PI = math.log(2 * math.pi)
@@ -99,6 +100,10 @@ class JerkStatistics:
         """The windows named by ``index``."""
         return JerkStatistics(*(getattr(self, f.name)[index] for f in fields(self)))
 
+    def to(self, device: Device) -> JerkStatistics:
+        """The same sums on another device, where the density made of them then works."""
+        return JerkStatistics(*(getattr(self, f.name).to(device) for f in fields(self)))
+
     def with_least_noise(self, share: float = RESOLUTION) -> JerkStatistics:
         """The same sums with white noise of ``share`` of the RMS jerk mixed in, where the residual holds less.
 
@@ -141,7 +146,8 @@ class JerkDensity:
 
     def __init__(self, statistics: JerkStatistics, prior: Prior | None = None) -> None:
         self.statistics = statistics
-        self.prior = Joint(default_actuation_prior(), default_jerk_noise_prior()) if prior is None else prior
+        own = Joint(default_actuation_prior(), default_jerk_noise_prior()) if prior is None else prior
+        self.prior = prior_on(own, statistics.n.device)
         s = statistics
         # residual sum of squares as a quadratic form in (1, 1/T, K/T), divided by two once here
         rows = ((s.jj, s.aj, -s.uj), (s.aj, s.aa, -s.au), (-s.uj, -s.au, s.uu))
@@ -150,7 +156,8 @@ class JerkDensity:
         self._form: tuple[Prior, ExponentialForm] | None = None
         if len(s.n) == 1:
             self._form_of_one = 2 * self._half_form[0]
-            self._points_of_one = -s.n * torch.tensor([[0.0], [0.0], [1.0]], dtype=torch.float64)
+            self._points_of_one = -s.n * _LOG_SCALED.new_tensor([[0.0], [0.0], [1.0]]).to(s.n.device)
+            self._log_scaled = _LOG_SCALED.to(s.n.device)
 
     @property
     def windows(self) -> int:
@@ -186,7 +193,8 @@ class JerkDensity:
         if prior is None:
             return None
         n = self.statistics.n
-        linear = prior.linear + n[:, None] * prior.linear.new_tensor([0.0, 0.0, 1.0])
+        exponents, offsets = exponents.to(n.device), offsets.to(n.device)
+        linear = torch.cat([prior.linear[:, :2], prior.linear[:, 2:] + n[:, None]], -1)
         terms = replace(prior, constant=prior.constant + 0.5 * _LOG_2PI * n, linear=linear)
         form = ExponentialForm(terms, exponents, offsets, 2 * self._half_form)
         self._form = (self.prior, form)
@@ -213,9 +221,9 @@ class JerkDensity:
     def _score_of_one(self, z: Tensor) -> Tensor:
         """:meth:`score` of a single window in three products, where every call counts."""
         planes = to_planes(z)
-        scaled = (_LOG_SCALED @ planes.reshape(3, -1)).exp_()
+        scaled = (self._log_scaled @ planes.reshape(3, -1)).exp_()
         by_log = (self._form_of_one @ scaled).mul_(scaled)
-        score = torch.addmm(self._points_of_one, _LOG_SCALED.T, by_log, alpha=-1)
+        score = torch.addmm(self._points_of_one, self._log_scaled.T, by_log, alpha=-1)
         return from_planes(score.view(planes.shape)).add_(self.prior.score(z))
 
     def initial(self) -> Float[Tensor, "window 3"]:

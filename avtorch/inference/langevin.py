@@ -51,7 +51,7 @@ class LangevinOptimizer(Optimizer):
         super().load_state_dict(state)
         if generator is not None:
             if self.generator is None:
-                self.generator = torch.Generator()
+                self.generator = torch.Generator(device=self.param_groups[0]["params"][0].device)
             self.generator.set_state(generator)
 
     def normal_like(

@@ -15,7 +15,7 @@ from avtorch.inference.latent_rows import row_values
 from avtorch.inference.latent_steady import EvenRows, steady_log_likelihood
 from avtorch.inference.latent_values import steady_values
 from avtorch.inference.latent_window import LatentWindow
-from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior
+from avtorch.inference.priors import Joint, LogNormalPrior, Prior, default_actuation_prior, prior_on
 
 #: Rows count as even while their times are this close to an even grid: a quarter of a step, and 2.5 ms. The error in
 #: speed is 2.5 mm/s per m/s², below the noise of a wheel speed. Other rows use the row-by-row filter, which is exact
@@ -58,12 +58,14 @@ def run_log_likelihood(
 ) -> Float[Tensor, "*draw run"]:
     """Log likelihood ``(..., run)`` of parameters by name, each ``(..., run)``; ``even`` is ``even_rows(runs)``.
 
-    Where no gradient is asked for, the same number comes from the routes without a graph.
+    Where no gradient is asked for, the same number comes from the routes without a graph, on the processor.
     """
     noise = {name: (p[name].square() + FINEST**2).sqrt() for name in ("accel_noise", "speed_noise") if name in p}
     noise |= {name: p[name] for name in ("road_noise",) if name in p}
     five = (p["T_L"], p["K_L"], p["process_noise"], p["coloured_sd"], p["coloured_time"])
-    differentiated = torch.is_grad_enabled() and any(x.requires_grad for x in (*five, *noise.values()))
+    # the routes without a graph are NumPy's
+    elsewhere = runs.time.device.type != "cpu"
+    differentiated = elsewhere or (torch.is_grad_enabled() and any(x.requires_grad for x in (*five, *noise.values())))
     if even is not None:
         return (steady_log_likelihood if differentiated else steady_values)(*five, even, **noise)
     if not differentiated:
@@ -95,7 +97,7 @@ def _row_by_row(five: Sequence[Tensor], runs: LatentWindow, noise: dict[str, Ten
 def even_rows(runs: LatentWindow, *, most_steps: float = EVEN_STEPS, most_s: float = EVEN_S) -> EvenRows | None:
     """The layout of the fast route, or None where a row of some run is further off an even grid than both bounds."""
     count = runs.mask.sum(-1)
-    index = torch.arange(runs.time.shape[1], dtype=torch.float64)
+    index = torch.arange(runs.time.shape[1], dtype=torch.float64, device=runs.time.device)
     last = runs.time.gather(1, (count - 1)[:, None])[:, 0]
     dt = (last - runs.time[:, 0]) / (count - 1).clamp(min=1)
     # A run of a single row has no step; any value will do.
@@ -122,7 +124,8 @@ class LatentDensity:
         self.temper = temper
         self.data = data
         self.names = latent_names(accel=data.accel is not None, speed=data.speed is not None)
-        self.prior = Joint(default_actuation_prior(), default_noise_prior(self.names[2:])) if prior is None else prior
+        own = Joint(default_actuation_prior(), default_noise_prior(self.names[2:])) if prior is None else prior
+        self.prior = prior_on(own, data.time.device)
         self._runs, self._owner = data.runs()
         self._even = even_rows(self._runs)
 
@@ -163,7 +166,7 @@ class LatentDensity:
         lag = torch.tensor([0.1, 0.2, 0.4, 0.8, 1.6], dtype=torch.float64)
         gain = torch.tensor([0.5, 0.75, 1.0], dtype=torch.float64)
         rough = torch.tensor([0.02, 0.1, 0.5], dtype=torch.float64)
-        grid = torch.cartesian_prod(lag, gain, rough).log()
+        grid = torch.cartesian_prod(lag, gain, rough).log().to(center.device)
         z = center.expand(len(grid), *center.shape).clone()
         z[..., :3] = grid[:, None, :]
         if self.data.speed is not None:
@@ -171,7 +174,7 @@ class LatentDensity:
         with torch.no_grad():
             score = self.log_prob(z)
         best = torch.where(score.isfinite(), score, -torch.inf).argmax(0)
-        return z[best, torch.arange(self.windows)]
+        return z[best, torch.arange(self.windows, device=z.device)]
 
 
 def _speed_noise(runs: LatentWindow, owner: Int[Tensor, " run"], windows: int) -> Float[Tensor, " window"]:

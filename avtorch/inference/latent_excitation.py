@@ -38,6 +38,7 @@ def latent_excitation(
     (names and units of ``NOISE_PRIOR``; the default is ``REFERENCE_NOISE``), not on measured values or a posterior.
     Each run's start and a constant force on it are taken as unknown, so a constant command carries no information.
     """
+    place, data = data.time.device, data.to("cpu")  # some short recursions, row by row
     runs, owner = data.runs()
     names = latent_names(accel=data.accel is not None, speed=data.speed is not None)
     values = dict(zip(names[:2], reference, strict=True)) | REFERENCE_NOISE | dict(noise or {})
@@ -78,6 +79,7 @@ def latent_excitation(
     known_T, known_K = KNOWN
     determinant = (1.0 + known_T**2 * tt) * (1.0 + known_K**2 * kk) - (known_T * known_K * tk) ** 2
     bits = 0.5 * determinant.clamp(min=1.0).log() / math.log(2.0)
+    bits = bits.to(place)
     return bits >= least_bits, bits
 
 

@@ -61,7 +61,8 @@ class EvenRows:
         data = torch.nn.functional.pad(data, (0, 0, 0, pad))
         used = torch.nn.functional.pad(used, (0, pad))
         blocks = data.unflatten(1, (-1, BLOCK))
-        age = torch.arange(BLOCK)[:, None] - torch.arange(BLOCK)
+        row = torch.arange(BLOCK, device=u.device)
+        age = row[:, None] - row
         lagged = blocks[:, :, age.clamp(min=0)] * (age >= 0)[..., None]
         lagged = lagged.flatten(-2).flatten(1, 2).mT.contiguous()
         return cls(lagged, used.to(u.dtype), used.sum(-1).to(u.dtype), dt, speed is not None, accel is not None)

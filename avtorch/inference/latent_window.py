@@ -10,6 +10,7 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int, Real
 from avtorch.errors import InputError
+from avtorch.inference.device import Device
 
 #: A step longer than this many median steps is a gap: the filter starts afresh behind it.
 GAP = 2.5
@@ -92,6 +93,11 @@ class LatentWindow:
         speed = None if self.speed is None else self.speed[index]
         return LatentWindow(self.time[index], self.u[index], accel, speed, self.mask[index])
 
+    def to(self, device: Device) -> LatentWindow:
+        """The same rows on another device."""
+        accel, speed = (None if x is None else x.to(device) for x in (self.accel, self.speed))
+        return LatentWindow(self.time.to(device), self.u.to(device), accel, speed, self.mask.to(device))
+
     def runs(self) -> tuple[LatentWindow, Int[Tensor, " run"]]:
         """Stretches without a gap or an unused row, one a row, and the window ``(run,)`` each comes from.
 
@@ -118,4 +124,4 @@ class LatentWindow:
                 owner.append(w)
         if not pieces:
             raise InputError("mask: no row of any window may be used")
-        return LatentWindow.stack(pieces), torch.tensor(owner)
+        return LatentWindow.stack(pieces), torch.tensor(owner, device=self.time.device)

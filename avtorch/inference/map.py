@@ -53,7 +53,7 @@ class Mode:
         covariance = centred @ centred.mT / (len(z) - 1)
         factor, failed = torch.linalg.cholesky_ex(covariance.nan_to_num())
         sound = (failed == 0) & covariance.isfinite().flatten(1).all(-1)
-        everyone = torch.arange(len(mean))
+        everyone = torch.arange(len(mean), device=mean.device)
         return self.replaced(everyone, Mode(mean, factor, self.log_prob, self.converged), sound)
 
     def replaced(self, index: Int[Tensor, " chosen"], other: Mode, where: Bool[Tensor, " chosen"]) -> Mode:
@@ -117,7 +117,7 @@ def _search(
     density: Density, z: Tensor, iterations: int, tolerance: float, from_values: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Where the search from ``z`` ends, and potential, gradient and Hessian there."""
-    damping = torch.ones(z.shape[0], dtype=z.dtype)
+    damping = torch.ones_like(z[:, 0])
     potential, gradient, hessian = _expand(density, z, from_values)
     for _ in range(iterations):
         eigenvalues, basis = torch.linalg.eigh(hessian)
@@ -153,7 +153,7 @@ def _expand(
         potential, gradient, hessian = _from_graph(density, z)
     hessian = 0.5 * (hessian + hessian.mT)
     good = potential.isfinite() & gradient.isfinite().all(-1) & hessian.isfinite().flatten(1).all(-1)
-    eye = torch.eye(z.shape[-1], dtype=z.dtype)
+    eye = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
     return (
         torch.where(good, potential, torch.inf),
         torch.where(good[:, None], gradient, 0.0),
@@ -164,10 +164,10 @@ def _expand(
 def _from_score(density: ScoredDensity, z: Tensor, spacing: float = 1e-5) -> tuple[Tensor, Tensor, Tensor]:
     """The Hessian from central differences of the exact score, good to ten digits: one call in place of d graphs."""
     d = z.shape[-1]
-    shifts = spacing * torch.eye(d, dtype=z.dtype)
+    shifts = spacing * torch.eye(d, dtype=z.dtype, device=z.device)
     with torch.no_grad():
         potential = -density.log_prob(z)
-        around = -density.score(z + torch.cat([torch.zeros(1, d, dtype=z.dtype), shifts, -shifts])[:, None, :])
+        around = -density.score(z + torch.cat([z.new_zeros(1, d), shifts, -shifts])[:, None, :])
     hessian = (around[1 : d + 1] - around[d + 1 :]) / (2 * spacing)
     return potential, around[0], hessian.movedim(0, -2)
 
@@ -179,9 +179,9 @@ def _from_values(density: Density, z: Tensor, spacing: float = 2e-3) -> tuple[Te
     off is of relative order ``spacing²``. Both are far below the 0.4 of the widest noise prior.
     """
     d = z.shape[-1]
-    axes = spacing * torch.eye(d, dtype=z.dtype)
-    first, second = torch.triu_indices(d, d, 1)
-    shifts = torch.cat([torch.zeros(1, d, dtype=z.dtype), axes, -axes, axes[first] + axes[second]])
+    axes = spacing * torch.eye(d, dtype=z.dtype, device=z.device)
+    first, second = torch.triu_indices(d, d, 1, device=z.device)
+    shifts = torch.cat([z.new_zeros(1, d), axes, -axes, axes[first] + axes[second]])
     shifts = torch.cat([shifts, -shifts[2 * d + 1 :]])
     with torch.no_grad():
         values = -density.log_prob(z + shifts[:, None, :])
@@ -189,8 +189,8 @@ def _from_values(density: Density, z: Tensor, spacing: float = 2e-3) -> tuple[Te
     bent = plus + minus - 2 * centre
     pairs = len(first)
     both = values[2 * d + 1 : 2 * d + 1 + pairs] + values[2 * d + 1 + pairs :] - 2 * centre
-    hessian = torch.zeros(d, d, len(z), dtype=z.dtype)
-    hessian[range(d), range(d)] = bent
+    hessian = z.new_zeros(d, d, len(z))
+    hessian.diagonal().copy_(bent.T)
     hessian[first, second] = hessian[second, first] = 0.5 * (both - bent[first] - bent[second])
     return centre, (plus - minus).T / (2 * spacing), hessian.movedim(-1, 0) / spacing**2
 

@@ -54,7 +54,7 @@ class PositiveNormal(dist.TorchDistribution):
 
     def sample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008
         below = torch.special.ndtr(-self.loc / self.scale)
-        uniform = torch.rand(self._extended_shape(sample_shape), dtype=self.loc.dtype)
+        uniform = torch.rand(self._extended_shape(sample_shape), dtype=self.loc.dtype, device=self.loc.device)
         cut = (below + (1 - below) * uniform).clamp(1e-300, 1 - 1e-16)
         return (self.loc + self.scale * torch.special.ndtri(cut)).clamp_min(1e-12)
 
@@ -89,7 +89,7 @@ def _sites(prior: Prior, names: tuple[str, ...], first: int = 0) -> list[_Site]:
     elif isinstance(prior, HalfNormalPrior):
         laws = [dist.HalfNormal(scale) for scale in prior.scale]
     elif isinstance(prior, QuadrantNormal):
-        sd = torch.as_tensor(prior.variance, dtype=torch.float64).sqrt()
+        sd = torch.as_tensor(prior.variance, dtype=torch.float64, device=prior.mean.device).sqrt()
         laws = [PositiveNormal(mean, sd) for mean in prior.mean.reshape(-1)]
     else:
         raise InputError(f"prior: no Pyro distribution is known for {type(prior).__name__}")
@@ -120,7 +120,7 @@ class PyroModel:
             raise InputError(f"window: {window} is not in 0 to {density.windows - 1}")
         if samples is not None and not isinstance(density, JerkDensity):
             raise InputError(f"samples: the form of {type(density).__name__} is not that of measured jerk")
-        index = torch.tensor([window])
+        index = torch.tensor([window], device=density.initial().device)
         self.density, self.samples = density.select(index), samples
         self.names = density.names
         self.sites = _sites(density.prior.select(index), density.names)
@@ -180,11 +180,11 @@ def nuts(
         of the draws diverged.
     """
     model = PyroModel(density, window=window, samples=samples)
-    alone = density.select(torch.tensor([window]))
+    alone = density.select(torch.tensor([window], device=density.initial().device))
     mode = find_mode(alone)
     how: dict[str, Any] = {"model": model} if statements or samples is not None else {"potential_fn": _potential(alone)}
     walked, diverged = [], 0
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[mode.z.device] if mode.z.device.type == "cuda" else []):
         torch.manual_seed(seed)
         for _ in range(chains):
             z = mode.z[0] + mode.scale[0] @ torch.randn_like(mode.z[0])

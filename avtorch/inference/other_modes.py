@@ -33,7 +33,7 @@ def missed_mass(
     Args:
         mean, lower: the draws' mean ``(window, parameter)`` and triangular root of their covariance.
     """
-    w = starts(mean.shape[-1])[:, None].expand(-1, len(mean), -1)
+    w = starts(mean.shape[-1]).to(mean.device)[:, None].expand(-1, len(mean), -1)
     try:
         for _ in range(STEPS):
             slope = lower_transposed_times(lower, score_of(density, lower_times(lower, w) + mean))

@@ -44,7 +44,7 @@ def _shape(x: Tensor) -> Tensor:
     """
     n = len(x)
     count = 30 + int(n**0.5)
-    steps = 1 - (count / (torch.arange(1, count + 1, dtype=x.dtype) - 0.5)).sqrt()
+    steps = 1 - (count / (torch.arange(1, count + 1, dtype=x.dtype, device=x.device) - 0.5)).sqrt()
     quarter = x[int(n / 4 + 0.5) - 1].clamp_min(1e-300)
     b = steps[:, None] / (3 * quarter) + 1 / x[-1]
     k = torch.log1p(-b[:, None] * x).mean(1)

@@ -33,9 +33,11 @@ def join_planes(*blocks: Tensor) -> Float[Tensor, "*draw window parameter"]:
     return from_planes(torch.cat([to_planes(block) for block in blocks]))
 
 
-def empty_planes(*shape: int, dtype: torch.dtype = torch.float64) -> Float[Tensor, "*draw window parameter"]:
+def empty_planes(
+    *shape: int, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+) -> Float[Tensor, "*draw window parameter"]:
     """An uninitialised ``(..., window, parameter)``."""
-    return from_planes(torch.empty(shape[-1], shape[-2], *shape[:-2], dtype=dtype))
+    return from_planes(torch.empty(shape[-1], shape[-2], *shape[:-2], dtype=dtype, device=device))
 
 
 def lower_times(

@@ -44,7 +44,7 @@ class _Drives:
         if not (bool(values.isfinite().all()) and bool(sd.isfinite().all()) and bool((sd > 0).all())):
             raise InputError("values, sd: found a number that is not finite or an sd of 0 or less, need sd above 0")
         known, drives = car.unique(return_counts=True)
-        if len(known) < 2 or not torch.equal(known, torch.arange(len(known))):
+        if len(known) < 2 or not torch.equal(known, torch.arange(len(known), device=known.device)):
             raise InputError("car: needs two cars or more, numbered 0, 1, 2 ... without a gap")
         self.values, self.sd, self.car = values.double(), sd.double(), car
         self.cars = len(known)
@@ -208,5 +208,5 @@ class PopulationMargin(_Drives):
 
 def _log_normal(off: Tensor, variance: Tensor | float) -> Tensor:
     """Log density of a normal, `off` from its mean."""
-    variance = torch.as_tensor(variance, dtype=off.dtype)
+    variance = torch.as_tensor(variance, dtype=off.dtype, device=off.device)
     return -0.5 * (_LOG_2PI + variance.log() + off.square() / variance)

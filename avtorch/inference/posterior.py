@@ -87,7 +87,7 @@ class Posterior(Displayed):
         chains, draws, windows, _ = self.draws.shape
         place = torch.cartesian_prod(torch.arange(chains), torch.arange(draws), torch.arange(windows)).reshape(-1, 3)
         index = {dim: place[:, i].numpy() for i, dim in enumerate(("chain", "draw", "window"))}
-        return Frame(index | {name: self[name].flatten().numpy() for name in self.names}).to_dataframe()
+        return Frame(index | {name: self[name].flatten().cpu().numpy() for name in self.names}).to_dataframe()
 
     def to_arviz(self, *, window: int | None = None) -> InferenceData:
         """The draws as ``arviz.InferenceData``: one variable a parameter, with its unit in ``attrs["units"]``.
@@ -108,7 +108,7 @@ class Posterior(Displayed):
         dims = ("chain", "draw", "window") if window is None else ("chain", "draw")
         flags = self.converged[kept].int().reshape(-1).tolist()
         attributes = {"converged": flags, "pareto_k": self.pareto_k[kept].reshape(-1).tolist()}
-        draws = {name: self[name][..., kept].numpy() for name in self.names}
+        draws = {name: self[name][..., kept].cpu().numpy() for name in self.names}
         return inference_data(draws, dims, units=UNITS, attributes=attributes)
 
     def __getitem__(self, name: str) -> Float[Tensor, "chain draw window"]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -23,7 +23,10 @@ _LOG_2PI = math.log(2 * math.pi)
 
 
 class Prior(Protocol):
-    """Log density over the last dimension of ``z``; ``select`` keeps the windows named by an index."""
+    """Log density over the last dimension of ``z``; ``select`` keeps the windows named by an index.
+
+    One with a ``device`` and ``to(device)`` follows the data that it is used with; another has to be there already.
+    """
 
     def log_prob(self, z: Float[Tensor, "*draw window parameter"]) -> Float[Tensor, "*draw window"]: ...
 
@@ -75,13 +78,20 @@ class LogNormalPrior:
         linear, quadratic = -self._precision * self._log_median, self._precision.diag()
         return PotentialTerms.of(windows, len(self.median), constant=constant, linear=linear, quadratic=quadratic)
 
+    @property
+    def device(self) -> torch.device:
+        return self.median.device
+
+    def to(self, device: torch.device) -> LogNormalPrior:
+        return LogNormalPrior(self.median.to(device), self.log_sd.to(device))
+
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> LogNormalPrior:
         return self
 
     def sample(
         self, count: int, windows: int, *, generator: torch.Generator | None = None
     ) -> Float[Tensor, "count window parameter"]:
-        noise = torch.randn(count, windows, len(self.median), generator=generator, dtype=torch.float64)
+        noise = torch.randn(count, windows, len(self.median), generator=generator, **_like(self.median))
         return self.median.log() + self.log_sd * noise
 
     def center(self) -> Float[Tensor, " parameter"]:
@@ -114,13 +124,20 @@ class HalfNormalPrior:
         square = -self._minus_precision
         return PotentialTerms.of(windows, len(self.scale), constant=constant, linear=-1.0, own_square=square)
 
+    @property
+    def device(self) -> torch.device:
+        return self.scale.device
+
+    def to(self, device: torch.device) -> HalfNormalPrior:
+        return HalfNormalPrior(self.scale.to(device))
+
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> HalfNormalPrior:
         return self
 
     def sample(
         self, count: int, windows: int, *, generator: torch.Generator | None = None
     ) -> Float[Tensor, "count window parameter"]:
-        noise = torch.randn(count, windows, len(self.scale), generator=generator, dtype=torch.float64)
+        noise = torch.randn(count, windows, len(self.scale), generator=generator, **_like(self.scale))
         return (self.scale * noise.abs()).log()
 
     def center(self) -> Float[Tensor, " parameter"]:
@@ -166,6 +183,13 @@ class QuadrantNormal:
             own_square=1 / self.variance,
         )
 
+    @property
+    def device(self) -> torch.device:
+        return self.mean.device
+
+    def to(self, device: torch.device) -> QuadrantNormal:
+        return QuadrantNormal(self.mean.to(device), self.variance)
+
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> QuadrantNormal:
         return QuadrantNormal(self.mean[index], self.variance)
 
@@ -173,7 +197,7 @@ class QuadrantNormal:
         self, count: int, windows: int, *, generator: torch.Generator | None = None
     ) -> Float[Tensor, "count window parameter"]:
         # inverse CDF of the part above zero: exact, with a fixed number of uniforms
-        uniform = torch.rand(count, windows, self.mean.shape[-1], generator=generator, dtype=torch.float64)
+        uniform = torch.rand(count, windows, self.mean.shape[-1], generator=generator, **_like(self.mean))
         sd = math.sqrt(self.variance)
         below = torch.special.ndtr(-self.mean / sd)
         cut = (below + (1 - below) * uniform).clamp(1e-300, 1 - 1e-16)
@@ -199,7 +223,7 @@ class LogSpaceNormal:
 
     def __post_init__(self) -> None:
         lower = torch.linalg.cholesky(self.cov_z)
-        eye = torch.eye(lower.shape[-1], dtype=lower.dtype).expand_as(lower)
+        eye = torch.eye(lower.shape[-1], dtype=lower.dtype, device=lower.device).expand_as(lower)
         object.__setattr__(self, "_inverse", torch.linalg.solve_triangular(lower, eye, upper=False))
         object.__setattr__(self, "_half_log_det", lower.diagonal(dim1=-2, dim2=-1).log().sum(-1))
 
@@ -217,13 +241,20 @@ class LogSpaceNormal:
         constant = -0.5 * (linear * mean).sum(-1) + self._half_log_det + 0.5 * d * _LOG_2PI
         return PotentialTerms.of(windows, d, constant=constant, linear=linear, quadratic=precision)
 
+    @property
+    def device(self) -> torch.device:
+        return self.mean_z.device
+
+    def to(self, device: torch.device) -> LogSpaceNormal:
+        return LogSpaceNormal(self.mean_z.to(device), self.cov_z.to(device))
+
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> LogSpaceNormal:
         return LogSpaceNormal(self.mean_z[index], self.cov_z[index])
 
     def sample(
         self, count: int, windows: int, *, generator: torch.Generator | None = None
     ) -> Float[Tensor, "count window parameter"]:
-        noise = torch.randn(count, windows, self.mean_z.shape[-1], generator=generator, dtype=torch.float64)
+        noise = torch.randn(count, windows, self.mean_z.shape[-1], generator=generator, **_like(self.mean_z))
         return self.mean_z + torch.einsum("wij,cwj->cwi", torch.linalg.cholesky(self.cov_z), noise)
 
     def center(self) -> Float[Tensor, "window parameter"]:
@@ -246,6 +277,13 @@ class Joint:
     def potential_terms(self, windows: int) -> PotentialTerms | None:
         first, rest = terms_of(self.actuation, windows), terms_of(self.noise, windows)
         return None if first is None or rest is None else first.beside(rest)
+
+    @property
+    def device(self) -> torch.device | None:
+        return getattr(self.noise, "device", None)
+
+    def to(self, device: torch.device) -> Joint:
+        return Joint(prior_on(self.actuation, device), prior_on(self.noise, device))
 
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Joint:
         return Joint(self.actuation.select(index), self.noise.select(index))
@@ -280,6 +318,13 @@ class Switch:
         first, later = terms_of(self.first, windows), terms_of(self.later, windows)
         return None if first is None or later is None else later.where(self.started, first)
 
+    @property
+    def device(self) -> torch.device | None:
+        return getattr(self.first, "device", None)
+
+    def to(self, device: torch.device) -> Switch:
+        return Switch(self.started.to(device), prior_on(self.first, device), prior_on(self.later, device))
+
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " window"]) -> Prior:
         started = self.started[index]
         first, later = self.first.select(index), self.later.select(index)
@@ -296,6 +341,18 @@ class Switch:
 
     def center(self) -> Float[Tensor, "window parameter"]:
         return torch.where(self.started[:, None], self.later.center(), self.first.center())
+
+
+def prior_on(prior: Prior, device: torch.device) -> Prior:
+    """The prior on a device; itself where it is there, or where it knows of none."""
+    here = getattr(prior, "device", None)
+    if here is None or here == device:
+        return prior
+    return prior.to(device)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _like(x: Tensor) -> dict[str, Any]:
+    return {"dtype": torch.float64, "device": x.device}
 
 
 def default_actuation_prior() -> LogNormalPrior:

@@ -97,7 +97,7 @@ class Quadrature(Displayed):
 
         spacing = self.nodes[..., 1:2] - self.nodes[..., :1]
         distance = torch.pi * (values.log().unsqueeze(-1) - self.nodes) / spacing
-        sine_integral = torch.from_numpy(sici(distance.numpy())[0])
+        sine_integral = torch.from_numpy(sici(distance.cpu().numpy())[0]).to(distance.device)
         return (self.mass * (0.5 + sine_integral / torch.pi)).sum(-1)
 
     def quantile(self, q: float) -> Float[Tensor, "window parameter"]:
@@ -218,7 +218,7 @@ class _Sums:
 
     def covers_mass(self) -> bool:
         """Whether the grid of every window lies where its mass is."""
-        eye = torch.eye(self.cov.shape[-1], dtype=self.cov.dtype)
+        eye = torch.eye(self.cov.shape[-1], dtype=self.cov.dtype, device=self.cov.device)
         still = (self.mean.abs() < 0.1).all() & ((self.cov - eye).abs() < 0.2).all()
         return bool(still & ~self.short().any())
 
@@ -239,7 +239,7 @@ class _Place:
     @classmethod
     def at(cls, mode: Mode) -> _Place:
         d = mode.z.shape[-1]
-        return cls(mode.z, mode.covariance, torch.full((*mode.z.shape, 2), REACH, dtype=mode.z.dtype), tuple(range(d)))
+        return cls(mode.z, mode.covariance, mode.z.new_full((*mode.z.shape, 2), REACH), tuple(range(d)))
 
     @property
     def lower(self) -> Float[Tensor, "window d d"]:
@@ -252,7 +252,7 @@ class _Place:
 
     def x(self, nodes: int) -> Float[Tensor, "window d node"]:
         """Coordinates of the nodes of every axis, ``(window, axis, node)``."""
-        share = torch.linspace(0, 1, nodes, dtype=self.center.dtype)
+        share = torch.linspace(0, 1, nodes, dtype=self.center.dtype, device=self.center.device)
         return -self.reach[..., :1] + self.reach.sum(-1, keepdim=True) * share
 
     def first_axis(self, nodes: int) -> Float[Tensor, "window node"]:
@@ -293,15 +293,17 @@ def _integrate(density: Density, place: _Place, nodes: int, reference: Float[Ten
     windows, d = place.center.shape
     x, lower = place.x(nodes), place.lower
     count = nodes ** (d - 1)
-    strides = nodes ** torch.arange(d - 2, -1, -1)
-    rest = torch.arange(count)[:, None] // strides % nodes  # the other axes' nodes in a slab, (count, d - 1)
+    strides = nodes ** torch.arange(d - 2, -1, -1, device=x.device)
+    rest = (
+        torch.arange(count, device=x.device)[:, None] // strides % nodes
+    )  # the other axes' nodes in a slab, (count, d - 1)
     others = x[:, 1:].gather(-1, rest.T.expand(windows, -1, -1)).permute(2, 0, 1)  # (count, window, d - 1)
     even = (rest % 2 == 0).all(-1)
     back = [place.order.index(j) for j in range(d)]
     slabs = max(1, min(nodes, BLOCK // (count * windows)))
     weights, coarse = [], []
     mean, square = torch.zeros_like(place.center), torch.zeros_like(place.cov)
-    shared = torch.zeros(count, windows, dtype=x.dtype)
+    shared = x.new_zeros(count, windows)
     for k in range(0, nodes, slabs):
         first = x[:, 0, k : k + slabs].T[:, None, :, None].expand(-1, count, -1, 1)
         points = torch.cat([first, others.expand(len(first), -1, -1, -1)], -1)  # (slab, node, window, d)

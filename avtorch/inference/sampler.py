@@ -13,6 +13,7 @@ from avtorch.errors import InputError
 from avtorch.inference.compiled import chosen
 from avtorch.inference.coordinates import Coordinates, stiffness
 from avtorch.inference.density import Density, SubsampledDensity, constrained, has_score, has_selection
+from avtorch.inference.device import check_generator
 from avtorch.inference.exactness import Exactness, compare_with_exact
 from avtorch.inference.map import Mode, find_mode
 from avtorch.inference.planes import empty_planes
@@ -67,15 +68,16 @@ def sample(
     """
     settings = SamplerSettings() if settings is None else settings
     mode = find_mode(density) if mode is None else mode
+    check_generator(generator, mode.z.device)
     mode, slowdown = _adapted(density, mode, settings, generator)
     # all draws of a parameter of a window behind one another, as its summaries read them
-    draws = torch.empty(*mode.z.shape, settings.chains, settings.draws, dtype=mode.z.dtype).permute(2, 3, 0, 1)
+    draws = mode.z.new_empty(*mode.z.shape, settings.chains, settings.draws).permute(2, 3, 0, 1)
     diverged, unmixed, stuck = (torch.zeros_like(mode.converged) for _ in range(3))
-    found = Exactness.unknown(*mode.z.shape)
+    found = Exactness.unknown(mode.z)
     # chains that agree still differ by chance: eight groups cut into halves of this many draws each
     members = max(1, settings.chains // 8) * (settings.draws // 2)
     limit = (rhat_max**2 + 4 / members) ** 0.5
-    open_ = torch.arange(density.windows)
+    open_ = torch.arange(density.windows, device=mode.z.device)
     for attempt in range(settings.attempts):
         for index in _batches(density, open_, slowdown, settings.chains):
             part, where = _select(density, index), mode.select(index)
@@ -102,7 +104,7 @@ def sample(
     off = found.why(density.names) if settings.compare else [""] * density.windows
     flags = zip(mode.converged.tolist(), diverged.tolist(), unmixed.tolist(), stuck.tolist(), off, strict=True)
     why = tuple(_why(*flag) for flag in flags)
-    converged = torch.tensor([not reason for reason in why])
+    converged = torch.tensor([not reason for reason in why], device=mode.z.device)
     return Posterior(density.names, draws, converged, why, found if settings.compare else None)
 
 
@@ -163,7 +165,7 @@ def _longer(slowdown: Float[Tensor, "*window"]) -> Float[Tensor, "*window"]:
 def _batches(density: Density, index: Tensor, slowdown: Tensor, chains: int) -> list[Tensor]:
     """Windows to sample together: with equal numbers of steps, and not too many windows at once."""
     if not has_selection(density):
-        return [torch.arange(density.windows)]
+        return [torch.arange(density.windows, device=index.device)]
     size = max(1, BLOCK // chains)
     times = _longer(slowdown[index])
     batches, few = [], index[:0]
@@ -194,7 +196,7 @@ def _diverged(
     distance = w.square().sum(-1).nan_to_num_(nan=torch.inf)
     furthest = distance.transpose(0, 1).flatten(0, 1).argmax(0)  # in the order of memory
     with torch.no_grad():
-        far = coordinates.z(w.transpose(0, 1).flatten(0, 1)[furthest, torch.arange(w.shape[2])])
+        far = coordinates.z(w.transpose(0, 1).flatten(0, 1)[furthest, torch.arange(w.shape[2], device=w.device)])
         return ~((mode.log_prob - density.log_prob(far)).abs() <= depth + w.shape[-1])
 
 
@@ -223,9 +225,9 @@ def _walk(
     # each window's own step is folded into its scale
     coordinates = Coordinates.of(mode, settings.whitening).slowed(slowdown)
     shape = (settings.chains, *mode.z.shape)
-    w = empty_planes(*shape, dtype=mode.z.dtype).zero_()
+    w = empty_planes(*shape, dtype=mode.z.dtype, device=mode.z.device).zero_()
     if settings.spread > 0:
-        start = torch.randn(shape, dtype=w.dtype, generator=generator)
+        start = torch.randn(shape, dtype=w.dtype, device=w.device, generator=generator)
         w += settings.spread * slowdown.sqrt()[:, None] * start
     loops = chosen(density, settings)
     if loops is not None:
@@ -240,7 +242,7 @@ def _walk(
     scheduler = None if settings.schedule is None else settings.schedule(optimizer)
     gradient = _gradient(density, coordinates, w, settings.batch, generator)
     graph = any(group.get("preconditioner") for group in optimizer.param_groups)
-    kept = empty_planes(settings.draws, *shape, dtype=w.dtype)
+    kept = empty_planes(settings.draws, *shape, dtype=w.dtype, device=w.device)
 
     def closure() -> Tensor | None:
         if graph:  # differentiates the potential itself, and again
@@ -267,7 +269,7 @@ def _log_prob(density: Density, z: Tensor, batch: int | None, generator: torch.G
         return density.log_prob(z)
     if not isinstance(density, SubsampledDensity):
         raise InputError(f"batch: {type(density).__name__} has no minibatch estimate; leave batch at None")
-    return density.log_prob_minibatch(z, torch.randint(density.points, (batch,), generator=generator))
+    return density.log_prob_minibatch(z, torch.randint(density.points, (batch,), generator=generator, device=z.device))
 
 
 def _gradient(

@@ -12,6 +12,7 @@ from avtorch.arrays import Bool
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief, Summary
 from avtorch.inference.density import Density
+from avtorch.inference.device import Device, checked_device, generator_on
 from avtorch.inference.form import Rows, WindowLikelihood
 from avtorch.inference.posterior import sorted_quantile
 from avtorch.inference.priors import (
@@ -22,6 +23,7 @@ from avtorch.inference.priors import (
     Switch,
     default_actuation_prior,
     default_jerk_noise_prior,
+    prior_on,
 )
 from avtorch.inference.sampler import sample
 from avtorch.inference.sampler_settings import SamplerSettings
@@ -51,9 +53,10 @@ class SequentialInference:
         forgetting: in (0, 1]; 1 forgets nothing.
         noise_prior: prior of the noise parameters of every window.
         kept: draws per vehicle that a belief carries.
+        device: where beliefs are and posteriors are sampled; densities of `update` have to be there.
 
     Raises:
-        InputError: for a mode, ``lam`` or ``forgetting`` out of range.
+        InputError: for a mode, ``lam`` or ``forgetting`` out of range, or a device that this machine lacks.
 
     Example:
         >>> import torch
@@ -81,6 +84,7 @@ class SequentialInference:
         settings: SamplerSettings | None = None,
         kept: int = 1000,
         seed: int = 0,
+        device: Device = "cpu",
     ) -> None:
         if mode not in ("lambda", "posterior", "forgetting"):
             raise InputError(f"mode: {mode!r} is none of 'lambda', 'posterior', 'forgetting'")
@@ -92,15 +96,15 @@ class SequentialInference:
             raise InputError(f"forgetting: {forgetting} is not in (0, 1]")
         self.mode, self.lam, self.forgetting = mode, lam, forgetting
         self.settings = SamplerSettings() if settings is None else settings
-        self.noise_prior = default_jerk_noise_prior() if noise_prior is None else noise_prior
-        self.first_prior = Joint(
-            default_actuation_prior() if actuation_prior is None else actuation_prior, self.noise_prior
-        )
-        self.generator = torch.Generator().manual_seed(seed)
+        self.device = checked_device(device)
+        self.noise_prior = prior_on(default_jerk_noise_prior() if noise_prior is None else noise_prior, self.device)
+        first = default_actuation_prior() if actuation_prior is None else actuation_prior
+        self.first_prior = Joint(prior_on(first, self.device), self.noise_prior)
+        self.generator = generator_on(self.device, seed)
         self.belief = Belief.of_prior(names, self.first_prior, kept, vehicles, self.generator)
-        self._started = torch.zeros(vehicles, dtype=torch.bool)
+        self._started = torch.zeros(vehicles, dtype=torch.bool, device=self.device)
         self._mean_z = self.belief.draws.log().mean(0)
-        self._cov_z = torch.eye(len(names), dtype=torch.float64).repeat(vehicles, 1, 1)
+        self._cov_z = torch.eye(len(names), dtype=torch.float64, device=self.device).repeat(vehicles, 1, 1)
 
     def prior(self) -> Prior:
         """The prior of the coming window, for all vehicles."""
@@ -119,6 +123,7 @@ class SequentialInference:
             density: builds the posterior density of the vehicles named by an index from their priors.
             excited: ``(vehicle,)`` bool; the others keep their belief.
         """
+        excited = excited.to(self.device)
         index = excited.nonzero().squeeze(-1)
         if not len(index):
             self.belief = self.belief.unused(excited)
@@ -127,7 +132,7 @@ class SequentialInference:
         used = index[converged]
         self._mean_z = self._mean_z.index_put((used,), mean_z[converged])
         self._cov_z = self._cov_z.index_put((used,), cov_z[converged])
-        self._started = self._started.index_put((used,), torch.tensor(True))
+        self._started = self._started.index_fill(0, used, True)
         self.belief = self.belief.updated(excited, index, found, converged)
         return self.belief
 
@@ -146,11 +151,12 @@ class SequentialInference:
         return summary, *posterior.log_moments(), posterior.converged
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything a resumed loop needs to continue bit for bit; plain tensors and names."""
+        """Everything a resumed loop needs to continue bit for bit; plain tensors, on the processor, and
+        names."""
         own = {
-            "started": self._started,
-            "mean_z": self._mean_z,
-            "cov_z": self._cov_z,
+            "started": self._started.cpu(),
+            "mean_z": self._mean_z.cpu(),
+            "cov_z": self._cov_z.cpu(),
             "generator": self.generator.get_state(),
         }
         return {"mode": self.mode, **self.belief.state_dict(), **own}
@@ -167,14 +173,19 @@ class SequentialInference:
         if saved != own:
             raise InputError(f"state: (mode, names, vehicles) were {saved} when it was saved, here they are {own}")
         shaped_as(self.state_dict(), state, "state")
-        belief, generator = self.belief.taken_from(state), generator_of(state["generator"], "state.generator")
+        belief, generator = (
+            self.belief.taken_from(state),
+            generator_of(state["generator"], "state.generator", self.device),
+        )
         if bool((state["cov_z"].diagonal(dim1=-2, dim2=-1) < 0).any()):
             raise InputError("state: cov_z: holds a variance below 0")
         self.belief = belief
-        self._started, self._mean_z, self._cov_z = (state[key].clone() for key in ("started", "mean_z", "cov_z"))
+        self._started, self._mean_z, self._cov_z = (
+            state[key].clone().to(self.device) for key in ("started", "mean_z", "cov_z")
+        )
         self.generator.set_state(generator.get_state())
 
 
 def _thin(draws: Tensor, count: int) -> Tensor:
     """``count`` draws spread evenly over the first dimension (repeated where there are fewer)."""
-    return draws[torch.linspace(0, len(draws) - 1, count, dtype=torch.float64).round().long()]
+    return draws[torch.linspace(0, len(draws) - 1, count, dtype=torch.float64, device=draws.device).round().long()]

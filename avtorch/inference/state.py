@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
+from avtorch.inference.device import generator_on
 
 
 def shaped_as(own: Any, given: Any, place: str) -> None:
@@ -57,13 +58,13 @@ def about(state: Any, *more: str) -> tuple[Any, ...]:
     return *(given.get(key) for key in more), plain, len(mean) if isinstance(mean, Tensor) and mean.ndim else None
 
 
-def generator_of(state: Tensor, place: str) -> torch.Generator:
-    """A generator in this state.
+def generator_of(state: Tensor, place: str, device: torch.device) -> torch.Generator:
+    """A generator of the device in this state.
 
     Raises:
         InputError: where it is no generator's state.
     """
-    made = torch.Generator()
+    made = generator_on(device, 0)
     try:
         made.set_state(state)
     except (RuntimeError, TypeError) as fault:

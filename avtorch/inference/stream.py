@@ -16,6 +16,7 @@ from avtorch.arrays import Real
 from avtorch.display import Card, Displayed
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief
+from avtorch.inference.device import Device, checked_device
 from avtorch.inference.estimators.choose import make_estimator
 from avtorch.inference.form import Form, JerkForm
 from avtorch.inference.stream_state import check_clock, read_state, with_checksum, without_checksum, write_state
@@ -71,11 +72,13 @@ class BeliefStream:
         check_units: refuse rows whose columns contradict each other in unit or sign
             (:mod:`avtorch.inference.stream_units`); false where units and signs are known to be right.
         estimator: a name of :data:`~avtorch.inference.estimators.ESTIMATORS`.
+        device: where posteriors are computed and beliefs are; rows are collected, and checked, on the processor.
         **inference: the estimator's options, for ``"sgld"`` those of
             :class:`~avtorch.inference.sequential.SequentialInference` (``mode``, ``lam``, ``settings``, ``seed`` ...).
 
     Raises:
-        InputError: for a ``window`` or ``gap`` that is not positive, an unknown estimator or an option it lacks.
+        InputError: for a ``window`` or ``gap`` that is not positive, an unknown estimator, an option it lacks, or a
+            device that this machine lacks.
 
     Example:
         >>> from avtorch import BeliefStream, GLVDPlant, Leader, simulate
@@ -96,6 +99,7 @@ class BeliefStream:
         vehicles: int = 1,
         check_units: bool = True,
         estimator: str = "sgld",
+        device: Device = "cpu",
         **inference: Any,
     ) -> None:
         if not window > 0:
@@ -104,8 +108,8 @@ class BeliefStream:
             raise InputError(f"gap: {gap} s is not positive")
         self.window, self.gap, self.vehicles = float(window), float(gap), vehicles
         self.form: Form = JerkForm() if form is None else form
-        self.estimator = estimator
-        self.inference = make_estimator(estimator, self.form, vehicles=vehicles, **inference)
+        self.estimator, self.device = estimator, checked_device(device)
+        self.inference = make_estimator(estimator, self.form, vehicles=vehicles, device=device, **inference)
         self._units = StreamUnits(self.form.columns, vehicles) if check_units else None
         self._rows: dict[str, Tensor] = self._empty()
         self._origin: float | None = None  # start of the first window since the last gap
@@ -144,7 +148,7 @@ class BeliefStream:
                 last 10 to 40 s prove that a column has another unit or sign: the belief then also returns to its value
                 before them.
         """
-        time = torch.atleast_1d(torch.as_tensor(time, dtype=torch.float64))
+        time = torch.atleast_1d(torch.as_tensor(time, dtype=torch.float64)).cpu()
         epoch = self._epoch
         if epoch is None and time.ndim == 1 and len(time) and bool(time[0].isfinite()):
             epoch = float(time[0])
@@ -216,7 +220,7 @@ class BeliefStream:
         if time.ndim != 1:
             return usable, self._driven  # which is refused in a moment
         shape = (self.vehicles, len(time))
-        own = torch.ones(shape) if engaged is None else torch.atleast_2d(torch.as_tensor(engaged))
+        own = torch.ones(shape) if engaged is None else torch.atleast_2d(torch.as_tensor(engaged)).cpu()
         if own.shape not in (shape, (1, shape[1])):
             raise InputError(f"engaged: of shape {tuple(own.shape)}, needs {shape} (vehicle, time) or ({shape[1]},)")
         on = own.bool().expand(shape)
@@ -227,19 +231,23 @@ class BeliefStream:
         rests, last = settled_rows(time.numpy(), on.numpy(), before)
         counts = on & torch.from_numpy(rests)
         driven = [float(x) if np.isfinite(x) else None for x in last]
-        return counts if usable is None else counts & torch.as_tensor(usable, dtype=torch.bool), driven
+        return counts if usable is None else counts & torch.as_tensor(usable, dtype=torch.bool).cpu(), driven
 
     def _checked(self, time: Tensor, columns: Mapping[str, Tensor], usable: Tensor | None) -> dict[str, Tensor]:
         """The block as ``(time,)`` times and ``(vehicle, time)`` columns, or an InputError."""
         time = torch.atleast_1d(torch.as_tensor(time, dtype=torch.float64))
         if time.ndim != 1 or not bool(time.isfinite().all()):
             raise InputError(f"time: of shape {tuple(time.shape)}, needs finite numbers of shape (time,)")
-        mask = torch.ones(len(time), dtype=torch.bool) if usable is None else torch.as_tensor(usable, dtype=torch.bool)
+        mask = (
+            torch.ones(len(time), dtype=torch.bool)
+            if usable is None
+            else torch.as_tensor(usable, dtype=torch.bool).cpu()
+        )
         given = {"usable": mask}
         for name in self.form.columns:
             if name not in columns:
                 raise InputError(f"columns: {name} is missing; this form needs {', '.join(self.form.columns)}")
-            given[name] = torch.as_tensor(columns[name], dtype=torch.float64)
+            given[name] = torch.as_tensor(columns[name], dtype=torch.float64).cpu()
         block = {"time": time}
         shape = (self.vehicles, len(time))
         for name, value in given.items():
@@ -295,8 +303,9 @@ class BeliefStream:
             end = min(end, float(rows["time"][-1]) + (self.window / full))
         if self._units is not None:
             self._units.take(rows, self.inference.state_dict())
-        likelihood = self.form.likelihood(rows, full)
-        belief = self.inference.take(rows, likelihood)
+        there = {name: value.to(self.device) for name, value in rows.items()}
+        likelihood = self.form.likelihood(there, full)
+        belief = self.inference.take(there, likelihood)
         self._index += 1
         clock = 0.0 if self._epoch is None else self._epoch
         return Window(start + clock, end + clock, likelihood.n, belief)

@@ -11,6 +11,7 @@ from torch.distributions.constraints import Constraint
 
 from avtorch.arrays import Float
 from avtorch.errors import InputError
+from avtorch.inference.device import Device, checked_device
 
 LogDensity = Callable[[dict[str, Tensor]], Tensor]
 
@@ -27,9 +28,11 @@ class TorchDensity:
         parameters: names and their ``torch.distributions.constraints``, of one real number each.
         start: where the search for the mode begins, in the parameters' own units; where their bijections map 0 by
             default.
+        device: where ``log_density`` computes.
 
     Raises:
-        InputError: for no parameters, a constraint that is not of a single number, or a start that breaks one.
+        InputError: for no parameters, a constraint that is not of a single number, a start that breaks one, or a
+            device that this machine lacks.
 
     Example:
         >>> import torch
@@ -49,6 +52,7 @@ class TorchDensity:
         parameters: Mapping[str, Constraint],
         *,
         start: Mapping[str, float] | None = None,
+        device: Device = "cpu",
     ) -> None:
         if not parameters:
             raise InputError("parameters: none named, need one or more")
@@ -70,7 +74,7 @@ class TorchDensity:
                     raise InputError(f"start: {name} = {float(given):g} breaks its constraint {parameters[name]}")
                 value = to_constrained.inv(given)
             z.append(value)
-        self._start = torch.stack(z)[None]
+        self._start = torch.stack(z)[None].to(checked_device(device))
 
     def constrain(self, z: Float[Tensor, "*draw parameter"]) -> Float[Tensor, "*draw parameter"]:
         """Parameters in their own units, shape of ``z``."""
@@ -80,7 +84,7 @@ class TorchDensity:
         """Log density of ``z`` ``(..., 1, parameter)``, Jacobian included; returns ``(..., 1)``, NaN where ``z`` is."""
         # torch's distributions raise at the first NaN: one chain that diverges must not end the others
         lost = z.isnan().any(-1)
-        free = torch.where(lost[..., None], torch.zeros((), dtype=z.dtype), z).unbind(-1)
+        free = torch.where(lost[..., None], z.new_zeros(()), z).unbind(-1)
         values = [t(x) for t, x in zip(self._maps, free, strict=True)]
         log_density = self.log_density(dict(zip(self.names, values, strict=True)))
         for t, x, y in zip(self._maps, free, values, strict=True):

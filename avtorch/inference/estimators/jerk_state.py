@@ -19,8 +19,8 @@ class JerkState:
 
     def __init__(self, sigma: Float[Tensor, " vehicle"], drift: float) -> None:
         self.variance = sigma.square().unsqueeze(-1)
-        self._walk = drift**2 * torch.eye(2, dtype=sigma.dtype)
-        self._still = torch.eye(2, dtype=sigma.dtype)
+        self._walk = drift**2 * torch.eye(2, dtype=sigma.dtype, device=sigma.device)
+        self._still = torch.eye(2, dtype=sigma.dtype, device=sigma.device)
 
     def start(self, actuation: GaussianState, row: Observation) -> GaussianState:
         return actuation

@@ -87,15 +87,15 @@ class JointKalman(WindowedEstimator):
         """
         time, usable = rows["time"], rows["usable"]
         steps = time.diff()
-        usual = steps.median() if len(steps) else torch.tensor(math.inf)
-        cut = torch.cat([torch.ones(1, dtype=torch.bool), steps > GAP * usual])
+        usual = steps.median() if len(steps) else steps.new_tensor(math.inf)
+        cut = torch.cat([torch.ones_like(time[:1], dtype=torch.bool), steps > GAP * usual])
         # a masked row may hold any number or NaN
         signals = {name: value for name, value in rows.items() if name not in ("time", "usable")}
         clean = {name: torch.where(usable, value, 0.0) for name, value in signals.items()}
         measured = torch.stack([clean[name] for name in columns], -1)
         dts = torch.cat([steps, steps.new_zeros(1)])
         state, total = actuation, usable.new_zeros(len(usable), dtype=torch.float64)
-        before = torch.zeros(len(usable), dtype=torch.bool)
+        before = torch.zeros_like(usable[:, 0])
         for k in range(len(time)):
             row = Observation(
                 clean["accel_cmd"][:, k], clean.get("accel", clean["accel_cmd"])[:, k], measured[:, k], dts[k]
@@ -120,9 +120,10 @@ class JointKalman(WindowedEstimator):
         actuation = GaussianState(self._memory["mean"][index], self._memory["cov"][index])
         if isinstance(self.form, LatentForm):
             columns = self.form.measured
-            model: StateModel = LatentState(columns, self.noise, self.drift, len(index))
+            model: StateModel = LatentState(columns, self.noise, self.drift, len(index), self.device)
             level = torch.tensor([self.noise[name] for name in self.form.names[2:]], dtype=torch.float64).log()
-            noise_z, noise_var = level.expand(len(index), -1), torch.zeros(len(index), len(level), dtype=torch.float64)
+            noise_z = level.to(self.device).expand(len(index), -1)
+            noise_var = torch.zeros_like(noise_z)
         else:
             columns = ("jerk",)
             columns_of_sums = (rows[name] for name in ("accel", "accel_cmd", "jerk", "usable"))
@@ -147,7 +148,9 @@ class JointKalman(WindowedEstimator):
 
 def _plausible(actuation: GaussianState) -> Tensor:
     """Where mean and covariance are plausible for a vehicle, ``(vehicle,)`` bool."""
-    low, high = (torch.tensor(x, dtype=torch.float64).log() for x in zip(*PLAUSIBLE, strict=True))
+    low, high = (
+        torch.tensor(x, dtype=torch.float64).log().to(actuation.mean.device) for x in zip(*PLAUSIBLE, strict=True)
+    )
     inside = ((actuation.mean > low) & (actuation.mean < high)).all(-1)
     sound = torch.linalg.cholesky_ex(actuation.cov.nan_to_num())[1] == 0
     return inside & sound & actuation.cov.isfinite().flatten(1).all(-1)

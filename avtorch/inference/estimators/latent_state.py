@@ -23,19 +23,21 @@ class LatentState:
         measured: the channels, some of ``"accel"``, ``"speed"``.
         noise: the latent form's noise parameters by name; a filter takes them as given.
         drift: SD of the parameters' walk per square root of a second, of both logarithms.
-        vehicles: how many.
+        vehicles: how many. device: where their rows are.
     """
 
-    def __init__(self, measured: tuple[str, ...], noise: Mapping[str, float], drift: float, vehicles: int) -> None:
+    def __init__(
+        self, measured: tuple[str, ...], noise: Mapping[str, float], drift: float, vehicles: int, device: torch.device
+    ) -> None:
         self.measured, self.drift = measured, drift
-        self._noise = {name: torch.tensor(value, dtype=torch.float64) for name, value in noise.items()}
+        self._noise = {name: torch.tensor(value, dtype=torch.float64, device=device) for name, value in noise.items()}
         variances = torch.stack([self._noise[f"{name}_noise"].square() for name in measured])
         self.variance = variances.expand(vehicles, -1)
-        self._rows = [torch.tensor((*_ROWS[name], 0.0, 0.0), dtype=torch.float64) for name in measured]
+        self._rows = [torch.tensor((*_ROWS[name], 0.0, 0.0), dtype=torch.float64, device=device) for name in measured]
 
     def start(self, actuation: GaussianState, row: Observation) -> GaussianState:
         vehicles = len(actuation.mean)
-        mean, cov = torch.zeros(vehicles, 6, dtype=torch.float64), torch.zeros(vehicles, 6, 6, dtype=torch.float64)
+        mean, cov = actuation.mean.new_zeros(vehicles, 6), actuation.mean.new_zeros(vehicles, 6, 6)
         mean[:, 4:], cov[:, 4:, 4:] = actuation
         if "speed" in self.measured:
             mean[:, 0] = row.measured[:, self.measured.index("speed")]
@@ -44,7 +46,7 @@ class LatentState:
 
     def _step(self, x: Tensor, row: Observation) -> Step:
         n = self._noise
-        road = n.get("road_noise", torch.zeros((), dtype=torch.float64))
+        road = n.get("road_noise", row.dt.new_zeros(()))
         parameters = (n["process_noise"], road, n["coloured_sd"], n["coloured_time"])
         return discretise(x[..., 4].exp(), x[..., 5].exp(), *parameters, row.dt)
 
@@ -65,7 +67,7 @@ class LatentState:
         return out
 
     def noise(self, x: Float[Tensor, "vehicle 6"], row: Observation) -> Float[Tensor, "vehicle 6 6"]:
-        out = torch.zeros(*x.shape, 6, dtype=x.dtype)
+        out = x.new_zeros(*x.shape, 6)
         out[..., :4, :4] = self._step(x, row).noise
         out[..., 4, 4] = out[..., 5, 5] = self.drift**2 * row.dt
         return out

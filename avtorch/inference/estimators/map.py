@@ -40,7 +40,9 @@ class MaximumAPosteriori(SequentialInference):
         converged = mode.converged & (mode.covariance.diagonal(dim1=-2, dim2=-1).amax(-1) < WIDEST**2)
         # the others are not used; any finite covariance will do
         covariance = torch.where(
-            converged[:, None, None], mode.covariance, torch.eye(mode.z.shape[-1], dtype=mode.z.dtype)
+            converged[:, None, None],
+            mode.covariance,
+            torch.eye(mode.z.shape[-1], dtype=mode.z.dtype, device=mode.z.device),
         )
         summary = Summary.log_normal(mode.z, covariance, len(self.belief.draws), self.generator)
         return summary, mode.z, covariance, converged

@@ -61,7 +61,7 @@ class RecursiveLeastSquares(WindowedEstimator):
             raise InputError(f"forgetting: {forgetting} is not in (0, 1]")
         super().__init__(form, **options)
         self.forgetting = forgetting
-        self._memory = {name: torch.zeros(self.vehicles, dtype=torch.float64) for name in _SUMS}
+        self._memory = {name: torch.zeros(self.vehicles, dtype=torch.float64, device=self.device) for name in _SUMS}
 
     def _learn(self, rows: Rows, index: Tensor) -> tuple[Summary, Tensor]:
         usable = rows["usable"]
@@ -101,7 +101,7 @@ class RecursiveLeastSquares(WindowedEstimator):
         self, b: Tensor, g: Tensor, sigma: Tensor, sd_b: Tensor, gg: Tensor, bg: Tensor, spread: Tensor
     ) -> Tensor:
         """``(draw, vehicle, 3)`` from the normal of the coefficients, which lies well above zero."""
-        noise = torch.randn(3, self.kept, len(b), generator=self.generator, dtype=b.dtype)
+        noise = torch.randn(3, self.kept, len(b), generator=self.generator, dtype=b.dtype, device=b.device)
         slope = torch.where(sd_b > 0, bg / sd_b.clamp_min(1e-300), 0.0)
         one = b + sd_b * noise[0]
         two = g + slope * noise[0] + (gg - slope.square()).clamp_min(0.0).sqrt() * noise[1]

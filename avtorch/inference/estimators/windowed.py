@@ -5,13 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from avtorch.errors import InputError
 from avtorch.inference.belief import Belief, Summary
+from avtorch.inference.device import Device, checked_device, generator_on
 from avtorch.inference.form import Form, Rows, WindowLikelihood
-from avtorch.inference.priors import Joint, LogNormalPrior, default_actuation_prior
+from avtorch.inference.priors import Joint, LogNormalPrior, default_actuation_prior, prior_on
 from avtorch.inference.state import about, generator_of, shaped_as
 
 
@@ -22,9 +22,10 @@ class WindowedEstimator(ABC):
         form: what is measured; the belief has its parameters.
         actuation_prior: of ``(T_L [s], K_L [-])`` before the first excited window.
         kept: draws per vehicle that a belief carries.
+        device: where belief and memory are, and the rows of `take` have to be.
 
     Raises:
-        InputError: for fewer than two draws or one vehicle.
+        InputError: for fewer than two draws or one vehicle, or a device that this machine lacks.
     """
 
     def __init__(
@@ -35,13 +36,16 @@ class WindowedEstimator(ABC):
         actuation_prior: LogNormalPrior | None = None,
         kept: int = 1000,
         seed: int = 0,
+        device: Device = "cpu",
     ) -> None:
         if kept < 2 or vehicles < 1:
             raise InputError(f"kept, vehicles: found {kept}, {vehicles}, need 2 or more draws and 1 or more vehicles")
         self.form, self.kept, self.vehicles = form, kept, vehicles
-        self.actuation_prior = default_actuation_prior() if actuation_prior is None else actuation_prior
-        self.generator = torch.Generator().manual_seed(seed)
-        prior = Joint(self.actuation_prior, form.noise_prior)
+        self.device = checked_device(device)
+        given = default_actuation_prior() if actuation_prior is None else actuation_prior
+        self.actuation_prior = given.to(self.device)
+        self.generator = generator_on(self.device, seed)
+        prior = Joint(self.actuation_prior, prior_on(form.noise_prior, self.device))
         self.belief = Belief.of_prior(form.names, prior, kept, vehicles, self.generator)
         self._memory: dict[str, Tensor] = {}
 
@@ -62,7 +66,7 @@ class WindowedEstimator(ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue bit for bit; plain tensors and names."""
-        memory = {name: value.clone() for name, value in self._memory.items()}
+        memory = {name: value.cpu().clone() for name, value in self._memory.items()}
         return {**self.belief.state_dict(), "memory": memory, "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -76,7 +80,10 @@ class WindowedEstimator(ABC):
         if saved != own:
             raise InputError(f"state: (names, vehicles) were {saved} when it was saved, here they are {own}")
         shaped_as(self.state_dict(), state, "state")
-        belief, generator = self.belief.taken_from(state), generator_of(state["generator"], "state.generator")
+        belief, generator = (
+            self.belief.taken_from(state),
+            generator_of(state["generator"], "state.generator", self.device),
+        )
         self.belief = belief
-        self._memory = {name: value.clone() for name, value in state["memory"].items()}
+        self._memory = {name: value.clone().to(self.device) for name, value in state["memory"].items()}
         self.generator.set_state(generator.get_state())
