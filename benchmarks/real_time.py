@@ -1,10 +1,11 @@
 """Cost of updating the belief: seconds per 2 s window, for one vehicle and for many in one batch.
 
-    python -m benchmarks.real_time [--repeats 5]
+    python -m benchmarks.real_time [--repeats 5] [--chains 128] [--threads 2] [--vehicles 1000]
 
-One thread. A window has 200 rows at 100 Hz and is sampled with the default settings. The aim is an update
-in less than 5 % of the window's length, and a cost that grows more slowly than the number of vehicles. The share is of
-processor time, which does not grow on a busy machine; wall time is printed beside it.
+A window has 200 rows at 100 Hz and is sampled with the default settings, by one thread unless told otherwise. The aims
+are an update in less than 5 % of the window's length, a cost that grows more slowly than the number of vehicles, and
+1000 vehicles of 128 chains each in less than 0.5 s on two cores. The share is of processor time, which grows less than
+wall time on a busy machine; wall time is printed beside it.
 """
 
 from __future__ import annotations
@@ -35,10 +36,11 @@ def drive(vehicles: int, windows: int, seed: int = 0) -> tuple[torch.Tensor, dic
     return time_s, {"accel_cmd": u, "accel": a, "jerk": jerk}
 
 
-def seconds_per_window(vehicles: int, repeats: int = 5) -> tuple[list[float], list[float]]:
+def seconds_per_window(vehicles: int, repeats: int = 5, chains: int | None = None) -> tuple[list[float], list[float]]:
     """Clock and processor seconds of the first window and of each of the ``repeats`` that follow; all are excited."""
     time_s, columns = drive(vehicles, repeats + 1)
-    stream = BeliefStream(window=WINDOW_S, vehicles=vehicles)
+    options = {} if chains is None else {"settings": SamplerSettings(chains=chains)}
+    stream = BeliefStream(window=WINDOW_S, vehicles=vehicles, **options)
     rows = round(WINDOW_S * RATE_HZ)
     by_clock, by_processor = [], []
     for k in range(repeats + 1):
@@ -56,22 +58,27 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description="Seconds per window, for one vehicle and for many.")
     parser.add_argument("--repeats", type=int, default=5, help="windows timed after the first")
-    repeats = parser.parse_args().repeats
-    torch.set_num_threads(1)
-    chains = SamplerSettings().chains
-    print(f"window {WINDOW_S:g} s at {RATE_HZ:g} Hz, {chains} chains, one thread, torch {torch.__version__}")
+    parser.add_argument("--chains", type=int, default=SamplerSettings().chains)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--vehicles", type=int, nargs="+", default=[1, 10, 100, 1000])
+    given = parser.parse_args()
+    repeats, chains = given.repeats, given.chains
+    torch.set_num_threads(given.threads)
+    threads = "one thread" if given.threads == 1 else f"{given.threads} threads"
+    print(f"window {WINDOW_S:g} s at {RATE_HZ:g} Hz, {chains} chains, {threads}, torch {torch.__version__}")
     heads = ("vehicles", "first [s]", "clock [s]", "processor [s]", "of window", "per vehicle", "against one")
     print("".join(f"{head:>14}" for head in heads))
     one = None
-    for vehicles in (1, 10, 100, 1000):
-        by_clock, by_processor = seconds_per_window(vehicles, repeats)
+    for vehicles in given.vehicles:
+        by_clock, by_processor = seconds_per_window(vehicles, repeats, chains)
         clock, median = statistics.median(by_clock[1:]), statistics.median(by_processor[1:])
         one = median if one is None else one
         print(
             f"{vehicles:14d}{by_clock[0]:14.4f}{clock:14.4f}{median:14.4f}{median / WINDOW_S:14.2%}"
             f"{1e3 * median / vehicles:11.3f} ms{median / one:12.1f} x"
         )
-    assert one is not None
+    if one is None or given.vehicles[0] != 1:
+        return
     verdict = "met" if one / WINDOW_S < AIM else "MISSED"
     print(f"aim for one vehicle: below {AIM:.0%} of the window: {verdict}")
 

@@ -327,7 +327,7 @@ def slope(samples: list[tuple[float, float]]) -> tuple[float, float] | None:
     """MiB per simulated hour and half of its 95 % interval, from means of eight parts: neighbours depend on each
     other."""
     kept = np.array(samples[int(WARM_UP * len(samples)) :])
-    if len(kept) < 24:
+    if len(kept) < 16:
         return None
     means = np.array([part.mean(0) for part in np.array_split(kept, 8)])
     fit = linregress(means[:, 0], means[:, 1])

@@ -120,7 +120,7 @@ class PyroModel:
             raise InputError(f"window: {window} is not in 0 to {density.windows - 1}")
         if samples is not None and not isinstance(density, JerkDensity):
             raise InputError(f"samples: the form of {type(density).__name__} is not that of measured jerk")
-        index = torch.tensor([window], device=density.initial().device)
+        index = torch.tensor([window], device=getattr(density.prior, "device", None))
         self.density, self.samples = density.select(index), samples
         self.names = density.names
         self.sites = _sites(density.prior.select(index), density.names)
@@ -180,7 +180,7 @@ def nuts(
         of the draws diverged.
     """
     model = PyroModel(density, window=window, samples=samples)
-    alone = density.select(torch.tensor([window], device=density.initial().device))
+    alone = density.select(torch.tensor([window], device=getattr(density.prior, "device", None)))
     mode = find_mode(alone)
     how: dict[str, Any] = {"model": model} if statements or samples is not None else {"potential_fn": _potential(alone)}
     walked, diverged = [], 0

@@ -247,8 +247,9 @@ class _Place:
 
     def led_by(self, i: int) -> _Place:
         """The same with parameter ``i`` first."""
-        order = [i, *(j for j in range(len(self.order)) if j != i)]
-        return _Place(self.center[:, order], self.cov[:, order][:, :, order], self.reach[:, order], tuple(order))
+        order = (i, *(j for j in range(len(self.order)) if j != i))
+        by = torch.tensor(order, device=self.center.device)
+        return _Place(self.center[:, by], self.cov[:, by][:, :, by], self.reach[:, by], order)
 
     def x(self, nodes: int) -> Float[Tensor, "window d node"]:
         """Coordinates of the nodes of every axis, ``(window, axis, node)``."""
@@ -299,7 +300,7 @@ def _integrate(density: Density, place: _Place, nodes: int, reference: Float[Ten
     )  # the other axes' nodes in a slab, (count, d - 1)
     others = x[:, 1:].gather(-1, rest.T.expand(windows, -1, -1)).permute(2, 0, 1)  # (count, window, d - 1)
     even = (rest % 2 == 0).all(-1)
-    back = [place.order.index(j) for j in range(d)]
+    back = torch.tensor([place.order.index(j) for j in range(d)], device=x.device)
     slabs = max(1, min(nodes, BLOCK // (count * windows)))
     weights, coarse = [], []
     mean, square = torch.zeros_like(place.center), torch.zeros_like(place.cov)

@@ -186,7 +186,12 @@ def test_the_emulated_device_finds_a_tensor_made_without_a_device(elsewhere: Oth
     assert (x + torch.tensor(1.0)).tolist() == [2.0] * 3
 
 
-@pytest.mark.parametrize("name", DENSITIES)
+QUICK = ("jerk, switch", "points", "position lag")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in DENSITIES]
+)
 def test_densities_and_modes(name: str, elsewhere: OtherDevice) -> None:
     here, there = DENSITIES[name]("cpu"), DENSITIES[name](ELSEWHERE)
     z = here.initial() + 0.1
@@ -208,10 +213,10 @@ def test_densities_and_modes(name: str, elsewhere: OtherDevice) -> None:
     ("name", "noise"),
     [
         ("jerk, switch", "averaged"),
-        ("points", "independent"),
-        ("margin", "averaged"),
-        ("own", "averaged"),
-        ("position lag", "averaged"),
+        pytest.param("points", "independent", marks=pytest.mark.slow),
+        pytest.param("margin", "averaged", marks=pytest.mark.slow),
+        pytest.param("own", "averaged", marks=pytest.mark.slow),
+        pytest.param("position lag", "averaged", marks=pytest.mark.slow),
     ],
 )
 def test_sampled(name: str, noise: Any, elsewhere: OtherDevice) -> None:
@@ -228,6 +233,7 @@ def test_sampled(name: str, noise: Any, elsewhere: OtherDevice) -> None:
     assert_alike(found.summary().columns, expected.summary().columns, 1e-6)
 
 
+@pytest.mark.slow
 def test_sampled_in_minibatches_with_spread_and_a_schedule(elsewhere: OtherDevice) -> None:
     settings = SamplerSettings(
         chains=16, draws=4, batch=50, spread=1.0, step=0.3, attempts=1,
@@ -276,6 +282,7 @@ def test_optimizers_resume_there(optimizer: Any, elsewhere: OtherDevice) -> None
     assert theta.tolist() == copy.tolist()
 
 
+@pytest.mark.slow
 def test_integrated_conjugate_and_importance(elsewhere: OtherDevice) -> None:
     here, there = jerk_density("cpu", "quadrant"), jerk_density(ELSEWHERE, "quadrant")
     expected, found = integrate(here, nodes=15), integrate(there, nodes=15)
@@ -289,20 +296,27 @@ def test_integrated_conjugate_and_importance(elsewhere: OtherDevice) -> None:
     assert drawn.equal(10, g[1]).device == ELSEWHERE
 
 
-@pytest.mark.parametrize("form", ["jerk", "latent"])
-@pytest.mark.parametrize("estimator", ESTIMATORS)
+# the latent density's own parts are tested above: a stream of it by its graph takes a minute
+@pytest.mark.parametrize(
+    ("estimator", "form"),
+    [
+        pytest.param(name, form, marks=() if (name, form) == ("map", "jerk") else pytest.mark.slow)
+        for name in ESTIMATORS
+        for form in (("jerk", "latent") if name in ("ekf", "ukf") else ("jerk",))
+    ],
+)
 def test_streams_go_on_from_states_of_another_device(estimator: str, form: str, elsewhere: OtherDevice) -> None:
     """Two windows there, of which the second begins from the state of a stream here; and back."""
-    if form == "latent" and estimator in ("rls", "sgld", "map", "importance"):
-        pytest.skip("rls has no latent form; the others are a minute of its graph, and their parts are tested above")
     time, columns = rows(count=401)
+    step = 4 if estimator in ("ekf", "ukf") else 1  # a filter works row by row
+    time, columns = time[::step], {name: x[:, ::step] for name, x in columns.items()}
     options: dict[str, Any] = {"window": 2.0, "vehicles": 2, "estimator": estimator}
     if form == "latent":
         options["form"] = LatentForm(accel=True, speed=True)
     if estimator == "sgld":
         options["settings"] = EAGER
     here, there = BeliefStream(**options), BeliefStream(**options, device=ELSEWHERE)
-    half = 201
+    half = 200 // step + 1
 
     def part(stream: BeliefStream, which: slice, device: Any) -> Any:
         block = {name: x[:, which].to(device) for name, x in columns.items() if name in stream.form.columns}
@@ -320,6 +334,7 @@ def test_streams_go_on_from_states_of_another_device(estimator: str, form: str, 
     assert_alike(second[1].summary().columns, second[0].summary().columns, 1e-3)
 
 
+@pytest.mark.slow
 def test_excitation_of_latent_windows(elsewhere: OtherDevice) -> None:
     time, columns = rows(count=200)
     form = LatentForm(accel=True, speed=True)
@@ -330,6 +345,7 @@ def test_excitation_of_latent_windows(elsewhere: OtherDevice) -> None:
     assert found.excited.tolist() == expected.excited.tolist()
 
 
+@pytest.mark.slow
 def test_what_leaves_for_other_libraries_is_on_the_processor(elsewhere: OtherDevice) -> None:
     pytest.importorskip("pandas")
     pytest.importorskip("arviz")
@@ -396,6 +412,7 @@ def test_on_a_gpu_quadrature_is_the_same() -> None:
     same(integrate(jerk_density("cuda"), nodes=25).mean, integrate(jerk_density("cpu"), nodes=25).mean, 1e-4)
 
 
+@pytest.mark.slow
 def test_estimate_takes_a_device(elsewhere: OtherDevice, tmp_path: Any) -> None:
     from avtorch import GLVDPlant, Leader, simulate
 

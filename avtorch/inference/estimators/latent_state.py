@@ -27,7 +27,12 @@ class LatentState:
     """
 
     def __init__(
-        self, measured: tuple[str, ...], noise: Mapping[str, float], drift: float, vehicles: int, device: torch.device
+        self,
+        measured: tuple[str, ...],
+        noise: Mapping[str, float],
+        drift: float,
+        vehicles: int,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.measured, self.drift = measured, drift
         self._noise = {name: torch.tensor(value, dtype=torch.float64, device=device) for name, value in noise.items()}
