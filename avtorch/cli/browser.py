@@ -18,5 +18,6 @@ Open = Annotated[bool, Parameter(name="--open", negative=(), group=OUTPUT, help=
 
 def show(page: Path, talk: Talk) -> None:
     """Open `page`, or say where it is: a machine without a screen has no browser."""
-    if not webbrowser.open(page.resolve().as_uri()):
+    # absolute, not resolved: the link stays when the next answer replaces the folder that it points to
+    if not webbrowser.open(page.absolute().as_uri()):
         talk.line(f"No browser was found to open {page}")
