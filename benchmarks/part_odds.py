@@ -16,6 +16,7 @@ import subprocess
 from collections import Counter
 from collections.abc import Sequence
 from datetime import date
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
 
@@ -31,7 +32,8 @@ from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.forward_selection import select
 from avtorch.gap.budget.held_out_evidence import Evidence
 from avtorch.gap.budget.part_odds import PATH, SCHEMA, PartOdds, by_agreement, figures
-from avtorch.gap.budget.share_order import energies, largest_first
+from avtorch.gap.budget.selection_step import complexity
+from avtorch.gap.budget.share_order import energies, largest_first, own_response
 from avtorch.gap.simulator.effect_choice import chosen_effects
 from avtorch.io import write_json
 
@@ -65,8 +67,10 @@ def case_figures(index: int, seed: int, recorder: Recording, signals: Sequence[s
                 "nats": step.evidence.nats,
                 "errors": step.evidence.errors,
                 "freedom": step.evidence.freedom,
+                "parameters": complexity(step.fit) - complexity(before.fit),
+                "response": own_response(selection.last, str(step.entered)),
             }
-            for step in selection.steps[1:]
+            for before, step in pairwise(selection.steps)
         ],
     }
 
@@ -92,12 +96,12 @@ def kept(folder: Path) -> list[dict[str, Any]]:
 def table(
     cases: Sequence[dict[str, Any]],
 ) -> tuple[FloatArray, FloatArray, BoolArray, IntArray, FloatArray, FloatArray]:
-    """Of all parts: figures (part, 3), log effects tried, whether there, its case, `by_agreement`, Student's law."""
+    """Of all parts: figures (part, 4), log effects tried, whether there, its case, `by_agreement`, Student's law."""
     rows, tried, there, of, agreed, strict = [], [], [], [], [], []
     for number, case in enumerate(cases):
         for part in case["parts"]:
             evidence = Evidence(part["nats"], part["errors"], part["freedom"])
-            rows.append(figures(evidence, len(case["signals"])))
+            rows.append(figures(evidence, part["response"], len(case["signals"])))
             there.append(part["there"])
             of.append(number)
             tried.append(np.log(case["tried"]))
@@ -107,13 +111,14 @@ def table(
 
 
 def fit(rows: FloatArray, tried: FloatArray, there: BoolArray, empty: float = 0.5) -> PartOdds:
-    """The weights that make `there` likeliest; `empty` as it is."""
+    """The weights that make `there` likeliest, none of which says that more evidence is less; `empty` as it is."""
     sign = np.where(there, 1.0, -1.0)
 
     def cost(w: FloatArray) -> float:
         return float(-log_expit(sign * (rows @ w - tried)).sum() + 0.5 * _RIDGE * (w[1:] ** 2).sum())
 
-    best = minimize(cost, np.zeros(rows.shape[1]), method="BFGS").x
+    bounds = [(None, None), *[(0.0, None)] * (rows.shape[1] - 1)]
+    best = minimize(cost, np.zeros(rows.shape[1]), method="L-BFGS-B", bounds=bounds).x
     return PartOdds(*(float(f"{w:.{_DIGITS}g}") for w in [*best, empty]))
 
 

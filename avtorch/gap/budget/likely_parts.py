@@ -8,7 +8,7 @@ from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.budget.parts import LIKELY, MATERIAL
 from avtorch.gap.budget.redundancy import without_the_redundant
 from avtorch.gap.budget.selection_step import Selection, Step, one_by_one, without_effects
-from avtorch.gap.budget.share_order import largest_first
+from avtorch.gap.budget.share_order import largest_first, own_response
 
 
 def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int = 0) -> Selection:
@@ -28,10 +28,12 @@ def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int 
 
 def probabilities(selection: Selection) -> dict[str, float]:
     """That each effect is there, by name."""
-    odds, channels = PartOdds.read(), len(selection.fitting.whitening.record.channels)
+    odds, channels, last = PartOdds.read(), len(selection.fitting.whitening.record.channels), selection.last
     return {
-        str(s.entered): odds.probability(s.evidence, channels=channels, tried=selection.tried)
-        for s in selection.steps[1:]
+        name: odds.probability(
+            step.evidence, response=own_response(last, name), channels=channels, tried=selection.tried
+        )
+        for name, step in ((str(step.entered), step) for step in selection.steps[1:])
     }
 
 

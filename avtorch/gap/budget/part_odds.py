@@ -27,6 +27,7 @@ from avtorch.gap.budget.held_out_evidence import MUCH, Evidence
 SCHEMA = "avtorch.part-odds/1"
 PATH = Path(__file__).with_name("part_odds.json")
 _LEAST_NATS, _LEAST_ERRORS = 0.5, 0.1  # below which there is no evidence
+_RESPONSES = (0.01, 0.5)  # beyond which a smaller or larger response says no more
 _SUREST = 0.9995  # no frequency on some hundred simulated drives supports more
 
 
@@ -40,6 +41,7 @@ class PartOdds:
     constant: float
     nats: float
     errors: float
+    response: float
     empty: float
 
     @classmethod
@@ -54,19 +56,22 @@ class PartOdds:
 
     @property
     def weights(self) -> FloatArray:
-        """In the order of `figures` (3,)."""
-        return np.array([self.constant, self.nats, self.errors])
+        """In the order of `figures` (4,)."""
+        return np.array([self.constant, self.nats, self.errors, self.response])
 
-    def probability(self, evidence: Evidence, *, channels: int, tried: int) -> float:
-        """That the effect is there, the best of as many as were `tried`, on drives with so many `channels`."""
-        odds = figures(evidence, channels) @ self.weights - np.log(max(tried, 1))
+    def probability(self, evidence: Evidence, *, response: float, channels: int, tried: int) -> float:
+        """That the effect is there, the best of as many as were `tried`, on drives with so many `channels`.
+
+        `response`: the share of the response that is its own.
+        """
+        odds = figures(evidence, response, channels) @ self.weights - np.log(max(tried, 1))
         return float(np.clip(min(expit(odds), by_agreement(evidence, tried)), 1 - _SUREST, _SUREST))
 
 
-def figures(evidence: Evidence, channels: int) -> FloatArray:
-    """What the log odds are linear in (3,), the constant first. Each channel adds to the nats of wrong effects too."""
-    nats = max(evidence.nats / channels, _LEAST_NATS)
-    return np.array([1.0, np.log(nats), np.log(max(evidence.errors, _LEAST_ERRORS))])
+def figures(evidence: Evidence, response: float, channels: int) -> FloatArray:
+    """What the log odds are linear in (4,), the constant first. Each channel adds to the nats of wrong effects too."""
+    nats, own = max(evidence.nats / channels, _LEAST_NATS), float(np.clip(response, *_RESPONSES))
+    return np.array([1.0, np.log(nats), np.log(max(evidence.errors, _LEAST_ERRORS)), np.log(own)])
 
 
 def by_agreement(evidence: Evidence, tried: int) -> float:

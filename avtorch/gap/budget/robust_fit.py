@@ -60,6 +60,11 @@ class HeldOut:
     z: FloatArray
     white: FloatArray
 
+    @property
+    def prior(self) -> float:
+        """What the coordinates cost by their prior [nats], mean of the folds: a value that no car has pays for it."""
+        return 0.5 * float((self.z**2).sum(-1).mean())
+
 
 @dataclass(frozen=True, eq=False)
 class RobustFit:
@@ -182,7 +187,7 @@ class RobustFit:
 
     def _evidence(self, before: HeldOut, after: HeldOut, score: FloatArray, change: FloatArray) -> Evidence:
         errors, freedom = agreement(score, self._by_block(before, change**2))
-        return Evidence(float((before.nats - after.nats).sum()), errors, freedom)
+        return Evidence(float((before.nats - after.nats).sum()) + before.prior - after.prior, errors, freedom)
 
     def _by_block(self, held: HeldOut, products: FloatArray) -> FloatArray:
         """Sums (block,) of `products` (channel, counted), weighed by Student's law."""

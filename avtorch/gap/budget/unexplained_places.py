@@ -45,17 +45,17 @@ def placed(rest: Unexplained, selection: Selection, *, epoch_s: float = 0.0) -> 
         return rest
     white = fitting.whitening(residuals)
     gain = float((fitting.nats(white) - fitting.nats(white - fitting.whitening(predicted))).sum())
-    where = _places(selection, white, predicted, epoch_s)
+    where = _places(selection, residuals, predicted, epoch_s)
     return replace(rest, where=where, resembles=_resembling(selection, gain))
 
 
-def _places(selection: Selection, white: FloatArray, predicted: FloatArray, epoch_s: float) -> tuple[Location, ...]:
+def _places(selection: Selection, residuals: FloatArray, predicted: FloatArray, epoch_s: float) -> tuple[Location, ...]:
     fitting, fit = selection.fitting, selection.last.fit
     record, whitening = fitting.whitening.record, fitting.whitening
-    found = whitening(predicted)
+    white, found = whitening(residuals), whitening(predicted)
     score, size = white * found, found**2
-    does = np.zeros(record.rows)
-    does[whitening.order] = size.sum(0)
+    # not whitened: white residuals hold little but what is quick, and a place is of what a rollout shows
+    does = ((predicted / residuals[:, record.counts].std(-1)[:, None]) ** 2).sum(0) * record.counts
     lag = float(fit.model.values(fit.z)["T_L"])
     axes: list[tuple[Axis, FloatArray]] = [("command", lowpass(record.command, lag, record.dt))]
     if record.has_speed:
@@ -70,7 +70,7 @@ def _places(selection: Selection, white: FloatArray, predicted: FloatArray, epoc
             continue
         rows = inside[whitening.order]
         errors, freedom = agreement(whitening.by_block(score * rows), whitening.by_block(size * rows))
-        share = float((size * rows).sum() / size.sum())
+        share = float(does[inside].sum() / does.sum())
         shift = epoch_s if axis == "time" else 0.0
         parts.append(Location(axis, low + shift, high + shift, share, float(stdtr(freedom, -errors))))
     if not parts:

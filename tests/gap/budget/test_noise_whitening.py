@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from avtorch.blindtest import draw_case
+from avtorch.gap import gap_budget
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.noise_whitening import BAND_HZ, NoiseWhitening
+from avtorch.gap.budget.noise_whitening import NoiseWhitening
 from tests.bars import BAR
 from tests.gap.budget.cars import log_of
 
@@ -19,7 +21,7 @@ def test_what_an_autoregression_leaves_is_white_and_of_size_one(rotating_seed: i
     record = AnalysisRecord.of([log_of(seconds=400.0)])
     rng = np.random.default_rng(rotating_seed)
     noise = np.asarray(lfilter([1.0], [1.0, -1.4, 0.7], rng.normal(0.0, 0.3, (2, record.rows)), axis=-1))
-    whitening = NoiseWhitening.autoregressive(record, noise, band_hz=0.5 / record.dt)
+    whitening = NoiseWhitening.autoregressive(record, noise)
     white = whitening(noise)
     n = white.shape[-1]
     # the SD's own error, and that of twenty more coefficients than there are
@@ -29,19 +31,24 @@ def test_what_an_autoregression_leaves_is_white_and_of_size_one(rotating_seed: i
     assert np.abs(correlation).max() < BAR / np.sqrt(n)
 
 
-def test_what_is_above_the_band_is_not_compared_and_rows_count_as_what_they_say() -> None:
-    record = AnalysisRecord.of([log_of(seconds=200.0)])
-    noise = np.random.default_rng(0).normal(0.0, 0.3, (2, record.rows))
-    in_band, whole = (NoiseWhitening.autoregressive(record, noise, band_hz=hz) for hz in (BAND_HZ, 0.5 / record.dt))
-    frequency = np.fft.rfftfreq(4096, record.dt)
-    passed = np.abs(np.fft.rfft(in_band.taps, 4096) / np.fft.rfft(whole.taps, 4096)) ** 2
-    # a filter of one period of the band's edge: half the amplitude there, a tenth at twice the edge
-    assert (passed[:, frequency < 0.5 * BAND_HZ] > 0.6).all()
-    assert (passed[:, frequency > 2 * BAND_HZ] < 0.02).all()
-    # flat noise through it has as many independent values as this; no row may count for more
-    independent = passed.mean(-1) ** 2 / (passed**2).mean(-1)
-    assert (in_band.share <= independent).all()
-    assert (in_band.share > 0.7 * independent).all()
+def test_a_bias_that_sets_in_is_no_noise() -> None:
+    # taken for noise that wanders, a step of the reading hid itself
+    log = log_of(seconds=300.0)
+    assert log.accel is not None
+    stepped = replace(log, accel=log.accel + np.where(log.time > 170.0, 0.75, 0.0))
+    (part,) = gap_budget(stepped, effects=["sensor_bias"]).parts
+    assert part.onset_s == pytest.approx(170.0, abs=12.5)  # a block
+
+
+def test_a_loop_that_feeds_noise_back_has_no_dead_time() -> None:
+    # behind a low-pass this car without a cause had a dead time of 0.3 s, and a lag of 0.07 s
+    case = draw_case(35, 555, mix={"none": 1.0}, recorder="ordinary", seconds=150.0)
+    assert case.drive.manoeuvre == "following"
+    budget = gap_budget(case.log(), effects=["dead_time"])
+    assert budget.names == ()
+    lag = budget.repaired["T_L"]
+    # three standard errors, and 5 % for what the recorder's own low-pass adds
+    assert abs(lag.mean - case.truth()["baseline"]["T_L"]) < 3 * lag.sd + 0.05 * lag.mean
 
 
 def test_a_stretch_knows_nothing_of_the_one_before() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -96,3 +98,15 @@ def test_every_row_is_predicted_by_a_model_that_did_not_see_it() -> None:
     scored = whitening.spread(fitting.fold.astype(float))
     assert np.array_equal(row_fold[whitening.order], scored)
     assert set(row_fold[~np.isin(record.block, whitening.numbers)]) == {-1}
+
+
+def test_a_value_that_no_car_has_pays_for_it() -> None:
+    record = AnalysisRecord.of([log_of([ConstantResistance(0.2)], seed=3)])
+    fitting = RobustFit(white_noise(record))
+    bare, model = EffectModel(record, plant()), EffectModel(record, plant(), (EFFECTS["constant_resistance"],))
+    before, after = (fitting.hold_out(fitting.fit(m, np.zeros((1, m.size)), iterations=40)) for m in (bare, model))
+    z = after.z.copy()
+    z[:, -1] += 2.0  # all folds, by two standard deviations of the prior
+    odd = replace(after, z=z)
+    paid = fitting.evidence(before, after).nats - fitting.evidence(before, odd).nats
+    assert paid == pytest.approx(0.5 * float((z[:, -1] ** 2 - after.z[:, -1] ** 2).mean()))

@@ -7,12 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from avtorch.gap import gap_budget
-from avtorch.gap.budget.share_order import taken_off
+from avtorch.gap import EFFECTS, gap_budget, plant
+from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.effect_model import EffectModel
+from avtorch.gap.budget.robust_fit import Fit, HeldOut
+from avtorch.gap.budget.selection_step import Step
+from avtorch.gap.budget.share_order import own_response, taken_off
 from avtorch.io import Log
+from tests.gap.budget.cars import log_of
 
 energies = st.lists(st.floats(0.0, 100.0), min_size=2, max_size=6)
 
@@ -31,6 +37,18 @@ def test_where_each_takes_less_than_the_one_before_it_nothing_is_shared() -> Non
 
 def test_an_effect_that_takes_nothing_has_no_share() -> None:
     assert one_draw([10.0, 1.0, 1.5]) == pytest.approx([9.0, 0.0])
+
+
+def test_an_effects_own_response_is_what_it_changes_all_else_equal() -> None:
+    record = AnalysisRecord.of([log_of()])
+    model = EffectModel(record, plant(), (EFFECTS["constant_resistance"], EFFECTS["sensor_scale"]))
+    scale = model.plant.parameters()["sensor_scale.scale"].unconstrain(torch.tensor(1.2, dtype=torch.float64))
+    z = model.coordinates({"sensor_scale.scale": np.array(float(scale))})
+    step = Step(
+        Fit(model, z, 0.0, np.zeros(record.blocks)), HeldOut(np.zeros(record.blocks), z[None], np.zeros((2, 1)))
+    )
+    # of the accelerometer's reading, the channel that it changes
+    assert own_response(step, "sensor_scale") == pytest.approx(0.2 / 1.2, rel=1e-6)
 
 
 @given(energies)
