@@ -7,24 +7,15 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
-from torch import Tensor
 
-from avtorch.inference import Posterior, Quadrature
-from avtorch.plots.chosen_windows import ChosenWindows, converged, place, relative_width
+from avtorch.plots.chosen_windows import ChosenWindows, converged, relative_width
 from avtorch.plots.posteriors import agreement_reach, agreement_scatter, joint_cloud, marginals
-from avtorch.plots.ranks import METHODS, ecdf_difference, pooled_rank_counts, rank_plot
+from avtorch.plots.ranks import METHODS, ecdf_difference, rank_plot
 from avtorch.plots.style import BLACK, short, styled
+from avtorch.plots.validation_ranks import POINTS, ecdfs_of, groups_of, ranks_of
 from avtorch.validation.agreement import MEAN_TOLERANCE, SD_TOLERANCE
-from avtorch.validation.diagnostics import sampling_diagnostics
-from avtorch.validation.uniformity import ecdf_band
 from avtorch.validation.validate import Validation
-
-#: Points of an ECDF of PIT values, and windows whose ECDF is drawn at most.
-POINTS, MOST = 100, 200
-#: Groups that SGLD's chains are joined into for the rank plots, and their bins.
-GROUPS, BINS = 4, 10
 
 _NARROW = 4.0  # inches
 
@@ -109,28 +100,17 @@ def joint_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
 def ranks_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
     """Ranks of groups of SGLD's chains, of NUTS and of exact draws in their common pool; a row a window."""
     found, names = chosen.validation, chosen.validation.names
-    groups = min(GROUPS, found.sgld.draws.shape[0])
-    rows = groups + 2
+    rows = groups_of(found) + 2
     figure, axes = _panels(
         len(chosen.windows), len(names), (_wide(names), 0.33 * rows + 0.6), beside=1.4, narrow=narrow
     )
-    reference = sampling_diagnostics(found.nuts) if len(found.nuts_index) else None
     for row, (window, line) in enumerate(zip(chosen.windows, axes, strict=True)):
-        for i, (name, ax) in enumerate(zip(names, line, strict=True)):
-            drawn = _grouped(found.sgld[name][..., window.number], groups)
-            compared = place(found.compared, window.number)
-            assert compared is not None
-            worth = {label: _ess(found.agreement.ess_bulk[compared, i]) / groups for label in drawn}
-            if window.nuts is not None and reference is not None:
-                drawn["NUTS"] = found.nuts[name][..., window.nuts].numpy()
-                worth["NUTS"] = _ess(reference.ess_bulk[window.nuts, i])
-            if chosen.exact is not None:
-                drawn["exact"] = chosen.exact[name][..., row].numpy()
-            rank_plot(ax, pooled_rank_counts(drawn, bins=BINS), effective=worth)
+        for name, counted, ax in zip(names, ranks_of(chosen, row), line, strict=True):
+            rank_plot(ax, counted.counts, effective=counted.effective)
             if row == len(axes) - 1 or narrow:
                 ax.set_xlabel(f"rank of {short(name)} [-]")
-            if i and not narrow:
-                ax.set_yticklabels([])
+        for ax in () if narrow else line[1:]:
+            ax.set_yticklabels([])
         line[0].set_title(window.title)
     _title(
         figure,
@@ -144,32 +124,23 @@ def ranks_figure(chosen: ChosenWindows, *, narrow: bool = False) -> Figure:
 @styled
 def ecdf_figure(validation: Validation, *, narrow: bool = False) -> Figure:
     """Exact probabilities below the draws: their ECDF less the uniform one, a line a window, for SGLD and for NUTS."""
-    exact, names = validation.quadrature, validation.names
-    assert exact is not None
-    arms = [("SGLD", validation.sgld, torch.arange(len(exact.mean)), validation.agreement.ess_bulk)]
-    if len(validation.nuts_index):
-        arms.append(("NUTS", validation.nuts, validation.nuts_index, sampling_diagnostics(validation.nuts).ess_bulk))
+    names, arms = validation.names, ecdfs_of(validation)
     figure, axes = _panels(len(arms), len(names), (_wide(names), 2.7), beside=0.5, sharey="row", narrow=narrow)
-    for line, (method, posterior, index, worth) in zip(axes, arms, strict=True):
-        sound = (posterior.converged & exact.converged[index]).nonzero().squeeze(-1)
-        taken = sound[torch.linspace(0, len(sound) - 1, min(MOST, len(sound))).long()]
-        curves = _pit_ecdf(posterior, exact, taken, index[taken])
+    for line, arm in zip(axes, arms, strict=True):
         reach = 0.0
         for i, (name, ax) in enumerate(zip(names, line, strict=True)):
-            bands = [_band(_ess(worth[w, i])) for w in taken]
-            inside = np.array([_inside(c, band) for c, band in zip(curves[i], bands, strict=True)], dtype=bool)
-            if len(taken):
-                middle = float(worth[taken, i].nanmedian())
-                ecdf_difference(ax, {}, _band(middle), label="95 % band at the median effective sample size")
+            inside, taken = arm.inside[i], len(arm.windows)
+            drawn = arm.less_uniform[i]
+            if taken:
+                ecdf_difference(ax, {}, arm.band[i], label="95 % band at the median effective sample size")
             at = np.linspace(0, 1, POINTS + 1)
-            drawn = np.pad(curves[i], ((0, 0), (1, 0))) - at
             for mask, look in (
-                (inside, {"linewidth": 0.7, "alpha": float(np.clip(12 / max(1, len(taken)), 0.15, 0.8))}),
+                (inside, {"linewidth": 0.7, "alpha": float(np.clip(12 / max(1, taken), 0.15, 0.8))}),
                 (~inside, {"linewidth": 1.0, "linestyle": "--"}),
             ):
-                ax.plot(at, drawn[mask].T, color=METHODS[method], zorder=2, **look)
+                ax.plot(at, drawn[mask].T, color=METHODS[arm.method], zorder=2, **look)
             reach = max([reach, ax.get_ylim()[1], 1.05 * float(np.abs(drawn).max(initial=0))])
-            ax.set_title(f"{method}, {short(name)}: {inside.sum()} of {len(taken)} inside")
+            ax.set_title(f"{arm.method}, {short(name)}: {inside.sum()} of {taken} inside")
         line[0].set_ylim(-reach, reach)
         line[0].set_ylabel("ECDF less uniform [-]")
     for ax in axes[-1]:
@@ -221,50 +192,6 @@ def agreement_figure(validation: Validation, *, narrow: bool = False) -> Figure:
     )
     _legend(figure, axes, where="outside lower center", narrow=narrow)
     return figure
-
-
-def _grouped(chains: Tensor, groups: int) -> dict[str, np.ndarray]:
-    """Draws ``(chain, draw)`` in groups of neighbouring chains, named by their first and last."""
-    named, first = {}, 1
-    for part in chains.tensor_split(groups):
-        last = first + len(part) - 1
-        named[f"SGLD {first}–{last}" if last > first else f"SGLD {first}"] = part.numpy()
-        first = last + 1
-    return named
-
-
-def _ess(value: Tensor) -> float:
-    """An effective sample size as a number: chains that stand still have none."""
-    return max(4.0, float(value)) if bool(value.isfinite()) else 4.0
-
-
-def _band(effective: float) -> tuple[np.ndarray, np.ndarray]:
-    """Simultaneous band of an ECDF at `POINTS` points; sizes are rounded by up to 5 %, so that few bands are made."""
-    rounded = int(np.exp(0.1 * np.round(10 * np.log(effective))))
-    low, high = ecdf_band(rounded, POINTS - 1)
-    return low.numpy(), high.numpy()
-
-
-def _inside(curve: np.ndarray, band: tuple[np.ndarray, np.ndarray]) -> bool:
-    return bool(((curve >= band[0] - 1e-12) & (curve <= band[1] + 1e-12)).all())
-
-
-def _pit_ecdf(posterior: Posterior, quadrature: Quadrature, own: Tensor, exact: Tensor) -> np.ndarray:
-    """ECDF of the exact probability below each draw, ``(parameter, window, POINTS)``.
-
-    ``own`` are the windows among those of the draws, ``exact`` the same among those of the quadrature.
-    """
-    share = torch.linspace(0, 1, 401, dtype=quadrature.nodes.dtype)
-    grid = torch.lerp(quadrature.nodes[..., :1], quadrature.nodes[..., -1:], share).exp()
-    below = quadrature.cdf(grid.movedim(-1, 0)).movedim(0, -1)[exact].clamp(0, 1).numpy()
-    levels = np.arange(1, POINTS) / POINTS
-    # between nodes a thirtieth of an SD apart a straight line is off by less than 1e-4
-    pairs = zip(below.reshape(-1, 401), grid[exact].reshape(-1, 401).numpy(), strict=True)
-    edges = torch.from_numpy(np.array([np.interp(levels, *pair) for pair in pairs]))
-    edges = edges.reshape(*below.shape[:2], POINTS - 1)
-    drawn = posterior.flat[:, own].permute(1, 2, 0).contiguous()
-    found = torch.searchsorted(drawn.sort(-1).values, edges, right=True) / drawn.shape[-1]
-    return torch.cat([found, torch.ones_like(found[..., :1])], -1).transpose(0, 1).numpy()
 
 
 def _wide(names: tuple[str, ...]) -> float:

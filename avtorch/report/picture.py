@@ -48,6 +48,9 @@ _COLOURS = {
     "#DCDCDC": "p-fill",
     "#BBBBBB": "p-bar",
     "#DDDDDD": "p-fill",
+    "#D5D5D5": "p-fill",  # a band of ranks
+    "#DADADA": "p-fill",  # an exact density
+    "#555555": "soft",  # its outline
     "#E6E6E6": "p-grid",
 }
 """Colours of the drawings by the style's name for them."""

@@ -13,6 +13,7 @@ from avtorch.report.answer_page import AnswerPage, Section, answer_html, written
 from avtorch.report.origin import Origin
 from avtorch.report.picture import Picture, picture_of
 from avtorch.report.table import Table
+from avtorch.report.validation_tables import tables_behind
 from avtorch.results import validation_answer
 
 if TYPE_CHECKING:
@@ -79,8 +80,14 @@ def write_validation_page(found: Validation, folder: str | PathLike[str], *, ori
 
 def _pictures(found: Validation) -> dict[str, Picture]:
     by_width = {narrow: validation_figures(found, narrow=narrow) for narrow in (False, True)}
+    tables = tables_behind(found)
     return {
-        name: picture_of(name, lambda narrow, name=name: by_width[narrow][f"{name}.png"](), _SAYS[name])
+        name: picture_of(
+            name,
+            lambda narrow, name=name: by_width[narrow][f"{name}.png"](),
+            _SAYS[name],
+            tables[name],
+        )
         for name in _TITLES
         if f"{name}.png" in by_width[False]
     }

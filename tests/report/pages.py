@@ -15,9 +15,11 @@ from avtorch.gap.change.change_cause import ChangeCause, ChangePart
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import Change, Comparison
 from avtorch.gap.result.log_facts import LogFacts
-from avtorch.report import Origin, comparison_html, estimates_html, run_html
+from avtorch.inference import SamplerSettings
+from avtorch.report import Origin, comparison_html, estimates_html, run_html, validation_html
 from avtorch.report.run_page import Regions
 from avtorch.results import estimates_answer
+from avtorch.validation import NutsSettings, synthetic_windows, validate
 from tests.report.conftest import HOSTILE
 
 ORIGIN = Origin("avtorch estimate lap.csv", {"lap.csv": "0" * 64}, "1" * 64)
@@ -134,9 +136,16 @@ def simulators() -> str:
     return comparison_html(found, notes=["900 rows"], origin=ORIGIN)
 
 
+def validation() -> str:
+    """Of two windows, one of which NUTS was run on."""
+    quick: Any = {"settings": SamplerSettings(chains=64), "nuts": NutsSettings(1, 20, 10), "nuts_windows": 1}
+    return validation_html(validate(replace(synthetic_windows(2, seed=1), name=HOSTILE), **quick), origin=ORIGIN)
+
+
 PAGES: Mapping[str, Callable[[], str]] = {
     "estimates": estimates,
     "run": run,
     "comparison": comparison,
     "simulators": simulators,
+    "validation": validation,
 }

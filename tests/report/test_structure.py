@@ -13,11 +13,15 @@ from avtorch.report import report_html
 from tests.report.pages import PAGES
 from tests.report.tree import Element, read
 
-PICTURES = {"diagnosis": 7, "estimates": 2, "run": 3, "comparison": 1, "simulators": 1}
+PICTURES = {"diagnosis": 7, "estimates": 2, "run": 3, "comparison": 1, "simulators": 1, "validation": 5}
 """Of each page, by its name."""
+SLOW = {"validation"}
+"""Its draws take seconds."""
 
 
-@pytest.fixture(scope="module", params=PICTURES)
+@pytest.fixture(
+    scope="module", params=[pytest.param(page, marks=[pytest.mark.slow] * (page in SLOW)) for page in PICTURES]
+)
 def name(request: pytest.FixtureRequest) -> str:
     return request.param
 
@@ -93,27 +97,33 @@ def test_ids_are_unique_and_every_reference_is_met(text: str, page: Element) -> 
     assert set(re.findall(r'(?:href="|url\()#([^")]+)', text)) <= set(ids)
 
 
-def test_it_requests_nothing(page: Element) -> None:
-    """No element that loads, no address in an attribute or a style but the page's own ids."""
-    assert not list(page.all("link", "img", "iframe", "object", "embed", "image", "video", "audio"))
+def test_it_requests_nothing(name: str, page: Element) -> None:
+    """No element that loads, no address in an attribute or a style but the page's own ids; clouds are within it."""
+    assert not list(page.all("link", "img", "iframe", "object", "embed", "video", "audio"))
+    clouds = list(page.all("image"))
+    assert bool(clouds) == (name == "validation")
     scripts = list(page.all("script"))
     lines = any("data-curves" in svg.attributes for svg in page.all("svg"))
     assert [script.attributes for script in scripts] == [{}] * lines, (
         "the page's own, within it, where it has lines to read"
     )
     for element in page.all():
-        for name, value in element.attributes.items():
-            if not name.startswith("xmlns"):
-                assert "//" not in value, (element.tag, name)
-            if name in ("src", "href", "xlink:href"):
+        for attribute, value in element.attributes.items():
+            if element.tag == "image" and attribute == "xlink:href":
+                assert re.fullmatch(r"data:image/png;base64,[A-Za-z0-9+/=\s]+", value)
+                continue
+            if not attribute.startswith("xmlns"):
+                assert "//" not in value, (element.tag, attribute)
+            if attribute in ("src", "href", "xlink:href"):
                 assert value.startswith("#")
             assert not re.search(r"url\((?!#)", value)
     (style,) = page.all("style")
     assert not re.search(r"url\(|@import", style.text())
     policy = next(x for x in page.all("meta") if x.attributes.get("http-equiv") == "Content-Security-Policy")
     digests = [base64.b64encode(hashlib.sha256(script.words[0].encode()).digest()).decode() for script in scripts]
+    images = "; img-src data:" if clouds else ""
     own = "".join(f"; script-src 'sha256-{digest}'" for digest in digests)
-    assert policy.attributes["content"] == f"default-src 'none'; style-src 'unsafe-inline'{own}"
+    assert policy.attributes["content"] == f"default-src 'none'; style-src 'unsafe-inline'{images}{own}"
 
 
 def test_a_hostile_name_is_text(name: str, text: str) -> None:
