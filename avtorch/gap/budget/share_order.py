@@ -26,7 +26,7 @@ from avtorch.gap.budget.rollout_energy import (
 )
 from avtorch.gap.budget.selection_step import Selection, Step, without_effects
 
-_OF_THE_RESPONSE = 2.0  # times as large a share of the response, which counts beside the gap
+_OF_THE_RESPONSE = 3.0  # times as large a share of the response, which counts beside the gap
 _LEAST_GAP = 0.1  # of the floor's energy, that there is a gap
 _DRAWS = 2000
 
@@ -35,9 +35,9 @@ def largest_first(selection: Selection, material: float = MATERIAL, *, seed: int
     """The selection's effects in the order of what each takes off the energy on top of those before it.
 
     One without which the others leave no more than `material` of the energy is left out: a delay of ten milliseconds
-    may be certain, and is no part of a gap. Unless twice as much of the response is its own: slow noise, and beside it
-    a large force, may leave little else to see in errors of rollouts, and a lag that is fitted anew hides most of a
-    dead time, which a controller feels all the same. With `material` 0 none is left out.
+    may be certain, and is no part of a gap. Unless three times as much of the response is its own: slow noise, and
+    beside it a large force, may leave little else to see in errors of rollouts, and a lag that is fitted anew hides
+    most of a dead time, which a controller feels all the same. With `material` 0 none is left out.
     """
     bare = selection.steps[0]
     entered = {str(s.entered): s for s in selection.steps[1:]}
