@@ -4,6 +4,7 @@ a straight line along an axis."""
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 
 _MARKERS = re.compile(r"<g([^>]*)>\n?((?:<use [^>]*/>\n){2,})</g>")
 _KEPT = re.compile(r"panel-|line-\d+-")
@@ -23,9 +24,13 @@ def compact(text: str) -> str:
     text = re.sub(r' transform="rotate\(-?0 [^"]*\)"', "", text)
     text = re.sub(r'\bd="([^"]*)"', lambda m: f'd="{_path(m[1])}"', text)
     text = re.sub(r'\b(?:transform|x|y|width|height)="[^"]*"', _rounded, text)
-    met = set(re.findall(r'(?:url\(#|href="#)([^")]+)', text))
+    # what is drawn by a name gets a short one, after the picture's
+    met = {name: i for i, name in enumerate(dict.fromkeys(re.findall(r'(?:url\(#|href="#)([^")]+)', text)))}
+    text = re.sub(r'(url\(#|href="#)([^")]+)', lambda m: m[1] + _short(m[2], met), text)
     text = re.sub(r' id="([^"]*)"', lambda m: _named(m[1], met), text)
-    text = re.sub(r'\bstyle="([^"]*)"', lambda m: f'style="{_style(m[1])}"', text)
+    text = re.sub(r' style="([^"]*)"', lambda m: _style(m[1]), text)
+    # a mark of an axis has its style where it is defined
+    text = re.sub(r'(<use [^>]*?) style="fill:var\(--p-grey\);stroke:var\(--p-grey\);stroke-width:0.8"', r"\1", text)
     text = _MARKERS.sub(_shared, re.sub(r"\n\s*", "\n", text))
     text = text.replace("<g>\n", "<g>").replace("\n</g>", "</g>")
     # a browser would give the space between two letters a size of its own
@@ -109,16 +114,26 @@ def _rounded_text(text: str) -> str:
     return re.sub(r"-?\d+\.\d{3,}", lambda m: f"{float(m[0]):.2f}".rstrip("0").rstrip("."), text)
 
 
-def _named(name: str, met: set[str]) -> str:
+def _short(name: str, met: Mapping[str, int]) -> str:
+    return f"{name.rpartition('-')[0]}-{met[name]}"
+
+
+def _named(name: str, met: Mapping[str, int]) -> str:
     """An id that is needed, or a class in its place, or nothing."""
-    if name in met or _KEPT.search(name):
+    if name in met:
+        return f' id="{_short(name, met)}"'
+    if _KEPT.search(name):
         return f' id="{name}"'
     tick = re.search(r"(?:^|-)([xy]tick)_\d+$", name)
     return f' class="{tick[1]}"' if tick else ""
 
 
 def _style(style: str) -> str:
-    # which font, the page's style says; the short form does not hold without one
+    """The attribute without what the page's style says of all pictures: the letters, 10 points high, and the ends."""
+    style = re.sub(r"font: (\d[\d.]*px) [^;]*", r"font-size: \1", style)
+    # the short form of a bold or slanted letter does not hold without a font
     style = re.sub(r"(font: [^;]*?px )[^;]*", r"\g<1>DejaVu Sans, Verdana, sans-serif", style)
-    style = re.sub(r" ?font-family: [^;]*;?", "", style)
-    return re.sub(r"([:;,]) ", r"\1", style)
+    style = re.sub(r"font-family: [^;]*;? ?|font-size: 10px(?:;|$) ?", "", style)
+    style = re.sub(r"; stroke-linecap: round|stroke-linejoin: miter;? ?", "", style)
+    style = re.sub(r"([:;,]) ", r"\1", style).strip("; ")
+    return f' style="{style}"' if style else ""

@@ -128,9 +128,10 @@ function plotOf(svg, runs, finer) {
 function explore(figure, svgs) {
   const finer = JSON.parse(svgs[0].dataset.curves);
   const plots = svgs.map(svg => plotOf(svg, finer.runs, finer));
-  const first = plots[0].panels[0], [x0, x1] = first.x01, fixed = Boolean(first.log[0]);
+  const first = plots[0].panels[0], [x0, x1] = first.x01, log = Boolean(first.log[0]);
+  const fixed = !/^time(,| \[|$)/.test(first.along);
   const [, quantity, unit] = first.along.match(/^(.*?)(?: \[(.*)\])?$/);
-  const back = x => fixed ? 10 ** x : x;
+  const back = x => log ? 10 ** x : x;
   let view = [x0, x1], cursor = null, began = null;
   const [tools, readout] = ["div", "p"].map(tag => {
     const element = document.createElement(tag);
@@ -165,7 +166,7 @@ function explore(figure, svgs) {
     const several = new Set(parts.map(p => p[3])).size > 1;
     const said = parts.map(([label, value, of, name], i) => (several && name !== label && (!i || parts[i - 1][3] !== name) ? `${name}: ` : "") +
       `${label} ${value}${of && of !== "-" ? " " + of : ""}`).join(", ");
-    const text = `${fixed ? at.toPrecision(3) : at.toFixed(digits(view[1] - view[0]))} ${unit || ""}: ${said || "no line here"}`;
+    const text = `${log ? at.toPrecision(3) : at.toFixed(digits(view[1] - view[0]))} ${unit || ""}: ${said || "no line here"}`;
     readout.textContent = text;
     slider.value = (cursor - view[0]) / (view[1] - view[0]) * SLIDES;
     slider.setAttribute("aria-valuetext", text);

@@ -14,8 +14,10 @@ from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.io import atomic
 from avtorch.report.entries import budget_table, measure_table, percent, place_table, setting_table
 from avtorch.report.house import page_of
+from avtorch.report.manoeuvre_pictures import manoeuvre_pictures
 from avtorch.report.origin import Origin
 from avtorch.report.pictures import pictures
+from avtorch.report.residual_section import residual_section
 
 
 def report_html(
@@ -72,6 +74,8 @@ def report_html(
         notes=list(found.notes),
         quality=list(quality),
         pictures=pictures(found, experiment),
+        left=residual_section(found),
+        each_manoeuvre=manoeuvre_pictures(found),
     )
 
 

@@ -61,8 +61,9 @@ _VARIABLES = {colour.lower(): f"var(--{name})" for colour, name in _COLOURS.item
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture as `wide` and `narrow` SVG, for a desk and for a phone; `says`: what it shows, in words; `caption`;
-    `tables`: its numbers, shown at once where `opened`.
+    """A picture as `wide` and `narrow` SVG, for a desk and for a phone; `narrow` is empty where one serves both.
+
+    `says`: what it shows, in words; `caption`; `tables`: its numbers, shown at once where `opened`.
 
     Example:
         >>> from markupsafe import Markup
@@ -102,6 +103,18 @@ def picture_of(
     return Picture(wide, narrow, says, caption, tables, opened)
 
 
+def small_picture(name: str, figure: Figure, says: str, *tables: Table, caption: str = "") -> Picture:
+    """A figure as wide as a phone, beside another on a desk.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> from avtorch.report.picture import small_picture
+        >>> small_picture("empty", Figure(figsize=(1, 1)), "Nothing.").narrow
+        Markup('')
+    """
+    return Picture(inline_svg(name, figure, says), Markup(""), says, caption, tables)
+
+
 def inline_svg(name: str, figure: Figure, says: str, rows: Rows | None = None) -> Markup:
     """A figure as SVG for the page: text as text, no date, equal for equal figures.
 
@@ -133,7 +146,11 @@ def inline_svg(name: str, figure: Figure, says: str, rows: Rows | None = None) -
     text = re.sub(r"((?:fill|stroke): )(#[0-9a-f]{6})", lambda m: m[1] + _VARIABLES.get(m[2], m[2]), text)
     opening = Markup('<svg class="picture" role="img" aria-label="{}" {}').format(printable(says), Markup(view[0]))
     if lines:
-        opening += Markup(' data-curves="{}"').format(printable(curves_json(figure, lines, name, rows)))
+        told = printable(curves_json(figure, lines, name, rows))
+        # JSON is full of quotation marks
+        for letter, escaped in (("&", "&amp;"), ("<", "&lt;"), (">", "&gt;"), ("'", "&#39;")):
+            told = told.replace(letter, escaped)
+        opening += Markup(f" data-curves='{told}'")
     # letters are of one size on a desk, whatever the width of the figure
     opening += Markup(' style="max-width: {}px">').format(round(_PX_A_POINT * 72 * figure.get_figwidth()))
     # matplotlib escapes what it writes

@@ -1,0 +1,180 @@
+"""What is left of the gap: residuals of the rollouts against command, speed, time, frequency and earlier commands.
+
+Bands say how far chance alone would go: means of bins by the spread between blocks of the drive, the spectrum by the
+chi-square law of its average, the correlation with earlier commands by Bartlett's formula for two independent coloured
+signals (Box, Jenkins and Reinsel, Time Series Analysis, 4th ed., 2008, Sec. 12.1), as in the residual test of system
+identification (Ljung, System Identification, 2nd ed., 1999, Sec. 16.6).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.signal import correlate, get_window
+from scipy.special import chdtri, stdtrit
+
+from avtorch.arrays import FloatArray, IntArray
+from avtorch.gap.result.traces import Traces
+
+BLOCK_S = 10.0
+"""Length of the blocks whose spread gives a bin's interval [s]."""
+_SLOPE_S = 1.0  # over which a speed error is turned into an acceleration error
+_SEGMENT_S = 20.0  # of the averaged spectra
+_COLOUR_S = 30.0  # up to which signals are correlated with themselves
+_LEAST_BLOCKS = 4  # in a bin that has an interval
+_Z99 = 2.5758293035489004
+_OVERLAPPED = 1.89  # degrees of freedom per segment: Hann windows that overlap by half (Welch, 1967)
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals (row,) [m/s²] of the simulator `before` and `after` the repair: measured less simulated.
+
+    Of the acceleration where it was measured; else of the speed's slope over 1 s, as a rollout's speed itself drifts.
+    `time` [s] from the log's start, `command` [m/s²] and `speed` [m/s], None where it was not measured, all (row,);
+    `stretch` (row,) numbers stretches without gaps and `step` is the time between their rows [s].
+
+    Example:
+        >>> import numpy as np
+        >>> from avtorch.gap.result.residuals import Residuals
+        >>> from avtorch.gap.result.traces import Traces
+        >>> time, u = np.arange(0.0, 60.0, 0.05), np.zeros(1200)
+        >>> traces = Traces(time, u, ("accel",), u[None] + 0.3, u[None], u[None] + 0.2, u, u.astype(int))
+        >>> left = Residuals.of(traces)
+        >>> round(float(left.before.mean()), 2), round(float(left.after.mean()), 2)
+        (0.3, 0.1)
+    """
+
+    channel: str
+    step: float
+    time: FloatArray = field(repr=False)
+    stretch: IntArray = field(repr=False)
+    command: FloatArray = field(repr=False)
+    speed: FloatArray | None = field(repr=False)
+    before: FloatArray = field(repr=False)
+    after: FloatArray = field(repr=False)
+
+    @classmethod
+    def of(cls, traces: Traces) -> Residuals:
+        """The residuals of a diagnosis' traces."""
+        inside = np.diff(traces.stretch) == 0
+        step = float(np.median(np.diff(traces.time)[inside])) if inside.any() else 0.05
+        k = traces.channels.index("accel") if "accel" in traces.channels else 0
+        channel = traces.channels[k]
+        errors = [traces.measured[k] - x[k] for x in (traces.before, traces.after)]
+        rows = np.arange(len(traces.time))
+        if channel == "speed":
+            width = max(1, round(_SLOPE_S / step))
+            begin = np.arange(len(rows) - width)
+            begin = begin[traces.stretch[begin] == traces.stretch[begin + width]]
+            errors = [(e[begin + width] - e[begin]) / (width * step) for e in errors]
+            rows = begin + width // 2
+        speed = None if traces.speed is None else traces.speed[rows]
+        return cls(channel, step, traces.time[rows], traces.stretch[rows], traces.command[rows], speed, *errors)
+
+    def against(self, axis: FloatArray, residual: FloatArray, *, bins: int = 9) -> BinnedMeans:
+        """Means of `residual` (row,) in bins of `axis` (row,) that hold as many rows each."""
+        edges = np.unique(np.quantile(axis, np.linspace(0, 1, bins + 1)))
+        number = np.searchsorted(edges[1:-1], axis, side="right")
+        block = self._blocks()
+        many = max(int(number.max(initial=0)) + 1, 1)
+        counts, sums, along = (np.zeros((int(block.max(initial=0)) + 1, many)) for _ in range(3))
+        for array, values in ((counts, np.ones_like(axis)), (sums, residual), (along, axis)):
+            np.add.at(array, (block, number), values)
+        total = counts.sum(0)
+        mean = sums.sum(0) / total
+        blocks = (counts > 0).sum(0)
+        # a ratio of sums over blocks, whose errors are those of independent blocks
+        spread = np.sqrt(((sums - mean * counts) ** 2).sum(0) * blocks / np.maximum(blocks - 1, 1)) / total
+        half = np.where(blocks >= _LEAST_BLOCKS, stdtrit(np.maximum(blocks - 1, 1), 0.95) * spread, np.nan)
+        return BinnedMeans(along.sum(0) / total, mean, mean - half, mean + half)
+
+    def spectrum(self, residual: FloatArray) -> Spectrum | None:
+        """Power of `residual` (row,) over frequency; None where no stretch is long enough."""
+        size = max(8, round(_SEGMENT_S / self.step))
+        window = np.asarray(get_window("hann", size), float)
+        power = []
+        for rows in self._stretches():
+            for begin in range(0, len(rows) - size + 1, size // 2):
+                part = residual[rows[begin : begin + size]]
+                power.append(np.abs(np.fft.rfft(window * (part - part.mean()))) ** 2)
+        if not power:
+            return None
+        mean = np.mean(power, 0)[1:] * 2 * self.step / (window**2).sum()
+        freedom = max(2.0, _OVERLAPPED * len(power))
+        low, high = (freedom / chdtri(freedom, p) for p in (0.05, 0.95))
+        return Spectrum(np.asarray(np.fft.rfftfreq(size, self.step)[1:], np.float64), mean, mean * low, mean * high)
+
+    def correlation(self, residual: FloatArray, *, seconds: float = 5.0) -> Correlation:
+        """Of `residual` (row,) with the command a lag earlier, from -1 s (a later command) to `seconds`."""
+        first, last = -round(1.0 / self.step), round(seconds / self.step)
+        parts = self._stretches()
+        u, e = self.command - self.command.mean(), residual - residual.mean()
+        scale = np.sqrt((u**2).sum() * (e**2).sum()) or 1.0
+        both = _products(u, e, parts, first, last) / scale
+        reach = min(round(_COLOUR_S / self.step), max(map(len, parts), default=1) - 1)
+        own = [_products(x, x, parts, 0, reach) / ((x**2).sum() or 1.0) for x in (u, e)]
+        together = own[0] * own[1]
+        # independent coloured signals vary like fewer white rows
+        variance = max(float(together[0] + 2 * together[1:].sum()), 1.0) / len(e)
+        return Correlation(
+            np.linspace(first * self.step, last * self.step, last - first + 1), both, _Z99 * variance**0.5
+        )
+
+    def usual(self, residual: FloatArray) -> float:
+        """Within ± this [m/s²] would lie 99 % of a steady normal `residual` (row,) with these quartiles."""
+        low, high = np.quantile(residual, (0.25, 0.75))
+        return float(_Z99 * (high - low) / (2 * 0.6744897501960817))
+
+    def _stretches(self) -> list[IntArray]:
+        return np.split(np.arange(len(self.time)), np.flatnonzero(np.diff(self.stretch)) + 1)
+
+    def _blocks(self) -> IntArray:
+        """The number of each row's block."""
+        size = max(1, round(BLOCK_S / self.step))
+        numbers, first = [], 0
+        for rows in self._stretches():
+            numbers.append(first + np.arange(len(rows)) // size)
+            first = int(numbers[-1][-1]) + 1 if len(rows) else first
+        return np.concatenate(numbers)
+
+
+def _products(u: FloatArray, e: FloatArray, parts: list[IntArray], least: int, most: int) -> FloatArray:
+    """Sums over the stretches of `u`, a lag earlier, times `e`, for every lag [rows] from `least` to `most`."""
+    total = np.zeros(most - least + 1)
+    for rows in parts:
+        size = len(rows)
+        both = correlate(e[rows], u[rows], method="fft")  # lags -(size - 1) to size - 1
+        lags = np.arange(max(least, 1 - size), min(most, size - 1) + 1)
+        total[lags - least] += both[lags + size - 1]
+    return total
+
+
+@dataclass(frozen=True)
+class BinnedMeans:
+    """Bins (bin,): their mean place, the residual's mean [m/s²] and its central 90 %, NaN where blocks are too few."""
+
+    place: FloatArray
+    mean: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Power density [(m/s²)²/Hz] over `frequency` [Hz], each (frequency,), with its central 90 %."""
+
+    frequency: FloatArray
+    power: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Correlation (lag,) [-] over `lag` [s]; within ± `band` lie 99 % where the two signals are independent."""
+
+    lag: FloatArray
+    value: FloatArray
+    band: float
