@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from avtorch.cli import main
-from avtorch.cli.estimate import estimates_note
 from avtorch.io import Log
+from avtorch.report.estimates_sentences import estimates_note
 from avtorch.vehicle import GLVDPlant, Leader, simulate
 from tests.faulty_disk import visible
 
@@ -89,7 +89,7 @@ def test_estimate_writes_answer_and_pictures(drive: Path, tmp_path: Path, capsys
     for w in used:
         assert abs(w["T_L"]["mean"] - 0.3) < 5 * w["T_L"]["sd"]
         assert set(w["sigma"]) == STAT
-    assert {p.name for p in out.glob("[!.]*")} == {"estimates.json", "belief.png", "probability.png"}
+    assert {p.name for p in out.glob("[!.]*")} == {"estimates.html", "estimates.json", "belief.png", "probability.png"}
 
 
 def test_json_is_all_there_is_on_stdout(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

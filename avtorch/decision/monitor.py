@@ -207,8 +207,9 @@ class Monitor:
         T_L, K_L = T_L.to(torch.float64), K_L.to(torch.float64)
         mean = (T_L.mean(dim=-1), K_L.mean(dim=-1))
         window = self._gaussian(T_L, K_L)
-        delays = {"dead_time": self.dead_time, "link_delay": self.link_delay}
-        p_local, p_string = setting.p_locally_and_string_stable(T_L, K_L, **delays)
+        p_local, p_string = setting.p_locally_and_string_stable(
+            T_L, K_L, dead_time=self.dead_time, link_delay=self.link_delay
+        )
 
         alerts: dict[str, Tensor] = {}
         statistics: dict[str, Tensor] = {}

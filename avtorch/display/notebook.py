@@ -15,8 +15,7 @@ def notebook_display() -> ModuleType | None:
 
 
 def show(*answers: object) -> None:
-    """Display answers below the cell in a notebook, as if each were a cell's last line; elsewhere print what a
-    console would.
+    """Display answers below the cell in a notebook, as its last line would; elsewhere print them.
 
     Example:
         >>> from avtorch import Leader, simulate

@@ -45,7 +45,7 @@ def test_from_a_file_to_the_page(drive: Path, tmp_path: Path, capsys: pytest.Cap
     told = " ".join(capsys.readouterr().out.split())
     assert "2023-11-14" in told
     assert "1 return to engaged" in told
-    assert "lacks dead_time" in told
+    assert "late (dead_time)" in told
     answer = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
     assert answer["verdict"]["names"] == ["dead_time"]
     delay = next(e for e in answer["effects"] if e["name"] == "dead_time")["parameters"]["delay_s"]

@@ -62,8 +62,11 @@ class HeldOut:
 
     @property
     def prior(self) -> float:
-        """What the coordinates cost by their prior [nats], mean of the folds: a value that no car has pays for it."""
-        return 0.5 * float((self.z**2).sum(-1).mean())
+        """What the coordinates cost by their prior [nats], mean of the folds: a value that no car has pays for it.
+
+        Without coordinates nothing.
+        """
+        return 0.5 * float((self.z**2).sum(-1).mean()) if self.z.size else 0.0
 
 
 @dataclass(frozen=True, eq=False)
