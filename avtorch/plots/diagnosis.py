@@ -33,18 +33,19 @@ def budget_bars(ax: Axes, budget: Budget, *, narrow: bool = False) -> Axes:
     """
     named = [(p.name, p.share, BLUE if p.probability >= LIKELY else SKY) for p in budget.parts]
     rows = [*named, ("unexplained", budget.unexplained.share, ORANGE)]
-    begun = 0.0
+    begun, reach = 0.0, 1.0
     for i, (_, share, colour) in enumerate(rows):
         ax.barh(i, share.mean, left=begun, color=colour, height=_height(narrow))
         ax.plot([begun + share.q05, begun + share.q95], [i, i], color=BLACK, lw=1.0)
         ax.text(max(begun + share.q95, begun + share.mean) + 0.012, i, percent(share.mean), va="center", fontsize=9)
         if i:
             ax.plot([begun, begun], [i - 1, i], color=GREY, lw=0.6)
+        reach = max(reach, begun + share.q95)  # a whisker may end beyond the whole
         begun += share.mean
     _name_bars(ax, [name for name, _, _ in rows], narrow=narrow, down=True)
     ax.set(
         xlabel=f"share of the gap in held-out {budget.horizon_s:.3g} s rollouts",
-        xlim=(0, 1.25 if narrow else 1.12),
+        xlim=(0, reach * (1.25 if narrow else 1.12)),
         ylim=(len(rows) - 0.4, -0.8 if narrow else -0.6),
     )
     ax.set_xticks(_UP_TO_ONE)

@@ -123,7 +123,7 @@ def drive_panels(found: Diagnosis) -> list[DrivePanel]:
         >>> late = plant([DeadTime(0.4)], sigma=0.0)
         >>> log = simulate(Leader.default(start=50.0, duration=14.0, dt=0.1), plant=late).log()
         >>> [panel.label for panel in drive_panels(diagnose(log, effects=["dead_time"], pairs=False))]
-        ['speed [m/s]', 'acceleration [m/s²]']
+        ['acceleration [m/s²]', 'speed [m/s]']
     """
     traces = found.traces
     if traces is None:

@@ -16,7 +16,7 @@ def cause_words(name: str, values: Mapping[str, float]) -> str:
     Example:
         >>> from avtorch.gap.simulator.cause_words import cause_words
         >>> cause_words("brake_throttle_asymmetry", {"brake_gain_ratio": 0.7, "brake_lag_ratio": 1.0})
-        'the brake is weaker than the throttle, 0.7 times its gain'
+        'the brake is weaker than the throttle'
         >>> cause_words("dead_time", {}), cause_words("trailer", {"mass_ratio": 0.4})
         ('the command acts after a delay', '')
     """
