@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 
 __all__ = [
+    "MEASURES",
     "alert_entries",
     "estimates_answer",
     "finite",
@@ -30,6 +31,17 @@ __all__ = [
     "validation_answer",
     "window_entry",
 ]
+
+MEASURES = {
+    "speed_rms_ratio": "speed RMS, follower / leader [-]",
+    "accel_rms_ratio": "acceleration RMS, follower / leader [-]",
+    "min_spacing_m": "least spacing [m]",
+    "min_ttc_s": "least time to collision [s]",
+    "jerk_rms_mps3": "jerk RMS [m/s³]",
+    "clipped_share": "share of commands clipped [-]",
+    "throughput_vph": "throughput at equilibrium [1/h]",
+}
+"""What is told of a drive, in words, by its key in `performance` of `run.json`."""
 
 
 def window_entry(watched: WatchedWindow, scenario: int = 0) -> dict[str, Any]:

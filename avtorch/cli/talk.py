@@ -185,8 +185,10 @@ class Talk:
         table.add_column("")
         for name in ("without action", "with action"):
             table.add_column(name, justify="right")
+        from avtorch.results import MEASURES
+
         both = answer["performance"]
-        for key, words in _MEASURES.items():
+        for key, words in MEASURES.items():
             table.add_row(escape(words), *(_number(both[side][key]) for side in ("without_action", "with_action")))
         self.out.print()
         self.out.print(table)
@@ -223,17 +225,6 @@ class Talk:
             sorted(p.name for p in out.iterdir() if p.suffix in (".html", ".json", ".png") and p.is_file())
         )
         self.out.print(f"\nWritten to [bold]{escape(str(out))}[/bold]: {escape(names)}", soft_wrap=True)
-
-
-_MEASURES = {
-    "speed_rms_ratio": "speed RMS, follower / leader [-]",
-    "accel_rms_ratio": "acceleration RMS, follower / leader [-]",
-    "min_spacing_m": "least spacing [m]",
-    "min_ttc_s": "least time to collision [s]",
-    "jerk_rms_mps3": "jerk RMS [m/s³]",
-    "clipped_share": "share of commands clipped [-]",
-    "throughput_vph": "throughput at equilibrium [1/h]",
-}
 
 
 def _whole(window: Mapping[str, Any]) -> bool:

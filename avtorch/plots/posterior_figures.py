@@ -196,7 +196,7 @@ def agreement_figure(validation: Validation, *, narrow: bool = False) -> Figure:
 
 def _wide(names: tuple[str, ...]) -> float:
     """Width of a panel [inch]: many parameters share the paper."""
-    return 3.4 if len(names) <= 3 else 2.6
+    return 3.0 if len(names) <= 3 else 2.6
 
 
 def _panels(

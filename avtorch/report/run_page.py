@@ -22,17 +22,9 @@ from avtorch.report.origin import Origin
 from avtorch.report.picture import Picture, picture_of
 from avtorch.report.table import Table, of_numbers
 from avtorch.report.window_table import window_table
+from avtorch.results import MEASURES
 from avtorch.vehicle import stability
 
-_MEASURES = {
-    "speed_rms_ratio": "speed RMS, follower / leader [-]",
-    "accel_rms_ratio": "acceleration RMS, follower / leader [-]",
-    "min_spacing_m": "least spacing [m]",
-    "min_ttc_s": "least time to collision [s]",
-    "jerk_rms_mps3": "jerk RMS [m/s³]",
-    "clipped_share": "share of commands clipped [-]",
-    "throughput_vph": "throughput at equilibrium [1/h]",
-}
 _QUANTITIES = {"speed": ("speed", "m/s"), "accel": ("acceleration", "m/s²"), "spacing": ("spacing", "m")}
 _STRATEGIES = {
     1: "the lower level",
@@ -195,7 +187,7 @@ def _performance(answer: Mapping[str, Any]) -> Table:
     columns = ("measure", *(side.replace("_", " ") if answer["actions"] else "value" for side in sides))
     rows = tuple(
         (words, *(_number(both[side][key]) for side in sides))
-        for key, words in _MEASURES.items()
+        for key, words in MEASURES.items()
         if all(key in both[side] for side in sides)
     )
     caption = "The drive without and with action" if answer["actions"] else "The drive, without action"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -11,6 +13,7 @@ from avtorch.blindtest import draw_case
 from avtorch.experiment import Experiment, Information, library
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.remedy import setting_for
+from tests.report.in_chromium import PROGRAM
 
 HOSTILE = '<script>alert(1)</script>"&{{ 7 * 7 }}.csv'
 
@@ -36,3 +39,13 @@ def found(ahead: Experiment) -> Diagnosis:
     told = avtorch.diagnose(log, effects=["sensor_bias", "constant_resistance"], pairs=False)
     setting = setting_for(told, log.accel_cmd)
     return replace(told, setting=None if setting is None else setting.to_dict(), next_experiment=ahead.to_dict())
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as play:
+        # the sandbox needs rights that containers lack, and the pages are our own
+        program = play.chromium.launch(executable_path=PROGRAM, args=["--no-sandbox"])
+        yield program
+        program.close()

@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 
 from avtorch.experiment import Experiment
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.report import write_report
-from tests.report.in_chromium import CUT_OFF, LETTERS_PX, OUTSIDE, PROGRAM
+from tests.report.in_chromium import Scheme, fits_and_is_accessible, marks
 
-sync_api = pytest.importorskip("playwright.sync_api")
-axe = pytest.importorskip("axe_playwright_python.sync_playwright")
-
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(PROGRAM is None, reason="needs Chromium: Debian's chromium-headless-shell or chromium"),
-]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with sync_api.sync_playwright() as play:
-        # the sandbox needs rights that containers lack, and the page is our own
-        program = play.chromium.launch(executable_path=PROGRAM, args=["--no-sandbox"])
-        yield program
-        program.close()
+pytestmark = marks
 
 
 @pytest.fixture(scope="module")
@@ -38,27 +22,8 @@ def path(found: Diagnosis, ahead: Experiment, tmp_path_factory: pytest.TempPathF
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 780, 1280])
-def test_it_fits_and_is_accessible(browser: Any, path: Path, width: int, scheme: Literal["light", "dark"]) -> None:
-    page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
-    requests, complaints = [], []
-    page.on("request", lambda request: requests.append(request.url))
-    page.on("console", lambda message: complaints.append(message.text))
-    page.goto(path.as_uri())
-    page.evaluate("() => document.querySelectorAll('details').forEach(e => { e.open = true; })")
-    assert page.evaluate("() => document.documentElement.scrollWidth") <= width
-    assert page.evaluate(CUT_OFF) == []
-    assert page.evaluate(OUTSIDE) == []
-    letters = page.evaluate(LETTERS_PX)
-    assert len(letters) > 30
-    assert min(letters) >= 9.0, "letters of a picture that a reader can read"
-    ground = page.evaluate("() => getComputedStyle(document.body).backgroundColor")
-    assert (sum(map(int, ground[4:-1].split(","))) < 150) == (scheme == "dark")
-    assert requests == [path.as_uri()]
-    assert complaints == []
-    judged = axe.Axe().run(page).response
-    assert [(fault["id"], [node["html"][:200] for node in fault["nodes"]]) for fault in judged["violations"]] == []
-    assert len(judged["passes"]) > 10
-    page.close()
+def test_it_fits_and_is_accessible(browser: Any, path: Path, width: int, scheme: Scheme) -> None:
+    fits_and_is_accessible(browser, path, width, scheme, letters=30)
 
 
 def test_every_table_and_every_line_is_reached_by_keyboard(browser: Any, path: Path) -> None:

@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 
 from avtorch.report import write_fleet_page
 from tests.report.conftest import HOSTILE
 from tests.report.fleets import answer_of
-from tests.report.in_chromium import CUT_OFF, OUTSIDE, PROGRAM
+from tests.report.in_chromium import Scheme, fits_and_is_accessible, marks
 
-sync_api = pytest.importorskip("playwright.sync_api")
-axe = pytest.importorskip("axe_playwright_python.sync_playwright")
-
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(PROGRAM is None, reason="needs Chromium: Debian's chromium-headless-shell or chromium"),
-]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with sync_api.sync_playwright() as play:
-        # the sandbox needs rights that containers lack, and the page is our own
-        program = play.chromium.launch(executable_path=PROGRAM, args=["--no-sandbox"])
-        yield program
-        program.close()
+pytestmark = marks
 
 
 @pytest.fixture(scope="module")
@@ -38,22 +22,8 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 780, 1280])
-def test_it_fits_and_is_accessible(browser: Any, path: Path, width: int, scheme: Literal["light", "dark"]) -> None:
-    page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
-    requests, complaints = [], []
-    page.on("request", lambda request: requests.append(request.url))
-    page.on("console", lambda message: complaints.append(message.text))
-    page.on("pageerror", lambda error: complaints.append(str(error)))
-    page.goto(path.as_uri())
-    page.evaluate("() => document.querySelectorAll('details').forEach(e => { e.open = true; })")
-    assert page.evaluate("() => document.documentElement.scrollWidth") <= width
-    assert page.evaluate(CUT_OFF) == []
-    assert page.evaluate(OUTSIDE) == []
-    assert requests == [path.as_uri()]
-    assert complaints == []
-    judged = axe.Axe().run(page).response
-    assert [(fault["id"], [node["html"][:200] for node in fault["nodes"]]) for fault in judged["violations"]] == []
-    page.close()
+def test_it_fits_and_is_accessible(browser: Any, path: Path, width: int, scheme: Scheme) -> None:
+    fits_and_is_accessible(browser, path, width, scheme)
 
 
 def test_cars_are_found_sorted_and_turned_over(browser: Any, path: Path) -> None:

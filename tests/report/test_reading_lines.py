@@ -12,23 +12,9 @@ import pytest
 
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.report import write_report
-from tests.report.in_chromium import CUT_OFF, PROGRAM
+from tests.report.in_chromium import CUT_OFF, marks
 
-sync_api = pytest.importorskip("playwright.sync_api")
-
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(PROGRAM is None, reason="needs Chromium: Debian's chromium-headless-shell or chromium"),
-]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with sync_api.sync_playwright() as play:
-        # the sandbox needs rights that containers lack, and the page is our own
-        program = play.chromium.launch(executable_path=PROGRAM, args=["--no-sandbox"])
-        yield program
-        program.close()
+pytestmark = marks
 
 
 @pytest.fixture(scope="module")
