@@ -25,6 +25,7 @@ demo: $(VENV)/.installed
 	@echo
 	@echo "The pictures are in $(CURDIR)/out/demo:"
 	@ls out/demo/*.png | sed 's/^/  /'
+	@echo "All on one page, with what they say: $(CURDIR)/out/demo/run.html"
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n $(JOBS) -m "not slow" $(PYTEST_ARGS)

@@ -54,6 +54,18 @@ def may_be_late(correlation: Any, *, known: Any) -> Any:
     return (known == 0) | (correlation >= _MAY_BE)
 
 
+def late_response(time: NDArray, parts: Sequence[slice], level: NDArray, rate: NDArray) -> tuple[Scale | None, bool]:
+    """For a response that looks inverted: the best one at LATER_S, None where unknown, and whether it may be the true
+    one (`may_be_late`). Arguments as of `scale_between`.
+
+    Short stretches know the smaller delays only; as the largest is unknown then, it may be the car's.
+    """
+    later = scale_between(time, parts, level, rate, delays=LATER_S)
+    if later is None or scale_between(time, parts, level, rate, delays=LATER_S[-1:]) is None:
+        return None, True
+    return later, bool(may_be_late(later.correlation, known=True))
+
+
 def _compare(totals: list[tuple[NDArray, NDArray, NDArray]], span: float, delay: float) -> Scale | None:
     changes, integrals, spans = [], [], 0.0
     for t, x, total in totals:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.io.bad_rows import MOST_BAD, beyond
-from avtorch.io.consistency import LATER_S, Scale, may_be_late, scale_between
+from avtorch.io.consistency import Scale, late_response, scale_between
 from avtorch.io.units import GRAVITY
 
 RATE_HZ = (10.0, 200.0)
@@ -162,7 +162,7 @@ def command_scale(
 ) -> Scale | None:
     """How the motion follows the command ``u``: from speed where it is known, else from the integrated acceleration.
 
-    An inverted response counts only where it cannot be a late one (`may_be_late`).
+    An inverted response counts only where it cannot be a late one (`late_response`).
     """
     if speed is None:
         assert accel is not None
@@ -171,8 +171,8 @@ def command_scale(
         level = speed
     found = scale_between(time, parts, level, u, delays=_DELAYS_S)
     if found is not None and found.slope < 0 and found.correlation <= -_SURE:
-        later = scale_between(time, parts, level, u, delays=LATER_S)
-        if later is None or may_be_late(later.correlation, known=True):
+        later, possible = late_response(time, parts, level, u)
+        if possible:
             return later
     return found
 

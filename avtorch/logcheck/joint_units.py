@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.io.consistency import LATER_S, Scale, may_be_late, scale_between
+from avtorch.io.consistency import Scale, late_response, scale_between
 from avtorch.io.units import to_si
 
 # natural logarithms of how much rarer a unit is than SI in logs of cars
@@ -114,10 +114,8 @@ def _keep(found: dict[tuple[str, str], Scale], pair: tuple[str, str], scale: Sca
 
 def _response(time: FloatArray, parts: list[slice], level: FloatArray, u: FloatArray) -> Scale | None:
     found = scale_between(time, parts, level, u, delays=_DELAYS_S)
-    if found is not None and found.slope < 0:
-        later = scale_between(time, parts, level, u, delays=LATER_S)
-        if later is None or may_be_late(later.correlation, known=True):
-            return None  # inverted, or late by half a period: the data cannot tell
+    if found is not None and found.slope < 0 and late_response(time, parts, level, u)[1]:
+        return None  # inverted, or late by half a period: the data cannot tell
     return found
 
 

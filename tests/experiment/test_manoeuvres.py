@@ -123,9 +123,12 @@ def test_a_manoeuvre_as_driven_is_a_log_that_is_read(limits: Limits, car: str, t
     np.testing.assert_array_equal(again.accel_cmd, logs[0].accel_cmd)
 
 
-@pytest.mark.parametrize("seed", [2055135581, 4])
+@pytest.mark.parametrize("seed", [2055135581, 4, 563241250])
 def test_a_very_late_car_is_not_taken_for_one_of_the_wrong_sign(seed: int) -> None:
-    """Ramps return with the other sign after some 2 s, as late as this car follows them; both seeds were refused."""
+    """Ramps return with the other sign after some 2 s, as late as this car follows them; all three seeds were refused.
+
+    With the third, the stretches that are known to move are too short to compare at the car's own delay.
+    """
     limits = Limits(accel_min=-1, accel_max=1, seconds=30)
     assert driven(limits, CARS["later"], np.random.default_rng(seed))
 

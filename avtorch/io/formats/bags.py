@@ -37,7 +37,9 @@ class Topic:
 
     @property
     def count(self) -> int:
-        return sum(max(0, connection.msgcount) for connection in self.connections)
+        """Messages as the bag's index says, where it says a number; a folder's metadata may be damaged."""
+        told = (connection.msgcount for connection in self.connections)
+        return sum(max(0, n) for n in told if isinstance(n, int))
 
 
 class BagRecording(TopicRecording):

@@ -3,11 +3,13 @@ installed without ROS)."""
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import struct
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap_ros2.writer import Writer as McapWriter
 
@@ -315,3 +317,19 @@ def test_damage_to_the_folders_metadata_is_read_or_refused(tmp_path: Path, fresh
         (path / "metadata.yaml").write_bytes(damaged(raw, i % KINDS, rng))
         said = outcome(path)
         assert not isinstance(said, str) or said.isprintable()
+
+
+@pytest.mark.parametrize("count", ["", "many", "[4]"])
+def test_a_folder_is_read_whatever_its_metadata_counts(tmp_path: Path, count: str) -> None:
+    """A count that is no number ended in a TypeError; the messages are there all the same."""
+    path = folder(tmp_path / "drive")
+    metadata = path / "metadata.yaml"
+    text = metadata.read_text()
+    whole = open_here(path)
+    damaged = re.sub(r"(?m)^(\s*(?:- )?message_count:).*$", rf"\1 {count}", text)
+    assert damaged != text
+    metadata.write_text(damaged)
+    again = open_here(path)
+    assert again.names == whole.names
+    for name, channel in whole.read(whole.names).items():
+        np.testing.assert_array_equal(again.read([name])[name].values, channel.values)
