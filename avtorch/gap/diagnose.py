@@ -31,6 +31,7 @@ from avtorch.gap.result.diagnosis import Diagnosis, LogFacts
 from avtorch.gap.result.gap_size import gap_size
 from avtorch.gap.result.predictive_model import predictive_models
 from avtorch.gap.result.traces import Traces, rolled_out
+from avtorch.gap.result.uncounted import uncounted
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 from avtorch.gap.search.search import Search
 from avtorch.gap.selection import periodic_commands as delays
@@ -44,7 +45,7 @@ from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.effect_choice import chosen_effects
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.whole_progress import WholeProgress
-from avtorch.io import LogSource, as_logs
+from avtorch.io import Log, LogSource, as_logs
 from avtorch.io.mapping import Pairs
 
 # Probability of an unknown cause after the best single effect, from which held-out blocks decide without any pair: in
@@ -241,7 +242,7 @@ def diagnose(
         else localise(attribution, onset_s=None if onset is None else onset.from_start_s, lag=race.none.values["T_L"]),
         shrinkage=shrinkage,
         contenders=predictive_models(race, verdict),
-        traces=_traces(race, winner, attribution, car if selected is not None else None),
+        traces=_traces(each, race, winner, attribution, car if selected is not None else None),
         remaining=given_dead_time(candidates, verdict, base),
         complete=race.complete,
         scope=race.scope,
@@ -262,7 +263,11 @@ def _unknown(found: Sequence[FittedModel], record: Record, prior: Mapping[str, f
 
 
 def _traces(
-    race: SearchResult, winner: FittedModel | None, attribution: RowAttribution, car: GapPlant | None
+    logs: Sequence[Log],
+    race: SearchResult,
+    winner: FittedModel | None,
+    attribution: RowAttribution,
+    car: GapPlant | None,
 ) -> Traces:
     """`car`: the simulator with the effects that held-out blocks selected."""
     record = race.record
@@ -279,6 +284,7 @@ def _traces(
         after=measured - errors.mean(-1),
         does=attribution.does,
         stretch=record.stretch,
+        uncounted=uncounted(logs, record),
     )
 
 

@@ -6,7 +6,8 @@ Long drives are drawn by envelopes: of each short interval the least and the gre
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.uncounted import Reason, Uncounted
 from avtorch.plots.style import BLACK, BLUE, GREY, VERMILLION, styled
 
 _WIDE, _NARROW = (8.6, 260), (4.0, 120)
@@ -22,13 +24,20 @@ _WIDE, _NARROW = (8.6, 260), (4.0, 120)
 _COLOURS = {"command": GREY, "measured": BLACK, "baseline simulator": VERMILLION, "with what was named": BLUE}
 _LABELS = {"accel": "acceleration [m/s²]", "speed": "speed [m/s]"}
 _BEYOND = 0.3  # of the measured range: how far beyond it a rollout is followed, whose speed may drift without end
+_GROUNDS: dict[Reason, tuple[str, dict[str, Any]]] = {
+    "driver": ("driver", {"facecolor": "#DDDDDD"}),
+    "standstill": ("standstill", {"facecolor": "none", "edgecolor": "#BBBBBB", "hatch": "////"}),
+    "gap": ("no rows", {"facecolor": "none", "edgecolor": "#BBBBBB", "hatch": "..."}),
+    "settling": ("settling", {"facecolor": "#E6E6E6"}),
+}
+"""What did not count: its label, and a ground that is told from the others without colour."""
 _LOGS_APART = 0.02  # of the whole, between two logs
 
 
 @dataclass(frozen=True)
 class DriveTime:
     """Where the rows of a diagnosis lie on one axis: `along` (row,) [s], several logs one behind the other; `begins` of
-    the logs on it [s]; `unused`: spans between counted rows [s]; `onset` on it [s], where an effect sets in.
+    the logs on it [s]; `uncounted` with its ends on it; `onset` on it [s], where an effect sets in.
 
     Example:
         >>> from avtorch import Leader, diagnose, simulate
@@ -42,7 +51,7 @@ class DriveTime:
 
     along: FloatArray
     begins: tuple[float, ...]
-    unused: tuple[tuple[float, float], ...]
+    uncounted: tuple[Uncounted, ...]
     onset: float | None
 
 
@@ -60,13 +69,13 @@ def drive_time(found: Diagnosis) -> DriveTime:
     for n in range(int(number[-1])):
         begins.append(begins[-1] + float(time[number == n].max()) + apart)
     along = time + np.array(begins)[number]
-    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    ends = np.flatnonzero((np.diff(traces.stretch) != 0) & (np.diff(along) > 2 * step) & (np.diff(number) == 0))
-    unused = tuple((float(along[i]), float(along[i + 1])) for i in ends)
+    moved = (replace(x, begin=x.begin + begins[x.log], end=x.end + begins[x.log]) for x in traces.uncounted)
+    # the axis begins and ends with rows that count
+    inside = tuple(x for x in moved if x.end > along[0] and x.begin < along[-1])
     onset = found.onset_from_start_s
     if onset is not None:
         onset += begins[min(found.onset_log, len(begins) - 1)]
-    return DriveTime(along, tuple(begins), unused, onset)
+    return DriveTime(along, tuple(begins), inside, onset)
 
 
 def envelope(time: FloatArray, values: FloatArray, stretch: IntArray, intervals: int) -> tuple[FloatArray, FloatArray]:
@@ -166,8 +175,11 @@ def drive_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
 
 
 def _shade(ax: Axes, axis: DriveTime) -> None:
-    for i, (begin, end) in enumerate(axis.unused):
-        ax.axvspan(begin, end, color="#DDDDDD", lw=0, zorder=0, label="not counted" if i == 0 else None)
+    told: set[str] = set()
+    for x in axis.uncounted:
+        label, look = _GROUNDS[x.why]
+        ax.axvspan(x.begin, x.end, **look, lw=0, zorder=0, label=None if x.why in told else label)
+        told.add(x.why)
     for begin in axis.begins[1:]:
         ax.axvline(begin, color=GREY, lw=0.8, ls=":", label="next log" if begin == axis.begins[1] else None)
     if axis.onset is not None:

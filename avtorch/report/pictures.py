@@ -27,6 +27,12 @@ from avtorch.report.picture import Picture, picture_of
 from avtorch.report.table import Table, of_numbers
 
 _MOST = 60  # rows of a table behind a picture of lines
+_NOT_COUNTED = {
+    "driver": "grey, the driver's hand",
+    "standstill": "hatched, standstill",
+    "gap": "dotted, no rows",
+    "settling": "pale, the first seconds of a drive and after a return",
+}
 _PARTS = 12  # of the drive, rows of its table
 
 
@@ -122,10 +128,13 @@ def _fit(found: Diagnosis) -> str:
 
 def _marked(axis: DriveTime) -> str:
     told = []
-    if axis.unused:
-        seconds = sum(end - begin for begin, end in axis.unused)
-        many = f"{len(axis.unused)} stretch{'es' if len(axis.unused) > 1 else ''} of together {seconds:.0f} s"
-        told.append(f" Grey ground: {many} that did not count (driver, standstill or a gap).")
+    if axis.uncounted:
+        each = [
+            f"{words} {sum(x.end - x.begin for x in axis.uncounted if x.why == why):.0f} s"
+            for why, words in _NOT_COUNTED.items()
+            if any(x.why == why for x in axis.uncounted)
+        ]
+        told.append(f" Shaded: what did not count ({'; '.join(each)}).")
     if len(axis.begins) > 1:
         told.append(f" {len(axis.begins)} logs, one behind the other.")
     if axis.onset is not None:

@@ -10,6 +10,7 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.gap.result.traces import Traces
+from avtorch.gap.result.uncounted import Uncounted
 from avtorch.plots.whole_drive import drive_figure, drive_time, envelope
 
 STEP = 0.05
@@ -21,7 +22,13 @@ def found(channels: tuple[str, ...] = ("accel", "speed"), **more: Any) -> Any:
     time, stretch = np.concatenate([one, one[:400]]), np.repeat([0, 1, 2], [400, 600, 400])
     rng = np.random.default_rng(0)
     lines = [rng.normal(size=(len(channels), len(time))) for _ in range(3)]
-    traces = Traces(time, np.sin(time), channels, *lines, np.zeros(len(time)), stretch)
+    unused = (
+        Uncounted(0.0, 0.0, "settling"),
+        Uncounted(20.0, 28.0, "driver"),
+        Uncounted(28.0, 30.0, "settling"),
+        Uncounted(4.0, 6.0, "standstill", 1),
+    )
+    traces = Traces(time, np.sin(time), channels, *lines, np.zeros(len(time)), stretch, unused)
     given = {"traces": traces, "onset_from_start_s": None, "onset_log": 0, "winner": SimpleNamespace(effects=("x",))}
     return SimpleNamespace(**{**given, **more})
 
@@ -47,7 +54,9 @@ def test_logs_lie_one_behind_the_other_and_what_did_not_count_is_told() -> None:
     assert (np.diff(axis.along) > 0).all()
     assert len(axis.begins) == 2
     assert axis.begins[1] > 59.9
-    assert axis.unused == ((pytest.approx(19.95), pytest.approx(30.0)),)
+    spans = [(x.why, x.begin, x.end) for x in axis.uncounted]
+    start = axis.begins[1]
+    assert spans == [("driver", 20.0, 28.0), ("settling", 28.0, 30.0), ("standstill", start + 4.0, start + 6.0)]
     assert axis.onset == pytest.approx(axis.begins[1] + 5.0)
 
 
@@ -64,7 +73,8 @@ def test_a_panel_a_channel(channels: tuple[str, ...], labels: list[str]) -> None
         figure = drive_figure(found(channels), narrow=narrow)
         assert [ax.get_ylabel() for ax in figure.axes] == labels
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert set(names) == {"not counted", "next log", "command", "measured", "baseline simulator", "with what was named"}
+    grounds = {"driver", "settling", "standstill"}
+    assert set(names) == grounds | {"next log", "command", "measured", "baseline simulator", "with what was named"}
 
 
 def test_a_speed_that_drifts_does_not_squeeze_the_rest() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.likelihood.record import Record
+from avtorch.gap.result.uncounted import Uncounted
 from avtorch.gap.simulator.plant import GapPlant
 
 
@@ -17,7 +18,7 @@ class Traces:
 
     `command` (row,); `measured`, `before`, `after` (channel, row): measurements, and rollouts over whole drives of the
     fitted simulator without and with the effect (equal where nothing was named). `does` (row,) [nats]: the effect's
-    contribution in each row. `stretch` (row,) numbers the stretches without gaps.
+    contribution in each row. `stretch` (row,) numbers the stretches without gaps; `uncounted`: what lies between them.
     """
 
     time: FloatArray
@@ -28,6 +29,7 @@ class Traces:
     after: FloatArray = field(repr=False)
     does: FloatArray = field(repr=False)
     stretch: IntArray = field(repr=False)
+    uncounted: tuple[Uncounted, ...] = field(default=(), repr=False)
 
     @property
     def speed(self) -> FloatArray | None:
