@@ -1,11 +1,12 @@
 """The budget of the gap on recordings: each whole, and its halves by themselves; or with effects put in front.
 
-``AVTORCH_DATA=DIR python -m benchmarks.budgets [--only TEXT] [--in-front SIZE ...]``
+``AVTORCH_DATA=DIR python -m benchmarks.budgets [--only TEXT] [--in-front SIZE ...] [--picture FILE]``
 
 Prints a line a recording: the causes with their shares and parameters, and what each half says alone. With
 ``--in-front`` a line a known effect of that size, put in front of the recording as one car's, several logs as segments
 of one: what is named, the size found on top of the untouched recording's over the size put in, names that neither the
 effect nor the untouched recording accounts for, and what the simplest selection names (`reference_selection`).
+``--picture`` draws the budget and the drive of the first recording, as `avtorch diagnose` answers, and no more.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from avtorch import diagnose, plots
 from avtorch.blindtest import IN_FRONT, put_in_front
 from avtorch.blindtest.in_front_score import SIZE_OF, SIZE_WITHIN
 from avtorch.errors import InputError
@@ -139,6 +141,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="recordings with this in their name")
     parser.add_argument("--in-front", type=float, nargs="+", default=[], metavar="SIZE")
+    parser.add_argument("--picture", metavar="FILE")
     arguments = parser.parse_args()
     folder = os.environ.get("AVTORCH_DATA")
     if folder is None:
@@ -147,6 +150,9 @@ def main() -> None:
         if arguments.only not in name:
             continue
         logs = [Log.read(Path(folder) / file) for file in files]
+        if arguments.picture:
+            plots.save(plots.diagnosis_figure(diagnose(logs)), arguments.picture)
+            return
         if arguments.in_front:
             for size in arguments.in_front:
                 print(f"{name}, size {size:g}", flush=True)

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from avtorch.plots.style import STYLE, save, show
     from avtorch.plots.time import belief_band, data_quality, events, motion, string_probability
     from avtorch.plots.verdicts import confusion, confusion_figure
+    from avtorch.plots.whole_drive import diagnosis_figure
 
 _HOME = {
     "avtorch.plots.calibration_figures": ("calibration_figure",),
@@ -116,6 +117,7 @@ _HOME = {
         "confusion",
         "confusion_figure",
     ),
+    "avtorch.plots.whole_drive": ("diagnosis_figure",),
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 
@@ -130,6 +132,7 @@ __all__ = [
     "confusion",
     "confusion_figure",
     "data_quality",
+    "diagnosis_figure",
     "ecdf_difference",
     "ecdf_of",
     "effect_signature",

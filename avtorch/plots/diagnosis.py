@@ -15,7 +15,7 @@ from matplotlib.ticker import PercentFormatter
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
-from avtorch.gap.budget.parts import LIKELY, Budget, percent
+from avtorch.gap.budget.parts import HORIZON_S, LIKELY, Budget, percent
 from avtorch.gap.crossval.localisation import UNITS, Axis
 from avtorch.gap.result.diagnosis import Candidate, Diagnosis
 from avtorch.io.clock import time_label
@@ -112,6 +112,8 @@ def stretch_of(found: Diagnosis, *, seconds: float = _SECONDS) -> DriveStretch:
     shows = errors[0] / np.maximum(errors[1], 1e-12)
     # unlike the speed, the acceleration shows an event at its own time
     k = 0 if shows[0] > 1.1 else int(np.argmax(shows))
+    if traces.channels[k] == "speed":
+        seconds = min(seconds, HORIZON_S)  # beyond which a simulated speed may be anywhere
     inside = _liveliest(traces.time, traces.stretch, np.abs(traces.before[k] - traces.after[k]), seconds)
     offset = np.zeros(2)
     if traces.channels[k] == "speed":

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.uncounted import Reason, Uncounted
+from avtorch.plots.diagnosis import budget_bars
 from avtorch.plots.style import BLACK, BLUE, GREY, VERMILLION, styled
 
 _WIDE, _NARROW = (8.6, 260), (4.0, 120)
@@ -121,7 +122,7 @@ class DrivePanel:
 
 def drive_panels(found: Diagnosis) -> list[DrivePanel]:
     """What was measured and simulated over the whole drive, a panel a channel, the command with the acceleration or in
-    a panel of its own; a rollout's speed begins at the measured one in each stretch.
+    a panel of its own; a simulated speed begins at the measured one every ten seconds (`Traces.begun_anew`).
 
     Raises `InputError` where there are no traces.
 
@@ -137,18 +138,18 @@ def drive_panels(found: Diagnosis) -> list[DrivePanel]:
     traces = found.traces
     if traces is None:
         raise InputError("traces: the diagnosis has none to draw")
-    firsts = np.concatenate([[0], np.flatnonzero(np.diff(traces.stretch) != 0) + 1])
-    of = np.searchsorted(firsts, np.arange(len(traces.time)), side="right") - 1
     panels = [] if "accel" in traces.channels else [DrivePanel("command [m/s²]", {"command": traces.command})]
     for name, measured, before, after in zip(
-        traces.channels, traces.measured, traces.before, traces.after, strict=True
+        traces.channels,
+        traces.measured,
+        traces.begun_anew(traces.before),
+        traces.begun_anew(traces.after),
+        strict=True,
     ):
         lines = {"command": traces.command} if name == "accel" else {}
         lines |= {"measured": measured, "baseline simulator": before}
         if found.winner.effects:
             lines["with what was named"] = after
-        if name == "speed":
-            lines = {label: values + (measured - values)[firsts][of] for label, values in lines.items()}
         panels.append(DrivePanel(_LABELS[name], lines))
     return panels
 
@@ -157,21 +158,54 @@ def drive_panels(found: Diagnosis) -> list[DrivePanel]:
 def drive_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     """The whole drive, a panel a channel, the command with the acceleration or in a panel of its own.
 
-    A rollout's speed begins at the measured one in each stretch. Raises `InputError` where there are no traces.
+    A simulated speed begins at the measured one every ten seconds. Raises `InputError` where there are no traces.
     """
-    axis, panels, traces = drive_time(found), drive_panels(found), found.traces
-    assert traces is not None
-    width, intervals = _NARROW if narrow else _WIDE
+    panels = drive_panels(found)
+    width, _ = _NARROW if narrow else _WIDE
     figure = Figure(figsize=(width, 0.8 + 1.9 * len(panels)), layout="constrained")
+    _drive(figure, found, panels, narrow=narrow)
+    return figure
+
+
+@styled
+def diagnosis_figure(found: Diagnosis) -> Figure:
+    """A diagnosis at a glance: the budget of the gap above the whole drive.
+
+    Raises `InputError` where there is no budget, or no traces.
+
+    Example:
+        >>> from avtorch import Leader, diagnose, plots, simulate
+        >>> from avtorch.gap import ConstantResistance, plant
+        >>> car = plant([ConstantResistance(0.3)], sigma=0.02)
+        >>> log = simulate(Leader.default(start=30.0, duration=40.0, dt=0.1), plant=car).log()
+        >>> figure = plots.diagnosis_figure(diagnose(log, effects=["constant_resistance"], pairs=False))
+        >>> [ax.get_xlabel() or ax.get_ylabel() for ax in figure.axes]
+        ['share of the gap in held-out 10 s rollouts', 'acceleration [m/s²]', 'time [s]']
+    """
+    if found.budget is None:
+        raise InputError("budget: the diagnosis has none to draw; its drives are too short to hold out blocks")
+    panels = drive_panels(found)
+    heights = 0.7 + 0.3 * (len(found.budget.parts) + 1), 0.8 + 1.6 * len(panels)
+    figure = Figure(figsize=(_WIDE[0], sum(heights)), layout="constrained")
+    parts = figure.add_gridspec(2, 1, height_ratios=heights)
+    above, below = figure.add_subfigure(parts[0]), figure.add_subfigure(parts[1])
+    budget_bars(above.add_subplot(), found.budget)
+    _drive(below, found, panels, narrow=False)
+    return figure
+
+
+def _drive(figure: FigureBase, found: Diagnosis, panels: list[DrivePanel], *, narrow: bool) -> None:
+    axis, traces = drive_time(found), found.traces
+    assert traces is not None
+    intervals = (_NARROW if narrow else _WIDE)[1]
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for ax, panel in zip(axes, panels, strict=True):
         _shade(ax, axis)
-        _channel(ax, axis, traces.stretch, panel, intervals)
+        _channel(ax, axis, traces.piece, panel, intervals)
     axes[-1].set_xlabel("time [s]" if len(axis.begins) == 1 else "time, one log behind the other [s]")
     axes[-1].set_xlim(float(axis.along[0]), float(axis.along[-1]))
     handles = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     figure.legend(list(handles.values()), list(handles), loc="outside upper left", ncols=2 if narrow else 3)
-    return figure
 
 
 def _shade(ax: Axes, axis: DriveTime) -> None:
@@ -186,9 +220,9 @@ def _shade(ax: Axes, axis: DriveTime) -> None:
         ax.axvline(axis.onset, color=BLACK, lw=1.0, ls="--", label="onset")
 
 
-def _channel(ax: Axes, axis: DriveTime, stretch: IntArray, panel: DrivePanel, intervals: int) -> None:
+def _channel(ax: Axes, axis: DriveTime, piece: IntArray, panel: DrivePanel, intervals: int) -> None:
     for label, values in panel.lines.items():
-        ax.plot(*envelope(axis.along, values, stretch, intervals), color=_COLOURS[label], lw=0.9, label=label)
+        ax.plot(*envelope(axis.along, values, piece, intervals), color=_COLOURS[label], lw=0.9, label=label)
     ax.set_ylabel(panel.label)
     measured = panel.lines.get("measured")
     if measured is not None:

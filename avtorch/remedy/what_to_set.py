@@ -284,16 +284,19 @@ def _sentence(
         steps.append(f"feed the leader's acceleration forward with k_f {s['feedforward']:g}")
     if not steps:
         if good:
-            return f"Nothing to set: P(string stable) is {before:.2f} without a change."
+            return (
+                "Nothing to set: as it is, disturbances die out along a line of such cars with probability "
+                f"{before:.2f} (string stability)."
+            )
         return (
-            "No available setting is sufficient, and none is better than the one in force "
-            f"(P(string stable) {before:.2f})."
+            "no available setting lets disturbances die out along a line of such cars (string stability), and none is "
+            f"better than the one in force (probability {before:.2f})."
         )
     what = "; ".join(steps)
-    change = f"P(string stable) {then:.2f} instead of {before:.2f}"
+    change = f"probability of string stability {then:.2f} instead of {before:.2f}"
     if good:
-        return f"Least intrusive sufficient setting: {what} ({change})."
-    return f"No available setting reaches {required:g}; the best is: {what} ({change})."
+        return f"{what} ({change}); the least intrusive setting that is sufficient."
+    return f"no available setting reaches {required:g}; the best is {what} ({change})."
 
 
 def _finite(x: float) -> float | None:

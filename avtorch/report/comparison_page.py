@@ -114,7 +114,7 @@ def _cause(cause: ChangeCause | None, told: str) -> Section:
     if cause is None:
         return Section("What has changed")
     lines = () if cause.why in told else (cause.why,)
-    columns = ("what", "probability", *_SIDES, "alike in these drives")
+    columns = ("what", "probability", *_SIDES, "cannot be told from")
     rows = []
     for part in cause.parts:
         sides = {side: "" for side in _SIDES}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from avtorch.gap.budget import parts as budget_parts
 from avtorch.gap.budget.parts import Budget
 from avtorch.gap.crossval.localisation import UNITS
 from avtorch.gap.quantity import unit_of, words_of
@@ -31,7 +32,7 @@ _IMPLAUSIBLE = "physically implausible"
 
 def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
     """What each cause contributes to the gap; times count from `epoch_s`."""
-    columns = ("effect", "share of the gap (90 %)", "probability", "parameters (90 %)", "alike in these drives")
+    columns = ("effect", "share of the gap (90 %)", "probability", "parameters (90 %)", "cannot be told from")
     rows = []
     for part in budget.parts:
         parameters = _parameters(part.parameters) + ([] if part.plausible else [_IMPLAUSIBLE])
@@ -124,8 +125,8 @@ def percent(q: Quantity) -> str:
         >>> percent(Quantity.of_normal(0.5, 0.1))
         '50 % (34 to 66)'
     """
-    mean, low, high = (round(100 * x) for x in (q.mean, q.q05, q.q95))
-    return f"{mean} % ({low} to {high})"
+    low, high = (round(100 * x) for x in (q.q05, q.q95))
+    return f"{budget_parts.percent(q.mean)} ({low} to {high})"
 
 
 def _parameters(parameters: Mapping[str, Quantity]) -> list[str]:

@@ -71,8 +71,9 @@ def _budget(found: Diagnosis) -> Picture | None:
         lambda narrow: budget_figure(found, narrow=narrow),
         f"Bars of what each effect contributes to the gap: {says}.",
         budget_table(budget, found.log.epochs_s[0]),
-        caption=f"A share is what an effect takes off the squared error of held-out {budget.horizon_s:.3g} s rollouts, "
-        "above the noise floor and on top of the effects before it. Whiskers: 90 %.",
+        caption=f"A share is what an effect takes off the squared error of {budget.horizon_s:.3g} s simulations, above "
+        "that of noise alone, on parts of the drive left out of the fit; effects are added in the order shown. Black "
+        "lines: 90 % intervals.",
         opened=True,
     )
 
@@ -87,6 +88,7 @@ def _drive(found: Diagnosis) -> Picture | None:
         unit = "m/s²" if name == "accel" else "m/s"
         columns += [f"{name} [{unit}]", f"{name}, error without [{unit}]", f"{name}, error with [{unit}]"]
     rows = []
+    rollouts = [traces.begun_anew(x) for x in (traces.before, traces.after)]
     for part in np.array_split(np.arange(len(axis.along)), _PARTS):
         command = traces.command[part]
         cells = [
@@ -94,8 +96,8 @@ def _drive(found: Diagnosis) -> Picture | None:
             f"{command.min():.2f} to {command.max():.2f}",
         ]
         for k in range(len(traces.channels)):
-            wholes = (traces.measured[k], *((traces.measured - x)[k] for x in (traces.before, traces.after)))
-            sizes = [np.std(x[part]) for x in wholes]
+            wholes = (traces.measured[k], *((traces.measured - x)[k] for x in rollouts))
+            sizes = [np.std(wholes[0][part]), *(np.sqrt(np.mean(x[part] ** 2)) for x in wholes[1:])]
             cells += [f"{size:.3f}" for size in sizes]
         rows.append(tuple(cells))
     named = " and that with what was named" if found.winner.effects else ""
@@ -104,10 +106,10 @@ def _drive(found: Diagnosis) -> Picture | None:
         lambda narrow: drive_figure(found, narrow=narrow),
         f"Lines over the whole drive, {axis.along[0]:.0f} to {axis.along[-1]:.0f} s: the command, the measured "
         f"{' and '.join(traces.channels)}, the baseline simulator{named}.{_marked(axis)}",
-        Table("The drive in parts: standard deviation of each signal, and of the error", tuple(columns), tuple(rows)),
-        caption="Of each short interval the least and the greatest value. Simulated lines are rollouts from the logged "
-        f"commands; in each stretch a speed begins at the measured one.{_marked(axis)}{_fit(found)}",
-        rows=Rows(axis.along, traces.stretch, [panel.lines for panel in drive_panels(found)]),
+        Table("The drive in parts: standard deviation of each signal, RMS of each error", tuple(columns), tuple(rows)),
+        caption="Each line shows the least and the greatest value of short intervals. Simulated lines come from the "
+        f"logged commands; every ten seconds a speed begins at the measured one.{_marked(axis)}{_fit(found)}",
+        rows=Rows(axis.along, traces.piece, [panel.lines for panel in drive_panels(found)]),
     )
 
 
@@ -123,7 +125,7 @@ def _fit(found: Diagnosis) -> str:
             told.append(f"{word} {before:.0f} %{' without what was named' if named else ''}{named}")
     if not told:
         return ""
-    return f" Fit over the whole drive (100 % is exact, 0 % no better than the mean): {'; '.join(told)}."
+    return f" Fit of the simulated lines (100 % is exact, 0 % no better than the mean): {'; '.join(told)}."
 
 
 def _marked(axis: DriveTime) -> str:
@@ -164,9 +166,8 @@ def _road(found: Diagnosis) -> Picture | None:
         f"Lines of {_quantity(stretch.axis)} over time, {stretch.time[0]:.0f} to {stretch.time[-1]:.0f} s: "
         f"{', '.join(labels)}. RMS error: {off}.",
         table,
-        caption=f"{_which_stretch(found)} All simulated lines are rollouts over the "
-        "whole drive: the simulator gets the logged commands and never the measured acceleration; its speed starts at "
-        "the measured one.",
+        caption=f"{_which_stretch(found)} Simulated lines: the simulator gets the logged commands and never "
+        "the measured acceleration; its speed starts at the measured one.",
     )
 
 

@@ -466,7 +466,7 @@ def test_notes(logs: list[Log]) -> None:
     notes = diagnosis_notes(answer(logs, verdict=both, **more))
     told = lines("\n".join(notes), 200)
     assert told[0] == "This log cannot distinguish dead_time from second_order_actuator."
-    assert told[1] == "Onset: at 132.4 s of the log's time."
+    assert told[1] == "The gap begins at 132.4 s of the log's time."
     assert told[2] == "Baseline fitted without and with the effect: T_L 0.52 → 0.31 s, K_L 1.02 → 0.99."
     assert told[3] == (
         "Gap of the baseline simulator, in rollouts of 5 s: acceleration error 0.21 m/s² (0.05 with the best "
@@ -479,8 +479,8 @@ def test_notes(logs: list[Log]) -> None:
     sure = verdict_of(CANDIDATES, aliases=lambda ranked: ())
     told = lines("\n".join(diagnosis_notes(answer(logs, verdict=sure))), 200)
     assert told[:2] == [
-        "This log distinguishes dead_time from every other hypothesis.",
-        "Onset: present from the start.",
+        "No other known cause explains this log as well.",
+        "The gap is there from the start.",
     ]
     wide = verdict_of(CANDIDATES, aliases=lambda ranked: ["none", "unknown", "backlash+dead_band"])
     told = lines("\n".join(diagnosis_notes(answer(logs, verdict=wide))), 200)

@@ -141,7 +141,7 @@ def test_a_complete_search_reports_nothing_untried() -> None:
     whole = replace(found, scope=replace(found.scope, not_scored=()), notes=())
     assert whole.scope is not None
     assert sentences.untried(whole.scope) == []
-    assert sentences.aliases(whole) == f"This log distinguishes {whole.verdict.name} from every other hypothesis."
+    assert sentences.aliases(whole) == "No other known cause explains this log as well."
     assert "Provisional" not in str(found)
 
 

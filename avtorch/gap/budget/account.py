@@ -289,12 +289,15 @@ def _verdict(budget: Budget, by_likelihood: Verdict) -> Verdict:
 def _why(budget: Budget) -> str:
     if not budget.names:
         if budget.unexplained.material:
-            return "On held-out blocks no known effect reduces the error, though part of it is reproducible."
+            return (
+                "On parts of the drive left out of the fit no known effect reduces the error, though part of it is "
+                "reproducible."
+            )
         share = percent(PartOdds.read().empty)
         return (
-            "What the residuals hold is noise: commands, speed and place do not predict it on held-out blocks. "
-            f"Of simulated drives that say so {share} have no cause, the others one too weak to show."
+            "What is left is noise: commands, speed and place do not predict it on parts of the drive left out of the "
+            f"fit. Of simulated drives that say so {share} have no cause, the others one too weak to show."
         )
     count = len(budget.names)
-    effects = "this effect" if count == 1 else f"these {count} effects"
-    return f"Held-out blocks select {effects}; residual noise may have any spectrum."
+    effects = "This effect was" if count == 1 else f"These {count} effects were"
+    return f"{effects} selected by how well each predicts parts of the drive that were left out of the fit."

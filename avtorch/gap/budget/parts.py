@@ -237,7 +237,7 @@ class Budget:
 def _words(part: Part | ChancePart, behind: str = "") -> str:
     """A cause in words; by its name alone where its parameters are not those of such an effect."""
     if not part.plausible:
-        return f"{part.name} ({behind})" if behind else part.name
+        return f"{part.name} ({f'{behind}, ' if behind else ''}physically implausible as fitted)"
     return named_cause(part.name, {key: q.mean for key, q in (part.parameters or {}).items()}, behind)
 
 

@@ -45,7 +45,13 @@ class SensorLag(Effect):
     alias = "pole"
     reading = fixed(lag="lag_s")
     starts = fixed(lag_s=(0.03, 0.1, 0.2, 0.4))
-    parameters = (Parameter("lag_s", "s", 0.0, 0.05, 0.5, possible=(0.0, 1.0), beyond="no accelerometer is so slow"),)
+    parameters = (
+        Parameter(
+            *("lag_s", "s", 0.0, 0.05, 0.5),
+            possible=(0.0, 1.0),
+            beyond="no accelerometer is so slow, but for a filter on its signal",
+        ),
+    )
 
     @classmethod
     def in_words(cls, values: Mapping[str, float]) -> str:

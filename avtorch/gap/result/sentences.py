@@ -20,6 +20,7 @@ from avtorch.io.clock import clock_words
 SURE = 0.9
 """Probability from which a headline is unqualified."""
 _UNIT = {"speed": "m/s", "accel": "m/s²"}
+_WORD = {"speed": "speed", "accel": "acceleration"}
 _ALIASES = 4  # hypotheses named beside the verdict
 _UNTRIED = 6  # names of effects listed as not tried
 _MEASURES = {
@@ -155,15 +156,16 @@ def budget(found: Findings) -> list[str]:
     """The sentence on the budget of the gap, and what it divides."""
     if found.budget is None or not found.budget.parts:
         return []
-    these = "this effect" if len(found.budget.names) == 1 else "these effects"
+    takes = "this effect takes" if len(found.budget.names) == 1 else "these effects take"
     line = [] if headline(found).endswith(str(found.budget)) else [str(found.budget)]
-    errors = [
-        f"{name} {error.before:.2g} to {error.left:.2g} {_UNIT[name]} (noise floor {error.floor:.2g})"
-        for name, error in found.budget.by_channel.items()
-    ]
+    errors, floors = [], []
+    for name, error in found.budget.by_channel.items():
+        errors.append(f"in {_WORD[name]} from {error.before:.2g} to {error.left:.2g} {_UNIT[name]}")
+        floors.append(f"{error.floor:.2g} {_UNIT[name]}")
     return [
         *line,
-        f"Error of held-out {found.budget.horizon_s:.3g} s rollouts, without and with {these}: {', '.join(errors)}.",
+        f"In simulations of {found.budget.horizon_s:.3g} s from the logged commands, of parts of the drive left out of "
+        f"the fit, {takes} the error {' and '.join(errors)}; noise alone makes {' and '.join(floors)}.",
     ]
 
 
@@ -172,10 +174,10 @@ def onset(found: Findings) -> list[str]:
     late = [] if found.budget is None else [p for p in found.budget.parts if p.onset_s is not None]
     if late and len(found.verdict.names) > 1 and found.onset_s is None:
         began = found.log.epochs_s[0]
-        return [f"Onset of {p.name}: {(p.onset_s or 0.0) - began:.1f} s after the log's start." for p in late]
+        return [f"{p.name} sets in {(p.onset_s or 0.0) - began:.1f} s after the log's start." for p in late]
     if found.onset_s is not None:
-        return [f"Onset: at {moment(found)}."]
-    return ["Onset: present from the start."] if found.winner.effects else []
+        return [f"The gap begins at {moment(found)}."]
+    return ["The gap is there from the start."] if found.winner.effects else []
 
 
 def moment(found: Findings) -> str:
@@ -199,10 +201,13 @@ def where(found: Findings) -> list[str]:
 
 
 def shrinkage(found: Findings) -> list[str]:
-    """How far the gap shrinks on held-out data."""
+    """How far the gap shrinks on held-out data; no second time where the budget's sentence has said so."""
     scores = found.shrinkage
     if scores is None:
         return []
+    if budget(found):
+        chosen = scores.chosen
+        return [] if chosen in (1, None) else [f"{100 * chosen:.0f} % of the fits without a part select the same."]
     top, few = (
         scores.top,
         "" if scores.chosen in (1, None) else f"; {100 * scores.chosen:.0f} % of the folds selected it",
@@ -242,13 +247,15 @@ def aliases(found: Findings) -> str:
     if found.budget is not None and len(found.verdict.names) > 2:
         alike = [(p.name, [n for n in p.alias_set if n != p.name]) for p in found.budget.parts]
         confused = [f"{name} from {' or '.join(others)}" for name, others in alike if others]
-        return f"This log cannot distinguish {', nor '.join(confused)}." if confused else "This log distinguishes them."
+        if not confused:
+            return "No other known cause explains this log as well."
+        return f"This log cannot distinguish {', nor '.join(confused)}."
     if _cut(found):
         from_words["unknown"] = "a cause that was not tried"
     others = [from_words.get(n, n.replace("+", " with ")) for n in found.verdict.alias_set if n != found.verdict.name]
     if not others:
-        which = "hypothesis" if _all_tried(found) else "hypothesis tried, and only from those"
-        return f"This log distinguishes {found.verdict.name.replace('+', ' with ')} from every other {which}."
+        which = "known cause" if _all_tried(found) else "cause that was tried"
+        return f"No {'' if found.verdict.name == 'none' else 'other '}{which} explains this log as well."
     if len(others) > _ALIASES + 1:
         others = [*others[:_ALIASES], f"any of {len(others) - _ALIASES} less probable hypotheses"]
     listing = others[0] if len(others) == 1 else f"{', '.join(others[:-1])} or {others[-1]}"

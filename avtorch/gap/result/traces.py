@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
+from avtorch.gap.budget.parts import HORIZON_S
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.result.uncounted import Uncounted
 from avtorch.gap.simulator.plant import GapPlant
+
+_BEGIN_S = 0.5  # over which the measured start of a rollout is averaged
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,14 +40,40 @@ class Traces:
         """Measured speed, (row,); None where it was not measured."""
         return self.measured[self.channels.index("speed")] if "speed" in self.channels else None
 
+    @cached_property
+    def piece(self) -> IntArray:
+        """Number (row,) of the rollout of at most `HORIZON_S` that a row belongs to; each stretch begins one."""
+        firsts = np.flatnonzero(np.diff(self.stretch, prepend=self.stretch[:1] - 1))
+        since = self.time - self.time[firsts][np.searchsorted(firsts, np.arange(len(self.time)), side="right") - 1]
+        begins = (np.diff(self.stretch, prepend=self.stretch[:1] - 1) != 0) | (
+            np.diff(since // HORIZON_S, prepend=-1.0) > 0
+        )
+        return np.cumsum(begins) - 1
+
+    def begun_anew(self, simulated: FloatArray) -> FloatArray:
+        """`simulated` (channel, row), with a speed that begins each `piece` at the measured one, as in the budget: over
+        a whole drive it would drift without end on a car that rolls to a stop where its simulator does not.
+        """
+        if "speed" not in self.channels:
+            return simulated
+        k = self.channels.index("speed")
+        off = self.measured[k] - simulated[k]
+        firsts = np.flatnonzero(np.diff(self.piece, prepend=-1))
+        starts = self.time - self.time[firsts][self.piece] <= _BEGIN_S
+        level = np.bincount(self.piece[starts], off[starts]) / np.bincount(self.piece[starts])
+        out = simulated.copy()
+        out[k] += level[self.piece]
+        return out
+
     def fit(self, simulated: FloatArray) -> FloatArray:
-        """Fit [%] of `simulated` (channel, row), such as `before` or `after`, to what was measured: (channel,).
+        """Fit [%] of `simulated` (channel, row), such as `before` or `after`, to what was measured: (channel,), a speed
+        `begun_anew`.
 
         100 (1 - |y - y_sim| / |y - mean(y)|), the fit by normalised root mean square error of system identification
         (Ljung, System Identification, 2nd ed., 1999): 100 is exact, 0 no better than the mean, less is worse than it.
         NaN for a channel that stands still.
         """
-        error = np.linalg.norm(self.measured - simulated, axis=1)
+        error = np.linalg.norm(self.measured - self.begun_anew(simulated), axis=1)
         spread = np.linalg.norm(self.measured - self.measured.mean(axis=1, keepdims=True), axis=1)
         return 100 * (1 - np.divide(error, spread, out=np.full_like(error, np.nan), where=spread > 0))
 

@@ -161,14 +161,14 @@ def verdict_of(
 
 def _why(ranked: Sequence[Candidate], known: str) -> str:
     first, second = ranked[0], ranked[1]
-    rival = f"next is {second.name} with probability {second.probability:.3g}"
+    words = {"none": "that nothing is missing", "unknown": "a cause that is not known here"}
+    rival = f"next is {words.get(second.name, second.name)}, with {second.probability:.3g}"
     if first.name == "none":
         which = "effect" if known == "known effect" else known
         return f"No {which} explains the log better than the baseline does; {rival}."
     if first.name == "unknown":
         return f"No {known} leaves residuals that could be noise; {rival}."
-    gain = "" if first.log_evidence is None else f" explains the log {first.log_evidence:.0f} nats better than none and"
-    return f"{first.name}{gain} has probability {first.probability:.3g}; {rival}."
+    return f"{first.name} has probability {first.probability:.3g}; {rival}."
 
 
 def plain(quantities: Mapping[str, Quantity]) -> dict[str, dict[str, float]]:

@@ -182,10 +182,7 @@ def test_verdict_is_the_most_probable_with_its_aliases() -> None:
     given = candidates(sensor_lag=0.3, dead_time=0.63, none=0.01, unknown=0.06)
     verdict = verdict_of(given)
     assert (verdict.names, verdict.alias_set, verdict.abstained) == (("dead_time",), ("dead_time", "sensor_lag"), False)
-    assert verdict.why == (
-        "dead_time explains the log 6 nats better than none and has probability 0.63; "
-        "next is sensor_lag with probability 0.3."
-    )
+    assert verdict.why == ("dead_time has probability 0.63; next is sensor_lag, with 0.3.")
     assert verdict_of(given, aliases=near(0.6)).alias_set == ("dead_time",)
     # a hypothesis without prediction is a rival only where it is about as probable
     assert verdict_of(given, aliases=near(0.6, unknown=0.05)).alias_set == ("dead_time", "unknown")
@@ -248,7 +245,7 @@ def test_printed_it_reports_its_result() -> None:
         "Probably the simulator lacks this (probability 0.80): the command acts after a delay (dead_time)."
     )
     assert found.verdict.why in told
-    assert "Onset: at 12.0 s of the log's time." in told
+    assert "The gap begins at 12.0 s of the log's time." in told
     assert told[-1] == "Mind the gap."
     assert "dead_time" in repr(found)
     assert "Probably the simulator lacks this" in repr(found).splitlines()[0]
@@ -285,7 +282,7 @@ def test_an_onset_is_said_from_the_start_and_on_the_clock() -> None:
     log = replace(FACTS, epochs_s=(1_700_000_000.0,))
     found = replace(diagnosis(of), log=log, onset_s=1_700_000_012.0)
     clock = "1700000012 s, as Unix time 2023-11-14 22:13:32 UTC"
-    assert f"Onset: at 12.0 s from the log's start ({clock})." in str(found).splitlines()
+    assert f"The gap begins at 12.0 s from the log's start ({clock})." in str(found).splitlines()
     assert found.to_dict()["onset_s"] == 1_700_000_012.0
     assert found.to_dict()["onset_from_start_s"] == 12.0
     assert found.to_dict()["log"]["epochs_s"] == [1_700_000_000.0]

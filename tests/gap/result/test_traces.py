@@ -13,7 +13,7 @@ def test_the_fit_of_the_exact_the_mean_and_a_known_error() -> None:
     measured = np.stack([np.sin(time), 20 + 3 * np.sin(time)])
     wrong = measured + np.array([[0.25], [3.0]]) * np.cos(time)  # as large as a quarter of the spread, and as all of it
     zeros = np.zeros(len(time))
-    traces = Traces(time, zeros, ("accel", "speed"), measured, measured, wrong, zeros, zeros.astype(int))
+    traces = Traces(time, zeros, ("accel", "another"), measured, measured, wrong, zeros, zeros.astype(int))
     assert traces.fit(traces.before).tolist() == [100.0, 100.0]
     assert traces.fit(traces.after) == pytest.approx([75.0, 0.0], abs=1e-9)
     mean = np.broadcast_to(measured.mean(axis=1, keepdims=True), measured.shape)
@@ -26,3 +26,19 @@ def test_a_channel_that_stands_still_has_no_fit() -> None:
     still, zeros = np.full((1, 50), 4.0), np.zeros(50)
     traces = Traces(np.arange(50.0), zeros, ("speed",), still, still, still, zeros, zeros.astype(int))
     assert np.isnan(traces.fit(traces.after)).all()
+
+
+def test_a_simulated_speed_begins_anew_every_ten_seconds_and_in_each_stretch() -> None:
+    time = 0.05 * np.concatenate([np.arange(500), np.arange(600, 700)])  # 25 s, 5 s without rows, 5 s
+    stretch = np.repeat([0, 1], [500, 100])
+    speed, zeros = 20 + np.sin(time), np.zeros(600)
+    drifting = speed + 7.0 + 0.4 * time
+    traces = Traces(time, zeros, ("speed",), speed[None], drifting[None], speed[None], zeros, stretch)
+    assert [int((traces.piece == n).sum()) for n in range(4)] == [200, 200, 100, 100]
+    off = traces.begun_anew(traces.before)[0] - speed
+    since = np.concatenate([0.05 * (np.arange(500) % 200), 0.05 * np.arange(100)])
+    # from the mean of the first half second, 11 rows, on
+    np.testing.assert_allclose(off, 0.4 * (since - 0.25), atol=1e-9)
+    np.testing.assert_allclose(traces.begun_anew(traces.after)[0], speed)
+    accel = Traces(time, zeros, ("accel",), speed[None], drifting[None], speed[None], zeros, stretch)
+    assert accel.begun_anew(accel.before) is accel.before

@@ -73,7 +73,7 @@ def test_a_multiple_of_the_period_is_no_delay(shape: str, period: float, rate: f
     assert found.probability("dead_time") < 0.05
     if found.verdict.name == "none":
         assert "dead_time" in found.verdict.alias_set
-        assert "This log distinguishes" not in str(found)
+        assert "explains this log as well" not in str(found)
 
 
 @pytest.mark.slow
