@@ -202,11 +202,20 @@ class Budget:
         if not self.names:
             found = "No known effect explains the gap." if self.unexplained.material else "Nothing material is missing."
             return found
+        return self._sentence(lead="")
+
+    def beside_its_name(self) -> str:
+        """As `str()`, where the sentence before has told the one part that is named."""
+        if len(self.names) != 1 or len(self.parts) != 1:
+            return str(self)
+        return self._sentence(lead=f"That is {percent(self.parts[0].share.mean)} of the gap")
+
+    def _sentence(self, lead: str) -> str:
         named = [p for p in self.parts if p.probability >= LIKELY]
         large = [p for p in named if p.share.mean >= self.material] or named[:1]
         small = [_words(p) for p in named if p not in large]
         words = [_words(p, f"{percent(p.share.mean)} of the gap") for p in large]
-        lines = [f"Chiefly {', then '.join(words)}"] if words else []
+        lines = [lead or f"Chiefly {', then '.join(words)}"] if words else []
         if small:
             lines.append(f"{listing(small)} with under {percent(self.material)}{' each' if small[1:] else ''}")
         if self.unexplained.share.mean >= 0.005 and named:

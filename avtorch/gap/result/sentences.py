@@ -157,7 +157,9 @@ def budget(found: Findings) -> list[str]:
     if found.budget is None or not found.budget.parts:
         return []
     takes = "this effect takes" if len(found.budget.names) == 1 else "these effects take"
-    line = [] if headline(found).endswith(str(found.budget)) else [str(found.budget)]
+    told = found.budget.names == found.verdict.names and not found.verdict.partial
+    line = [found.budget.beside_its_name() if told else str(found.budget)]
+    line = [] if headline(found).endswith(str(found.budget)) else line
     errors, floors = [], []
     for name, error in found.budget.by_channel.items():
         errors.append(f"in {_WORD[name]} from {error.before:.2g} to {error.left:.2g} {_UNIT[name]}")
