@@ -16,6 +16,7 @@ from matplotlib.figure import Figure, FigureBase
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import Reason, Uncounted
 from avtorch.plots.diagnosis import budget_bars
 from avtorch.plots.style import BLACK, BLUE, GREY, VERMILLION, styled
@@ -28,7 +29,7 @@ _BEYOND = 0.3  # of the measured range: how far beyond it a rollout is followed,
 _GROUNDS: dict[Reason, tuple[str, dict[str, Any]]] = {
     "driver": ("driver", {"facecolor": "#DDDDDD"}),
     "standstill": ("standstill", {"facecolor": "none", "edgecolor": "#BBBBBB", "hatch": "////"}),
-    "gap": ("no rows", {"facecolor": "none", "edgecolor": "#BBBBBB", "hatch": "..."}),
+    "gap": ("no rows", {"facecolor": "none", "edgecolor": "#BBBBBB", "hatch": "\\\\\\\\"}),
     "settling": ("settling", {"facecolor": "#E6E6E6"}),
 }
 """What did not count: its label, and a ground that is told from the others without colour."""
@@ -201,7 +202,7 @@ def _drive(figure: FigureBase, found: Diagnosis, panels: list[DrivePanel], *, na
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for ax, panel in zip(axes, panels, strict=True):
         _shade(ax, axis)
-        _channel(ax, axis, traces.piece, panel, intervals)
+        _channel(ax, axis, traces, panel, intervals)
     axes[-1].set_xlabel("time [s]" if len(axis.begins) == 1 else "time, one log behind the other [s]")
     axes[-1].set_xlim(float(axis.along[0]), float(axis.along[-1]))
     handles = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
@@ -220,9 +221,12 @@ def _shade(ax: Axes, axis: DriveTime) -> None:
         ax.axvline(axis.onset, color=BLACK, lw=1.0, ls="--", label="onset")
 
 
-def _channel(ax: Axes, axis: DriveTime, piece: IntArray, panel: DrivePanel, intervals: int) -> None:
+def _channel(ax: Axes, axis: DriveTime, traces: Traces, panel: DrivePanel, intervals: int) -> None:
     for label, values in panel.lines.items():
-        ax.plot(*envelope(axis.along, values, piece, intervals), color=_COLOURS[label], lw=0.9, label=label)
+        # what was logged does not begin anew with a rollout, and a simulated acceleration does not either
+        anew = panel.label == _LABELS["speed"] and label not in ("command", "measured")
+        parts = traces.piece if anew else traces.stretch
+        ax.plot(*envelope(axis.along, values, parts, intervals), color=_COLOURS[label], lw=0.9, label=label)
     ax.set_ylabel(panel.label)
     measured = panel.lines.get("measured")
     if measured is not None:

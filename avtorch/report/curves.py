@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from avtorch.arrays import FloatArray, IntArray
 
 _LEAST = 8  # points of a line that is worth reading; rules and markers have fewer
-_ROWS = 4500  # of a line, at most, that can be seen when a part is made larger
+_ROWS = 3000  # of a line, at most, that can be seen when a part is made larger
 _LEVELS = 4096  # of a value in two letters
 _LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/"
 _GREEK = {r"\tau": "τ", r"\sigma": "σ", r"\omega": "ω"}

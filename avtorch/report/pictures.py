@@ -29,8 +29,8 @@ from avtorch.report.table import Table, of_numbers
 _MOST = 60  # rows of a table behind a picture of lines
 _NOT_COUNTED = {
     "driver": "grey, the driver's hand",
-    "standstill": "hatched, standstill",
-    "gap": "dotted, no rows",
+    "standstill": "hatched upwards, standstill",
+    "gap": "hatched downwards, no rows",
     "settling": "pale, the first seconds of a drive and after a return",
 }
 _PARTS = 12  # of the drive, rows of its table
