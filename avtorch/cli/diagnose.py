@@ -110,6 +110,13 @@ def diagnose(
         Literal["laplace", "sgld"],
         Parameter(help="Posterior of the winner's parameters: normal approximation, or SGLD."),
     ] = "sgld",
+    estimates: Annotated[
+        list[Path] | None,
+        Parameter(
+            negative=(),
+            help="estimates.json of avtorch estimate on the same log, whose alarms the report marks; one for each log.",
+        ),
+    ] = None,
     follower: Annotated[
         bool, Parameter(group=FOLLOWER, negative=(), help="The log is of a car that follows, and has no accel_cmd.")
     ] = False,
@@ -172,13 +179,14 @@ def diagnose(
     if assumed is not None and (simulated or simulator is not None):
         raise InputError("--baseline: found beside --simulated or --simulator, needs one simulator")
 
+    from avtorch.gap.result.alarms import read_alarms
     from avtorch.io import Log, check
 
     talk = Talk(json=json, quiet=quiet)
     if follower:
         usual = {"accel_kind": accel_kind == "kinematic", "no_pairs": pairs, "posterior": posterior == "sgld"}
         idle = {"simulated": simulated, "simulator": simulator, "step": step is not None, "adjust": adjust}
-        idle |= {"rollouts": rollouts is not None, "processes": processes != 1}
+        idle |= {"estimates": estimates, "rollouts": rollouts is not None, "processes": processes != 1}
         idle |= {"baseline": assumed, "prior": weights, "budget": budget is not None}
         idle |= {option: not default for option, default in usual.items()}
         refuse(logs, **idle, **{option: value is not None for option, value in track.items()})
@@ -197,6 +205,7 @@ def diagnose(
         _usable(path, drive, accel_kind)
         _check_effects(chosen or (), path, drive)
     limits = _limits(drives, track)
+    alarms = read_alarms(estimates, drives) if estimates else ()
     with_paths = list(zip(logs, drives, strict=True))
     own = simulator_of(
         simulated or (), simulator, step, with_paths, adjust=adjust or (), rollouts=rollouts, processes=processes
@@ -210,7 +219,7 @@ def diagnose(
         quality += [f"{Path(drive.name).name}: {note}" for note in noted]
 
     origin = origin_of(
-        [*logs, *([Path(baseline)] if baseline.endswith(".toml") else [])],
+        [*logs, *([Path(baseline)] if baseline.endswith(".toml") else []), *(estimates or ())],
         map=map,
         unit=unit,
         stamp=stamp,
@@ -268,6 +277,7 @@ def diagnose(
     found = replace(
         found,
         notes=notes,
+        alarms=alarms,
         setting=None if setting is None else setting.to_dict(),
         next_experiment=None if ahead is None else ahead.to_dict(),
     )

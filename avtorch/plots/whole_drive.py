@@ -15,11 +15,12 @@ from matplotlib.figure import Figure, FigureBase
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
+from avtorch.gap.result.alarms import Alarm
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import Reason, Uncounted
 from avtorch.plots.diagnosis import budget_bars
-from avtorch.plots.style import BLACK, BLUE, GREY, VERMILLION, styled
+from avtorch.plots.style import BLACK, BLUE, GREY, PURPLE, VERMILLION, styled
 
 _WIDE, _NARROW = (8.6, 260), (4.0, 120)
 """Width [in] and intervals of a line, on a desk and on a phone."""
@@ -39,7 +40,7 @@ _LOGS_APART = 0.02  # of the whole, between two logs
 @dataclass(frozen=True)
 class DriveTime:
     """Where the rows of a diagnosis lie on one axis: `along` (row,) [s], several logs one behind the other; `begins` of
-    the logs on it [s]; `uncounted` with its ends on it; `onset` on it [s], where an effect sets in.
+    the logs on it [s]; `uncounted` and `alarms` at their times on it; `onset` on it [s], where an effect sets in.
 
     Example:
         >>> from avtorch import Leader, diagnose, simulate
@@ -55,6 +56,7 @@ class DriveTime:
     begins: tuple[float, ...]
     uncounted: tuple[Uncounted, ...]
     onset: float | None
+    alarms: tuple[Alarm, ...] = ()
 
 
 def drive_time(found: Diagnosis) -> DriveTime:
@@ -77,7 +79,8 @@ def drive_time(found: Diagnosis) -> DriveTime:
     onset = found.onset_from_start_s
     if onset is not None:
         onset += begins[min(found.onset_log, len(begins) - 1)]
-    return DriveTime(along, tuple(begins), inside, onset)
+    alarms = tuple(replace(x, at=x.at + begins[x.log]) for x in found.alarms if x.log < len(begins))
+    return DriveTime(along, tuple(begins), inside, onset, alarms)
 
 
 def envelope(time: FloatArray, values: FloatArray, stretch: IntArray, intervals: int) -> tuple[FloatArray, FloatArray]:
@@ -217,6 +220,8 @@ def _shade(ax: Axes, axis: DriveTime) -> None:
         told.add(x.why)
     for begin in axis.begins[1:]:
         ax.axvline(begin, color=GREY, lw=0.8, ls=":", label="next log" if begin == axis.begins[1] else None)
+    for i, alarm in enumerate(axis.alarms):
+        ax.axvline(alarm.at, color=PURPLE, lw=0.9, ls="-.", label="alarm" if i == 0 else None)
     if axis.onset is not None:
         ax.axvline(axis.onset, color=BLACK, lw=1.0, ls="--", label="onset")
 

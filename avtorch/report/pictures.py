@@ -33,6 +33,7 @@ _NOT_COUNTED = {
     "gap": "hatched downwards, no rows",
     "settling": "pale, the first seconds of a drive and after a return",
 }
+_ALARMS = 6  # named in the words below a picture
 _PARTS = 12  # of the drive, rows of its table
 
 
@@ -141,6 +142,10 @@ def _marked(axis: DriveTime) -> str:
         told.append(f" {len(axis.begins)} logs, one behind the other.")
     if axis.onset is not None:
         told.append(f" Dashed: the onset, at {axis.onset:.1f} s.")
+    if axis.alarms:
+        some = [f"{x.detector} at {x.at:.1f} s" for x in axis.alarms[:_ALARMS]]
+        more = [f"{len(axis.alarms) - _ALARMS} more"] if len(axis.alarms) > _ALARMS else []
+        told.append(f" Dash-dotted: alarms of the monitor ({', '.join([*some, *more])}).")
     return "".join(told)
 
 

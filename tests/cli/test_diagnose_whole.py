@@ -29,10 +29,21 @@ def drive(tmp_path: Path, rotating_seed: int) -> Path:
 
 @pytest.mark.statistical
 def test_from_a_file_to_the_page(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "out"
+    out, estimates = tmp_path / "out", tmp_path / "estimates.json"
+    log = Log.read(drive)
+    windows = [{"end_s": log.epoch_s + 30.0, "alerts": ["stability"]}]
+    of_log = {
+        "schema": "avtorch.estimates/1",
+        "epoch_s": log.epoch_s,
+        "quality": {"rows": log.rows},
+        "windows": windows,
+    }
+    estimates.write_text(json.dumps(of_log), encoding="utf-8")
     command = [
         "diagnose",
         str(drive),
+        "--estimates",
+        str(estimates),
         "--effects",
         "dead_time,sensor_bias",
         "--no-pairs",
@@ -52,7 +63,9 @@ def test_from_a_file_to_the_page(drive: Path, tmp_path: Path, capsys: pytest.Cap
     assert abs(delay["mean"] - 0.2) < BAR * delay["sd"]
     assert answer["not_tried"]["pairs"] == "none"
     assert "aerodynamic_drag" in answer["not_tried"]["effects"]
-    assert "dead_time" in (out / "report.html").read_text(encoding="utf-8")
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "dead_time" in page
+    assert "alarms of the monitor (stability at 30.0 s)" in page
     # the same command again goes on from kept fits, to the same answer
     before = (out / "diagnosis.json").read_bytes()
     assert main([*command, "--quiet"]) == 0

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from avtorch.errors import InputError
+from avtorch.gap.result.alarms import Alarm
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import Uncounted
 from avtorch.plots.whole_drive import drive_figure, drive_time, envelope
@@ -29,7 +30,8 @@ def found(channels: tuple[str, ...] = ("accel", "speed"), **more: Any) -> Any:
         Uncounted(4.0, 6.0, "standstill", 1),
     )
     traces = Traces(time, np.sin(time), channels, *lines, np.zeros(len(time)), stretch, unused)
-    given = {"traces": traces, "onset_from_start_s": None, "onset_log": 0, "winner": SimpleNamespace(effects=("x",))}
+    given: dict[str, Any] = {"traces": traces, "onset_from_start_s": None, "onset_log": 0, "alarms": ()}
+    given["winner"] = SimpleNamespace(effects=("x",))
     return SimpleNamespace(**{**given, **more})
 
 
@@ -58,6 +60,9 @@ def test_logs_lie_one_behind_the_other_and_what_did_not_count_is_told() -> None:
     start = axis.begins[1]
     assert spans == [("driver", 20.0, 28.0), ("settling", 28.0, 30.0), ("standstill", start + 4.0, start + 6.0)]
     assert axis.onset == pytest.approx(axis.begins[1] + 5.0)
+    warned = found(alarms=(Alarm(7.0, "change"), Alarm(3.0, "stability", 1)))
+    assert [(x.detector, x.at) for x in drive_time(warned).alarms] == [("change", 7.0), ("stability", start + 3.0)]
+    assert "alarm" in [text.get_text() for text in drive_figure(warned).legends[0].get_texts()]
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from avtorch.gap.crossval.gap_closed import MetricShrinkage, Shrinkage
 from avtorch.gap.crossval.localisation import Location
 from avtorch.gap.quantity import Quantity, frame_of, unit_of
 from avtorch.gap.result import sentences
+from avtorch.gap.result.alarms import Alarm
 from avtorch.gap.result.gap_size import GapSize
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.predictive_model import PredictiveModel
@@ -95,6 +96,8 @@ class Diagnosis(Displayed):
     - `complete` False: the budget ended the search; `scope`: what was tried, None where unknown. Where that is not
       everything, probabilities cover what was tried, and `unknown` includes the causes that were not
 
+    - `alarms`: what `avtorch estimate` raised on these drives, where that was given; it is drawn and changes nothing
+
     The verdict is the budget's where there is one, else the most probable hypothesis. Raises `InputError` where they
     are inconsistent.
 
@@ -135,6 +138,7 @@ class Diagnosis(Displayed):
     onset_log: int = 0
     budget: Budget | None = None
     tested: SimulatorUnderTest | None = None
+    alarms: tuple[Alarm, ...] = ()
 
     def __post_init__(self) -> None:
         if self.onset_s is not None and self.onset_from_start_s is None:
