@@ -42,6 +42,7 @@ class EffectModel:
     onsets: Mapping[str, float] = field(default_factory=dict)
     plant: GapPlant = field(init=False)
     index: Mapping[str, slice] = field(init=False)
+    roads: Mapping[str, Integrated] = field(init=False)
     low: FloatArray = field(init=False)
     high: FloatArray = field(init=False)
 
@@ -68,7 +69,15 @@ class EffectModel:
             index[LATENESS] = slice(len(low), len(low) + 1)
             low.append(-_WIDEST)
             high.append(_WIDEST)
-        for name, value in (("plant", whole), ("index", index), ("low", np.array(low)), ("high", np.array(high))):
+        roads = {
+            f"{e.name}.{p.name}": e
+            for e in whole.effects
+            if isinstance(e, Integrated) and e.name in new
+            for p in e.coordinates()
+            if p.size > 1
+        }
+        made = {"plant": whole, "index": index, "roads": roads, "low": np.array(low), "high": np.array(high)}
+        for name, value in made.items():
             object.__setattr__(self, name, value)
 
     @property
@@ -98,6 +107,9 @@ class EffectModel:
             if key == LATENESS:
                 continue
             value = parameters[key].constrain(inside[..., at])
+            if key in self.roads:
+                # a slope that is the same everywhere is a constant resistance, which has a name of its own
+                value = self.roads[key].levelled(value)
             out[key] = value if parameters[key].size > 1 else value[..., 0]
         return out
 

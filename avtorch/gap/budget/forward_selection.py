@@ -26,9 +26,9 @@ from avtorch.gap.budget.selection_step import Selection, Step, one_by_one
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant
 
-MOST_PARTS = 5
-"""Effects that a selection may hold."""
-_ROUNDS = 8  # of entering, as effects may leave again
+MOST_PARTS = 8
+"""Effects that a selection may hold. On no recording or simulated drive tried do as many stay."""
+_ROUNDS = 12  # of entering, as effects may leave again
 
 
 def select(

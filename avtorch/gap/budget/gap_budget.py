@@ -136,13 +136,16 @@ def _part(
     assert step.entered is not None
     model, z = selection.last.fit.model, selection.last.fit.z
     onset = model.onsets.get(step.entered)
+    parameters = parameters_of(selection, step.entered)
+    kind = next(e for e in model.effects if e.name == step.entered)
+    always = set(kind.alike({key: q.mean for key, q in parameters.items()})) - set(model.names)
     return Part(
         name=step.entered,
-        alias_set=step.aliases,
+        alias_set=tuple(sorted({*step.aliases, *always})),
         probability=sure[step.entered],
         share=share,
         after=after,
-        parameters=parameters_of(selection, step.entered),
+        parameters=parameters,
         onset_s=None if onset is None else onset + epoch_s,
         plausible=model.plausible(z, step.entered),
     )

@@ -11,7 +11,11 @@ from torch import Tensor
 from avtorch.gap.simulator.effect import Effect, fixed, register
 from avtorch.gap.simulator.effect_context import EffectContext
 from avtorch.gap.simulator.parameter import Parameter
+from avtorch.io.units import GRAVITY
 from avtorch.vehicle.arguments import Number, tensor
+
+_MEAN_SLOPE = 0.06
+"""Of a road that climbs all the way: as much as such a resistance, and steeper than roads are for long."""
 
 
 @register
@@ -56,6 +60,10 @@ class ConstantResistance(Effect):
     @classmethod
     def in_words(cls, values: Mapping[str, float]) -> str:
         return f"the car is slowed by {values['resistance_mps2']:.2g} m/s² at every speed"
+
+    @classmethod
+    def alike(cls, values: Mapping[str, float]) -> tuple[str, ...]:
+        return ("road_grade",) if values["resistance_mps2"] <= _MEAN_SLOPE * GRAVITY else ()
 
     def apply(self, x: Tensor, row: EffectContext) -> Tensor:
         force = -tensor(self.resistance_mps2)

@@ -114,6 +114,12 @@ class RoadGrade(Integrated):
         grade = tensor(self.grade_rms)[..., None] * _spline(position, self._coefficients(), self.knot_m, True)
         return grade.std(-1, correction=0)
 
+    def levelled(self, coefficients: Tensor) -> Tensor:
+        """`coefficients` (..., knot) of the same road without its mean slope."""
+        lower = _lower(coefficients.shape[-1], self.knot_m)
+        flat = torch.linalg.solve_triangular(lower, torch.ones_like(lower[:, :1]), upper=False)[:, 0]
+        return coefficients - (coefficients @ lower.mean(0))[..., None] * flat
+
     def spaced(self, knot_m: float) -> Self:
         return replace(self, knot_m=max(self.knot_m, knot_m))
 

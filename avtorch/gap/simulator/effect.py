@@ -263,6 +263,11 @@ class Effect:
         return cls.meaning
 
     @classmethod
+    def alike(cls, values: Mapping[str, float]) -> tuple[str, ...]:
+        """Names of effects that no log tells from it, at `values` of its parameters under the answer's names."""
+        return ()
+
+    @classmethod
     def brings_words(cls) -> bool:
         """Whether it has a clause of its own; else it is called by its name."""
         return cls.in_words.__func__ is not Effect.in_words.__func__

@@ -44,6 +44,10 @@ class Integrated(Effect):
         """The size that the coefficients have over these places: a root mean square, (...); `position` (time,) [m]."""
         raise NotImplementedError(f"{type(self).__name__} has no size_along")
 
+    def levelled(self, coefficients: Tensor) -> Tensor:
+        """`coefficients` (..., knot) without the part that makes the same force everywhere."""
+        return coefficients
+
     def spaced(self, knot_m: float) -> Self:
         """The effect with knots at least `knot_m` [m] apart."""
         return self

@@ -46,6 +46,26 @@ def test_the_size_of_a_road_is_that_of_its_coefficients() -> None:
     assert part.parameters["grade_rms"].mean == pytest.approx(float(road.size_along(position)), rel=0.25)
 
 
+def test_a_constant_force_is_no_road_and_may_be_a_slope_all_the_way() -> None:
+    """A free course of the road took the place of a resistance of 1.3 m/s², a mean slope of 13 %."""
+    log = log_of([ConstantResistance(0.3)], seed=11)
+    assert gap_budget(log, effects=["road_grade"]).names == ()
+    (part,) = gap_budget(log, effects=["road_grade", "constant_resistance"]).parts
+    assert (part.name, part.alias_set) == ("constant_resistance", ("constant_resistance", "road_grade"))
+    # 13 % all the way is no road
+    assert ConstantResistance.alike({"resistance_mps2": 1.3}) == ()
+
+
+def test_a_levelled_road_is_the_same_road_without_its_mean_slope() -> None:
+    position = torch.linspace(0.0, 40 * 80.0, 500, dtype=torch.float64)
+    road = RoadGrade(knots=64)
+    some = torch.randn(3, 64, generator=torch.Generator().manual_seed(1), dtype=torch.float64) + 2.0
+    before, after = road.force(position, some), road.force(position, road.levelled(some))
+    away = before - after
+    torch.testing.assert_close(away, away.mean(-1, keepdim=True).expand_as(away))
+    torch.testing.assert_close(road.levelled(road.levelled(some)), road.levelled(some))
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_coloured_noise_is_no_cause(seed: int) -> None:
     budget = gap_budget(log_of(seed=seed), effects=FEW)
