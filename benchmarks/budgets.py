@@ -4,8 +4,9 @@
 
 Prints a line a recording: the causes with their shares and parameters, and what each half says alone. With
 ``--in-front`` a line a known effect of that size, put in front of the recording as one car's, several logs as segments
-of one: what is named, the size found on top of the untouched recording's over the size put in, names that neither the
-effect nor the untouched recording accounts for, and what the simplest selection names (`reference_selection`).
+of one: what is named, the size found on top of the untouched recording's over the size put in, the same on top of what
+the untouched recording has where the same effects are fitted to it, names that neither the effect nor the untouched
+recording accounts for, and what the simplest selection names (`reference_selection`).
 ``--picture`` draws the budget and the drive of the first recording, as `avtorch diagnose` answers, and no more.
 """
 
@@ -24,7 +25,12 @@ from avtorch import diagnose, plots
 from avtorch.blindtest import IN_FRONT, put_in_front
 from avtorch.blindtest.in_front_score import SIZE_OF, SIZE_WITHIN
 from avtorch.errors import InputError
-from avtorch.gap import EFFECTS, Budget, gap_budget
+from avtorch.gap import EFFECTS, Budget, gap_budget, plant
+from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.forward_selection import baseline_noise
+from avtorch.gap.budget.given_effects import given_effects
+from avtorch.gap.budget.repaired_model import parameters_of
+from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.io import Log
 from benchmarks.reference_selection import selected
 
@@ -92,11 +98,11 @@ def joined(logs: Sequence[Log]) -> Log:
 
 def in_front(log: Log, size: float) -> None:
     """Prints a line per effect, and a last one with the counts."""
-    control = gap_budget(log)
+    control, alone = gap_budget(log), baseline_noise(AnalysisRecord.for_budget([log]), plant([]))
     simple_control = selected([log])
-    print(f"| untouched | | | | {causes(control)} | {', '.join(simple_control) or 'none'} |", flush=True)
+    print(f"| untouched | | | | | {causes(control)} | {', '.join(simple_control) or 'none'} |", flush=True)
     T_L, K_L = control.baseline["T_L"], control.baseline["K_L"]
-    tried = named = sized = extra = simple = simple_extra = 0
+    tried = named = sized = matched = extra = simple = simple_extra = 0
     for number, effect in enumerate(IN_FRONT):
         if EFFECTS[effect].random:
             continue
@@ -108,20 +114,26 @@ def in_front(log: Log, size: float) -> None:
         others = [name for name in budget.names if name != effect and name not in control.names]
         reference = list(selected([changed]))
         ratio = _ratio(budget, control, effect, put_in)
+        same = _same_effects(budget, alone, effect, put_in)
         held = effect in budget.names
         alike = any(effect in part.alias_set for part in budget.parts if part.name in budget.names)
         tried, named, extra = tried + 1, named + held, extra + bool(others)
         sized += ratio is not None and abs(ratio - 1) <= SIZE_WITHIN
+        matched += same is not None and abs(same - 1) <= SIZE_WITHIN
         simple += effect in reference
         simple_extra += any(name != effect and name not in simple_control for name in reference)
         truth = ", ".join(f"{value:.3g}" for value in put_in.values())
         print(
             f"| {effect} ({truth}) | {'named' if held else 'alias' if alike else 'missed'} | "
-            f"{'' if ratio is None else f'{ratio:.2f}'} | {', '.join(others)} | {causes(budget)} | "
+            f"{'' if ratio is None else f'{ratio:.2f}'} | {'' if same is None else f'{same:.2f}'} | "
+            f"{', '.join(others)} | {causes(budget)} | "
             f"{', '.join(reference) or 'none'} |",
             flush=True,
         )
-    print(f"named {named} of {tried}, of these {sized} within 25 % in size; with others {extra}")
+    print(
+        f"named {named} of {tried}, of these {sized} within 25 % in size, {matched} beside the same effects; ", end=""
+    )
+    print(f"with others {extra}")
     print(f"the simplest selection: named {simple} of {tried}, with others {simple_extra}", flush=True)
 
 
@@ -130,6 +142,24 @@ def _ratio(budget: Budget, control: Budget, effect: str, put_in: Mapping[str, fl
     key, without, relative = SIZE_OF[effect]
     found, before = _size(budget, effect, key), _size(control, effect, key)
     return None if found is None else relative(found, without if before is None else before, put_in[key])
+
+
+def _same_effects(
+    budget: Budget, alone: tuple[RobustFit, Fit], effect: str, put_in: Mapping[str, float]
+) -> float | None:
+    """As `_ratio`, on top of what the untouched recording has of the effect when the same effects are fitted to it.
+
+    `alone`: its noise and its bare baseline. What a car has of an effect may be too little to be named.
+    """
+    key, _, relative = SIZE_OF[effect]
+    found = _size(budget, effect, key)
+    if found is None:
+        return None
+    parts = [part for part in budget.parts if part.name in budget.names]
+    values = {f"{part.name}.{name}": q.mean for part in parts for name, q in part.parameters.items()}
+    onsets = {part.name: part.onset_s for part in parts if part.onset_s is not None}
+    selection = given_effects(*alone, [EFFECTS[part.name] for part in parts], values=values, onsets=onsets)
+    return relative(found, parameters_of(selection, effect)[key].mean, put_in[key])
 
 
 def _size(budget: Budget, effect: str, key: str) -> float | None:
