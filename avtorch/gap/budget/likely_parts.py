@@ -12,13 +12,16 @@ from avtorch.gap.budget.share_order import largest_first, own_response
 
 
 def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int = 0) -> Selection:
-    """The selection's parts in the order of what they take off the gap, without those less likely there than not.
+    """The selection's parts in the order of what they take off the gap, without those less likely there than not, or
+    at the limit of what a fit may take.
 
     The least likely goes first; what its going does to the others is looked at anew.
     """
     selection = largest_first(selection, material, seed=seed)
     while len(selection.steps) > 1:
-        each = probabilities(selection)
+        each, last = probabilities(selection), selection.last.fit
+        # where a fit ends, far beyond what is possible, an effect stands in for something else
+        each |= {name: 0.0 for name in each if last.model.at_limit(last.z, name)}
         unlikeliest = min(each, key=each.__getitem__)
         if each[unlikeliest] >= LIKELY:
             break

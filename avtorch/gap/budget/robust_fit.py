@@ -125,7 +125,9 @@ class RobustFit:
 
     def slope(self, model: FittedModel, z: FloatArray, white: FloatArray) -> FloatArray:
         """Derivatives (size, channel, counted) of the white response at `z`, where the white residuals are `white`."""
-        return (white - self.white(model, z + _STEP * np.eye(model.size))) / _STEP
+        # at the upper limit of a coordinate nothing lies ahead
+        step = np.where(z + _STEP > model.high, -_STEP, _STEP)
+        return (white - self.white(model, z + np.diag(step))) / step[:, None, None]
 
     def errors(self, fit: Fit[M]) -> FloatArray:
         """Standard errors (size,) of the coordinates by how much the blocks disagree (Liang and Zeger's sandwich)."""

@@ -132,6 +132,15 @@ def test_a_model_cars_resistance_is_what_its_authors_say(data_dir: Path) -> None
     assert budget.parts[0].parameters["resistance_mps2"].mean == pytest.approx(2.9, rel=0.25)
 
 
+@pytest.mark.slow
+def test_no_part_rests_at_a_limit_and_intervals_have_a_width(data_dir: Path) -> None:
+    """A road on a laboratory's floor, its coefficients at three times their prior's reach, all without an interval."""
+    budget = gap_budget(Log.read(data_dir / "roboracer/ftg_stanley_total_validation.csv"))
+    assert "road_grade" not in budget.names
+    for part in budget.parts:
+        assert all(q.q95 > q.q05 for q in part.parameters.values()), part.name
+
+
 def test_a_short_drive_is_divided_into_short_blocks() -> None:
     """Twenty seconds hold four blocks of four; `diagnose` answers them, and so does the budget by itself."""
     log = log_of([SensorBias(0.4)], seed=11, seconds=20.0)

@@ -47,6 +47,22 @@ def test_the_slope_is_that_of_the_cost() -> None:
         assert cost(fit.z - step) > cost(fit.z) - 1e-3
 
 
+def test_a_slope_at_the_upper_limit_looks_back() -> None:
+    """It was nought there, so no fit without a fold left a limit, and intervals had no width."""
+    record = AnalysisRecord.of([log_of(seed=3)])
+    model = EffectModel(record, plant(), (EFFECTS["constant_resistance"],))
+    fitting = RobustFit(white_noise(record))
+    z = np.zeros(model.size)
+    at = model.index["constant_resistance.resistance_mps2"]
+    z[at] = model.high[at]
+    slope = fitting.slope(model, z, fitting.white(model, z))[at]
+    z[at] -= 0.01
+    below = fitting.slope(model, z, fitting.white(model, z))[at]
+    # the response grows a little faster at the limit than a hundredth of a prior's deviation below it
+    np.testing.assert_allclose(np.square(slope).sum(), np.square(below).sum(), rtol=0.05)
+    assert np.square(slope).sum() > 1.0
+
+
 def test_one_wild_block_hardly_moves_a_fit() -> None:
     record = AnalysisRecord.of([log_of(seed=5)])
     model = EffectModel(record, plant())
