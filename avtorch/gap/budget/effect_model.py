@@ -151,14 +151,6 @@ class EffectModel:
             for at in own
         )
 
-    def plausible(self, z: FloatArray, effect: str) -> bool:
-        """Whether all parameters of `effect` are physically possible."""
-        parameters, values = self.plant.parameters(), self.values(z)
-        own = {key: parameters[key] for key in values if key.startswith(f"{effect}.")}
-        return all(
-            bool(((values[key] >= p.physical[0]) & (values[key] <= p.physical[1])).all()) for key, p in own.items()
-        )
-
     # response ------------------------------------------------------------------------------------------------------
     @torch.inference_mode()
     def simulate(self, z: FloatArray) -> FloatArray:

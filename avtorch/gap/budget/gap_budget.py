@@ -28,6 +28,7 @@ from avtorch.gap.budget.share_order import energies, gap_is_there, taken_off
 from avtorch.gap.budget.slow_disturbance import slow_disturbance
 from avtorch.gap.budget.unexplained_places import placed
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.selection.plausibility import implausible
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.effect_choice import chosen_effects
 from avtorch.gap.simulator.plant import GapPlant, plant
@@ -134,7 +135,7 @@ def _part(
     selection: Selection, step: Step, sure: Mapping[str, float], share: Quantity, after: float, epoch_s: float
 ) -> Part:
     assert step.entered is not None
-    model, z = selection.last.fit.model, selection.last.fit.z
+    model = selection.last.fit.model
     onset = model.onsets.get(step.entered)
     parameters = parameters_of(selection, step.entered)
     kind = next(e for e in model.effects if e.name == step.entered)
@@ -147,7 +148,7 @@ def _part(
         after=after,
         parameters=parameters,
         onset_s=None if onset is None else onset + epoch_s,
-        plausible=model.plausible(z, step.entered),
+        plausible=not implausible(parameters, {}, [kind]),
     )
 
 
