@@ -290,7 +290,7 @@ def _sentence(
             )
         return (
             "no available setting lets disturbances die out along a line of such cars (string stability), and none is "
-            f"better than the one in force (probability {before:.2f})."
+            f"better than the one in force (probability that they do: {before:.2f})."
         )
     what = "; ".join(steps)
     change = f"probability of string stability {then:.2f} instead of {before:.2f}"

@@ -73,7 +73,7 @@ def _budget(found: Diagnosis) -> Picture | None:
         f"Bars of what each effect contributes to the gap: {says}.",
         budget_table(budget, found.log.epochs_s[0]),
         caption=f"A share is what an effect takes off the squared error of {budget.horizon_s:.3g} s simulations, above "
-        "that of noise alone, on parts of the drive left out of the fit; effects are added in the order shown. Black "
+        "that of noise alone, on parts of the drive not used for fitting; effects are added in the order shown. Black "
         "lines: 90 % intervals.",
         opened=True,
     )

@@ -290,14 +290,14 @@ def _why(budget: Budget) -> str:
     if not budget.names:
         if budget.unexplained.material:
             return (
-                "On parts of the drive left out of the fit no known effect reduces the error, though part of it is "
+                "On parts of the drive not used for fitting no known effect reduces the error, though part of it is "
                 "reproducible."
             )
         share = percent(PartOdds.read().empty)
         return (
-            "What is left is noise: commands, speed and place do not predict it on parts of the drive left out of the "
-            f"fit. Of simulated drives that say so {share} have no cause, the others one too weak to show."
+            "What is left is noise: commands, speed and place do not predict it on parts of the drive not used for "
+            f"fitting. Of simulated drives that say so {share} have no cause, the others one too weak to show."
         )
     count = len(budget.names)
-    effects = "This effect was" if count == 1 else f"These {count} effects were"
-    return f"{effects} selected by how well each predicts parts of the drive that were left out of the fit."
+    chosen = "This effect was chosen because it" if count == 1 else f"These {count} effects were chosen because they"
+    return f"{chosen} best predict{'s' if count == 1 else ''} parts of the drive not used for fitting."

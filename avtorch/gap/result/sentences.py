@@ -156,7 +156,7 @@ def budget(found: Findings) -> list[str]:
     """The sentence on the budget of the gap, and what it divides."""
     if found.budget is None or not found.budget.parts:
         return []
-    takes = "this effect takes" if len(found.budget.names) == 1 else "these effects take"
+    cut = "this effect cuts" if len(found.budget.names) == 1 else "these effects cut"
     told = found.budget.names == found.verdict.names and not found.verdict.partial
     line = [found.budget.beside_its_name() if told else str(found.budget)]
     line = [] if headline(found).endswith(str(found.budget)) else line
@@ -166,8 +166,8 @@ def budget(found: Findings) -> list[str]:
         floors.append(f"{error.floor:.2g} {_UNIT[name]}")
     return [
         *line,
-        f"In simulations of {found.budget.horizon_s:.3g} s from the logged commands, of parts of the drive left out of "
-        f"the fit, {takes} the error {' and '.join(errors)}; noise alone makes {' and '.join(floors)}.",
+        f"In simulations of {found.budget.horizon_s:.3g} s from the logged commands, on parts of the drive not used "
+        f"for fitting, {cut} the error {' and '.join(errors)}; noise alone makes {' and '.join(floors)}.",
     ]
 
 

@@ -161,8 +161,8 @@ def verdict_of(
 
 def _why(ranked: Sequence[Candidate], known: str) -> str:
     first, second = ranked[0], ranked[1]
-    words = {"none": "that nothing is missing", "unknown": "a cause that is not known here"}
-    rival = f"next is {words.get(second.name, second.name)}, with {second.probability:.3g}"
+    words = {"none": "that nothing is missing", "unknown": "a cause that is not in the table of effects"}
+    rival = f"next likeliest, with {second.probability:.3g}, is {words.get(second.name, second.name)}"
     if first.name == "none":
         which = "effect" if known == "known effect" else known
         return f"No {which} explains the log better than the baseline does; {rival}."
