@@ -210,7 +210,8 @@ def test_a_diagnosis_is_a_row(tmp_path: Path, scheduler: str, rotating_seed: int
     assert delay["name"] == "delay_s"
     assert abs(delay["value_mean"] - 0.3) < BAR * delay["value_sd"]
     assert row["unexplained_mean"] == full["budget"]["unexplained"]["share"]["mean"]
-    assert row["summary"].startswith("The simulator lacks this")
+    # how sure it says it is depends on the draw: "Probably the simulator lacks this" below 0.9
+    assert "the simulator lacks this" in row["summary"].lower()
     car = answer["cars"][0]
     assert (car["reason"], car["gap"]["verdict"]) == ("gap", ["dead_time"])
     assert not (tmp_path / "out" / "unfinished").exists()
