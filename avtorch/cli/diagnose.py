@@ -179,7 +179,7 @@ def diagnose(
     if assumed is not None and (simulated or simulator is not None):
         raise InputError("--baseline: found beside --simulated or --simulator, needs one simulator")
 
-    from avtorch.gap.result.alarms import read_alarms
+    from avtorch.cli.alarms import read_alarms
     from avtorch.io import Log, check
 
     talk = Talk(json=json, quiet=quiet)

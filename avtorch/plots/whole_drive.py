@@ -15,7 +15,7 @@ from matplotlib.figure import Figure, FigureBase
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
-from avtorch.gap.result.alarms import Alarm
+from avtorch.gap.result.alarm import Alarm
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import Reason, Uncounted

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from avtorch.errors import InputError
-from avtorch.gap.result.alarms import Alarm
+from avtorch.gap.result.alarm import Alarm
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import Uncounted
 from avtorch.plots.whole_drive import drive_figure, drive_time, envelope

@@ -12,6 +12,8 @@ from avtorch.gap.simulator.cause_words import named_cause
 
 HORIZON_S = 10.0
 """Of the rollouts whose errors a budget divides [s]."""
+BEGIN_S = 0.5
+"""Over which the measured start of a rollout is averaged [s]."""
 MATERIAL = 0.03
 """Share of the gap from which something counts, unless a user says otherwise."""
 LIKELY = 0.5

@@ -10,10 +10,8 @@ import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.parts import HORIZON_S
+from avtorch.gap.budget.parts import BEGIN_S, HORIZON_S
 from avtorch.gap.budget.selection_step import Selection, Step
-
-_BEGIN_S = 0.5  # over which the measured start of a rollout is averaged
 
 
 def horizon(record: AnalysisRecord) -> float:
@@ -34,7 +32,7 @@ def rollout_squares(selection: Selection, residuals: FloatArray) -> FloatArray:
     """Mean squared errors (channel, block) of rollouts of `residuals` (channel, row), begun anew every 10 s."""
     record = selection.fitting.whitening.record
     out = np.zeros((len(record.channels), record.blocks))
-    window, begin = round(HORIZON_S / record.dt), max(1, round(_BEGIN_S / record.dt))
+    window, begin = round(HORIZON_S / record.dt), max(1, round(BEGIN_S / record.dt))
     errors = residuals.copy()
     if record.has_speed:
         drift = np.zeros(record.rows)

@@ -19,7 +19,7 @@ from avtorch.gap.crossval.gap_closed import MetricShrinkage, Shrinkage
 from avtorch.gap.crossval.localisation import Location
 from avtorch.gap.quantity import Quantity, frame_of, unit_of
 from avtorch.gap.result import sentences
-from avtorch.gap.result.alarms import Alarm
+from avtorch.gap.result.alarm import Alarm
 from avtorch.gap.result.gap_size import GapSize
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.predictive_model import PredictiveModel

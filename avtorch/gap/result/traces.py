@@ -8,12 +8,10 @@ from functools import cached_property
 import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
-from avtorch.gap.budget.parts import HORIZON_S
+from avtorch.gap.budget.parts import BEGIN_S, HORIZON_S
 from avtorch.gap.likelihood.record import Record
 from avtorch.gap.result.uncounted import Uncounted
 from avtorch.gap.simulator.plant import GapPlant
-
-_BEGIN_S = 0.5  # over which the measured start of a rollout is averaged
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +57,7 @@ class Traces:
         k = self.channels.index("speed")
         off = self.measured[k] - simulated[k]
         firsts = np.flatnonzero(np.diff(self.piece, prepend=-1))
-        starts = self.time - self.time[firsts][self.piece] <= _BEGIN_S
+        starts = self.time - self.time[firsts][self.piece] <= BEGIN_S
         level = np.bincount(self.piece[starts], off[starts]) / np.bincount(self.piece[starts])
         out = simulated.copy()
         out[k] += level[self.piece]

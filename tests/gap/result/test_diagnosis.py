@@ -182,7 +182,7 @@ def test_verdict_is_the_most_probable_with_its_aliases() -> None:
     given = candidates(sensor_lag=0.3, dead_time=0.63, none=0.01, unknown=0.06)
     verdict = verdict_of(given)
     assert (verdict.names, verdict.alias_set, verdict.abstained) == (("dead_time",), ("dead_time", "sensor_lag"), False)
-    assert verdict.why == ("dead_time has probability 0.63; next likeliest, with 0.3, is sensor_lag.")
+    assert verdict.why == "dead_time has probability 0.63; next likeliest, with 0.3, is sensor_lag."
     assert verdict_of(given, aliases=near(0.6)).alias_set == ("dead_time",)
     # a hypothesis without prediction is a rival only where it is about as probable
     assert verdict_of(given, aliases=near(0.6, unknown=0.05)).alias_set == ("dead_time", "unknown")

@@ -1,29 +1,20 @@
-"""Alarms that a monitor raised on the same drives, for the picture of a diagnosis."""
+"""`avtorch diagnose --estimates`: the alarms in answers of `avtorch estimate`."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from avtorch.errors import InputError, quoted
+from avtorch.gap.result.alarm import Alarm
 from avtorch.io import Log
 from avtorch.io.opening import place, read_regular
 
 _MOST_BYTES = 1 << 28
 _NEED = "estimates.json, the answer of `avtorch estimate`"
-
-
-@dataclass(frozen=True)
-class Alarm:
-    """An alarm of `detector` that began `at` [s] from the start of log number `log`, when its window ended."""
-
-    at: float
-    detector: str
-    log: int = 0
 
 
 def read_alarms(paths: Sequence[Path], logs: Sequence[Log]) -> tuple[Alarm, ...]:

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from avtorch import Log
+from avtorch.cli.alarms import read_alarms
 from avtorch.errors import InputError
-from avtorch.gap.result.alarms import Alarm, read_alarms
+from avtorch.gap.result.alarm import Alarm
 
 TIME = 1000.0 + 0.05 * np.arange(200)
 LOG = Log.from_arrays(name="drive.csv", time=TIME, accel_cmd=np.sin(TIME), speed=10 + np.cos(TIME))
