@@ -31,6 +31,7 @@ _SHORTEST_BLOCK_S = 4.0
 _SHORT_DRIVES_BLOCK_S = 1.0  # where drives are too short for six of the usual ones
 _BLOCKS = 24  # aimed at, within those lengths
 _FEWEST_BLOCKS = 6
+_LEAST_WAY_M = 10.0
 _COUNTED_SHARE = 0.4  # of a block that must count
 _AT_ONCE = 64  # rows that are filtered at once
 
@@ -74,6 +75,14 @@ class AnalysisRecord:
     @property
     def blocks(self) -> int:
         return int(self.block.max(initial=-1)) + 1
+
+    @property
+    def block_way(self) -> float:
+        """Distance that is driven in a block [m], mean over what counts, and 10 m at least.
+
+        In a block that is held out, its neighbours predict nothing finer of what depends on the place.
+        """
+        return max(float(np.abs(self.speed[self.counts]).sum()) * self.dt / self.blocks, _LEAST_WAY_M)
 
     @property
     def has_speed(self) -> bool:

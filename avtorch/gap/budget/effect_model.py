@@ -219,9 +219,10 @@ def _averaged(x: FloatArray, stretch: Stretch, dt: float) -> FloatArray:
 def _box(parameter: Parameter) -> tuple[float, float]:
     """Coordinates that a fit may take: what physics allows, and three times as far where that is said in logarithms.
 
+    Of a force along the road physics limits the size, and no coefficient by itself.
     A car beyond what physics allows is a finding, and said to be implausible; one far beyond it is no fit.
     """
-    if parameter.constraint == "interval":
+    if parameter.constraint == "interval" or parameter.size > 1:
         return -_WIDEST, _WIDEST
     low, high = parameter.physical
     if parameter.constraint == "positive":
@@ -233,14 +234,8 @@ def _box(parameter: Parameter) -> tuple[float, float]:
 
 
 def _coarse(effect: Effect, record: AnalysisRecord) -> Effect:
-    """A force along the road with knots far enough apart that neighbours of a held-out block predict it."""
-    if not isinstance(effect, Integrated):
-        return effect
-    ends = [float(s.drive.position[-1]) for s in record.stretches if s.drive.position is not None]
-    return effect.spaced(max(ends, default=0.0) / _KNOTS)
-
-
-_KNOTS = 12
+    """A force along the road with knots as far apart as what is driven in a block."""
+    return effect.spaced(record.block_way) if isinstance(effect, Integrated) else effect
 
 
 def _sizes(effects: Sequence[type[Effect]]) -> set[str]:

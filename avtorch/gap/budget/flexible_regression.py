@@ -1,4 +1,4 @@
-"""What commands, speed and time predict of the residuals, by a regression without physics.
+"""What commands, speed, place and time predict of the residuals, by a regression without physics.
 
 It has two uses: what it leaves over is the noise that `noise_whitening` fits, and what it predicts of blocks that were
 held out is reproducible and not explained.
@@ -7,6 +7,7 @@ held out is reproducible and not explained.
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
@@ -14,6 +15,8 @@ from avtorch.gap.budget.held_out_evidence import Evidence, agreement
 from avtorch.gap.budget.robust_fit import Fit, M, RobustFit
 from avtorch.gap.likelihood.basis import lowpass
 
+_DEGREE = 3
+_FEWEST = 8  # knots along the way; fewer follow what changes slowly with time just as well
 _RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)  # of the columns' own sums of squares
 
 
@@ -37,6 +40,23 @@ def columns(fit: Fit[M]) -> FloatArray:
         return forces[:, None]
     faults = np.stack([np.zeros_like(forces), forces], 1)[:12]
     return np.concatenate([np.stack([forces, forces], 1), faults])
+
+
+def _places(fit: Fit[M]) -> FloatArray:
+    """Cubic splines of the place (column, channel, row), with knots as far apart as what is driven in a block."""
+    record = fit.model.record
+    positions = [s.drive.position for s in record.stretches]
+    if not record.has_speed or any(x is None for x in positions):
+        return np.empty((0, len(record.channels), record.rows))
+    place = np.concatenate([np.asarray(x, float) for x in positions if x is not None])
+    way, knot = float(np.ptp(place)), record.block_way
+    if way < _FEWEST * knot:
+        return np.empty((0, len(record.channels), record.rows))
+    inner = np.linspace(place.min(), place.max(), max(round(way / knot), 2) + 1)
+    knots = np.concatenate([[inner[0]] * _DEGREE, inner, [inner[-1]] * _DEGREE])
+    # their sum is the constant, which is a column already
+    along = BSpline.design_matrix(place, knots, _DEGREE).toarray().T[1:]
+    return np.stack([along] * len(record.channels), 1)
 
 
 def _forces(record: AnalysisRecord, a: FloatArray, speed: FloatArray, t: FloatArray, u: FloatArray) -> FloatArray:
@@ -65,12 +85,31 @@ def _forces(record: AnalysisRecord, a: FloatArray, speed: FloatArray, t: FloatAr
     return np.array([*plain, *rest, lowpass(u, 1.0, dt), lowpass(u, 3.0, dt), t, t**2], dtype=float)
 
 
-def left_over(fitting: RobustFit, fit: Fit[M]) -> FloatArray:
-    """Residuals (channel, row) less the regression, fitted to all blocks."""
+def left_over(fitting: RobustFit, fit: Fit[M], *, places: bool = False) -> FloatArray:
+    """Residuals (channel, row) less the regression, fitted to all blocks; `places`: on the place, too.
+
+    Without the place a road is slow noise, and the noise hides it. But where each place is passed once, its columns
+    follow whatever wanders, and the noise seems smaller than it is: see `place_predicts`.
+    """
     residuals, shapes = fit.residuals, columns(fit)
+    if places:
+        shapes = np.concatenate([shapes, _places(fit)])
     X, y, scale = _white(fitting, shapes, residuals)
     coefficients = np.linalg.solve(X @ X.T + 1e-4 * X.shape[1] * np.eye(len(X)), X @ y) / scale
     return residuals - (coefficients @ shapes.reshape(len(shapes), -1)).reshape(residuals.shape)
+
+
+def has_places(fit: Fit[M]) -> bool:
+    """Whether the drive is long enough that the place tells more than the time."""
+    return len(_places(fit)) > 0
+
+
+def place_predicts(fitting: RobustFit, fit: Fit[M], residuals: FloatArray | None = None) -> bool:
+    """Whether blocks that were held out agree that the place predicts the `residuals`, by default those of `fit`."""
+    places = _places(fit)
+    return len(places) > 0 and bool(
+        _predicted(fitting, places, fit.residuals if residuals is None else residuals).any()
+    )
 
 
 def predicted_residuals(fitting: RobustFit, fit: Fit, residuals: FloatArray) -> FloatArray:
@@ -78,11 +117,16 @@ def predicted_residuals(fitting: RobustFit, fit: Fit, residuals: FloatArray) -> 
 
     The ridge is what predicts held-out blocks best; where these do not agree on it more surely than chance, nothing.
     """
-    whitening, record = fitting.whitening, fit.model.record
     shapes = columns(fit)
+    if place_predicts(fitting, fit, residuals):
+        shapes = np.concatenate([shapes, _places(fit)])
+    return _predicted(fitting, shapes, residuals)
+
+
+def _predicted(fitting: RobustFit, shapes: FloatArray, residuals: FloatArray) -> FloatArray:
+    whitening, channels = fitting.whitening, shapes.shape[1]
     X, y, scale = _white(fitting, shapes, residuals)
-    fold = whitening.spread(fitting.fold.astype(float))
-    fold = np.tile(fold, len(record.channels))
+    fold = np.tile(whitening.spread(fitting.fold.astype(float)), channels)
     row_fold = fitting.fold_of_row
     before = fitting.nats(whitening(residuals))
     best, after = np.zeros_like(residuals), before

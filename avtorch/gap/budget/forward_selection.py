@@ -14,16 +14,18 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from avtorch.arrays import FloatArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.effect_model import LATENESS, EffectModel
 from avtorch.gap.budget.entry import candidates_for, enter, observable
 from avtorch.gap.budget.exchange import exchanged
-from avtorch.gap.budget.flexible_regression import left_over
+from avtorch.gap.budget.flexible_regression import has_places, left_over
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 from avtorch.gap.budget.redundancy import without_the_redundant
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.budget.selection_step import Selection, Step, one_by_one
-from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.effect import EFFECTS, Effect
+from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.plant import GapPlant
 
 MOST_PARTS = 8
@@ -79,8 +81,31 @@ def baseline_noise(record: AnalysisRecord, base: GapPlant) -> tuple[RobustFit, F
     whitening = NoiseWhitening.band(record, record.measured - record.measured[:, record.counts].mean(-1, keepdims=True))
     fit = RobustFit(whitening).fit(bare, starts)
     fit = RobustFit(NoiseWhitening.band(record, fit.residuals)).fit(bare, fit.z[None])
-    fitting = RobustFit(NoiseWhitening.band(record, fit.residuals))
+    start = RobustFit(NoiseWhitening.band(record, fit.residuals))
+    fitting, settled = _settled(start, fit, starts)
+    if not has_places(settled):
+        return fitting, settled
+    # with the place the noise is smaller in any case, and a road has to show by that noise
+    other, along = _settled(start, fit, starts, places=True)
+    return (other, along) if _road_shows(other, along) else (fitting, settled)
+
+
+def _road_shows(fitting: RobustFit, bare: Fit) -> bool:
+    """Whether blocks that were held out agree on a force along the road."""
+    before = fitting.hold_out(bare)
+    for kind in observable(EFFECTS.values(), fitting.whitening.record):
+        if not issubclass(kind, Integrated) or kind.name in {e.name for e in bare.model.base.effects}:
+            continue
+        model = bare.model.with_effect(kind)
+        fit = fitting.fit(model, model.coordinates(bare.known)[None])
+        if fitting.evidence(before, fitting.hold_out(fit)).of_entry > 0:
+            return True
+    return False
+
+
+def _settled(fitting: RobustFit, fit: Fit, starts: FloatArray, *, places: bool = False) -> tuple[RobustFit, Fit]:
+    """The noise that a regression leaves over, on the `places` too, and the baseline under it, by turns."""
     for _ in range(3):
-        fitting = RobustFit(NoiseWhitening.autoregressive(record, left_over(fitting, fit)))
-        fit = fitting.fit(bare, np.concatenate([fit.z[None], starts]), iterations=12)
+        fitting = RobustFit(NoiseWhitening.autoregressive(fit.model.record, left_over(fitting, fit, places=places)))
+        fit = fitting.fit(fit.model, np.concatenate([fit.z[None], starts]), iterations=12)
     return fitting, fit

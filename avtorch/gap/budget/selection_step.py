@@ -9,6 +9,7 @@ from avtorch.gap.budget.held_out_evidence import NOTHING, Evidence
 from avtorch.gap.budget.robust_fit import Fit, HeldOut, RobustFit
 
 _REFITTING = 5  # iterations after a model has lost an effect
+_ROAD = 16  # parameters that a road counts at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,5 +64,7 @@ def cost(step: Step) -> float:
 
 
 def complexity(fit: Fit) -> int:
-    """Parameters, those of a force along the road among them."""
-    return fit.model.size + len(fit.model.onsets)
+    """Parameters. A long road counts no more than a short one: its coefficients hang together by their prior."""
+    model = fit.model
+    along = sum(max(at.stop - at.start - _ROAD, 0) for key, at in model.index.items() if key in model.roads)
+    return model.size - along + len(model.onsets)

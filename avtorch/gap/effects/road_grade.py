@@ -21,7 +21,8 @@ from avtorch.vehicle.arguments import Number, tensor
 
 GRAVITY = 9.80665
 """[m/s²]"""
-_SMOOTH_M = 180.0  # correlation length of the grade (Matern 3/2) [m]
+_PER_KNOT = 20  # places of which a mean over the way is taken
+_SMOOTH_KNOTS = 2.25  # knots to a correlation length, in a road whose knots are spaced
 
 
 @register
@@ -29,8 +30,9 @@ _SMOOTH_M = 180.0  # correlation length of the grade (Matern 3/2) [m]
 class RoadGrade(Integrated):
     """`-g sin(slope(position))`; the grade is a Gaussian process over position of RMS `grade_rms`; neutral at 0.
 
-    It is expanded in cubic B-splines, one every `knot_m` [m]; `profile` (..., knots) holds their coefficients, with
-    independent standard normal priors (the correlation is included in the basis). The response is linear in them as far
+    Its correlation (Matern 3/2) has the length `smooth_m` [m]. It is expanded in cubic B-splines, one every `knot_m`
+    [m]; `profile` (..., knots) holds their coefficients, with independent standard normal priors (the correlation is
+    included in the basis). The response is linear in them as far
     as the sine is, so a likelihood can integrate them out by the `columns`. Where `profile` is None the grade is 0, or
     drawn where drives are sampled.
 
@@ -51,6 +53,7 @@ class RoadGrade(Integrated):
     profile: Tensor | None = None
     knots: int = 256
     knot_m: float = 80.0
+    smooth_m: float = 180.0
 
     name = "road_grade"
     place = "body"
@@ -65,6 +68,7 @@ class RoadGrade(Integrated):
         Domain("profile", -100.0, 100.0, least=4, most=4096),
         Domain("knots", 4, 4096, whole=True),
         Domain("knot_m", 10.0, 10_000.0, "m"),
+        Domain("smooth_m", 10.0, 30_000.0, "m"),
     )
 
     @classmethod
@@ -97,12 +101,12 @@ class RoadGrade(Integrated):
 
     def columns(self, position: Tensor) -> Tensor:
         """Acceleration (time, knot) per unit of each coefficient at `grade_rms` 1, `position` (time,) [m]."""
-        lower = _lower(self.knots, self.knot_m)
+        lower = _lower(self.knots, self.knot_m, self.smooth_m)
         return -GRAVITY * _spline(position, lower.T, self.knot_m, True).movedim(0, -1)
 
     def force(self, position: Tensor, coefficients: Tensor) -> Tensor:
         """Acceleration (..., time) of a grade, linear in its `coefficients` (..., knot); `position` (time,) [m]."""
-        lower = _lower(self.knots, self.knot_m)
+        lower = _lower(self.knots, self.knot_m, self.smooth_m)
         return -GRAVITY * _spline(position, coefficients @ lower.T, self.knot_m, True)
 
     def magnitude(self, position: Tensor, coefficients: Tensor) -> Tensor:
@@ -116,12 +120,13 @@ class RoadGrade(Integrated):
 
     def levelled(self, coefficients: Tensor) -> Tensor:
         """`coefficients` (..., knot) of the same road without its mean slope."""
-        lower = _lower(coefficients.shape[-1], self.knot_m)
+        lower = _lower(coefficients.shape[-1], self.knot_m, self.smooth_m)
         flat = torch.linalg.solve_triangular(lower, torch.ones_like(lower[:, :1]), upper=False)[:, 0]
-        return coefficients - (coefficients @ lower.mean(0))[..., None] * flat
+        mean = coefficients @ (lower.T @ _along_the_way(lower.shape[-1]))
+        return coefficients - mean[..., None] * flat
 
     def spaced(self, knot_m: float) -> Self:
-        return replace(self, knot_m=max(self.knot_m, knot_m))
+        return replace(self, knot_m=knot_m, smooth_m=_SMOOTH_KNOTS * knot_m)
 
     def along(self, coefficients: Tensor, size: float) -> Self:
         profile = coefficients / size
@@ -129,7 +134,7 @@ class RoadGrade(Integrated):
 
     def _coefficients(self) -> Tensor:
         profile = tensor(self.profile)
-        return profile @ _lower(profile.shape[-1], self.knot_m).T
+        return profile @ _lower(profile.shape[-1], self.knot_m, self.smooth_m).T
 
 
 def _spline(position: Tensor, coefficients: Tensor, knot: float, whole: bool) -> Tensor:
@@ -153,9 +158,16 @@ def _spline(position: Tensor, coefficients: Tensor, knot: float, whole: bool) ->
 
 
 @lru_cache(maxsize=16)
-def _lower(knots: int, knot: float) -> Tensor:
+def _along_the_way(knots: int) -> Tensor:
+    """What each of so many splines adds to the mean over the way (knot,). The first and last hardly reach into it."""
+    place = torch.linspace(0, knots - 3, _PER_KNOT * (knots - 3) + 1, dtype=torch.float64)
+    return _spline(place, torch.eye(knots, dtype=torch.float64), 1.0, True).mean(-1)
+
+
+@lru_cache(maxsize=16)
+def _lower(knots: int, knot: float, smooth: float) -> Tensor:
     """Cholesky factor of the coefficients' prior, scaled so that the grade has standard deviation 1 at mid-cell."""
-    away = math.sqrt(3) * knot / _SMOOTH_M * (torch.arange(knots)[:, None] - torch.arange(knots)).abs().double()
+    away = math.sqrt(3) * knot / smooth * (torch.arange(knots)[:, None] - torch.arange(knots)).abs().double()
     covariance = (1 + away) * torch.exp(-away)
     middle = torch.tensor([1.0, 23.0, 23.0, 1.0], dtype=torch.float64) / 48
     size = middle @ covariance[:4, :4] @ middle

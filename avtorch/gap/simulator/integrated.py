@@ -49,7 +49,7 @@ class Integrated(Effect):
         return coefficients
 
     def spaced(self, knot_m: float) -> Self:
-        """The effect with knots at least `knot_m` [m] apart."""
+        """The effect with knots `knot_m` [m] apart, and as smooth as these can follow."""
         return self
 
     def along(self, coefficients: Tensor, size: float) -> Self:
