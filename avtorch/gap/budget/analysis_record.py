@@ -31,7 +31,9 @@ _SHORTEST_BLOCK_S = 4.0
 _SHORT_DRIVES_BLOCK_S = 1.0  # where drives are too short for six of the usual ones
 _BLOCKS = 24  # aimed at, within those lengths
 _FEWEST_BLOCKS = 6
-_LEAST_WAY_M = 10.0
+MOST_KNOTS = 36
+"""Along the way, of what depends on the place."""
+_LEAST_KNOT_M = 10.0
 _COUNTED_SHARE = 0.4  # of a block that must count
 _AT_ONCE = 64  # rows that are filtered at once
 
@@ -77,12 +79,14 @@ class AnalysisRecord:
         return int(self.block.max(initial=-1)) + 1
 
     @property
-    def block_way(self) -> float:
-        """Distance that is driven in a block [m], mean over what counts, and 10 m at least.
+    def knot_m(self) -> float:
+        """Distance between the knots of what depends on the place [m]: what is driven in a block.
 
-        In a block that is held out, its neighbours predict nothing finer of what depends on the place.
+        In a block that is held out, its neighbours predict nothing finer. Along the whole way there are not more than
+        `MOST_KNOTS`, as a fit's cost grows with their square.
         """
-        return max(float(np.abs(self.speed[self.counts]).sum()) * self.dt / self.blocks, _LEAST_WAY_M)
+        way = float(np.abs(self.speed[self.counts]).sum()) * self.dt
+        return max(way / min(self.blocks, MOST_KNOTS), _LEAST_KNOT_M)
 
     @property
     def has_speed(self) -> bool:

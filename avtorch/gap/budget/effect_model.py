@@ -235,7 +235,7 @@ def _box(parameter: Parameter) -> tuple[float, float]:
 
 def _coarse(effect: Effect, record: AnalysisRecord) -> Effect:
     """A force along the road with knots as far apart as what is driven in a block."""
-    return effect.spaced(record.block_way) if isinstance(effect, Integrated) else effect
+    return effect.spaced(record.knot_m) if isinstance(effect, Integrated) else effect
 
 
 def _sizes(effects: Sequence[type[Effect]]) -> set[str]:

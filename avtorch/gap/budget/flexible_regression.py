@@ -49,7 +49,7 @@ def _places(fit: Fit[M]) -> FloatArray:
     if not record.has_speed or any(x is None for x in positions):
         return np.empty((0, len(record.channels), record.rows))
     place = np.concatenate([np.asarray(x, float) for x in positions if x is not None])
-    way, knot = float(np.ptp(place)), record.block_way
+    way, knot = float(np.ptp(place)), record.knot_m
     if way < _FEWEST * knot:
         return np.empty((0, len(record.channels), record.rows))
     inner = np.linspace(place.min(), place.max(), max(round(way / knot), 2) + 1)
