@@ -7,6 +7,6 @@ from avtorch.gap import gap_budget
 
 
 def test_a_steep_road_of_many_waves_is_named() -> None:
-    # seven kilometres, waves of 235 m: a dozen knots could not follow them; of 34 coefficients two were at a fit's limit
+    # seven kilometres with waves of 235 m: a dozen knots could not follow them, and two coefficients were at a limit
     case = draw_case(0, 7002, mix={"single": 1.0}, effects=["road_grade"], tiers=["easy"], seconds=300.0)
     assert gap_budget(case.log(), effects=["road_grade", "constant_resistance"]).names == ("road_grade",)
