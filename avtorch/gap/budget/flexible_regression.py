@@ -89,7 +89,7 @@ def left_over(fitting: RobustFit, fit: Fit[M], *, places: bool = False) -> Float
     """Residuals (channel, row) less the regression, fitted to all blocks; `places`: on the place, too.
 
     Without the place a road is slow noise, and the noise hides it. But where each place is passed once, its columns
-    follow whatever wanders, and the noise seems smaller than it is: see `place_predicts`.
+    follow whatever wanders, and the noise seems smaller than it is, so `baseline_noise` asks for a road first.
     """
     residuals, shapes = fit.residuals, columns(fit)
     if places:
@@ -104,22 +104,14 @@ def has_places(fit: Fit[M]) -> bool:
     return len(_places(fit)) > 0
 
 
-def place_predicts(fitting: RobustFit, fit: Fit[M], residuals: FloatArray | None = None) -> bool:
-    """Whether blocks that were held out agree that the place predicts the `residuals`, by default those of `fit`."""
-    places = _places(fit)
-    return len(places) > 0 and bool(
-        _predicted(fitting, places, fit.residuals if residuals is None else residuals).any()
-    )
-
-
 def predicted_residuals(fitting: RobustFit, fit: Fit, residuals: FloatArray) -> FloatArray:
     """What the regression makes of `residuals` (channel, row), each block by a fit to the other folds.
 
     The ridge is what predicts held-out blocks best; where these do not agree on it more surely than chance, nothing.
     """
-    shapes = columns(fit)
-    if place_predicts(fitting, fit, residuals):
-        shapes = np.concatenate([shapes, _places(fit)])
+    shapes, places = columns(fit), _places(fit)
+    if len(places) and _predicted(fitting, places, residuals).any():
+        shapes = np.concatenate([shapes, places])
     return _predicted(fitting, shapes, residuals)
 
 

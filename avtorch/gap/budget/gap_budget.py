@@ -17,7 +17,7 @@ from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.flexible_regression import left_over, place_predicts
+from avtorch.gap.budget.flexible_regression import left_over
 from avtorch.gap.budget.forward_selection import select
 from avtorch.gap.budget.likely_parts import likely_parts, probabilities
 from avtorch.gap.budget.parts import MATERIAL, Budget, ChancePart, ChannelError, Part, Unexplained
@@ -84,7 +84,7 @@ def by_chance(selection: Selection, base: GapPlant, kinds: Sequence[type[Effect]
     if not random:
         return ()
     fitting, fit = selection.fitting, selection.last.fit
-    noise, T_L = left_over(fitting, fit, places=place_predicts(fitting, fit)), float(fit.model.values(fit.z)["T_L"])
+    noise, T_L = left_over(fitting, fit), float(fit.model.values(fit.z)["T_L"])
     found = [slow_disturbance(fitting.whitening.record, noise, T_L, kind) for kind in random]
     return tuple(part for part in found if part is not None)
 

@@ -9,7 +9,7 @@ from avtorch.gap.budget.held_out_evidence import NOTHING, Evidence
 from avtorch.gap.budget.robust_fit import Fit, HeldOut, RobustFit
 
 _REFITTING = 5  # iterations after a model has lost an effect
-_ROAD = 16  # parameters that a road counts at most
+_ROAD = 16  # parameters that a road counts at most; of 30 to 50 coefficients, data settle some 17 to 28
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,9 +32,8 @@ class RoadGrade(Integrated):
 
     Its correlation (Matern 3/2) has the length `smooth_m` [m]. It is expanded in cubic B-splines, one every `knot_m`
     [m]; `profile` (..., knots) holds their coefficients, with independent standard normal priors (the correlation is
-    included in the basis). The response is linear in them as far
-    as the sine is, so a likelihood can integrate them out by the `columns`. Where `profile` is None the grade is 0, or
-    drawn where drives are sampled.
+    included in the basis). The response is linear in them as far as the sine is, so a likelihood can integrate them out
+    by the `columns`. Where `profile` is None the grade is 0, or drawn where drives are sampled.
 
     Possible up to 0.2 over a drive: the steepest streets reach 0.35.
 
