@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -141,7 +142,7 @@ class Setting:
 
     def effective(self, T_L: Tensor, K_L: Tensor) -> tuple[Tensor, Tensor]:
         """Effective (T_e, K_e) of the unclipped loop for draws of the plant (scenario, draw)."""
-        return self._over_draws().lower_level().effective(T_L, K_L)
+        return self._law_over_draws.effective(T_L, K_L)
 
     def p_string_stable(self, T_L: Tensor, K_L: Tensor, *, dead_time: Number = 0.0, link_delay: Number = 0.0) -> Tensor:
         """P(string stable) (scenario,) under draws of the plant (scenario, draw), exact and through (T_e, K_e).
@@ -229,10 +230,10 @@ class Setting:
             "feedforward": float(self.feedforward[scenario]),
         }
 
-    def _over_draws(self) -> Setting:
-        return Setting(
-            **{f.name: getattr(self, f.name).unsqueeze(-2 if f.name == "gains" else -1) for f in fields(self)}
-        )
+    @cached_property
+    def _law_over_draws(self) -> LowerLevel:
+        """The lower level with a last dimension for draws; a watch asks for it at every window."""
+        return LowerLevel(*(x.unsqueeze(-1) for x in (self.T_hat, self.K_hat, self.T_d, self.K_d)))
 
 
 @dataclass(frozen=True)

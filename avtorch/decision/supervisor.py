@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from typing import Any, Literal
 
 import torch
@@ -330,7 +331,7 @@ def _time_gap_now(loop: ClosedLoop, setting: Setting) -> Tensor:
 
 def _for_scenarios(setting: Setting, n: int) -> Setting:
     """A given setting, (scenario,)."""
-    whole = Setting(**vars(setting), scenarios=n)
+    whole = setting.replace(scenarios=n)
     if whole.shape != (n,):
         raise InputError(f"setting: found shape {tuple(setting.shape)}, needs one or {n} scenarios")
     return whole
@@ -364,4 +365,6 @@ def _of(value: float | Tensor, index: Tensor) -> float | Tensor:
 
 def _scatter(setting: Setting, index: Tensor, new: Setting) -> Setting:
     """`setting` with the scenarios `index` replaced by `new`."""
-    return Setting(**{name: getattr(setting, name).index_put((index,), value) for name, value in vars(new).items()})
+    return setting.replace(
+        **{f.name: getattr(setting, f.name).index_put((index,), getattr(new, f.name)) for f in fields(Setting)}
+    )

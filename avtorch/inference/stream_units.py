@@ -11,9 +11,11 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.inference.form import Rows
 from avtorch.inference.jerk import JerkStatistics
@@ -78,7 +80,7 @@ class StreamUnits:
 
     def clear(self) -> None:
         """Begin a stretch with the next window."""
-        self.rows: dict[str, Tensor] = {}
+        self.rows: dict[str, FloatArray] = {}
         self.sums: Tensor | None = None
         self.checks = 0
         self.before: dict[str, Any] | None = None
@@ -110,35 +112,33 @@ class StreamUnits:
             self.clear()
 
     def _append(self, rows: Rows) -> None:
-        """Integrals over all rows, kept at every STEP_S of them."""
-        time, usable = rows["time"], rows["usable"]
+        """Integrals over all rows, kept at every STEP_S of them; in NumPy, whose calls cost a live watch less."""
         if {"accel_cmd", "accel", "jerk"} <= set(self.columns):
-            statistics = JerkStatistics.from_samples(rows["accel"], rows["accel_cmd"], rows["jerk"], usable)
+            statistics = JerkStatistics.from_samples(rows["accel"], rows["accel_cmd"], rows["jerk"], rows["usable"])
             sums = torch.stack([getattr(statistics, name) for name in ("n", "jj", "aj", "uj", "aa", "au", "uu")])
             self.sums = sums if self.sums is None else self.sums + sums
-        # a masked row may hold any number or NaN
-        clean = {name: torch.where(usable, rows[name], 0.0) for name in self.columns}
+        time, usable = rows["time"].numpy(), rows["usable"].numpy()
+        # a masked row may hold any number or NaN; (column, vehicle, time)
+        values = np.where(usable, np.stack([rows[name].numpy() for name in self.columns]), 0.0)
         last = {name: value[..., -1:] for name, value in self.rows.items()}
         if last:
-            time = torch.cat([last["time"], time])
-            usable = torch.cat([last["usable"] > 0, usable], -1)
-            clean = {name: torch.cat([last[name], value], -1) for name, value in clean.items()}
-        steps = time.diff()
-        usual = steps.median() if len(steps) else torch.tensor(math.inf)
-        lost = ~(usable[:, 1:] & usable[:, :-1]) | (steps > torch.clamp(3 * usual, min=0.1))
-        new = {"time": time, "usable": usable.double(), **clean}
-        parts = {"lost": lost.double()}
-        parts |= {f"total {name}": 0.5 * (x[:, 1:] + x[:, :-1]) * steps for name, x in clean.items()}
-        for name, part in parts.items():
-            begin = last[name] if last else torch.zeros(len(usable), 1, dtype=torch.float64)
-            new[name] = torch.cat([begin, begin + part.cumsum(-1)], -1)
-        every = max(1, int(STEP_S / float(usual) + 1e-6)) if bool(usual > 0) else 1
+            time = np.concatenate([last["time"], time])
+            usable = np.concatenate([last["usable"] > 0, usable], -1)
+            values = np.concatenate([np.stack([last[name] for name in self.columns]), values], -1)
+        steps = np.diff(time)
+        usual = float(np.median(steps)) if len(steps) else math.inf
+        lost = ~(usable[:, 1:] & usable[:, :-1]) | (steps > max(3 * usual, 0.1))
+        parts = np.concatenate([lost[None].astype(np.float64), 0.5 * (values[..., 1:] + values[..., :-1]) * steps])
+        names = ("lost", *(f"total {name}" for name in self.columns))
+        begin = np.stack([last[name] for name in names]) if last else np.zeros((*parts.shape[:-1], 1))
+        totals = np.concatenate([begin, begin + parts.cumsum(-1)], -1)
+        every = max(1, int(STEP_S / usual + 1e-6)) if usual > 0 else 1
         # always keep the last row: the next window continues from it
-        kept = torch.tensor(sorted({*range(1 if last else 0, len(time), every), len(time) - 1}))
-        self.rows = {
-            name: torch.cat([self.rows[name], value[..., kept]], -1) if last else value[..., kept]
-            for name, value in new.items()
-        }
+        kept = np.unique(np.append(np.arange(1 if last else 0, len(time), every), len(time) - 1))
+        new = {"time": time, "usable": usable.astype(np.float64)}
+        new |= dict(zip(self.columns, values, strict=True)) | dict(zip(names, totals, strict=True))
+        new = {name: value.take(kept, -1) for name, value in new.items()}
+        self.rows = {name: np.concatenate([self.rows[name], x], -1) if last else x for name, x in new.items()}
 
     def _check(self, pair: Pair) -> bool:
         """Whether the stretch decides ``pair`` for every vehicle; raises InputError where one of them is wrong."""
@@ -146,10 +146,10 @@ class StreamUnits:
         if len(pair.delays) > 1 and bool((correlation <= -SURE).any()):
             later = self._best(pair._replace(delays=LATER_S))
             late = (correlation <= -SURE) & may_be_late(later[1], known=later[1] != 0)
-            slope, correlation = torch.where(late, later[0], slope), torch.where(late, later[1], correlation)
-        sure = correlation.abs() >= SURE
+            slope, correlation = np.where(late, later[0], slope), np.where(late, later[1], correlation)
+        sure = np.abs(correlation) >= SURE
         wrong = sure & ~((slope >= pair.limits[0]) & (slope <= pair.limits[1]))
-        for v in wrong.nonzero().squeeze(-1).tolist():
+        for v in np.flatnonzero(wrong).tolist():
             moves = f"{pair.level} responds with" if pair.integrated else f"{pair.level} changes"
             scale = f"{moves} {float(slope[v]):.3g} times as much as {pair.rate} implies"
             if float(slope[v]) < 0:
@@ -159,42 +159,38 @@ class StreamUnits:
             raise self._refusal(v, pair.level, pair.rate, f"{scale}, so their units differ; perhaps {near}")
         return bool(sure.all())
 
-    def _best(self, pair: Pair) -> tuple[Tensor, Tensor]:
+    def _best(self, pair: Pair) -> tuple[FloatArray, FloatArray]:
         """Slope and correlation, each ``(vehicle,)``, at the delay and the span where they correlate best."""
         found = [self._compare(pair, span) for span in SPANS_S]
-        slope, correlation = (torch.cat(x) for x in zip(*found, strict=True))  # (span x delay, vehicle)
+        slope, correlation = (np.concatenate(x) for x in zip(*found, strict=True))  # (span x delay, vehicle)
         # a periodic drive correlates as strongly, with the other sign, half a period off: the agreeing sign goes first
-        best = (correlation.abs() + (correlation > 0.5)).argmax(0, keepdim=True)
-        return slope.gather(0, best)[0], correlation.gather(0, best)[0]
+        best = (np.abs(correlation) + (correlation > 0.5)).argmax(0), np.arange(self.vehicles)
+        return slope[best], correlation[best]
 
-    def _compare(self, pair: Pair, span: float) -> tuple[Tensor, Tensor]:
+    def _compare(self, pair: Pair, span: float) -> tuple[FloatArray, FloatArray]:
         """Slope and correlation of level on rate for every delay, ``(delay, vehicle)``; a correlation of 0: unknown."""
         rows, time = self.rows, self.rows["time"]
-        starts = torch.arange(float(time[0]) + max(pair.delays), float(time[-1]) - span, span / 4, dtype=time.dtype)
-        delays = torch.tensor(pair.delays, dtype=time.dtype)[:, None]
+        starts = np.arange(time[0] + max(pair.delays), time[-1] - span, span / 4)
+        delays = np.array(pair.delays)[:, None]
         if len(starts) < 2:
-            return torch.zeros(2, len(delays), self.vehicles, dtype=time.dtype).unbind(0)  # type: ignore[return-value]
+            return np.zeros((len(delays), self.vehicles)), np.zeros((len(delays), self.vehicles))
         level = rows[f"total {pair.level}" if pair.integrated else pair.level]
-        starts = starts.expand(len(delays), -1)
-
-        def change(x: Tensor, begin: Tensor, end: Tensor) -> Tensor:
-            return _at(time, x, end) - _at(time, x, begin)  # (vehicle, delay, start)
-
-        whole = change(rows["lost"], starts - delays, starts + span) < 0.5
-        x = change(rows[f"total {pair.rate}"], starts - delays, starts + span - delays)
-        y = change(level, starts, starts + span)
+        begun = starts - delays  # (delay, start)
+        x = _change(time, rows[f"total {pair.rate}"], begun, begun + span)
+        y = _change(time, level, starts, starts + span)[:, None]
+        whole = _change(time, rows["lost"], begun, np.broadcast_to(starts + span, begun.shape)) < 0.5
         count = whole.sum(-1)
 
-        def mean(value: Tensor) -> Tensor:
-            return torch.where(whole, value, 0.0).sum(-1) / count.clamp_min(1)
+        def mean(value: FloatArray) -> FloatArray:
+            return np.where(whole, value, 0.0).sum(-1) / np.maximum(count, 1)
 
         x, y = x - mean(x)[..., None], y - mean(y)[..., None]
-        xx, xy, yy = mean(x.square()), mean(x * y), mean(y.square())
+        xx, xy, yy = mean(x * x), mean(x * y), mean(y * y)
         moves = (xx > 1e-12) & (yy > 1e-12) & (count >= 4 * MIN_SPANS - 4)
-        correlation = torch.where(moves, xy / (xx * yy).clamp_min(1e-300).sqrt(), 0.0)
+        correlation = np.where(moves, xy / np.sqrt(np.maximum(xx * yy, 1e-300)), 0.0)
         # as in a log: the slope by which the two would be alike in size, its sign that of the correlation
-        slope = torch.where(moves, correlation * (yy / xx.clamp_min(1e-300)).sqrt(), 1.0)
-        return slope.mT, correlation.mT
+        slope = np.where(moves, correlation * np.sqrt(yy / np.maximum(xx, 1e-300)), 1.0)
+        return slope.T, correlation.T
 
     def _check_swap(self) -> None:
         """Least squares of the jerk on ``(-accel, accel_cmd)``: where lag and gain are both negative, the columns are
@@ -221,7 +217,8 @@ class StreamUnits:
 
     def state_dict(self) -> dict[str, Any]:
         """Plain tensors and numbers."""
-        return {"rows": dict(self.rows), "sums": self.sums, "looks": self.checks, "before": self.before}
+        rows = {name: torch.from_numpy(value) for name, value in self.rows.items()}
+        return {"rows": rows, "sums": self.sums, "looks": self.checks, "before": self.before}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from :meth:`state_dict`.
@@ -245,12 +242,11 @@ class StreamUnits:
             tensor_as(value, torch.float64, shape, f"state: units: rows.{name}")
         if sums is not None:
             tensor_as(sums, torch.float64, (7, self.vehicles), "state: units: sums")
-        self.rows = {name: value.clone() for name, value in rows.items()}
+        self.rows = {name: value.numpy().copy() for name, value in rows.items()}
         self.sums, self.checks, self.before = sums, checks, before
 
 
-def _at(time: Tensor, x: Tensor, when: Tensor) -> Tensor:
-    """``x`` ``(vehicle, time)`` at ``when`` ``(...)``, linear between rows; returns ``(vehicle, ...)``."""
-    after = torch.searchsorted(time, when.contiguous()).clamp(1, len(time) - 1)
-    share = ((when - time[after - 1]) / (time[after] - time[after - 1])).clamp(0, 1)
-    return torch.lerp(x[:, after - 1], x[:, after], share.expand(len(x), *when.shape))
+def _change(time: FloatArray, x: FloatArray, begin: FloatArray, end: FloatArray) -> FloatArray:
+    """What ``x`` ``(vehicle, time)`` gains from ``begin`` to ``end`` ``(...)``, linear between rows; ``(vehicle,
+    ...)``."""
+    return np.stack([np.interp(end, time, own) - np.interp(begin, time, own) for own in x])

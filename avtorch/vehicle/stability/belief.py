@@ -236,6 +236,9 @@ class _Blocks:
 
     def __iter__(self) -> Iterator[LinearLoop]:
         count = self.shape.numel()
+        if 0 < count * self.draws <= BLOCK and len(self.shape) == 1:
+            yield self.setting.map(torch.detach)  # what is the same for all draws need not be expanded
+            return
         s = self.setting.map(lambda x: x.detach().expand(*self.shape, x.shape[-1]).reshape(count, x.shape[-1]))
         rows = max(1, BLOCK // self.draws)
         for start in range(0, count, rows):
