@@ -7,14 +7,14 @@ the same moment (filters, holds, clocks that differ): speed has a lateness again
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from avtorch.arrays import FloatArray
+from avtorch.arrays import BoolArray, FloatArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord, Stretch, stacked
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.integrated import Integrated
@@ -27,6 +27,7 @@ LATENESS_S = 0.04  # its standard deviation [s]
 _BEYOND = 3.0  # times as far as physics allows
 _WIDEST = 6.0  # prior standard deviations, where physics sets no limit
 _AT_LIMIT = 0.02  # prior standard deviations from a limit
+_BEHIND = ("body", "sensor")  # places of the chain behind the actuator
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +88,28 @@ class EffectModel:
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(e.name for e in self.effects)
+
+    @property
+    def along(self) -> BoolArray:
+        """The coordinates (size,) in which the response is linear: those of forces along the road."""
+        return self._of(lambda key, effect: key in self.roads)
+
+    @property
+    def behind(self) -> BoolArray:
+        """The coordinates (size,) that leave the actuator as it is: those of forces and sensors."""
+        return self._of(lambda key, effect: key == LATENESS or (effect is not None and effect.place in _BEHIND))
+
+    def _of(self, chosen: Callable[[str, type[Effect] | None], bool]) -> BoolArray:
+        kinds, out = {e.name: e for e in self.effects}, np.zeros(self.size, dtype=bool)
+        for key, at in self.index.items():
+            out[at] = chosen(key, kinds.get(key.partition(".")[0]))
+        return out
+
+    def of_the_road(self) -> EffectModel:
+        """Forces along the road, and what reads them. What a further one adds depends on nothing else."""
+        kept = {e.name for e in self.effects if issubclass(e, Integrated) or e.place == "sensor"}
+        onsets = {name: onset for name, onset in self.onsets.items() if name in kept}
+        return replace(self, effects=tuple(e for e in self.effects if e.name in kept), onsets=onsets)
 
     def with_effect(self, effect: type[Effect]) -> EffectModel:
         return replace(self, effects=(*self.effects, effect))
@@ -154,8 +177,11 @@ class EffectModel:
     # response ------------------------------------------------------------------------------------------------------
     @torch.inference_mode()
     def simulate(self, z: FloatArray) -> FloatArray:
-        """Noise-free channels (..., channel, row) [m/s²] of coordinates `z` (..., size)."""
-        values = self.values(z)
+        """Noise-free channels (..., channel, row) [m/s²] of coordinates `z` (..., size).
+
+        What all of these have in common is simulated once.
+        """
+        values = {key: _shared(value, self.plant.parameters()[key].size > 1) for key, value in self.values(z).items()}
         if not self.onsets:
             return self._late(self._simulate(self.plant, values), z)
         out: FloatArray | None = None
@@ -195,6 +221,13 @@ class EffectModel:
             by_channel = {"speed": torch.cat([gained, gained[..., -1:]], -1), "accel": response.accel_measured}
             channels.append(_averaged(stacked([by_channel[c] for c in self.record.channels]), stretch, self.record.dt))
         return np.concatenate(channels, -1)
+
+
+def _shared(value: Tensor, long: bool) -> Tensor:
+    """`value` (batch, ...) without its batch where it is the same throughout; `long`: of several numbers each."""
+    if value.dim() != 1 + long or len(value) < 2 or bool((value != value[0]).any()):
+        return value
+    return value[0]
 
 
 def _delayed(x: FloatArray, rows: FloatArray) -> FloatArray:

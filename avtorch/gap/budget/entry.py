@@ -60,7 +60,7 @@ def candidates_for(
 
 def enter(fitting: RobustFit, now: Step, test: ScoreTest, candidates: Sequence[Candidate]) -> Step | None:
     """The best of `candidates` in, if the blocks that were held out agree on one."""
-    fits = [_fitted(fitting, test, c) for c in candidates[:_FITTED]]
+    fits = [fitted(fitting, test, c) for c in candidates[:_FITTED]]
     fits = [fit for fit in fits if now.fit.nats - fit.nats > _LEAST_NATS]
     fits.sort(key=lambda fit: fit.nats + complexity(fit))
     tried = []
@@ -97,7 +97,7 @@ def _much_simpler(now: Step, best: Step, other: Step) -> bool:
     return fewer >= _FAR_FEWER and cost(now) - cost(other) > _MOST_OF_IT * (cost(now) - cost(best))
 
 
-def _fitted(fitting: RobustFit, test: ScoreTest, candidate: Candidate) -> Fit:
+def fitted(fitting: RobustFit, test: ScoreTest, candidate: Candidate) -> Fit:
     """The candidate fitted, from the start on or from the onset that promises most."""
     fit = fitting.fit(candidate.model, candidate.starts, iterations=_SCREENING)
     kind, logs = candidate.model.effects[-1], set(candidate.model.record.log)

@@ -12,14 +12,14 @@ def without_the_redundant(
 ) -> tuple[Step, dict[str, Evidence]]:
     """The model without effects that do not hold their place, weakest first, and the evidence for each that does."""
     while True:
-        without = {name: _without(fitting, step, name) for name in step.fit.model.names if name != spared}
+        without = {name: without_one(fitting, step, name) for name in step.fit.model.names if name != spared}
         weakest = min(without.values(), key=lambda s: s.evidence.of_entry, default=None)
         if weakest is None or weakest.evidence.of_entry > 0:
             return step, {name: s.evidence for name, s in without.items()}
         step = weakest
 
 
-def _without(fitting: RobustFit, step: Step, name: str) -> Step:
+def without_one(fitting: RobustFit, step: Step, name: str) -> Step:
     """`step` without an effect, with the evidence for that one."""
     fit = without_effects(fitting, step.fit, [name])
     held = fitting.hold_out(fit)

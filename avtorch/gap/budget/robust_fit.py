@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Generic
+from typing import Any, Generic
 
 import numpy as np
 from typing_extensions import TypeVar
@@ -26,6 +26,7 @@ _DAMPING = (1e-3, 0.3, 10.0, 300.0)
 _CLOSE = (1e-3, 1.0)  # where the place is known nearly
 _LONGEST = 1.0  # step of a coordinate [prior SD], then two and a half of it
 _STOP_NATS = 0.05
+_MOVED, _KEPT = 0.25, 4  # prior SD, by which a lateness or a sensor has moved; places at which slopes are kept
 
 M = TypeVar("M", bound=FittedModel, default=EffectModel)
 
@@ -78,6 +79,7 @@ class RobustFit:
     fold: IntArray = field(init=False)
     prior: FloatArray = field(init=False)
     half: FloatArray = field(init=False)
+    _kept: dict[Any, list[tuple[FloatArray, FloatArray]]] = field(init=False, default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         n = self.whitening.lengths * len(self.whitening.taps) * self.whitening.share
@@ -127,7 +129,35 @@ class RobustFit:
         """Derivatives (size, channel, counted) of the white response at `z`, where the white residuals are `white`."""
         # at the upper limit of a coordinate nothing lies ahead
         step = np.where(z + _STEP > model.high, -_STEP, _STEP)
-        return (white - self.white(model, z + np.diag(step))) / step[:, None, None]
+        out, moved = np.empty((len(z), *white.shape)), z + np.diag(step)
+        car: FittedModel = model
+        none = np.zeros(len(z), dtype=bool)
+        along, behind = (car.along, car.behind) if isinstance(car, EffectModel) else (none, none)
+        for some in (~behind, behind & ~along):  # the second leave the actuator as it is
+            if some.any():
+                out[some] = (white - self.white(model, moved[some])) / step[some, None, None]
+        if isinstance(car, EffectModel) and along.any():
+            out[along] = self._along(car, z)
+        return out
+
+    def _along(self, model: EffectModel, z: FloatArray) -> FloatArray:
+        """`slope` (road coordinate, channel, counted) in coordinates in which the response is linear.
+
+        A road of some thirty coefficients would cost as many simulations at every step of a fit. Their slopes change
+        with what reads the force alone, and little with that, so they are kept until it has moved.
+        """
+        lean = model.of_the_road()
+        at, own = lean.coordinates(model.named(z)), lean.along
+        at[own] = 0.0
+        read = at[lean.behind & ~own]
+        kept = self._kept.setdefault((lean.names, tuple(sorted(lean.onsets.items()))), [])
+        for there, slopes in kept:
+            if np.abs(there - read).max(initial=0.0) <= _MOVED:
+                return slopes
+        change = lean.simulate(at + np.eye(len(at))[own]) - lean.simulate(at)
+        kept.insert(0, (read, self.whitening(change)))
+        del kept[_KEPT:]
+        return kept[0][1]
 
     def errors(self, fit: Fit[M]) -> FloatArray:
         """Standard errors (size,) of the coordinates by how much the blocks disagree (Liang and Zeger's sandwich)."""

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from avtorch.gap.simulator.actuator import Actuator, Substep
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.effect_context import EffectContext, context_at
 from avtorch.gap.simulator.order import actuator_of, at_place, substeps
@@ -55,10 +56,12 @@ def rollout(
                 continue
             at = context_at(rows[e.name], 0)
             accel0 = accel0 - e.advance(start, at, e.start(start, at))[0]
-    a, gained = actuator_of(whole).over(accel0.expand(shape[:-1]), parts)
+    actuator = actuator_of(whole)
+    # columns that differ in forces or sensors only share the actuator's motion
+    a, gained = actuator.over(accel0.expand(_own_shape(accel0, parts, actuator)), parts)
 
     forces = [e.over(a, rows[e.name]) for e in at_place(whole, "body")]
-    accel = a
+    accel = a.expand(shape)
     if forces:
         force = torch.stack([f.expand(shape) for f in forces]).sum(0) if len(forces) > 1 else forces[0].expand(shape)
         accel = a + force
@@ -87,3 +90,10 @@ def _shape(effects: list[Effect], row: EffectContext, drive: SimulatorInput) -> 
         long = {p.name for p in e.coordinates() if p.size > 1}
         shapes += [(*(v.shape[:-1] if k in long else v.shape), 1) for k, v in e.values().items()]
     return torch.Size(np.broadcast_shapes(*shapes))
+
+
+def _own_shape(accel0: Tensor, parts: list[Substep], actuator: Actuator) -> torch.Size:
+    """The common shape (...) of what moves the actuator."""
+    by_row = [x for part in parts for x in (part.target, part.lag, part.length)]
+    by_row += [x for x in (actuator.tau, actuator.jerk) if x is not None]
+    return torch.Size(np.broadcast_shapes(accel0.shape, *(x.shape[:-1] for x in by_row)))
