@@ -182,8 +182,13 @@ class EffectModel:
         What all of these have in common is simulated once.
         """
         values = {key: _shared(value, self.plant.parameters()[key].size > 1) for key, value in self.values(z).items()}
+        out = self._late(self._setting_in(values), z)
+        return np.broadcast_to(out, (*z.shape[:-1], *out.shape[-2:]))
+
+    def _setting_in(self, values: Mapping[str, Tensor]) -> FloatArray:
+        """The response to `values` (...), of which those of an effect that sets in act from its onset on."""
         if not self.onsets:
-            return self._late(self._simulate(self.plant, values), z)
+            return self._simulate(self.plant, values)
         out: FloatArray | None = None
         active = [e for e in self.plant.effects if e.name not in self.onsets]
         for name, onset in [("", -np.inf), *sorted(self.onsets.items(), key=lambda item: item[1])]:
@@ -194,7 +199,7 @@ class EffectModel:
             later = self._simulate(present, some)
             out = later if out is None else np.where(self.record.time >= onset, later, out)
         assert out is not None
-        return self._late(out, z)
+        return out
 
     def _late(self, channels: FloatArray, z: FloatArray) -> FloatArray:
         """`channels` (..., channel, row) with the one that is read late as late as it is.

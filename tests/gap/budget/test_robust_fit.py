@@ -13,6 +13,7 @@ from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.effect_model import EffectModel
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 from avtorch.gap.budget.robust_fit import RobustFit
+from avtorch.io import Log
 from tests.gap.budget.cars import log_of
 
 
@@ -158,3 +159,11 @@ def test_what_all_coordinates_share_is_simulated_once() -> None:
     z[1:, model.behind] = np.random.default_rng(0).standard_normal((2, int(model.behind.sum())))
     together = model.simulate(z)
     np.testing.assert_allclose(together, np.stack([model.simulate(each) for each in z]), atol=1e-12)
+
+
+def test_places_that_are_all_alike_are_as_many_as_before() -> None:
+    """Folds of a drive in which nothing moves ended alike, and without an accelerometer lost their dimension."""
+    log = log_of(seed=3)
+    for given in (log, Log.from_arrays(name="speed", time=log.time, accel_cmd=log.accel_cmd, speed=log.speed)):
+        model = EffectModel(AnalysisRecord.of([given]), plant())
+        assert model.simulate(np.zeros((3, model.size))).shape == (3, *model.simulate(np.zeros(model.size)).shape)
