@@ -232,29 +232,29 @@ def _spread(candidates: Sequence[Candidate], budget: Budget, kinds: Sequence[typ
 
     The likelihood cannot say how probable a hypothesis is whose noise does not hold; what it left to `unknown` goes to
     the parts that held-out blocks select, as far as these are sure, and to `unknown` as far as something material is
-    left besides. Where they select nothing, some drives have a cause that they are too short or too calm to show; each
-    effect by itself is as likely to be that.
+    left besides. Where they select nothing, or wrongly, some drives have a cause that they are too short or too calm to
+    show; each effect by itself is as likely to be that. Some have one that no effect describes (`PartOdds`).
     """
     free = math.fsum(c.probability for c in candidates if c.name in ALWAYS)
-    left = budget.unexplained.probability
-    name, sure = candidate_name(budget.names), min((p.probability for p in budget.parts), default=0.0)
-    empty = PartOdds.read().empty
-    hidden = [c.name for c in candidates if len(c.effects) == 1 and c.name not in ALWAYS]
-    shares = {"unknown": free * left, "none": free * (1 - left) * (empty if hidden else 1.0)}
+    left, odds = budget.unexplained.probability, PartOdds.read()
+    name = candidate_name(budget.names)
     if budget.names:
         sure = min(p.probability for p in (*budget.parts, *budget.chance) if p.name in budget.names)
-        shares = {"unknown": free * ((1 - sure) + sure * left), "none": 0.0, name: free * sure * (1 - left)}
+        none, unknown, other = odds.none_wrong, odds.unknown_wrong, free * (1 - sure)
+        shares = {"unknown": free * sure * left, "none": 0.0, name: free * sure * (1 - left)}
     else:
-        each = free * (1 - left) * (1 - empty) / max(len(hidden), 1)
-        shares |= {c.name: c.probability + each for c in candidates if c.name in hidden}
+        none, unknown, other = odds.none_unnamed, odds.unknown_unnamed, free * (1 - left)
+        shares = {"unknown": free * left, "none": 0.0}
+    hidden = [c for c in candidates if len(c.effects) == 1 and c.name not in (*ALWAYS, name)]
+    shares["unknown"] += other * unknown
+    shares["none"] += other * (none if hidden else 1 - unknown)
+    shares |= {c.name: c.probability + other * (1 - none - unknown) / len(hidden) for c in hidden}
     out = [replace(c, probability=shares.get(c.name, c.probability)) for c in candidates if c.name != name]
     if budget.names:
         before = next((c for c in candidates if c.name == name), None)
         known = 0.0 if before is None else before.probability
         chosen = _selected(budget, name, min(known + shares[name], 1.0), kinds)
         out.append(replace(chosen, log_evidence=None if before is None else before.log_evidence))
-    elif name:
-        out += [replace(c, probability=shares[name]) for c in candidates if c.name == name]
     return out
 
 
@@ -293,7 +293,7 @@ def _why(budget: Budget) -> str:
                 "On parts of the drive not used for fitting no known effect reduces the error, though part of it is "
                 "reproducible."
             )
-        share = percent(PartOdds.read().empty)
+        share = percent(PartOdds.read().none_unnamed)
         return (
             "What is left is noise: commands, speed and place do not predict it on parts of the drive not used for "
             f"fitting. Of simulated drives that say so {share} have no cause, the others one too weak to show."

@@ -2,10 +2,10 @@
 
 What Student's law for the blocks that excite it says of it is too sure where many do, and far too doubtful where two or
 three do, as in a drive of a minute. So a logistic regression is fitted to simulated drives behind ideal and ordinary
-recorders, on two figures: how much held-out blocks gain by the effect, and how well they agree on its size. Wrong
-effects have as many chances as are tried, so the odds are in inverse proportion to that. Nothing is surer than
-Student's law has it for the best of as many, but where much is gained: each e-fold of nats then counts for one standard
-error.
+recorders, on three figures: how much held-out blocks gain by the effect, how well they agree on its size, and how much
+of the response is its own. Wrong effects have as many chances as are tried, so the odds are in inverse proportion to
+that. Nothing is surer than Student's law has it for the best of as many, but where much is gained: each e-fold of nats
+then counts for one standard error.
 ``python -m benchmarks.part_odds`` writes its weights, with their provenance, to `part_odds.json` beside this module.
 """
 
@@ -24,7 +24,7 @@ from scipy.special import expit, ndtr
 from avtorch.arrays import FloatArray
 from avtorch.gap.budget.held_out_evidence import MUCH, Evidence
 
-SCHEMA = "avtorch.part-odds/1"
+SCHEMA = "avtorch.part-odds/2"
 PATH = Path(__file__).with_name("part_odds.json")
 _LEAST_NATS, _LEAST_ERRORS = 0.5, 0.1  # below which there is no evidence
 _RESPONSES = (0.01, 0.5)  # beyond which a smaller or larger response says no more
@@ -35,14 +35,19 @@ _SUREST = 0.9995  # no frequency on some hundred simulated drives supports more
 class PartOdds:
     """Weights of the log odds where one effect is tried; those but `constant` are of natural logarithms.
 
-    `empty`: the probability that a drive has no cause where no part is likely and nothing material is left.
+    `none_unnamed`, `unknown_unnamed`: the probabilities that a drive of which no part is likely has no cause, or one
+    that no effect describes; else it has an effect too weak to show. `none_wrong`, `unknown_wrong`: the same where a
+    part is likely that is not there.
     """
 
     constant: float
     nats: float
     errors: float
     response: float
-    empty: float
+    none_unnamed: float
+    unknown_unnamed: float
+    none_wrong: float
+    unknown_wrong: float
 
     @classmethod
     def read(cls) -> PartOdds:
