@@ -296,7 +296,8 @@ def _why(budget: Budget) -> str:
         share = percent(PartOdds.read().none_unnamed)
         return (
             "What is left is noise: commands, speed and place do not predict it on parts of the drive not used for "
-            f"fitting. Of simulated drives that say so {share} have no cause, the others one too weak to show."
+            f"fitting. Of simulated drives that say so {share} have no cause, the others one too weak to show, or one "
+            "that is not in the table of effects."
         )
     count = len(budget.names)
     chosen = "This effect was chosen because it" if count == 1 else f"These {count} effects were chosen because they"
