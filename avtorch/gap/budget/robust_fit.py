@@ -130,14 +130,13 @@ class RobustFit:
         # at the upper limit of a coordinate nothing lies ahead
         step = np.where(z + _STEP > model.high, -_STEP, _STEP)
         out, moved = np.empty((len(z), *white.shape)), z + np.diag(step)
-        car: FittedModel = model
         none = np.zeros(len(z), dtype=bool)
-        along, behind = (car.along, car.behind) if isinstance(car, EffectModel) else (none, none)
+        along, behind = (model.along, model.behind) if isinstance(model, EffectModel) else (none, none)
         for some in (~behind, behind & ~along):  # the second leave the actuator as it is
             if some.any():
                 out[some] = (white - self.white(model, moved[some])) / step[some, None, None]
-        if isinstance(car, EffectModel) and along.any():
-            out[along] = self._along(car, z)
+        if isinstance(model, EffectModel) and along.any():
+            out[along] = self._along(model, z)
         return out
 
     def _along(self, model: EffectModel, z: FloatArray) -> FloatArray:
