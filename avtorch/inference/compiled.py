@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
 from types import ModuleType
 
 import numpy as np
@@ -17,18 +16,12 @@ from avtorch.errors import InputError
 from avtorch.inference.coordinates import Coordinates
 from avtorch.inference.density import Density
 from avtorch.inference.exponential_form import ExponentialForm, has_form, outdated
+from avtorch.inference.kernel_loading import Unavailable, load_kernels
 from avtorch.inference.planes import empty_planes, to_planes
 from avtorch.inference.sampler_settings import SamplerSettings
 
 #: Steps of single chains below which a second thread costs more than it saves, some milliseconds of work.
 ALONE = 500_000
-
-
-@dataclass(frozen=True)
-class Unavailable:
-    """Why the walk of a density is not compiled."""
-
-    why: str
 
 
 @dataclass(frozen=True)
@@ -155,7 +148,7 @@ def compiled(density: Density) -> Compiled | Unavailable:
     name = type(density).__name__
     if not has_form(density) or outdated(density, "exponential_form"):
         return Unavailable(f"{name} has no closed form that the kernels know")
-    kernels = load_kernels()
+    kernels = load_kernels("kernels")
     if isinstance(kernels, Unavailable):
         return kernels
     form = density.exponential_form()
@@ -164,21 +157,3 @@ def compiled(density: Density) -> Compiled | Unavailable:
     if form.coupling.device.type != "cpu":
         return Unavailable(f"{name} is on {form.coupling.device.type}; the kernels are for the processor")
     return Compiled(kernels, form)
-
-
-@lru_cache(maxsize=1)
-def load_kernels() -> ModuleType | Unavailable:
-    """The compiled code, from numba's cache on disk; the first call on a machine compiles it and fills the cache."""
-    try:
-        import numba
-    except ImportError:
-        return Unavailable("numba is not installed: pip install 'avtorch[fast]'")
-    if numba.config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
-        return Unavailable("numba does not compile here: NUMBA_DISABLE_JIT is set")
-    try:
-        from avtorch.inference import kernels
-    except RuntimeError as fault:  # numba found no folder to write to; without one every process would compile anew
-        return Unavailable(
-            f"compiled code cannot be kept: {fault}; set NUMBA_CACHE_DIR to a folder that can be written"
-        )
-    return kernels

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from avtorch.arrays import Bool, Float, Int
 from avtorch.errors import InputError
+from avtorch.inference.kernel_loading import Unavailable, load_kernels
+from avtorch.inference.latent_compiled import compiled_values
 from avtorch.inference.latent_filter import latent_log_likelihood
 from avtorch.inference.latent_rows import row_values
 from avtorch.inference.latent_steady import EvenRows, steady_log_likelihood
@@ -63,9 +65,11 @@ def run_log_likelihood(
     noise = {name: (p[name].square() + FINEST**2).sqrt() for name in ("accel_noise", "speed_noise") if name in p}
     noise |= {name: p[name] for name in ("road_noise",) if name in p}
     five = (p["T_L"], p["K_L"], p["process_noise"], p["coloured_sd"], p["coloured_time"])
-    # the routes without a graph are NumPy's
+    # the routes without a graph are NumPy's or compiled
     elsewhere = runs.time.device.type != "cpu"
     differentiated = elsewhere or (torch.is_grad_enabled() and any(x.requires_grad for x in (*five, *noise.values())))
+    if not differentiated and not isinstance(kernels := load_kernels("latent_kernels"), Unavailable):
+        return compiled_values(kernels, *five, runs, even, **noise)
     if even is not None:
         return (steady_log_likelihood if differentiated else steady_values)(*five, even, **noise)
     if not differentiated:

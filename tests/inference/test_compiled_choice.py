@@ -11,8 +11,9 @@ import torch
 
 from avtorch.errors import InputError
 from avtorch.inference import SGLD, JerkDensity, JerkPoints, SamplerSettings, find_mode, sample
-from avtorch.inference.compiled import Compiled, Unavailable, compiled, load_kernels
+from avtorch.inference.compiled import Compiled, compiled
 from avtorch.inference.exponential_form import ExponentialForm
+from avtorch.inference.kernel_loading import Unavailable, load_kernels
 from avtorch.inference.priors import HalfNormalPrior, Joint, default_actuation_prior
 from avtorch.inference.sampler import walk
 from avtorch.inference.schedules import polynomial
@@ -138,6 +139,30 @@ def test_a_second_process_compiles_nothing_and_draws_the_same(tmp_path):
     assert first.startswith("[0, 0] [1, 1]")
     assert second.startswith("[1, 1] [0, 0]")
     assert first.split()[-1] == second.split()[-1]
+
+
+LATENT = """
+import torch
+from avtorch.inference.latent import LatentDensity, LatentWindow
+time = 0.01 * torch.arange(200, dtype=torch.float64)
+u = torch.sin(3 * time)
+a, v = 0.9 * torch.sin(3 * time - 0.5), 10 - torch.cos(3 * time) / 3
+density = LatentDensity(LatentWindow.single(time, u, accel=a, speed=v))
+print(density.log_prob(density.initial()).item())
+"""
+
+
+@pytest.mark.slow
+def test_the_latent_form_is_compiled_once_and_has_the_same_value_without(tmp_path):
+    told = (
+        LATENT + "from avtorch.inference import latent_kernels as k\nprint(sum(k.filtered.stats.cache_hits.values()))"
+    )
+    first, second = (fresh_process(told, NUMBA_CACHE_DIR=str(tmp_path)).split() for _ in range(2))
+    assert (first[1], second[1]) == ("0", "1")
+    assert first[0] == second[0]
+    without = fresh_process("import sys\nsys.modules['numba'] = None\n" + LATENT)
+    # the diffuse start cancels about seven digits
+    assert float(without) == pytest.approx(float(first[0]), rel=1e-9, abs=1e-8)
 
 
 @pytest.mark.slow

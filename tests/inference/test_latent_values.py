@@ -1,12 +1,17 @@
-"""The likelihood's values without a graph against the routes that have one, and what is differenced from them."""
+"""The likelihood's values without a graph, compiled and not, against the routes that have one, and what is differenced
+from them."""
 
 from __future__ import annotations
+
+from types import ModuleType
 
 import pytest
 import torch
 from torch import Tensor
 
-from avtorch.inference.latent import LatentDensity, LatentWindow
+from avtorch.inference.kernel_loading import Unavailable, load_kernels
+from avtorch.inference.latent import LatentDensity, LatentWindow, even_rows
+from avtorch.inference.latent_compiled import compiled_values
 from avtorch.inference.latent_filter import latent_log_likelihood
 from avtorch.inference.latent_rows import row_values
 from avtorch.inference.latent_steady import EvenRows, steady_log_likelihood
@@ -33,6 +38,13 @@ def parameters(generator: torch.Generator, *shape: int) -> tuple[tuple[Tensor, .
     return tuple(five), {"accel_noise": accel, "speed_noise": speed, "road_noise": road}
 
 
+def kernels() -> ModuleType:
+    found = load_kernels("latent_kernels")
+    if isinstance(found, Unavailable):
+        pytest.skip(found.why)
+    return found
+
+
 @CHANNELS
 @pytest.mark.parametrize("rows", [1, 2, 31, 33, 250])
 def test_even_values_equal_those_with_a_graph(channels: str, rows: int, fresh_seed: int) -> None:
@@ -45,6 +57,52 @@ def test_even_values_equal_those_with_a_graph(channels: str, rows: int, fresh_se
     found = steady_values(*five, data, **noise)
     # the tolerance of the graph's own route against the filter: the diffuse start cancels about seven digits
     torch.testing.assert_close(found, steady_log_likelihood(*five, data, **noise), rtol=1e-9, atol=1e-8)
+
+
+@CHANNELS
+@pytest.mark.parametrize("jitter", [0.0, 0.4, 1.9])
+@pytest.mark.parametrize("draws", [1, 8, 19])
+def test_compiled_values_equal_those_of_the_filter(channels: str, jitter: float, draws: int, fresh_seed: int) -> None:
+    """Two runs of different lengths, as many parameters as fill their lanes, fewer, and more."""
+    generator = torch.Generator().manual_seed(fresh_seed)
+    u, measured = signals(channels, 2, 80, generator)
+    steps = 0.02 * (1 + jitter * (torch.rand(2, 80, generator=generator, dtype=torch.float64) - 0.5))
+    used = torch.ones(2, 80, dtype=torch.bool)
+    used[1, 33:] = False
+    runs = LatentWindow(steps.cumsum(-1), u, measured["accel"], measured["speed"], used)
+    even = even_rows(runs) if jitter == 0 else None
+    assert (even is None) == (jitter > 0)
+    five, noise = parameters(generator, draws, 2)
+    given = {name: x for name, x in noise.items() if channels == "both" or channels in name or name == "road_noise"}
+    found = compiled_values(kernels(), *five, runs, even, **given)
+    exact = latent_log_likelihood(*five, runs.time, u, mask=used, **measured, **noise)
+    torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-8)
+
+
+def test_compiled_values_of_a_single_row(fresh_seed: int) -> None:
+    generator = torch.Generator().manual_seed(fresh_seed)
+    u, measured = signals("both", 1, 1, generator)
+    runs = LatentWindow(torch.zeros(1, 1, dtype=torch.float64), u, mask=torch.ones(1, 1, dtype=torch.bool), **measured)
+    five, noise = parameters(generator, 3, 1)
+    found = compiled_values(kernels(), *five, runs, None, **noise)
+    exact = latent_log_likelihood(*five, runs.time, u, **measured, **noise)
+    torch.testing.assert_close(found, exact, rtol=1e-9, atol=1e-8)
+
+
+def test_compiled_values_say_where_there_is_none(fresh_seed: int) -> None:
+    """Parameters that are no numbers give none, and leave the others as they are."""
+    generator = torch.Generator().manual_seed(fresh_seed)
+    u, measured = signals("both", 1, 50, generator)
+    runs = LatentWindow(
+        0.02 * torch.arange(50, dtype=torch.float64)[None], u, mask=torch.ones(1, 50, dtype=torch.bool), **measured
+    )
+    five, noise = parameters(generator, 9, 1)
+    before = compiled_values(kernels(), *five, runs, even_rows(runs), **noise)
+    five[0][4] = torch.nan
+    after = compiled_values(kernels(), *five, runs, even_rows(runs), **noise)
+    assert bool(after[4].isnan().all())
+    others = torch.arange(9) != 4
+    assert torch.equal(before[others], after[others])
 
 
 @CHANNELS
