@@ -148,6 +148,11 @@ def has_selection(density: Density) -> TypeGuard[SelectableDensity]:
     return hasattr(density, "select")
 
 
+def has_quick_values(density: Density) -> bool:
+    """Whether its values cost many times less than its derivatives, which are then better taken from differences."""
+    return getattr(density, "quick_values", False)
+
+
 def has_transform(density: Density) -> TypeGuard[ConstrainedDensity]:
     """Whether it has another transform than ``exp``."""
     return hasattr(density, "constrain")

@@ -122,6 +122,8 @@ class LatentDensity:
     (a gain that differs between throttle and brake, say); SDs grow about as ``temper^-1/2``. 1 is the law as written.
     """
 
+    quick_values = True
+
     def __init__(self, data: LatentWindow, prior: Prior | None = None, *, temper: float = 1.0) -> None:
         if not 0 < temper <= 1:
             raise InputError(f"temper: {temper} is not in (0, 1]")
