@@ -12,7 +12,7 @@ from avtorch.arrays import Bool, Float, Int
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
 from avtorch.inference.device import Device
-from avtorch.inference.posterior import sorted_quantile
+from avtorch.inference.posterior import quantile_of
 from avtorch.inference.priors import Prior
 from avtorch.inference.state import shaped_as
 from avtorch.inference.units import UNITS, shown_unit
@@ -191,7 +191,6 @@ class Belief(Displayed):
     def of_prior(cls, names: tuple[str, ...], prior: Prior, kept: int, vehicles: int, g: torch.Generator) -> Belief:
         """The belief before any window: ``kept`` draws of the prior, from the generator ``g``."""
         draws = prior.sample(kept, vehicles, generator=g).exp()
-        ordered = draws.sort(0).values
-        quantiles = (sorted_quantile(ordered, 0.05), sorted_quantile(ordered, 0.95))
+        quantiles = (quantile_of(draws, 0.05), quantile_of(draws, 0.95))
         never = torch.zeros(vehicles, dtype=torch.bool, device=draws.device)
         return cls(names, draws.mean(0), draws.std(0), *quantiles, draws, excited=never, converged=~never)

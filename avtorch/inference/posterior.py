@@ -155,7 +155,7 @@ class Posterior(Displayed):
 
     def quantile(self, q: float) -> Float[Tensor, "window parameter"]:
         """Posterior quantiles, ``(window, parameter)``."""
-        return sorted_quantile(self.flat.sort(0).values, q)
+        return quantile_of(self.flat, q)
 
     def log_moments(self) -> tuple[Float[Tensor, "window parameter"], Float[Tensor, "window parameter parameter"]]:
         """Mean ``(window, parameter)`` and covariance ``(window, parameter, parameter)`` of the log parameters."""
@@ -164,12 +164,22 @@ class Posterior(Displayed):
         return z.mean(0), torch.einsum("nwi,nwj->wij", centred, centred) / (len(z) - 1)
 
 
-def sorted_quantile(ordered: Float[Tensor, "draw *rest"], q: float) -> Float[Tensor, "*rest"]:
-    """Quantile along the first dimension of sorted draws, linear between order statistics."""
-    position = q * (len(ordered) - 1)
+def quantile_of(draws: Float[Tensor, "draw *rest"], q: float) -> Float[Tensor, "*rest"]:
+    """Quantile along the first dimension, linear between order statistics; of the ends no more is sorted than needed."""
+    count = len(draws)
+    position = q * (count - 1)
     low = int(position)
-    high = min(low + 1, len(ordered) - 1)
-    return torch.lerp(ordered[low], ordered[high], position - low)
+    high = min(low + 1, count - 1)
+    if high < count // 4:
+        below = draws.topk(high + 1, 0, largest=False).values
+        pair = below[low], below[high]
+    elif low > count - count // 4:
+        above = draws.topk(count - low, 0).values
+        pair = above[count - 1 - low], above[count - 1 - high]
+    else:
+        ordered = draws.sort(0).values
+        pair = ordered[low], ordered[high]
+    return torch.lerp(*pair, position - low)
 
 
 def nested_rhat(draws: Float[Tensor, "chain draw *rest"], groups: int = 8) -> Float[Tensor, "*rest"]:

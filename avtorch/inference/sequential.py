@@ -14,7 +14,7 @@ from avtorch.inference.belief import Belief, Summary
 from avtorch.inference.density import Density
 from avtorch.inference.device import Device, checked_device, generator_on
 from avtorch.inference.form import Rows, WindowLikelihood
-from avtorch.inference.posterior import sorted_quantile
+from avtorch.inference.posterior import quantile_of
 from avtorch.inference.priors import (
     Joint,
     LogSpaceNormal,
@@ -144,8 +144,7 @@ class SequentialInference:
     def _solve(self, density: Density) -> tuple[Summary, Tensor, Tensor, Tensor]:
         """Posterior of some vehicles: its summary, log moments, and where it converged ``(vehicle,)`` bool."""
         posterior = sample(density, self.settings, generator=self.generator)
-        ordered = posterior.flat.sort(0).values
-        quantiles = sorted_quantile(ordered, 0.05), sorted_quantile(ordered, 0.95)
+        quantiles = quantile_of(posterior.flat, 0.05), quantile_of(posterior.flat, 0.95)
         draws = _thin(posterior.flat, len(self.belief.draws))
         summary = Summary(posterior.mean, posterior.sd, *quantiles, draws)
         return summary, *posterior.log_moments(), posterior.converged
