@@ -23,14 +23,13 @@ from avtorch.blindtest.cases import Recording
 from avtorch.blindtest.intervals import wilson
 from avtorch.gap import plant
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.entry import fitted, observable
+from avtorch.gap.budget.entry import candidates_for, fitted, observable
 from avtorch.gap.budget.forward_selection import select
 from avtorch.gap.budget.likely_parts import likely_parts
 from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.budget.parts import LIKELY
 from avtorch.gap.budget.redundancy import without_one
 from avtorch.gap.budget.robust_fit import RobustFit
-from avtorch.gap.budget.score_test import ScoreTest
 from avtorch.gap.budget.selection_step import Step, cost
 from avtorch.gap.budget.share_order import own_response
 from avtorch.gap.simulator.effect import EFFECTS, Effect
@@ -43,13 +42,11 @@ def given(fitting: RobustFit, bare: Step, kinds: Sequence[type[Effect]]) -> Step
     """All of `kinds` in, each time the one that fits best, as the selection fits an effect that it tries."""
     now, left = bare, list(kinds)
     while left:
-        test = ScoreTest.at(fitting, now.fit)
-        best, kind = min(
-            ((fitted(fitting, test, test.candidate(kind)), kind) for kind in left), key=lambda pair: pair[0].nats
-        )
+        tried = [fitted(fitting, candidate) for candidate in candidates_for(fitting, now, left, None, "")]
+        best = min(tried, key=lambda fit: fit.nats)
         fit = fitting.fit(best.model, best.z[None])
-        now = Step(fit, fitting.hold_out(fit), kind.name)
-        left.remove(kind)
+        now = Step(fit, fitting.hold_out(fit), fit.model.names[-1])
+        left = [kind for kind in left if kind.name != now.entered]
     return now
 
 

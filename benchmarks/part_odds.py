@@ -38,7 +38,9 @@ from avtorch.gap.budget.forward_selection import select
 from avtorch.gap.budget.held_out_evidence import Evidence
 from avtorch.gap.budget.part_odds import PATH, SCHEMA, PartOdds, by_agreement, figures
 from avtorch.gap.budget.parts import LIKELY
-from avtorch.gap.budget.selection_step import complexity
+from avtorch.gap.budget.redundancy import without_one
+from avtorch.gap.budget.rollout_energy import relative_energy
+from avtorch.gap.budget.selection_step import Selection, complexity
 from avtorch.gap.budget.share_order import energies, largest_first, own_response
 from avtorch.gap.simulator.effect_choice import chosen_effects
 from avtorch.io import write_json
@@ -78,10 +80,17 @@ def case_figures(
                 "freedom": step.evidence.freedom,
                 "parameters": complexity(step.fit) - complexity(before.fit),
                 "response": own_response(selection.last, str(step.entered)),
+                "share": taken(selection, str(step.entered)),
             }
             for before, step in pairwise(selection.steps)
         ],
     }
+
+
+def taken(selection: Selection, name: str) -> float:
+    """What an effect takes off the errors of held-out rollouts beside the others, in units of the bare baseline's."""
+    without = without_one(selection.fitting, selection.last, name)
+    return relative_energy(selection, without) - relative_energy(selection, selection.last)
 
 
 def collect(

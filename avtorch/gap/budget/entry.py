@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.onset_search import ONSET_NATS, may_set_in, set_in
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.budget.score_test import Candidate, ScoreTest
 from avtorch.gap.budget.selection_step import Step, complexity, cost
 from avtorch.gap.simulator.effect import Effect
-from avtorch.gap.simulator.integrated import Integrated
 
 _LEAST_NATS = 3.0  # in the blocks that fitted it, below which no effect is held out
 _FAR_FEWER, _MOST_OF_IT = 3, 0.4  # parameters, and share of the gain, with which a simpler effect takes precedence
@@ -25,7 +25,6 @@ _OF_ITS_OWN = 0.5  # share of an effect's gain, on top of another, from which it
 _FITTED = 9  # effects that are fitted, those of which a score test promises most
 _SCREENING = 3  # iterations of these fits
 _SCREENED = 5  # effects that are held out, of those fitted
-_ONSET_NATS = 6.0  # that an onset must gain
 
 
 def observable(kinds: Iterable[type[Effect]], record: AnalysisRecord) -> list[type[Effect]]:
@@ -45,8 +44,8 @@ def candidates_for(
     kinds: Sequence[type[Effect]],
     progress: Callable[[str, int, int], None] | None,
     role: str,
-) -> tuple[ScoreTest, list[Candidate]]:
-    """A score test at `now`, and those of `kinds` that it lacks, the most promising first."""
+) -> list[Candidate]:
+    """Those of `kinds` that `now` lacks, the most promising by a score test first."""
     test, names = ScoreTest.at(fitting, now.fit), now.fit.model.names
     candidates = []
     for kind in kinds:
@@ -54,19 +53,30 @@ def candidates_for(
             continue
         if progress is not None:
             progress(f"budget, {role}: {kind.name}", len(candidates), len(kinds) - len(names))
-        candidates.append(test.candidate(kind))
-    return test, sorted(candidates, key=lambda candidate: -candidate.promise)
+        candidate = test.candidate(kind)
+        if may_set_in(candidate.model, kind.name):
+            candidate = replace(candidate, late=test.late(candidate))
+        candidates.append(candidate)
+    return sorted(candidates, key=_promise, reverse=True)
 
 
-def enter(fitting: RobustFit, now: Step, test: ScoreTest, candidates: Sequence[Candidate]) -> Step | None:
+def _promise(candidate: Candidate) -> float:
+    """Of the effect from the start on, or of the onset that promises most [nats]."""
+    late = candidate.late
+    return candidate.promise if late is None else max(candidate.promise, late.promise - ONSET_NATS)
+
+
+def enter(fitting: RobustFit, now: Step, candidates: Sequence[Candidate]) -> Step | None:
     """The best of `candidates` in, if the blocks that were held out agree on one."""
-    fits = [fitted(fitting, test, c) for c in candidates[:_FITTED]]
+    fits = [fitted(fitting, c) for c in candidates[:_FITTED]]
     fits = [fit for fit in fits if now.fit.nats - fit.nats > _LEAST_NATS]
     fits.sort(key=lambda fit: fit.nats + complexity(fit))
     tried = []
     for rough in fits[:_SCREENED]:
         fit = fitting.fit(rough.model, rough.z[None])
         name = fit.model.names[-1]
+        if name in fit.model.onsets:
+            fit = set_in(fitting, fit, name)
         if fit.model.at_limit(fit.z, name):
             continue
         held = fitting.hold_out(fit)
@@ -97,15 +107,16 @@ def _much_simpler(now: Step, best: Step, other: Step) -> bool:
     return fewer >= _FAR_FEWER and cost(now) - cost(other) > _MOST_OF_IT * (cost(now) - cost(best))
 
 
-def fitted(fitting: RobustFit, test: ScoreTest, candidate: Candidate) -> Fit:
+def fitted(fitting: RobustFit, candidate: Candidate) -> Fit:
     """The candidate fitted, from the start on or from the onset that promises most."""
     fit = fitting.fit(candidate.model, candidate.starts, iterations=_SCREENING)
-    kind, logs = candidate.model.effects[-1], set(candidate.model.record.log)
-    if kind.own_onset is not None or issubclass(kind, Integrated) or len(logs) > 1:
+    name = candidate.model.names[-1]
+    if not may_set_in(candidate.model, name):
         return fit
-    late = test.late(candidate)
-    if late is None or late.promise < candidate.promise + _ONSET_NATS:
-        return fit
-    starts = np.concatenate([late.starts, late.model.coordinates(fit.known)[None]])
-    later = fitting.fit(late.model, starts, iterations=_SCREENING)
-    return later if later.nats + _ONSET_NATS < fit.nats else fit
+    later = set_in(fitting, fit, name)
+    late = candidate.late
+    if late is not None and late.promise >= candidate.promise + ONSET_NATS:
+        starts = np.concatenate([late.starts, late.model.coordinates(fit.known)[None]])
+        other = set_in(fitting, fitting.fit(late.model, starts, iterations=_SCREENING), name)
+        later = min(later, other, key=lambda f: f.nats)
+    return later if later.nats + ONSET_NATS < fit.nats else fit

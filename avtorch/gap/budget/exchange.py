@@ -32,8 +32,8 @@ def exchanged(
         # those made of a model in which nothing has been exchanged yet still hold
         before = _without(fitting, now, name) if entered else without[name]
         others = [kind for kind in kinds if kind.name != name]
-        test, candidates = candidates_for(fitting, before, others, progress, f"in place of {name}")
-        step = enter(fitting, before, test, candidates)
+        candidates = candidates_for(fitting, before, others, progress, f"in place of {name}")
+        step = enter(fitting, before, candidates)
         if step is None or fitting.preference(now.held, step.held).strength() <= 0:
             continue
         now, entered[step.fit.model.names[-1]] = step, step

@@ -55,7 +55,7 @@ def select(
     for number in range(_ROUNDS):
         if len(now.fit.model.names) >= most:
             break
-        step = enter(fitting, now, *candidates_for(fitting, now, kinds, progress, f"effect {number + 1}"))
+        step = enter(fitting, now, candidates_for(fitting, now, kinds, progress, f"effect {number + 1}"))
         if step is None:
             break
         entered[step.fit.model.names[-1]] = step

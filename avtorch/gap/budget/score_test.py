@@ -33,11 +33,15 @@ _BEST = 3  # places to start from
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A `model` with one effect more, promising places (start, size) to fit it from, and what they `promise` [nats]."""
+    """A `model` with one effect more, promising places (start, size) to fit it from, and what they `promise` [nats].
+
+    `late`: the same with the effect from the onset on that promises most.
+    """
 
     model: EffectModel
     starts: FloatArray
     promise: float
+    late: Candidate | None = None
 
 
 @dataclass(frozen=True, eq=False)

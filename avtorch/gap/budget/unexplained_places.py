@@ -83,7 +83,7 @@ def _places(selection: Selection, residuals: FloatArray, predicted: FloatArray, 
 def _resembling(selection: Selection, gain: float) -> str | None:
     """The effect not selected that promises most, if that is much of the `gain` [nats]."""
     kinds = observable(EFFECTS.values(), selection.fitting.whitening.record)
-    candidates = candidates_for(selection.fitting, selection.last, kinds, None, "")[1]
+    candidates = candidates_for(selection.fitting, selection.last, kinds, None, "")
     best = max((c.promise for c in candidates), default=0.0)
     if best < _MUCH * max(gain, 1.0):
         return None

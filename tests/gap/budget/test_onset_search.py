@@ -1,0 +1,79 @@
+"""Since when an effect acts, found from a fit that has it all along or from a wrong time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from avtorch.gap import SimulatorInput, plant
+from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.effect_model import EffectModel
+from avtorch.gap.budget.forward_selection import baseline_noise
+from avtorch.gap.budget.onset_search import best_onset, may_set_in, set_in
+from avtorch.gap.effects import Backlash, ConstantResistance, DeadTime, GainChange, RoadGrade
+from avtorch.gap.simulator.effect import Effect
+from avtorch.io import Log
+
+from .cars import DT, command
+
+SECONDS, ONSET_S = 200.0, 130.0
+
+
+def changed(effect: Effect, seed: int) -> Log:
+    """A car that has `effect` from `ONSET_S` on."""
+    rng = np.random.default_rng(seed)
+    u = command(SECONDS, rng)
+    time = np.arange(len(u)) * DT
+    given = SimulatorInput(torch.as_tensor(time), torch.as_tensor(u), torch.full((len(u),), 20.0).double(), 0.0)
+    before, after = (plant(e, T_L=0.35, K_L=0.95).response(given).accel.numpy() for e in ([], [effect]))
+    accel = np.where(time < ONSET_S, before, after)
+    speed = 20.0 + np.cumsum(accel) * DT
+    noise = rng.normal(0.0, [[0.05], [0.02]], (2, len(u)))
+    return Log.from_arrays(
+        name="car", time=time, accel_cmd=u, speed=speed - speed.min() + 5 + noise[1], accel=accel + noise[0]
+    )
+
+
+@pytest.mark.parametrize("effect", [DeadTime(0.4), Backlash(0.3)], ids=lambda e: e.name)
+@pytest.mark.parametrize("begun", [None, 60.0])
+def test_it_is_found_from_all_along_and_from_a_wrong_time(effect: Effect, begun: float | None, fresh_seed: int) -> None:
+    record = AnalysisRecord.for_budget([changed(effect, fresh_seed)])
+    fitting, bare = baseline_noise(record, plant([]))
+    model = bare.model.with_effect(type(effect))
+    wrong = model if begun is None else model.setting_in(effect.name, begun)
+    told = model.setting_in(effect.name, ONSET_S)
+    # not far from the car, as the search for the fit itself is tested elsewhere
+    values = {f"{effect.name}.{key}": value for key, value in effect.values().items()}
+    known = {
+        key: np.array([float(model.plant.parameters()[key].unconstrain(x))])
+        for key, x in values.items()
+        if key in model.index
+    }
+    start = {**bare.known, **known}
+    fit = fitting.fit(wrong, wrong.coordinates(start)[None])
+    found = set_in(fitting, fit, effect.name)
+    # a few seconds in which the command hardly moves leave the row open
+    assert found.model.onsets[effect.name] == pytest.approx(ONSET_S, abs=6.0)
+    exact = fitting.fit(told, told.coordinates(found.known)[None])
+    # a row or two beside the true one another size of the effect fits nearly as well
+    assert found.nats - exact.nats < 0.2 * (fit.nats - exact.nats)
+
+
+def test_what_has_no_onset_is_left_alone(fresh_seed: int) -> None:
+    record = AnalysisRecord.for_budget([changed(DeadTime(0.3), fresh_seed)])
+    two = AnalysisRecord.for_budget([changed(DeadTime(0.3), fresh_seed + k) for k in range(2)])
+    of = {kind.name: EffectModel(record, plant([]), (kind,)) for kind in (ConstantResistance, GainChange, RoadGrade)}
+    assert {name for name, model in of.items() if may_set_in(model, name)} == {"constant_resistance"}
+    assert not may_set_in(EffectModel(two, plant([]), (ConstantResistance,)), "constant_resistance")
+
+
+def test_there_is_none_without_a_block_on_either_side(fresh_seed: int) -> None:
+    record = AnalysisRecord.for_budget([changed(DeadTime(0.3), fresh_seed)])
+    fitting, bare = baseline_noise(record, plant([]))
+    model = bare.model.with_effect(DeadTime)
+    fit = fitting.fit(model, model.coordinates(bare.known)[None])
+    found = best_onset(fitting, fit, "dead_time")
+    assert found is not None
+    first, last = (record.time[record.block == number] for number in (0, record.blocks - 1))
+    assert first.max() < found[0] < last.min()
