@@ -165,7 +165,7 @@ class Posterior(Displayed):
 
 
 def quantile_of(draws: Float[Tensor, "draw *rest"], q: float) -> Float[Tensor, "*rest"]:
-    """Quantile along the first dimension, linear between order statistics; of the ends no more is sorted than needed."""
+    """Quantile along the first dimension, linear between order statistics; no more is sorted than is needed."""
     count = len(draws)
     position = q * (count - 1)
     low = int(position)

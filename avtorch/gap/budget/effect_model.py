@@ -271,7 +271,7 @@ def _box(parameter: Parameter) -> tuple[float, float]:
         low, high = low / _BEYOND, high * _BEYOND
     elif parameter.constraint == "negative":
         low, high = low * _BEYOND, high / _BEYOND
-    elif parameter.neutral == 0.0:
+    elif parameter.constraint == "real" and parameter.neutral == 0.0:
         low, high = low * _BEYOND, high * _BEYOND
     ends = [float(parameter.unconstrain(torch.tensor(x, dtype=torch.float64))) for x in (low, high)]
     return max(min(ends), -_WIDEST), min(max(ends), _WIDEST)

@@ -24,6 +24,7 @@ _FAR_FEWER, _MOST_OF_IT = 3, 0.4  # parameters, and share of the gain, with whic
 _OF_ITS_OWN = 0.5  # share of an effect's gain, on top of another, from which it is no alias of that
 _FITTED = 9  # effects that are fitted, those of which a score test promises most
 _SCREENING = 3  # iterations of these fits
+_SCREENING_TURNS = 2  # of effect and onset
 _SCREENED = 5  # effects that are held out, of those fitted
 
 
@@ -113,10 +114,11 @@ def fitted(fitting: RobustFit, candidate: Candidate) -> Fit:
     name = candidate.model.names[-1]
     if not may_set_in(candidate.model, name):
         return fit
-    later = set_in(fitting, fit, name)
+    later = set_in(fitting, fit, name, turns=_SCREENING_TURNS)
     late = candidate.late
     if late is not None and late.promise >= candidate.promise + ONSET_NATS:
         starts = np.concatenate([late.starts, late.model.coordinates(fit.known)[None]])
-        other = set_in(fitting, fitting.fit(late.model, starts, iterations=_SCREENING), name)
+        other = fitting.fit(late.model, starts, iterations=_SCREENING)
+        other = set_in(fitting, other, name, turns=_SCREENING_TURNS)
         later = min(later, other, key=lambda f: f.nats)
     return later if later.nats + ONSET_NATS < fit.nats else fit

@@ -15,7 +15,8 @@ from avtorch.gap.simulator.integrated import Integrated
 
 ONSET_NATS = 6.0
 """What an onset must gain."""
-_TURNS = 6
+TURNS = 6
+"""At most, of effect and onset."""
 _LEAST_NATS = 1.0  # that a turn promises
 _SCREENING = 3  # iterations of a fit between two turns
 
@@ -51,10 +52,10 @@ def best_onset(fitting: RobustFit, fit: Fit, name: str) -> tuple[float, float] |
     return float(record.time[whitening.order[by_time][best]]), float(later[best]) - so_far
 
 
-def set_in(fitting: RobustFit, fit: Fit, name: str) -> Fit:
+def set_in(fitting: RobustFit, fit: Fit, name: str, *, turns: int = TURNS) -> Fit:
     """The fit with the effect `name` acting from the onset on that fits best, found by turns; `fit` where none does."""
     best = fit
-    for _ in range(_TURNS):
+    for _ in range(turns):
         found = best_onset(fitting, best, name)
         if found is None or found[1] < _LEAST_NATS:
             break
