@@ -2,8 +2,8 @@
 
 ``python -m benchmarks.ceiling --seed 20261125 --cases 40 --kept out/ceiling [--kind several] [--recorder ordinary]``
 
-Draws cases of the blind test's reference vehicle, selects effects on their held-out blocks, and fits the true causes to
-the same blocks. Of each true cause that a rollout can show it keeps whether it was named, and how likely its own
+Draws cases of the blind test's reference vehicle, selects effects on their held-out blocks, and fits the true causes,
+from their true onset on where they have one, to the same blocks. Of each true cause that a rollout can show it keeps whether it was named, and how likely its own
 held-out evidence makes it once the others are in; of each case, whether the held-out blocks prefer the true causes to
 those selected. A cause is likely here by the odds of one effect among all that were tried, as it would be if the search
 came upon it. One line a case is kept in `--kept`; a second call goes on where the first ended.
@@ -26,6 +26,7 @@ from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.entry import candidates_for, fitted, observable
 from avtorch.gap.budget.forward_selection import select
 from avtorch.gap.budget.likely_parts import likely_parts
+from avtorch.gap.budget.onset_search import may_set_in
 from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.budget.parts import LIKELY
 from avtorch.gap.budget.redundancy import without_one
@@ -38,11 +39,16 @@ from avtorch.gap.simulator.effect_choice import chosen_effects
 KINDS = ("single", "pair", "several")
 
 
-def given(fitting: RobustFit, bare: Step, kinds: Sequence[type[Effect]]) -> Step:
-    """All of `kinds` in, each time the one that fits best, as the selection fits an effect that it tries."""
+def given(fitting: RobustFit, bare: Step, kinds: Sequence[type[Effect]], onset: float | None) -> Step:
+    """All of `kinds` in, each time the one that fits best, as the selection fits an effect that it tries, or from the
+    true `onset` on."""
     now, left = bare, list(kinds)
     while left:
         tried = [fitted(fitting, candidate) for candidate in candidates_for(fitting, now, left, None, "")]
+        if onset is not None:
+            late = [fit for fit in tried if may_set_in(fit.model, fit.model.names[-1])]
+            models = [fit.model.setting_in(fit.model.names[-1], onset) for fit in late]
+            tried += [fitting.fit(m, m.coordinates(fit.known)[None]) for m, fit in zip(models, late, strict=True)]
         best = min(tried, key=lambda fit: fit.nats)
         fit = fitting.fit(best.model, best.z[None])
         now = Step(fit, fitting.hold_out(fit), fit.model.names[-1])
@@ -58,7 +64,8 @@ def case_figures(index: int, seed: int, kind: str, recorder: Recording) -> dict[
     parts = likely_parts(selection).steps[1:]
     named = {name for part in parts for name in (str(part.entered), *part.aliases)}
     fitting = selection.fitting
-    told = given(fitting, selection.steps[0], observable([EFFECTS[n] for n in case.names if n in EFFECTS], record))
+    kinds = observable([EFFECTS[n] for n in case.names if n in EFFECTS], record)
+    told = given(fitting, selection.steps[0], kinds, case.onset_s)
     causes = []
     for name in told.fit.model.names:
         evidence = without_one(fitting, told, name).evidence
