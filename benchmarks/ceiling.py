@@ -3,10 +3,11 @@
 ``python -m benchmarks.ceiling --seed 20261125 --cases 40 --kept out/ceiling [--kind several] [--recorder ordinary]``
 
 Draws cases of the blind test's reference vehicle, selects effects on their held-out blocks, and fits the true causes,
-from their true onset on where they have one, to the same blocks. Of each true cause that a rollout can show it keeps whether it was named, and how likely its own
-held-out evidence makes it once the others are in; of each case, whether the held-out blocks prefer the true causes to
-those selected. A cause is likely here by the odds of one effect among all that were tried, as it would be if the search
-came upon it. One line a case is kept in `--kept`; a second call goes on where the first ended.
+from their true onset on where they have one, to the same blocks. Of each true cause that a rollout can show it keeps
+whether it was named, and how likely its own held-out evidence makes it once the others are in; of each case, whether
+the held-out blocks prefer the true causes to those selected. A cause is likely here by the odds of one effect among all
+that were tried, as it would be if the search came upon it. One line a case is kept in `--kept`; a second call goes on
+where the first ended.
 """
 
 from __future__ import annotations
