@@ -259,7 +259,7 @@ def _averaged(x: FloatArray, stretch: Stretch, dt: float) -> FloatArray:
 
 
 def _box(parameter: Parameter) -> tuple[float, float]:
-    """Coordinates that a fit may take: what physics allows, and three times as far where that is said of a size.
+    """Coordinates that a fit may take: what physics allows, and three times as far where that is said in logarithms.
 
     Of a force along the road physics limits the size, and no coefficient by itself.
     A car beyond what physics allows is a finding, and said to be implausible; one far beyond it is no fit.
@@ -271,8 +271,6 @@ def _box(parameter: Parameter) -> tuple[float, float]:
         low, high = low / _BEYOND, high * _BEYOND
     elif parameter.constraint == "negative":
         low, high = low * _BEYOND, high / _BEYOND
-    elif parameter.constraint == "real" and parameter.neutral == 0.0:
-        low, high = low * _BEYOND, high * _BEYOND
     ends = [float(parameter.unconstrain(torch.tensor(x, dtype=torch.float64))) for x in (low, high)]
     return max(min(ends), -_WIDEST), min(max(ends), _WIDEST)
 
