@@ -107,7 +107,7 @@ def budget_of(
     rest = np.maximum(energy[-2] - energy[-1], 0.0)
     total = np.maximum(taken.sum(0) + rest, 1e-12)
     shares = taken / total
-    unexplained = 1.0 - shares.sum(0)
+    unexplained = np.maximum(1.0 - shares.sum(0), 0.0)
     sure = probabilities(selection)
     parts = tuple(
         _part(selection, step, sure, _quantity(share), float(np.sqrt(energy[number + 1, 0])), epoch_s)
