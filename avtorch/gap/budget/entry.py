@@ -14,7 +14,7 @@ import numpy as np
 
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.onset_search import ONSET_NATS, may_set_in, set_in
-from avtorch.gap.budget.robust_fit import Fit, RobustFit
+from avtorch.gap.budget.robust_fit import Fit, HeldOut, RobustFit
 from avtorch.gap.budget.score_test import Candidate, ScoreTest
 from avtorch.gap.budget.selection_step import Step, complexity, cost
 from avtorch.gap.simulator.effect import Effect
@@ -81,6 +81,8 @@ def enter(fitting: RobustFit, now: Step, candidates: Sequence[Candidate]) -> Ste
         if fit.model.at_limit(fit.z, name):
             continue
         held = fitting.hold_out(fit)
+        if name in fit.model.onsets:
+            fit, held = _from_the_start_or_not(fitting, fit, held)
         tried.append(Step(fit, held, name, fitting.evidence(now.held, held)))
     tried = [step for step in tried if step.evidence.of_entry > 0]
     if not tried:
@@ -91,6 +93,19 @@ def enter(fitting: RobustFit, now: Step, candidates: Sequence[Candidate]) -> Ste
     chosen = min([s for s in same if s in alike or _much_simpler(now, best, s)], key=lambda s: complexity(s.fit))
     aliases = {s.entered for s in alike} | {chosen.entered}
     return replace(chosen, aliases=tuple(sorted(name for name in aliases if name is not None)))
+
+
+def _from_the_start_or_not(fitting: RobustFit, fit: Fit, held: HeldOut) -> tuple[Fit, HeldOut]:
+    """The fit, or one in which the last effect acts from the start, unless blocks that were held out prefer the onset.
+
+    A stretch with wilder noise than the rest would otherwise have an effect of its own.
+    """
+    name = fit.model.names[-1]
+    model = fit.model.without_onset(name)
+    always = fitting.fit(model, model.coordinates(fit.known)[None])
+    before = fitting.hold_out(always)
+    preferred = fitting.preference(before, held).strength() > 0
+    return (fit, held) if preferred or model.at_limit(always.z, name) else (always, before)
 
 
 def _explains_the_same(fitting: RobustFit, now: Step, best: Step, other: Step) -> bool:
