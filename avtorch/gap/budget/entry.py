@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.held_out_evidence import MUCH
 from avtorch.gap.budget.onset_search import ONSET_NATS, may_set_in, set_in
 from avtorch.gap.budget.robust_fit import Fit, HeldOut, RobustFit
 from avtorch.gap.budget.score_test import Candidate, ScoreTest
@@ -98,13 +99,15 @@ def enter(fitting: RobustFit, now: Step, candidates: Sequence[Candidate]) -> Ste
 def _from_the_start_or_not(fitting: RobustFit, fit: Fit, held: HeldOut) -> tuple[Fit, HeldOut]:
     """The fit, or one in which the last effect acts from the start, unless blocks that were held out prefer the onset.
 
-    A stretch with wilder noise than the rest would otherwise have an effect of its own.
+    A stretch with wilder noise than the rest would otherwise have an effect of its own. Few blocks lie between a wrong
+    onset and the right one, so much that is gained counts as well as blocks that agree.
     """
     name = fit.model.names[-1]
     model = fit.model.without_onset(name)
     always = fitting.fit(model, model.coordinates(fit.known)[None])
     before = fitting.hold_out(always)
-    preferred = fitting.preference(before, held).strength() > 0
+    found = fitting.preference(before, held)
+    preferred = found.nats > MUCH or found.strength() > 0
     return (fit, held) if preferred or model.at_limit(always.z, name) else (always, before)
 
 
