@@ -51,6 +51,7 @@ def diagnosed(folder: Path, out: Path, *arguments: str) -> dict:
     return json.loads((out / "diagnosis.json").read_text())
 
 
+@pytest.mark.slow
 def test_output_beside_the_log_and_in_its_columns_say_the_same(files: Path, tmp_path: Path) -> None:
     one = diagnosed(files, tmp_path / "one", str(files / "real.csv"), "--simulated", str(files / "sim.csv"))
     assert one["verdict"]["names"] == ["sensor_bias"]
@@ -92,6 +93,7 @@ def test_what_cannot_be_is_refused_in_one_line(
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_its_own_parameters_are_fitted_to_the_car(files: Path, tmp_path: Path) -> None:
     """An object whose lag is wrong by its own name: the car has 0.3 s behind a second-order actuator of 6 rad/s."""
     given = [str(files / "real.csv"), "--simulator", f"{files / 'my_car.py'}:Car", "--adjust", "lag=0.05:1.5"]
