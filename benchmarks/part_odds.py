@@ -80,7 +80,9 @@ def case_figures(
                 "freedom": step.evidence.freedom,
                 "parameters": complexity(step.fit) - complexity(before.fit),
                 "response": own_response(selection.last, str(step.entered)),
+                # not among the odds' figures yet
                 "share": taken(selection, str(step.entered)),
+                "onset": step.entered in selection.last.fit.model.onsets,
             }
             for before, step in pairwise(selection.steps)
         ],

@@ -82,6 +82,16 @@ def _discretise(step, p, first, dt):
 
 
 @njit(**_OPTIONS)
+def _sum_seen(one, other, R, seen):
+    """Two independent numbers of mean 0 and these variances, of which the sum is `seen` with noise of variance `R`.
+
+    Their means, variances and covariance afterwards, and the sum's variance before.
+    """
+    S = one + other + R
+    return one / S * seen, other / S * seen, one * (other + R) / S, other * (one + R) / S, -one * other / S, S
+
+
+@njit(**_OPTIONS)
 def _begin(b, total, product, p, first, variances, speed_sd, accel_sd, speed, accel, has_speed, has_accel):
     """The belief after the first row: its start is diagonal, so nothing large is taken from anything large."""
     for i in range(_BELIEF * LANES):
@@ -93,19 +103,13 @@ def _begin(b, total, product, p, first, variances, speed_sd, accel_sd, speed, ac
         total[c], product[c] = 0.0, 1.0
         mean_v, mean_a, mean_c, mean_e, vc, ae = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         if has_speed:
-            R = variances[0, d]
-            S = v + slow + R
-            mean_v, mean_c = v / S * speed, slow / S * speed
+            mean_v, mean_c, v, slow, vc, S = _sum_seen(v, slow, variances[0, d], speed)
             total[c] += speed * speed / S
             product[c] *= S
-            v, slow, vc = v * (slow + R) / S, slow * (v + R) / S, -v * slow / S
         if has_accel:
-            R = variances[1, d]
-            S = a + e + R
-            mean_a, mean_e = a / S * accel, e / S * accel
+            mean_a, mean_e, a, e, ae, S = _sum_seen(a, e, variances[1, d], accel)
             total[c] += accel * accel / S
             product[c] *= S
-            a, e, ae = a * (e + R) / S, e * (a + R) / S, -a * e / S
         b[0 * LANES + c], b[1 * LANES + c], b[2 * LANES + c], b[3 * LANES + c] = mean_v, mean_a, mean_c, mean_e
         b[4 * LANES + c], b[6 * LANES + c], b[8 * LANES + c] = v, vc, a
         b[10 * LANES + c], b[11 * LANES + c], b[13 * LANES + c] = ae, slow, e

@@ -99,8 +99,9 @@ def enter(fitting: RobustFit, now: Step, candidates: Sequence[Candidate]) -> Ste
 def _from_the_start_or_not(fitting: RobustFit, fit: Fit, held: HeldOut) -> tuple[Fit, HeldOut]:
     """The fit, or one in which the last effect acts from the start, unless blocks that were held out prefer the onset.
 
-    A stretch with wilder noise than the rest would otherwise have an effect of its own. Few blocks lie between a wrong
-    onset and the right one, so much that is gained counts as well as blocks that agree.
+    Where the effect from the start rests at a limit there is no such fit. A stretch with wilder noise than the rest
+    would otherwise have an effect of its own. Few blocks lie between a wrong onset and the right one, so much that is
+    gained counts as well as blocks that agree.
     """
     name = fit.model.names[-1]
     model = fit.model.without_onset(name)
@@ -132,11 +133,11 @@ def fitted(fitting: RobustFit, candidate: Candidate) -> Fit:
     name = candidate.model.names[-1]
     if not may_set_in(candidate.model, name):
         return fit
-    later = set_in(fitting, fit, name, turns=_SCREENING_TURNS)
+    later = set_in(fitting, fit, name, turns=_SCREENING_TURNS, iterations=_SCREENING)
     late = candidate.late
     if late is not None and late.promise >= candidate.promise + ONSET_NATS:
         starts = np.concatenate([late.starts, late.model.coordinates(fit.known)[None]])
         other = fitting.fit(late.model, starts, iterations=_SCREENING)
-        other = set_in(fitting, other, name, turns=_SCREENING_TURNS)
+        other = set_in(fitting, other, name, turns=_SCREENING_TURNS, iterations=_SCREENING)
         later = min(later, other, key=lambda f: f.nats)
     return later if later.nats + ONSET_NATS < fit.nats else fit

@@ -15,10 +15,8 @@ from avtorch.gap.simulator.integrated import Integrated
 
 ONSET_NATS = 6.0
 """What an onset must gain."""
-TURNS = 6
-"""At most, of effect and onset."""
+_TURNS, _ITERATIONS = 6, 8  # of effect and onset at most, and of a fit between two turns
 _LEAST_NATS = 1.0  # that a turn promises
-_SCREENING = 3  # iterations of a fit between two turns
 
 
 def may_set_in(model: EffectModel, name: str) -> bool:
@@ -52,7 +50,7 @@ def best_onset(fitting: RobustFit, fit: Fit, name: str) -> tuple[float, float] |
     return float(record.time[whitening.order[by_time][best]]), float(later[best]) - so_far
 
 
-def set_in(fitting: RobustFit, fit: Fit, name: str, *, turns: int = TURNS) -> Fit:
+def set_in(fitting: RobustFit, fit: Fit, name: str, *, turns: int = _TURNS, iterations: int = _ITERATIONS) -> Fit:
     """The fit with the effect `name` acting from the onset on that fits best, found by turns; `fit` where none does."""
     best = fit
     for _ in range(turns):
@@ -60,7 +58,7 @@ def set_in(fitting: RobustFit, fit: Fit, name: str, *, turns: int = TURNS) -> Fi
         if found is None or found[1] < _LEAST_NATS:
             break
         model = fit.model.setting_in(name, found[0])
-        trial = fitting.fit(model, model.coordinates(best.known)[None], iterations=_SCREENING)
+        trial = fitting.fit(model, model.coordinates(best.known)[None], iterations=iterations)
         if trial.nats >= best.nats:
             break
         best = trial

@@ -9,6 +9,7 @@ import torch
 from avtorch.gap import SimulatorInput, plant
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.effect_model import EffectModel
+from avtorch.gap.budget.entry import _from_the_start_or_not
 from avtorch.gap.budget.forward_selection import baseline_noise
 from avtorch.gap.budget.onset_search import best_onset, may_set_in, set_in
 from avtorch.gap.effects import Backlash, ConstantResistance, DeadTime, GainChange, RoadGrade
@@ -20,14 +21,14 @@ from .cars import DT, command
 SECONDS, ONSET_S = 200.0, 130.0
 
 
-def changed(effect: Effect, seed: int) -> Log:
-    """A car that has `effect` from `ONSET_S` on."""
+def changed(effect: Effect, seed: int, *, onset_s: float = ONSET_S) -> Log:
+    """A car that has `effect` from `onset_s` on."""
     rng = np.random.default_rng(seed)
     u = command(SECONDS, rng)
     time = np.arange(len(u)) * DT
     given = SimulatorInput(torch.as_tensor(time), torch.as_tensor(u), torch.full((len(u),), 20.0).double(), 0.0)
     before, after = (plant(e, T_L=0.35, K_L=0.95).response(given).accel.numpy() for e in ([], [effect]))
-    accel = np.where(time < ONSET_S, before, after)
+    accel = np.where(time < onset_s, before, after)
     speed = 20.0 + np.cumsum(accel) * DT
     noise = rng.normal(0.0, [[0.05], [0.02]], (2, len(u)))
     return Log.from_arrays(
@@ -77,3 +78,21 @@ def test_there_is_none_without_a_block_on_either_side(fresh_seed: int) -> None:
     assert found is not None
     first, last = (record.time[record.block == number] for number in (0, record.blocks - 1))
     assert first.max() < found[0] < last.min()
+
+
+@pytest.mark.parametrize("sets_in", [False, True])
+def test_blocks_that_were_held_out_say_whether_it_sets_in(sets_in: bool, fresh_seed: int) -> None:
+    """An onset at the true time of a car that changes stays, one of a car that has the effect all along goes."""
+    log = changed(DeadTime(0.4), fresh_seed) if sets_in else changed(DeadTime(0.4), fresh_seed, onset_s=0.0)
+    fitting, bare = baseline_noise(AnalysisRecord.for_budget([log]), plant([]))
+    model = bare.model.with_effect(DeadTime)
+    known = {
+        **bare.known,
+        "dead_time.delay_s": np.array(
+            [float(model.plant.parameters()["dead_time.delay_s"].unconstrain(torch.tensor(0.4)))]
+        ),
+    }
+    late = model.setting_in("dead_time", ONSET_S)
+    fit = fitting.fit(late, late.coordinates(known)[None])
+    kept, _ = _from_the_start_or_not(fitting, fit, fitting.hold_out(fit))
+    assert ("dead_time" in kept.model.onsets) == sets_in
