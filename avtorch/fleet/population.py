@@ -6,35 +6,19 @@ Logarithms of T_L and K_L are pooled, each by itself: the rows of a window have 
 from __future__ import annotations
 
 import math
-import random
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from avtorch.fleet.pooling import FEWEST, Z_90, Drive, Pooling, interval
 from avtorch.fleet.rows import Row
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from avtorch.inference.population import PopulationMargin
-
 QUANTITIES = ("T_L", "K_L")
-
-FEWEST = 3
-"""Cars from which there are siblings to compare with."""
-
-SAMPLED = 200
-"""Cars that SGLD walks over at most, drawn at random from more: they tell the spread between cars to 5 %."""
 
 APART = 0.05
 """Expected share of false ones among the cars that are said to differ from their siblings."""
 
 _LEAST_SD = 1e-3
 """Of a logarithm: no drive tells a lag better than to a thousandth."""
-
-_Z = 1.6448536269514722  # of the 95 % quantile
-
-Drive = Mapping[str, tuple[float, float]]
-"""Mean and standard deviation of the logarithm of each quantity."""
 
 
 def drive_belief(used: Sequence[Row]) -> Drive | None:
@@ -64,80 +48,37 @@ def drive_belief(used: Sequence[Row]) -> Drive | None:
 
 def population(cars: Mapping[str, Sequence[Drive]], seed: int = 0) -> tuple[dict[str, Any] | None, dict[str, Any]]:
     """What is common to the cars, and each car beside its siblings, by name; None and nothing below `FEWEST` cars."""
-    names = [name for name, drives in cars.items() if drives]
-    if len(names) < FEWEST:
+    if sum(bool(drives) for drives in cars.values()) < FEWEST:
         return None, {}
-    import torch
-
     from avtorch.fleet.siblings import left_out
-    from avtorch.inference import SamplerSettings, sample
 
-    margin = _margin(cars, names)
-    few = margin if len(names) <= SAMPLED else _margin(cars, random.Random(seed).sample(names, SAMPLED))
-    # its draws are also what every car is drawn in by: fewer and longer chains than for one window
-    settings = SamplerSettings(chains=64, draws=64, burn_in=16)
-    posterior = sample(few, settings, generator=torch.Generator().manual_seed(seed))
+    pooling = Pooling(cars, QUANTITIES, seed)
     common: dict[str, Any] = {
-        "cars": len(names),
-        "drives": sum(len(cars[name]) for name in names),
-        "sampled_cars": few.cars,
+        "cars": len(pooling.names),
+        "drives": pooling.drives,
+        "sampled_cars": pooling.sampled,
         "sampler": "sgld",
     }
     for i, name in enumerate(QUANTITIES):
-        draws = posterior.flat[:, i]
-        spreads = {key: _interval(draws[:, k]) for k, key in enumerate(few.hyper) if k}
-        # drives that were not repeated, by chance among those drawn, leave no spread between drives
-        common[name] = {"typical": _interval(draws[:, 0].exp()), "between": spreads["between"]}
-        common[name] |= {"within": spreads.get("within"), "converged": bool(posterior.converged[i])}
-        common[name]["why"] = "" if posterior.converged[i] else posterior.why[i]
-    others, own = left_out(margin)
-    means, sds = _pooled(margin, posterior.flat[::16], few.repeated)
+        common[name] = {"typical": interval(pooling.mean[:, i].exp()), **pooling.spreads(i)}
+    others, own = left_out(pooling.margin)
+    means, sds = pooling.each_car()
     apart = _q_values((2 * own.amin(0)).clamp(max=1.0).tolist())
     beside: dict[str, Any] = {}
-    for c, name in enumerate(names):
+    for c, name in enumerate(pooling.names):
         beside[name] = {"q_value": apart[c]}
         for i, quantity in enumerate(QUANTITIES):
             mean, sd = float(means[i, c]), float(sds[i, c])
             beside[name][quantity] = {
-                "pooled": {"median": math.exp(mean), "q05": math.exp(mean - _Z * sd), "q95": math.exp(mean + _Z * sd)},
+                "pooled": {
+                    "median": math.exp(mean),
+                    "q05": math.exp(mean - Z_90 * sd),
+                    "q95": math.exp(mean + Z_90 * sd),
+                },
                 "ratio": math.exp(mean - float(others[i, c])),
                 "tail": float(own[i, c]),
             }
     return common, beside
-
-
-def _margin(cars: Mapping[str, Sequence[Drive]], names: Sequence[str]) -> PopulationMargin:
-    import torch
-
-    from avtorch.inference.population import PopulationMargin
-
-    drives = [(number, drive) for number, name in enumerate(names) for drive in cars[name]]
-    values, sd = (
-        torch.tensor([[drive[q][part] for _, drive in drives] for q in QUANTITIES], dtype=torch.float64)
-        for part in (0, 1)
-    )
-    return PopulationMargin(values, sd, torch.tensor([number for number, _ in drives]))
-
-
-def _pooled(margin: PopulationMargin, draws: Tensor, repeated: bool) -> tuple[Tensor, Tensor]:
-    """Mean and SD `(quantity, car)` of the logarithm of each car, over `draws` `(draw, quantity, parameter)`."""
-    import torch
-
-    z = torch.cat([draws[..., :1], draws[..., 1:].log()], -1)
-    if margin.repeated and not repeated:
-        z = torch.cat([z, torch.full_like(z[..., :1], -math.inf)], -1)
-    first = second = inside = torch.zeros((), dtype=torch.float64)
-    for one in z:  # each of all cars: memory for one draw at a time
-        mean, variance = margin.cars_given(one)
-        first, second, inside = first + mean, second + mean.square(), inside + variance
-    first, second, inside = first / len(z), second / len(z), inside / len(z)
-    return first, (inside + (second - first.square()).clamp_min(0.0)).sqrt()
-
-
-def _interval(draws: Tensor) -> dict[str, float]:
-    ordered = draws.sort().values
-    at = (float(ordered[round(q * (len(ordered) - 1))]) for q in (0.5, 0.05, 0.95))
-    return dict(zip(("median", "q05", "q95"), at, strict=True))
 
 
 def _q_values(p: Sequence[float]) -> list[float]:

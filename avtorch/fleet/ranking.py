@@ -14,6 +14,7 @@ from statistics import fmean, pvariance
 from typing import Any
 
 from avtorch.fleet.causes import car_causes, fleet_causes
+from avtorch.fleet.effect_sizes import drive_sizes, effect_sizes
 from avtorch.fleet.folder import FleetFolder
 from avtorch.fleet.log_list import FleetLog, LogList
 from avtorch.fleet.population import APART, drive_belief, population
@@ -42,9 +43,19 @@ def fleet_answer(found: LogList, folder: FleetFolder, settings: FleetSettings) -
         of_car.setdefault(log.car, []).append(log)
     cars = [_car(car, sorted(logs, key=_when), folder, settings) for car, logs in of_car.items()]
     common, beside = population({car["car"]: car.pop("beliefs") for car in cars}, settings.seed)
-    causes = fleet_causes({car["car"]: car_causes(drives) for car in cars if (drives := car.pop("diagnosed"))})
+    diagnosed = {car["car"]: drives for car in cars if (drives := car.pop("diagnosed"))}
+    has = {car: car_causes(drives) for car, drives in diagnosed.items()}
+    causes = fleet_causes(has)
+    sizes: dict[str, dict[str, Any]] = {}
+    for cause in causes:
+        name = cause["name"]
+        told = {car: [one["sizes"] for one in diagnosed[car]] for car, (named, _) in has.items() if name in named}
+        cause["parameters"], own = effect_sizes(name, told, settings.seed)
+        for car, values in own.items():
+            sizes.setdefault(car, {})[name] = values
     for car in cars:
         car["siblings"] = beside.get(car["car"])
+        car["effects"] = sizes.get(car["car"], {})
         car["reason"] = _reason(car, settings.target)
     cars.sort(key=_rank)
     elsewhere = folder.others(list(found.logs))
@@ -83,9 +94,11 @@ def _car(car: str, logs: Sequence[FleetLog], folder: FleetFolder, settings: Flee
     diagnosed = [d for d in (one.pop("diagnosis") for one in drives) if d is not None]
     latest = past[-1] if past else None
     found: dict[str, Any] = {"car": car, "reason": "no answer", "p_string_stable": None, "T_L": None, "K_L": None}
-    found |= {"change": None, "siblings": None, "gap": None, "logs": drives}
+    found |= {"change": None, "siblings": None, "effects": {}, "gap": None, "logs": drives}
     found["beliefs"] = [one["log"] for one in past if one["log"] is not None]
-    found["diagnosed"] = [{"named": _named(one), "alike": one.pop("alike")} for one in diagnosed]
+    found["diagnosed"] = [
+        {"named": _named(one), "alike": one.pop("alike"), "sizes": one.pop("sizes")} for one in diagnosed
+    ]
     if latest is not None:
         lowest = min(one["lowest"] for one in past)
         found["p_string_stable"] = {"now": latest["p_string_stable"], "lowest": lowest}
@@ -153,6 +166,7 @@ def _gap(row: Row) -> dict[str, Any]:
     unexplained = {part: row[f"unexplained_{part}"] for part in ("mean", "q05", "q95", "material")}
     out = {"detected": row["gap_detected"], "before": row["gap_before"], "left": row["gap_left"]}
     out |= {"verdict": row["verdict"], "causes": causes, "summary": row["summary"], "alike": alike}
+    out["sizes"] = drive_sizes(row["causes"] or ())
     return out | {"unexplained": None if unexplained["mean"] is None else unexplained}
 
 

@@ -126,6 +126,24 @@ def cause_table(answer: Answer) -> Table | None:
     return Table("Causes over the fleet", columns, rows, marked=marked) if rows else None
 
 
+def size_table(answer: Answer) -> Table | None:
+    """How large causes are in the cars that have them; None where too few cars tell."""
+    columns = ("cause", "parameter", "typical car (90 %)", "nine of ten cars", "cars", "drives")
+    rows = tuple(
+        (
+            cause["name"],
+            f"{name} [{of['unit']}]",
+            "{:.3g} ({:.3g} to {:.3g})".format(*(of["typical"][key] for key in ("median", "q05", "q95"))),
+            "{:.3g} to {:.3g}".format(*(of["next_car"][key] for key in ("q05", "q95"))),
+            str(of["cars"]),
+            str(of["drives"]),
+        )
+        for cause in answer["causes"]
+        for name, of in cause.get("parameters", {}).items()
+    )
+    return Table("How large causes are", columns, rows, numeric=("cars", "drives")) if rows else None
+
+
 def _some(cars: Sequence[str], most: int = 5) -> str:
     more = f" and {len(cars) - most} more" if len(cars) > most else ""
     return ", ".join(cars[:most]) + more

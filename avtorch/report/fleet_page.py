@@ -23,6 +23,7 @@ from avtorch.report.fleet_entries import (
     population_table,
     ranking_row,
     report_of,
+    size_table,
     stability_table,
 )
 from avtorch.report.house import page_of, text_of
@@ -72,6 +73,7 @@ def fleet_html(answer: Answer, *, origin: Origin | None = None) -> str:
         lead=_lead(answer),
         whose=_whose(answer),
         causes=cause_table(answer),
+        sizes=size_table(answer),
         population=population_table(answer),
         picture=_picture(answer),
         any_report=any(link for _, link in rows),
@@ -147,6 +149,10 @@ def _whose(answer: Answer) -> list[str]:
         names = [one["name"] for one in causes if one["verdict"] == verdict]
         if names:
             found.append(words.format(", ".join(names)))
+    for one in causes:
+        for name, of in one.get("parameters", {}).items():
+            if not of["converged"]:
+                found.append(f"How far {one['name']} differs in {name} is not to be relied on: {of['why']}.")
     if not causes:
         found.append("No diagnosis names a cause." if "diagnose" in answer["steps"] else "The logs were not diagnosed.")
     if common is None:
@@ -201,6 +207,12 @@ def _method(answer: Answer) -> list[str]:
         "have it (Jeffreys' prior): above 2/3 it is the model's; it is single cars' where that of the cars that may "
         "have it is below 1/3. Errors of the diagnoses themselves are not counted in.",
     ]
+    if any(one.get("parameters") for one in answer["causes"]):
+        found.append(
+            "Sizes of a cause are pooled over the drives that name it, of cars that have it, in the coordinate of its "
+            "prior. Drives in which it is too small to be named do not count, so that a typical car's is rather too "
+            "large than too small. What belongs to a drive and not to a car, as a road does, is not pooled."
+        )
     common: Any = answer["population"]
     if common is not None:
         spread = " The spread between cars includes that between drives." if common["T_L"]["within"] is None else ""

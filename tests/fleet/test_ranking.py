@@ -123,10 +123,19 @@ def test_a_car_unlike_its_siblings_comes_after_those_that_changed(fleet: Fleet) 
 
 
 def test_causes_are_those_of_the_cars_diagnoses(fleet: Fleet) -> None:
-    late = {"name": "late", "alias_set": ["late", "slow"], "probability": 0.9, "parameters": []}
+    late: dict[str, Any] = {"name": "dead_time", "alias_set": ["dead_time", "slow"], "probability": 0.9}
     for number in range(6):
-        fleet.drive(f"car {number}", [window(0.3, 1.0)], diagnosis("late", 2.0) | {"causes": [late]})
+        delay = {"name": "delay_s", "value_mean": 0.2 + 0.01 * number, "value_sd": 0.01}
+        causes = {"causes": [late | {"parameters": [delay]}]}
+        fleet.drive(f"car {number}", [window(0.3, 1.0)], diagnosis("dead_time", 2.0) | causes)
+    fleet.drive("other", [window(0.3, 1.0)])
     answer = fleet.answer()
     (cause,) = answer["causes"]
-    assert (cause["name"], cause["cars"], cause["verdict"]) == ("late", 6, "the model's")
+    assert (cause["name"], cause["cars"], cause["diagnosed"]) == ("dead_time", 6, 7)
     assert "alike" not in answer["cars"][0]["gap"]
+    delay = cause["parameters"]["delay_s"]
+    assert (delay["cars"], delay["drives"], delay["unit"]) == (6, 6, "s")
+    assert delay["typical"]["q05"] < 0.225 < delay["typical"]["q95"]
+    of_cars = {car["car"]: car["effects"] for car in answer["cars"]}
+    assert of_cars["other"] == {}
+    assert 0.2 < of_cars["car 0"]["dead_time"]["delay_s"]["median"] < of_cars["car 5"]["dead_time"]["delay_s"]["median"]

@@ -18,7 +18,9 @@ def answer_of(count: int, *, causes: bool = True) -> dict[str, Any]:
     quantity = {"typical": interval, "between": interval, "within": None, "converged": True, "why": ""}
     share = {"mean": 0.9, "q05": 0.8, "q95": 0.97}
     one = {"name": "late", "cars": count, "may": count, "diagnosed": count, "share": share, "verdict": "the model's"}
-    other = {**one, "name": "steep", "cars": 1, "verdict": "single cars'", "of": [HOSTILE]}
+    other = {**one, "name": "steep", "cars": 1, "verdict": "single cars'", "of": [HOSTILE], "parameters": {}}
+    delay = quantity | {"unit": "s", "cars": count, "drives": 2 * count, "next_car": {"q05": 0.25, "q95": 0.45}}
+    one |= {"of": None, "parameters": {"delay_s": delay}}
     reasons = {name: sum(car["reason"] == name for car in cars) for name in ("below target", "sound")}
     return {
         "schema": "avtorch.fleet/1",
@@ -28,7 +30,7 @@ def answer_of(count: int, *, causes: bool = True) -> dict[str, Any]:
         "failed_logs": 1,
         "reasons": reasons,
         "population": common | {"T_L": quantity, "K_L": quantity},
-        "causes": [one | {"of": None}, other] if causes else [],
+        "causes": [one, other] if causes else [],
         "cars": cars,
         "notes": [HOSTILE],
     }

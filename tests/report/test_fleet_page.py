@@ -46,6 +46,11 @@ def test_it_says_which_cars_whose_causes_and_what_failed(text: str, page: Elemen
     assert "T_L 1.80 times theirs, tail 1e-05" in text
     assert text.count("times theirs") == 2, "of the car that is unlike its siblings alone, in HTML and for the script"
     assert "avtorch fleet logs --out out" in text
+    (sizes,) = (t for t in page.all("table") if next(t.all("caption")).text() == "How large causes are")
+    (row,) = next(sizes.all("tbody")).all("tr")
+    assert [cell.text() for cell in row.inside] == [
+        *("late", "delay_s [s]", "0.35 (0.3 to 0.4)", "0.25 to 0.45", "10", "20")
+    ]
     assert len(ranking(page)) == 10
     (table,) = (t for t in page.all("table") if t.attributes.get("id") == "ranking")
     titles = [th.text() for th in next(table.all("thead")).all("th")]
