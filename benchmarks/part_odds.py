@@ -80,7 +80,8 @@ def case_figures(
                 "freedom": step.evidence.freedom,
                 "parameters": complexity(step.fit) - complexity(before.fit),
                 "response": own_response(selection.last, str(step.entered)),
-                # not among the odds' figures yet
+                "at_limit": selection.last.fit.model.at_limit(selection.last.fit.z, str(step.entered)),
+                # the odds do without these two: they tell no more than the others
                 "share": taken(selection, str(step.entered)),
                 "onset": step.entered in selection.last.fit.model.onsets,
             }
@@ -123,6 +124,8 @@ def table(
     rows, tried, there, of, agreed, strict = [], [], [], [], [], []
     for number, case in enumerate(cases):
         for part in case["parts"]:
+            if part.get("at_limit", False):  # which is no part of an answer
+                continue
             evidence = Evidence(part["nats"], part["errors"], part["freedom"])
             rows.append(figures(evidence, part["response"], len(case["signals"])))
             there.append(part["there"])
@@ -213,7 +216,7 @@ def main() -> None:
         print(f"{key:20} {by_odds[key]:8} by the odds (cases left out) {by_law[key]:8} by Student's law")
     unnamed, wrong = verdicts(probability, there, of, cases)
     outside = [case for case in every if case["kind"] == "outside"]
-    if outside and any(case["parts"] for case in outside):
+    if outside and any(not part.get("at_limit", False) for case in outside for part in case["parts"]):
         others, others_tried, _, others_of, others_agreed, _ = table(outside)
         odds = fit(rows, tried, there)
         blamed = np.minimum(np.exp(log_expit(others @ odds.weights - others_tried)), others_agreed)

@@ -4,8 +4,9 @@ An effect enters if the blocks that were held out agree on it as surely as one e
 (`held_out_evidence`): while several are missing, each hides the others, and none would pass a stricter test. Of the
 effects that explain the same, as far as the blocks can tell, the simplest is added, and the others are its aliases; so
 is one that explains most of the same with far fewer parameters. Once one has entered, each of those before it has to
-hold its place without it. Then each may be exchanged for another (`exchange`). Which of them are likely enough to be
-named is decided at the end, once the gap is known (`likely_parts`).
+hold its place without it. Then each may be exchanged for another (`exchange`), and has to hold its place under the
+noise of what all of them leave (`own_noise`). Which of them are likely enough to be named is decided at the end, once
+the gap is known (`likely_parts`).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from avtorch.gap.budget.entry import candidates_for, enter, observable
 from avtorch.gap.budget.exchange import exchanged
 from avtorch.gap.budget.flexible_regression import has_places, left_over
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
+from avtorch.gap.budget.own_noise import judged
 from avtorch.gap.budget.redundancy import without_the_redundant
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.budget.selection_step import Selection, Step, one_by_one
@@ -63,7 +65,8 @@ def select(
     if len(now.fit.model.names) > 1:
         now, others = exchanged(fitting, now, kinds, progress)
         entered |= others
-    now, evidence = without_the_redundant(fitting, now)
+    now, _ = without_the_redundant(fitting, now)
+    now, evidence = judged(fitting, now)
     aliases = {name: entered[name].aliases for name in now.fit.model.names}
     return Selection(fitting, (bare, *one_by_one(fitting, now, evidence, aliases)), len(kinds))
 

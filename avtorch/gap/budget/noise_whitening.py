@@ -23,7 +23,8 @@ from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 
 _MEMORY_S = 1.0  # of the autoregression
-_LEVEL_S = 60.0  # over which a level is no noise
+LEVEL_S = 60.0
+"""Seconds over which a level is no noise."""
 _WILDEST = 0.15  # of the pieces of that length, which do not count
 _GUESSED_HZ = 1.0  # band of the first guess, in which noise is flat
 _LOWPASS_PERIODS = 1.0  # of the band's edge, that its filter lasts
@@ -120,18 +121,30 @@ def _covariance(record: AnalysisRecord, x: FloatArray, lags: int) -> FloatArray:
     pieces would take from the noise what wanders in a few seconds, and loops feed that back.
     """
     sums, counted = [], []
+    for piece in pieces(record, LEVEL_S):
+        own = record.counts[piece]
+        moved = np.where(own, x[piece] - x[piece][own].mean(), 0.0)
+        spectrum = np.abs(np.fft.rfft(moved, len(piece) + lags)) ** 2
+        sums.append(np.fft.irfft(spectrum, len(piece) + lags)[: lags + 1])
+        counted.append(int(own.sum()))
+    covariances, rows = np.array(sums), np.array(counted)
+    kept = calm(covariances[:, :1] / rows[:, None])
+    return covariances[kept].sum(0) / rows[kept].sum()
+
+
+def pieces(record: AnalysisRecord, seconds: float | None) -> list[IntArray]:
+    """Rows of each stretch, in pieces of about `seconds` (None: whole), those without a row that counts left out."""
+    found = []
     for stretch in record.stretches:
         whole = np.arange(stretch.rows.start, stretch.rows.stop)
-        for piece in np.array_split(whole, max(1, round(len(whole) * record.dt / _LEVEL_S))):
-            own = record.counts[piece]
-            if own.any():
-                moved = np.where(own, x[piece] - x[piece][own].mean(), 0.0)
-                spectrum = np.abs(np.fft.rfft(moved, len(piece) + lags)) ** 2
-                sums.append(np.fft.irfft(spectrum, len(piece) + lags)[: lags + 1])
-                counted.append(int(own.sum()))
-    covariances, rows = np.array(sums), np.array(counted)
-    calm = np.argsort(covariances[:, 0] / rows)[: max(1, round((1 - _WILDEST) * len(rows)))]
-    return covariances[calm].sum(0) / rows[calm].sum()
+        count = 1 if seconds is None else max(1, round(len(whole) * record.dt / seconds))
+        found += [piece for piece in np.array_split(whole, count) if record.counts[piece].any()]
+    return found
+
+
+def calm(variance: FloatArray) -> IntArray:
+    """The pieces without the wildest, by their `variance` (piece, channel) summed over channels."""
+    return np.argsort(variance.sum(-1))[: max(1, round((1 - _WILDEST) * len(variance)))]
 
 
 def _lowpass(band_hz: float, dt: float) -> FloatArray:

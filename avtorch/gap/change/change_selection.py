@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.budget.joint_whitening import JointWhitening
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 from avtorch.gap.change.change_model import Change, ChangeModel
 from avtorch.gap.change.joint_fit import Fit, HeldOut, JointFit
-from avtorch.gap.change.joint_whitening import JointWhitening
 from avtorch.gap.change.shared_remainder import BASIC, columns
 from avtorch.gap.change.two_sides import TwoSides
 from avtorch.gap.simulator.plant import GapPlant

@@ -13,7 +13,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.noise_whitening import NoiseWhitening
+from avtorch.gap.budget.noise_whitening import NoiseWhitening, calm, pieces
 
 _MEMORY_S = 1.0
 _RIDGE = 1e-6
@@ -26,10 +26,15 @@ class JointWhitening(NoiseWhitening):
     mixed: FloatArray = None  # type: ignore[assignment]
 
     @classmethod
-    def vector_autoregressive(cls, record: AnalysisRecord, residuals: FloatArray) -> JointWhitening:
-        """Yule and Walker's, of `residuals` (channel, row) [m/s²] in all channels at once."""
+    def vector_autoregressive(
+        cls, record: AnalysisRecord, residuals: FloatArray, *, level_s: float | None = None
+    ) -> JointWhitening:
+        """Yule and Walker's, of `residuals` (channel, row) [m/s²] in all channels at once.
+
+        `level_s`: time [s] over which a level is no noise, the wildest such pieces left out; None: all is noise.
+        """
         lags, channels = max(4, round(_MEMORY_S / record.dt)), len(residuals)
-        lagged = _covariances(record, residuals, lags)
+        lagged = _covariances(record, residuals, lags, level_s)
         blocks = [[lagged[m - k] if m >= k else lagged[k - m].T for m in range(lags)] for k in range(lags)]
         predicted = np.concatenate(list(lagged[1:]), 1)
         coefficients = np.linalg.solve(np.block(blocks).T, predicted.T).T  # (channel, lag · channel)
@@ -50,15 +55,19 @@ class JointWhitening(NoiseWhitening):
         return out
 
 
-def _covariances(record: AnalysisRecord, residuals: FloatArray, lags: int) -> FloatArray:
+def _covariances(record: AnalysisRecord, residuals: FloatArray, lags: int, level_s: float | None) -> FloatArray:
     """E[x_t x_(t-k)'], (lag, channel, channel), over the rows that count."""
-    channels = len(residuals)
-    out = np.zeros((lags + 1, channels, channels))
-    for stretch in record.stretches:
-        x = np.where(record.counts[stretch.rows], residuals[:, stretch.rows], 0.0)
-        spectra = np.fft.rfft(x, 2 * x.shape[-1])
-        lagged = np.fft.irfft(spectra[:, None] * spectra[None].conj())[..., : lags + 1]
-        out[: lagged.shape[-1]] += np.moveaxis(lagged, -1, 0)
-    out /= record.counts.sum()
-    out[0] += _RIDGE * np.diag(np.diag(out[0])) + 1e-12 * np.eye(channels)
+    sums, rows = [], []
+    for piece in pieces(record, level_s):
+        own, x = record.counts[piece], residuals[:, piece]
+        x = np.where(own, x if level_s is None else x - x[:, own].mean(-1, keepdims=True), 0.0)
+        spectra = np.fft.rfft(x, x.shape[-1] + lags)
+        lagged = np.fft.irfft(spectra[:, None] * spectra[None].conj(), x.shape[-1] + lags)[..., : lags + 1]
+        sums.append(np.moveaxis(lagged, -1, 0))
+        rows.append(int(own.sum()))
+    covariances, counted = np.array(sums), np.array(rows)
+    size = np.diagonal(covariances[:, 0], axis1=1, axis2=2) / counted[:, None]
+    kept = np.arange(len(counted)) if level_s is None else calm(size / size.mean(0))
+    out = covariances[kept].sum(0) / counted[kept].sum()
+    out[0] += _RIDGE * np.diag(np.diag(out[0])) + 1e-12 * np.eye(len(residuals))
     return out
