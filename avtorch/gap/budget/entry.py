@@ -26,6 +26,7 @@ _OF_ITS_OWN = 0.5  # share of an effect's gain, on top of another, from which it
 _FITTED = 9  # effects that are fitted, those of which a score test promises most
 _SCREENING = 3  # iterations of these fits
 _FAR_STARTS, _FAR_LAGS = 3, (-1.0, 0.0, 1.0)  # of the effect, and of the lag [prior SD]
+_ORDINARY = 2.0  # prior SD, of gain and lag
 _SCREENING_TURNS = 2  # of effect and onset
 _SCREENED = 5  # effects that are held out, of those fitted
 
@@ -67,7 +68,8 @@ def _from_afar(fitting: RobustFit, now: Step, candidate: Candidate) -> Candidate
     """The candidate with one more start, away from the fit so far, where a short fit from there promises more.
 
     What clips or swallows commands hides gain and lag: of a car that never exceeds 0.3 m/s² the fit without saturation
-    has a quarter of the gain, and next to it saturation changes nothing.
+    has a quarter of the gain, and next to it saturation changes nothing. Where gain and lag do not come out as those of
+    an ordinary car, they were not hidden: a truck on a hilly road got a dead band with a lag of 12 s.
     """
     model = candidate.model
     starts = [
@@ -77,7 +79,8 @@ def _from_afar(fitting: RobustFit, now: Step, candidate: Candidate) -> Candidate
     ]
     fit = fitting.fit(model, np.clip(np.array(starts), model.low, model.high), iterations=_SCREENING)
     gain = now.fit.nats - fit.nats
-    if gain <= candidate.promise:
+    ordinary = all(abs(float(fit.known[key].item())) < _ORDINARY for key in ("T_L", "K_L"))
+    if gain <= candidate.promise or not ordinary:
         return candidate
     return replace(candidate, starts=np.concatenate([fit.z[None], candidate.starts]), promise=gain)
 
