@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from avtorch.gap.budget.own_noise import judged
+from avtorch.gap.budget.own_noise import settled
 from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.budget.parts import LIKELY, MATERIAL
-from avtorch.gap.budget.selection_step import Selection, Step, one_by_one, without_effects
+from avtorch.gap.budget.selection_step import Selection, without_effects
 from avtorch.gap.budget.share_order import largest_first, own_response
 
 
@@ -41,8 +39,6 @@ def probabilities(selection: Selection) -> dict[str, float]:
 
 
 def _without(selection: Selection, name: str) -> Selection:
-    fitting = selection.fitting
-    fit = without_effects(fitting, selection.last.fit, [name])
-    last, evidence = judged(fitting, Step(fit, fitting.hold_out(fit)))
+    fit = without_effects(selection.fitting, selection.last.fit, [name])
     aliases = {str(s.entered): s.aliases for s in selection.steps[1:]}
-    return replace(selection, steps=(selection.steps[0], *one_by_one(fitting, last, evidence, aliases)))
+    return settled(selection.searching, selection.steps[0].fit, fit, aliases, selection.tried)

@@ -25,11 +25,20 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """`steps` from the bare baseline on, each with one effect more than the one before; `tried`: of how many."""
+    """`steps` from the bare baseline on, each with one effect more than the one before; `tried`: of how many.
+
+    `fitting`: the noise of what the selection leaves, under which steps are fitted. `search`: that of a flexible
+    regression, in which nothing that is still missing hides; None where the two are the same.
+    """
 
     fitting: RobustFit
     steps: tuple[Step, ...]
     tried: int = 1
+    search: RobustFit | None = None
+
+    @property
+    def searching(self) -> RobustFit:
+        return self.fitting if self.search is None else self.search
 
     @property
     def last(self) -> Step:
