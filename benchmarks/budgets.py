@@ -29,6 +29,7 @@ from avtorch.gap import EFFECTS, Budget, gap_budget, plant
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.forward_selection import baseline_noise
 from avtorch.gap.budget.given_effects import given_effects
+from avtorch.gap.budget.own_noise import with_own_noise
 from avtorch.gap.budget.repaired_model import parameters_of
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.io import Log
@@ -158,7 +159,8 @@ def _same_effects(
     parts = [part for part in budget.parts if part.name in budget.names]
     values = {f"{part.name}.{name}": q.mean for part in parts for name, q in part.parameters.items()}
     onsets = {part.name: part.onset_s for part in parts if part.onset_s is not None}
-    selection = given_effects(*alone, [EFFECTS[part.name] for part in parts], values=values, onsets=onsets)
+    kinds = [EFFECTS[part.name] for part in parts]
+    selection = with_own_noise(given_effects(*alone, kinds, values=values, onsets=onsets))
     return relative(found, parameters_of(selection, effect)[key].mean, put_in[key])
 
 

@@ -22,10 +22,10 @@ from avtorch.gap.budget.entry import candidates_for, enter, observable
 from avtorch.gap.budget.exchange import exchanged
 from avtorch.gap.budget.flexible_regression import has_places, left_over
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
-from avtorch.gap.budget.own_noise import settled
+from avtorch.gap.budget.own_noise import judged
 from avtorch.gap.budget.redundancy import without_the_redundant
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
-from avtorch.gap.budget.selection_step import Selection, Step
+from avtorch.gap.budget.selection_step import Selection, Step, one_by_one
 from avtorch.gap.simulator.effect import EFFECTS, Effect
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.plant import GapPlant
@@ -52,7 +52,7 @@ def select(
     if begun is None:
         fitting, start = baseline_noise(record, base)
         begun = Selection(fitting, (Step(start, fitting.hold_out(start)),))
-    fitting, bare, now = begun.searching, begun.steps[0], begun.last
+    fitting, bare, now = begun.fitting, begun.steps[0], begun.last
     entered = {s.entered: s for s in begun.steps if s.entered is not None}
     for number in range(_ROUNDS):
         if len(now.fit.model.names) >= most:
@@ -66,8 +66,9 @@ def select(
         now, others = exchanged(fitting, now, kinds, progress)
         entered |= others
     now, _ = without_the_redundant(fitting, now)
+    now, evidence = judged(fitting, now)
     aliases = {name: entered[name].aliases for name in now.fit.model.names}
-    return settled(fitting, bare.fit, now.fit, aliases, len(kinds))
+    return Selection(fitting, (bare, *one_by_one(fitting, now, evidence, aliases)), len(kinds))
 
 
 def baseline_noise(record: AnalysisRecord, base: GapPlant) -> tuple[RobustFit, Fit]:

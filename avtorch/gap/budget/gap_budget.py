@@ -83,7 +83,7 @@ def by_chance(selection: Selection, base: GapPlant, kinds: Sequence[type[Effect]
     random = [k for k in kinds if k.own_search() == "force" and k.name not in present]
     if not random:
         return ()
-    fitting, fit = selection.searching, selection.last.fit
+    fitting, fit = selection.fitting, selection.last.fit
     noise, T_L = left_over(fitting, fit), float(fit.model.values(fit.z)["T_L"])
     found = [slow_disturbance(fitting.whitening.record, noise, T_L, kind) for kind in random]
     return tuple(part for part in found if part is not None)

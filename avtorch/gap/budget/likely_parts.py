@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from avtorch.gap.budget.own_noise import settled
+from dataclasses import replace
+
+from avtorch.gap.budget.own_noise import judged, with_own_noise
 from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.budget.parts import LIKELY, MATERIAL
-from avtorch.gap.budget.selection_step import Selection, without_effects
+from avtorch.gap.budget.selection_step import Selection, Step, one_by_one, without_effects
 from avtorch.gap.budget.share_order import largest_first, own_response
 
 
@@ -24,7 +26,7 @@ def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int 
         if each[unlikeliest] >= LIKELY:
             break
         selection = largest_first(_without(selection, unlikeliest), material, seed=seed)
-    return selection
+    return with_own_noise(selection)
 
 
 def probabilities(selection: Selection) -> dict[str, float]:
@@ -39,6 +41,8 @@ def probabilities(selection: Selection) -> dict[str, float]:
 
 
 def _without(selection: Selection, name: str) -> Selection:
-    fit = without_effects(selection.fitting, selection.last.fit, [name])
+    fitting = selection.fitting
+    fit = without_effects(fitting, selection.last.fit, [name])
+    last, evidence = judged(fitting, Step(fit, fitting.hold_out(fit)))
     aliases = {str(s.entered): s.aliases for s in selection.steps[1:]}
-    return settled(selection.searching, selection.steps[0].fit, fit, aliases, selection.tried)
+    return replace(selection, steps=(selection.steps[0], *one_by_one(fitting, last, evidence, aliases)))

@@ -24,7 +24,7 @@ from avtorch.gap.simulator.plant import GapPlant, plant
 
 def parameters_of(selection: Selection, name: str) -> dict[str, Quantity]:
     """The parameters of one effect under the answer's names."""
-    model, every = selection.last.fit.model, _folds(selection)
+    model, every = selection.sized.fit.model, _folds(selection)
     plants = model.plant.with_values(model.values(every))
     effect = next(e for e in plants.effects if e.name == name)
     reported = effect.report(torch.as_tensor(plants.T_L))
@@ -46,7 +46,7 @@ def _places(selection: Selection) -> Tensor:
 
 def lag_and_gain(selection: Selection) -> dict[str, Quantity]:
     """`T_L` [s] and `K_L` [-], fitted together with all parts."""
-    values = selection.last.fit.model.values(_folds(selection))
+    values = selection.sized.fit.model.values(_folds(selection))
     return {key: _jackknife(values[key].numpy()) for key in ("T_L", "K_L")}
 
 
@@ -55,7 +55,7 @@ def repaired_plant(selection: Selection, base: GapPlant, sigma: float) -> GapPla
 
     `sigma`: its jerk noise.
     """
-    return plant_of(selection.last.fit, base, sigma)
+    return plant_of(selection.sized.fit, base, sigma)
 
 
 def plant_of(fit: Fit, base: GapPlant, sigma: float | None = None) -> GapPlant:
@@ -70,7 +70,7 @@ def plant_of(fit: Fit, base: GapPlant, sigma: float | None = None) -> GapPlant:
 
 def parameter_draws(selection: Selection, *, count: int = 64, seed: int = 0) -> dict[str, FloatArray]:
     """Draws (draw,) of the repaired simulator's parameters, normal with the folds' covariance."""
-    model, z, folds = selection.last.fit.model, selection.last.fit.z, selection.last.held.z
+    model, z, folds = selection.sized.fit.model, selection.sized.fit.z, selection.sized.held.z
     away = (folds - folds.mean(0)) * np.sqrt((len(folds) - 1) / len(folds))
     normal = np.random.default_rng(seed).standard_normal((count, len(folds)))
     values = model.values(z + normal @ away)
@@ -79,7 +79,7 @@ def parameter_draws(selection: Selection, *, count: int = 64, seed: int = 0) -> 
 
 def _folds(selection: Selection) -> FloatArray:
     """(1 + fold, size): all blocks, then without each fold."""
-    return np.concatenate([selection.last.fit.z[None], selection.last.held.z])
+    return np.concatenate([selection.sized.fit.z[None], selection.sized.held.z])
 
 
 def _jackknife(x: FloatArray) -> Quantity:

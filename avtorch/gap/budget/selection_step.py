@@ -27,22 +27,22 @@ class Step:
 class Selection:
     """`steps` from the bare baseline on, each with one effect more than the one before; `tried`: of how many.
 
-    `fitting`: the noise of what the selection leaves, under which steps are fitted. `search`: that of a flexible
-    regression, in which nothing that is still missing hides; None where the two are the same.
+    `own`: the last model fitted under the noise of what it leaves (`own_noise`), which says how large effects are.
     """
 
     fitting: RobustFit
     steps: tuple[Step, ...]
     tried: int = 1
-    search: RobustFit | None = None
-
-    @property
-    def searching(self) -> RobustFit:
-        return self.fitting if self.search is None else self.search
+    own: Step | None = None
 
     @property
     def last(self) -> Step:
         return self.steps[-1]
+
+    @property
+    def sized(self) -> Step:
+        """The model whose parameters are the answer's."""
+        return self.last if self.own is None else self.own
 
 
 def one_by_one(

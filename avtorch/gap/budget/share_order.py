@@ -87,8 +87,9 @@ def energies(selection: Selection, seed: int) -> tuple[FloatArray, FloatArray, F
 
     Models are the selection's steps, and last the floor's; draws of blocks, the first of which is all of them once.
     """
+    fitting = selection.fitting
     held = [held_out_residuals(selection, step) for step in selection.steps]
-    floor = held[-1] - predicted_residuals(selection.searching, selection.last.fit, held[-1])
+    floor = held[-1] - predicted_residuals(fitting, selection.last.fit, held[-1])
     errors = np.stack([rollout_squares(selection, x) for x in [*held, floor]])  # (model, channel, block)
     calm = calm_blocks(selection)
     blocks = len(calm)

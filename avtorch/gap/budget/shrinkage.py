@@ -22,7 +22,7 @@ def shrinkage_of(selection: Selection, *, seed: int = 0) -> Shrinkage:
     """
     first, last = selection.steps[0], selection.last
     before, after = (held_out_residuals(selection, step) for step in (first, last))
-    fitting = selection.searching
+    fitting = selection.fitting
     floor = after - predicted_residuals(fitting, last.fit, after)
     ceiling = before - predicted_residuals(fitting, first.fit, before)
     squares = np.stack([rollout_squares(selection, x) for x in (before, after, floor, ceiling)])

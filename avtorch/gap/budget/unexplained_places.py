@@ -38,7 +38,7 @@ def placed(rest: Unexplained, selection: Selection, *, epoch_s: float = 0.0) -> 
     """
     if not rest.material:
         return rest
-    fitting, last = selection.searching, selection.last
+    fitting, last = selection.fitting, selection.last
     residuals = held_out_residuals(selection, last)
     predicted = predicted_residuals(fitting, last.fit, residuals)
     if not predicted.any():
@@ -50,7 +50,7 @@ def placed(rest: Unexplained, selection: Selection, *, epoch_s: float = 0.0) -> 
 
 
 def _places(selection: Selection, residuals: FloatArray, predicted: FloatArray, epoch_s: float) -> tuple[Location, ...]:
-    fitting, fit = selection.searching, selection.last.fit
+    fitting, fit = selection.fitting, selection.last.fit
     record, whitening = fitting.whitening.record, fitting.whitening
     white, found = whitening(residuals), whitening(predicted)
     score, size = white * found, found**2
@@ -83,9 +83,7 @@ def _places(selection: Selection, residuals: FloatArray, predicted: FloatArray, 
 def _resembling(selection: Selection, gain: float) -> str | None:
     """The effect not selected that promises most, if that is much of the `gain` [nats]."""
     kinds = observable(EFFECTS.values(), selection.fitting.whitening.record)
-    last, search = selection.last, selection.searching
-    now = replace(last, fit=search.fit(last.fit.model, last.fit.z[None]))
-    candidates = candidates_for(search, now, kinds, None, "")
+    candidates = candidates_for(selection.fitting, selection.last, kinds, None, "")
     best = max((c.promise for c in candidates), default=0.0)
     if best < _MUCH * max(gain, 1.0):
         return None
