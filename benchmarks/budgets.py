@@ -16,6 +16,7 @@ import argparse
 import os
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from avtorch.gap import EFFECTS, Budget, gap_budget, plant
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.forward_selection import baseline_noise
 from avtorch.gap.budget.given_effects import given_effects
-from avtorch.gap.budget.own_noise import with_own_noise
+from avtorch.gap.budget.own_noise import own_noise, with_sizes
 from avtorch.gap.budget.repaired_model import parameters_of
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.io import Log
@@ -160,7 +161,8 @@ def _same_effects(
     values = {f"{part.name}.{name}": q.mean for part in parts for name, q in part.parameters.items()}
     onsets = {part.name: part.onset_s for part in parts if part.onset_s is not None}
     kinds = [EFFECTS[part.name] for part in parts]
-    selection = with_own_noise(given_effects(*alone, kinds, values=values, onsets=onsets))
+    selection = given_effects(*alone, kinds, values=values, onsets=onsets)
+    selection = with_sizes(replace(selection, judging=own_noise(selection.last.fit)))
     return relative(found, parameters_of(selection, effect)[key].mean, put_in[key])
 
 

@@ -22,7 +22,7 @@ from avtorch.gap.budget.entry import candidates_for, enter, observable
 from avtorch.gap.budget.exchange import exchanged
 from avtorch.gap.budget.flexible_regression import has_places, left_over
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
-from avtorch.gap.budget.own_noise import judged
+from avtorch.gap.budget.own_noise import judged, own_noise
 from avtorch.gap.budget.redundancy import without_the_redundant
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.budget.selection_step import Selection, Step, one_by_one
@@ -66,9 +66,12 @@ def select(
         now, others = exchanged(fitting, now, kinds, progress)
         entered |= others
     now, _ = without_the_redundant(fitting, now)
-    now, evidence = judged(fitting, now)
+    if not now.fit.model.names:
+        return Selection(fitting, (bare,), len(kinds))
+    judging = own_noise(now.fit)
+    now, evidence = judged(fitting, judging, now.fit)
     aliases = {name: entered[name].aliases for name in now.fit.model.names}
-    return Selection(fitting, (bare, *one_by_one(fitting, now, evidence, aliases)), len(kinds))
+    return Selection(fitting, (bare, *one_by_one(fitting, now, evidence, aliases)), len(kinds), judging)
 
 
 def baseline_noise(record: AnalysisRecord, base: GapPlant) -> tuple[RobustFit, Fit]:

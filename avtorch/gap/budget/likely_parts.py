@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from avtorch.gap.budget.own_noise import judged, with_own_noise
+from avtorch.gap.budget.own_noise import judged, with_sizes
 from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.budget.parts import LIKELY, MATERIAL
-from avtorch.gap.budget.selection_step import Selection, Step, one_by_one, without_effects
+from avtorch.gap.budget.selection_step import Selection, one_by_one, without_effects
 from avtorch.gap.budget.share_order import largest_first, own_response
 
 
@@ -26,7 +26,7 @@ def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int 
         if each[unlikeliest] >= LIKELY:
             break
         selection = largest_first(_without(selection, unlikeliest), material, seed=seed)
-    return with_own_noise(selection)
+    return with_sizes(selection)
 
 
 def probabilities(selection: Selection) -> dict[str, float]:
@@ -41,8 +41,8 @@ def probabilities(selection: Selection) -> dict[str, float]:
 
 
 def _without(selection: Selection, name: str) -> Selection:
-    fitting = selection.fitting
+    fitting, judging = selection.fitting, selection.judging
     fit = without_effects(fitting, selection.last.fit, [name])
-    last, evidence = judged(fitting, Step(fit, fitting.hold_out(fit)))
+    last, evidence = judged(fitting, fitting if judging is None else judging, fit)
     aliases = {str(s.entered): s.aliases for s in selection.steps[1:]}
     return replace(selection, steps=(selection.steps[0], *one_by_one(fitting, last, evidence, aliases)))

@@ -5,6 +5,9 @@ closed loop that is too little: the command follows the measured speed, so a reg
 the noise itself. A cruising car that has no dead time had one of 0.1 s, by 64 nats. Once the effects are in, what they
 leave is noise, of both channels together: a force of chance is in both and counts once.
 
+It stays that of all effects found, also once some of them are not likely enough to be named: what a model leaves that
+lacks one would hide the others.
+
 Rollouts, and with them shares, keep the fits of the search: that noise makes little of what is slow, and rollouts show
 it.
 """
@@ -23,35 +26,33 @@ from avtorch.gap.budget.selection_step import Selection, Step, without_effects
 _TURNS = 2  # of noise and fit
 
 
-def judged(fitting: RobustFit, now: Step) -> tuple[Step, dict[str, Evidence]]:
-    """`now` without effects that do not hold their place under its own noise, and the evidence for the others there.
-
-    The model that stays is fitted under the noise of the search, `fitting`.
-    """
-    if not now.fit.model.names:
-        return now, {}
-    judging, own = _own(now.fit)
-    kept, evidence = without_the_redundant(judging, own)
-    gone = [name for name in now.fit.model.names if name not in kept.fit.model.names]
-    if not gone:
-        return now, evidence
-    rest = without_effects(fitting, now.fit, gone)
-    return Step(rest, fitting.hold_out(rest)), evidence
-
-
-def with_own_noise(selection: Selection) -> Selection:
-    """The selection with the fit that says how large its effects are."""
-    if not selection.last.fit.model.names:
-        return replace(selection, own=None)
-    return replace(selection, own=_own(selection.last.fit)[1])
-
-
-def _own(fit: Fit) -> tuple[RobustFit, Step]:
-    """Fits under the noise of what the model of `fit` leaves, and that model under it."""
+def own_noise(fit: Fit) -> RobustFit:
+    """Fits under the noise of what the model of `fit` leaves."""
     for _ in range(_TURNS):
         judging = _under(fit)
         fit = judging.fit(fit.model, fit.z[None])
-    return judging, Step(fit, judging.hold_out(fit))
+    return judging
+
+
+def judged(fitting: RobustFit, judging: RobustFit, fit: Fit) -> tuple[Step, dict[str, Evidence]]:
+    """The model of `fit` without effects that do not hold their place by `judging`, and the evidence for the others.
+
+    The model that stays is fitted under the noise of the search, `fitting`.
+    """
+    own = judging.fit(fit.model, fit.z[None])
+    kept, evidence = without_the_redundant(judging, Step(own, judging.hold_out(own)))
+    gone = [name for name in fit.model.names if name not in kept.fit.model.names]
+    rest = without_effects(fitting, fit, gone)
+    return Step(rest, fitting.hold_out(rest)), evidence
+
+
+def with_sizes(selection: Selection) -> Selection:
+    """The selection with the fit that says how large its effects are."""
+    judging, fit = selection.judging, selection.last.fit
+    if judging is None or not fit.model.names:
+        return replace(selection, own=None)
+    own = judging.fit(fit.model, fit.z[None])
+    return replace(selection, own=Step(own, judging.hold_out(own)))
 
 
 def _under(fit: Fit) -> RobustFit:

@@ -27,12 +27,14 @@ class Step:
 class Selection:
     """`steps` from the bare baseline on, each with one effect more than the one before; `tried`: of how many.
 
-    `own`: the last model fitted under the noise of what it leaves (`own_noise`), which says how large effects are.
+    `judging`: fits under the noise of what all effects found leave (`own_noise`), `own`: the last model under it, which
+    says how large effects are.
     """
 
     fitting: RobustFit
     steps: tuple[Step, ...]
     tried: int = 1
+    judging: RobustFit | None = None
     own: Step | None = None
 
     @property

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from avtorch.gap import plant
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.forward_selection import baseline_noise
-from avtorch.gap.budget.own_noise import judged, with_own_noise
+from avtorch.gap.budget.own_noise import judged, own_noise, with_sizes
 from avtorch.gap.budget.repaired_model import parameters_of
 from avtorch.gap.budget.robust_fit import RobustFit
 from avtorch.gap.budget.selection_step import Selection, Step
@@ -34,19 +35,19 @@ def with_effects(log: Log, *kinds: type[Effect]) -> tuple[RobustFit, Step, Step]
 def test_what_is_there_stays_and_what_is_not_goes(fresh_seed: int) -> None:
     log = log_of([DeadTime(0.3)], seed=fresh_seed)
     fitting, bare, now = with_effects(log, DeadTime, Backlash)
-    kept, evidence = judged(fitting, now)
+    kept, evidence = judged(fitting, own_noise(now.fit), now.fit)
     assert kept.fit.model.names == ("dead_time",)
     assert set(evidence) == {"dead_time"}
     assert evidence["dead_time"].of_entry > 0
-    assert judged(fitting, bare) == (bare, {})
+    assert judged(fitting, own_noise(bare.fit), bare.fit)[1] == {}
 
 
 def test_a_force_of_chance_counts_once(fresh_seed: int) -> None:
     # it is in both channels, which tell a bias of one of them by their difference
     fitting, bare, now = with_effects(log_of([SensorBias(0.15)], seed=fresh_seed), SensorBias)
     apart = fitting.evidence(bare.held, now.held)
-    kept, evidence = judged(fitting, now)
-    assert kept is now, "how large it is, is not asked again"
+    kept, evidence = judged(fitting, own_noise(now.fit), now.fit)
+    assert np.array_equal(kept.fit.z, now.fit.z), "how large it is, is not asked again"
     assert evidence["sensor_bias"].nats > 2 * apart.nats
 
 
@@ -56,16 +57,17 @@ def test_one_channel_has_a_noise_of_its_own(channel: str, fresh_seed: int) -> No
     columns = {channel: getattr(both, channel), "accel_cmd": both.accel_cmd}
     log = Log.from_arrays(name="car", time=both.time, **columns)
     fitting, _, now = with_effects(log, DeadTime)
-    assert judged(fitting, now)[1]["dead_time"].of_entry > 0
+    assert judged(fitting, own_noise(now.fit), now.fit)[1]["dead_time"].of_entry > 0
 
 
 def test_sizes_are_by_that_noise_and_rollouts_by_the_search(fresh_seed: int) -> None:
     fitting, bare, now = with_effects(log_of([SensorBias(0.15)], seed=fresh_seed), SensorBias)
-    plain = Selection(fitting, (bare, replace(now, entered="sensor_bias")))
-    found = with_own_noise(plain)
+    steps = (bare, replace(now, entered="sensor_bias"))
+    plain = Selection(fitting, steps, judging=own_noise(now.fit))
+    found = with_sizes(plain)
     assert found.last is plain.last
     bias = parameters_of(found, "sensor_bias")["bias_mps2"]
     # a force of chance, half of what a channel by itself leaves in doubt, is in both
     assert bias.sd < parameters_of(plain, "sensor_bias")["bias_mps2"].sd
     assert abs(bias.mean - 0.15) < student(fitting.folds - 1) * bias.sd
-    assert with_own_noise(Selection(fitting, (bare,))).sized is bare
+    assert with_sizes(Selection(fitting, (bare,))).sized is bare
