@@ -5,8 +5,11 @@ closed loop that is too little: the command follows the measured speed, so a reg
 the noise itself. A cruising car that has no dead time had one of 0.1 s, by 64 nats. Once the effects are in, what they
 leave is noise, of both channels together: a force of chance is in both and counts once.
 
-It stays that of all effects found, also once some of them are not likely enough to be named: what a model leaves that
-lacks one would hide the others.
+What wanders is noise, too, and hides a force that is slow: of a lap whose gap is for two thirds a constant resistance
+it left none. So the evidence for such an effect is that of the search, where that is stronger.
+
+The noise stays that of all effects found, also once some of them are not likely enough to be named: what a model leaves
+that lacks one would hide the others.
 
 Rollouts, and with them shares, keep the fits of the search: that noise makes little of what is slow, and rollouts show
 it.
@@ -19,9 +22,10 @@ from dataclasses import replace
 from avtorch.gap.budget.held_out_evidence import Evidence
 from avtorch.gap.budget.joint_whitening import JointWhitening
 from avtorch.gap.budget.noise_whitening import LEVEL_S, NoiseWhitening
-from avtorch.gap.budget.redundancy import without_the_redundant
+from avtorch.gap.budget.redundancy import without_one
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.budget.selection_step import Selection, Step, without_effects
+from avtorch.gap.simulator.effect import Effect
 
 _TURNS = 2  # of noise and fit
 
@@ -37,13 +41,36 @@ def own_noise(fit: Fit) -> RobustFit:
 def judged(fitting: RobustFit, judging: RobustFit, fit: Fit) -> tuple[Step, dict[str, Evidence]]:
     """The model of `fit` without effects that do not hold their place by `judging`, and the evidence for the others.
 
-    The model that stays is fitted under the noise of the search, `fitting`.
+    The model that stays is fitted under the noise of the search, `fitting`. A slow force has the stronger evidence of
+    the two.
     """
+    names = fit.model.names
+    searched = Step(fit, fitting.hold_out(fit))
+    slow = [effect.name for effect in fit.model.effects if effect.name in names and _is_slow(effect)]
+    before = {name: without_one(fitting, searched, name).evidence for name in slow}
     own = judging.fit(fit.model, fit.z[None])
-    kept, evidence = without_the_redundant(judging, Step(own, judging.hold_out(own)))
-    gone = [name for name in fit.model.names if name not in kept.fit.model.names]
+    step = Step(own, judging.hold_out(own))
+    while True:
+        without = {name: without_one(judging, step, name) for name in step.fit.model.names}
+        evidence = {name: _stronger(s.evidence, before.get(name, s.evidence)) for name, s in without.items()}
+        weakest = min(evidence, key=lambda name: evidence[name].of_entry, default=None)
+        if weakest is None or evidence[weakest].of_entry > 0:
+            break
+        step = without[weakest]
+    gone = [name for name in names if name not in evidence]
+    if not gone:
+        return searched, evidence
     rest = without_effects(fitting, fit, gone)
     return Step(rest, fitting.hold_out(rest)), evidence
+
+
+def _is_slow(effect: type[Effect]) -> bool:
+    """Whether it is a force by speed, place or nothing, which changes as they do."""
+    return effect.slow_force or (effect.place == "body" and not effect.memory)
+
+
+def _stronger(one: Evidence, other: Evidence) -> Evidence:
+    return max(one, other, key=lambda evidence: evidence.of_entry)
 
 
 def with_sizes(selection: Selection) -> Selection:

@@ -14,7 +14,7 @@ from avtorch.gap.budget.own_noise import judged, own_noise, with_sizes
 from avtorch.gap.budget.repaired_model import parameters_of
 from avtorch.gap.budget.robust_fit import RobustFit
 from avtorch.gap.budget.selection_step import Selection, Step
-from avtorch.gap.effects import Backlash, DeadTime, SensorBias
+from avtorch.gap.effects import Backlash, ConstantResistance, DeadTime, SensorBias
 from avtorch.gap.simulator.effect import Effect
 from avtorch.io import Log
 from tests.bars import student
@@ -49,6 +49,14 @@ def test_a_force_of_chance_counts_once(fresh_seed: int) -> None:
     kept, evidence = judged(fitting, own_noise(now.fit), now.fit)
     assert np.array_equal(kept.fit.z, now.fit.z), "how large it is, is not asked again"
     assert evidence["sensor_bias"].nats > 2 * apart.nats
+
+
+def test_a_slow_force_keeps_the_evidence_of_the_search(fresh_seed: int) -> None:
+    # what wanders is noise, too, and hides it
+    fitting, bare, now = with_effects(log_of([ConstantResistance(0.25)], seed=fresh_seed), ConstantResistance)
+    judging, apart = own_noise(now.fit), fitting.evidence(bare.held, now.held)
+    _, evidence = judged(fitting, judging, now.fit)
+    assert evidence["constant_resistance"].of_entry >= apart.of_entry
 
 
 @pytest.mark.parametrize("channel", ["accel", "speed"])
