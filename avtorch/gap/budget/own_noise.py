@@ -44,24 +44,18 @@ def judged(fitting: RobustFit, judging: RobustFit, fit: Fit) -> tuple[Step, dict
     The model that stays is fitted under the noise of the search, `fitting`. A slow force has the stronger evidence of
     the two.
     """
-    names = fit.model.names
-    searched = Step(fit, fitting.hold_out(fit))
-    slow = [effect.name for effect in fit.model.effects if effect.name in names and _is_slow(effect)]
-    before = {name: without_one(fitting, searched, name).evidence for name in slow}
+    slow = {effect.name for effect in fit.model.effects if _is_slow(effect)}
     own = judging.fit(fit.model, fit.z[None])
-    step = Step(own, judging.hold_out(own))
+    now, step = Step(fit, fitting.hold_out(fit)), Step(own, judging.hold_out(own))
     while True:
         without = {name: without_one(judging, step, name) for name in step.fit.model.names}
-        evidence = {name: _stronger(s.evidence, before.get(name, s.evidence)) for name, s in without.items()}
+        searched = {name: without_one(fitting, now, name) for name in without if name in slow}
+        evidence = {name: _stronger(s.evidence, searched.get(name, s).evidence) for name, s in without.items()}
         weakest = min(evidence, key=lambda name: evidence[name].of_entry, default=None)
         if weakest is None or evidence[weakest].of_entry > 0:
-            break
-        step = without[weakest]
-    gone = [name for name in names if name not in evidence]
-    if not gone:
-        return searched, evidence
-    rest = without_effects(fitting, fit, gone)
-    return Step(rest, fitting.hold_out(rest)), evidence
+            return now, evidence
+        step, rest = without[weakest], without_effects(fitting, now.fit, [weakest])
+        now = Step(rest, fitting.hold_out(rest))
 
 
 def _is_slow(effect: type[Effect]) -> bool:
