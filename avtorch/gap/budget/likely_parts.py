@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from avtorch.gap.budget.own_noise import judged, with_sizes
@@ -15,17 +16,18 @@ def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int 
     """The selection's parts in the order of what they take off the gap, without those less likely there than not, or
     at the limit of what a fit may take.
 
-    The least likely goes first; what its going does to the others is looked at anew.
+    The least likely goes first, unless that drives another to a limit; what its going does to the others is looked at
+    anew.
     """
     selection = largest_first(selection, material, seed=seed)
     while len(selection.steps) > 1:
         each, last = probabilities(selection), selection.last.fit
         # where a fit ends, far beyond what is possible, an effect stands in for something else
         each |= {name: 0.0 for name in each if last.model.at_limit(last.z, name)}
-        unlikeliest = min(each, key=each.__getitem__)
-        if each[unlikeliest] >= LIKELY:
+        unlikely = sorted((name for name in each if each[name] < LIKELY), key=each.__getitem__)
+        if not unlikely:
             break
-        selection = largest_first(_without(selection, unlikeliest), material, seed=seed)
+        selection = largest_first(_without_one_of(selection, unlikely), material, seed=seed)
     return with_sizes(selection)
 
 
@@ -38,6 +40,23 @@ def probabilities(selection: Selection) -> dict[str, float]:
         )
         for name, step in ((str(step.entered), step) for step in selection.steps[1:])
     }
+
+
+def _without_one_of(selection: Selection, names: Sequence[str]) -> Selection:
+    """Without the first of `names` that drives no other effect to a limit, or without the very first.
+
+    Two forces that explain the same may each be unlikely beside the other. On the AV-21's lap the resistance went,
+    its drag then had to stand in for it, rested at a limit and went too, and nothing was left of a force of 600 nats.
+    """
+    without = [_without(selection, names[0])]
+    while _rests(without[-1]) and len(without) < len(names):
+        without.append(_without(selection, names[len(without)]))
+    return without[0] if _rests(without[-1]) else without[-1]
+
+
+def _rests(selection: Selection) -> bool:
+    fit = selection.last.fit
+    return any(fit.model.at_limit(fit.z, name) for name in fit.model.names)
 
 
 def _without(selection: Selection, name: str) -> Selection:
