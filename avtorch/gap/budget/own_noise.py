@@ -5,8 +5,8 @@ closed loop that is too little: the command follows the measured speed, so a reg
 the noise itself. A cruising car that has no dead time had one of 0.1 s, by 64 nats. Once the effects are in, what they
 leave is noise, of both channels together: a force of chance is in both and counts once.
 
-What wanders is noise, too, and hides a force that is slow: of a lap whose gap is for two thirds a constant resistance
-it left none. So the evidence for such an effect is that of the search, where that is stronger.
+What wanders is noise, too, and hides a force that is slow: of a model car's resistance, 95 nats in the search, it left
+none. So the evidence for such an effect is that of the search, where that is stronger.
 
 The noise stays that of all effects found, also once some of them are not likely enough to be named: what a model leaves
 that lacks one would hide the others.
