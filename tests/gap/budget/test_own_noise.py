@@ -11,6 +11,7 @@ from avtorch.gap import plant
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.forward_selection import baseline_noise
 from avtorch.gap.budget.own_noise import judged, own_noise, with_sizes
+from avtorch.gap.budget.redundancy import without_one
 from avtorch.gap.budget.repaired_model import parameters_of
 from avtorch.gap.budget.robust_fit import RobustFit
 from avtorch.gap.budget.selection_step import Selection, Step
@@ -53,9 +54,9 @@ def test_a_force_of_chance_counts_once(fresh_seed: int) -> None:
 
 def test_a_slow_force_keeps_the_evidence_of_the_search(fresh_seed: int) -> None:
     # what wanders is noise, too, and hides it
-    fitting, bare, now = with_effects(log_of([ConstantResistance(0.25)], seed=fresh_seed), ConstantResistance)
-    judging, apart = own_noise(now.fit), fitting.evidence(bare.held, now.held)
-    _, evidence = judged(fitting, judging, now.fit)
+    fitting, _, now = with_effects(log_of([ConstantResistance(0.25)], seed=fresh_seed), ConstantResistance)
+    apart = without_one(fitting, now, "constant_resistance").evidence
+    _, evidence = judged(fitting, own_noise(now.fit), now.fit)
     assert evidence["constant_resistance"].of_entry >= apart.of_entry
 
 
