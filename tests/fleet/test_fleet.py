@@ -217,6 +217,41 @@ def test_a_diagnosis_is_a_row(tmp_path: Path, scheduler: str, rotating_seed: int
     assert not (tmp_path / "out" / "unfinished").exists()
 
 
+@pytest.mark.slow
+@pytest.mark.statistical
+def test_the_sizes_of_a_cause_are_pooled_over_cars_that_were_diagnosed(
+    tmp_path: Path, scheduler: str, rotating_seed: int
+) -> None:
+    rng = np.random.default_rng(rotating_seed)
+    delays = {f"car_{number}": 0.2 + 0.03 * number for number in range(5)}
+    for car, delay in delays.items():
+        (tmp_path / "logs" / car).mkdir(parents=True)
+        for number in range(2):
+            log = taken_over(seconds=40.0, overrides=(), rng=rng, delay_s=delay)
+            log.write(tmp_path / "logs" / car / f"drive_{number}.csv")
+    settings = FleetSettings(steps=("diagnose",), effects=("dead_time",), pairs=False, posterior="laplace")
+    answer = run_fleet(tmp_path / "logs", tmp_path / "out", settings=settings, scheduler=scheduler)
+
+    (cause,) = answer["causes"]
+    assert (cause["name"], cause["cars"], cause["diagnosed"], cause["verdict"]) == ("dead_time", 5, 5, "the model's")
+    common = cause["parameters"]["delay_s"]
+    assert (common["cars"], common["drives"], common["unit"]) == (5, 10, "s")
+    typical = common["typical"]
+    assert typical["q05"] < np.exp(np.mean(np.log(list(delays.values())))) < typical["q95"]
+
+    by_car: dict[str, list[dict[str, Any]]] = {car: [] for car in delays}
+    for row in read_rows(tmp_path / "out", "diagnoses").to_pylist():
+        by_car[row["car"]].append(row["causes"][0]["parameters"][0])
+    for car, delay in delays.items():
+        own = next(each for each in answer["cars"] if each["car"] == car)["effects"]["dead_time"]["delay_s"]
+        means, sds = (np.array([told[key] for told in by_car[car]]) for key in ("value_mean", "value_sd"))
+        # between its own drives and the typical car, of which the mean counts and the median is told
+        ends = np.array([*means, typical["median"]])
+        assert ends.min() - 0.1 * sds.min() < own["median"] < ends.max() + 0.1 * sds.min()
+        # and no further off than the worse drive says
+        assert abs(own["median"] - delay) < BAR * sds.max()
+
+
 def test_logs_by_url(tmp_path: Path, scheduler: str) -> None:
     """`memory://` is a store that only this process sees, so the worker is one of its threads."""
     import fsspec
