@@ -116,7 +116,7 @@ def in_front(log: Log, size: float) -> None:
         others = [name for name in budget.names if name != effect and name not in control.names]
         reference = list(selected([changed]))
         ratio = _ratio(budget, control, effect, put_in)
-        same = _same_effects(budget, alone, effect, put_in)
+        same = _same_effects(budget, alone, effect, put_in, changed.epoch_s)
         held = effect in budget.names
         alike = any(effect in part.alias_set for part in budget.parts if part.name in budget.names)
         tried, named, extra = tried + 1, named + held, extra + bool(others)
@@ -147,7 +147,7 @@ def _ratio(budget: Budget, control: Budget, effect: str, put_in: Mapping[str, fl
 
 
 def _same_effects(
-    budget: Budget, alone: tuple[RobustFit, Fit], effect: str, put_in: Mapping[str, float]
+    budget: Budget, alone: tuple[RobustFit, Fit], effect: str, put_in: Mapping[str, float], epoch_s: float
 ) -> float | None:
     """As `_ratio`, on top of what the untouched recording has of the effect when the same effects are fitted to it.
 
@@ -159,7 +159,7 @@ def _same_effects(
         return None
     parts = [part for part in budget.parts if part.name in budget.names]
     values = {f"{part.name}.{name}": q.mean for part in parts for name, q in part.parameters.items()}
-    onsets = {part.name: part.onset_s for part in parts if part.onset_s is not None}
+    onsets = {part.name: part.onset_s - epoch_s for part in parts if part.onset_s is not None}
     kinds = [EFFECTS[part.name] for part in parts]
     selection = given_effects(*alone, kinds, values=values, onsets=onsets)
     selection = with_sizes(replace(selection, judging=own_noise(selection.last.fit)))

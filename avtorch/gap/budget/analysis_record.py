@@ -31,6 +31,8 @@ _SHORTEST_BLOCK_S = 4.0
 _SHORT_DRIVES_BLOCK_S = 1.0  # where drives are too short for six of the usual ones
 _BLOCKS = 24  # aimed at, within those lengths
 _FEWEST_BLOCKS = 6
+MEMORY_S = 1.0
+"""Of the noise's filter: rows that count are compared once so much of what counts is before them [s]."""
 MOST_KNOTS = 36
 """Along the way, of what depends on the place."""
 _LEAST_KNOT_M = 10.0
@@ -142,11 +144,21 @@ class AnalysisRecord:
             speed=np.concatenate([p.speed for p in pieces]),
             dt=step,
         )
-        if record.blocks < _FEWEST_BLOCKS:
+        compared = record.with_past(round(MEMORY_S / step))
+        blocks = len(np.unique(block[compared]))
+        if blocks < _FEWEST_BLOCKS:
             raise InputError(
-                f"logs: found {record.blocks} blocks of {length:g} s that count, needs {_FEWEST_BLOCKS} for a budget"
+                f"logs: found {blocks} blocks of {length:g} s that count, each behind {MEMORY_S:g} s that count; "
+                f"needs {_FEWEST_BLOCKS} for a budget"
             )
         return record
+
+    def with_past(self, rows: int) -> BoolArray:
+        """The rows (row,) that count, as `rows` rows before them do."""
+        counts = self.counts.copy()
+        for stretch in self.stretches:
+            counts[stretch.rows] = _settled(self.counts[stretch.rows], rows)
+        return counts
 
     def runs(self) -> list[slice]:
         """Rows that count without one between them that does not: through another driver's rows there is no rollout."""

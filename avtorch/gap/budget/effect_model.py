@@ -34,7 +34,8 @@ _BEHIND = ("body", "sensor")  # places of the chain behind the actuator
 class EffectModel:
     """`effects` on top of `base`, whose own effects keep their values; `T_L` and `K_L` are free.
 
-    `onsets` [s from a log's start] by effect, of those that set in during the drives.
+    `onsets` [s from a log's start] by effect, of those that set in during the drives; before, the base's own of that
+    kind acts, if it has one.
     """
 
     record: AnalysisRecord
@@ -194,12 +195,16 @@ class EffectModel:
         if not self.onsets:
             return self._simulate(self.plant, values)
         out: FloatArray | None = None
-        active = [e for e in self.plant.effects if e.name not in self.onsets]
+        acting = {e.name: e for e in self.plant.effects if e.name not in self.onsets}
+        # until its onset an effect of the baseline acts as the baseline has it
+        before = [e for e in self.base.effects if e.name in self.onsets]
         for name, onset in [("", -np.inf), *sorted(self.onsets.items(), key=lambda item: item[1])]:
-            active += [e for e in self.plant.effects if e.name == name]
-            names = {e.name for e in active}
-            present = GapPlant(active, T_L=self.plant.T_L, K_L=self.plant.K_L, sigma=self.plant.sigma)
-            some = {k: v for k, v in values.items() if "." not in k or k.partition(".")[0] in names}
+            acting |= {e.name: e for e in self.plant.effects if e.name == name}
+            before = [e for e in before if e.name != name]
+            present = GapPlant(
+                [*acting.values(), *before], T_L=self.plant.T_L, K_L=self.plant.K_L, sigma=self.plant.sigma
+            )
+            some = {k: v for k, v in values.items() if "." not in k or k.partition(".")[0] in acting}
             later = self._simulate(present, some)
             out = later if out is None else np.where(self.record.time >= onset, later, out)
         assert out is not None

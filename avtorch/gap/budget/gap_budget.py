@@ -50,9 +50,10 @@ def gap_budget(
     """The budget of the gap between `baseline` (default: bare GLVD) and the car of these drives.
 
     Args: `effects`: candidates by name or class (default: all registered); of the random ones, which predict nothing,
-    only a slow force is looked for. `material`: share of the gap, or of the response, below which a cause is not a
-    part. `seed`: of the drawing of blocks for the intervals. `progress(what, done, of)` is called at each effect
-    tried; or True, False, None, as in `avtorch.diagnose`.
+    only a slow force is looked for. `material`: share of the bare baseline's squared error, or three times as much of
+    the response, below which a cause is not a part; and share of the gap from which what is unexplained is material.
+    `seed`: of the drawing of blocks for the intervals. `progress(what, done, of)` is called at each effect tried; or
+    True, False, None, as in `avtorch.diagnose`.
 
     Raises `InputError` for a log without `accel_cmd`, for logs with less than six seconds that count (blocks
     are then of one second; six of four seconds or more are better), or for wrong arguments.

@@ -8,6 +8,7 @@ from dataclasses import replace
 from avtorch.gap.budget.own_noise import judged, with_sizes
 from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.budget.parts import LIKELY, MATERIAL
+from avtorch.gap.budget.robust_fit import Fit
 from avtorch.gap.budget.selection_step import Selection, one_by_one, without_effects
 from avtorch.gap.budget.share_order import largest_first, own_response
 
@@ -19,7 +20,7 @@ def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int 
     The least likely goes first, unless that drives another to a limit; what its going does to the others is looked at
     anew.
     """
-    selection = largest_first(selection, material, seed=seed)
+    selection = _parts(selection, material, seed)
     while len(selection.steps) > 1:
         each, last = probabilities(selection), selection.last.fit
         # where a fit ends, far beyond what is possible, an effect stands in for something else
@@ -27,8 +28,18 @@ def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int 
         unlikely = sorted((name for name in each if each[name] < LIKELY), key=each.__getitem__)
         if not unlikely:
             break
-        selection = largest_first(_without_one_of(selection, unlikely), material, seed=seed)
+        selection = _parts(_without_one_of(selection, unlikely), material, seed)
     return with_sizes(selection)
+
+
+def _parts(selection: Selection, material: float, seed: int) -> Selection:
+    """The selection's parts in order; where an effect is none, what its going does to the others is looked at anew."""
+    while len(selection.steps) > 1:
+        parts = largest_first(selection, material, seed=seed)
+        if len(parts.steps) in (1, len(selection.steps)):
+            return parts
+        selection = _asked_anew(selection, parts.last.fit)
+    return selection
 
 
 def probabilities(selection: Selection) -> dict[str, float]:
@@ -60,8 +71,12 @@ def _rests(selection: Selection) -> bool:
 
 
 def _without(selection: Selection, name: str) -> Selection:
+    return _asked_anew(selection, without_effects(selection.fitting, selection.last.fit, [name]))
+
+
+def _asked_anew(selection: Selection, fit: Fit) -> Selection:
+    """The selection with the model of `fit` in place of its last, and the evidence for each of its effects."""
     fitting, judging = selection.fitting, selection.judging
-    fit = without_effects(fitting, selection.last.fit, [name])
     last, evidence = judged(fitting, fitting if judging is None else judging, fit)
     aliases = {str(s.entered): s.aliases for s in selection.steps[1:]}
     return replace(selection, steps=(selection.steps[0], *one_by_one(fitting, last, evidence, aliases)))

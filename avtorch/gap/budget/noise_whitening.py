@@ -20,9 +20,8 @@ from scipy.linalg import solve_toeplitz
 from scipy.signal import firwin
 
 from avtorch.arrays import FloatArray, IntArray
-from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.analysis_record import MEMORY_S, AnalysisRecord
 
-_MEMORY_S = 1.0  # of the autoregression
 LEVEL_S = 60.0
 """Seconds over which a level is no noise."""
 _WILDEST = 0.15  # of the pieces of that length, which do not count
@@ -48,11 +47,7 @@ class NoiseWhitening:
 
     @classmethod
     def of(cls, record: AnalysisRecord, taps: FloatArray, sd: FloatArray, share: float = 1.0) -> NoiseWhitening:
-        counts = record.counts.copy()
-        for stretch in record.stretches:
-            lost = np.concatenate([np.ones(taps.shape[1] - 1), ~record.counts[stretch.rows]])
-            counts[stretch.rows] = np.convolve(lost, np.ones(taps.shape[1]), "valid") == 0
-        rows = np.nonzero(counts)[0]
+        rows = np.nonzero(record.with_past(taps.shape[1] - 1))[0]
         order = rows[np.argsort(record.block[rows], kind="stable")]
         first = np.unique(record.block[order], return_index=True)[1]
         return cls(record, taps, sd, order, first, share)
@@ -66,7 +61,7 @@ class NoiseWhitening:
     @classmethod
     def autoregressive(cls, record: AnalysisRecord, residuals: FloatArray) -> NoiseWhitening:
         """By Yule and Walker, from `residuals` (channel, row)."""
-        lags = max(4, round(_MEMORY_S / record.dt))
+        lags = max(4, round(MEMORY_S / record.dt))
         taps = []
         for channel in residuals:
             covariance = _covariance(record, channel, lags)

@@ -35,7 +35,8 @@ def best_onset(fitting: RobustFit, fit: Fit, name: str) -> tuple[float, float] |
     inner = (record.block[whitening.order] > 0) & (record.block[whitening.order] < record.blocks - 1)
     if not inner.any():
         return None
-    always = fit.model.without_onset(name)
+    # not the model without an onset, which lacks the parameters that only an effect with one has
+    always = fit.model.setting_in(name, -np.inf)
     never = fit.model.without(name)
     now = fitting.white(fit.model, fit.z)
     with_it = now if name not in fit.model.onsets else fitting.white(always, always.coordinates(fit.known))

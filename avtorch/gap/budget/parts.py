@@ -15,7 +15,8 @@ HORIZON_S = 10.0
 BEGIN_S = 0.5
 """Over which the measured start of a rollout is averaged [s]."""
 MATERIAL = 0.03
-"""Share of the gap from which something counts, unless a user says otherwise."""
+"""Share from which something counts, unless a user says otherwise: a part of the bare baseline's squared error, what is
+unexplained of the gap."""
 LIKELY = 0.5
 """Probability from which a part is named."""
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.budget.joint_whitening import JointWhitening
+from avtorch.gap.budget.joint_whitening import of_both_channels
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 from avtorch.gap.change.change_model import Change, ChangeModel
 from avtorch.gap.change.joint_fit import Fit, HeldOut, JointFit
@@ -150,7 +150,7 @@ def _noise(sides: TwoSides, base: GapPlant, progress: Progress | None) -> tuple[
             progress("noise of both drives", number, 2)
         shapes = columns(record, model.simulate(fit.p)[0])
         both = JointFit(whitening, np.concatenate([shapes, shapes * sides.is_after]), ridge=_NOISE_RIDGE)
-        whitening = JointWhitening.vector_autoregressive(record, both.left(both.fit(model, fit.p[None], iterations=3)))
+        whitening = of_both_channels(record, both.left(both.fit(model, fit.p[None], iterations=3)))
         fit = JointFit(whitening, shapes[:basic]).fit(model, np.concatenate([fit.p[None], starts]), iterations=10)
     shapes = columns(record, model.simulate(fit.p)[0])
     fitting = replace(JointFit(whitening, shapes).beyond(model, fit.p, basic), anchor=model.named(fit.p))

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from avtorch import diagnose
 from avtorch.errors import InputError
 from avtorch.gap.budget.analysis_record import RATE_HZ, AnalysisRecord
 from tests.gap.budget.cars import log_of
@@ -64,3 +65,13 @@ def test_blocks_are_numbered_and_do_not_cross_stretches() -> None:
 def test_too_little_driving_is_refused() -> None:
     with pytest.raises(InputError, match=r"needs 6 for a budget|no stretch"):
         AnalysisRecord.of([log_of(seconds=15.0)])
+
+
+def test_what_counts_needs_a_second_of_it_before_for_the_noises_filter() -> None:
+    """A car taken over every six seconds: blocks count, and none of their rows can be compared."""
+    log = log_of(seconds=120.0)
+    engaged = (log.time % 6.0) >= 0.05
+    with pytest.raises(InputError, match=r"each behind 1 s that count; needs 6 for a budget"):
+        AnalysisRecord.for_budget([replace(log, engaged=engaged)])
+    found = diagnose(replace(log, engaged=engaged), effects=["dead_time"], pairs=False, posterior="laplace")
+    assert found.budget is None

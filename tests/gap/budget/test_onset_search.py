@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -12,11 +14,11 @@ from avtorch.gap.budget.effect_model import EffectModel
 from avtorch.gap.budget.entry import _from_the_start_or_not
 from avtorch.gap.budget.forward_selection import baseline_noise
 from avtorch.gap.budget.onset_search import best_onset, may_set_in, set_in
-from avtorch.gap.effects import Backlash, ConstantResistance, DeadTime, GainChange, RoadGrade
+from avtorch.gap.effects import Backlash, ConstantResistance, DeadTime, GainChange, RoadGrade, SpeedDependentGain
 from avtorch.gap.simulator.effect import Effect
 from avtorch.io import Log
 
-from .cars import DT, command
+from .cars import DT, command, log_of
 
 SECONDS, ONSET_S = 200.0, 130.0
 
@@ -96,3 +98,22 @@ def test_blocks_that_were_held_out_say_whether_it_sets_in(sets_in: bool, fresh_s
     fit = fitting.fit(late, late.coordinates(known)[None])
     kept, _ = _from_the_start_or_not(fitting, fit, fitting.hold_out(fit))
     assert ("dead_time" in kept.model.onsets) == sets_in
+
+
+def test_parameters_that_only_an_onset_has_are_kept_while_it_is_searched(fresh_seed: int) -> None:
+    """A gain that falls with speed from 60 s on and is another altogether, sought from 25 s too late."""
+    plain = log_of(seconds=120.0, seed=fresh_seed)
+    record = AnalysisRecord.for_budget([plain])
+    told = EffectModel(record, plant([]), (SpeedDependentGain,), {"speed_dependent_gain": 60.0})
+    z = told.coordinates(
+        {"speed_dependent_gain.pivot": np.array(-2.0), "speed_dependent_gain.gain_slope": np.array(1.0)}
+    )
+    without = told.without("speed_dependent_gain")
+    change = told.simulate(z) - without.simulate(without.coordinates(told.named(z)))
+    fitting, bare = baseline_noise(replace(record, measured=record.measured + change), plant([]))
+    late = bare.model.with_effect(SpeedDependentGain).setting_in("speed_dependent_gain", 85.0)
+    fit = fitting.fit(late, late.coordinates(bare.known)[None], iterations=15)
+    # without the gain's level it stopped at 85 s, or went on to 39.5 s
+    assert set_in(fitting, fit, "speed_dependent_gain").model.onsets["speed_dependent_gain"] == pytest.approx(
+        60.0, abs=3.0
+    )

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter, savgol_filter
 
 from avtorch.gap import plant
 from avtorch.gap.budget.analysis_record import AnalysisRecord
@@ -15,12 +16,12 @@ from avtorch.gap.budget.redundancy import without_one
 from avtorch.gap.budget.repaired_model import parameters_of
 from avtorch.gap.budget.robust_fit import RobustFit
 from avtorch.gap.budget.selection_step import Selection, Step
-from avtorch.gap.effects import Backlash, ConstantResistance, DeadTime, SensorBias
+from avtorch.gap.effects import Backlash, ConstantResistance, DeadBand, DeadTime, SensorBias
 from avtorch.gap.simulator.effect import Effect
 from avtorch.io import Log
 from tests.bars import student
 
-from .cars import log_of
+from .cars import DT, log_of
 
 
 def with_effects(log: Log, *kinds: type[Effect]) -> tuple[RobustFit, Step, Step]:
@@ -80,3 +81,20 @@ def test_sizes_are_by_that_noise_and_rollouts_by_the_search(fresh_seed: int) -> 
     assert bias.sd < parameters_of(plain, "sensor_bias")["bias_mps2"].sd
     assert abs(bias.mean - 0.15) < student(fitting.folds - 1) * bias.sd
     assert with_sizes(Selection(fitting, (bare,))).sized is bare
+
+
+@pytest.mark.parametrize("computed", ["row to row", "over eleven rows", "behind a low-pass"])
+def test_an_acceleration_that_was_computed_from_the_speed_is_no_second_channel(computed: str, fresh_seed: int) -> None:
+    # the noise of both would be that of the computation: with it the lag of 0.35 s came out as 0.49, 0.94 and 0.92
+    plain = log_of([DeadBand(0.25)], seed=fresh_seed)
+    assert plain.speed is not None
+    step = np.gradient(plain.speed, plain.time)
+    if computed == "over eleven rows":
+        step = savgol_filter(plain.speed, 11, 2, deriv=1, delta=DT)
+    elif computed == "behind a low-pass":
+        step = lfilter([DT / 0.3], [1.0, DT / 0.3 - 1.0], step)
+    log = Log.from_arrays(name="car", time=plain.time, accel_cmd=plain.accel_cmd, speed=plain.speed, accel=step)
+    fitting, bare, now = with_effects(log, DeadBand)
+    own = with_sizes(Selection(fitting, (bare, replace(now, entered="dead_band")), judging=own_noise(now.fit))).sized
+    searched, found = (float(step.fit.model.values(step.fit.z)["T_L"]) for step in (now, own))
+    assert found == pytest.approx(searched, abs=0.1)
