@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -143,7 +144,7 @@ def watch(
             open_.enter_context(sole_use(state, work="avtorch watch"))
         rows = _source(source, parser, follow=follow, rate=rate, car=car, map=map, unit=unit, state=state)
         kept = None if state is None else KeptCars(state, rows.identity)
-        sink = _sink(out, kept, stop)
+        sink = _sink(out, kept, stop, source)
         open_.callback(sink.close)
         observers = []
         if address is not None:
@@ -184,6 +185,8 @@ def _source(
     if follow and (played or source == "-" or is_mqtt(source)):
         raise InputError("--follow: has a meaning for a file of lines alone; leave it out")
     if source == "-":
+        if sys.stdin is None:
+            raise InputError("-: standard input is closed; needs a file, a topic, or rows by a pipe")
         return StreamSource(parser, sys.stdin.fileno())
     if is_mqtt(source):
         # by its folder: the broker keeps for the next run what comes between two of them
@@ -198,7 +201,7 @@ def _source(
     return FileSource(source, parser, follow=follow)
 
 
-def _sink(out: str | None, kept: KeptCars | None, stop: Stop) -> Sink:
+def _sink(out: str | None, kept: KeptCars | None, stop: Stop, source: str) -> Sink:
     from avtorch.live import FileSink, LineSink, MqttAddress, MqttSink
     from avtorch.live.mqtt import is_mqtt
 
@@ -206,7 +209,16 @@ def _sink(out: str | None, kept: KeptCars | None, stop: Stop) -> Sink:
         return LineSink()
     if is_mqtt(out):
         return MqttSink(MqttAddress.of(out), stop)
+    if _are_one_file(source, out):
+        raise InputError(f"--out: {quoted(out)} is the source itself; needs another name")
     return FileSink(out, resume=kept is not None and kept.same_source)
+
+
+def _are_one_file(source: str, out: str) -> bool:
+    try:
+        return os.path.samefile(source, out)
+    except (OSError, ValueError):  # not there yet, or a source that is no file
+        return False
 
 
 def host_and_port(text: str) -> tuple[str, int]:

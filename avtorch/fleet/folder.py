@@ -38,7 +38,7 @@ def task_key(step: Step, sha256: str | None, settings: FleetSettings) -> str:
 
 def label_of(log: FleetLog) -> dict[str, Any]:
     """What is known of a log beside its content."""
-    return {"car": log.car, "log": log.place, "date": log.date, "tags": dict(log.tags)}
+    return {"car": log.car, "log": log.shown, "date": log.date, "tags": dict(log.tags)}
 
 
 @dataclass(frozen=True)

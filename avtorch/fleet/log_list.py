@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Literal
 
-from avtorch.errors import InputError
+from avtorch.errors import InputError, printable
 from avtorch.fleet.manifest import is_manifest, read_manifest
 from avtorch.fleet.marks import is_rows
 from avtorch.fleet.places import file_system, is_url, url_of
@@ -43,6 +43,11 @@ class FleetLog:
     car: str
     date: str | None = None
     tags: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def shown(self) -> str:
+        """The place as rows, answers and messages show it, bytes that are no text escaped."""
+        return printable(self.place)
 
     @property
     def identity(self) -> str:
@@ -116,14 +121,31 @@ def _named(paths: Sequence[str]) -> LogList:
     several = len(set(folders.values())) > 1
     cars = {path: PurePath(folders[path]).name if several else _stem(path) for path in paths}
     if several:
-        # folders of one name in different places, such as fleet_a/car_1 and fleet_b/car_1
-        names = Counter(PurePath(folder).name for folder in set(folders.values()))
-        cars = {p: "/".join(PurePath(folders[p]).parts[-2:]) if names[c] > 1 else c for p, c in cars.items()}
+        names = _apart(set(folders.values()))
+        cars = {path: names[folder] for path, folder in folders.items()}
     else:
         names = Counter(cars.values())
         cars = {p: PurePath(p).name if names[c] > 1 else c for p, c in cars.items()}
-    logs = tuple(FleetLog(path, cars[path] or "car") for path in paths)
+    logs = tuple(FleetLog(path, printable(cars[path]) or "car") for path in paths)
     return LogList(logs, "folder" if several else "file")
+
+
+def _apart(folders: Iterable[str]) -> dict[str, str]:
+    """A name for each folder: its last part, and before it as many as tell it from others that end alike.
+
+    So fleet_a/car_1 and fleet_b/car_1 are two cars, as red/run_1/data and blue/run_1/data are.
+    """
+    alike: dict[str, list[str]] = {}
+    for folder in folders:
+        alike.setdefault(PurePath(folder).name, []).append(folder)
+    names = {}
+    for together in alike.values():
+        parts = {folder: PurePath(folder).parts for folder in together}
+        count = 1
+        while len({parts[folder][-count:] for folder in together}) < len(together):
+            count += 1
+        names |= {folder: "/".join(parts[folder][-count:]) for folder in together}
+    return names
 
 
 def _logs_of(source: str, leave_out: Path | None) -> list[str]:
@@ -141,18 +163,25 @@ def _logs_of(source: str, leave_out: Path | None) -> list[str]:
         return [source]
     if glob.has_magic(source):
         matched = sorted(glob.glob(source, recursive=True))
-        found = [
-            x for p in matched for x in ([p] if not os.path.isdir(p) or is_recording(p) else _below(Path(p), leave_out))
-        ]
+        found = [log for path in matched for log in _matched(Path(path), leave_out)]
         if found:
             return found
         raise InputError(f"{place(source)}: matches no log; needs a glob such as 'logs/**/*.csv'")
     raise InputError(f"{place(source)}: no such file")
 
 
+def _matched(path: Path, leave_out: Path | None) -> list[str]:
+    """What a glob names with one of its matches; nothing of the fleet's own folder, nor other answers."""
+    if leave_out is not None and Path(os.path.abspath(path)).is_relative_to(leave_out):
+        return []
+    if path.is_dir() and not is_recording(path):
+        return _below(path, leave_out)
+    return [] if _is_answer(path) else [str(path)]
+
+
 def _below(folder: Path, leave_out: Path | None) -> list[str]:
     found: list[str] = []
-    for root, folders, names in os.walk(folder):
+    for root, folders, names in os.walk(folder, onerror=_closed):
         here = Path(root)
         folders[:] = sorted(
             f for f in folders if not f.startswith(".") and Path(os.path.abspath(here / f)) != leave_out
@@ -163,9 +192,14 @@ def _below(folder: Path, leave_out: Path | None) -> list[str]:
     return sorted(found)
 
 
+def _closed(fault: OSError) -> None:
+    raise InputError(f"{place(fault.filename or '.')}: cannot be searched for logs ({fault.strerror or fault})")
+
+
 def _is_log(path: Path) -> bool:
-    """Whether a file of a folder is one to read: a table or a recording, and nothing that avtorch has written there."""
-    if path.name.startswith(".") or not path.is_file() or _is_answer(path):
+    """Whether a file of a folder is one to read: a table or a recording, no manifest, and nothing that avtorch has
+    written there."""
+    if path.name.startswith(".") or not path.is_file() or _is_answer(path) or is_manifest(str(path)):
         return False
     return _is_table(path.name) or is_recording(path)
 

@@ -30,7 +30,7 @@ class ManifestRow:
 
 
 def is_manifest(source: str) -> bool:
-    """Whether a file is a manifest and no log: a `.csv` whose header has `log`, and no `time` as every log has."""
+    """Whether a file is a manifest and no log: a `.csv` whose header has `log`, and `car` or no `time` as logs have."""
     if not source.lower().endswith(".csv"):
         return False
     try:
@@ -41,8 +41,16 @@ def is_manifest(source: str) -> bool:
             head = _head(Path(source))
     except (InputError, OSError, ValueError):
         return False
-    names = [name.strip().lower() for name in head.split(",")]
-    return "log" in names and "time" not in names
+    try:
+        names = [name.strip().lower() for name in next(csv.reader([head], delimiter=_delimiter(head)), [])]
+    except csv.Error:
+        return False
+    return "log" in names and ("car" in names or "time" not in names)
+
+
+def _delimiter(head: str) -> str:
+    """What separates the columns of a header: a comma, or the semicolon of spreadsheets where the comma is decimal."""
+    return ";" if ";" in head and "," not in head else ","
 
 
 def _head(path: Path) -> str:
@@ -69,7 +77,7 @@ def read_manifest(source: str) -> list[ManifestRow]:
     except UnicodeDecodeError as fault:
         line = raw.count(b"\n", 0, fault.start) + 1
         raise InputError(f"{shown}: line {line}: is not UTF-8; a manifest is a CSV file in UTF-8") from None
-    reader = csv.reader(io.StringIO(text), strict=True)
+    reader = csv.reader(io.StringIO(text), delimiter=_delimiter(text.partition("\n")[0]), strict=True)
     rows: list[ManifestRow] = []
     first: dict[str, int] = {}
     try:

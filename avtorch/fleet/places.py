@@ -74,9 +74,15 @@ def content_hash(log: Path) -> tuple[str, int]:
     That is the mapping beside it, the files that it names, and the databases beside a CAN log. Raises `InputError` for
     what is no regular file, or folder of such files.
     """
-    own = sorted(p for p in log.rglob("*") if p.is_file()) if log.is_dir() else [log]
+    try:
+        own = sorted(p for p in log.rglob("*") if p.is_file()) if log.is_dir() else [log]
+        files = (*own, *_beside(log))
+    except InputError:
+        raise
+    except (OSError, ValueError) as fault:  # a name too long or with a null, a folder that is closed
+        raise InputError(f"{place(log)}: cannot be read ({_why(fault)})") from None
     state, size = hashlib.sha256(), 0
-    for number, file in enumerate((*own, *_beside(log))):
+    for number, file in enumerate(files):
         try:
             info = os.stat(file)
             if not stat.S_ISREG(info.st_mode):  # opening a pipe would wait for its writer
@@ -85,8 +91,10 @@ def content_hash(log: Path) -> tuple[str, int]:
                 digest = hashlib.file_digest(stream, "sha256")
         except FileNotFoundError:
             raise InputError(f"{place(file)}: no such file") from None
-        except OSError as fault:
-            raise InputError(f"{place(file)}: cannot be read ({fault.strerror or fault})") from None
+        except InputError:
+            raise
+        except (OSError, ValueError) as fault:
+            raise InputError(f"{place(file)}: cannot be read ({_why(fault)})") from None
         state.update(f"{file.name}:{info.st_size}:".encode("utf-8", "backslashreplace"))
         state.update(digest.digest())
         size += info.st_size if number < len(own) else 0
@@ -105,6 +113,10 @@ def _beside(log: Path) -> list[Path]:
     if log.suffix.lower() in _CAN and log.is_file():
         found += sorted(p for p in log.parent.glob("*.dbc") if p.is_file())
     return found
+
+
+def _why(fault: OSError | ValueError) -> str:
+    return printable(str(getattr(fault, "strerror", None) or fault), 160)
 
 
 def _reason(fault: Exception) -> str:

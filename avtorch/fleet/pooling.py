@@ -32,19 +32,28 @@ Drive = Mapping[str, tuple[float, float]]
 class Pooling:
     """The `quantities` of `cars`, each with one drive or more; all cars, numbered in order, are those of `names`.
 
-    `margin` is the density over all of them, `mean` (draw, quantity) the draws of the mean over cars.
+    `spread`: what cars are expected to differ by, None: as much as lags do. `margin` is the density over all of them,
+    `mean` (draw, quantity) the draws of the mean over cars.
     """
 
-    def __init__(self, cars: Mapping[str, Sequence[Drive]], quantities: Sequence[str], seed: int = 0) -> None:
+    def __init__(
+        self,
+        cars: Mapping[str, Sequence[Drive]],
+        quantities: Sequence[str],
+        seed: int = 0,
+        *,
+        spread: float | None = None,
+    ) -> None:
         import torch
 
         from avtorch.inference import SamplerSettings, sample
 
         self.names = [name for name, drives in cars.items() if drives]
         self.drives = sum(len(cars[name]) for name in self.names)
-        self.margin = _margin(cars, self.names, quantities)
+        self.margin = _margin(cars, self.names, quantities, spread)
         many = len(self.names) > SAMPLED
-        few = _margin(cars, random.Random(seed).sample(self.names, SAMPLED), quantities) if many else self.margin
+        chosen = random.Random(seed).sample(self.names, SAMPLED) if many else self.names
+        few = _margin(cars, chosen, quantities, spread) if many else self.margin
         # its draws are also what every car is drawn in by: fewer and longer chains than for one window
         settings = SamplerSettings(chains=64, draws=64, burn_in=16)
         self._posterior = sample(few, settings, generator=torch.Generator().manual_seed(seed))
@@ -92,14 +101,17 @@ def interval(draws: Tensor) -> dict[str, float]:
     return dict(zip(("median", "q05", "q95"), at, strict=True))
 
 
-def _margin(cars: Mapping[str, Sequence[Drive]], names: Sequence[str], quantities: Sequence[str]) -> PopulationMargin:
+def _margin(
+    cars: Mapping[str, Sequence[Drive]], names: Sequence[str], quantities: Sequence[str], spread: float | None
+) -> PopulationMargin:
     import torch
 
-    from avtorch.inference.population import PopulationMargin
+    from avtorch.inference.population import SPREAD, PopulationMargin
 
     drives = [(number, drive) for number, name in enumerate(names) for drive in cars[name]]
     values, sd = (
         torch.tensor([[drive[q][part] for _, drive in drives] for q in quantities], dtype=torch.float64)
         for part in (0, 1)
     )
-    return PopulationMargin(values, sd, torch.tensor([number for number, _ in drives]))
+    number = torch.tensor([number for number, _ in drives])
+    return PopulationMargin(values, sd, number, spread=SPREAD if spread is None else spread)

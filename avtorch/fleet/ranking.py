@@ -33,6 +33,7 @@ _CHECK = ["status", "error"]
 _WINDOW = ["status", "error", "used", "end_s", "p_string_stable"]
 _WINDOW += [f"{name}_{part}" for name in ("T_L", "K_L") for part in ("mean", "sd", "q05", "q95")]
 _DIAGNOSIS = ["status", "error", "verdict", "causes", "gap_before", "gap_left", "gap_detected", "summary"]
+_DIAGNOSIS += ["alias_set"]
 _DIAGNOSIS += [f"unexplained_{part}" for part in ("mean", "q05", "q95", "material")]
 
 
@@ -112,7 +113,7 @@ def _car(car: str, logs: Sequence[FleetLog], folder: FleetFolder, settings: Flee
 
 def _log(log: FleetLog, folder: FleetFolder, settings: FleetSettings) -> dict[str, Any]:
     rows = {DATASETS[s]: folder.path(s, log).relative_to(folder.root).as_posix() for s in settings.steps}
-    out: dict[str, Any] = {"log": log.place, "date": log.date, "tags": dict(log.tags), "errors": {}}
+    out: dict[str, Any] = {"log": log.shown, "date": log.date, "tags": dict(log.tags), "errors": {}}
     report = folder.report(log)
     there = "diagnose" in settings.steps and report.is_file()
     out |= {"rows": rows, "report": report.relative_to(folder.root).as_posix() if there else None}
@@ -162,7 +163,9 @@ def _gap(row: Row) -> dict[str, Any]:
         | {"share": None if c["share_mean"] is None else {p: c[f"share_{p}"] for p in ("mean", "q05", "q95")}}
         for c in row["causes"] or ()
     ]
-    alike = sorted({name for c in row["causes"] or () for name in c.get("alias_set") or ()})
+    # a pair's name is those of two with a plus between
+    aliases = [*(row["alias_set"] or ()), *(name for c in row["causes"] or () for name in c.get("alias_set") or ())]
+    alike = sorted({name for alias in aliases for name in alias.split("+")} - {"none", "unknown"})
     unexplained = {part: row[f"unexplained_{part}"] for part in ("mean", "q05", "q95", "material")}
     out = {"detected": row["gap_detected"], "before": row["gap_before"], "left": row["gap_left"]}
     out |= {"verdict": row["verdict"], "causes": causes, "summary": row["summary"], "alike": alike}

@@ -152,7 +152,7 @@ def _plan(
                     continue
                 name = f"{step}-{Path(log.file_name).stem}"
                 of[name] = log
-                tasks.append(Task(name, step, log.place, sha256, size, settings, report=report))
+                tasks.append(Task(name, step, log.identity, sha256, size, settings, report=report, shown=log.shown))
     # what is soon done first, and the longest diagnoses before the short ones, which then fill the last gaps
     tasks.sort(key=lambda task: (STEPS.index(task.step), -task.size))
     return _Plan(tasks, of, kept, list(unread.values()))

@@ -14,6 +14,7 @@ from avtorch.fleet.places import content_hash, fetched
 from avtorch.fleet.rows import Row, check_rows, diagnosis_rows, failure_rows, window_rows
 from avtorch.fleet.settings import FleetSettings, Step
 from avtorch.io import Damaged, Log
+from avtorch.io.opening import place
 from avtorch.logcheck.check import check
 from avtorch.version import __version__
 
@@ -27,7 +28,7 @@ class Task:
 
     `checkpoint`: a file that keeps what was finished, for a worker that comes after one that was killed; None where
     workers share no disk with the caller. `report`: makes the page of a diagnosis, where one is wanted; a function that
-    the worker can import.
+    the worker can import. `shown`: the place as the caller has it, for messages; None: as it is.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Task:
     settings: FleetSettings
     checkpoint: str | None = None
     report: Callable[[Diagnosis], str] | None = None
+    shown: str | None = None
     version: str = __version__
 
 
@@ -53,35 +55,31 @@ class Outcome:
 def work(task: Task) -> Outcome:
     """Do a task. Raises nothing but what ends the process."""
     begun = time.perf_counter()
-    page = None
+    page, where = None, task.place
     try:
         if task.version != __version__:
             raise RuntimeError(f"this worker has avtorch {__version__}, needs {task.version}")
         with fetched(task.place) as local:
+            where = str(local)
+            if content_hash(local)[0] != task.sha256:
+                raise RuntimeError("the log was changed while the fleet ran; needs another run")
             try:
-                found, page = _rows(task, local)
-                rows = [_named_by_its_place(row, task, local) for row in found]
+                rows, page = _rows(task, local)
             except Damaged:
                 raise  # of the checkpoint, not of the log
             except InputError as fault:
-                rows = [_named_by_its_place(row, task, local) for row in failure_rows("failed", str(fault))]
+                rows = failure_rows("failed", str(fault))
     except InputError as fault:
-        rows = failure_rows("crashed", str(fault))  # a store that could not be reached may be there tomorrow
+        rows = failure_rows("crashed", str(fault))  # what could not be reached may be there tomorrow
     except Exception as fault:
         rows = failure_rows("crashed", printable(f"{type(fault).__name__}: {fault}", 400))
+    for row in rows:
+        if row.get("error") is not None:  # on a copy from a store, or by a path that the caller did not give
+            row["error"] = row["error"].replace(place(where), task.shown or task.place)
     return Outcome(rows, time.perf_counter() - begun, page)
 
 
-def _named_by_its_place(row: Row, task: Task, local: Path) -> Row:
-    """Sentences on a copy from a store name where it is from."""
-    if row.get("error") is not None:
-        row["error"] = row["error"].replace(str(local), task.place)
-    return row
-
-
 def _rows(task: Task, local: Path) -> tuple[list[Row], str | None]:
-    if content_hash(local)[0] != task.sha256:
-        raise RuntimeError("the log was changed while the fleet ran; needs another run")
     given = task.settings
     read: dict[str, Any] = {name: getattr(given, name) or None for name in ("map", "unit", "stamp")}
     mapped = any(read.values())

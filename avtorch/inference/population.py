@@ -23,8 +23,8 @@ MEAN_SD = 2.0
 """Prior standard deviation of the mean of a logarithm, about 0: a lag within a factor of 50 about a second."""
 
 SPREAD = 0.2
-"""Prior mean of the spreads, whose prior is Gamma(2, 2/0.2): cars of a model differ by a fifth or so, and not by
-nothing. It vanishes at 0, where a half-normal leaves a tail in the logarithm that no sampler crosses well."""
+"""Prior mean of the spreads, whose prior is Gamma(2, 2 / mean): lags of a model's cars differ by a fifth or so, and not
+by nothing. It vanishes at 0, where a half-normal leaves a tail in the logarithm that no sampler crosses well."""
 
 _LOG_2PI = math.log(2 * math.pi)
 
@@ -37,6 +37,8 @@ class _Drives:
         values: Float[Tensor, "quantity drive"],
         sd: Float[Tensor, "quantity drive"],
         car: Int[Tensor, " drive"],
+        *,
+        spread: float = SPREAD,
     ) -> None:
         if values.ndim != 2 or sd.shape != values.shape or car.shape != values.shape[1:]:
             found = f"{tuple(values.shape)}, {tuple(sd.shape)} and {tuple(car.shape)}"
@@ -46,7 +48,9 @@ class _Drives:
         known, drives = car.unique(return_counts=True)
         if len(known) < 2 or not torch.equal(known, torch.arange(len(known), device=known.device)):
             raise InputError("car: needs two cars or more, numbered 0, 1, 2 ... without a gap")
-        self.values, self.sd, self.car = values.double(), sd.double(), car
+        if not (math.isfinite(spread) and spread > 0):
+            raise InputError(f"spread: found {spread:g}, needs a number above 0")
+        self.values, self.sd, self.car, self.spread = values.double(), sd.double(), car, spread
         self.cars = len(known)
         #: whether drives of one car tell its spread from drive to drive; otherwise that is part of `between`
         self.repeated = bool((drives > 1).any())
@@ -94,7 +98,8 @@ class _Drives:
         found = _log_normal(z[..., 0], MEAN_SD**2)
         for i in range(1, len(self.hyper)):
             # Gamma(2, rate), and the Jacobian of the logarithm
-            found = found + 2 * math.log(2 / SPREAD) + 2 * z[..., i] - 2 / SPREAD * z[..., i].exp()
+            rate = 2 / self.spread
+            found = found + 2 * math.log(rate) + 2 * z[..., i] - rate * z[..., i].exp()
         return found
 
     def _start(self) -> Float[Tensor, "quantity hyper"]:
@@ -107,7 +112,7 @@ class PopulationDensity(_Drives):
 
     Parameters: `mean` of the logarithm over cars, `between`, the SD of cars about it, `within`, the SD of a car's
     drives about the car (only where some car has two drives or more), and `car_0`, `car_1`, ..., each the logarithm of
-    the car's quantity. Priors: Normal(0, 2²) of the mean and Gamma(2, 10) of the spreads.
+    the car's quantity. Priors: Normal(0, 2²) of the mean and Gamma(2, 2 / `spread`) of the spreads.
 
     Cars written as themselves have no joint mode: as `between` falls to 0 all cars meet at the mean, and the density
     grows without bound. So `z` has the logarithms of the spreads, and of each car the number of standard deviations
@@ -117,10 +122,11 @@ class PopulationDensity(_Drives):
         values: `(quantity, drive)`, a drive's estimate of the logarithm.
         sd: `(quantity, drive)`, its standard deviation.
         car: `(drive,)`, the number of the drive's car, from 0.
+        spread: prior mean of the spreads.
 
     Raises:
-        InputError: for other shapes, numbers that are not finite, an sd of 0, fewer than two cars, or numbers of cars
-            with a gap.
+        InputError: for other shapes, numbers that are not finite, an sd or spread of 0, fewer than two cars, or numbers
+            of cars with a gap.
 
     Example:
         >>> import torch
@@ -159,14 +165,14 @@ class PopulationDensity(_Drives):
 
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " quantity"]) -> PopulationDensity:
         """The quantities named by `index`."""
-        return PopulationDensity(self.values[index], self.sd[index], self.car)
+        return PopulationDensity(self.values[index], self.sd[index], self.car, spread=self.spread)
 
 
 class PopulationMargin(_Drives):
     """`PopulationDensity` with the cars integrated out: two or three parameters for any number of cars.
 
     Args:
-        values, sd, car: as of `PopulationDensity`.
+        values, sd, car, spread: as of `PopulationDensity`.
 
     Raises:
         InputError: as `PopulationDensity`.
@@ -203,7 +209,7 @@ class PopulationMargin(_Drives):
 
     def select(self, index: Int[Tensor, " chosen"] | Bool[Tensor, " quantity"]) -> PopulationMargin:
         """The quantities named by `index`."""
-        return PopulationMargin(self.values[index], self.sd[index], self.car)
+        return PopulationMargin(self.values[index], self.sd[index], self.car, spread=self.spread)
 
 
 def _log_normal(off: Tensor, variance: Tensor | float) -> Tensor:

@@ -56,6 +56,14 @@ class LineParser:
         self._header: list[str] | None = None
         self._json: bool | None = None
 
+    def begin(self) -> None:
+        """What comes is another file's, with a first line of its own."""
+        self._header = self._json = None
+
+    def begun(self) -> bool:
+        """Whether the first line was seen: a CSV's header, or one that is JSON."""
+        return bool(self._json) or self._header is not None
+
     def row(self, line: bytes, position: int | None = None) -> Row | None:
         """The row of a line; None for an empty line, a header, and what was counted as refused."""
         if not line.strip():
@@ -138,7 +146,7 @@ class LineParser:
         return cells
 
     def _made(self, car: str, time: float, signals: dict[str, Any], position: int | None) -> Row | None:
-        if not car or len(car) > _CAR:
+        if not car or len(car) > _CAR or not _is_text(car):
             return self._refused("corrupt")
         if self._factors:
             return self._scaled(Row(car, time, signals, position))
@@ -151,12 +159,21 @@ class LineParser:
                 name: value * factors[name] if name in factors and value is not None else value
                 for name, value in row.signals.items()
             }
-        except TypeError:
+        except (TypeError, OverflowError):  # an integer of four hundred digits is no float
             return self._refused("implausible")
         return row._replace(time=row.time * factors.get("time", 1.0), signals=signals)
 
     def _refused(self, kind: str) -> None:
         self.counts.refuse(kind)
+
+
+def _is_text(name: str) -> bool:
+    """Whether it can be written: JSON may hold half of a surrogate pair."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _number(text: str) -> float | str | None:

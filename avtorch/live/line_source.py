@@ -147,6 +147,7 @@ class FileSource:
                     yield _batch(self.parser, lines.last(), lines, seekable=True)
                     file.close()
                     self._file = file = self._opened()
+                    self.parser.begin()
                     lines, anew = _Lines(), True
                 else:
                     yield Batch([], lines.position)
@@ -160,14 +161,15 @@ class FileSource:
         size = os.fstat(file.fileno()).st_size
         if start is None or start > size:
             return _Lines(), start is not None
-        first = file.readline(LONGEST)
-        if start >= len(first):
-            # a CSV's header, or what shows that it is JSON, is of every run
-            before = self.parser.counts.to_dict()
-            self.parser.row(first)
-            self.parser.counts.load(before)
+        # a CSV's header, or what shows that it is JSON, is of every run
+        before = self.parser.counts.to_dict()
+        while not self.parser.begun() and file.tell() < start and (line := file.readline(LONGEST)):
+            self.parser.row(line)
+        self.parser.counts.load(before)
+        if file.tell() <= start:
             file.seek(start)
             return _Lines(start), False
+        self.parser.begin()
         file.seek(0)
         return _Lines(), False
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import unquote
 
 from avtorch.errors import InputError, printable, quoted
 from avtorch.live.line_parser import LineParser
@@ -54,23 +55,37 @@ class MqttAddress:
 
     @staticmethod
     def of(url: str) -> MqttAddress:
-        """Raises `InputError` for what is no such URL; its password is not told."""
+        """Raises `InputError` for what is no such URL; its password is not told.
+
+        User and password may hold any character as `%` and two hexadecimal digits, and must so hold `/`, `@` and `:`.
+        """
         scheme, _, rest = url.partition("://")
         authority, _, topic = rest.partition("/")
         login, _, place = authority.rpartition("@")
-        user, _, password = login.partition(":")
-        host, _, port = place.rpartition(":") if ":" in place else (place, "", "")
+        user, _, password = (unquote(part) for part in login.partition(":"))
+        # [::1]:1883, the brackets of IPv6
+        bracketed, _, behind = place[1:].partition("]") if place.startswith("[") else ("", "", "")
+        host, _, port = (bracketed, "", behind.removeprefix(":")) if bracketed else place.partition(":")
         number = port or ("8883" if scheme == "mqtts" else "1883")
-        shown = quoted(f"{scheme}://{place}/{topic}", 80)
-        if scheme not in ("mqtt", "mqtts") or not host or not number.isdecimal() or not 0 < int(number) < 65536:
+        # a password with a slash of its own would else be told as host and topic
+        shown = quoted(f"{scheme}://{rest.rpartition('@')[2]}", 80)
+        if scheme not in ("mqtt", "mqtts") or not host or not _is_port(number):
             raise InputError(f"MQTT: found {shown}, {_NEED}")
+        if "@" in topic and "@" not in authority and ":" in authority:
+            need = "in a password / is %2F; where there is none, needs @ before the host"
+            raise InputError(f"MQTT: found @ behind the first /, before {shown}; {need}")
         if not topic or "\0" in topic or len(topic.encode()) > 65535:
             raise InputError(f"MQTT: found {shown}, without a topic; {_NEED}")
         return MqttAddress(host, int(number), topic, scheme == "mqtts", user or None, password or None)
 
     @property
     def name(self) -> str:
-        return f"{'mqtts' if self.tls else 'mqtt'}://{self.host}:{self.port}/{self.topic}"
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{'mqtts' if self.tls else 'mqtt'}://{host}:{self.port}/{self.topic}"
+
+
+def _is_port(text: str) -> bool:
+    return text.isascii() and text.isdecimal() and 0 < int(text) < 65536
 
 
 def is_mqtt(text: str) -> bool:

@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO, Any, Protocol
 
 from avtorch.errors import InputError
 from avtorch.io.answers import json_text
@@ -43,6 +43,17 @@ class Sink(Protocol):
 def line_of(answer: Answer) -> str:
     """The answer as one line of JSON, with its line end."""
     return json_text(answer.entry, indent=None, ascii_only=True).strip() + "\n"
+
+
+def _answered(entry: Any) -> tuple[str, int]:
+    """The car and the number of the window of an answer; 0 for one that has none, as the refusal of a car.
+
+    Raises `ValueError` or another error of bad lines for what is no answer, such as the rows of a source.
+    """
+    car, window = entry["car"], entry.get("window", 0)
+    if type(car) is not str or type(window) is not int or "accel_cmd" in entry:
+        raise ValueError("no answer")
+    return car, window
 
 
 class LineSink:
@@ -116,9 +127,8 @@ class FileSink(LineSink):
                     break
                 whole += len(line)
                 try:
-                    entry = json.loads(line)
-                    car, window = entry["car"], entry.get("window", 0)
-                except (ValueError, TypeError, KeyError, AttributeError):
+                    car, window = _answered(json.loads(line))
+                except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
                     raise InputError(
                         f"{self.path}, line {number}: is no answer of avtorch watch; needs another name for --out"
                     ) from None

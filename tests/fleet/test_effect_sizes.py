@@ -57,6 +57,24 @@ def test_a_size_of_either_sign_stays_what_it_is() -> None:
     assert bias["within"] is None, "no car has two drives"
 
 
+def test_a_skewed_belief_is_taken_by_the_ends_of_its_interval() -> None:
+    """Log-normal about 0.1 s, whose mean is 0.138: eight such drives do not say 0.138."""
+    skewed = {
+        "value_mean": 0.138,
+        "value_sd": 0.13,
+        "value_q05": 0.1 * math.exp(-1.316),
+        "value_q95": 0.1 * math.exp(1.316),
+    }
+    drives = [drive_sizes([{"name": "dead_time", "parameters": [{"name": "delay_s", **skewed}]}])]
+    common, _ = effect_sizes("dead_time", {str(i): drives for i in range(8)})
+    assert common["delay_s"]["typical"]["median"] == pytest.approx(0.1, rel=0.05)
+    # an end that the parameter cannot have: by mean and standard deviation
+    edge = {"value_mean": 0.2, "value_sd": 0.02, "value_q05": -0.1, "value_q95": 0.5}
+    (belief,) = drive_sizes([{"name": "dead_time", "parameters": [{"name": "delay_s", **edge}]}])["dead_time"].values()
+    (plain,) = late(0.2, sd=0.02)[0]["dead_time"].values()
+    assert belief == plain
+
+
 def test_what_is_no_car_s_and_what_no_drive_tells_is_left_out() -> None:
     assert drive_sizes([cause("road_grade", grade_rms=(0.02, 0.001))]) == {}
     assert drive_sizes([cause("gain_change", gain_ratio=(0.7, 0.1), change_s=(30.0, 1.0))]) == {}

@@ -11,6 +11,7 @@ import pytest
 from avtorch.errors import InputError
 from avtorch.fleet import find_logs, run_fleet
 from avtorch.fleet.places import content_hash, fetched
+from avtorch.io import write_json
 from tests.fleet.drives import QUICK, drive, write_fleet
 
 
@@ -53,6 +54,28 @@ def test_several_folders_are_cars(here: Path) -> None:
     }
 
 
+def test_folders_that_end_alike_are_told_apart_by_as_many_names_as_it_takes(here: Path) -> None:
+    touch("d/red/run_1/data/log.csv", "d/blue/run_1/data/log.csv", "d/blue/run_2/data/log.csv", "d/green/log.csv")
+    assert list(found("d")[0].values()) == ["blue/run_1/data", "blue/run_2/data", "green", "red/run_1/data"]
+
+
+def test_a_name_that_is_no_text_is_a_log(here: Path, scheduler: str) -> None:
+    write_fleet(here, {"red": 0.4})
+    os.rename(b"red/drive.csv", b"red/m_\xe4.csv")
+    answer = run_fleet(".", "out", settings=QUICK, scheduler=scheduler)
+    assert [(car["car"], car["reason"]) for car in answer["cars"]] == [("m_\\udce4", "sound")]
+    write_json("again.json", answer)
+
+
+def test_what_cannot_be_opened_is_a_row(here: Path, scheduler: str) -> None:
+    write_fleet(here, {"red": 0.4})
+    Path("fleet.csv").write_text(f"log,car\nred/drive.csv,red\n{300 * 'x'}.csv,blue\na\0.csv,green\n")
+    cars = {car["car"]: car for car in run_fleet("fleet.csv", "out", settings=QUICK, scheduler=scheduler)["cars"]}
+    assert {name: car["reason"] for name, car in cars.items()} == {"red": "sound", "blue": "failed", "green": "failed"}
+    assert "cannot be read (File name too long)" in cars["blue"]["logs"][0]["errors"]["check"]
+    assert "null" in cars["green"]["logs"][0]["errors"]["check"]
+
+
 def test_a_folder_is_searched_for_what_can_be_read(here: Path) -> None:
     touch("logs/a.csv", "logs/README.md", "logs/a.toml", "logs/.hidden.csv", "logs/.git/x.csv", "logs/deep/er/b.TXT")
     Path("logs/drive.mcap").write_bytes(b"\x89MCAP0\r\n")
@@ -72,6 +95,13 @@ def test_what_avtorch_wrote_in_a_folder_is_no_log(here: Path, scheduler: str) ->
     assert [log.place for log in find_logs(".").logs] == ["red/drive.csv"]
     drive().write("red/drive.parquet")
     assert len(find_logs(".").logs) == 2
+    # the same by a glob, which finds the fleet's own folder and other answers too
+    globbed = find_logs("**/*.parquet", leave_out="red/out").logs
+    assert (
+        [log.place for log in globbed] == [log.place for log in find_logs("**/*.parquet").logs] == ["red/drive.parquet"]
+    )
+    Path("red/fleet.csv").write_text("log,car\ndrive.csv,red\n")
+    assert len(find_logs(".").logs) == 2, "a manifest is no log"
 
 
 @pytest.mark.parametrize(
@@ -131,6 +161,21 @@ def test_an_error_in_a_manifest_names_file_row_and_column(text: str | bytes, mes
         find_logs("fleet.csv")
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        '"log","car"\n"a.csv","red"\n',
+        "log;car\na.csv;red\n",
+        "log,car,time\na.csv,red,noon\n",
+        "log,car\r\na.csv,red\r\n",
+    ],
+)
+def test_a_manifest_as_other_programs_write_it(text: str, here: Path) -> None:
+    Path("fleet.csv").write_bytes(text.encode())
+    (log,) = find_logs("fleet.csv").logs
+    assert (log.place, log.car) == ("a.csv", "red")
+
+
 def test_a_log_with_a_column_called_log_is_no_manifest(here: Path) -> None:
     Path("a.csv").write_text("time,accel_cmd,speed,log\n0,0,1,1\n")
     assert found("a.csv") == ({"a.csv": "a"}, "file")
@@ -152,7 +197,7 @@ def test_the_hash_of_a_log_is_that_of_all_that_it_is_read_with(here: Path) -> No
     Path("b.csv").write_text("not its own")
     assert digest() == seen[-1]
     os.mkfifo("pipe")
-    with pytest.raises(InputError, match="pipe: is a named pipe"):
+    with pytest.raises(InputError, match=r"^pipe: is a named pipe"):
         content_hash(Path("pipe"))
 
 

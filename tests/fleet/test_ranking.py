@@ -122,6 +122,16 @@ def test_a_car_unlike_its_siblings_comes_after_those_that_changed(fleet: Fleet) 
     assert cars[1]["siblings"]["T_L"]["tail"] < 1e-3 < cars[2]["siblings"]["T_L"]["tail"]
 
 
+def test_what_a_verdict_cannot_tell_from_its_cause_is_one_that_the_car_may_have(fleet: Fleet) -> None:
+    """Causes of chance are no parts of the gap: what they are alike stands in the verdict alone."""
+    alike = {"alias_set": ["outliers", "gust", "dead_time+gust"]}
+    for number in range(9):
+        fleet.drive(f"car {number}", [window(0.3, 1.0)], diagnosis("outliers", 1.2) | alike)
+    fleet.drive("other", [window(0.3, 1.0)], diagnosis("gust", 1.2) | {"alias_set": ["gust"]})
+    causes = {cause["name"]: cause for cause in fleet.answer()["causes"]}
+    assert (causes["gust"]["cars"], causes["gust"]["may"], causes["gust"]["verdict"]) == (1, 10, "not decided")
+
+
 def test_causes_are_those_of_the_cars_diagnoses(fleet: Fleet) -> None:
     late: dict[str, Any] = {"name": "dead_time", "alias_set": ["dead_time", "slow"], "probability": 0.9}
     for number in range(6):

@@ -192,7 +192,8 @@ def test_metrics_are_served_while_it_runs(here: Path, capsys: pytest.CaptureFixt
         (["rows.jsonl", "--lateness", "-1"], "--lateness: found -1"),
         (["rows.jsonl", "--unit", "speed=furlong"], "furlong"),
         (["rows.jsonl", "--out", "."], ".: is no regular file"),
-        (["mqtt://localhost"], "MQTT: found 'mqtt://localhost/', without a topic"),
+        (["rows.jsonl", "--out", "./rows.jsonl"], "--out: './rows.jsonl' is the source itself"),
+        (["mqtt://localhost"], "MQTT: found 'mqtt://localhost', without a topic"),
         (["rows.jsonl", "--out", "mqtt://localhost/a/#"], "answers need one topic"),
     ],
 )
@@ -202,6 +203,14 @@ def test_bad_input_is_one_line(here: Path, capsys: pytest.CaptureFixture[str], a
     assert out == ""
     assert told in err
     assert err.count("\n") == 1
+
+
+def test_a_closed_standard_input_is_one_line(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", None)
+    assert main(["watch", "-"]) == 2
+    assert "standard input is closed" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("module", ["paho", "prometheus_client"])

@@ -116,6 +116,7 @@ def test_corrupt_messages_are_counted_by_kind():
         b'{"car": "red", "time": 1.0, "accel_c\n': "corrupt",
         b"\xff\xfe\x00\n": "corrupt",
         b"[1, 2]\n": "corrupt",
+        b'{"car": "\\ud800", "time": 1.0, "accel_cmd": 0.1, "accel": 0.1, "jerk": 0, "speed": 3}\n': "corrupt",
         b'{"car": {"a": 1}, "time": 1.0}\n': "corrupt",
         b'{"car": "red", "accel_cmd": 0.1, "accel": 0.1, "jerk": 0, "speed": 3}\n': "incomplete",
         b'{"car": "red", "time": 5.0, "accel_cmd": 0.1, "jerk": 0, "speed": 3}\n': "incomplete",
@@ -140,6 +141,13 @@ def test_corrupt_messages_are_counted_by_kind():
         expected[kind] = expected.get(kind, 0) + 2
     assert counts.refused == expected
     assert [json.loads(line) for line in told.getvalue().splitlines()] == answered(rows)[1]
+
+
+def test_a_number_too_large_for_its_unit_is_implausible():
+    counts = Counts()
+    parser = LineParser(counts, unit=["speed=km/h"])
+    assert parser.row(b'{"time": 1, "accel_cmd": 0, "speed": 1' + 400 * b"0" + b"}") is None
+    assert counts.refused == {"implausible": 1}
 
 
 def test_one_wrong_time_does_not_make_the_rows_behind_it_late():

@@ -196,6 +196,20 @@ def test_an_address_does_not_tell_its_password() -> None:
     address = MqttAddress.of("mqtts://me:secret@broker.example/a/b#c")
     assert (address.user, address.password, address.port, address.topic) == ("me", "secret", 8883, "a/b#c")
     assert "secret" not in address.name
-    with pytest.raises(InputError) as fault:
-        MqttAddress.of("mqtt://me:secret@broker.example")
-    assert "secret" not in str(fault.value)
+    for url in ("mqtt://me:secret@broker.example", "mqtt://me:se/secret@host/a", "mqtt://me:1/secret@host/a"):
+        with pytest.raises(InputError) as fault:
+            MqttAddress.of(url)
+        assert "secret" not in str(fault.value)
+
+
+def test_parts_of_an_address_may_hold_any_character() -> None:
+    address = MqttAddress.of("mqtt://me:a%2Fb%40c@[::1]:1884/cars")
+    assert (address.password, address.host, address.port, address.name) == (
+        "a/b@c",
+        "::1",
+        1884,
+        "mqtt://[::1]:1884/cars",
+    )
+    assert MqttAddress.of("mqtt://[::1]/cars").port == 1883
+    assert MqttAddress.of("mqtt://host/cars@home").topic == "cars@home"
+    assert MqttAddress.of("mqtt://@host:1884/cars@home").topic == "cars@home"

@@ -148,6 +148,30 @@ def test_a_file_is_followed_cut_and_replaced(tmp_path: Path) -> None:
     assert not watch.counts.refused
 
 
+def test_a_file_that_takes_the_place_of_another_has_a_header_of_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_text("time,accel_cmd,speed\n1,0.5,20\n")
+    parser, stop, rows = LineParser(Counts()), Stop(), []
+    source = FileSource(path, parser, follow=True)
+    for batch in source.batches(stop):
+        rows += batch.rows
+        if len(rows) == 2:
+            stop.set()
+        elif len(rows) == 1 and not (tmp_path / "old").exists():
+            path.rename(tmp_path / "old")
+            path.write_text("time,speed,accel_cmd\n2,20,0.5\n")
+    assert [row.signals for row in rows] == [{"accel_cmd": 0.5, "speed": 20.0}] * 2
+    assert not parser.counts.refused
+
+
+def test_what_follows_is_read_by_a_header_below_empty_lines(tmp_path: Path) -> None:
+    text = "\n\ntime,accel_cmd,speed\n1,0.5,20\n"
+    (tmp_path / "rows.csv").write_text(text + "2,0.5,20\n")
+    source = FileSource(tmp_path / "rows.csv", LineParser(Counts()))
+    rows = [row for batch in source.batches(Stop(), len(text)) for row in batch.rows]
+    assert [row.time for row in rows] == [2.0]
+
+
 def test_states_of_other_settings_and_damaged_ones_are_refused(tmp_path: Path) -> None:
     (tmp_path / "rows.jsonl").write_bytes(lines(fleet(4.0)))
     watch, source, kept = begin(tmp_path, SETTINGS["map"])
@@ -170,3 +194,13 @@ def test_a_file_of_something_else_is_not_written_to(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="line 1: is no answer of avtorch watch"):
         FileSink(tmp_path / "notes.txt")
     assert (tmp_path / "notes.txt").read_text() == "mine\n"
+    for line in (
+        '{"car": "red", "time": 1, "accel_cmd": 0, "speed": 9}',
+        '{"car": "red", "window": "x"}',
+        '{"car": ["red"]}',
+        "[]",
+    ):
+        (tmp_path / "rows.jsonl").write_text(f"{line}\n{line}")
+        with pytest.raises(InputError, match="line 1: is no answer of avtorch watch"):
+            FileSink(tmp_path / "rows.jsonl", resume=True)
+        assert (tmp_path / "rows.jsonl").read_text() == f"{line}\n{line}"
