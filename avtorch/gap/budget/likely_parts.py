@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from avtorch.gap.budget.own_noise import judged, with_sizes
+from avtorch.gap.budget.own_noise import evidence_by_own_noise, judged, with_sizes
 from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.budget.parts import LIKELY, MATERIAL
-from avtorch.gap.budget.robust_fit import Fit
 from avtorch.gap.budget.selection_step import Selection, one_by_one, without_effects
 from avtorch.gap.budget.share_order import largest_first, own_response
 
@@ -33,13 +32,17 @@ def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int 
 
 
 def _parts(selection: Selection, material: float, seed: int) -> Selection:
-    """The selection's parts in order; where an effect is none, what its going does to the others is looked at anew."""
-    while len(selection.steps) > 1:
-        parts = largest_first(selection, material, seed=seed)
-        if len(parts.steps) in (1, len(selection.steps)):
-            return parts
-        selection = _asked_anew(selection, parts.last.fit)
-    return selection
+    """The selection's parts in order; where an effect is none, the evidence for the others is asked anew.
+
+    None of them leaves by that: which of several unlikely ones does is decided with limits in view.
+    """
+    parts = largest_first(selection, material, seed=seed)
+    if len(parts.steps) in (1, len(selection.steps)):
+        return parts
+    fitting, judging = parts.fitting, parts.judging
+    evidence = evidence_by_own_noise(fitting, fitting if judging is None else judging, parts.last.fit)
+    bare, *steps = parts.steps
+    return replace(parts, steps=(bare, *(replace(step, evidence=evidence[str(step.entered)]) for step in steps)))
 
 
 def probabilities(selection: Selection) -> dict[str, float]:
@@ -58,25 +61,27 @@ def _without_one_of(selection: Selection, names: Sequence[str]) -> Selection:
 
     Two forces that explain the same may each be unlikely beside the other. On the AV-21's lap the resistance went,
     its drag then had to stand in for it, rested at a limit and went too, and nothing was left of a force of 600 nats.
+    So what would rest at a limit is tried as well: it stands in for the one that would leave.
     """
-    without = [_without(selection, names[0])]
-    while _rests(without[-1]) and len(without) < len(names):
-        without.append(_without(selection, names[len(without)]))
-    return without[0] if _rests(without[-1]) else without[-1]
+    order, without = list(names), list[Selection]()
+    while len(without) < len(order):
+        without.append(_without(selection, order[len(without)]))
+        resting = _resting(without[-1])
+        if not resting:
+            return without[-1]
+        order += [name for name in resting if name not in order]
+    return without[0]
 
 
-def _rests(selection: Selection) -> bool:
+def _resting(selection: Selection) -> list[str]:
+    """The effects at a limit."""
     fit = selection.last.fit
-    return any(fit.model.at_limit(fit.z, name) for name in fit.model.names)
+    return [name for name in fit.model.names if fit.model.at_limit(fit.z, name)]
 
 
 def _without(selection: Selection, name: str) -> Selection:
-    return _asked_anew(selection, without_effects(selection.fitting, selection.last.fit, [name]))
-
-
-def _asked_anew(selection: Selection, fit: Fit) -> Selection:
-    """The selection with the model of `fit` in place of its last, and the evidence for each of its effects."""
     fitting, judging = selection.fitting, selection.judging
+    fit = without_effects(fitting, selection.last.fit, [name])
     last, evidence = judged(fitting, fitting if judging is None else judging, fit)
     aliases = {str(s.entered): s.aliases for s in selection.steps[1:]}
     return replace(selection, steps=(selection.steps[0], *one_by_one(fitting, last, evidence, aliases)))

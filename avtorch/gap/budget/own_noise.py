@@ -47,18 +47,35 @@ def judged(fitting: RobustFit, judging: RobustFit, fit: Fit) -> tuple[Step, dict
     The model that stays is fitted under the noise of the search, `fitting`. A slow force has the stronger evidence of
     the two.
     """
-    slow = {effect.name for effect in fit.model.effects if _is_slow(effect)}
-    own = judging.fit(fit.model, fit.z[None])
-    now, step = Step(fit, fitting.hold_out(fit)), Step(own, judging.hold_out(own))
+    now, step = Step(fit, fitting.hold_out(fit)), _under_its_own(judging, fit)
     while True:
-        without = {name: without_one(judging, step, name) for name in step.fit.model.names}
-        searched = {name: without_one(fitting, now, name) for name in without if name in slow}
-        evidence = {name: _stronger(s.evidence, searched.get(name, s).evidence) for name, s in without.items()}
+        without, evidence = _each_beside_the_others(fitting, judging, now, step)
         weakest = min(evidence, key=lambda name: evidence[name].of_entry, default=None)
         if weakest is None or evidence[weakest].of_entry > 0:
             return now, evidence
         step, rest = without[weakest], without_effects(fitting, now.fit, [weakest])
         now = Step(rest, fitting.hold_out(rest))
+
+
+def evidence_by_own_noise(fitting: RobustFit, judging: RobustFit, fit: Fit) -> dict[str, Evidence]:
+    """The evidence for each effect of the model of `fit`, as `judged` takes it; none of them leaves."""
+    now, step = Step(fit, fitting.hold_out(fit)), _under_its_own(judging, fit)
+    return _each_beside_the_others(fitting, judging, now, step)[1]
+
+
+def _under_its_own(judging: RobustFit, fit: Fit) -> Step:
+    own = judging.fit(fit.model, fit.z[None])
+    return Step(own, judging.hold_out(own))
+
+
+def _each_beside_the_others(
+    fitting: RobustFit, judging: RobustFit, now: Step, step: Step
+) -> tuple[dict[str, Step], dict[str, Evidence]]:
+    """The model without each effect by `judging`, from `step`, and the evidence; `now` is the same by the search."""
+    slow = {effect.name for effect in now.fit.model.effects if _is_slow(effect)}
+    without = {name: without_one(judging, step, name) for name in step.fit.model.names}
+    searched = {name: without_one(fitting, now, name) for name in without if name in slow}
+    return without, {name: _stronger(s.evidence, searched.get(name, s).evidence) for name, s in without.items()}
 
 
 def _is_slow(effect: type[Effect]) -> bool:
@@ -75,8 +92,7 @@ def with_sizes(selection: Selection) -> Selection:
     judging, fit = selection.judging, selection.last.fit
     if judging is None or not fit.model.names:
         return replace(selection, own=None)
-    own = judging.fit(fit.model, fit.z[None])
-    return replace(selection, own=Step(own, judging.hold_out(own)))
+    return replace(selection, own=_under_its_own(judging, fit))
 
 
 def _under(fit: Fit) -> RobustFit:

@@ -2,50 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from types import SimpleNamespace
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, cast
 
 import pytest
 
 from avtorch.gap.budget import likely_parts
+from avtorch.gap.budget.held_out_evidence import Evidence
+from avtorch.gap.budget.selection_step import Selection, Step
 
 
 @pytest.mark.parametrize(
     ("drives_to_a_limit", "leaves"),
     [
-        (set(), "resistance"),
-        ({"resistance"}, "drag"),
-        ({"resistance", "drag"}, "creep"),
-        ({"resistance", "drag", "creep"}, "resistance"),
+        ({}, "resistance"),
+        ({"resistance": "creep"}, "drag"),
+        ({"resistance": "creep", "drag": "resistance"}, "creep"),
+        ({"resistance": "drag", "drag": "resistance", "creep": "drag"}, "resistance"),
+        # a likely one that only stands in for the unlikely
+        ({"resistance": "gear", "drag": "gear", "creep": "gear"}, "gear"),
     ],
 )
 def test_the_one_that_drives_no_other_to_a_limit(
-    drives_to_a_limit: Collection[str], leaves: str, monkeypatch: pytest.MonkeyPatch
+    drives_to_a_limit: Mapping[str, str], leaves: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def without(selection: Any, name: str) -> Any:
         return name
 
     monkeypatch.setattr(likely_parts, "_without", without)
-    monkeypatch.setattr(likely_parts, "_rests", lambda name: name in drives_to_a_limit)
+    monkeypatch.setattr(
+        likely_parts, "_resting", lambda name: [drives_to_a_limit[name]] if name in drives_to_a_limit else []
+    )
     whole: Any = None
     assert likely_parts._without_one_of(whole, ["resistance", "drag", "creep"]) == leaves
 
 
-def test_what_the_going_of_an_immaterial_effect_does_to_the_others_is_looked_at_anew(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A dead time of 47 nats beside a filter that is no part had 300 without it."""
+def test_beside_an_effect_that_is_no_part_the_evidence_is_asked_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dead time of 47 nats beside a filter that is no part had 300 without it; none leaves by that."""
+    weak, strong = Evidence(47.0, 3.0, 10), Evidence(300.0, 9.0, 10)
 
-    def drives(*names: str, anew: bool) -> Any:
-        return SimpleNamespace(steps=("bare", *names), last=SimpleNamespace(fit=names), anew=anew)
+    def selection(*names: str) -> Any:
+        steps = [Step(cast(Any, name), cast(Any, None), name, weak) for name in names]
+        return Selection(cast(Any, None), (Step(cast(Any, "bare"), cast(Any, None)), *steps), 3)
 
-    monkeypatch.setattr(
-        likely_parts, "largest_first", lambda s, material, seed: s if s.anew else drives("dead_time", anew=False)
-    )
-    monkeypatch.setattr(likely_parts, "_asked_anew", lambda s, fit: drives(*fit, anew=True))
-    found: Any = likely_parts._parts(drives("sensor_lag", "dead_time", anew=False), 0.03, 0)
-    assert (found.steps, found.anew) == (("bare", "dead_time"), True)
+    monkeypatch.setattr(likely_parts, "largest_first", lambda s, material, seed: selection("dead_time"))
+    monkeypatch.setattr(likely_parts, "evidence_by_own_noise", lambda fitting, judging, fit: {fit: strong})
+    found = likely_parts._parts(selection("sensor_lag", "dead_time"), 0.03, 0)
+    assert [(step.entered, step.evidence) for step in found.steps[1:]] == [("dead_time", strong)]
     # where none leaves nothing is asked
-    kept: Any = likely_parts._parts(drives("dead_time", anew=False), 0.03, 0)
-    assert not kept.anew
+    assert likely_parts._parts(selection("dead_time"), 0.03, 0).steps[1].evidence == weak
