@@ -47,7 +47,9 @@ def check(
     elif proposal is None:
         talk.line(f"Read as {mapping_beside(log)} says.")
     elif proposal.needed:
-        if yes or _agreed(talk, beside):
+        if found.fault is not None:
+            talk.line(f"Nothing was written: as proposed the log cannot be read yet; {beside} may name what is missing")
+        elif yes or _agreed(talk, beside):
             with atomic(beside) as file:
                 file.write(proposal.toml(log.name))
             talk.line(f"Written to {beside}. Next: avtorch estimate {log}, or avtorch diagnose {log}")

@@ -227,7 +227,7 @@ def _of_cause(comparison: Comparison) -> list[tuple[str, str]]:
     for part in cause.parts:
         others = [name for name in part.alias_set if name != part.name]
         alike = f" (or {', '.join(others)})" if others else ""
-        rows.append((f"cause: {part.name}{alike}", f"probability {part.probability:.2f}"))
+        rows.append((f"cause: {'less ' if part.less else ''}{part.name}{alike}", f"probability {part.probability:.2f}"))
         for key, q in part.parameters.items():
             unit = unit_of(key)
             name = f"  {words_of(key)}" + ("" if unit == "-" else f" [{unit}]")

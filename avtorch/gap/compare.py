@@ -33,6 +33,7 @@ from avtorch.gap.crossval.folds import blocks_of
 from avtorch.gap.crossval.rollout_errors import HORIZON_S, RolloutMetric, block_squares, reached
 from avtorch.gap.dead_time_or_lag import DeadTimeFit, compare_explanations
 from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
+from avtorch.gap.likelihood.record import Record
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import Change, Comparison, DeadTimeTest, SimulatorChange
 from avtorch.gap.result.diagnosis import LogFacts
@@ -50,6 +51,8 @@ Simulator = GapPlant | str | PathLike[str] | None
 LEVEL = 0.04
 """Significance level: with one car, "no change" is the right answer in more than 95 % of comparisons."""
 _DRAWS = 2000
+_HORIZONS = (HORIZON_S, 5.0, 2.0, 1.0)
+_WHOLE_SHARE = 0.4  # of a side's rows that have a whole rollout behind them
 _CAR = ("T_L", "K_L")
 
 
@@ -148,7 +151,9 @@ def compare(
         p_value=p_value,
         changed=changed,
         simulator=simulator,
-        why=_sentence(car, p_value, simulator, dead_time_test, cause, same=same),
+        why=_sentence(
+            car, p_value, simulator, dead_time_test, cause, same=same, simulators=1 + (given[0] is not given[1])
+        ),
         dead_time_test=dead_time_test,
         cause=cause,
         horizon_s=horizon,
@@ -215,14 +220,35 @@ def _as_fitted(found: FittedModel) -> GapPlant:
 
 def _alike(one: Log, two: Log) -> bool:
     """Whether both logs hold the same rows."""
-    signals = ((getattr(x, name) for x in (one, two)) for name in ("time", "accel_cmd", "accel", "speed"))
+    signals = ((getattr(x, name) for x in (one, two)) for name in ("time", "accel_cmd", "accel", "speed", "usable"))
     return all(a is b if a is None or b is None else np.array_equal(a, b) for a, b in signals)
 
 
 def _horizon(sides: Sequence[_Side]) -> float:
-    """Length of the rollouts [s], up to `HORIZON_S`, that fits the stretches of both sides: errors grow with it."""
+    """Length of the rollouts [s], up to `HORIZON_S`, that fits the stretches of both sides: errors grow with it.
+
+    The longest of which both sides hold enough that is whole. A rollout that begins with its stretch is shorter, and of
+    many overrides most would be.
+    """
     records = [side.found.hypothesis.record for side in sides]
-    return min(reached(RolloutMetric(r.channels[0], HORIZON_S), r) or HORIZON_S for r in records)
+    for horizon in _HORIZONS:
+        if all(_rows_of(_whole(record, horizon)) > _WHOLE_SHARE * record.rows for record in records):
+            return horizon
+    return min(reached(RolloutMetric(r.channels[0], _HORIZONS[-1]), r) or _HORIZONS[-1] for r in records)
+
+
+def _whole(record: Record, horizon: float) -> list[slice]:
+    """The blocks without the rows that have less than `horizon` [s] of their stretch before them."""
+    found: list[slice] = []
+    for block in blocks_of(record, fewest=FEWEST_BLOCKS):
+        stretch = int(record.starts[np.searchsorted(record.starts, block.start, side="right") - 1])
+        begin = max(block.start, stretch + round(horizon / record.dt))
+        found += [slice(begin, block.stop)] if begin < block.stop else []
+    return found if len(found) >= FEWEST_BLOCKS else []
+
+
+def _rows_of(blocks: Sequence[slice]) -> int:
+    return sum(block.stop - block.start for block in blocks)
 
 
 def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float, *, same: bool) -> dict[str, Change]:
@@ -232,7 +258,7 @@ def _gaps(sides: Sequence[_Side], simulators: Sequence[GapPlant], horizon: float
         rng = np.random.default_rng(0 if same else i)
         record = side.found.hypothesis.record
         errors = record.measured - rolled_out(record, simulator)
-        blocks = blocks_of(record, fewest=FEWEST_BLOCKS)
+        blocks = _whole(record, horizon) or blocks_of(record, fewest=FEWEST_BLOCKS)
         squares = block_squares(record, errors, blocks, float(simulator.T_L), horizon)
         rows = np.array([(b.stop - b.start) * record.group for b in blocks], float)
         weights = rng.multinomial(len(blocks), np.full(len(blocks), 1 / len(blocks)), size=_DRAWS)
@@ -265,7 +291,10 @@ def _sentence(
     cause: ChangeCause | None,
     *,
     same: bool,
+    simulators: int,
 ) -> str:
+    if same and simulators == 1:
+        return "Both sides are the same drive and the same simulator: there is nothing to compare."
     if same:
         of_two = {"closer": "The second simulator is closer", "farther": "The second simulator is farther from it"}
         return f"One drive, two simulators. {of_two.get(simulator, 'Neither simulator is measurably closer to it')}."
@@ -281,7 +310,9 @@ def _sentence(
         "farther": "the drives after are farther from the simulator",
         "inconclusive": "the simulator's error has not changed measurably",
     }
-    last = "The drives are too short to name a cause." if cause is None else cause.why
+    last = (
+        "The drives, or the stretches between overrides, are too short to name a cause." if cause is None else cause.why
+    )
     return f"{first}; {words[simulator]}. {last}"
 
 

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Literal
 
 import numpy as np
 
+from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.budget.account import account, divisible, restated
 from avtorch.gap.budget.forward_selection import MOST_PARTS
-from avtorch.gap.budget.parts import MATERIAL
+from avtorch.gap.budget.parts import MATERIAL, Budget
 from avtorch.gap.budget.repaired_model import parameter_draws, repaired_plant
 from avtorch.gap.budget.shrinkage import shrinkage_of
 from avtorch.gap.crossval.attribution import RowAttribution
@@ -40,7 +41,7 @@ from avtorch.gap.selection.aliases import Identifiability
 from avtorch.gap.selection.given_dead_time import given_dead_time
 from avtorch.gap.selection.model_probabilities import favourite, model_probabilities
 from avtorch.gap.selection.plausibility import implausible
-from avtorch.gap.selection.verdict import Candidate, verdict_of
+from avtorch.gap.selection.verdict import Candidate, Verdict, verdict_of
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.effect_choice import chosen_effects
 from avtorch.gap.simulator.plant import GapPlant, plant
@@ -209,6 +210,8 @@ def diagnose(
     named = winner is not None and winner.name != "none"
     # an unknown cause gets the onset of the most probable named effect
     onset = None if verdict.name == "none" or selected is not None else _onset(winner or top, race)
+    if selected is not None and budget is not None:
+        onset = _of_the_only_part(budget, verdict, each)
     alike = {part for name in verdict.alias_set for part in name.split("+")}
     # where nothing is named, no effect closes anything
     held = cross_validate(race, winner, alike=sorted(alike), progress=stages) if named and winner else None
@@ -242,7 +245,7 @@ def diagnose(
         else localise(attribution, onset_s=None if onset is None else onset.from_start_s, lag=race.none.values["T_L"]),
         shrinkage=shrinkage,
         contenders=predictive_models(race, verdict),
-        traces=_traces(each, race, winner, attribution, car if selected is not None else None),
+        traces=_traces(each, race, winner, attribution, car if selected is not None else None, budget),
         remaining=given_dead_time(candidates, verdict, base),
         complete=race.complete,
         scope=race.scope,
@@ -268,13 +271,15 @@ def _traces(
     winner: FittedModel | None,
     attribution: RowAttribution,
     car: GapPlant | None,
+    budget: Budget | None,
 ) -> Traces:
-    """`car`: the simulator with the effects that held-out blocks selected."""
+    """`car`: the simulator with the effects that held-out blocks selected, the parts of the `budget`."""
     record = race.record
     measured = record.measured.mean(-1)
     errors = (race.none if winner is None else winner).errors
-    if car is not None:
-        errors = record.measured - rolled_out(record, car)
+    if car is not None and budget is not None:
+        late = {p.name: p.onset_s - logs[0].epoch_s for p in budget.parts if p.onset_s is not None}
+        errors = record.measured - _setting_in(record, car, late)
     return Traces(
         time=record.time[record.source],
         command=record.command[record.source],
@@ -286,6 +291,21 @@ def _traces(
         stretch=record.stretch,
         uncounted=uncounted(logs, record),
     )
+
+
+def _setting_in(record: Record, car: GapPlant, onsets: Mapping[str, float]) -> FloatArray:
+    """The long rollout of `car`, whose effects in `onsets` [s from the log's start] act from then on."""
+
+    def driven(without: Collection[str]) -> FloatArray:
+        kept = [e for e in car.effects if e.name not in without]
+        return rolled_out(record, GapPlant(kept, T_L=car.T_L, K_L=car.K_L, sigma=car.sigma))
+
+    waiting = sorted(onsets, key=onsets.__getitem__)
+    out, time = driven(waiting), record.time[record.source][:, None]
+    while waiting:
+        onset = onsets[waiting.pop(0)]
+        out = np.where(time >= onset, driven(waiting), out)
+    return out
 
 
 def _draws(found: FittedModel, seed: int) -> Draws:
@@ -328,6 +348,12 @@ class _Onset:
         start = float(record.time[place]) if time is None else time
         stamp = float(record.stamp[place]) if time is None else start + float(record.stamp[place] - record.time[place])
         return cls(stamp, start, int(record.log[place]))
+
+
+def _of_the_only_part(budget: Budget, verdict: Verdict, logs: Sequence[Log]) -> _Onset | None:
+    """The onset of the part that held-out blocks selected, where it is the whole verdict; of several each has one."""
+    found = next((part.onset_s for part in budget.parts if (part.name,) == tuple(verdict.names)), None)
+    return None if found is None else _Onset(found, found - logs[0].epoch_s, 0)
 
 
 def _onset(found: FittedModel | None, race: SearchResult) -> _Onset | None:

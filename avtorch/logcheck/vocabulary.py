@@ -11,7 +11,8 @@ _ACCEL = {"accel", "acceleration", "beschl", "beschleunigung", "acc", "ax", "alo
 _SPEED = {"speed", "veloc", "velocity", "geschw", "geschwindigkeit", "vitesse", "v", "vx", "spd", "vel", "vlon"}
 _COMMAND = {
     "command", "commanded", "request", "requested", "demand", "demanded", "desired", "setpoint", "soll", "reference",
-    "cmd", "req", "des", "dmd", "tgt", "ref", "sp", "set", "target", "control", "ctrl", "u", "wanted",
+    "cmd", "req", "des", "dmd", "tgt", "ref", "sp", "set", "target", "control", "ctrl", "u", "wanted", "dem",
+    "anforderung", "anf", "wunsch",
 }  # fmt: skip
 _LEAD = {"lead", "leader", "front", "preceding", "ahead", "vorder", "object", "obj", "radar", "other", "pov"}
 _OTHER = {
@@ -30,6 +31,11 @@ _OF_BRAKES = {
     "light", "lamp", "switch", "park", "parking", "torque", "temp", "temperature", "on", "disc", "hold",
 }  # fmt: skip
 _OF_STEERING = {"steer", "steering", "driver", "eps", "column", "yaw", "lateral", "hand", "servo", "friction", "loss"}
+_OTHER_FLAGS = {
+    "override", "overridden", "fault", "error", "available", "avail", "ready", "standby", "brake", "braking", "hold",
+    "abs", "esp", "esc", "tcs", "turn", "indicator", "blinker", "lane", "lka", "aeb", "fcw", "warning", "light", "lamp",
+    "door", "wiper", "horn",
+}  # fmt: skip
 _NOW = {
     "speed", "velocity", "accel", "gear", "lane", "position", "distance", "lap", "index", "heading", "battery",
     "target", "leak",
@@ -70,7 +76,7 @@ _SIGNALS: dict[str, _Wanted] = {
     "speed": _Wanted((_SPEED,), _OTHER | _COMMAND | _LEAD, _TURNING | {"raw", "relative", "rel"}),
     "engaged": _Wanted(
         ({"engaged", "enabled", "enable", "active", "autonomous", "automatic", "auto", "autopilot", "acc", "cruise"},),
-        {"speed", "cmd", "accel", "set", "time", "x", "request"},
+        {"speed", "cmd", "accel", "set", "time", "x", "request"} | _OTHER_FLAGS,
     ),
     "spacing": _Wanted(
         ({"gap", "spacing", "headway", "clearance", "distance", "abstand", "range", "drel", "ivs"},),
@@ -92,7 +98,10 @@ _SIGNALS: dict[str, _Wanted] = {
     ),
     "current": _Wanted(({"current", "strom", "amps", "amperes"},), _STATE | _OF_STEERING | _NOW, _ANSWERED),
     "speed_cmd": _Wanted((_SPEED, _COMMAND), _OTHER | _LEAD | _ACCEL | {"measured", "actual"}, _TURNING | {"raw"}),
-    "segment": _Wanted(({"segment", "run", "lap", "drive", "trip"},), {"time", "distance", "speed", "length"}),
+    "segment": _Wanted(
+        ({"segment", "run", "lap", "drive", "trip"},),
+        {"time", "distance", "speed", "length", "driver", "drivetrain", "brake", "override", "mode", "torque", "count"},
+    ),
 }
 _STEM = 4  # letters from which a word may begin with a wanted one, such as `acceleration` with `accel`
 

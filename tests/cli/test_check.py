@@ -50,6 +50,23 @@ def test_yes_writes_what_the_other_commands_read(drive: Path, capsys: pytest.Cap
     assert drive.with_suffix(".toml").read_bytes() == before
 
 
+def test_what_cannot_be_read_as_proposed_is_not_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A command whose word nobody knows is taken for the acceleration, so that there is none."""
+    time = np.arange(0.0, 40.0, 0.05)
+    command = np.sin(0.9 * time) + 0.5 * np.sin(2.1 * time)
+    accel = np.convolve(command, np.full(8, 1 / 8))[: len(time)]
+    rows = zip(time, command, accel, 20 + np.cumsum(accel) * 0.05, strict=True)
+    path = tmp_path / "drive.csv"
+    path.write_text(
+        "\n".join(["t,Zugriff_Beschl,Beschl_laengs,v", *(",".join(f"{x:.4f}" for x in row) for row in rows)])
+    )
+    assert main(["check", str(path), "--yes"]) == 2
+    words = told(capsys)
+    assert "Nothing was written" in words
+    assert "Next:" not in words
+    assert not path.with_suffix(".toml").exists()
+
+
 @pytest.mark.parametrize(("key", "written"), [("", True), ("y", True), ("n", False), (EOFError(), False)])
 def test_one_key_accepts(
     drive: Path,

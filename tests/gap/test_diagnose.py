@@ -3,14 +3,18 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import avtorch
+from avtorch import diagnose
 from avtorch.blindtest import draw_case
 from avtorch.errors import InputError
+from avtorch.gap.effects import SensorBias
 from avtorch.gap.search.checkpoint import SCHEMA
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log, read_sealed, write_sealed
+from tests.gap.budget.cars import log_of
 
 
 def _drive(effect: str, index: int = 0) -> Log:
@@ -70,3 +74,27 @@ def test_the_repaired_simulator_reads_back() -> None:
         pytest.fail(f"verdict {answer.verdict.name}, expected a plain bias to be named")
     again = GapPlant.from_toml(answer.plant.to_toml())
     assert [e.name for e in again.effects] == [e.name for e in answer.plant.effects]
+
+
+def test_the_onset_of_a_part_selected_on_held_out_blocks_is_that_of_the_verdict(
+    tmp_path: Path, fresh_seed: int
+) -> None:
+    """A bias from 75 s on, behind sensors whose noise the likelihood does not describe, by a clock from 1000 s on."""
+    plain, biased = (log_of(effects, seed=fresh_seed) for effects in ([], [SensorBias(0.5)]))
+    accel = np.where(plain.time > 75.0, biased.accel, plain.accel)
+    log = Log.from_arrays(
+        name="car", time=plain.time + 1000.0, accel_cmd=plain.accel_cmd, accel=accel, speed=plain.speed
+    )
+    found = diagnose(log, effects=["dead_time", "sensor_bias"], pairs=False, posterior="laplace")
+    assert found.verdict.names == ("sensor_bias",)
+    assert found.onset_s == pytest.approx(1075.0, abs=1.0)
+    assert found.onset_from_start_s == pytest.approx(75.0, abs=1.0)
+    assert "The gap begins at 75." in str(found)
+    assert "from the start" not in str(found)
+    found.write(tmp_path)
+    assert (tmp_path / "plant.toml").read_text().startswith("# In the log sensor_bias from 75.")
+    # and the repaired simulator's course is the bare one's until then
+    channel = found.traces.channels.index("accel")
+    early = found.traces.time < 74.0
+    moved = np.abs(found.traces.after - found.traces.before)[channel]
+    assert moved[early].max() < 0.2 < moved[found.traces.time > 80.0].mean()

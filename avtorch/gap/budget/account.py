@@ -77,7 +77,7 @@ def account(
     if winner is not None and not winner.blown:
         selection = largest_first(begun, 0.0)
         budget = _as_adequate(budget_of(selection, epoch_s=epoch, **options), candidates)
-        budget = _by_likelihood(budget, candidates, verdict, named, winner)
+        budget = _by_likelihood(budget, candidates, verdict, named, winner, epoch if len(logs) == 1 else None)
         return Account(budget, selection, tuple(candidates), _verdict(budget, verdict), held_out=False)
     selection = select(record, base, kinds, begun=begun, most=most, progress=progress)
     selection = likely_parts(selection, material, seed=seed)
@@ -124,12 +124,18 @@ def _by_likelihood(
     verdict: Verdict,
     named: Sequence[type[Effect]],
     winner: FittedModel,
+    epoch_s: float | None,
 ) -> Budget:
-    """The budget whose parts have the likelihood's probabilities, aliases, parameters and onset."""
+    """The budget whose parts have the likelihood's probabilities, aliases, parameters and onset.
+
+    `epoch_s`: the log's start on its own clock; None: several logs.
+    """
     by_name = {kind.name: kind for kind in named}
     own = next(c for c in candidates if c.name == verdict.name)
     left = budget.unexplained.probability
-    parts = tuple(_part(part, by_name[part.name], own, candidates, verdict, winner, left) for part in budget.parts)
+    parts = tuple(
+        _part(part, by_name[part.name], own, candidates, verdict, winner, left, epoch_s) for part in budget.parts
+    )
     return replace(budget, parts=parts, chance=_chance(candidates, verdict, winner, left))
 
 
@@ -152,16 +158,21 @@ def _part(
     verdict: Verdict,
     winner: FittedModel,
     left: float,
+    epoch_s: float | None,
 ) -> Part:
     aliases = _aliases(part.name, verdict)
     parameters = _own_parameters(part.name, own)
     late = kind.own_onset is not None or winner.onset is not None
+    onset = own.onset_s if late else None
+    own_onset = parameters.get(kind.own_onset or "")
+    if onset is None and epoch_s is not None and own_onset is not None:
+        onset = epoch_s + own_onset.mean  # of a pair, which has no onset of its own
     return replace(
         part,
         alias_set=aliases,
         probability=_probability(aliases, candidates, left),
         parameters=parameters or part.parameters,
-        onset_s=own.onset_s if late else None,
+        onset_s=onset,
         plausible=not implausible(parameters, {}, [kind]),
     )
 

@@ -17,6 +17,7 @@ ONSET_NATS = 6.0
 """What an onset must gain."""
 _TURNS, _ITERATIONS = 6, 8  # of effect and onset at most, and of a fit between two turns
 _LEAST_NATS = 1.0  # that a turn promises
+_NEAR_S = 3.0  # on either side of the onset found first, where each row is priced exactly
 
 
 def may_set_in(model: EffectModel, name: str) -> bool:
@@ -46,9 +47,16 @@ def best_onset(fitting: RobustFit, fit: Fit, name: str) -> tuple[float, float] |
     gain = (weight * (without**2 - with_it**2).sum(0))[by_time]
     # what acting from each row on gains over never
     later = np.cumsum(gain[::-1])[::-1]
-    best = int(np.argmax(np.where(inner[by_time], later, -np.inf)))
-    so_far = float((weight * (without**2 - now**2).sum(0)).sum())
-    return float(record.time[whitening.order[by_time][best]]), float(later[best]) - so_far
+    best = record.time[whitening.order[by_time][int(np.argmax(np.where(inner[by_time], later, -np.inf)))]]
+    # where noise wanders, what sets in shows by its first row most of all: the filter has to see the response switch
+    ends = [record.measured - m.simulate(m.coordinates(fit.known)) for m in (never, always)]
+    onsets = np.unique(record.time[whitening.order[inner]])
+    onsets = onsets[np.abs(onsets - best) <= _NEAR_S]
+    costs = [
+        float((weight * whitening(np.where(record.time >= onset, ends[1], ends[0])) ** 2).sum()) for onset in onsets
+    ]
+    number = int(np.argmin(costs))
+    return float(onsets[number]), float((weight * (now**2).sum(0)).sum()) - costs[number]
 
 
 def set_in(fitting: RobustFit, fit: Fit, name: str, *, turns: int = _TURNS, iterations: int = _ITERATIONS) -> Fit:

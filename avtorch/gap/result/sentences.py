@@ -174,7 +174,7 @@ def budget(found: Findings) -> list[str]:
 def onset(found: Findings) -> list[str]:
     """The sentence on the onset; with several causes one for each that sets in during the drive."""
     late = [] if found.budget is None else [p for p in found.budget.parts if p.onset_s is not None]
-    if late and len(found.verdict.names) > 1 and found.onset_s is None:
+    if late and found.onset_s is None:
         began = found.log.epochs_s[0]
         return [f"{p.name} sets in {(p.onset_s or 0.0) - began:.1f} s after the log's start." for p in late]
     if found.onset_s is not None:
