@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
+from scipy.signal import lfilter
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.budget.analysis_record import MEMORY_S, AnalysisRecord
@@ -68,6 +69,13 @@ class JointWhitening(NoiseWhitening):
         for i, row in enumerate(self.mixed):
             for j, taps in enumerate(row):
                 out[..., i, :] += self.record.filtered(x[..., j, :], taps)[..., self.order]
+        return out
+
+    def since(self, x: FloatArray) -> FloatArray:
+        out = np.zeros_like(x)
+        for i, row in enumerate(self.mixed):
+            for j, taps in enumerate(row):
+                out[..., i, :] += lfilter(taps, [1.0], x[..., j, :])
         return out
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
-from scipy.signal import firwin
+from scipy.signal import firwin, lfilter
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.budget.analysis_record import MEMORY_S, AnalysisRecord
@@ -99,6 +99,13 @@ class NoiseWhitening:
         for c, (taps, sd) in enumerate(zip(self.taps, self.sd / np.sqrt(self.share), strict=True)):
             out[..., c, :] = self.record.filtered(x[..., c, :], taps)[..., self.order] / sd
         return out
+
+    def since(self, x: FloatArray) -> FloatArray:
+        """As a call, of consecutive rows `x` (..., channel, row) of a stretch before which all is zero."""
+        out = [
+            lfilter(taps, [1.0], x[..., c, :]) / sd for c, (taps, sd) in enumerate(zip(self.taps, self.sd, strict=True))
+        ]
+        return np.stack(out, -2) * np.sqrt(self.share)
 
     def by_block(self, squares: FloatArray) -> FloatArray:
         """Sums (..., block) of `squares` (..., channel, counted)."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.budget.effect_model import EffectModel
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.simulator.integrated import Integrated
@@ -39,24 +40,48 @@ def best_onset(fitting: RobustFit, fit: Fit, name: str) -> tuple[float, float] |
     # not the model without an onset, which lacks the parameters that only an effect with one has
     always = fit.model.setting_in(name, -np.inf)
     never = fit.model.without(name)
-    now = fitting.white(fit.model, fit.z)
-    with_it = now if name not in fit.model.onsets else fitting.white(always, always.coordinates(fit.known))
-    without = fitting.white(never, never.coordinates(fit.known))
+    responses = [model.simulate(model.coordinates(fit.known)) for model in (never, always)]
+    without, with_it = (whitening(record.measured - response) for response in responses)
+    now = fitting.white(fit.model, fit.z) if name in fit.model.onsets else with_it
     weight = 0.5 * fitting.weights(now, np.ones(whitening.blocks))
     by_time = np.argsort(whitening.order, kind="stable")
     gain = (weight * (without**2 - with_it**2).sum(0))[by_time]
     # what acting from each row on gains over never
     later = np.cumsum(gain[::-1])[::-1]
-    best = record.time[whitening.order[by_time][int(np.argmax(np.where(inner[by_time], later, -np.inf)))]]
-    # where noise wanders, what sets in shows by its first row most of all: the filter has to see the response switch
-    ends = [record.measured - m.simulate(m.coordinates(fit.known)) for m in (never, always)]
-    onsets = np.unique(record.time[whitening.order[inner]])
-    onsets = onsets[np.abs(onsets - best) <= _NEAR_S]
-    costs = [
-        float((weight * whitening(np.where(record.time >= onset, ends[1], ends[0])) ** 2).sum()) for onset in onsets
-    ]
+    best = whitening.order[by_time][int(np.argmax(np.where(inner[by_time], later, -np.inf)))]
+    change = responses[0] - responses[1]
+    rows, costs = _exactly(fitting, change, without, with_it, weight, near=best, among=np.sort(whitening.order[inner]))
     number = int(np.argmin(costs))
-    return float(onsets[number]), float((weight * (now**2).sum(0)).sum()) - costs[number]
+    return float(record.time[rows[number]]), float((weight * (now**2).sum(0)).sum()) - float(costs[number])
+
+
+def _exactly(
+    fitting: RobustFit,
+    change: FloatArray,
+    without: FloatArray,
+    with_it: FloatArray,
+    weight: FloatArray,
+    *,
+    near: int,
+    among: IntArray,
+) -> tuple[IntArray, FloatArray]:
+    """The rows `among` those within `_NEAR_S` of the row `near`, and what the residuals cost with an onset at each.
+
+    `change` (channel, row) [m/s²] of the residuals by the effect, `without` and `with_it` (channel, counted) white.
+    Where noise wanders, what sets in shows by its first row most of all: the filter has to see the response switch.
+    """
+    whitening = fitting.whitening
+    record, order = whitening.record, whitening.order
+    stretch = next(s.rows for s in record.stretches if s.rows.start <= near < s.rows.stop)
+    reach = round(_NEAR_S / record.dt)
+    rows = among[(np.abs(among - near) <= reach) & (among >= stretch.start) & (among < stretch.stop)]
+    begin, end = int(rows[0]), min(int(rows[-1]) + whitening.taps.shape[1], stretch.stop)
+    switched = np.where(np.arange(begin, end) >= rows[:, None, None], change[:, begin:end], 0.0)
+    inside = (order >= begin) & (order < end)
+    white = without[:, inside] + whitening.since(switched)[..., order[inside] - begin]
+    outside = np.where(order < begin, without, with_it)[:, ~inside]
+    rest = float((weight[~inside] * outside**2).sum())
+    return rows, rest + (weight[inside] * white**2).sum((-2, -1))
 
 
 def set_in(fitting: RobustFit, fit: Fit, name: str, *, turns: int = _TURNS, iterations: int = _ITERATIONS) -> Fit:

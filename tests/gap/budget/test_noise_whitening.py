@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 from avtorch.blindtest import draw_case
 from avtorch.gap import gap_budget
 from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.joint_whitening import JointWhitening
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 from tests.bars import BAR
 from tests.gap.budget.cars import log_of
@@ -37,7 +38,22 @@ def test_a_bias_that_sets_in_is_no_noise() -> None:
     assert log.accel is not None
     stepped = replace(log, accel=log.accel + np.where(log.time > 170.0, 0.75, 0.0))
     (part,) = gap_budget(stepped, effects=["sensor_bias"]).parts
-    assert part.onset_s == pytest.approx(170.0, abs=12.5)  # a block
+    assert part.onset_s == pytest.approx(170.0, abs=0.1)  # two rows
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_what_begins_within_a_stretch_is_filtered_as_in_the_whole(joint: bool, fresh_seed: int) -> None:
+    log = log_of(seconds=90.0, seed=fresh_seed)
+    record = AnalysisRecord.of([replace(log, segment=(log.time > 45.0).astype(int))])
+    noise = np.random.default_rng(fresh_seed).normal(0.0, 0.3, (2, record.rows))
+    made = JointWhitening.vector_autoregressive if joint else NoiseWhitening.autoregressive
+    whitening = made(record, np.asarray(lfilter([1.0], [1.0, -0.9], noise, axis=-1)))
+    begin, end = record.stretches[1].rows.start + 100, record.stretches[1].rows.stop
+    late = np.where((np.arange(record.rows) >= begin) & (np.arange(record.rows) < end), noise, 0.0)
+    inside = (whitening.order >= begin) & (whitening.order < end)
+    found = whitening.since(late[:, begin:end])[:, whitening.order[inside] - begin]
+    np.testing.assert_allclose(found, whitening(late)[:, inside], atol=1e-9)
+    assert not whitening(late)[:, whitening.order < begin].any()
 
 
 def test_a_loop_that_feeds_noise_back_has_no_dead_time() -> None:
