@@ -1,6 +1,7 @@
 """Two drives of one car, and of two."""
 
 import json
+from dataclasses import replace
 from functools import partial
 from io import StringIO
 
@@ -125,6 +126,11 @@ def test_two_simulators_on_one_drive(rotating_seed: int) -> None:
     assert "second simulator is closer" in told.why
     turned = avtorch.compare(log, log, baseline=plant(T_L=0.4, K_L=0.9), baseline_after=plant(T_L=0.2, K_L=0.8))
     assert turned.simulator == "farther"
+    alone = avtorch.compare(log, log, baseline=plant(T_L=0.4, K_L=0.9))
+    assert alone.why == "Both sides are the same drive and the same simulator: there is nothing to compare."
+    # other rows count: no longer one drive
+    hand = replace(log, engaged=log.time > 20.0)
+    assert "drive" not in avtorch.compare(log, hand, baseline=plant(T_L=0.4, K_L=0.9), effects=[]).why.partition(".")[0]
 
 
 @pytest.mark.statistical
