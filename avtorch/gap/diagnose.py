@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Literal
 
 import numpy as np
 
-from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.gap.black_box import BlackBoxSimulator
@@ -279,7 +278,7 @@ def _traces(
     errors = (race.none if winner is None else winner).errors
     if car is not None and budget is not None:
         late = {p.name: p.onset_s - logs[0].epoch_s for p in budget.parts if p.onset_s is not None}
-        errors = record.measured - _setting_in(record, car, late)
+        errors = record.measured - rolled_out(record, car, late)
     return Traces(
         time=record.time[record.source],
         command=record.command[record.source],
@@ -291,21 +290,6 @@ def _traces(
         stretch=record.stretch,
         uncounted=uncounted(logs, record),
     )
-
-
-def _setting_in(record: Record, car: GapPlant, onsets: Mapping[str, float]) -> FloatArray:
-    """The long rollout of `car`, whose effects in `onsets` [s from the log's start] act from then on."""
-
-    def driven(without: Collection[str]) -> FloatArray:
-        kept = [e for e in car.effects if e.name not in without]
-        return rolled_out(record, GapPlant(kept, T_L=car.T_L, K_L=car.K_L, sigma=car.sigma))
-
-    waiting = sorted(onsets, key=onsets.__getitem__)
-    out, time = driven(waiting), record.time[record.source][:, None]
-    while waiting:
-        onset = onsets[waiting.pop(0)]
-        out = np.where(time >= onset, driven(waiting), out)
-    return out
 
 
 def _draws(found: FittedModel, seed: int) -> Draws:

@@ -72,6 +72,7 @@ class JointWhitening(NoiseWhitening):
         return out
 
     def since(self, x: FloatArray) -> FloatArray:
+        """As a call, of consecutive rows `x` (..., channel, row) of a stretch before which all is zero."""
         out = np.zeros_like(x)
         for i, row in enumerate(self.mixed):
             for j, taps in enumerate(row):
