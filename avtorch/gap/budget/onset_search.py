@@ -2,7 +2,8 @@
 
 A model's response switches from one to the other at the onset, so for given parameters two simulations price every row.
 From the best one the parameters are fitted anew, by turns. A score test cannot do that: it knows the response near the
-fit without the effect, whose lag and gain make up for as much of it as they can.
+fit without the effect, whose lag and gain make up for as much of it as they can. Where turns end, onset and parameters
+may be wrong together, and a step of all of them is tried (`onset_step`).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.budget.effect_model import EffectModel
+from avtorch.gap.budget.onset_step import onset_by_step
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.simulator.integrated import Integrated
 
@@ -85,15 +87,33 @@ def _exactly(
 
 
 def set_in(fitting: RobustFit, fit: Fit, name: str, *, turns: int = _TURNS, iterations: int = _ITERATIONS) -> Fit:
-    """The fit with the effect `name` acting from the onset on that fits best, found by turns; `fit` where none does."""
+    """The fit with the effect `name` acting from the onset on that fits best, found by turns; `fit` where none does.
+
+    Where no row is better for the parameters as they are, one is sought for which all of them give way.
+    """
     best = fit
     for _ in range(turns):
-        found = best_onset(fitting, best, name)
-        if found is None or found[1] < _LEAST_NATS:
-            break
-        model = fit.model.setting_in(name, found[0])
-        trial = fitting.fit(model, model.coordinates(best.known)[None], iterations=iterations)
-        if trial.nats >= best.nats:
+        trial = _of_rows(fitting, best, name, iterations) or _of_steps(fitting, best, name, iterations)
+        if trial is None:
             break
         best = trial
     return best
+
+
+def _of_rows(fitting: RobustFit, best: Fit, name: str, iterations: int) -> Fit | None:
+    """A better fit than `best`, from the best row for its parameters."""
+    found = best_onset(fitting, best, name)
+    if found is None or found[1] < _LEAST_NATS:
+        return None
+    model = best.model.setting_in(name, found[0])
+    trial = fitting.fit(model, model.coordinates(best.known)[None], iterations=iterations)
+    return trial if trial.nats < best.nats else None
+
+
+def _of_steps(fitting: RobustFit, best: Fit, name: str, iterations: int) -> Fit | None:
+    """A better fit than `best`, from the onset at which a step of all parameters promises most."""
+    found = onset_by_step(fitting, best, name)
+    if found is None or found.promises < _LEAST_NATS:
+        return None
+    trial = fitting.fit(found.model, found.z[None], iterations=iterations)
+    return trial if trial.nats < best.nats - _LEAST_NATS else None

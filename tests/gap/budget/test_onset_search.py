@@ -100,20 +100,44 @@ def test_blocks_that_were_held_out_say_whether_it_sets_in(sets_in: bool, fresh_s
     assert ("dead_time" in kept.model.onsets) == sets_in
 
 
-def test_parameters_that_only_an_onset_has_are_kept_while_it_is_searched(fresh_seed: int) -> None:
-    """A gain that falls with speed from 60 s on and is another altogether, sought from 25 s too late."""
-    plain = log_of(seconds=120.0, seed=fresh_seed)
+@pytest.mark.parametrize("begun", [None, 85.0])
+def test_onset_and_parameters_that_are_wrong_together_are_left(begun: float | None, fresh_seed: int) -> None:
+    """A gain that falls with speed from 60 s on and is another altogether, sought from all along or 25 s too late.
+
+    The slope comes out as nothing, or of the wrong sign, and then no row is better than another.
+    """
+    plain, name = log_of(seconds=120.0, seed=fresh_seed), "speed_dependent_gain"
     record = AnalysisRecord.for_budget([plain])
-    told = EffectModel(record, plant([]), (SpeedDependentGain,), {"speed_dependent_gain": 60.0})
-    z = told.coordinates(
-        {"speed_dependent_gain.pivot": np.array(-2.0), "speed_dependent_gain.gain_slope": np.array(1.0)}
-    )
-    without = told.without("speed_dependent_gain")
-    change = told.simulate(z) - without.simulate(without.coordinates(told.named(z)))
+    car = EffectModel(record, plant([]), (SpeedDependentGain,), {name: 60.0})
+    z = car.coordinates({f"{name}.pivot": np.array(-2.0), f"{name}.gain_slope": np.array(1.0)})
+    without = car.without(name)
+    change = car.simulate(z) - without.simulate(without.coordinates(car.named(z)))
     fitting, bare = baseline_noise(replace(record, measured=record.measured + change), plant([]))
-    late = bare.model.with_effect(SpeedDependentGain).setting_in("speed_dependent_gain", 85.0)
-    fit = fitting.fit(late, late.coordinates(bare.known)[None], iterations=15)
-    # without the gain's level it stopped at 85 s, or went on to 39.5 s
-    assert set_in(fitting, fit, "speed_dependent_gain").model.onsets["speed_dependent_gain"] == pytest.approx(
-        60.0, abs=3.0
-    )
+    model = bare.model.with_effect(SpeedDependentGain)
+    wrong = model if begun is None else model.setting_in(name, begun)
+    fit = fitting.fit(wrong, wrong.coordinates(bare.known)[None], iterations=15)
+    found = set_in(fitting, fit, name)
+    told = model.setting_in(name, 60.0)
+    values = {key: value for key, value in car.named(z).items() if key.startswith(name)}
+    starts = np.array([told.coordinates(known) for known in (found.known, {**bare.known, **values})])
+    exact = fitting.fit(told, starts, iterations=20)
+    # of 300 draws one came to 0.25 and the others to 0.08 at most; without a step of all parameters, 4 in 10 to 1
+    assert found.nats - exact.nats < 0.4 * (fit.nats - exact.nats)
+
+
+def test_parameters_that_only_an_onset_has_are_kept_while_it_is_searched(fresh_seed: int) -> None:
+    """The gain's own level before an onset: a row's price without it is another car's."""
+    record = AnalysisRecord.for_budget([log_of(seconds=120.0, seed=fresh_seed)])
+    name = "speed_dependent_gain"
+    car = EffectModel(record, plant([]), (SpeedDependentGain,), {name: 60.0})
+    z = car.coordinates({f"{name}.pivot": np.array(-2.0), f"{name}.gain_slope": np.array(1.0)})
+    without = car.without(name)
+    change = car.simulate(z) - without.simulate(without.coordinates(car.named(z)))
+    fitting, bare = baseline_noise(replace(record, measured=record.measured + change), plant([]))
+    told = bare.model.with_effect(SpeedDependentGain).setting_in(name, 60.0)
+    values = {key: value for key, value in car.named(z).items() if key.startswith(name)}
+    exact = fitting.fit(told, told.coordinates({**bare.known, **values})[None], iterations=15)
+    late = fitting.fit(told.setting_in(name, 85.0), exact.z[None], iterations=0)
+    found = best_onset(fitting, late, name)
+    assert found is not None
+    assert found[0] == pytest.approx(60.0, abs=3.0)
