@@ -31,6 +31,11 @@ _OF_SIMULATOR: Mapping[str, tuple[str, Tone]] = {
     "farther": ("the simulator is farther from the car after", "amber"),
     "inconclusive": ("whether the simulator is closer cannot be told", "blue"),
 }
+_ONE_DRIVE = {
+    "closer": "The simulator after is closer to the car",
+    "farther": "The simulator after is farther from the car",
+    "inconclusive": "Which simulator is closer to the car cannot be told",
+}
 
 
 def comparison_html(
@@ -73,7 +78,9 @@ def write_comparison_page(
 # two sets of drives ------------------------------------------------------------------------------------------------
 def _of_drives(found: Comparison, notes: Sequence[str]) -> AnswerPage:
     said, tone = _OF_SIMULATOR[found.simulator]
+    one_drive = found.before == found.after
     car = "The car has changed" if found.changed else "No change of T_L and K_L is detected"
+    heading = _ONE_DRIVE[found.simulator] if one_drive else f"{car}; {said}"
     moved = {**found.car, **found.gap}
     names = [_ROWS.get(name, name).format(horizon=f"{found.horizon_s:.3g}") for name in moved]
     columns = ("quantity", "before (90 %)", "after (90 %)", "after / before (90 %)")
@@ -86,8 +93,8 @@ def _of_drives(found: Comparison, notes: Sequence[str]) -> AnswerPage:
     picture = _ratios("after / before", ratios, table, none)
     return AnswerPage(
         "Comparison",
-        f"before: {_facts(found.before)}; after: {_facts(found.after)}",
-        Section(f"{car}; {said}", (found.why,), (picture,)),
+        _facts(found.before) if one_drive else f"before: {_facts(found.before)}; after: {_facts(found.after)}",
+        Section(heading, (found.why,), (picture,)),
         (
             _cause(found.cause, found.why),
             Section("The data", items=tuple(notes)),

@@ -18,7 +18,7 @@ from avtorch.gap.budget.gap_budget import budget_of, by_chance
 from avtorch.gap.budget.given_effects import given_effects
 from avtorch.gap.budget.likely_parts import likely_parts
 from avtorch.gap.budget.part_odds import PartOdds
-from avtorch.gap.budget.parts import LIKELY, MATERIAL, Budget, ChancePart, Part, percent
+from avtorch.gap.budget.parts import LIKELY, MATERIAL, Budget, ChancePart, Part, own_onset, percent
 from avtorch.gap.budget.selection_step import Selection
 from avtorch.gap.budget.share_order import largest_first
 from avtorch.gap.budget.unexplained_places import placed
@@ -164,9 +164,8 @@ def _part(
     parameters = _own_parameters(part.name, own)
     late = kind.own_onset is not None or winner.onset is not None
     onset = own.onset_s if late else None
-    own_onset = parameters.get(kind.own_onset or "")
-    if onset is None and epoch_s is not None and own_onset is not None:
-        onset = epoch_s + own_onset.mean  # of a pair, which has no onset of its own
+    if onset is None:  # as of a pair, which has no onset of its own
+        onset = own_onset(kind, parameters, epoch_s)
     return replace(
         part,
         alias_set=aliases,

@@ -20,7 +20,7 @@ from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.flexible_regression import left_over
 from avtorch.gap.budget.forward_selection import select
 from avtorch.gap.budget.likely_parts import likely_parts, probabilities
-from avtorch.gap.budget.parts import MATERIAL, Budget, ChancePart, ChannelError, Part, Unexplained
+from avtorch.gap.budget.parts import MATERIAL, Budget, ChancePart, ChannelError, Part, Unexplained, own_onset
 from avtorch.gap.budget.repaired_model import lag_and_gain, parameters_of
 from avtorch.gap.budget.rollout_energy import horizon
 from avtorch.gap.budget.selection_step import Selection, Step
@@ -137,9 +137,11 @@ def _part(
 ) -> Part:
     assert step.entered is not None
     model = selection.last.fit.model
-    onset = model.onsets.get(step.entered)
     parameters = parameters_of(selection, step.entered)
     kind = next(e for e in model.effects if e.name == step.entered)
+    onset = model.onsets.get(step.entered)
+    several = len(set(model.record.log)) > 1
+    since = own_onset(kind, parameters, None if several else epoch_s) if onset is None else onset + epoch_s
     always = set(kind.alike({key: q.mean for key, q in parameters.items()})) - set(model.names)
     return Part(
         name=step.entered,
@@ -148,7 +150,7 @@ def _part(
         share=share,
         after=after,
         parameters=parameters,
-        onset_s=None if onset is None else onset + epoch_s,
+        onset_s=since,
         plausible=not implausible(parameters, {}, [kind]),
     )
 

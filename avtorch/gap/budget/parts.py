@@ -9,6 +9,7 @@ from typing import Any
 from avtorch.gap.crossval.localisation import Location
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.cause_words import named_cause
+from avtorch.gap.simulator.effect import Effect
 
 HORIZON_S = 10.0
 """Of the rollouts whose errors a budget divides [s]."""
@@ -58,6 +59,15 @@ class Part:
             "onset_s": self.onset_s,
             "plausible": self.plausible,
         }
+
+
+def own_onset(kind: type[Effect], parameters: Mapping[str, Quantity], epoch_s: float | None) -> float | None:
+    """Since when [s] an effect acts that has the time among its `parameters`; None of others, or of several logs.
+
+    `epoch_s`: the log's start on its own clock; None: several logs.
+    """
+    own = parameters.get(kind.own_onset or "")
+    return None if own is None or epoch_s is None else epoch_s + own.mean
 
 
 @dataclass(frozen=True)

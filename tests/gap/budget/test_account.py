@@ -13,7 +13,17 @@ import pytest
 
 from avtorch import Leader, diagnose, simulate
 from avtorch.errors import InputError
-from avtorch.gap import Budget, ChancePart, ChannelError, ConstantResistance, Part, SensorBias, Unexplained, plant
+from avtorch.gap import (
+    Budget,
+    ChancePart,
+    ChannelError,
+    ConstantResistance,
+    GainChange,
+    Part,
+    SensorBias,
+    Unexplained,
+    plant,
+)
 from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
@@ -109,6 +119,18 @@ def test_the_likelihood_decides_where_it_holds(faults: Callable[[dict], list[str
     held = found.probability("sensor_bias") + _pairs_with(found, "sensor_bias")
     assert part.probability == pytest.approx(held / (1 - doubt))
     assert faults(found.to_dict()) == []
+
+
+@pytest.mark.parametrize("beside", [[], [SensorBias(0.3)]], ids=["alone", "beside a bias"])
+def test_a_change_of_gain_sets_in_when_its_own_parameter_says(beside: list[SensorBias], fresh_seed: int) -> None:
+    log = log_of([GainChange(0.7, 45.0), *beside], seconds=90.0, seed=fresh_seed)
+    found = diagnose(log, effects=["gain_change", "sensor_bias"], posterior="laplace")
+    assert found.budget is not None
+    assert set(found.verdict.names) == {"gain_change", *(e.name for e in beside)}
+    (part,) = (p for p in found.budget.parts if p.name == "gain_change")
+    # seconds in which the command hardly moves leave the row open
+    assert part.onset_s == pytest.approx(45.0, abs=6.0)
+    assert part.onset_s == pytest.approx(part.parameters["change_s"].mean, abs=0.5)
 
 
 def test_none_is_no_surer_than_a_drive_can_make_it() -> None:

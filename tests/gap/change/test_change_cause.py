@@ -27,6 +27,7 @@ from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import Comparison
 from avtorch.gap.result.diagnosis import LogFacts
 from avtorch.io import Log
+from avtorch.report import comparison_html
 from tests.bars import LEVEL, student
 from tests.gap.budget.cars import log_of
 
@@ -205,6 +206,23 @@ def test_the_terminal_has_rows_for_the_cause() -> None:
     assert "cause:" not in _text(replace(comparison, cause=None))
     assert comparison.to_dict()["cause"] == AMBIGUOUS.to_dict()
     assert replace(comparison, cause=None).to_dict()["cause"] is None
+
+
+def test_terminal_and_page_say_what_there_is_less_of() -> None:
+    before, after = (LogFacts.of([log_of(seconds=20.0, seed=seed)]) for seed in (1, 2))
+    fewer = replace(AMBIGUOUS, parts=(replace(BIAS, less=True),))
+    for cause in (fewer, AMBIGUOUS):
+        comparison = Comparison(before, after, {}, {}, 0.5, False, "inconclusive", "", cause=cause)
+        page = comparison_html(comparison)
+        assert ("less sensor_bias" in page) == ("less sensor_bias" in _text(comparison)) == (cause is fewer)
+        assert "No change of T_L and K_L is detected" in page
+
+
+def test_the_heading_of_one_drive_and_two_simulators_is_of_the_simulators() -> None:
+    facts = LogFacts.of([log_of(seconds=20.0)])
+    page = comparison_html(Comparison(facts, facts, {}, {}, 0.5, False, "closer", "", cause=None))
+    assert "The simulator after is closer to the car" in page
+    assert "No change of T_L and K_L" not in page
 
 
 def _text(comparison: Comparison) -> str:
