@@ -24,6 +24,7 @@ from avtorch.io.units import to_si
 from avtorch.io.validity import check_range, check_rate, check_time, off_clock, stray
 
 _NAME = 40  # characters of the longest column name that may be a signal's, mistyped
+_DEAD_MPS = 1.0  # change of speed that an accelerometer in order notices
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,7 @@ def assemble(
             f"with the log's clock ({elapsed[-1]:.6g} s from {clock_words(float(time[0]))}); at least two are needed"
         )
     signals = {signal: values[keep] for signal, values in signals.items()}
+    _leave_out_dead(signals, mapping, remarks)
     fresh = np.diff(elapsed[keep]) > gap_limit(time_step)
     if "segment" in signals:
         fresh |= np.diff(signals["segment"]) != 0
@@ -118,6 +120,19 @@ def assemble(
     used |= set(mapping.stamp.values())
     ignored = tuple(printable(name, 200) for name in table.names if name not in used)
     return Assembled(signals, segment, ignored, tuple(remarks))
+
+
+def _leave_out_dead(signals: dict[str, FloatArray], mapping: SignalMap, remarks: list[str]) -> None:
+    """Leave out an acceleration that never moves on a drive whose speed does: a lag fitted to it would be minutes."""
+    if "accel" not in signals or "speed" not in signals or np.ptp(signals["accel"]) > 0:
+        return
+    change = float(np.ptp(signals["speed"]))
+    if change > _DEAD_MPS:
+        value = float(signals.pop("accel")[0])
+        remarks.append(
+            f"column {mapping.column.get('accel', 'accel')!r} is {value:g} in every row while speed changes by "
+            f"{change:.3g} m/s: the sensor is dead, and accel left out"
+        )
 
 
 def _with_stated_units(table: Table, mapping: SignalMap) -> SignalMap:

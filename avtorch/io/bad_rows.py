@@ -18,6 +18,7 @@ from avtorch.errors import InputError
 MOST_BAD = 0.05
 """Share of the rows that may be left out for one signal."""
 _TOLD = 3
+_APART = 5.0  # times the range of the others
 
 
 class BadRows:
@@ -55,6 +56,26 @@ def beyond(values: FloatArray, low: float, high: float, plausible: float) -> Boo
     rest = np.abs(values[~bad & ~np.isnan(values)])
     few = 0 < bad.sum() <= MOST_BAD * len(values)
     return bad if few and len(rest) and rest.max() <= plausible else np.zeros(len(values), bool)
+
+
+def codes(values: FloatArray) -> BoolArray:
+    """Values (row,) that lie farther from all others than five times their range: a few, such as -999 for "none".
+
+    They are known without a unit, for which a code of 2 % of the rows would otherwise decide.
+    """
+    known = np.sort(values[np.isfinite(values)])
+    few = int(MOST_BAD * len(known))
+    out = np.zeros(len(values), bool)
+    if not few:
+        return out
+    inner = known[few : len(known) - few]
+    for tail, end, sign in ((known[: few + 1], inner[-1], 1.0), (known[len(known) - few - 1 :][::-1], inner[0], -1.0)):
+        # from the outermost value inwards: how far the next is, and what the rest of the range is from there
+        gap, rest = sign * np.diff(tail), np.abs(end - tail[1:])
+        apart = np.flatnonzero((gap > _APART * rest) & (rest > 0))
+        if len(apart):
+            out |= sign * values <= sign * tail[apart[-1]]
+    return out
 
 
 def out_of_order(time: FloatArray) -> BoolArray:

@@ -83,7 +83,7 @@ class Table:
         """A column as float64, NaN where a cell is no finite number, and what is wrong with each such cell.
 
         An empty cell is no fault where ``empty_is_nan``. Texts may be dates and times of day where ``as_time``, and
-        true and false where ``as_state``.
+        true and false, on and off, yes and no where ``as_state``.
         """
         count = self.names.count(column)
         if count != 1:
@@ -149,7 +149,7 @@ class Readings:
     remarks: tuple[str, ...] = ()
 
 
-_STATES = {"true": 1.0, "false": 0.0}
+_STATES = {"true": 1.0, "false": 0.0, "on": 1.0, "off": 0.0, "yes": 1.0, "no": 0.0}
 
 
 def _is_text(cell: Any) -> bool:

@@ -100,7 +100,7 @@ class _Tried(NamedTuple):
             x, y = self.seconds[i - 1 : i + 2], left[i - 1 : i + 2]
             curve = np.polyfit(x - x[1], y, 2)
             found += float(np.clip(-curve[1] / (2 * curve[0]), x[0] - x[1], x[2] - x[1])) if curve[0] > 0 else 0.0
-        return found, float(1 - left[i] / whole)
+        return found, float(1 - left[i] / whole) if whole > 0 else 0.0
 
     def on_time(self) -> _Tried:
         """The delay of zero alone."""

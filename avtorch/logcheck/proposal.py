@@ -10,7 +10,7 @@ import numpy as np
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import printable
-from avtorch.io.bad_rows import MOST_BAD
+from avtorch.io.bad_rows import MOST_BAD, codes
 from avtorch.io.consistency import scale_between
 from avtorch.io.mapping import PEDALS
 from avtorch.io.segments import gap_limit, stretches
@@ -28,6 +28,7 @@ _TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _RATES_HZ = (9.5, 210.0)
 _LARGEST = 1e9  # of a speed or an acceleration, in any unit
 _TRIED = 60  # columns without a telling name that are compared with the others
+_MOST_STATES = 8  # numbers of a column that says who drives
 _ONE_MOTION, _FOLLOWS = 0.9, 0.8  # correlations from which a column without a name is taken
 # a response that comes so long before its command, and so many rows, by so much more correlation
 _EARLY_S, _EARLY_ROWS, _PLAINLY = 0.08, 2.0, 0.01
@@ -109,8 +110,8 @@ def propose(table: Table) -> Proposal:
     left = [column for column in columns if column.name != time.column]
     for signal in _MOTION:
         _by_name(signal, left, found, reasons)
-    _by_motion(clock, parts, left, found, reasons)
     doubts: list[str] = []
+    _by_motion(clock, parts, left, found, reasons, doubts)
     _swapped(clock, parts, found, reasons)
     units = _units(clock, parts, found, reasons, doubts)
     signals = {"time": time}
@@ -125,7 +126,23 @@ def propose(table: Table) -> Proposal:
     left = [column for column in left if column.name not in used]
     for signal, one in _others(left, signals, found, known).items():
         signals[signal] = one
+    if "engaged" not in signals:
+        doubts += _states(left)
     return Proposal(signals, tuple(doubts))
+
+
+def _states(columns: list[Column]) -> list[str]:
+    """Columns named as one that says who drives, whose numbers may be states: which of them means the controller?"""
+    doubts = []
+    for column in ranked(columns, "engaged"):
+        numbers = np.unique(column.values[np.isfinite(column.values)])
+        if 2 <= len(numbers) <= _MOST_STATES and (numbers == np.round(numbers)).all():
+            name, told = printable(column.name, 30), ", ".join(f"{x:g}" for x in numbers)
+            doubts.append(
+                f"{name} ({told}) may say when the controller drives; if so, name it with --map engaged=COLUMN and in "
+                "the file beside the log, under [state], the numbers that mean it"
+            )
+    return doubts
 
 
 def _time(columns: list[Column]) -> tuple[Proposed | None, FloatArray | None]:
@@ -175,7 +192,7 @@ def _by_what(column: Column) -> str:
 
 def _by_motion(
     clock: FloatArray, parts: list[slice], columns: list[Column], found: dict[str, Column],
-    reasons: dict[str, list[str]],
+    reasons: dict[str, list[str]], doubts: list[str],
 ) -> None:  # fmt: skip
     """Signals that no name tells, by how they go with the others.
 
@@ -194,6 +211,12 @@ def _by_motion(
             if how_much > strength:
                 best, strength = column, how_much
         if best is not None and strength > (_FOLLOWS if signal == "accel_cmd" else _ONE_MOTION):
+            if signal == "accel_cmd" and _one_sided(_filled(best)):
+                doubts.append(
+                    f"the car's motion follows {printable(best.name, 30)} (correlation {strength:.2f}), which is never "
+                    "about zero as an acceleration is; name it with --map throttle=COLUMN, torque=COLUMN or what it is"
+                )
+                continue
             words = {
                 "speed": "its change is the integral of the acceleration",
                 "accel": "its integral is the change of speed",
@@ -201,6 +224,12 @@ def _by_motion(
             }[signal]
             found[signal] = best
             reasons[signal] = [f"no name tells; {words} (correlation {strength:.2f})"]
+
+
+def _one_sided(values: FloatArray) -> bool:
+    """Whether values (row,) have one sign all along and no zero among the usual ones: a pedal's way, a torque."""
+    low, high = np.quantile(values, (0.01, 0.99))
+    return bool(low > 0 or high < 0)
 
 
 def _goes_with(
@@ -366,8 +395,8 @@ def _unit_of_command(signal: str, column: Column) -> str | None:
 
 
 def _filled(column: Column) -> FloatArray:
-    """Values (row,) held where none arrived."""
+    """Values (row,) held where none arrived, or a code for none."""
     values = column.values
-    known = np.flatnonzero(np.isfinite(values))
+    known = np.flatnonzero(np.isfinite(values) & ~codes(values))
     last = np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)
     return values[known[last]]

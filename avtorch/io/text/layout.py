@@ -119,9 +119,11 @@ def _header(head: Sequence[tuple[int, str]], rows: Sequence[tuple[int, list[str]
         return first, ""
     usual = widths.most_common(1)[0][0]
     number, cells = next((number, cells) for number, cells in rows if len(cells) == usual and _has_data(cells))
-    names = [at for at, row in rows if at < number and len(row) == len(cells) and not _has_data(row)]
+    names = [(at, row) for at, row in rows if at < number and len(row) == len(cells) and not _has_data(row)]
     if names:
-        return names[0], ""
+        # a spreadsheet pads the lines before the header with empty cells
+        filled = [sum(bool(cell.strip()) for cell in row) for _, row in names]
+        return names[filled.index(max(filled))][0], ""
     for at, line in reversed([(at, line.strip()) for at, line in head if at < number and line.strip()]):
         mark = next((mark for mark in COMMENT if line.startswith(mark)), None)
         if mark is not None and number == first:
