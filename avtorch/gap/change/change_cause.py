@@ -235,4 +235,6 @@ def detectable_text(name: str, value: float) -> str:
     """A least change with its unit: a share of T_L and K_L, seconds of dead time."""
     if not isfinite(value):
         return "none"
-    return f"{value:.0%}" if name in ("T_L", "K_L") else f"{value:.2g} s"
+    if name not in ("T_L", "K_L"):
+        return f"{value:.2g} s"
+    return f"{value:.0%}" if value > 0.02 else f"{100 * value:.1g}%"

@@ -14,6 +14,7 @@ from avtorch.gap.budget.effect_model import EffectModel
 from avtorch.gap.budget.entry import _from_the_start_or_not
 from avtorch.gap.budget.forward_selection import baseline_noise
 from avtorch.gap.budget.onset_search import best_onset, may_set_in, set_in
+from avtorch.gap.budget.onset_step import onset_by_step
 from avtorch.gap.effects import Backlash, ConstantResistance, DeadTime, GainChange, RoadGrade, SpeedDependentGain
 from avtorch.gap.simulator.effect import Effect
 from avtorch.io import Log
@@ -77,9 +78,27 @@ def test_there_is_none_without_a_block_on_either_side(fresh_seed: int) -> None:
     model = bare.model.with_effect(DeadTime)
     fit = fitting.fit(model, model.coordinates(bare.known)[None])
     found = best_onset(fitting, fit, "dead_time")
+    stepped = onset_by_step(fitting, fit, "dead_time")
     assert found is not None
+    assert stepped is not None
     first, last = (record.time[record.block == number] for number in (0, record.blocks - 1))
-    assert first.max() < found[0] < last.min()
+    for onset in (found[0], stepped.model.onsets["dead_time"]):
+        assert first.max() < onset < last.min()
+
+
+def test_a_step_of_all_parameters_is_one_where_the_onset_is_known(fresh_seed: int) -> None:
+    """From the fit itself nothing is promised; from a later onset, about what the fit at the true one gains."""
+    record = AnalysisRecord.for_budget([changed(DeadTime(0.3), fresh_seed)])
+    fitting, bare = baseline_noise(record, plant([]))
+    told = bare.model.with_effect(DeadTime).setting_in("dead_time", ONSET_S)
+    exact = fitting.fit(told, told.coordinates({**bare.known, "dead_time.delay_s": np.array(0.4)})[None], iterations=15)
+    at_best = onset_by_step(fitting, exact, "dead_time")
+    late = fitting.fit(told.setting_in("dead_time", ONSET_S + 30.0), exact.z[None], iterations=0)
+    from_late = onset_by_step(fitting, late, "dead_time")
+    assert at_best is not None
+    assert from_late is not None
+    assert from_late.model.onsets["dead_time"] == pytest.approx(ONSET_S, abs=6.0)
+    assert from_late.promises > 10 * max(at_best.promises, 1.0)
 
 
 @pytest.mark.parametrize("sets_in", [False, True])

@@ -192,6 +192,7 @@ def test_the_answer_as_json() -> None:
 def test_a_least_change_has_its_unit() -> None:
     assert [detectable_text("K_L", 0.051), detectable_text("dead_time", 0.024)] == ["5%", "0.024 s"]
     assert detectable_text("dead_time", float("inf")) == "none"
+    assert detectable_text("K_L", 0.0031) == "0.3%", "no 0%"
 
 
 def test_the_terminal_has_rows_for_the_cause() -> None:
