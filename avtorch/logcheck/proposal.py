@@ -138,10 +138,8 @@ def _states(columns: list[Column]) -> list[str]:
         numbers = np.unique(column.values[np.isfinite(column.values)])
         if 2 <= len(numbers) <= _MOST_STATES and (numbers == np.round(numbers)).all():
             name, told = printable(column.name, 30), ", ".join(f"{x:g}" for x in numbers)
-            doubts.append(
-                f"{name} ({told}) may say when the controller drives; if so, name it with --map engaged=COLUMN and in "
-                "the file beside the log, under [state], the numbers that mean it"
-            )
+            where = "with --map engaged=COLUMN and in the file beside the log, under [state], the numbers that mean it"
+            doubts.append(f"{name} ({told}) may say when the controller drives; if so, name it {where}")
     return doubts
 
 

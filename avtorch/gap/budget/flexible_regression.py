@@ -2,6 +2,10 @@
 
 It has two uses: what it leaves over is the noise that `noise_whitening` fits, and what it predicts of blocks that were
 held out is reproducible and not explained.
+
+It looks back only. In a closed loop a command answers the noise of the moment, so columns that hold the command of the
+next row predict noise: the fit took 0.5 to 1 Hz from it and left up to twenty times as much below 0.2 Hz, in which
+slow forces were hidden and gusts seen.
 """
 
 from __future__ import annotations
@@ -15,13 +19,14 @@ from avtorch.gap.budget.held_out_evidence import Evidence, agreement
 from avtorch.gap.budget.robust_fit import Fit, M, RobustFit
 from avtorch.gap.likelihood.basis import lowpass
 
+_BACK_S = 0.1  # that columns are late, two rows at least: derivatives and resampled rows hold the next ones
 _DEGREE = 3
 _FEWEST = 8  # knots along the way; fewer follow what changes slowly with time just as well
 _RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)  # of the columns' own sums of squares
 
 
 def columns(fit: Fit[M]) -> FloatArray:
-    """Smooth functions of the rollout's acceleration, commands, speed and time: (column, channel, row).
+    """Smooth functions of the past acceleration of the rollout, commands, speed and time: (column, channel, row).
 
     A force shows in both channels, a fault of the accelerometer in its own alone.
     """
@@ -29,9 +34,10 @@ def columns(fit: Fit[M]) -> FloatArray:
     rollout = fit.model.simulate(fit.z)[0]
     time = (record.time - record.time.min()) / (np.ptp(record.time) + 1e-9) - 0.5
     speed = (record.speed - record.speed[record.counts].mean()) / max(float(record.speed[record.counts].std()), 0.1)
+    back = max(2, round(_BACK_S / record.dt))
     forces = np.concatenate(
         [
-            _forces(record, rollout[s.rows], speed[s.rows], time[s.rows], record.command[s.rows])
+            _late(_forces(record, rollout[s.rows], speed[s.rows], time[s.rows], record.command[s.rows]), back)
             for s in record.stretches
         ],
         -1,
@@ -83,6 +89,12 @@ def _forces(record: AnalysisRecord, a: FloatArray, speed: FloatArray, t: FloatAr
     ]
     rest = [a * v**2, a * t**3, np.tanh(a / 0.1), np.tanh(a / 0.3), np.tanh(jerk / 0.3), play]
     return np.array([*plain, *rest, lowpass(u, 1.0, dt), lowpass(u, 3.0, dt), t, t**2], dtype=float)
+
+
+def _late(x: FloatArray, rows: int) -> FloatArray:
+    """`x` (..., row) so many `rows` later."""
+    rows = min(rows, x.shape[-1])
+    return np.concatenate([np.repeat(x[..., :1], rows, -1), x[..., : x.shape[-1] - rows]], -1)
 
 
 def left_over(fitting: RobustFit, fit: Fit[M], *, places: bool = False) -> FloatArray:
