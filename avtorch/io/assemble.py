@@ -123,11 +123,13 @@ def assemble(
 
 
 def _leave_out_dead(signals: dict[str, FloatArray], mapping: SignalMap, remarks: list[str]) -> None:
-    """Leave out an acceleration that never moves on a drive whose speed does: a lag fitted to it would be minutes."""
+    """Leave out an acceleration that never moves on a drive whose speed is no straight line over time: a lag fitted to
+    it would be minutes."""
     if "accel" not in signals or "speed" not in signals or np.ptp(signals["accel"]) > 0:
         return
-    change = float(np.ptp(signals["speed"]))
-    if change > _DEAD_MPS:
+    time, speed = signals["time"] - signals["time"].mean(), signals["speed"]
+    change = float(np.ptp(speed))
+    if np.ptp(speed - time * (time @ speed) / max(float(time @ time), 1e-12)) > _DEAD_MPS:
         value = float(signals.pop("accel")[0])
         remarks.append(
             f"column {mapping.column.get('accel', 'accel')!r} is {value:g} in every row while speed changes by "

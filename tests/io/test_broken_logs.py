@@ -93,7 +93,7 @@ def test_several_bad_cells_are_counted(tmp_path):
     ("signal", "value", "what"),
     [
         ("engaged", 2.0, "0 (driver) or 1 (engaged)"),
-        ("engaged", "yes", "'yes' is no number"),
+        ("engaged", "maybe", "'maybe' is no number"),
         ("segment", 0.5, "a whole number"),
         ("grade", 3.0, "--unit grade=%"),
         ("jerk", 1e5, "m/s3"),
