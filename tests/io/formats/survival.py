@@ -70,11 +70,14 @@ def refused(path: Path, *words: str, dbc: Sequence[Path] | None = None) -> str:
     return said
 
 
+_MOST_SECONDS = 20  # for one content, of some kilobytes; `apart.MOST_SECONDS` is for recordings
+
+
 def survive(path: Path, contents: Sequence[bytes], dbc: Sequence[Path] | None = None) -> int:
     """How many of the `contents` are read; the others are refused as they should be.
 
-    They are read in a copy of this process: a library that is to run apart may end it, by a fault of memory only. The
-    copy after that goes on behind the content that did.
+    They are read in a copy of this process: a library that is to run apart may end it, by a fault of memory or because
+    it reads without an end, which the process apart has no time for either. The next copy goes on behind that content.
     """
     begun, read = 0, 0
     while begun < len(contents):
@@ -92,7 +95,7 @@ def survive(path: Path, contents: Sequence[bytes], dbc: Sequence[Path] | None = 
         read += said.count(b"1")
         if code == 0:
             break
-        fatal = code in (-signal.SIGSEGV, -signal.SIGABRT, -signal.SIGBUS, -signal.SIGFPE)
+        fatal = code in (-signal.SIGSEGV, -signal.SIGABRT, -signal.SIGBUS, -signal.SIGFPE, -signal.SIGALRM)
         assert fatal, f"content {at} of {len(contents)}: status {code}"
         path.write_bytes(contents[at])
         kind = kind_at(path)
@@ -110,6 +113,7 @@ def _serve(path: Path, contents: Sequence[bytes], dbc: Sequence[Path] | None, an
         limit_memory(apart_process.MOST_MEMORY)
         for content in contents:
             path.write_bytes(content)
+            signal.alarm(_MOST_SECONDS)
             os.write(answers, b"1" if _held(path, dbc) else b"0")
         os._exit(0)
     except BaseException:
