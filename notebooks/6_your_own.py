@@ -89,8 +89,8 @@ for what, answer in (("this minute", quiet), ("a livelier one", without)):
 
 # %% [markdown]
 # With the class among the hypotheses the diagnosis names the effect and its size. Without it it cannot. In this
-# minute nothing is left to explain, as a smaller gain answers such small commands as well: the verdict is `none`. In a
-# livelier minute of the same car an effect of the table stands in for it.
+# minute no effect of the table is likelier there than not, as a smaller gain explains most of it: the verdict is
+# `none`. In a livelier minute of the same car an effect of the table stands in for it.
 #
 # `@register` above the class would make it available everywhere: in strings, in TOML files, in every diagnosis.
 #
