@@ -118,7 +118,8 @@ def in_front(log: Log, size: float) -> None:
         ratio = _ratio(budget, control, effect, put_in)
         same = _same_effects(budget, alone, effect, put_in, changed.epoch_s)
         held = effect in budget.names
-        alike = any(effect in part.alias_set for part in budget.parts if part.name in budget.names)
+        each = (*budget.parts, *budget.chance)
+        alike = any(effect in part.alias_set for part in each if part.name in budget.names)
         tried, named, extra = tried + 1, named + held, extra + bool(others)
         sized += ratio is not None and abs(ratio - 1) <= SIZE_WITHIN
         matched += same is not None and abs(same - 1) <= SIZE_WITHIN

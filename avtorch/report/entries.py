@@ -41,7 +41,8 @@ def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
     for part in budget.chance:
         parameters = _parameters(part.parameters or {}) + ([] if part.plausible else [_IMPLAUSIBLE])
         share = "by chance, part of the noise"
-        rows.append((part.name, share, sentences.number(part.probability), "; ".join(parameters), ""))
+        alike = ", ".join(name for name in part.alias_set if name != part.name)
+        rows.append((part.name, share, sentences.number(part.probability), "; ".join(parameters), alike))
     rows.append(("unexplained", percent(budget.unexplained.share), "", budget.unexplained.places(epoch_s), ""))
     return Table("The gap's budget", columns, tuple(rows), numeric=("probability",))
 

@@ -288,7 +288,7 @@ def _verdict(budget: Budget, by_likelihood: Verdict) -> Verdict:
     own = candidate_name(names)
     swapped = [
         candidate_name({*names} - {part.name} | {alias})
-        for part in budget.parts
+        for part in (*budget.parts, *budget.chance)
         if part.name in names
         for alias in part.alias_set
         if alias not in names

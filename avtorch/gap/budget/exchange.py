@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from avtorch.gap.budget.entry import candidates_for, enter
+from avtorch.gap.budget.redundancy import at_limits
 from avtorch.gap.budget.robust_fit import RobustFit
 from avtorch.gap.budget.selection_step import Step, without_effects
 from avtorch.gap.simulator.effect import Effect
@@ -35,6 +36,8 @@ def exchanged(
         candidates = candidates_for(fitting, before, others, progress, f"in place of {name}")
         step = enter(fitting, before, candidates)
         if step is None or fitting.preference(now.held, step.held).strength() <= 0:
+            continue
+        if not at_limits(step.fit) <= at_limits(now.fit):  # another stands in for what was taken out
             continue
         now, entered[step.fit.model.names[-1]] = step, step
     return now, entered

@@ -31,6 +31,7 @@ from avtorch.gap.quantity import Quantity
 from avtorch.gap.selection.plausibility import implausible
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.effect_choice import chosen_effects
+from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log
 
@@ -85,9 +86,23 @@ def by_chance(selection: Selection, base: GapPlant, kinds: Sequence[type[Effect]
     if not random:
         return ()
     fitting, fit = selection.fitting, selection.last.fit
-    noise, T_L = left_over(fitting, fit), float(fit.model.values(fit.z)["T_L"])
-    found = [slow_disturbance(fitting.whitening.record, noise, T_L, kind) for kind in random]
-    return tuple(part for part in found if part is not None)
+    noise, record = left_over(fitting, fit), fitting.whitening.record
+    T_L, bare = (float(f.model.values(f.z)["T_L"]) for f in (fit, selection.steps[0].fit))
+    found = [(kind, slow_disturbance(record, noise, T_L, kind, bare_lag=bare)) for kind in random]
+    along = [k.name for k in kinds if issubclass(k, Integrated) and k.name not in {*present, *fit.model.names}]
+    return tuple(
+        replace(part, alias_set=tuple(along)) if _within_a_knot(record, kind, part) else part
+        for kind, part in found
+        if part is not None
+    )
+
+
+def _within_a_knot(record: AnalysisRecord, kind: type[Effect], force: ChancePart) -> bool:
+    """Whether a slow `force` could as well belong to places: each is passed once, and it changes between two knots."""
+    if not record.has_speed or len(set(record.log)) > 1:
+        return False
+    lasts = (force.parameters or {})[kind.noise_parameters["force_time"]].mean
+    return lasts * float(np.abs(record.speed[record.counts]).mean()) < record.knot_m
 
 
 def budget_of(

@@ -18,9 +18,10 @@ from avtorch.gap.budget.analysis_record import MEMORY_S, AnalysisRecord
 from avtorch.gap.budget.noise_whitening import NoiseWhitening, calm, pieces
 
 _RIDGE = 1e-6
-_TWO_SIGNALS = -1.5  # log of what knowing both channels leaves of their innovations' variances
+_TWO_SIGNALS = -1.0  # log of what knowing both channels leaves of their innovations' variances
 # simulated drives behind either recorder, and recordings with an accelerometer: -0.03 to -0.73; acceleration computed
-# from the speed: -2.6 by a fit over eleven rows, -3.3 behind a low-pass of 0.3 s, -6.2 from row to row
+# from the speed, 21 drives each: -1.3 to -2.7 by a fit over eleven rows, -2.2 to -3.0 behind a low-pass of 0.3 s, -5.1
+# to -6.9 from row to row
 
 
 @dataclass(frozen=True, eq=False)

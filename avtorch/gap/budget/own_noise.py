@@ -25,7 +25,7 @@ from dataclasses import replace
 from avtorch.gap.budget.held_out_evidence import Evidence
 from avtorch.gap.budget.joint_whitening import of_both_channels
 from avtorch.gap.budget.noise_whitening import LEVEL_S, NoiseWhitening
-from avtorch.gap.budget.redundancy import without_one
+from avtorch.gap.budget.redundancy import at_limits, without_one
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.budget.selection_step import Selection, Step, without_effects
 from avtorch.gap.simulator.effect import Effect
@@ -50,11 +50,14 @@ def judged(fitting: RobustFit, judging: RobustFit, fit: Fit) -> tuple[Step, dict
     now, step = Step(fit, fitting.hold_out(fit)), _under_its_own(judging, fit)
     while True:
         without, evidence = _each_beside_the_others(fitting, judging, now, step)
-        weakest = min(evidence, key=lambda name: evidence[name].of_entry, default=None)
-        if weakest is None or evidence[weakest].of_entry > 0:
+        before = at_limits(now.fit)
+        for weakest in sorted((n for n in evidence if evidence[n].of_entry <= 0), key=lambda n: evidence[n].of_entry):
+            rest = without_effects(fitting, now.fit, [weakest])
+            if at_limits(rest) <= before:  # else another would stand in for it
+                break
+        else:
             return now, evidence
-        step, rest = without[weakest], without_effects(fitting, now.fit, [weakest])
-        now = Step(rest, fitting.hold_out(rest))
+        step, now = without[weakest], Step(rest, fitting.hold_out(rest))
 
 
 def evidence_by_own_noise(fitting: RobustFit, judging: RobustFit, fit: Fit) -> dict[str, Evidence]:

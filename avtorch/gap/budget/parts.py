@@ -74,12 +74,13 @@ def own_onset(kind: type[Effect], parameters: Mapping[str, Quantity], epoch_s: f
 class ChancePart:
     """A random cause, such as a gust: no rollout predicts it, so it is a part of the noise.
 
-    `share_of_noise`: of the variance that is left with all parts; None where it was not estimated.
+    `share_of_noise`: of the variance that is left with all parts; None where it was not estimated. `alias_set`: effects
+    that these drives cannot distinguish from it, itself among them (it is added).
 
     Example:
         >>> from avtorch.gap import ChancePart
-        >>> ChancePart("outliers", 0.97).to_dict()["probability"]
-        0.97
+        >>> ChancePart("gust", 0.97, alias_set=("road_grade",)).to_dict()["alias_set"]
+        ['gust', 'road_grade']
     """
 
     name: str
@@ -87,10 +88,15 @@ class ChancePart:
     share_of_noise: float | None = None
     parameters: Mapping[str, Quantity] | None = None
     plausible: bool = True
+    alias_set: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "alias_set", tuple(sorted({self.name, *self.alias_set})))
 
     def to_dict(self) -> dict[str, Any]:
         return {
             "names": [self.name],
+            "alias_set": list(self.alias_set),
             "probability": self.probability,
             "share_of_noise": self.share_of_noise,
             "parameters": {key: value.to_dict() for key, value in (self.parameters or {}).items()},

@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 from avtorch.gap.budget.held_out_evidence import Evidence
-from avtorch.gap.budget.robust_fit import RobustFit
+from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.budget.selection_step import Step, without_effects
 
 
 def without_the_redundant(
     fitting: RobustFit, step: Step, *, spared: str | None = None
 ) -> tuple[Step, dict[str, Evidence]]:
-    """The model without effects that do not hold their place, weakest first, and the evidence for each that does."""
+    """The model without effects that do not hold their place, weakest first, and the evidence for each that does.
+
+    One stays whose going drives another to a limit of what a fit may take: that would stand in for it.
+    """
     while True:
         without = {name: without_one(fitting, step, name) for name in step.fit.model.names if name != spared}
-        weakest = min(without.values(), key=lambda s: s.evidence.of_entry, default=None)
-        if weakest is None or weakest.evidence.of_entry > 0:
+        before = at_limits(step.fit)
+        leaving = [s for s in without.values() if s.evidence.of_entry <= 0 and at_limits(s.fit) <= before]
+        if not leaving:
             return step, {name: s.evidence for name, s in without.items()}
-        step = weakest
+        step = min(leaving, key=lambda s: s.evidence.of_entry)
+
+
+def at_limits(fit: Fit) -> set[str]:
+    """The effects of a model that rest at a limit."""
+    return {name for name in fit.model.names if fit.model.at_limit(fit.z, name)}
 
 
 def without_one(fitting: RobustFit, step: Step, name: str) -> Step:

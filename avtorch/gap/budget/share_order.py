@@ -55,8 +55,11 @@ def largest_first(selection: Selection, material: float = MATERIAL, *, seed: int
         now = replace(now, held=selection.fitting.hold_out(now.fit))
         without = _without_each(selection, now)
     steps: list[Step] = []
+    bare_energy = relative_energy(selection, bare)
     while without:
-        name = min(without, key=lambda name: relative_energy(selection, without[name]))
+        # of those that reduce the error only together, the one that makes the least of the response goes
+        left = {name: min(relative_energy(selection, step), bare_energy) for name, step in without.items()}
+        name = min(left, key=lambda name: (left[name], own_response(now, name)))
         steps.append(replace(entered[name], fit=now.fit, held=now.held))
         now = without[name]
         without = _without_each(selection, now)

@@ -26,7 +26,8 @@ _BELOW_HZ = 1.0
 _LEAST_S = 15.0  # of rows without a gap, for a periodogram
 _REPEATED = 1 + 2 * ((2 / 3) ** 2 + (1 / 6) ** 2)  # ordinates that say the same, under a Hann window
 _TIMES_S = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0)
-_LAGS = (0.5, 1.0, 2.0)  # times T_L, that the lag of GLVD's own noise may be: other equations of the actuator change it
+_LAGS = (0.5, 1.0, 2.0)  # times a car's lag, that of GLVD's own noise may be: other equations of the actuator change it
+_SLOWEST_S = 1.0  # lag that noise has from an actuator: a bare baseline may have a longer one in place of what it lacks
 _RATIOS = np.exp(np.linspace(-1.6, 1.2, 15))  # of the force's SD to its most likely one
 _NEGLIGIBLE = 1e-9
 _FEWEST = 16  # independent ordinates, some four for each size
@@ -78,9 +79,12 @@ class Periodogram:
 
 
 def slow_disturbance(
-    record: AnalysisRecord, residuals: FloatArray, T_L: float, kind: type[Effect]
+    record: AnalysisRecord, residuals: FloatArray, T_L: float, kind: type[Effect], *, bare_lag: float | None = None
 ) -> ChancePart | None:
     """The random force `kind` in `residuals` (channel, row) [m/s²] of a car with lag `T_L` [s].
+
+    `bare_lag` [s]: that of the baseline without any effect. A dead time leaves little to the lag beside it, and what
+    shakes an actuator passes through all of it: by a lag of 0.03 s the Genesis had a gust of 0.7 s.
 
     Its probability weighs the likelihood's gain against two more parameters (BIC) and against what any effect has to
     gain over none (`calibration.json`). None where it is less likely than not, or where no run is long enough to see.
@@ -91,7 +95,8 @@ def slow_disturbance(
         return None
     omega = 2 * np.pi * seen.frequency
     sensors = [omega**2 if channel == "speed" else np.ones_like(omega) for channel in record.channels]
-    owns = [np.array([1 / (1 + (omega * ratio * T_L) ** 2), *sensors]) for ratio in _LAGS]
+    lags = [ratio * T_L for ratio in _LAGS] + ([] if bare_lag is None else [min(bare_lag, _SLOWEST_S)])
+    owns = [np.array([1 / (1 + (omega * lag) ** 2), *sensors]) for lag in lags]
     bares = [seen.fitted(own)[0] for own in owns]
     own, bare = owns[int(np.argmin(bares))], min(bares)
     forces = [4 * time / (1 + (omega * time) ** 2) for time in _TIMES_S]  # of unit variance

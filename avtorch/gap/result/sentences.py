@@ -247,7 +247,8 @@ def aliases(found: Findings) -> str:
     """The hypotheses that the log cannot distinguish from the verdict."""
     from_words = {"none": "no effect at all", "unknown": "a cause outside the table"}
     if found.budget is not None and len(found.verdict.names) > 2:
-        alike = [(p.name, [n for n in p.alias_set if n != p.name]) for p in found.budget.parts]
+        each = (*found.budget.parts, *found.budget.chance)
+        alike = [(p.name, [n for n in p.alias_set if n != p.name]) for p in each if p.name in found.verdict.names]
         confused = [f"{name} from {' or '.join(others)}" for name, others in alike if others]
         if not confused:
             return "No other known cause explains this log as well."

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from scipy.signal import lfilter
 
 from avtorch.errors import InputError
 from avtorch.gap import ConstantResistance, DeadBand, DeadTime, Effect, RoadGrade, SensorBias, gap_budget
@@ -54,6 +56,22 @@ def test_a_constant_force_is_no_road_and_may_be_a_slope_all_the_way() -> None:
     assert (part.name, part.alias_set) == ("constant_resistance", ("constant_resistance", "road_grade"))
     # 13 % all the way is no road
     assert ConstantResistance.alike({"resistance_mps2": 1.3}) == ()
+
+
+def test_a_slow_force_on_a_road_that_is_driven_once_may_be_that_roads() -> None:
+    """What changes within a block belongs to the time as well as to the place, until the place is passed again."""
+    log, keep = log_of(seed=11), float(np.exp(-0.05 / 3.0))
+    assert log.speed is not None
+    assert log.accel is not None
+    kicks = np.random.default_rng(5).normal(0.0, 0.3 * np.sqrt(1 - keep**2), log.rows)
+    force = np.asarray(lfilter([1.0], [1.0, -keep], kicks))
+    pushed = replace(log, accel=log.accel + force, speed=log.speed + np.cumsum(force) * 0.05)
+    (wind,) = gap_budget(pushed, effects=["gust", "road_grade"]).chance
+    assert (wind.name, wind.alias_set) == ("gust", ("gust", "road_grade"))
+    (wind,) = gap_budget(pushed, effects=["gust"]).chance  # of what was asked
+    assert wind.alias_set == ("gust",)
+    twice = gap_budget([pushed, pushed], effects=["gust", "road_grade"])  # what is finer than its knots stays
+    assert twice.names[0] == "road_grade"
 
 
 def test_a_levelled_road_is_the_same_road_without_its_mean_slope() -> None:

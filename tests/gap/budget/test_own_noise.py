@@ -97,4 +97,5 @@ def test_an_acceleration_that_was_computed_from_the_speed_is_no_second_channel(c
     fitting, bare, now = with_effects(log, DeadBand)
     own = with_sizes(Selection(fitting, (bare, replace(now, entered="dead_band")), judging=own_noise(now.fit))).sized
     searched, found = (float(step.fit.model.values(step.fit.z)["T_L"]) for step in (now, own))
+    # in 31 drives the fit over eleven rows differs by -0.044, with a standard deviation of 0.010
     assert found == pytest.approx(searched, abs=0.1)
