@@ -91,8 +91,8 @@ def diagnose(
     search short, `complete` is False and the verdict provisional: `scope` lists what was tested, and the verdict is
     distinguished only from that. `accel_kind`: whether `accel` is dv/dt or an accelerometer's reading (default: as the
     logs state). `progress(what, done, of)` is called at each step, with `done` of `of` in the whole diagnosis;
-    True is a bar, False none, and None a bar in a notebook only. `checkpoint`: a file that stores fits; a later
-    search of the same logs with the same settings continues from it, to the same answer.
+    True is a bar, False none, and None a bar in a notebook only. `checkpoint`: a file that stores what is finished; a
+    later search of the same logs with the same settings continues from it, to the same answer.
 
     Raises `InputError` for a log without `accel_cmd`, without 10 s of usable driving, for wrong arguments, or for a
     `checkpoint` that is damaged or belongs to other logs or settings.
@@ -137,7 +137,7 @@ def diagnose(
     each, noise_added = [log for log, _ in read], dict.fromkeys(note for _, note in read if note)
     base = baseline if isinstance(baseline, GapPlant) else plant([], baseline=baseline)
     kinds = chosen_effects(effects)
-    race = Search(
+    search = Search(
         each,
         base,
         effects=kinds,
@@ -146,7 +146,8 @@ def diagnose(
         budget_s=budget_s,
         progress=stages,
         checkpoint=checkpoint,
-    ).run()
+    )
+    race = search.run()
     top = favourite(race.found)
     apart = Identifiability.of(race, kinds, prior)
     chances = apart.shared(model_probabilities(race.found, left_over(top, race.record), prior))
@@ -176,6 +177,7 @@ def diagnose(
         most=(MOST_PARTS if pairs else 1) if race.complete else 0,
         seed=seed,
         progress=stages,
+        checkpoint=search.fits.checkpoint,
     )
     if accounted is not None:
         candidates, verdict = list(accounted.candidates), accounted.verdict

@@ -3,7 +3,7 @@
 A sealed file is JSON. Its first line holds the schema and the SHA-256 of everything else, so that the checksum is
 compared before anything is parsed:
 
-    {"schema": "avtorch.fits/2", "sha256": "9f…",
+    {"schema": "avtorch.fits/3", "sha256": "9f…",
      "of": {…},
      "content": {…}
     }

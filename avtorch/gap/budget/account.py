@@ -23,6 +23,7 @@ from avtorch.gap.budget.selection_step import Selection
 from avtorch.gap.budget.share_order import largest_first
 from avtorch.gap.budget.unexplained_places import placed
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.selection.plausibility import implausible
 from avtorch.gap.selection.verdict import ALWAYS, Candidate, Verdict, candidate_name
@@ -59,8 +60,11 @@ def account(
     most: int = MOST_PARTS,
     seed: int = 0,
     progress: Progress | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> Account | None:
     """The account of these drives, given the likelihood's `candidates`, its `verdict`, and the fit that won.
+
+    `checkpoint`: the search's own, which keeps the steps of a selection, too.
 
     None where the drives are too short to hold out blocks.
     """
@@ -79,7 +83,7 @@ def account(
         budget = _as_adequate(budget_of(selection, epoch_s=epoch, **options), candidates)
         budget = _by_likelihood(budget, candidates, verdict, named, winner, epoch if len(logs) == 1 else None)
         return Account(budget, selection, tuple(candidates), _verdict(budget, verdict), held_out=False)
-    selection = select(record, base, kinds, begun=begun, most=most, progress=progress)
+    selection = select(record, base, kinds, begun=begun, most=most, progress=progress, checkpoint=checkpoint)
     selection = likely_parts(selection, material, seed=seed)
     budget = budget_of(selection, epoch_s=epoch, **options)
     rest = placed(budget.unexplained, selection, epoch_s=epoch)

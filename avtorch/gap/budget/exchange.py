@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from avtorch.gap.budget.entry import candidates_for, enter
+from avtorch.gap.budget.next_step import next_step
 from avtorch.gap.budget.redundancy import at_limits
 from avtorch.gap.budget.robust_fit import RobustFit
 from avtorch.gap.budget.selection_step import Step, without_effects
+from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.gap.simulator.effect import Effect
 
 
@@ -21,6 +22,7 @@ def exchanged(
     now: Step,
     kinds: Sequence[type[Effect]],
     progress: Callable[[str, int, int], None] | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> tuple[Step, dict[str, Step]]:
     """`now` after all exchanges, and the steps by which new effects entered, by their names.
 
@@ -33,8 +35,7 @@ def exchanged(
         # those made of a model in which nothing has been exchanged yet still hold
         before = _without(fitting, now, name) if entered else without[name]
         others = [kind for kind in kinds if kind.name != name]
-        candidates = candidates_for(fitting, before, others, progress, f"in place of {name}")
-        step = enter(fitting, before, candidates)
+        step = next_step(fitting, before, others, progress, f"in place of {name}", checkpoint)
         if step is None or fitting.preference(now.held, step.held).strength() <= 0:
             continue
         if not at_limits(step.fit) <= at_limits(now.fit):  # another stands in for what was taken out

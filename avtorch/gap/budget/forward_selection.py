@@ -18,14 +18,16 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.effect_model import LATENESS, EffectModel
-from avtorch.gap.budget.entry import candidates_for, enter, observable
+from avtorch.gap.budget.entry import observable
 from avtorch.gap.budget.exchange import exchanged
 from avtorch.gap.budget.flexible_regression import has_places, left_over
+from avtorch.gap.budget.next_step import next_step
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 from avtorch.gap.budget.own_noise import judged, own_noise
 from avtorch.gap.budget.redundancy import without_the_redundant
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.budget.selection_step import Selection, Step, one_by_one
+from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.gap.simulator.effect import EFFECTS, Effect
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.plant import GapPlant
@@ -43,10 +45,12 @@ def select(
     begun: Selection | None = None,
     most: int = MOST_PARTS,
     progress: Callable[[str, int, int], None] | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> Selection:
     """The effects of `kinds` that `base` lacks on these drives, or has with other parameters than the car.
 
     At `most` so many, with every step on the way. `begun`: a selection of the same record, which is continued.
+    `checkpoint`: keeps the steps, of the same logs and baseline; those that it has are not made again.
     """
     kinds = observable(kinds, record)
     if begun is None:
@@ -57,13 +61,13 @@ def select(
     for number in range(_ROUNDS):
         if len(now.fit.model.names) >= most:
             break
-        step = enter(fitting, now, candidates_for(fitting, now, kinds, progress, f"effect {number + 1}"))
+        step = next_step(fitting, now, kinds, progress, f"effect {number + 1}", checkpoint)
         if step is None:
             break
         entered[step.fit.model.names[-1]] = step
         now, _ = without_the_redundant(fitting, step, spared=step.entered)
     if len(now.fit.model.names) > 1:
-        now, others = exchanged(fitting, now, kinds, progress)
+        now, others = exchanged(fitting, now, kinds, progress, checkpoint)
         entered |= others
     now, _ = without_the_redundant(fitting, now)
     if not now.fit.model.names:

@@ -158,6 +158,10 @@ class RobustFit:
         del kept[_KEPT:]
         return kept[0][1]
 
+    def forget(self) -> None:
+        """Let go of the slopes that are kept: those of the next fit are its own."""
+        self._kept.clear()
+
     def errors(self, fit: Fit[M]) -> FloatArray:
         """Standard errors (size,) of the coordinates by how much the blocks disagree (Liang and Zeger's sandwich)."""
         white = self.white(fit.model, fit.z)

@@ -1,8 +1,8 @@
-"""A file of finished fits, from which an interrupted search continues.
+"""A file of what is finished, from which an interrupted search continues: fits, and steps of the budget's selection.
 
-The file states what its fits belong to: the content of the logs and every setting that changes a fit. A fit is reused
-only if it started from exactly the same values, bit for bit; a search that takes another path, for instance under a
-budget, makes its own fits.
+The file states what these belong to: the content of the logs and every setting that changes a fit. A fit or a step is
+reused only if it started from exactly the same values, bit for bit; a search that takes another path, for instance
+under a budget, makes its own.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +27,16 @@ from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.fitted_work import difference
 from avtorch.io import fingerprint, read_sealed, write_sealed
 
-SCHEMA = "avtorch.fits/2"
+SCHEMA = "avtorch.fits/3"
 MOST = 16 * 2**20
-"""Limit on the bytes of a file of fits; a search makes some tens of fits, of a few hundred bytes each."""
+"""Limit on the bytes of a file; a search makes some tens of fits and steps, of some hundred to thousand bytes each."""
 
 REMEDY = "remove it to begin anew (avtorch diagnose --no-resume), or use another folder"
 
 _ENTRY = {"name", "onset", "inputs", "z", "noise", "log_prior"}
+_STEP = {"inputs", "effects", "onsets", "z", "nats", "block_nats", "aliases"}
 _LARGEST = 64  # most coordinates of a fit
+_LARGEST_STEP = 4096  # most coordinates or blocks of a step
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +58,22 @@ class StoredFit:
         return FittedModel.of(hypothesis, fit, noise, fit.log_evidence + self.log_prior, likelihood, onset)
 
 
+@dataclass(frozen=True, eq=False)
+class StoredStep:
+    """A step of the budget's selection: the names of the model's `effects`, the last of which entered, and its fit.
+
+    `onsets` [s] by effect, coordinates `z` (coordinate,), cost `nats` with the prior and `block_nats` (block,) without,
+    `aliases` of the effect that entered. Without `effects`: none entered.
+    """
+
+    effects: tuple[str, ...] = ()
+    onsets: Mapping[str, float] = field(default_factory=dict)
+    z: FloatArray = field(default_factory=lambda: np.zeros(0))
+    nats: float = 0.0
+    block_nats: FloatArray = field(default_factory=lambda: np.zeros(0))
+    aliases: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True)
 class FitKey:
     """The start of a fit; `inputs` is the fingerprint of everything that determines its result."""
@@ -71,7 +89,7 @@ class FitKey:
 
 
 class Checkpoint:
-    """The fits of one search; with `path` None nothing is stored.
+    """The fits and steps of one search; with `path` None nothing is stored.
 
     `work`: what the fits belong to, from `fitted_work`. Raises `InputError` for a file that is damaged, that is not a
     file of fits, or that belongs to other work, and states the difference.
@@ -80,9 +98,11 @@ class Checkpoint:
     def __init__(self, path: str | os.PathLike[str] | None, work: Mapping[str, Any] | None = None) -> None:
         self.path, self.work = None if path is None else Path(path), dict(work or {})
         self._done: dict[str, dict[str, Any]] = {}
+        self._steps: dict[str, dict[str, Any]] = {}
         # this includes a dangling symlink
         if self.path is not None and os.path.lexists(self.path):
-            self._done = {entry["inputs"]: entry for entry in read_fits(self.path, self.work)}
+            kept = _read(self.path, self.work)
+            self._done, self._steps = ({x["inputs"]: x for x in kept[name]} for name in ("fits", "steps"))
 
     def next(self, start: FitKey | None) -> StoredFit | None:
         """The stored fit with this start, or None."""
@@ -112,25 +132,60 @@ class Checkpoint:
             "noise": asdict(fit.noise),
             "log_prior": fit.log_prior,
         }
-        write_sealed(self.path, {"fits": list(self._done.values())}, schema=SCHEMA, of=self.work)
+        self._write(self.path)
+
+    def step(self, inputs: str) -> StoredStep | None:
+        """The stored step with these inputs, a fingerprint, or None."""
+        entry = self._steps.get(inputs)
+        if entry is None:
+            return None
+        z, block_nats = (np.array(entry[name], float) for name in ("z", "block_nats"))
+        names, aliases = (tuple(entry[name]) for name in ("effects", "aliases"))
+        return StoredStep(names, entry["onsets"], z, float(entry["nats"]), block_nats, aliases)
+
+    def keep_step(self, inputs: str, step: StoredStep) -> None:
+        """Store one more finished step."""
+        if self.path is None:
+            return
+        self._steps[inputs] = {
+            "inputs": inputs,
+            "effects": list(step.effects),
+            "onsets": dict(step.onsets),
+            "z": step.z.tolist(),
+            "nats": step.nats,
+            "block_nats": step.block_nats.tolist(),
+            "aliases": list(step.aliases),
+        }
+        self._write(self.path)
+
+    def _write(self, path: Path) -> None:
+        content = {"fits": list(self._done.values()), "steps": list(self._steps.values())}
+        write_sealed(path, content, schema=SCHEMA, of=self.work)
 
 
 def read_fits(path: Path, work: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The entries of a file of fits, each checked in shape and type.
+    """The fits of a file, each checked in shape and type, as its steps are.
 
     Raises `InputError` as `Checkpoint` does.
     """
+    return _read(path, work)["fits"]
+
+
+def _read(path: Path, work: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """The fits and the steps of a file."""
     found = read_sealed(path, schema=SCHEMA, most=MOST, remedy=REMEDY)
     other = difference(found.of, work)
     if other is not None:
         raise InputError(f"{path}: was begun with {other}; needs the same logs and settings, or {REMEDY}")
     content = found.content
-    if not isinstance(content, dict) or set(content) != {"fits"} or not isinstance(content["fits"], list):
-        raise InputError(f"{path}: holds no list of fits; {REMEDY}")
-    for i, entry in enumerate(content["fits"]):
-        for wrong in _faults(entry):
-            raise InputError(f"{path}: fit {i}: {wrong}; {REMEDY}")
-    return content["fits"]
+    lists = isinstance(content, dict) and set(content) == {"fits", "steps"}
+    if not lists or not all(isinstance(entries, list) for entries in content.values()):
+        raise InputError(f"{path}: holds no lists of fits and steps; {REMEDY}")
+    for one, name, faults in (("fit", "fits", _faults), ("step", "steps", _step_faults)):
+        for i, entry in enumerate(content[name]):
+            for wrong in faults(entry):
+                raise InputError(f"{path}: {one} {i}: {wrong}; {REMEDY}")
+    return content
 
 
 def _faults(entry: Any) -> Iterable[str]:
@@ -155,6 +210,32 @@ def _faults(entry: Any) -> Iterable[str]:
         yield "noise has a time constant that is not above 0"
     if not _is_number(entry["log_prior"]):
         yield "log_prior is no finite number"
+
+
+def _step_faults(entry: Any) -> Iterable[str]:
+    """Faults of a step, in words."""
+    if not isinstance(entry, dict) or set(entry) != _STEP:
+        yield f"is no object of {', '.join(sorted(_STEP))}"
+        return
+    if not isinstance(entry["inputs"], str):
+        yield "inputs is no string"
+    for key in ("effects", "aliases"):
+        if not isinstance(entry[key], list) or not all(isinstance(name, str) for name in entry[key]):
+            yield f"{key} is no list of names"
+            return
+    onsets = entry["onsets"]
+    if (
+        not isinstance(onsets, dict)
+        or not set(onsets) <= set(entry["effects"])
+        or not all(map(_is_number, onsets.values()))
+    ):
+        yield "onsets is not finite numbers by effect"
+    for key in ("z", "block_nats"):
+        values = entry[key]
+        if not isinstance(values, list) or len(values) > _LARGEST_STEP or not all(map(_is_number, values)):
+            yield f"{key} is no list of at most {_LARGEST_STEP} finite numbers"
+    if not _is_number(entry["nats"]):
+        yield "nats is no finite number"
 
 
 def _is_number(x: Any) -> bool:

@@ -90,11 +90,11 @@ def test_a_search_goes_on_to_the_same_answer(log: Log, diagnosed: tuple[dict[str
     fits = found.content["fits"]
     assert len(fits) >= 2
     for part in (fits[:1], fits[1:], []):
-        write_sealed(kept, {"fits": part}, schema=SCHEMA, of=found.of)
+        write_sealed(kept, {"fits": part, "steps": []}, schema=SCHEMA, of=found.of)
         assert avtorch.diagnose(log, checkpoint=kept, **ONLY).to_dict() == diagnosed[0]
     # a fit of the same name that began elsewhere, as under a budget, is none of this search
     strange = [{**fit, "inputs": "0" * 64, "z": [2.0] * len(fit["z"])} for fit in fits]
-    write_sealed(kept, {"fits": strange}, schema=SCHEMA, of=found.of)
+    write_sealed(kept, {"fits": strange, "steps": []}, schema=SCHEMA, of=found.of)
     assert avtorch.diagnose(log, checkpoint=kept, **ONLY).to_dict() == diagnosed[0]
 
 
@@ -177,7 +177,7 @@ def test_a_mode_of_another_candidate_is_refused(log: Log, kept: Path) -> None:
     found = read_sealed(kept, schema=SCHEMA)
     for change in ({"z": [0.1]}, {"name": "gust"}, {"onset": 7}):
         fits = [{**fit, **change} for fit in found.content["fits"]]
-        write_sealed(kept, {"fits": fits}, schema=SCHEMA, of=found.of)
+        write_sealed(kept, {"fits": fits, "steps": []}, schema=SCHEMA, of=found.of)
         with pytest.raises(InputError, match=r"fits\.json: the fit of \w+ does not match its recorded start"):
             avtorch.diagnose(log, checkpoint=kept, **ONLY)
 
