@@ -84,10 +84,12 @@ class AnalysisRecord:
     def knot_m(self) -> float:
         """Distance between the knots of what depends on the place [m]: what is driven in a block.
 
-        In a block that is held out, its neighbours predict nothing finer. Along the whole way there are not more than
+        In a block that is held out, its neighbours predict nothing finer; nor do other drives, unless they pass the
+        same places: all of several logs begin where the first does. Along the whole way there are not more than
         `MOST_KNOTS`, as a fit's cost grows with their square.
         """
-        way = float(np.abs(self.speed[self.counts]).sum()) * self.dt
+        driven = np.abs(self.speed) * self.counts * self.dt
+        way = max(float(driven[self.log == log].sum()) for log in np.unique(self.log))
         return max(way / min(self.blocks, MOST_KNOTS), _LEAST_KNOT_M)
 
     @property
