@@ -89,7 +89,7 @@ def account(
     rest = placed(budget.unexplained, selection, epoch_s=epoch)
     chance = _all_chance(selection, base, kinds, candidates, verdict, winner, budget)
     budget = replace(budget, unexplained=rest, chance=chance)
-    held_out = tuple(_spread(candidates, budget, kinds))
+    held_out = tuple(shared_out(candidates, budget, kinds))
     return Account(budget, selection, held_out, _verdict(budget, verdict), held_out=True)
 
 
@@ -241,27 +241,32 @@ def _own_parameters(name: str, candidate: Candidate) -> Mapping[str, Quantity]:
 
 
 # by held-out blocks ------------------------------------------------------------------------------------------------
-def _spread(candidates: Sequence[Candidate], budget: Budget, kinds: Sequence[type[Effect]]) -> list[Candidate]:
+def shared_out(candidates: Sequence[Candidate], budget: Budget, kinds: Sequence[type[Effect]]) -> list[Candidate]:
     """The hypotheses, with what `none` and `unknown` held shared out as held-out blocks decide.
 
     The likelihood cannot say how probable a hypothesis is whose noise does not hold; what it left to `unknown` goes to
     the parts that held-out blocks select, as far as these are sure, and to `unknown` as far as something material is
     left besides. Where they select nothing, or wrongly, some drives have a cause that they are too short or too calm to
-    show; each effect by itself is as likely to be that. Some have one that no effect describes (`PartOdds`).
+    show; each effect by itself is as likely to be that. Some have one that no effect describes (`PartOdds`). Where
+    nothing is selected and something material is left, it is either of these two, in the same proportion.
     """
     free = math.fsum(c.probability for c in candidates if c.name in ALWAYS)
     left, odds = budget.unexplained.probability, PartOdds.read()
     name = candidate_name(budget.names)
+    hidden = [c for c in candidates if len(c.effects) == 1 and c.name not in (*ALWAYS, name)]
     if budget.names:
         sure = min(p.probability for p in (*budget.parts, *budget.chance) if p.name in budget.names)
         none, unknown, other = odds.none_wrong, odds.unknown_wrong, free * (1 - sure)
         shares = {"unknown": free * sure * left, "none": 0.0, name: free * sure * (1 - left)}
+        none = none if hidden else 1 - unknown
     else:
-        none, unknown, other = odds.none_unnamed, odds.unknown_unnamed, free * (1 - left)
-        shares = {"unknown": free * left, "none": 0.0}
-    hidden = [c for c in candidates if len(c.effects) == 1 and c.name not in (*ALWAYS, name)]
+        none, unknown, other = odds.none_unnamed, odds.unknown_unnamed, free
+        shares = {"unknown": 0.0, "none": 0.0}
+        none = none if hidden else 1 - unknown
+        # as far as something material is left there is a cause: an effect that does not show yet, or one of no table
+        none, unknown = (1 - left) * none, unknown * (1 - left + left / (1 - none))
     shares["unknown"] += other * unknown
-    shares["none"] += other * (none if hidden else 1 - unknown)
+    shares["none"] += other * none
     shares |= {c.name: c.probability + other * (1 - none - unknown) / len(hidden) for c in hidden}
     out = [replace(c, probability=shares.get(c.name, c.probability)) for c in candidates if c.name != name]
     if budget.names:
