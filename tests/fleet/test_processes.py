@@ -119,9 +119,7 @@ def test_a_log_that_ends_every_worker_becomes_a_row_and_the_others_are_done(tmp_
 
 @pytest.mark.slow
 @pytest.mark.statistical
-def test_a_diagnosis_goes_on_from_what_a_killed_worker_had_finished(
-    tmp_path: Path, scheduler: str, rotating_seed: int
-) -> None:
+def test_a_diagnosis_goes_on_from_what_a_killed_worker_had_finished(tmp_path: Path, rotating_seed: int) -> None:
     log = tmp_path / "late.csv"
     taken_over(seconds=40.0, overrides=(), rng=np.random.default_rng(rotating_seed), delay_s=0.3).write(log)
     settings = FleetSettings(steps=("diagnose",), effects=("dead_time", "sensor_bias"), posterior="laplace")
@@ -142,7 +140,8 @@ def test_a_diagnosis_goes_on_from_what_a_killed_worker_had_finished(
     answer = run_fleet(log, tmp_path / "out", settings=settings, workers=1)
     assert answer["failed_logs"] == 0
     assert not (tmp_path / "out" / "unfinished").exists()
-    run_fleet(log, tmp_path / "undisturbed", settings=settings, scheduler=scheduler)
+    # by a worker of the same kind: sums in two threads differ in the last digit from those in one
+    run_fleet(log, tmp_path / "undisturbed", settings=settings, workers=1)
     own, whole = (read_rows(tmp_path / name, "diagnoses").drop_columns(["seconds"]).to_pylist() for name in NAMES)
     assert own == whole
 

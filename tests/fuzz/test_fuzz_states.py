@@ -52,7 +52,7 @@ def whole() -> dict[str, bytes]:
     """A file of fits, and the state of a stream in the middle of its first window."""
     with TemporaryDirectory() as name:
         folder = Path(name)
-        content = {"fits": [FIT | {"noise": asdict(NoiseModel())}]}
+        content = {"fits": [FIT | {"noise": asdict(NoiseModel())}], "steps": []}
         write_sealed(folder / "fits", content, schema=SCHEMA, of=work())
         stream, time = new_stream(), torch.arange(90, dtype=torch.float64) / 100
         wave = torch.sin(3 * time)[None]

@@ -122,9 +122,13 @@ def predicted_residuals(fitting: RobustFit, fit: Fit, residuals: FloatArray) -> 
     The ridge is what predicts held-out blocks best; where these do not agree on it more surely than chance, nothing.
     """
     shapes, places = columns(fit), _places(fit)
-    if len(places) and _predicted(fitting, places, residuals).any():
-        shapes = np.concatenate([shapes, places])
-    return _predicted(fitting, shapes, residuals)
+    found = _predicted(fitting, shapes, residuals)
+    if not len(places) or not _predicted(fitting, places, residuals).any():
+        return found
+    # many places may hide what commands and speed predict by themselves
+    both = _predicted(fitting, np.concatenate([shapes, places]), residuals)
+    costs = [float(fitting.nats(fitting.whitening(residuals - x)).sum()) for x in (found, both)]
+    return both if costs[1] < costs[0] else found
 
 
 def _predicted(fitting: RobustFit, shapes: FloatArray, residuals: FloatArray) -> FloatArray:
