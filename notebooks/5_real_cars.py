@@ -113,8 +113,9 @@ if there(*LAPS):
 
 # %% [markdown]
 # The measured speed fluctuates at 8 to 20 Hz as under no effect of the table, so the likelihood does not hold and
-# held-out blocks decide: of these four effects they name an actuator of second order. The likelihood with `unknown`
-# excluded names brakes that are stronger than the engine. The two disagree: take neither for a fact of the car.
+# held-out blocks decide: something reproducible is left, and they are sure of none of these four effects. So the
+# verdict is `unknown`, and its probability, that of a cause outside the four, is far from 1. The likelihood with
+# `unknown` excluded names brakes that are stronger than the engine: do not take that for a fact of the car.
 
 # %%
 if there(*LAPS) and named.shrinkage is not None:
