@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from avtorch.gap.budget.next_step import next_step
-from avtorch.gap.budget.redundancy import at_limits
+from avtorch.gap.budget.redundancy import driven_to_a_limit
 from avtorch.gap.budget.robust_fit import RobustFit
 from avtorch.gap.budget.selection_step import Step, without_effects
 from avtorch.gap.search.checkpoint import Checkpoint
@@ -38,7 +38,7 @@ def exchanged(
         step = next_step(fitting, before, others, progress, f"in place of {name}", checkpoint)
         if step is None or fitting.preference(now.held, step.held).strength() <= 0:
             continue
-        if not at_limits(step.fit) <= at_limits(now.fit):  # another stands in for what was taken out
+        if driven_to_a_limit(now.fit, step.fit):
             continue
         now, entered[step.fit.model.names[-1]] = step, step
     return now, entered

@@ -8,6 +8,7 @@ from dataclasses import replace
 from avtorch.gap.budget.own_noise import evidence_by_own_noise, judged, with_sizes
 from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.budget.parts import LIKELY, MATERIAL
+from avtorch.gap.budget.redundancy import at_limits
 from avtorch.gap.budget.selection_step import Selection, one_by_one, without_effects
 from avtorch.gap.budget.share_order import largest_first, own_response
 
@@ -23,7 +24,7 @@ def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int 
     while len(selection.steps) > 1:
         each, last = probabilities(selection), selection.last.fit
         # where a fit ends, far beyond what is possible, an effect stands in for something else
-        each |= {name: 0.0 for name in each if last.model.at_limit(last.z, name)}
+        each |= dict.fromkeys(at_limits(last), 0.0)
         unlikely = sorted((name for name in each if each[name] < LIKELY), key=each.__getitem__)
         if not unlikely:
             break
@@ -66,17 +67,11 @@ def _without_one_of(selection: Selection, names: Sequence[str]) -> Selection:
     order, without = list(names), list[Selection]()
     while len(without) < len(order):
         without.append(_without(selection, order[len(without)]))
-        resting = _resting(without[-1])
+        resting = at_limits(without[-1].last.fit)
         if not resting:
             return without[-1]
         order += [name for name in resting if name not in order]
     return without[0]
-
-
-def _resting(selection: Selection) -> list[str]:
-    """The effects at a limit."""
-    fit = selection.last.fit
-    return [name for name in fit.model.names if fit.model.at_limit(fit.z, name)]
 
 
 def _without(selection: Selection, name: str) -> Selection:

@@ -25,7 +25,7 @@ from dataclasses import replace
 from avtorch.gap.budget.held_out_evidence import Evidence
 from avtorch.gap.budget.joint_whitening import of_both_channels
 from avtorch.gap.budget.noise_whitening import LEVEL_S, NoiseWhitening
-from avtorch.gap.budget.redundancy import at_limits, without_one
+from avtorch.gap.budget.redundancy import driven_to_a_limit, without_one
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.budget.selection_step import Selection, Step, without_effects
 from avtorch.gap.simulator.effect import Effect
@@ -50,10 +50,9 @@ def judged(fitting: RobustFit, judging: RobustFit, fit: Fit) -> tuple[Step, dict
     now, step = Step(fit, fitting.hold_out(fit)), _under_its_own(judging, fit)
     while True:
         without, evidence = _each_beside_the_others(fitting, judging, now, step)
-        before = at_limits(now.fit)
         for weakest in sorted((n for n in evidence if evidence[n].of_entry <= 0), key=lambda n: evidence[n].of_entry):
             rest = without_effects(fitting, now.fit, [weakest])
-            if at_limits(rest) <= before:  # else another would stand in for it
+            if not driven_to_a_limit(now.fit, rest):
                 break
         else:
             return now, evidence

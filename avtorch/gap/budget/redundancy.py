@@ -16,16 +16,20 @@ def without_the_redundant(
     """
     while True:
         without = {name: without_one(fitting, step, name) for name in step.fit.model.names if name != spared}
-        before = at_limits(step.fit)
-        leaving = [s for s in without.values() if s.evidence.of_entry <= 0 and at_limits(s.fit) <= before]
+        leaving = [s for s in without.values() if s.evidence.of_entry <= 0 and not driven_to_a_limit(step.fit, s.fit)]
         if not leaving:
             return step, {name: s.evidence for name, s in without.items()}
         step = min(leaving, key=lambda s: s.evidence.of_entry)
 
 
-def at_limits(fit: Fit) -> set[str]:
+def at_limits(fit: Fit) -> list[str]:
     """The effects of a model that rest at a limit."""
-    return {name for name in fit.model.names if fit.model.at_limit(fit.z, name)}
+    return [name for name in fit.model.names if fit.model.at_limit(fit.z, name)]
+
+
+def driven_to_a_limit(before: Fit, after: Fit) -> bool:
+    """Whether an effect rests at a limit `after` that did not `before`: it stands in for what is missing there."""
+    return not set(at_limits(after)) <= set(at_limits(before))
 
 
 def without_one(fitting: RobustFit, step: Step, name: str) -> Step:

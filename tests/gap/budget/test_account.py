@@ -146,7 +146,7 @@ def test_none_is_no_surer_than_a_drive_can_make_it() -> None:
 
 
 def test_what_is_left_without_a_name_is_not_surely_outside_the_table() -> None:
-    """All six such answers in 340 blind trials were of effects that the table has; `unknown` was at 0.87 to 1.00."""
+    """All six such answers in 404 blind trials were of effects that the table has; `unknown` was at 0.87 to 1.00."""
     singles = [Candidate(kind, 0.0) for kind in KINDS]
     before = [*singles, Candidate("none", 0.1), Candidate("unknown", 0.9)]
     odds = PartOdds.read()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -27,14 +28,15 @@ def test_the_one_that_drives_no_other_to_a_limit(
     drives_to_a_limit: Mapping[str, str], leaves: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def without(selection: Any, name: str) -> Any:
-        return name
+        return SimpleNamespace(last=SimpleNamespace(fit=name))  # the fit of the others
+
+    def resting(fit: Any) -> list[str]:
+        return [drives_to_a_limit[fit]] if fit in drives_to_a_limit else []
 
     monkeypatch.setattr(likely_parts, "_without", without)
-    monkeypatch.setattr(
-        likely_parts, "_resting", lambda name: [drives_to_a_limit[name]] if name in drives_to_a_limit else []
-    )
+    monkeypatch.setattr(likely_parts, "at_limits", resting)
     whole: Any = None
-    assert likely_parts._without_one_of(whole, ["resistance", "drag", "creep"]) == leaves
+    assert cast(Any, likely_parts._without_one_of(whole, ["resistance", "drag", "creep"])).last.fit == leaves
 
 
 def test_beside_an_effect_that_is_no_part_the_evidence_is_asked_anew(monkeypatch: pytest.MonkeyPatch) -> None:
