@@ -3,6 +3,7 @@
 The coordinates are those of the effects' priors, standard normal each, and kept within what physics allows. An effect
 may set in during the drives: before its onset the model is the one without it. Recorders do not read two channels at
 the same moment (filters, holds, clocks that differ): speed has a lateness against the accelerometer, which is no cause.
+Where speed is all there is it has one against the command, up to what a recorder's filter makes.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from avtorch.gap.simulator.parameter import Parameter
 from avtorch.gap.simulator.plant import GapPlant, plant
 
 LATENESS = "recorder.lateness"
-"""The coordinate that is no parameter of an effect: how late speed is read against acceleration."""
+"""The coordinate that is no parameter of an effect: how late speed is read against acceleration, or the command."""
 LATENESS_S = 0.04  # its standard deviation [s]
+_FILTERED = 2.0  # prior standard deviations, as late as a recorder's filter, hold and clock make speed by itself
 _BEYOND = 3.0  # times as far as physics allows
 _WIDEST = 6.0  # prior standard deviations, where physics sets no limit
 _AT_LIMIT = 0.02  # prior standard deviations from a limit
@@ -67,10 +69,11 @@ class EffectModel:
             ends = _box(parameter)
             low += [ends[0]] * parameter.size
             high += [ends[1]] * parameter.size
-        if len(self.record.channels) == 2:
+        if "speed" in self.record.channels:
+            beside = len(self.record.channels) == 2
             index[LATENESS] = slice(len(low), len(low) + 1)
-            low.append(-_WIDEST)
-            high.append(_WIDEST)
+            low.append(-_WIDEST if beside else 0.0)
+            high.append(_WIDEST if beside else _FILTERED)
         roads = {
             f"{e.name}.{p.name}": e
             for e in whole.effects
@@ -221,6 +224,8 @@ class EffectModel:
         seconds = LATENESS_S * np.clip(z, self.low, self.high)[..., self.index[LATENESS]]
         out = np.array(np.broadcast_to(channels, (*z.shape[:-1], *channels.shape[-2:])))
         for name, late in (("speed", seconds), ("accel", -seconds)):
+            if name not in self.record.channels:
+                continue
             channel = self.record.channels.index(name)
             for stretch in self.record.stretches:
                 at = (..., channel, stretch.rows)
