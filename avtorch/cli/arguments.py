@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,7 +24,23 @@ def whole_number(_: Any, tokens: Sequence[Token]) -> int:
         raise ValueError(f"found {tokens[0].value!r}, needs a whole number") from None
 
 
-Out = Annotated[Path, Parameter(name="--out", group=OUTPUT, help="Folder for the answer and the pictures.")]
+def is_address(text: str) -> bool:
+    """Whether `text` is a URL, `s3://bucket/out` or `file:///tmp/out`, and no path; `C://out` is a path."""
+    return re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", text) is not None
+
+
+def local_folder(_: Any, tokens: Sequence[Token]) -> Path:
+    """A path would make a folder `s3:` of s3://bucket/out."""
+    text = tokens[0].value
+    if is_address(text):
+        raise ValueError(f"found {quoted(text)}; output is local: needs a folder of this machine, such as out/fleet")
+    return Path(text)
+
+
+Out = Annotated[
+    Path,
+    Parameter(name="--out", group=OUTPUT, converter=local_folder, help="Folder for the answer and the pictures."),
+]
 Json = Annotated[bool, Parameter(name="--json", negative=(), group=OUTPUT, help="Print the answer as JSON, no tables.")]
 Quiet = Annotated[bool, Parameter(name=("--quiet", "-q"), negative=(), group=OUTPUT, help="Print nothing but errors.")]
 Seed = Annotated[int, Parameter(name="--seed", converter=whole_number, help="Seed of everything random.")]

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from rich.markup import escape
 from rich.table import Table
 
-from avtorch.cli.arguments import OUTPUT, Json, Quiet, free_folder
+from avtorch.cli.arguments import OUTPUT, Json, Quiet, free_folder, local_folder
 from avtorch.cli.browser import Open, show
 from avtorch.cli.command_line import origin_of
 from avtorch.cli.simulator import read_simulator
@@ -62,7 +62,8 @@ def compare(
         str | None, Parameter(help="The simulator that AFTER is compared with; default: the same.")
     ] = None,
     out: Annotated[
-        Path | None, Parameter(name="--out", group=OUTPUT, help="Folder for comparison.html and .json.")
+        Path | None,
+        Parameter(name="--out", group=OUTPUT, converter=local_folder, help="Folder for comparison.html and .json."),
     ] = None,
     map: Annotated[
         list[str] | None,

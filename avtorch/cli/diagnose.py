@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Group, Parameter
 from rich.markup import escape
 
-from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, positive, seed_number
+from avtorch.cli.arguments import OUTPUT, Json, Quiet, Seed, free_folder, local_folder, positive, seed_number
 from avtorch.cli.browser import Open, show
 from avtorch.cli.command_line import origin_of
 from avtorch.cli.diagnosis_table import budget_table, diagnosis_headline, diagnosis_notes, diagnosis_table
@@ -42,7 +42,10 @@ def diagnose(
     /,
     *,
     out: Annotated[
-        Path, Parameter(name="--out", group=OUTPUT, help="Folder for the answer and the repaired simulator.")
+        Path,
+        Parameter(
+            name="--out", group=OUTPUT, converter=local_folder, help="Folder for the answer and the repaired simulator."
+        ),
     ],
     map: Annotated[
         list[str] | None,

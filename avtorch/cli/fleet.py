@@ -19,6 +19,7 @@ from avtorch.cli.arguments import (
     Seed,
     TimeGap,
     free_folder,
+    local_folder,
     positive,
     positive_pair,
     seed_number,
@@ -44,7 +45,15 @@ def fleet(
     logs: list[str],
     /,
     *,
-    out: Annotated[Path, Parameter(name="--out", group=OUTPUT, help="Folder for the rows and the answer.")],
+    out: Annotated[
+        Path,
+        Parameter(
+            name="--out",
+            group=OUTPUT,
+            converter=local_folder,
+            help="Folder of this machine for the rows and the answer.",
+        ),
+    ],
     only: Annotated[
         str | None, Parameter(help="Only these steps, STEP,STEP of check, estimate and diagnose; default: all.")
     ] = None,

@@ -20,6 +20,8 @@ from avtorch.cli.arguments import (
     Seed,
     TimeGap,
     free_folder,
+    is_address,
+    local_folder,
     not_negative,
     positive,
     positive_pair,
@@ -85,7 +87,12 @@ def watch(
     accepted: Annotated[str, Parameter(help="T_L,K_L of the cars as they should be [s, -].")] = "0.3,1.0",
     seed: Seed = 0,
     state: Annotated[
-        Path | None, Parameter(group=OUTPUT, help="Folder for the cars' states; the same command goes on from there.")
+        Path | None,
+        Parameter(
+            group=OUTPUT,
+            converter=local_folder,
+            help="Folder for the cars' states; the same command goes on from there.",
+        ),
     ] = None,
     out: Annotated[
         str | None,
@@ -209,6 +216,8 @@ def _sink(out: str | None, kept: KeptCars | None, stop: Stop, source: str) -> Si
         return LineSink()
     if is_mqtt(out):
         return MqttSink(MqttAddress.of(out), stop)
+    if is_address(out):
+        raise InputError(f"--out: found {quoted(out)}; needs a file of this machine, or mqtt://HOST:PORT/TOPIC")
     if _are_one_file(source, out):
         raise InputError(f"--out: {quoted(out)} is the source itself; needs another name")
     return FileSink(out, resume=kept is not None and kept.same_source)

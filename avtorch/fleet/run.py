@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from avtorch.display.progress import called, shows_progress
-from avtorch.errors import InputError
+from avtorch.errors import InputError, quoted
 from avtorch.fleet.cluster import Cluster, connected, require_dask
 from avtorch.fleet.fleet_progress import FleetProgress
 from avtorch.fleet.folder import FleetFolder, task_key
 from avtorch.fleet.log_list import FleetLog, LogList, find_logs
-from avtorch.fleet.places import content_hash, fetched
+from avtorch.fleet.places import content_hash, fetched, is_url
 from avtorch.fleet.ranking import fleet_answer
 from avtorch.fleet.rows import failure_rows
 from avtorch.fleet.settings import STEPS, FleetSettings
@@ -87,6 +87,8 @@ def run_fleet(
         raise InputError(f"workers: found {workers}, needs 1 or more")
     require_dask()
     given.refuse_unknown()
+    if is_url(os.fspath(out)):
+        raise InputError(f"out: found {quoted(os.fspath(out))}; output is local: needs a folder of this machine")
     found = logs if isinstance(logs, LogList) else find_logs(logs, leave_out=out)
     folder = FleetFolder(Path(out))
     with sole_use(out, work="a fleet"):

@@ -35,6 +35,37 @@ def test_every_command_that_writes_holds_its_folder() -> None:
         assert "out" in inspect.signature(command).parameters
 
 
+ARGUMENTS = {
+    "run": ["run"],
+    "estimate": ["estimate", "drive.csv"],
+    "diagnose": ["diagnose", "drive.csv"],
+    "compare": ["compare", "before.csv", "after.csv"],
+    "fleet": ["fleet", "logs"],
+    "stability": ["stability"],
+    "validate": ["validate"],
+    "blindtest": ["blindtest"],
+    "paper": ["paper"],
+    "watch": ["watch", "drive.csv"],
+}
+
+
+@pytest.mark.parametrize("url", ["s3://bucket/out", "file:///tmp/out"])
+@pytest.mark.parametrize("command", [*ARGUMENTS, "watch --state"])
+def test_a_url_for_the_folder_is_refused(
+    command: str, url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert set(ARGUMENTS) == {*COMMANDS, "watch"}
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "drive.csv").write_text("time,accel_cmd,accel\n")
+    option = "--state" if command == "watch --state" else "--out"
+    assert main([*ARGUMENTS[command.split()[0]], option, url]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert f"{option}: found '{url}'" in told
+    assert "of this machine" in told
+    assert [path.name for path in tmp_path.iterdir()] == ["drive.csv"]
+
+
 def test_a_second_process_gets_the_name_of_the_first(tmp_path: Path) -> None:
     out = tmp_path / "out"
     line = [sys.executable, "-m", "avtorch.cli", "stability", "--quiet", "--out", str(out)]

@@ -322,6 +322,7 @@ def test_a_call_with_nothing_to_compute_loads_neither_torch_nor_dask(tmp_path: P
         (lambda: run_fleet("a.csv", "out", settings=FleetSettings(estimator="mle")), "estimator: found 'mle'"),
         (lambda: run_fleet("missing.csv", "out"), "missing.csv: no such file"),
         (lambda: read_rows("out", "diagnoses"), "has no rows"),
+        (lambda: run_fleet("a.csv", "s3://bucket/out"), "out: found 's3://bucket/out'; output is local"),
         (lambda: read_rows("out", "rows"), "dataset: found 'rows', needs checks, windows, diagnoses"),
     ],
 )
