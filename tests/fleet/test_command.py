@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,15 @@ def test_cars_are_printed_in_their_order_with_what_failed(
     assert json.loads(capsys.readouterr().out)["work"] == {"kept": 6, "computed": 0}
     assert main([*command, "--quiet"]) == 0
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.slow
+def test_a_cluster_of_its_own_tells_where_its_dashboard_is(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_fleet(here / "logs", {"red": 0.3})
+    assert main(["fleet", "logs", "--out", "out", "--workers", "1", *FAST]) == 0
+    told = capsys.readouterr()
+    assert re.search(r"^Dask's dashboard: http://127\.0\.0\.1:\d+/status$", told.out, re.M)
+    assert told.err == ""
 
 
 def test_the_extra_is_named_where_it_is_missing(

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -53,12 +54,15 @@ def test_workers_are_processes_of_one_thread_that_end_with_the_work(tmp_path: Pa
     seen: dict[str, Any] = {}
 
     def look(cluster: Cluster) -> None:
-        seen.update(pids=pids(cluster), threads=cluster.client.nthreads(), dashboard=cluster.dashboard)
+        seen.update(pids=pids(cluster), threads=cluster.client.nthreads())
+        with urllib.request.urlopen(cluster.dashboard or "", timeout=30) as page:
+            seen["status"] = page.status
         seen["memory"] = {w["memory_limit"] for w in cluster.client.scheduler_info()["workers"].values()}
 
     check = replace(QUICK, steps=("check",))
     run_fleet(tmp_path / "logs", tmp_path / "out", settings=check, workers=2, memory="1GiB", connected_to=look)
     assert len(set(seen["pids"].values()) - {os.getpid()}) == 2
+    assert seen["status"] == 200
     assert (set(seen["threads"].values()), seen["memory"]) == ({1}, {2**30})
     for pid in seen["pids"].values():
         with pytest.raises(ProcessLookupError):
