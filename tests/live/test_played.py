@@ -1,10 +1,11 @@
-"""Recordings played back: an MCAP file of ROS 2 messages, and Parquet."""
+"""Recordings played back: ROS 2 bags, as an MCAP file and as a folder with a database, and Parquet."""
 
 from __future__ import annotations
 
 import io
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,11 +15,11 @@ from avtorch import Log
 from avtorch.cli import main
 from avtorch.errors import InputError
 from avtorch.live import KeptCars, LineSink, LiveWatch, PlayedLog, Stop, watch_source
+from tests.io.formats.test_bags import cdr, folder_of
 from tests.live.drives import drive
 
 NAMES = ("accel_cmd", "accel", "speed", "jerk")
 START_NS = 1_700_000_000 * 10**9
-MAPS = [f"{name}=/car/{name}" for name in NAMES]
 
 
 def mcap(path: Path) -> Path:
@@ -34,15 +35,27 @@ def mcap(path: Path) -> Path:
     return path
 
 
+def database(path: Path) -> Path:
+    """A folder of `ros2 bag record`: a topic a signal, each message at the time at which it was recorded."""
+    rows = drive(1.5, 0.5, 6.0)
+    topics = {f"/{name}": ("std_msgs/msg/Float64", [cdr("d", row[name]) for row in rows]) for name in NAMES}
+    return folder_of(path, topics, [START_NS + round(row["time"] * 1e9) for row in rows], late=0)
+
+
 def parquet(path: Path) -> Path:
     rows = drive(1.5, 0.5, 6.0)
     Log.from_arrays(**{name: [row[name] for row in rows] for name in ("time", *NAMES)}).write(path)
     return path
 
 
-def test_a_bag_gives_the_windows_of_its_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    maps = [part for text in MAPS for part in ("--map", text)]
-    assert main(["watch", str(mcap(tmp_path / "drive.mcap")), *maps]) == 0
+@pytest.mark.parametrize(
+    ("write", "file", "channel"), [(mcap, "drive.mcap", "/car/{}"), (database, "drive", "/{}/data")]
+)
+def test_a_bag_gives_the_windows_of_its_rows(
+    write: Callable[[Path], Path], file: str, channel: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    maps = [part for name in NAMES for part in ("--map", f"{name}={channel.format(name)}")]
+    assert main(["watch", str(write(tmp_path / file)), *maps]) == 0
     told = capsys.readouterr()
     by_bag = [json.loads(line) for line in told.out.splitlines()]
     assert main(["watch", str(parquet(tmp_path / "drive.parquet"))]) == 0

@@ -61,7 +61,11 @@ def cdr(layout: str, *values: float) -> bytes:
     return b"\0\1\0\0" + raw
 
 
-def sqlite(path: Path, topics: dict[str, tuple[str, list[bytes]]]) -> Path:
+Topics = dict[str, tuple[str, list[bytes]]]
+"""Type and messages of each, a message a stamp."""
+
+
+def sqlite(path: Path, topics: Topics, stamps: list[int] = STAMPS, late: int = LATE) -> Path:
     """As rosbag2 wrote until Iron: no definitions."""
     base = sqlite3.connect(path)
     base.executescript(
@@ -72,7 +76,7 @@ def sqlite(path: Path, topics: dict[str, tuple[str, list[bytes]]]) -> Path:
     )
     for number, (topic, (type_, messages)) in enumerate(topics.items(), 1):
         base.execute("INSERT INTO topics VALUES (?, ?, ?, 'cdr', '')", (number, topic, type_))
-        rows = [(number, stamp + LATE, raw) for stamp, raw in zip(STAMPS, messages, strict=True)]
+        rows = [(number, stamp + late, raw) for stamp, raw in zip(stamps, messages, strict=True)]
         base.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
     base.commit()
     base.close()
@@ -87,8 +91,8 @@ def control(i: int, newest: bool) -> bytes:
     return cdr(layout, *twice, *twice, 0.1, 0.2, 1, *twice, 10.0, i / 8, 0.5, 1, 0)
 
 
-def autoware(path: Path, newest: bool = True) -> Path:
-    topics = {
+def autoware_topics(newest: bool = True) -> Topics:
+    return {
         "/control/command/control_cmd": (
             "autoware_control_msgs/msg/Control",
             [control(i, newest) for i in range(COUNT)],
@@ -100,31 +104,33 @@ def autoware(path: Path, newest: bool = True) -> Path:
         "/odd": ("car_msgs/msg/Odd", [b"\0\1\0\0" for _ in STAMPS]),
         "/speed": ("std_msgs/msg/Float64", [cdr("d", i / 4) for i in range(COUNT)]),
     }
-    return sqlite(path, topics)
 
 
-def folder(path: Path) -> Path:
+def autoware(path: Path, newest: bool = True) -> Path:
+    return sqlite(path, autoware_topics(newest))
+
+
+def folder_of(path: Path, topics: Topics, stamps: list[int] = STAMPS, late: int = LATE) -> Path:
+    """As `ros2 bag record` leaves it: a database, and what is in it."""
     path.mkdir()
-    autoware(path / "drive_0.db3")
-    types = {
-        "/control/command/control_cmd": "autoware_control_msgs/msg/Control",
-        "/vehicle/status/control_mode": "autoware_vehicle_msgs/msg/ControlModeReport",
-        "/odd": "car_msgs/msg/Odd",
-        "/speed": "std_msgs/msg/Float64",
-    }
+    sqlite(path / "drive_0.db3", topics, stamps, late)
     listing = "".join(
         f"    - topic_metadata:\n        name: {name}\n        type: {type_}\n        serialization_format: cdr\n"
-        f"        offered_qos_profiles: ''\n      message_count: {COUNT}\n"
-        for name, type_ in types.items()
+        f"        offered_qos_profiles: ''\n      message_count: {len(stamps)}\n"
+        for name, (type_, _) in topics.items()
     )
     (path / "metadata.yaml").write_text(
         "rosbag2_bagfile_information:\n  version: 4\n  storage_identifier: sqlite3\n"
         "  relative_file_paths:\n    - drive_0.db3\n"
-        f"  duration:\n    nanoseconds: {STAMPS[-1] - STAMPS[0]}\n"
-        f"  starting_time:\n    nanoseconds_since_epoch: {STAMPS[0]}\n  message_count: {4 * COUNT}\n"
+        f"  duration:\n    nanoseconds: {stamps[-1] - stamps[0]}\n"
+        f"  starting_time:\n    nanoseconds_since_epoch: {stamps[0]}\n  message_count: {len(topics) * len(stamps)}\n"
         f"  topics_with_message_count:\n{listing}  compression_format: ''\n  compression_mode: ''\n"
     )
     return path
+
+
+def folder(path: Path) -> Path:
+    return folder_of(path, autoware_topics())
 
 
 def ros1(path: Path) -> Path:
