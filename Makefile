@@ -1,5 +1,6 @@
 # Two commands on a fresh machine: `make demo` and `make test`. `make test-all` adds the slow tests,
-# `make fuzz` tries 100,000 damaged inputs (about half an hour), `make soak` drives 100 simulated cars for a week.
+# `make fuzz` tries 100,000 damaged inputs (about half an hour), `make soak` drives 100 simulated cars for a week;
+# `make nightly` is all of these, the soak for two hours.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -17,8 +18,10 @@ export MKL_NUM_THREADS ?= 1
 FUZZ ?= 100000
 # Options of the soak: --cars, --hours (simulated), --minutes (of this machine), --folder.
 SOAK ?= --cars 100 --hours 168
+# Minutes that the soak may take in a night; the next night goes on from there.
+SOAK_MINUTES ?= 120
 
-.PHONY: demo test test-all fuzz soak lint docs notebooks release clean
+.PHONY: demo test test-all fuzz soak nightly lint docs notebooks release clean
 
 demo: $(VENV)/.installed
 	$(BIN)/avtorch run --out out/demo
@@ -42,6 +45,13 @@ fuzz: $(VENV)/.installed-dev
 # Ctrl-C ends it; the same command goes on from there. Exit code 1 where an answer, a count or memory is wrong.
 soak: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.soak $(SOAK)
+
+# Each is run, whatever becomes of the one before. The tests marked `gpu` are among all tests, and skipped without a card.
+nightly: $(VENV)/.installed-sumo
+	@$(BIN)/python -c 'import torch as t; print("Tests marked gpu:", t.cuda.is_available() and "run" or "skipped, no card")'
+	status=0; for what in test-all fuzz soak; do \
+	  $(MAKE) $$what SOAK="$(SOAK) --minutes $(SOAK_MINUTES)" || status=1; \
+	done; exit $$status
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
