@@ -17,6 +17,7 @@ from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
 from avtorch.gap.budget.parts import HORIZON_S, LIKELY, Budget, percent
 from avtorch.gap.crossval.localisation import UNITS, Axis
+from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Candidate, Diagnosis
 from avtorch.io.clock import time_label
 from avtorch.plots.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILLION, styled
@@ -29,10 +30,10 @@ _NAMES = {"accel": "acceleration [m/s²]", "speed": "speed [m/s]"}
 def budget_bars(ax: Axes, budget: Budget, *, narrow: bool = False) -> Axes:
     """The gap's budget: each part's share begins where the one before it ends; whiskers are central 90 % intervals.
 
+    Without any part all of the gap is unexplained, so the bars divide the error: what is unexplained, and noise.
     `narrow`: names above their bars rather than beside them.
     """
-    named = [(p.name, p.share, BLUE if p.probability >= LIKELY else SKY) for p in budget.parts]
-    rows = [*named, ("unexplained", budget.unexplained.share, ORANGE)]
+    rows = _bars_of(budget)
     begun, reach = 0.0, 1.0
     for i, (_, share, colour) in enumerate(rows):
         ax.barh(i, share.mean, left=begun, color=colour, height=_height(narrow))
@@ -44,7 +45,7 @@ def budget_bars(ax: Axes, budget: Budget, *, narrow: bool = False) -> Axes:
         begun += share.mean
     _name_bars(ax, [name for name, _, _ in rows], narrow=narrow, down=True)
     ax.set(
-        xlabel=f"share of the gap in held-out {budget.horizon_s:.3g} s rollouts",
+        xlabel=f"share of the {'gap' if budget.parts else 'error'} in held-out {budget.horizon_s:.3g} s rollouts",
         xlim=(0, reach * (1.25 if narrow else 1.12)),
         ylim=(len(rows) - 0.4, -0.8 if narrow else -0.6),
     )
@@ -52,6 +53,21 @@ def budget_bars(ax: Axes, budget: Budget, *, narrow: bool = False) -> Axes:
     ax.xaxis.set_major_formatter(PercentFormatter(1.0, 0, " %"))
     ax.grid(axis="y", visible=False)
     return ax
+
+
+def _bars_of(budget: Budget) -> list[tuple[str, Quantity, str]]:
+    """Names, shares and colours."""
+    if budget.parts:
+        named = [(p.name, p.share, BLUE if p.probability >= LIKELY else SKY) for p in budget.parts]
+        return [*named, ("unexplained", budget.unexplained.share, ORANGE)]
+    rest = budget.left_above_noise
+    both = (("unexplained", rest, ORANGE if budget.unexplained.material else SKY), ("noise", 1.0 - rest, GREY))
+    return [(name, Quantity(share, 0.0, share, share), colour) for name, share, colour in both]
+
+
+def budget_bar_count(budget: Budget) -> int:
+    """Bars that `budget_bars` draws."""
+    return len(_bars_of(budget))
 
 
 _UP_TO_ONE = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -304,7 +320,7 @@ def budget_figure(found: Diagnosis, *, narrow: bool = False) -> Figure:
     """The budget of the gap. Raises `InputError` where the diagnosis has none."""
     if found.budget is None:
         raise InputError("budget: the diagnosis has none to draw; its drives are too short to hold out blocks")
-    figure = _bars_figure(len(found.budget.parts) + 1, narrow)
+    figure = _bars_figure(budget_bar_count(found.budget), narrow)
     budget_bars(figure.add_subplot(), found.budget, narrow=narrow)
     return figure
 

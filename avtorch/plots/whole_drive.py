@@ -19,7 +19,7 @@ from avtorch.gap.result.alarm import Alarm
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import Reason, Uncounted
-from avtorch.plots.diagnosis import budget_bars
+from avtorch.plots.diagnosis import budget_bar_count, budget_bars
 from avtorch.plots.style import BLACK, BLUE, GREY, PURPLE, VERMILLION, styled
 
 _WIDE, _NARROW = (8.6, 260), (4.0, 120)
@@ -189,7 +189,7 @@ def diagnosis_figure(found: Diagnosis) -> Figure:
     if found.budget is None:
         raise InputError("budget: the diagnosis has none to draw; its drives are too short to hold out blocks")
     panels = drive_panels(found)
-    heights = 0.7 + 0.3 * (len(found.budget.parts) + 1), 0.8 + 1.6 * len(panels)
+    heights = 0.7 + 0.3 * budget_bar_count(found.budget), 0.8 + 1.6 * len(panels)
     figure = Figure(figsize=(_WIDE[0], sum(heights)), layout="constrained")
     parts = figure.add_gridspec(2, 1, height_ratios=heights)
     above, below = figure.add_subfigure(parts[0]), figure.add_subfigure(parts[1])

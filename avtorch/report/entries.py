@@ -31,8 +31,9 @@ _IMPLAUSIBLE = "physically implausible"
 
 
 def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
-    """What each cause contributes to the gap; times count from `epoch_s`."""
-    columns = ("effect", "share of the gap (90 %)", "probability", "parameters (90 %)", "cannot be told from")
+    """What each cause contributes to the gap, or without any what the error consists of; times count from `epoch_s`."""
+    share = "share of the gap (90 %)" if budget.parts else "share of the error"
+    columns = ("effect", share, "probability", "parameters (90 %)", "cannot be told from")
     rows = []
     for part in budget.parts:
         parameters = _parameters(part.parameters) + ([] if part.plausible else [_IMPLAUSIBLE])
@@ -43,7 +44,14 @@ def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
         share = "by chance, part of the noise"
         alike = ", ".join(name for name in part.alias_set if name != part.name)
         rows.append((part.name, share, sentences.number(part.probability), "; ".join(parameters), alike))
-    rows.append(("unexplained", percent(budget.unexplained.share), "", budget.unexplained.places(epoch_s), ""))
+    places, rest = budget.unexplained.places(epoch_s), budget.left_above_noise
+    if budget.parts:
+        rows.append(("unexplained", percent(budget.unexplained.share), "", places, ""))
+    else:
+        rows += [
+            ("unexplained", budget_parts.percent(rest), "", places, ""),
+            ("noise", budget_parts.percent(1.0 - rest), "", "", ""),
+        ]
     return Table("The gap's budget", columns, tuple(rows), numeric=("probability",))
 
 

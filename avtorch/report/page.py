@@ -8,11 +8,10 @@ from os import PathLike
 from pathlib import Path
 
 from avtorch.experiment import Experiment
-from avtorch.gap.budget.parts import Budget
 from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.io import atomic
-from avtorch.report.entries import budget_table, measure_table, percent, place_table, setting_table
+from avtorch.report.entries import measure_table, percent, place_table, setting_table
 from avtorch.report.house import page_of
 from avtorch.report.manoeuvre_pictures import manoeuvre_pictures
 from avtorch.report.origin import Origin
@@ -43,7 +42,6 @@ def report_html(
         >>> "dead_time" in page, page.rstrip().endswith("</html>")
         (True, True)
     """
-    budget = found.budget
     return page_of(
         "diagnosis.html",
         origin=origin,
@@ -64,7 +62,6 @@ def report_html(
         where=sentences.where(found),
         places=place_table(found),
         gap=[*sentences.gap(found), *sentences.moved(found), *sentences.remains(found)],
-        budget=budget_table(budget, found.log.epochs_s[0]) if budget and _apart(budget) else None,
         shrinkage=sentences.shrinkage(found),
         measures=None if found.shrinkage is None else measure_table(found.shrinkage),
         placebo=_placebo(found),
@@ -77,11 +74,6 @@ def report_html(
         left=residual_section(found),
         each_manoeuvre=manoeuvre_pictures(found),
     )
-
-
-def _apart(budget: Budget) -> bool:
-    """Whether the budget's table says what the table behind its picture does not, or there is no picture."""
-    return bool(budget.chance) or (not budget.parts and budget.says_something)
 
 
 def write_report(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from avtorch.experiment import Experiment
+from avtorch.gap.budget.parts import Budget, percent
 from avtorch.gap.crossval.localisation import UNITS, Axis
 from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis, Shrinkage
@@ -63,8 +64,10 @@ def pictures(found: Diagnosis, experiment: Experiment | None = None) -> dict[str
 
 def _budget(found: Diagnosis) -> Picture | None:
     budget = found.budget
-    if budget is None or not budget.parts:
+    if budget is None:
         return None
+    if not budget.parts:
+        return _without_parts(found, budget)
     shares = [(part.name, part.share) for part in budget.parts] + [("unexplained", budget.unexplained.share)]
     says = ", ".join(f"{name} {100 * share.mean:.0f} %" for name, share in shares)
     return picture_of(
@@ -75,6 +78,27 @@ def _budget(found: Diagnosis) -> Picture | None:
         caption=f"A share is what an effect takes off the squared error of {budget.horizon_s:.3g} s simulations, above "
         "that of noise alone, on parts of the drive not used for fitting; effects are added in the order shown. Black "
         "lines: 90 % intervals.",
+        opened=True,
+    )
+
+
+def _without_parts(found: Diagnosis, budget: Budget) -> Picture:
+    """What the error consists of where no effect takes anything off it."""
+    rest = budget.left_above_noise
+    counts = ""
+    if not budget.unexplained.material:
+        counts = (
+            " What is unexplained does not count: it is too little, or not sure." if rest else " All of it is noise."
+        )
+    return picture_of(
+        "budget",
+        lambda narrow: budget_figure(found, narrow=narrow),
+        "Bars of what the error of the baseline simulator consists of: "
+        f"unexplained {percent(rest)}, noise {percent(1.0 - rest)}.",
+        budget_table(budget, found.log.epochs_s[0]),
+        caption=f"Shares of the squared error of {budget.horizon_s:.3g} s simulations by the baseline, on parts of the "
+        "drive not used for fitting. Noise is what commands, speed and place do not predict; what is unexplained is "
+        f"reproducible, and no known effect reduces it.{counts}",
         opened=True,
     )
 

@@ -202,6 +202,11 @@ class Budget:
         return tuple(x.name for x in (*self.parts, *self.chance) if x.probability >= LIKELY)
 
     @property
+    def left_above_noise(self) -> float:
+        """Share of the squared error that is left, with all parts, which is above the floor; the rest is noise."""
+        return max(1.0 - (self.floor / self.left) ** 2, 0.0)
+
+    @property
     def says_something(self) -> bool:
         """Whether there is more to tell than that nothing material is missing."""
         return bool(self.parts or self.chance or self.unexplained.material)

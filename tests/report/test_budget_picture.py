@@ -1,0 +1,69 @@
+"""The first picture of the page is the gap's budget, whatever the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from avtorch.gap.quantity import Quantity
+from avtorch.gap.result.diagnosis import Diagnosis
+from avtorch.report import report_html
+from tests.report.tree import Element, read
+
+WHOLE = Quantity(1.0, 0.0, 1.0, 1.0)
+
+
+def named(found: Diagnosis) -> Diagnosis:
+    assert found.budget is not None
+    assert found.budget.parts
+    return found
+
+
+def unnamed(found: Diagnosis, name: str, before: float) -> Diagnosis:
+    """An answer without any part, whose error is `before` times the floor."""
+    budget = named(found).budget
+    assert budget is not None
+    rest = replace(budget.unexplained, share=WHOLE, material=name == "unknown")
+    verdict = replace(
+        found.verdict, names=(name,), alias_set=(name,), abstained=name == "unknown", why="Nothing known."
+    )
+    bare = replace(budget, before=before, left=before, parts=(), chance=(), unexplained=rest)
+    return replace(found, budget=bare, verdict=verdict)
+
+
+def first_figure(found: Diagnosis) -> Element:
+    return next(read(report_html(found)).all("figure"))
+
+
+def label_and_rows(figure: Element) -> tuple[str, list[list[str]]]:
+    rows = [[cell.text() for cell in row.all("td", "th")] for row in figure.all("tr")]
+    return next(figure.all("svg")).attributes["aria-label"], rows
+
+
+def test_it_is_of_the_parts(found: Diagnosis) -> None:
+    label, rows = label_and_rows(first_figure(named(found)))
+    assert label.startswith("Bars of what each effect contributes to the gap: sensor_bias")
+    assert [row[0] for row in rows[1:]] == ["sensor_bias", "unexplained"]
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "unexplained"), [("unknown", 2.0, "75 %"), ("none", 1.01, "2 %"), ("none", 1.0, "0 %")]
+)
+def test_where_nothing_is_named_it_is_of_what_is_unexplained_and_noise(
+    found: Diagnosis, name: str, before: float, unexplained: str
+) -> None:
+    label, rows = label_and_rows(first_figure(unnamed(found, name, before)))
+    noise = f"{100 - int(unexplained[:-2])} %"
+    assert f"unexplained {unexplained}, noise {noise}" in label
+    assert [row[:2] for row in rows[1:]] == [["unexplained", unexplained], ["noise", noise]]
+
+
+def test_its_caption_says_whether_what_is_left_counts(found: Diagnosis) -> None:
+    captions = {}
+    for name, before in (("unknown", 2.0), ("none", 1.01), ("nothing", 1.0)):
+        answer = unnamed(found, "none" if name == "nothing" else name, before)
+        captions[name] = next(first_figure(answer).all("figcaption")).text()
+    assert "does not count" not in captions["unknown"]
+    assert "does not count" in captions["none"]
+    assert "All of it is noise" in captions["nothing"]
