@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
 from avtorch.gap.black_box import BlackBoxSimulator
@@ -30,6 +31,7 @@ from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis, LogFacts
 from avtorch.gap.result.gap_size import gap_size
 from avtorch.gap.result.predictive_model import predictive_models
+from avtorch.gap.result.rival_models import noise_left, rival_models
 from avtorch.gap.result.traces import Traces, rolled_out
 from avtorch.gap.result.uncounted import uncounted
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
@@ -225,8 +227,21 @@ def diagnose(
         car = repaired_plant(selected, base, float(simulator.sigma))
         beliefs = parameter_draws(selected, seed=seed)
     shrinkage = None if held is None else gap_closed(held)
-    if selected is not None and car is not None:
-        shrinkage = shrinkage_of(selected)
+    contenders, errors = predictive_models(race, verdict), (race.none if winner is None else winner).errors
+    if selected is not None and car is not None and budget is not None:
+        shrinkage, errors = shrinkage_of(selected), _errors(each, race.record, car, budget)
+        noise = noise_left(race.record, errors, race.none.noise.noise, car, budget)
+        contenders = rival_models(
+            selected,
+            budget,
+            verdict,
+            base,
+            kinds,
+            noise=noise,
+            probability=next(c.probability for c in candidates if c.name == verdict.name),
+            specific_force=race.record.accel_kind == "specific-force",
+            seed=seed,
+        )
     return Diagnosis(
         log=LogFacts.of(each),
         baseline=lag_and_gain(race.none),
@@ -245,8 +260,8 @@ def diagnose(
         if verdict.name == "none"
         else localise(attribution, onset_s=None if onset is None else onset.from_start_s, lag=race.none.values["T_L"]),
         shrinkage=shrinkage,
-        contenders=predictive_models(race, verdict),
-        traces=_traces(each, race, winner, attribution, car if selected is not None else None, budget),
+        contenders=contenders,
+        traces=_traces(each, race, errors, attribution),
         remaining=given_dead_time(candidates, verdict, base),
         complete=race.complete,
         scope=race.scope,
@@ -266,21 +281,16 @@ def _unknown(found: Sequence[FittedModel], record: Record, prior: Mapping[str, f
     return model_probabilities(found, left_over(favourite(found), record), prior)["unknown"]
 
 
-def _traces(
-    logs: Sequence[Log],
-    race: SearchResult,
-    winner: FittedModel | None,
-    attribution: RowAttribution,
-    car: GapPlant | None,
-    budget: Budget | None,
-) -> Traces:
-    """`car`: the simulator with the effects that held-out blocks selected, the parts of the `budget`."""
+def _errors(logs: Sequence[Log], record: Record, car: GapPlant, budget: Budget) -> FloatArray:
+    """Errors (channel, counted, group) of the simulator with the parts of a budget, each from its onset on."""
+    late = {p.name: p.onset_s - logs[0].epoch_s for p in budget.parts if p.onset_s is not None}
+    return record.measured - rolled_out(record, car, late)
+
+
+def _traces(logs: Sequence[Log], race: SearchResult, errors: FloatArray, attribution: RowAttribution) -> Traces:
+    """`errors` (channel, counted, group): of the simulator with what was named."""
     record = race.record
     measured = record.measured.mean(-1)
-    errors = (race.none if winner is None else winner).errors
-    if car is not None and budget is not None:
-        late = {p.name: p.onset_s - logs[0].epoch_s for p in budget.parts if p.onset_s is not None}
-        errors = record.measured - rolled_out(record, car, late)
     return Traces(
         time=record.time[record.source],
         command=record.command[record.source],

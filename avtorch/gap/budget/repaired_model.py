@@ -14,8 +14,9 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 from torch import Tensor
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.robust_fit import Fit
-from avtorch.gap.budget.selection_step import Selection
+from avtorch.gap.budget.selection_step import Selection, Step
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.integrated import Integrated
@@ -29,7 +30,7 @@ def parameters_of(selection: Selection, name: str) -> dict[str, Quantity]:
     effect = next(e for e in plants.effects if e.name == name)
     reported = effect.report(torch.as_tensor(plants.T_L))
     if isinstance(effect, Integrated):  # whose fit leaves the size at its default, and has it in the coefficients
-        reported = {**reported, effect.size: effect.size_along(_places(selection))}
+        reported = {**reported, effect.size: effect.size_along(places(model.record))}
     out = {}
     for key, value in reported.items():
         x = np.broadcast_to(value.numpy(), (len(every),) if value.dim() < 2 else value.shape)
@@ -38,10 +39,9 @@ def parameters_of(selection: Selection, name: str) -> dict[str, Quantity]:
     return out
 
 
-def _places(selection: Selection) -> Tensor:
+def places(record: AnalysisRecord) -> Tensor:
     """Positions (row,) [m] of all rows."""
-    stretches = selection.fitting.whitening.record.stretches
-    return torch.cat([s.drive.position for s in stretches if s.drive.position is not None])
+    return torch.cat([s.drive.position for s in record.stretches if s.drive.position is not None])
 
 
 def lag_and_gain(selection: Selection) -> dict[str, Quantity]:
@@ -69,8 +69,13 @@ def plant_of(fit: Fit, base: GapPlant, sigma: float | None = None) -> GapPlant:
 
 
 def parameter_draws(selection: Selection, *, count: int = 64, seed: int = 0) -> dict[str, FloatArray]:
-    """Draws (draw,) of the repaired simulator's parameters, normal with the folds' covariance."""
-    model, z, folds = selection.sized.fit.model, selection.sized.fit.z, selection.sized.held.z
+    """Draws (draw,) of the repaired simulator's parameters."""
+    return draws_of(selection.sized, count=count, seed=seed)
+
+
+def draws_of(step: Step, *, count: int = 64, seed: int = 0) -> dict[str, FloatArray]:
+    """Draws (draw,) of the parameters of a model, normal with the folds' covariance."""
+    model, z, folds = step.fit.model, step.fit.z, step.held.z
     away = (folds - folds.mean(0)) * np.sqrt((len(folds) - 1) / len(folds))
     normal = np.random.default_rng(seed).standard_normal((count, len(folds)))
     values = model.values(z + normal @ away)

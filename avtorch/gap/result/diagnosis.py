@@ -88,7 +88,8 @@ class Diagnosis(Displayed):
       None where the drives are too short to split or nothing was named
     - `budget`: what each cause contributes to the gap; None where the drives are too short to hold out blocks
     - `traces`: the drives beside the rollouts of `simulator` and `plant`
-    - `contenders`: predictive models of the alias set, as far as it was fitted
+    - `contenders`: predictive models of the alias set, as far as it was fitted; where held-out blocks selected effects,
+      of the repaired simulator and what could take its place
     - `next_experiment`, `setting`: objects as in `diagnosis.json`, None where they were not requested
     - `remaining`: with the default baseline, the hypotheses given that `dead_time` is in the simulator
     - `onset_s`: onset of the effect, on the own clock of log number `onset_log`; `onset_from_start_s`: from its first

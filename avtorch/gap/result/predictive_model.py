@@ -13,7 +13,8 @@ from avtorch.gap.selection.verdict import Verdict
 from avtorch.gap.simulator.plant import GapPlant
 
 _DRAWS = 64
-_MOST = 5
+MOST_MODELS = 5
+"""That an experiment is asked to tell apart."""
 _STAND_IN = 3
 
 
@@ -22,7 +23,8 @@ class PredictiveModel:
     """`plant` with the settings taken from the log; `belief`: draws (draw,) of its parameters by its own names.
 
     `noise`: of single rows of the log. `grade_rms`: size of an unknown road grade, None where the model has none.
-    `specific_force`: whether the log's `accel` is an accelerometer's reading.
+    `specific_force`: whether the log's `accel` is an accelerometer's reading. `probability`: relative to the other
+    models; None: that of the hypothesis of this name.
     """
 
     name: str
@@ -31,6 +33,7 @@ class PredictiveModel:
     noise: NoiseModel
     grade_rms: float | None = None
     specific_force: bool = False
+    probability: float | None = None
 
     @classmethod
     def of(cls, found: FittedModel) -> PredictiveModel:
@@ -59,7 +62,7 @@ def predictive_models(race: SearchResult, verdict: Verdict) -> tuple[PredictiveM
         others = [f.name for f in race.found if f.name not in names]
         # models that differ only in a random effect predict the same
         names = _apart([by_name[name] for name in [*names, *others]])[: len(names) + _STAND_IN]
-    return tuple(PredictiveModel.of(by_name[name]) for name in names[:_MOST])
+    return tuple(PredictiveModel.of(by_name[name]) for name in names[:MOST_MODELS])
 
 
 def _apart(found: Sequence[FittedModel]) -> list[str]:
