@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from avtorch.blindtest.ambiguity import causes, group_utility
@@ -31,7 +31,7 @@ class Answered:
     `placebo` (mean, q05), `onset_error` [s]: None where the case or the answer has none. `overlaps`: overlap of each
     true part of the gap with the part named on its axis; `parts_named`: how many parts are named. `partial`: the answer
     says that something material is left beside what it names. `budget`, `true_budget`: None where there is none;
-    `outside`: whether a cause outside the table is among the case's.
+    `outside`: whether a cause outside the table is among the case's. `true_parameters`: the causes' numbers, by name.
     """
 
     truth: str
@@ -50,6 +50,7 @@ class Answered:
     budget: AnsweredBudget | None = None
     true_budget: Mapping[str, Any] | None = None
     outside: bool = False
+    true_parameters: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def named(self) -> tuple[str, ...]:
@@ -162,6 +163,7 @@ def _of_case(truth: Mapping[str, Any]) -> dict[str, Any]:
         "tier": truth["tier"],
         "outside": outside,
         "true_budget": truth.get("budget"),
+        "true_parameters": truth.get("parameters") or {},
     }
 
 

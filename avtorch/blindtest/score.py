@@ -14,6 +14,7 @@ from avtorch.blindtest import budget_score as of_budget
 from avtorch.blindtest.answers import Answered, read_answer
 from avtorch.blindtest.deck import KINDS
 from avtorch.blindtest.intervals import Interval, bootstrap, cases_for, cases_for_mean, wilson
+from avtorch.blindtest.parameter_score import found_sizes
 from avtorch.blindtest.visibility import TIERS
 from avtorch.errors import InputError
 
@@ -43,6 +44,8 @@ def score(
     - `several.recall`, `.precision` (weighted by shares), `.sum_error`, `.share_error`, `.unexplained_error`,
       `.leading`, `.exact`, `.extra`: cases of several causes against the oracle's budget
       (`avtorch.blindtest.budget_score`). `part_ece`: calibration error of the budgets' parts, all cases.
+    - `parameters_covered`, `parameter_error`: of the sizes of parts that are named and true, the share whose 90 %
+      interval holds the true one, and the share within a quarter of it (`avtorch.blindtest.parameter_score`).
     - `utility.group`, `.weighted`, `.by_kind`: of the alias set as an ambiguity group (`avtorch.blindtest.ambiguity`).
     - `confident_errors`, `ece` (ten bins of the highest probability), `brier`: all cases.
     - `macro_f1`: over the labels that occur; an effect found within a pair counts for that effect.
@@ -89,6 +92,9 @@ def score(
     sheet.mean("pairs_jaccard", [_jaccard(r) for r in by_kind["pair"]])
     _several(sheet, by_kind["several"])
     sheet.measure("part_ece", [r for r in rows if of_budget.part_probabilities(r)], part_ece)
+    sizes = [size for r in rows for size in found_sizes(r)]
+    sheet.share("parameters_covered", [size.covered for size in sizes if size.covered is not None])
+    sheet.share("parameter_error", [size.right for size in sizes if size.right is not None])
     for kind, some in {"group": rows, "weighted": rows, **{f"by_kind.{k}": by_kind[k] for k in KINDS}}.items():
         sheet.mean(f"utility.{kind}", [r.utility(weighted=kind == "weighted") for r in some])
     sheet.mean("closed_error", [r.closed_error for r in rows if r.closed_error is not None])

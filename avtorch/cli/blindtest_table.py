@@ -36,6 +36,8 @@ _MEASURES = (
     ("several, leading cause", "several.leading", "%", ""),
     ("several, a name too many", "several.extra", "%", ""),
     ("parts, calibration error", "part_ece", "", "≤ 0.05"),
+    ("sizes, 90 % intervals that hold", "parameters_covered", "%", "85 to 95 %"),
+    ("sizes within 25 %", "parameter_error", "%", ""),
     ("utility of the alias set", "utility.group", "", ""),
     ("onset error, median [s]", "onset_error_s", "", "≤ 5"),
     ("seconds per case", "seconds_per_case", "", ""),
