@@ -1,0 +1,33 @@
+"""Budgets and counts in the cells of a table."""
+
+from __future__ import annotations
+
+from avtorch.blindtest.intervals import wilson
+from avtorch.gap import Budget
+from avtorch.gap.quantity import Quantity
+
+
+def interval(q: Quantity) -> str:
+    """A quantity with its 90 % interval."""
+    return f"{q.mean:.3g} ({q.q05:.3g} to {q.q95:.3g})"
+
+
+def causes(budget: Budget) -> str:
+    """Causes with shares and parameters, in one cell of a table."""
+    if not budget.names:
+        return budget.verdict[0]
+    cells: list[str] = []
+    for part in budget.parts:
+        if part.name in budget.names:
+            values = [interval(q) for q in part.parameters.values()]
+            cells.append(f"{part.name} {part.share.mean:.0%}: {', '.join(values)}")
+    cells += [f"{part.name}, by chance" for part in budget.chance if part.name in budget.names]
+    return "; ".join(cells)
+
+
+def counted(hits: int, of: int) -> str:
+    """How many of how many, with Wilson's 90 % interval of the share."""
+    between = wilson(hits, of)
+    return (
+        f"{hits} of {of}" if between is None else f"{hits} of {of} ({100 * between[0]:.0f} to {100 * between[1]:.0f} %)"
+    )

@@ -1,0 +1,180 @@
+"""Effects put in front of a recording: what the budget says of each, and the counts over all of them.
+
+The untouched recording has a gap of its own, so a size is compared twice: on top of what the untouched recording's
+answer has of the effect; and "beside the same effects", on top of what the untouched recording has of it where the
+effects of the changed recording's answer are fitted. What a car has of an effect may be too little to be named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from avtorch.blindtest import IN_FRONT, put_in_front
+from avtorch.blindtest.in_front_score import SIZE_OF, SIZE_WITHIN
+from avtorch.errors import InputError
+from avtorch.gap import EFFECTS, Budget, gap_budget, plant
+from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.forward_selection import baseline_noise
+from avtorch.gap.budget.given_effects import given_effects
+from avtorch.gap.budget.own_noise import own_noise, with_sizes
+from avtorch.gap.budget.repaired_model import parameters_of
+from avtorch.gap.budget.robust_fit import Fit, RobustFit
+from avtorch.gap.quantity import Quantity
+from avtorch.io import Log
+from benchmarks.budget_cells import causes, counted
+from benchmarks.reference_selection import selected
+
+_COLUMNS = (
+    "effect",
+    "",
+    "size",
+    "interval holds",
+    "size, same effects",
+    "interval holds, same effects",
+    "others",
+    "budget",
+    "simplest selection",
+)
+HEADER = f"| {' | '.join(_COLUMNS)} |\n{'|---' * len(_COLUMNS)}|"
+
+
+@dataclass(frozen=True)
+class Size:
+    """`ratio`: a size that was found over the size put in; `holds`: whether the 90 % interval holds what was put in."""
+
+    ratio: float
+    holds: bool
+
+    @property
+    def right(self) -> bool:
+        return abs(self.ratio - 1) <= SIZE_WITHIN
+
+
+@dataclass(frozen=True)
+class InFront:
+    """What is said of a recording with `effect` in front of it.
+
+    `named`: the verdict holds it; `alias`: it holds what these drives cannot tell from it. `size`, `same`: None where
+    it is not named. `others`: names that neither the effect nor the untouched recording accounts for; `nothing`:
+    whether the verdict is `none` or `unknown`. `simple`, `simple_others`: of the simplest selection.
+    """
+
+    effect: str
+    put_in: Mapping[str, float]
+    named: bool
+    alias: bool
+    size: Size | None
+    same: Size | None
+    others: tuple[str, ...]
+    nothing: bool
+    budget: str
+    simple: tuple[str, ...]
+    simple_others: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """Its row of the table under `HEADER`."""
+        truth = ", ".join(f"{value:.3g}" for value in self.put_in.values())
+        sizes = [cell for size in (self.size, self.same) for cell in _cells(size)]
+        found = "named" if self.named else "alias" if self.alias else "missed"
+        others, simple = ", ".join(self.others), ", ".join(self.simple) or "none"
+        return f"| {self.effect} ({truth}) | {found} | {' | '.join(sizes)} | {others} | {self.budget} | {simple} |"
+
+
+def _cells(size: Size | None) -> tuple[str, str]:
+    return ("", "") if size is None else (f"{size.ratio:.2f}", "yes" if size.holds else "no")
+
+
+def closing(rows: Sequence[InFront]) -> list[str]:
+    """The counts over all rows, with Wilson's 90 % intervals."""
+
+    def of_all(hits: Sequence[bool]) -> str:
+        return counted(sum(hits), len(hits))
+
+    sizes, same = [row.size for row in rows if row.size], [row.same for row in rows if row.same]
+    named, alike = [row.named for row in rows], [row.named or row.alias for row in rows]
+    others = [bool(row.others) for row in rows]
+    return [
+        f"named {of_all(named)}, with aliases {of_all(alike)}; with others {of_all(others)}; "
+        f"none or unknown {of_all([row.nothing for row in rows])}",
+        f"sizes within {100 * SIZE_WITHIN:.0f} % {of_all([size.right for size in sizes])}, "
+        f"beside the same effects {of_all([size.right for size in same])}",
+        f"intervals that hold {of_all([size.holds for size in sizes])}, "
+        f"beside the same effects {of_all([size.holds for size in same])}",
+        f"the simplest selection: named {of_all([row.effect in row.simple for row in rows])}, "
+        f"with others {of_all([bool(row.simple_others) for row in rows])}",
+    ]
+
+
+def in_front(log: Log, size: float) -> None:
+    """Prints a row per effect that no chance decides, and the counts."""
+    control, alone = gap_budget(log), baseline_noise(AnalysisRecord.for_budget([log]), plant([]))
+    simple_control = selected([log])
+    print(
+        f"{HEADER}\n| untouched | | | | | | | {causes(control)} | {', '.join(simple_control) or 'none'} |", flush=True
+    )
+    T_L, K_L = control.baseline["T_L"], control.baseline["K_L"]
+    rows: list[InFront] = []
+    for number, effect in enumerate(IN_FRONT):
+        if EFFECTS[effect].random:
+            continue
+        try:
+            changed, put_in = put_in_front(log, effect, T_L=T_L, K_L=K_L, size=size, seed=number)
+            budget = gap_budget(changed)
+        except InputError:
+            continue
+        before = size_of(control, effect)
+        own = _beside_the_same(budget, alone, effect, changed.epoch_s)
+        simple = tuple(selected([changed]))
+        rows.append(
+            InFront(
+                effect,
+                put_in,
+                named=effect in budget.names,
+                alias=any(effect in x.alias_set for x in (*budget.parts, *budget.chance) if x.name in budget.names),
+                size=compared(budget, effect, put_in, None if before is None else before.mean),
+                same=None if own is None else compared(budget, effect, put_in, own),
+                others=tuple(name for name in budget.names if name != effect and name not in control.names),
+                nothing=not budget.names,
+                budget=causes(budget),
+                simple=simple,
+                simple_others=tuple(name for name in simple if name != effect and name not in simple_control),
+            )
+        )
+        print(rows[-1], flush=True)
+    print("\n".join(closing(rows)), flush=True)
+
+
+def compared(budget: Budget, effect: str, put_in: Mapping[str, float], before: float | None) -> Size | None:
+    """The size found, and its interval, on top of `before` (None: none of it); None where it is not named."""
+    key, without, relative = SIZE_OF[effect]
+    found = size_of(budget, effect)
+    if found is None:
+        return None
+    before = without if before is None else before
+    ratio, *ends = (relative(x, before, put_in[key]) for x in (found.mean, found.q05, found.q95))
+    known = [end for end in ends if end is not None]
+    # a factor whose interval reaches 0 has no logarithm there
+    return None if ratio is None else Size(ratio, len(known) == 2 and min(known) <= 1 <= max(known))
+
+
+def size_of(budget: Budget, effect: str) -> Quantity | None:
+    """The size of a part, None where it is not named."""
+    part = next((part for part in budget.parts if part.name == effect and effect in budget.names), None)
+    return None if part is None else part.parameters.get(SIZE_OF[effect][0])
+
+
+def _beside_the_same(budget: Budget, alone: tuple[RobustFit, Fit], effect: str, epoch_s: float) -> float | None:
+    """What the untouched recording has of the effect when the effects named are fitted to it, None without a name.
+
+    `alone`: its noise and its bare baseline.
+    """
+    if size_of(budget, effect) is None:
+        return None
+    parts = [part for part in budget.parts if part.name in budget.names]
+    values = {f"{part.name}.{name}": q.mean for part in parts for name, q in part.parameters.items()}
+    onsets = {part.name: part.onset_s - epoch_s for part in parts if part.onset_s is not None}
+    kinds = [EFFECTS[part.name] for part in parts]
+    selection = given_effects(*alone, kinds, values=values, onsets=onsets)
+    selection = with_sizes(replace(selection, judging=own_noise(selection.last.fit)))
+    return parameters_of(selection, effect)[SIZE_OF[effect][0]].mean
