@@ -2,12 +2,15 @@
 
 ``AVTORCH_DATA=DIR python -m benchmarks.budgets [--only TEXT] [--in-front SIZE ...] [--picture FILE]``
 
-Prints a line a recording: the causes with their shares and parameters, and what each half says alone. With
-``--in-front`` a line a known effect of that size, put in front of the recording as one car's, several logs as segments
-of one: what is named; the size found on top of the untouched recording's over the size put in, and whether its 90 %
-interval holds what was put in; both on top of what the untouched recording has where the same effects are fitted to it;
-names that neither the effect nor the untouched recording accounts for; what the simplest selection names
+Prints a row a recording: the causes with their shares and parameters, and what each half says alone; and then what is
+known of these cars by other means (`known_facts`), a row a fact, beside the budget's figure.
+
+With ``--in-front`` a row a known effect of that size, put in front of the recording as one car's, several logs as
+segments of one: what is named; the size found on top of the untouched recording's over the size put in, and whether its
+90 % interval holds what was put in; both on top of what the untouched recording has where the same effects are fitted
+to it; names that neither the effect nor the untouched recording accounts for; what the simplest selection names
 (`reference_selection`). Then the counts, with 90 % intervals.
+
 ``--picture`` draws the budget and the drive of the first recording, as `avtorch diagnose` answers, and no more.
 """
 
@@ -28,6 +31,8 @@ from avtorch.gap import gap_budget
 from avtorch.io import Log
 from benchmarks.budget_cells import causes
 from benchmarks.effects_in_front import in_front
+from benchmarks.known_facts import HEADER as FACTS_HEADER
+from benchmarks.known_facts import Told, closing, told
 
 SETS: dict[str, tuple[str, ...]] = {
     "genesis, three laps": ("genesis/lap1.csv", "genesis/lap2.csv", "genesis/lap3.csv"),
@@ -47,6 +52,10 @@ SETS: dict[str, tuple[str, ...]] = {
     "volvo_truck": ("volvo_truck/052311_grade.csv",),
 }
 """Recordings with commands, by name: the logs of one car."""
+HEADER = (
+    "| recording | s | error before, left | causes | unexplained | first half / second half | processor s |\n"
+    "|---|---|---|---|---|---|---|"
+)
 _BETWEEN_S = 5.0
 
 
@@ -87,6 +96,9 @@ def main() -> None:
     folder = os.environ.get("AVTORCH_DATA")
     if folder is None:
         raise SystemExit("AVTORCH_DATA: not set, needs the folder of the recordings")
+    if not (arguments.picture or arguments.in_front):
+        print(HEADER, flush=True)
+    facts: list[Told] = []
     for name, files in SETS.items():
         if arguments.only not in name:
             continue
@@ -110,6 +122,9 @@ def main() -> None:
             f"| {name} | {seconds:.0f} | {share} | {causes(budget)} | {unexplained} | {halves} | {spent:.0f} |",
             flush=True,
         )
+        facts += told(name, budget)
+    if facts:
+        print("\n".join(["", FACTS_HEADER, *map(str, facts), "", closing(facts)]), flush=True)
 
 
 if __name__ == "__main__":
