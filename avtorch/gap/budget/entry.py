@@ -114,7 +114,8 @@ def enter(fitting: RobustFit, now: Step, candidates: Sequence[Candidate]) -> Ste
     best = min(tried, key=cost)
     same = [s for s in tried if s is best or _explains_the_same(fitting, now, best, s)]
     alike = [s for s in same if s is best or fitting.preference(s.held, best.held).strength() <= 0]
-    chosen = min([s for s in same if s in alike or _much_simpler(now, best, s)], key=lambda s: complexity(s.fit))
+    simpler = [s for s in same if s in alike or _much_simpler(now, best, s)]
+    chosen = min([s for s in simpler if _possible_lag(s.fit)] or simpler, key=lambda s: complexity(s.fit))
     aliases = {s.entered for s in alike} | {chosen.entered}
     return replace(chosen, aliases=tuple(sorted(name for name in aliases if name is not None)))
 
@@ -138,6 +139,15 @@ def _from_the_start_or_not(fitting: RobustFit, fit: Fit, held: HeldOut) -> tuple
 def _explains_the_same(fitting: RobustFit, now: Step, best: Step, other: Step) -> bool:
     """Whether little is left of what the other explains once the best is in."""
     return fitting.on_top(now.held, best.held, other.held) < _OF_ITS_OWN * (cost(now) - cost(other))
+
+
+def _possible_lag(fit: Fit) -> bool:
+    """Whether the lag is one that a vehicle can have, and does not stand in for something else.
+
+    A dead band with a lag of 12 s explains as much of a truck on a hilly road as the road, with far fewer parameters.
+    """
+    least, most = fit.model.plant.parameters()["T_L"].physical
+    return least <= float(fit.model.values(fit.z)["T_L"]) <= most
 
 
 def _much_simpler(now: Step, best: Step, other: Step) -> bool:
