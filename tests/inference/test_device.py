@@ -1,34 +1,24 @@
 """Everything in `inference` runs on the device that it is given: an emulated one anywhere, a real one where it is.
 
 The emulated device (`tests.other_device`) ends a test at the first tensor made without a device. Its numbers are the
-processor's, so that the results have to be those of the processor. The tests marked `gpu` do the same on a graphics
-card, whose random numbers are others: what is exact is compared as numbers, what is drawn by its spread.
+processor's, so that the results have to be those of the processor. A graphics card: `tests/inference/test_on_a_gpu.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
-from torch.distributions import Gamma, constraints
 
 from avtorch import estimate
 from avtorch.errors import InputError
 from avtorch.inference import (
     BeliefStream,
-    JerkDensity,
-    JerkPoints,
-    JerkStatistics,
-    PopulationDensity,
-    PopulationMargin,
-    PositionLagDensity,
     SamplerSettings,
     SequentialInference,
-    SpeedLagDensity,
-    TorchDensity,
     find_mode,
     integrate,
     sample,
@@ -38,23 +28,12 @@ from avtorch.inference.control_variates import ControlVariates
 from avtorch.inference.device import checked_device
 from avtorch.inference.estimators import ESTIMATORS
 from avtorch.inference.importance import weighted_draws
-from avtorch.inference.latent import LatentDensity
 from avtorch.inference.latent_form import LatentForm
-from avtorch.inference.latent_window import LatentWindow
-from avtorch.inference.priors import (
-    Joint,
-    LogSpaceNormal,
-    QuadrantNormal,
-    Switch,
-    default_actuation_prior,
-    default_jerk_noise_prior,
-)
 from avtorch.inference.sghmc import SGHMC
 from avtorch.inference.sgld import SGLD
-from avtorch.vehicle.glvd import glvd_jerk, glvd_rollout
+from tests.inference.device_cases import DENSITIES, F64, jerk_density, jerk_points, position_lag, rows, same
 from tests.other_device import ELSEWHERE, Elsewhere, OtherDevice, Strayed
 
-F64 = torch.float64
 EAGER = SamplerSettings(chains=16, draws=4, walk="eager", attempts=1)
 
 
@@ -62,97 +41,6 @@ EAGER = SamplerSettings(chains=16, draws=4, walk="eager", attempts=1)
 def elsewhere() -> Iterator[OtherDevice]:
     with OtherDevice() as device:
         yield device
-
-
-def rows(vehicles: int = 2, count: int = 400, seed: int = 0) -> tuple[Tensor, dict[str, Tensor]]:
-    """Time and columns (vehicle, time) at 100 Hz, on the processor."""
-    g = torch.Generator().manual_seed(seed)
-    time = torch.arange(count, dtype=F64) / 100
-    u = torch.stack([torch.sin(2 * time + k) + 0.5 * torch.sin(5 * time) for k in range(vehicles)])
-    lag, gain = 0.4 + 0.3 * torch.arange(vehicles, dtype=F64), 0.9 * torch.ones(vehicles, dtype=F64)
-    later = glvd_rollout(torch.zeros(vehicles, dtype=F64), u, lag, gain, 0.01)
-    a = torch.cat([torch.zeros(vehicles, 1, dtype=F64), later[:, :-1]], -1)
-    noise = torch.randn(3, *a.shape, dtype=F64, generator=g)
-    jerk = glvd_jerk(a, u, lag[:, None], gain[:, None]) + 0.1 * noise[0]
-    speed = 20 + 0.01 * a.cumsum(-1) + 0.01 * noise[1]
-    return time, {"accel_cmd": u, "accel": a + 0.02 * noise[2], "jerk": jerk, "speed": speed}
-
-
-def jerk_density(device: Any, which: str = "first") -> JerkDensity:
-    _, c = rows()
-    sums = JerkStatistics.from_samples(*(c[name].to(device) for name in ("accel", "accel_cmd", "jerk")))
-    mean = torch.tensor([[0.5, 0.9], [0.6, 0.8]], dtype=F64)
-    wide = LogSpaceNormal(torch.zeros(2, 3, dtype=F64), 0.5 * torch.eye(3, dtype=F64).repeat(2, 1, 1))
-    quadrant = Joint(QuadrantNormal(mean, 0.25), default_jerk_noise_prior())
-    first = Joint(default_actuation_prior(), default_jerk_noise_prior())
-    switch = Switch(torch.tensor([True, False]), first, quadrant)
-    return JerkDensity(sums, {"first": None, "wide": wide, "quadrant": quadrant, "switch": switch}[which])
-
-
-def jerk_points(device: Any) -> JerkPoints:
-    _, c = rows()
-    return JerkPoints(*(c[name].to(device) for name in ("accel", "accel_cmd", "jerk")))
-
-
-def latent_density(device: Any, jitter: float = 0.0) -> LatentDensity:
-    time, c = rows(count=120)
-    shaken = time + jitter * torch.rand(len(time), dtype=F64, generator=torch.Generator().manual_seed(1))
-    data = LatentWindow(
-        shaken.expand(2, -1), *(c[name][:, :120] for name in ("accel_cmd", "accel", "speed")),
-        torch.ones(2, 120, dtype=torch.bool),
-    )  # fmt: skip
-    return LatentDensity(data.to(device))
-
-
-def speed_lag(device: Any) -> SpeedLagDensity:
-    _, c = rows()
-    parts = (c[name].to(device) for name in ("accel", "accel_cmd", "jerk"))
-    return SpeedLagDensity(SpeedLagDensity.sums(*parts))
-
-
-def position_lag(device: Any) -> PositionLagDensity:
-    g = torch.Generator().manual_seed(0)
-    error, v, noise = torch.randn(3, 2, 500, dtype=F64, generator=g)
-    accel = error / 0.25 - 2 * 0.7 / 0.5 * v + 0.1 * noise
-    return PositionLagDensity(PositionLagDensity.sums(*(x.to(device) for x in (error, v, accel))))
-
-
-def population(device: Any) -> PopulationDensity:
-    lag = torch.tensor([[0.30, 0.32, 0.31, 0.33, 0.60]], dtype=F64).log()
-    return PopulationDensity(*(x.to(device) for x in (lag, torch.full_like(lag, 0.2), torch.arange(5))))
-
-
-def margin(device: Any) -> PopulationMargin:
-    lag = torch.tensor([[0.30, 0.32, 0.31, 0.33, 0.60]], dtype=F64).log()
-    return PopulationMargin(*(x.to(device) for x in (lag, torch.full_like(lag, 0.02), torch.arange(5))))
-
-
-def own(device: Any) -> TorchDensity:
-    shape, rate = (torch.tensor(x, dtype=F64).to(device) for x in (9.0, 3.0))
-    return TorchDensity(
-        lambda p: Gamma(shape, rate, validate_args=False).log_prob(p["rate"]),
-        {"rate": constraints.positive}, start={"rate": 2.0}, device=device,
-    )  # fmt: skip
-
-
-DENSITIES: dict[str, Callable[[Any], Any]] = {
-    **{f"jerk, {prior}": lambda d, prior=prior: jerk_density(d, prior) for prior in ("first", "wide", "quadrant")},
-    "jerk, switch": lambda d: jerk_density(d, "switch"),
-    "points": jerk_points,
-    "even rows": latent_density,
-    "uneven rows": lambda d: latent_density(d, 0.008),
-    "speed lag": speed_lag,
-    "position lag": position_lag,
-    "population": population,
-    "margin": margin,
-    "own": own,
-}
-
-
-def same(found: Any, expected: Any, rtol: float = 1e-9) -> None:
-    """Tensors elsewhere against those on the processor."""
-    assert found.device.type != "cpu"
-    torch.testing.assert_close(found.cpu(), expected, rtol=rtol, atol=rtol, equal_nan=True)
 
 
 def assert_alike(found: dict[str, Any], expected: dict[str, Any], rtol: float) -> None:
@@ -282,6 +170,34 @@ def test_optimizers_resume_there(optimizer: Any, elsewhere: OtherDevice) -> None
     assert theta.tolist() == copy.tolist()
 
 
+@pytest.mark.parametrize(
+    ("optimizer", "options"),
+    [
+        (SGLD, {"noise": "averaged", "foreach": True}),
+        (SGLD, {"preconditioner": "rmsprop", "chain_dims": 1, "noise_dtype": torch.float32}),
+        (SGHMC, {}),
+    ],
+)
+def test_optimizers_walk_there_as_here(optimizer: Any, options: dict[str, Any], elsewhere: OtherDevice) -> None:
+    walked = []
+    for device in ("cpu", ELSEWHERE):
+        theta = torch.linspace(-1, 1, 8, dtype=F64).to(device).requires_grad_()
+        by = optimizer([theta], lr=0.1, generator=torch.Generator(device=device).manual_seed(4), **options)
+        for _ in range(3):
+            by.step(lambda theta=theta: theta**4 / 4)
+        walked.append(theta.detach())
+    same(walked[1], walked[0])
+
+
+def test_importance_draws_are_those_of_the_processor(elsewhere: OtherDevice) -> None:
+    here, there = position_lag("cpu"), position_lag(ELSEWHERE)
+    g = torch.Generator().manual_seed(0), torch.Generator(device=ELSEWHERE).manual_seed(0)
+    expected, found = weighted_draws(here, generator=g[0]), weighted_draws(there, generator=g[1])
+    same(found.z, expected.z, 1e-4)
+    same(found.weight, expected.weight, 1e-3)
+    assert found.equal(10, g[1]).device == ELSEWHERE
+
+
 @pytest.mark.slow
 def test_integrated_conjugate_and_importance(elsewhere: OtherDevice) -> None:
     here, there = jerk_density("cpu", "quadrant"), jerk_density(ELSEWHERE, "quadrant")
@@ -376,40 +292,6 @@ def test_a_generator_of_another_device_is_one_error(elsewhere: OtherDevice) -> N
         sample(jerk_density(ELSEWHERE), EAGER, generator=torch.Generator())
     with pytest.raises(InputError, match="generator: found one on meta, needs one on cpu"):
         sample(jerk_density("cpu"), EAGER, generator=torch.Generator(device=ELSEWHERE))
-
-
-CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU on this machine")
-
-
-@pytest.mark.gpu
-@CUDA
-@pytest.mark.parametrize("name", DENSITIES)
-def test_on_a_gpu_densities_and_modes(name: str) -> None:
-    here, there = DENSITIES[name]("cpu"), DENSITIES[name]("cuda")
-    z = here.initial() + 0.1
-    same(there.log_prob(z.cuda()), here.log_prob(z), 1e-8)
-    same(find_mode(there).z, find_mode(here).z, 1e-4)
-
-
-@pytest.mark.gpu
-@CUDA
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_on_a_gpu_streams(estimator: str) -> None:
-    """Means by Monte Carlo agree to a tenth of an SD: thousands of draws err by a fiftieth."""
-    time, columns = rows(count=401)
-    beliefs = []
-    for device in ("cpu", "cuda"):
-        stream = BeliefStream(window=2.0, vehicles=2, estimator=estimator, device=device)
-        block = {name: columns[name] for name in stream.form.columns}
-        beliefs.append(stream.feed(time, block)[-1].belief)
-    assert beliefs[1].draws.device.type == "cuda"
-    assert ((beliefs[1].mean.cpu() - beliefs[0].mean).abs() < 0.1 * beliefs[0].sd).all()
-
-
-@pytest.mark.gpu
-@CUDA
-def test_on_a_gpu_quadrature_is_the_same() -> None:
-    same(integrate(jerk_density("cuda"), nodes=25).mean, integrate(jerk_density("cpu"), nodes=25).mean, 1e-4)
 
 
 @pytest.mark.slow
