@@ -18,6 +18,7 @@ from avtorch.errors import InputError
 from avtorch.fleet import FleetSettings, read_rows, run_fleet
 from avtorch.fleet import task as tasks
 from avtorch.fleet.marks import marks_of
+from avtorch.fleet.rows import schema
 from avtorch.io import Log
 from avtorch.results import window_entry
 from tests.bars import BAR
@@ -57,6 +58,26 @@ def test_rows_are_what_estimate_gives(tmp_path: Path, scheduler: str) -> None:
             assert {part: row[f"{name}_{part}"] for part in entry[name]} == entry[name]
         assert {n["name"]: n["value_mean"] for n in row["noise"]} == {"sigma": entry["sigma"]["mean"]}
         assert (row["car"], row["status"], row["error"]) == ("drive", "done", None)
+
+
+def test_polars_reads_the_folder_of_windows(tmp_path: Path, scheduler: str) -> None:
+    polars = pytest.importorskip("polars")
+    write_fleet(tmp_path / "logs", {"red": 0.4, "blue": 0.8})
+    (tmp_path / "logs" / "green").mkdir()
+    (tmp_path / "logs" / "green" / "drive.csv").write_text("a,b\n1,2\n")
+    run_fleet(tmp_path / "logs", tmp_path / "out", settings=QUICK, scheduler=scheduler)
+    expected = read_rows(tmp_path / "out", "windows")
+    found = polars.read_parquet(tmp_path / "out" / "windows")
+    assert found.columns == expected.column_names == schema("estimate").names
+    assert found.height == expected.num_rows
+    # one without an answer, and four windows of 2 s of each car's 8 s
+    counts = dict(found.group_by("car").len().iter_rows())
+    assert counts == {"red": 4, "blue": 4, "green": 1}
+    used = found.filter(polars.col("status") == "done").sort("car", "window")
+    rows = [row for row in expected.to_pylist() if row["status"] == "done"]
+    rows.sort(key=lambda row: (row["car"], row["window"]))
+    for column in ("T_L_mean", "K_L_sd", "begin_s", "excited", "alerts"):
+        assert used[column].to_list() == [row[column] for row in rows]
 
 
 def test_a_broken_log_is_a_row_that_says_why_and_the_others_are_done(tmp_path: Path, scheduler: str) -> None:
