@@ -16,7 +16,7 @@ from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.budget.account import account, divisible, restated
 from avtorch.gap.budget.forward_selection import MOST_PARTS
 from avtorch.gap.budget.parts import MATERIAL, Budget
-from avtorch.gap.budget.repaired_model import parameter_draws, repaired_plant
+from avtorch.gap.budget.repaired_model import parameter_draws, repaired_plant, with_chance
 from avtorch.gap.budget.shrinkage import shrinkage_of
 from avtorch.gap.crossval.attribution import RowAttribution
 from avtorch.gap.crossval.cross_validate import cross_validate
@@ -219,29 +219,29 @@ def diagnose(
     # where nothing is named, no effect closes anything
     held = cross_validate(race, winner, alike=sorted(alike), progress=stages) if named and winner else None
     attribution = RowAttribution.of(race, winner or top)
-    simulator = repaired(race.none, base)
     car, beliefs = None, belief(race.none)
-    if named and winner is not None:
-        car, beliefs = repaired(winner, base, draws), belief(winner, draws)
-    elif selected is not None and budget is not None and budget.parts:
-        car = repaired_plant(selected, base, float(simulator.sigma))
-        beliefs = parameter_draws(selected, seed=seed)
     shrinkage = None if held is None else gap_closed(held)
     contenders, errors = predictive_models(race, verdict), (race.none if winner is None else winner).errors
-    if selected is not None and car is not None and budget is not None:
-        shrinkage, errors = shrinkage_of(selected), _errors(each, race.record, car, budget)
+    if named and winner is not None:
+        car, beliefs = repaired(winner, base, draws), belief(winner, draws)
+    elif selected is not None and budget is not None and budget.names:
+        car, beliefs = repaired_plant(selected, base), parameter_draws(selected, seed=seed)
+        errors = _errors(each, race.record, car, budget)
         noise = noise_left(race.record, errors, race.none.noise.noise, car, budget)
-        contenders = rival_models(
-            selected,
-            budget,
-            verdict,
-            base,
-            kinds,
-            noise=noise,
-            probability=next(c.probability for c in candidates if c.name == verdict.name),
-            specific_force=race.record.accel_kind == "specific-force",
-            seed=seed,
-        )
+        car = with_chance(car, budget, kinds, noise)
+        if budget.parts:  # no rollout shows what chance decides
+            shrinkage = shrinkage_of(selected)
+            contenders = rival_models(
+                selected,
+                budget,
+                verdict,
+                base,
+                kinds,
+                noise=noise,
+                probability=next(c.probability for c in candidates if c.name == verdict.name),
+                specific_force=race.record.accel_kind == "specific-force",
+                seed=seed,
+            )
     return Diagnosis(
         log=LogFacts.of(each),
         baseline=lag_and_gain(race.none),
@@ -252,7 +252,7 @@ def diagnose(
         onset_from_start_s=None if onset is None else onset.from_start_s,
         onset_log=0 if onset is None else onset.log,
         plant=car,
-        simulator=simulator,
+        simulator=repaired(race.none, base),
         belief=beliefs,
         assumed=belief(race.none),
         draws=reported_draws(winner, draws) if draws is not None and winner is not None else None,

@@ -15,8 +15,10 @@ from torch import Tensor
 
 from avtorch.arrays import FloatArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.parts import Budget
 from avtorch.gap.budget.robust_fit import Fit
 from avtorch.gap.budget.selection_step import Selection, Step
+from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.integrated import Integrated
@@ -50,22 +52,33 @@ def lag_and_gain(selection: Selection) -> dict[str, Quantity]:
     return {key: _jackknife(values[key].numpy()) for key in ("T_L", "K_L")}
 
 
-def repaired_plant(selection: Selection, base: GapPlant, sigma: float) -> GapPlant:
-    """The simulator with all parts, from the start of a drive even where the car has them from an onset.
+def repaired_plant(selection: Selection, base: GapPlant) -> GapPlant:
+    """The simulator with all parts, from the start of a drive even where the car has them from an onset."""
+    return plant_of(selection.sized.fit, base)
 
-    `sigma`: its jerk noise.
+
+def with_chance(car: GapPlant, budget: Budget, kinds: Sequence[type[Effect]], noise: NoiseModel) -> GapPlant:
+    """The `car` with those of `kinds` that chance decides and the budget names, and with jerk noise besides.
+
+    `noise`: what is left with all parts, a slow force apart. Rollouts are the same: they are free of noise.
     """
-    return plant_of(selection.sized.fit, base, sigma)
+    known = {kind.name: kind for kind in kinds}
+    named = [part for part in budget.chance if part.name in budget.names and part.name in known and part.parameters]
+    effects = [
+        known[part.name].of({key: q.mean for key, q in (part.parameters or {}).items()}).in_noise(noise.accel_sd)
+        for part in named
+    ]
+    return plant(effects, baseline=car, sigma=noise.jerk_sd)
 
 
-def plant_of(fit: Fit, base: GapPlant, sigma: float | None = None) -> GapPlant:
-    """`base` with the effects, lag and gain of a fit; `sigma`: its jerk noise, default: that of `base`."""
+def plant_of(fit: Fit, base: GapPlant) -> GapPlant:
+    """`base` with the effects, lag and gain of a fit."""
     model = fit.model
     values = {key: x if x.dim() else float(x) for key, x in model.values(fit.z).items()}
     filled = model.plant.with_values(values)
     own = set(model.names)
     effects: Sequence[Effect] = [e for e in filled.effects if e.name in own]
-    return plant(effects, baseline=base, T_L=float(filled.T_L), K_L=float(filled.K_L), sigma=sigma)
+    return plant(effects, baseline=base, T_L=float(filled.T_L), K_L=float(filled.K_L))
 
 
 def parameter_draws(selection: Selection, *, count: int = 64, seed: int = 0) -> dict[str, FloatArray]:

@@ -50,6 +50,11 @@ class NoiseModel:
         more = ((self.more_sd, self.more_time),) if self.more_sd > 0 else ()
         return ((self.process_sd, self.process_time), (self.force_sd, self.force_time), *more)
 
+    @property
+    def jerk_sd(self) -> float:
+        """A plant's `sigma` [m/s³], whose white jerk has the standard deviation `process_sd` behind the lag."""
+        return float(self.process_sd * np.sqrt(2 / self.process_time))
+
     def replaced(self, **values: float) -> NoiseModel:
         return replace(self, **values)
 

@@ -84,16 +84,14 @@ def repaired(found: FittedModel, baseline: GapPlant | None = None, draws: Draws 
     for effect in chance:
         given = {key.partition(".")[2]: x for key, x in random_means.items() if key.startswith(f"{effect.name}.")}
         effects.append(_plain(effect.replaced(given).in_noise(float(noise.accel_sd))))
-    process_sd = noise.process_sd
     if found.by_chance is not None and found.by_chance.process_sd is not None:
-        process_sd = found.by_chance.process_sd
+        noise = noise.replaced(process_sd=found.by_chance.process_sd)
     return plant(
         effects,
         baseline=found.hypothesis.baseline if baseline is None else baseline,
         T_L=means["T_L"],
         K_L=means["K_L"],
-        # the stationary standard deviation of white jerk noise through a lag
-        sigma=float(process_sd * np.sqrt(2 / noise.process_time)),
+        sigma=noise.jerk_sd,
     )
 
 

@@ -247,16 +247,17 @@ class Diagnosis(Displayed):
         """Publish `diagnosis.json` and, where there is a plant, `plant.toml` at the same moment; returns the files.
 
         The plant's effects act from the start, even where the log has an onset; a comment in `plant.toml` then states
-        this (an effect with an onset of its own has it among its parameters). All files of an earlier diagnosis in the
-        folder are removed at the same moment, including its page, exports and manoeuvre: write these afterwards, or all
-        of them within one `avtorch.io.answer_set(folder, DIAGNOSIS_FILES)`. Raises `InputError` where the folder cannot
-        be written or a number is not finite; the earlier diagnosis is then kept.
+        this (an effect with an onset of its own has it among its parameters). Another names the random effects. All
+        files of an earlier diagnosis in the folder are removed at the same moment, including its page, exports and
+        manoeuvre: write these afterwards, or all of them within one `avtorch.io.answer_set(folder, DIAGNOSIS_FILES)`.
+        Raises `InputError` where the folder cannot be written or a number is not finite; the earlier diagnosis is then
+        kept.
         """
         names = ["diagnosis.json"] if self.plant is None else ["diagnosis.json", "plant.toml"]
         with answer_set(folder, DIAGNOSIS_FILES) as staged:
             if self.plant is not None:
                 with atomic(staged / "plant.toml") as stream:
-                    stream.write(self._late() + self.plant.to_toml())
+                    stream.write(self._late() + self._random() + self.plant.to_toml())
             write_json(staged / "diagnosis.json", self.to_dict())
         return [Path(folder) / name for name in names]
 
@@ -275,6 +276,13 @@ class Diagnosis(Displayed):
         if self.onset_s is None or not late:
             return ""
         return f"# In the log {late} from {sentences.moment(self)} on; in this plant from the start.\n"
+
+    def _random(self) -> str:
+        """A comment for `plant.toml` where chance decides some of its effects."""
+        names = [] if self.plant is None else [e.name for e in self.plant.effects if e.random]
+        return (
+            f"# By chance, drawn anew in every drive and not part of `closed`: {', '.join(names)}.\n" if names else ""
+        )
 
     def to_arviz(self) -> InferenceData:
         """The winner's draws as `arviz.InferenceData`, one variable (chain, draw) per parameter, its unit in `attrs`.

@@ -53,7 +53,7 @@ def rivals(
 def test_the_first_is_the_repaired_simulator(selected: tuple[Selection, Budget]) -> None:
     models = rivals(selected, dict.fromkeys(NAMES, 0.99), {})
     assert list(models) == [BOTH]
-    expected = repaired_plant(selected[0], BASE, 0.1).values()
+    expected = repaired_plant(selected[0], BASE).values()
     assert {k: float(x) for k, x in models[BOTH].plant.values().items()} == {k: float(x) for k, x in expected.items()}
     for key, draws in models[BOTH].belief.items():
         assert np.mean(draws) == pytest.approx(float(expected[key]), abs=4 * float(np.std(draws)) + 1e-9)
