@@ -20,6 +20,7 @@ from avtorch.gap.budget.likely_parts import likely_parts
 from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.budget.parts import LIKELY, MATERIAL, Budget, ChancePart, Part, own_onset, percent
 from avtorch.gap.budget.selection_step import Selection
+from avtorch.gap.budget.share_of_noise import share_of_noise
 from avtorch.gap.budget.share_order import largest_first
 from avtorch.gap.budget.unexplained_places import placed
 from avtorch.gap.quantity import Quantity
@@ -82,6 +83,7 @@ def account(
         selection = largest_first(begun, 0.0)
         budget = _as_adequate(budget_of(selection, epoch_s=epoch, **options), candidates)
         budget = _by_likelihood(budget, candidates, verdict, named, winner, epoch if len(logs) == 1 else None)
+        budget = replace(budget, chance=_chance(candidates, verdict, winner, budget.unexplained.probability, selection))
         return Account(budget, selection, tuple(candidates), _verdict(budget, verdict), held_out=False)
     selection = select(record, base, kinds, begun=begun, most=most, progress=progress, checkpoint=checkpoint)
     selection = likely_parts(selection, material, seed=seed)
@@ -140,7 +142,7 @@ def _by_likelihood(
     parts = tuple(
         _part(part, by_name[part.name], own, candidates, verdict, winner, left, epoch_s) for part in budget.parts
     )
-    return replace(budget, parts=parts, chance=_chance(candidates, verdict, winner, left))
+    return replace(budget, parts=parts)
 
 
 def restated(budget: Budget, candidate: Candidate) -> Budget:
@@ -181,7 +183,11 @@ def _part(
 
 
 def _chance(
-    candidates: Sequence[Candidate], verdict: Verdict, winner: FittedModel | None, left: float
+    candidates: Sequence[Candidate],
+    verdict: Verdict,
+    winner: FittedModel | None,
+    left: float,
+    selection: Selection,
 ) -> tuple[ChancePart, ...]:
     """The verdict's effects that chance decides."""
     if winner is None:
@@ -192,7 +198,8 @@ def _chance(
     for kind in random:
         parameters = _own_parameters(kind.name, own)
         probability = _probability(_aliases(kind.name, verdict), candidates, left)
-        out.append(ChancePart(kind.name, probability, None, parameters, not implausible(parameters, {}, [kind])))
+        share = share_of_noise(kind, winner, selection)
+        out.append(ChancePart(kind.name, probability, share, parameters, not implausible(parameters, {}, [kind])))
     return tuple(sorted(out, key=lambda part: -part.probability))
 
 
@@ -208,7 +215,8 @@ def _all_chance(
     """The residuals', which no part explains any more, and the likelihood's besides."""
     seen = by_chance(selection, base, kinds)
     own = {part.name for part in seen}
-    others = [x for x in _chance(candidates, verdict, winner, budget.unexplained.probability) if x.name not in own]
+    told = _chance(candidates, verdict, winner, budget.unexplained.probability, selection)
+    others = [x for x in told if x.name not in own]
     return tuple(sorted([*others, *seen], key=lambda part: -part.probability))
 
 

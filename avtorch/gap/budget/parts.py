@@ -74,7 +74,8 @@ def own_onset(kind: type[Effect], parameters: Mapping[str, Quantity], epoch_s: f
 class ChancePart:
     """A random cause, such as a gust: no rollout predicts it, so it is a part of the noise.
 
-    `share_of_noise`: of the variance that is left with all parts; None where it was not estimated. `alias_set`: effects
+    `share_of_noise`: of the variance that is left with all parts (outliers: of the accelerometer's errors); None where
+    it was not estimated. `alias_set`: effects
     that these drives cannot distinguish from it, itself among them (it is added).
 
     Example:
