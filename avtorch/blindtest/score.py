@@ -44,7 +44,7 @@ def score(
     - `several.recall`, `.precision` (weighted by shares), `.sum_error`, `.share_error`, `.unexplained_error`,
       `.leading`, `.exact`, `.extra`: cases of several causes against the oracle's budget
       (`avtorch.blindtest.budget_score`). `part_ece`: calibration error of the budgets' parts, all cases.
-    - `parameters_covered`, `parameter_error`: of the sizes of parts that are named and true, the share whose 90 %
+    - `parameters_covered`, `parameters_right`: of the sizes of parts that are named and true, the share whose 90 %
       interval holds the true one, and the share within a quarter of it (`avtorch.blindtest.parameter_score`).
     - `utility.group`, `.weighted`, `.by_kind`: of the alias set as an ambiguity group (`avtorch.blindtest.ambiguity`).
     - `confident_errors`, `ece` (ten bins of the highest probability), `brier`: all cases.
@@ -94,7 +94,7 @@ def score(
     sheet.measure("part_ece", [r for r in rows if of_budget.part_probabilities(r)], part_ece)
     sizes = [size for r in rows for size in found_sizes(r)]
     sheet.share("parameters_covered", [size.covered for size in sizes if size.covered is not None])
-    sheet.share("parameter_error", [size.right for size in sizes if size.right is not None])
+    sheet.share("parameters_right", [size.right for size in sizes if size.right is not None])
     for kind, some in {"group": rows, "weighted": rows, **{f"by_kind.{k}": by_kind[k] for k in KINDS}}.items():
         sheet.mean(f"utility.{kind}", [r.utility(weighted=kind == "weighted") for r in some])
     sheet.mean("closed_error", [r.closed_error for r in rows if r.closed_error is not None])

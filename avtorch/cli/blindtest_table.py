@@ -37,7 +37,7 @@ _MEASURES = (
     ("several, a name too many", "several.extra", "%", ""),
     ("parts, calibration error", "part_ece", "", "≤ 0.05"),
     ("sizes, 90 % intervals that hold", "parameters_covered", "%", "85 to 95 %"),
-    ("sizes within 25 %", "parameter_error", "%", ""),
+    ("sizes within 25 %", "parameters_right", "%", ""),
     ("utility of the alias set", "utility.group", "", ""),
     ("onset error, median [s]", "onset_error_s", "", "≤ 5"),
     ("seconds per case", "seconds_per_case", "", ""),

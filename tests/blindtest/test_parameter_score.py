@@ -73,8 +73,8 @@ def test_sizes_of_rightly_named_parts_are_held_against_the_truth() -> None:
     assert (scale.covered, scale.right) == (False, False)
     assert scale.ratio == pytest.approx(np.log(1.1) / np.log(1.2))
     s = score([case(CAUSES)], [said], resamples=5)
-    assert (s["parameters_covered"], s["parameter_error"]) == (0.5, 0.5)
-    assert (s["counts"]["parameters_covered"], s["counts"]["parameter_error"]) == (2, 2)
+    assert (s["parameters_covered"], s["parameters_right"]) == (0.5, 0.5)
+    assert (s["counts"]["parameters_covered"], s["counts"]["parameters_right"]) == (2, 2)
     assert s["intervals"]["parameters_covered"] == list(wilson(1, 2) or ())
 
 
@@ -86,7 +86,7 @@ def test_parts_that_are_not_named_and_answers_without_a_budget_have_no_sizes() -
     assert found_sizes(read_answer(case(CAUSES), None)) == []
     kept = {key: value for key, value in case(CAUSES).items() if key != "parameters"}
     s = score([kept], [sized(late)], resamples=5)
-    assert (s["parameters_covered"], s["parameter_error"], s["counts"]["parameters_covered"]) == (None, None, 0)
+    assert (s["parameters_covered"], s["parameters_right"], s["counts"]["parameters_covered"]) == (None, None, 0)
 
 
 def test_a_cause_of_chance_has_a_size_and_one_without_interval_is_not_bounded() -> None:
@@ -98,7 +98,7 @@ def test_a_cause_of_chance_has_a_size_and_one_without_interval_is_not_bounded() 
     assert (gust.covered, gust.right) == (True, True)
     assert (limit.covered, limit.right) == (None, False)
     s = score([case(causes)], [said], resamples=5)
-    assert (s["counts"]["parameters_covered"], s["counts"]["parameter_error"]) == (1, 2)
+    assert (s["counts"]["parameters_covered"], s["counts"]["parameters_right"]) == (1, 2)
 
 
 def test_each_size_is_told_by_answers_and_drawn_for_cases() -> None:

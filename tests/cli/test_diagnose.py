@@ -453,6 +453,11 @@ def test_headline_for_each_kind_of_verdict(logs: list[Log]) -> None:
     unsure = (Candidate("dead_time", 0.6), Candidate("gust", 0.4), Candidate("none", 0.0), Candidate("unknown", 0.0))
     assert diagnosis_headline(answer(logs, unsure))[0].startswith("[bold cyan]Probably the simulator lacks this")
     assert said("unknown").startswith("The cause is not among the effects known here")
+    weak = (Candidate("unknown", 0.38), Candidate("gust", 0.31), Candidate("dead_time", 0.31), Candidate("none", 0.0))
+    assert diagnosis_headline(answer(logs, weak))[0] == (
+        "[bold yellow]No cause can be named: perhaps it is not among the effects known here (probability 0.38), "
+        "perhaps too weak to tell.[/]"
+    )
     assert said("dead_time+gust") == (
         f"The simulator lacks this (probability over 0.99): {late}, "
         "and wind and road push the car at random, for seconds (gust)."

@@ -78,6 +78,8 @@ def headline(found: Findings) -> str:
 
 def _verdict(found: Findings) -> str:
     verdict, p = found.verdict, _share(found.winner.probability)
+    if verdict.abstained and found.winner.probability < 0.5:
+        return f"No cause can be named: perhaps it is not among the {_known(found)} ({p}), perhaps too weak to tell."
     if verdict.abstained:
         return f"The cause is not among the {_known(found)} ({p}); no cause is named."
     odd = found.winner.implausible
