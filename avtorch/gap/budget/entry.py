@@ -113,11 +113,30 @@ def enter(fitting: RobustFit, now: Step, candidates: Sequence[Candidate]) -> Ste
         return None
     best = min(tried, key=cost)
     same = [s for s in tried if s is best or _explains_the_same(fitting, now, best, s)]
-    alike = [s for s in same if s is best or fitting.preference(s.held, best.held).strength() <= 0]
-    simpler = [s for s in same if s in alike or _much_simpler(now, best, s)]
-    chosen = min([s for s in simpler if _possible_lag(s.fit)] or simpler, key=lambda s: complexity(s.fit))
+    chosen, alike = _simplest_alike(fitting, same)
+    simpler = [
+        s for s in same if _much_simpler(now, chosen, s) and (_possible_lag(s.fit) or not _possible_lag(chosen.fit))
+    ]
+    if simpler:
+        chosen, _ = _simplest_alike(fitting, simpler)
     aliases = {s.entered for s in alike} | {chosen.entered}
     return replace(chosen, aliases=tuple(sorted(name for name in aliases if name is not None)))
+
+
+def _simplest_alike(fitting: RobustFit, steps: Sequence[Step]) -> tuple[Step, list[Step]]:
+    """The simplest, with a possible lag if one has it, of those of `steps` that are as good as the best; all those."""
+    best = min(steps, key=cost)
+    alike = [s for s in steps if s is best or not _prefers(fitting, s.held, best.held)]
+    return min([s for s in alike if _possible_lag(s.fit)] or alike, key=lambda s: complexity(s.fit)), alike
+
+
+def _prefers(fitting: RobustFit, one: HeldOut, other: HeldOut) -> bool:
+    """Whether blocks that were held out prefer `other` to `one`: they agree on that, or much is gained.
+
+    In a short drive two or three blocks excite an effect, and no agreement of these is sure enough.
+    """
+    found = fitting.preference(one, other)
+    return found.nats > MUCH or found.strength() > 0
 
 
 def _from_the_start_or_not(fitting: RobustFit, fit: Fit, held: HeldOut) -> tuple[Fit, HeldOut]:
@@ -131,9 +150,7 @@ def _from_the_start_or_not(fitting: RobustFit, fit: Fit, held: HeldOut) -> tuple
     model = fit.model.without_onset(name)
     always = fitting.fit(model, model.coordinates(fit.known)[None])
     before = fitting.hold_out(always)
-    found = fitting.preference(before, held)
-    preferred = found.nats > MUCH or found.strength() > 0
-    return (fit, held) if preferred or model.at_limit(always.z, name) else (always, before)
+    return (fit, held) if _prefers(fitting, before, held) or model.at_limit(always.z, name) else (always, before)
 
 
 def _explains_the_same(fitting: RobustFit, now: Step, best: Step, other: Step) -> bool:

@@ -7,7 +7,8 @@ cannot say beforehand where that pays: of two exchanges that were right, neither
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 from avtorch.gap.budget.next_step import next_step
 from avtorch.gap.budget.redundancy import driven_to_a_limit
@@ -47,3 +48,30 @@ def exchanged(
 def _without(fitting: RobustFit, now: Step, name: str) -> Step:
     rest = without_effects(fitting, now.fit, [name])
     return Step(rest, fitting.hold_out(rest))
+
+
+def taken_over(
+    fitting: RobustFit,
+    now: Step,
+    entered: Mapping[str, Step],
+    kinds: Sequence[type[Effect]],
+    checkpoint: Checkpoint | None = None,
+) -> Step:
+    """`now` without an effect that the last one does for, fitted as if it had come in its place.
+
+    What explains the same as an effect before it may enter beside that, with the size and the onset of what that
+    leaves. Neither of them is then redundant, where the last one alone would be enough.
+    """
+    last = now.fit.model.names[-1]
+    for name in now.fit.model.names[:-1]:
+        if last not in entered[name].aliases:
+            continue
+        rest = without_effects(fitting, now.fit, [name, last])
+        before = Step(rest, fitting.hold_out(rest))
+        own = [kind for kind in kinds if kind.name == last]
+        alone = next_step(fitting, before, own, None, f"in place of {name}", checkpoint)
+        if alone is None or driven_to_a_limit(now.fit, alone.fit):
+            continue
+        if fitting.evidence(alone.held, now.held).of_entry <= 0:
+            return replace(alone, aliases=entered[name].aliases)
+    return now

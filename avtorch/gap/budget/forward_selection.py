@@ -19,7 +19,7 @@ from avtorch.arrays import FloatArray
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.effect_model import LATENESS, EffectModel
 from avtorch.gap.budget.entry import observable
-from avtorch.gap.budget.exchange import exchanged
+from avtorch.gap.budget.exchange import exchanged, taken_over
 from avtorch.gap.budget.flexible_regression import has_places, left_over
 from avtorch.gap.budget.next_step import next_step
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
@@ -64,6 +64,7 @@ def select(
         step = next_step(fitting, now, kinds, progress, f"effect {number + 1}", checkpoint)
         if step is None:
             break
+        step = taken_over(fitting, step, entered, kinds, checkpoint)
         entered[step.fit.model.names[-1]] = step
         now, _ = without_the_redundant(fitting, step, spared=step.entered)
     if len(now.fit.model.names) > 1:

@@ -17,19 +17,22 @@ def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int 
     """The selection's parts in the order of what they take off the gap, without those less likely there than not, or
     at the limit of what a fit may take.
 
-    The least likely goes first, unless that drives another to a limit; what its going does to the others is looked at
-    anew.
+    The least likely goes first, unless that drives another to a limit. The others are then as likely as they are
+    beside it and without it, each as far as it is likely itself.
     """
     selection = _parts(selection, material, seed)
-    while len(selection.steps) > 1:
-        each, last = probabilities(selection), selection.last.fit
+    each = probabilities(selection)
+    while each:
         # where a fit ends, far beyond what is possible, an effect stands in for something else
-        each |= dict.fromkeys(at_limits(last), 0.0)
+        each |= dict.fromkeys(at_limits(selection.last.fit), 0.0)
         unlikely = sorted((name for name in each if each[name] < LIKELY), key=each.__getitem__)
         if not unlikely:
             break
         selection = _parts(_without_one_of(selection, unlikely), material, seed)
-    return with_sizes(selection)
+        without = probabilities(selection)
+        there = min(each[name] for name in each if name not in without)
+        each = {name: there * each[name] + (1 - there) * p for name, p in without.items()}
+    return replace(with_sizes(selection), sure=each)
 
 
 def _parts(selection: Selection, material: float, seed: int) -> Selection:
@@ -48,6 +51,8 @@ def _parts(selection: Selection, material: float, seed: int) -> Selection:
 
 def probabilities(selection: Selection) -> dict[str, float]:
     """That each effect is there, by name."""
+    if selection.sure is not None:
+        return dict(selection.sure)
     odds, channels, last = PartOdds.read(), len(selection.fitting.whitening.record.channels), selection.last
     return {
         name: odds.probability(

@@ -28,7 +28,7 @@ class Selection:
     """`steps` from the bare baseline on, each with one effect more than the one before; `tried`: of how many.
 
     `judging`: fits under the noise of what all effects found leave (`own_noise`), `own`: the last model under it, which
-    says how large effects are.
+    says how large effects are. `sure`: the probability of each effect, once that of others that left is in it.
     """
 
     fitting: RobustFit
@@ -36,6 +36,7 @@ class Selection:
     tried: int = 1
     judging: RobustFit | None = None
     own: Step | None = None
+    sure: Mapping[str, float] | None = None
 
     @property
     def last(self) -> Step:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
 import pytest
 import torch
 
 from avtorch.gap import plant
+from avtorch.gap.budget import entry
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.entry import candidates_for, fitted
 from avtorch.gap.budget.forward_selection import baseline_noise
+from avtorch.gap.budget.held_out_evidence import Evidence
 from avtorch.gap.budget.selection_step import Step
 from avtorch.gap.effects import Backlash, ConstantResistance, DeadBand, RateLimit, Saturation
 from avtorch.gap.simulator.effect import Effect
@@ -36,3 +42,22 @@ def test_what_hides_gain_and_lag_is_found_from_the_fit_without_it(effect: Effect
     exact = fitting.fit(found.model, found.model.coordinates({**bare.known, **known})[None])
     # of the last of it a fit may stop short
     assert bare.nats - found.nats > 0.8 * (bare.nats - exact.nats) > 0
+
+
+@pytest.mark.parametrize(("nats", "chosen"), [(10.0, "dead_band"), (210.0, "gain_change")])
+def test_the_simplest_does_not_lose_much_to_the_best(nats: float, chosen: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a drive of a minute no blocks agree on anything, and a dead band of 570 nats stood in for a change of the gain
+    of 780, with four wrong effects more to mend it."""
+
+    def step(name: str, cost: float, parameters: int) -> Any:
+        return Step(cast(Any, parameters), cast(Any, SimpleNamespace(nats=np.array([cost]))), name)
+
+    # three blocks, which do not agree
+    fitting: Any = SimpleNamespace(preference=lambda one, other: Evidence(float((one.nats - other.nats)[0]), 2.0, 2.0))
+    monkeypatch.setattr(entry, "complexity", lambda fit: fit)
+    monkeypatch.setattr(entry, "_possible_lag", lambda fit: True)
+    steps = [step("gain_change", 100.0, 6), step("dead_band", 100.0 + nats, 5)]
+    found, alike = entry._simplest_alike(fitting, steps)
+    assert found.entered == chosen
+    assert found in alike
+    assert len(alike) == (2 if chosen == "dead_band" else 1)

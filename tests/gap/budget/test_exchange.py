@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
+from avtorch.blindtest import draw_case
 from avtorch.gap import EFFECTS, plant
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.exchange import exchanged
+from avtorch.gap.budget.exchange import exchanged, taken_over
 from avtorch.gap.budget.forward_selection import baseline_noise
 from avtorch.gap.budget.given_effects import given_effects
 from avtorch.gap.effects import ConstantResistance, DeadTime
@@ -34,3 +37,22 @@ def test_what_blocks_that_were_held_out_prefer_takes_the_place(
     assert set(now.fit.model.names) == reached
     assert set(entered) == reached - set(begun)
     assert now.held.nats.sum() <= wrong.last.held.nats.sum()
+
+
+@pytest.mark.slow
+def test_an_effect_that_entered_beside_one_that_it_does_for_takes_its_place() -> None:
+    """A driveline that rings from 305 s on entered as what a second-order actuator from there on leaves, and from the
+    start on; the actuator then was no more redundant than it, and was named."""
+    ringing = draw_case(27, 100135, recorder="ordinary")
+    assert (ringing.names, ringing.onset_s) == (("driveline_oscillation",), pytest.approx(304.7, abs=0.1))
+    fitting, bare = baseline_noise(AnalysisRecord.for_budget([ringing.log()]), plant([]))
+    pair = [EFFECTS["second_order_actuator"], EFFECTS["driveline_oscillation"]]
+    both = given_effects(fitting, bare, pair, values={}, onsets={pair[0].name: 313.5}).last
+    assert both.fit.model.names == ("second_order_actuator", "driveline_oscillation")
+    entered = replace(both, aliases=("driveline_oscillation", "second_order_actuator"))
+    alone = taken_over(fitting, both, {"second_order_actuator": entered}, pair)
+    assert alone.fit.model.names == ("driveline_oscillation",)
+    assert alone.fit.model.onsets["driveline_oscillation"] == pytest.approx(304.7, abs=10.0)
+    # what explains something else stays
+    other = replace(both, aliases=("second_order_actuator",))
+    assert taken_over(fitting, both, {"second_order_actuator": other}, pair) is both

@@ -26,8 +26,8 @@ def test_a_dead_time_is_no_driveline_that_rings_by_twice_the_step(data_dir: Path
     found = gap_budget(late, effects=LATE)
     assert found.names == ("dead_time",)
     delay = found.parts[0].parameters["delay_s"].mean
-    # the car's own, 0.14 s, comes on top
-    assert truth["delay_s"] < delay < truth["delay_s"] + 0.3
+    # the car's own, 0.14 s, comes on top; up to 0.08 s of both may be the recorder's
+    assert truth["delay_s"] - 0.08 < delay < truth["delay_s"] + 0.3
 
 
 def test_waves_of_a_road_that_is_driven_three_times_are_the_roads(data_dir: Path) -> None:
