@@ -71,7 +71,7 @@ def case_figures(index: int, seed: int, kind: str, recorder: Recording) -> dict[
     for name in told.fit.model.names:
         evidence = without_one(fitting, told, name).evidence
         likely = PartOdds.read().probability(
-            evidence, response=own_response(told, name), channels=len(record.channels), tried=selection.tried
+            evidence, response=own_response(told, name), channels=record.channels, tried=selection.tried
         )
         causes.append({"name": name, "named": name in named, "probability": likely, "nats": evidence.nats})
     return {

@@ -175,14 +175,14 @@ def kept(folder: Path) -> list[dict[str, Any]]:
 def table(
     cases: Sequence[dict[str, Any]],
 ) -> tuple[FloatArray, FloatArray, BoolArray, IntArray, FloatArray, FloatArray]:
-    """Of all parts: figures (part, 4), log effects tried, whether there, its case, `by_agreement`, Student's law."""
+    """Of all parts: figures (part, 5), log effects tried, whether there, its case, `by_agreement`, Student's law."""
     rows, tried, there, of, agreed, strict = [], [], [], [], [], []
     for number, case in enumerate(cases):
         for part in case["parts"]:
             if part.get("at_limit", False) or part.get("own", False):  # no part of an answer, or nobody knows
                 continue
             evidence = Evidence(part["nats"], part["errors"], part["freedom"])
-            rows.append(figures(evidence, part["response"], len(case["signals"])))
+            rows.append(figures(evidence, part["response"], case["signals"]))
             there.append(part["there"])
             of.append(number)
             tried.append(np.log(case["tried"]))
@@ -194,13 +194,16 @@ def table(
 def fit(
     rows: FloatArray, tried: FloatArray, there: BoolArray, *, of_cases: Sequence[float] = (0.5, 0, 0.5, 0)
 ) -> PartOdds:
-    """The weights that make `there` likeliest, none of which says that more evidence is less; `of_cases` as it is."""
+    """The weights that make `there` likeliest; more evidence is never less, nor is a speed that is recorded.
+
+    `of_cases`: what `none_and_outside` says of cases without a likely part, and of those with a wrong one.
+    """
     sign = np.where(there, 1.0, -1.0)
 
     def cost(w: FloatArray) -> float:
         return float(-log_expit(sign * (rows @ w - tried)).sum() + 0.5 * _RIDGE * (w[1:] ** 2).sum())
 
-    bounds = [(None, None), *[(0.0, None)] * (rows.shape[1] - 1)]
+    bounds = [(None, None), *[(0.0, None)] * (rows.shape[1] - 2), (None, 0.0)]
     best = minimize(cost, np.zeros(rows.shape[1]), method="L-BFGS-B", bounds=bounds).x
     return PartOdds(*(float(f"{w:.{_DIGITS}g}") for w in [*best, *of_cases]))
 

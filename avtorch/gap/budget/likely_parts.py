@@ -53,7 +53,7 @@ def probabilities(selection: Selection) -> dict[str, float]:
     """That each effect is there, by name."""
     if selection.sure is not None:
         return dict(selection.sure)
-    odds, channels, last = PartOdds.read(), len(selection.fitting.whitening.record.channels), selection.last
+    odds, channels, last = PartOdds.read(), selection.fitting.whitening.record.channels, selection.last
     return {
         name: odds.probability(
             step.evidence, response=own_response(last, name), channels=channels, tried=selection.tried
