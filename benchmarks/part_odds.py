@@ -11,7 +11,8 @@ beside Student's law alone. `--write` fits them to all the cases in `--kept`, of
 `avtorch/gap/budget/part_odds.json`. Causes outside the table serve for what an answer without a likely part, or with a
 wrong one, leaves open; learnt from as parts that are not there they made every name less likely, and on the Genesis'
 laps nothing was named. With `--background` the cases are effects put in front of a recording in place of drawn ones;
-parts that the untouched recording has, too, are neither right nor wrong. The drives that the odds in use are fitted to
+parts that the untouched recording has, too, are neither right nor wrong. The odds are fitted to drawn cases alone, and
+those of recordings show how they do there; fitted to these as well they did no better on other recordings. The drives that the odds in use are fitted to
 are in `benchmarks/part_odds_cases`; the recordings among them are none of those in front of which the budget is scored.
 """
 
@@ -276,8 +277,10 @@ def main() -> None:
     every = kept(args.kept)
     cases = [case for case in every if case["kind"] != "outside"]
     rows, tried, there, of, agreed, strict = table(cases)
-    probability = left_out(rows, tried, there, of, agreed)
     drawn = np.array([case["kind"] != "in_front" for case in cases])[of]
+    odds = fit(rows[drawn], tried[drawn], there[drawn])
+    probability = np.minimum(np.exp(log_expit(rows @ odds.weights - tried)), agreed)
+    probability[drawn] = left_out(rows[drawn], tried[drawn], there[drawn], of[drawn], agreed[drawn])
     scored = {}
     for world, own in ((_SIMULATED, drawn), (_IN_FRONT, ~drawn)):
         if own.any():
@@ -295,7 +298,6 @@ def main() -> None:
     outside = [case for case in every if case["kind"] == "outside"]
     if outside and any(not part.get("at_limit", False) for case in outside for part in case["parts"]):
         others, others_tried, _, others_of, others_agreed, _ = table(outside)
-        odds = fit(rows, tried, there)
         blamed = np.minimum(np.exp(log_expit(others @ odds.weights - others_tried)), others_agreed)
         more = verdicts(blamed, np.zeros(len(others), dtype=bool), others_of, outside)
         unnamed, wrong = unnamed + more[0], wrong + more[1]
@@ -303,7 +305,7 @@ def main() -> None:
     print(f"{len(unnamed)} cases without a likely part: none {of_cases[0]:.2f}, outside the table {of_cases[1]:.2f}")
     print(f"{len(wrong)} with a likely part that is wrong: none {of_cases[2]:.2f}, outside the table {of_cases[3]:.2f}")
     if args.write:
-        odds, cases = fit(rows, tried, there, of_cases=of_cases), every
+        odds, cases = fit(rows[drawn], tried[drawn], there[drawn], of_cases=of_cases), every
         counts = Counter(
             (c["recorder"], " ".join(c["signals"]), c["seed"], json.dumps(c["mix"]), c.get("background", ""))
             for c in cases
@@ -316,7 +318,7 @@ def main() -> None:
                 | ({"background": log} if log else {})
                 for (r, w, s, mix, log), n in sorted(counts.items())
             ],
-            "parts": len(rows),
+            "parts": int(drawn.sum()),
             "date": date.today().isoformat(),
             "commit": commit.stdout.strip(),
             "left_out": by_odds,
