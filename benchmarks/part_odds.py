@@ -7,13 +7,14 @@ Draws cases of the blind test's reference vehicle (with `--outside`: cases whose
 families that may serve to calibrate; they should be about one in seven of all, as in the blind test), selects effects
 on their held-out blocks, and keeps the figures of each part of the gap in `--kept`, one line a case (some ten seconds
 of processor time); a second call goes on where the first ended. It prints how the odds do on cases that were left out,
-beside Student's law alone. `--write` fits them to all the cases in `--kept`, of both recorders, and writes
+beside Student's law alone. `--write` fits them to all drawn cases in `--kept`, of both recorders, and writes
 `avtorch/gap/budget/part_odds.json`. Causes outside the table serve for what an answer without a likely part, or with a
 wrong one, leaves open; learnt from as parts that are not there they made every name less likely, and on the Genesis'
 laps nothing was named. With `--background` the cases are effects put in front of a recording in place of drawn ones;
 parts that the untouched recording has, too, are neither right nor wrong. The odds are fitted to drawn cases alone, and
-those of recordings show how they do there; fitted to these as well they did no better on other recordings. The drives that the odds in use are fitted to
-are in `benchmarks/part_odds_cases`; the recordings among them are none of those in front of which the budget is scored.
+those of recordings show how they do there; fitted to these as well they did no better on other recordings. The drives
+that the odds in use are fitted to are in `benchmarks/part_odds_cases`; the recordings among them are none of those in
+front of which the budget is scored.
 """
 
 from __future__ import annotations

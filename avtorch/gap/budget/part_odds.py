@@ -2,11 +2,11 @@
 
 What Student's law for the blocks that excite it says of it is too sure where many do, and far too doubtful where two or
 three do, as in a drive of a minute. So a logistic regression is fitted to simulated drives behind ideal and ordinary
-recorders and to effects in front of recordings, on three figures: how much held-out blocks gain by the effect, how well
-they agree on its size, and how much of the response is its own. Where no speed is recorded the effects that need one
-are not tried and others stand in for them, so all odds are lower. Wrong effects have as many chances as are tried, so
-the odds are in inverse proportion to that. Nothing is surer than Student's law has it for the
-best of as many, but where much is gained: each e-fold of nats then counts for one standard error.
+recorders, on three figures: how much held-out blocks gain by the effect, how well they agree on its size (which has
+next to no weight beside the other two on the drives in use), and how much of the response is its own. Where no speed is
+recorded the effects that need one are not tried and others stand in for them, so all odds are lower. Wrong effects have
+as many chances as are tried, so the odds are in inverse proportion to that. Nothing is surer than Student's law has it
+for the best of as many, but where much is gained: each e-fold of nats then counts for one standard error.
 ``python -m benchmarks.part_odds`` writes its weights, with their provenance, to `part_odds.json` beside this module.
 """
 
