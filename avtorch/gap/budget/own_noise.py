@@ -94,7 +94,8 @@ def with_sizes(selection: Selection) -> Selection:
     judging, fit = selection.judging, selection.last.fit
     if judging is None or not fit.model.names:
         return replace(selection, own=None)
-    return replace(selection, own=_under_its_own(judging, fit))
+    own = _under_its_own(judging, fit)
+    return replace(selection, own=replace(own, held=replace(own.held, z=judging.spread_out(own.fit, own.held))))
 
 
 def _under(fit: Fit) -> RobustFit:

@@ -11,7 +11,8 @@ import torch
 from avtorch.arrays import FloatArray
 from avtorch.gap import EFFECTS, ConstantResistance, plant
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.effect_model import EffectModel
+from avtorch.gap.budget.effect_model import LATENESS, EffectModel
+from avtorch.gap.budget.forward_selection import baseline_noise
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 from avtorch.gap.budget.robust_fit import RobustFit
 from avtorch.io import Log
@@ -184,3 +185,18 @@ def test_what_a_fit_may_take_holds_what_is_possible() -> None:
         parameter = next(p for p in EFFECTS[name].parameters if p.name == key)
         ends = parameter.constrain(torch.tensor([model.low[at][0], model.high[at][0]])).tolist()
         assert ends == pytest.approx(list(parameter.physical), abs=1e-3)
+
+
+def test_folds_that_find_nothing_better_than_the_fit_still_say_how_far_apart_they_are(fresh_seed: int) -> None:
+    """Under a lateness of just one row no fold moved, and a lag of the Genesis was 0.224 s (0.224 to 0.224)."""
+    record = AnalysisRecord.of([log_of([ConstantResistance(0.25)], seed=fresh_seed, seconds=120.0)])
+    fitting, bare = baseline_noise(record, plant())
+    model = bare.model.with_effect(EFFECTS["constant_resistance"])
+    fit = fitting.fit(model, model.coordinates(bare.known)[None], iterations=20)
+    held = fitting.hold_out(fit)
+    assert fitting.spread_out(fit, held) == pytest.approx(held.z)
+    still = replace(held, z=np.tile(fit.z, (len(held.z), 1)))
+    spread = fitting.spread_out(fit, still).std(0)
+    own = [at.start for key, at in model.index.items() if key != LATENESS]
+    # one step of least squares against a search for each fold, of sizes in which the response is nearly linear
+    assert spread[own] == pytest.approx(held.z.std(0)[own], rel=0.5)
