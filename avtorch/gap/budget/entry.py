@@ -114,13 +114,12 @@ def enter(fitting: RobustFit, now: Step, candidates: Sequence[Candidate]) -> Ste
     best = min(tried, key=cost)
     same = [s for s in tried if s is best or _explains_the_same(fitting, now, best, s)]
     chosen, alike = _simplest_alike(fitting, same)
-    if not _possible_lag(chosen.fit):
-        possible = [
-            s for s in same if _possible_lag(s.fit) and not fitting.preference(s.held, best.held).strength() > 0
-        ]
-        chosen = _simplest_alike(fitting, possible or [chosen])[0]
-    simpler = [s for s in same if _much_simpler(now, chosen, s) and _possible_lag(s.fit) >= _possible_lag(chosen.fit)]
-    chosen = _simplest_alike(fitting, simpler or [chosen])[0]
+    possible = [s for s in same if _possible_lag(s.fit)]
+    if _possible_lag(chosen.fit):
+        others = [s for s in possible if _much_simpler(now, chosen, s)]
+    else:  # what such a lag gains needs blocks that agree
+        others = [s for s in possible if fitting.preference(s.held, best.held).strength() <= 0]
+    chosen = _simplest_alike(fitting, others or [chosen])[0]
     aliases = {s.entered for s in alike} | {chosen.entered}
     return replace(chosen, aliases=tuple(sorted(name for name in aliases if name is not None)))
 
