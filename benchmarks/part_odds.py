@@ -80,7 +80,7 @@ def case_figures(
     }
 
 
-def figures_in_front(log: Log, index: int, seed: int, own: Collection[str]) -> dict[str, Any]:
+def figures_in_front(log: Log, background: str, index: int, seed: int, own: Collection[str]) -> dict[str, Any]:
     """The same of effect number `index` of those that no chance decides, in front of a recording, which has its `own`.
 
     The next round through them is of another size.
@@ -89,7 +89,7 @@ def figures_in_front(log: Log, index: int, seed: int, own: Collection[str]) -> d
     effect, size = effects[index % len(effects)], _SIZES[index // len(effects) % len(_SIZES)]
     bare = baseline_noise(AnalysisRecord.for_budget([log]), plant([]))[1]
     T_L, K_L = (float(bare.model.values(bare.z)[key]) for key in ("T_L", "K_L"))
-    case = {"case": index, "seed": seed, "recorder": "recording", "background": log.name, "kind": "in_front"}
+    case = {"case": index, "seed": seed, "recorder": "recording", "background": background, "kind": "in_front"}
     case |= {"mix": {}, "names": [effect], "size": size}
     try:
         changed, _ = put_in_front(log, effect, T_L=T_L, K_L=K_L, size=size, seed=seed + index)
@@ -155,7 +155,8 @@ def collect_in_front(folder: Path, seed: int, cases: int, recording: Path) -> No
     log = Log.read(recording)
     own = selected_names(log)
     path = folder / f"recording_{recording.stem}_{seed}.jsonl"
-    _kept_in(path, cases, lambda index: figures_in_front(log, index, seed, own))
+    background = f"{recording.resolve().parent.name}/{recording.name}"  # no path of the machine
+    _kept_in(path, cases, lambda index: figures_in_front(log, background, index, seed, own))
 
 
 def _kept_in(path: Path, cases: int, figures_of: Callable[[int], dict[str, Any]]) -> None:
