@@ -25,6 +25,7 @@ import subprocess
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from datetime import date
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
@@ -153,10 +154,10 @@ def collect(
 def collect_in_front(folder: Path, seed: int, cases: int, recording: Path) -> None:
     """The same of effects in front of a recording."""
     log = Log.read(recording)
-    own = selected_names(log)
+    own = cache(lambda: selected_names(log))  # not where all cases are kept already
     path = folder / f"recording_{recording.stem}_{seed}.jsonl"
     background = f"{recording.resolve().parent.name}/{recording.name}"  # no path of the machine
-    _kept_in(path, cases, lambda index: figures_in_front(log, background, index, seed, own))
+    _kept_in(path, cases, lambda index: figures_in_front(log, background, index, seed, own()))
 
 
 def _kept_in(path: Path, cases: int, figures_of: Callable[[int], dict[str, Any]]) -> None:

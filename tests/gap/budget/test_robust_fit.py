@@ -11,7 +11,7 @@ import torch
 from avtorch.arrays import FloatArray
 from avtorch.gap import EFFECTS, ConstantResistance, plant
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.effect_model import LATENESS, EffectModel
+from avtorch.gap.budget.effect_model import EffectModel
 from avtorch.gap.budget.forward_selection import baseline_noise
 from avtorch.gap.budget.noise_whitening import NoiseWhitening
 from avtorch.gap.budget.robust_fit import RobustFit
@@ -197,6 +197,6 @@ def test_folds_that_find_nothing_better_than_the_fit_still_say_how_far_apart_the
     assert fitting.spread_out(fit, held) == pytest.approx(held.z)
     still = replace(held, z=np.tile(fit.z, (len(held.z), 1)))
     spread = fitting.spread_out(fit, still).std(0)
-    own = [at.start for key, at in model.index.items() if key != LATENESS]
-    # one step of least squares against a search for each fold, of sizes in which the response is nearly linear
-    assert spread[own] == pytest.approx(held.z.std(0)[own], rel=0.5)
+    own = [model.index[key].start for key in ("K_L", "constant_resistance.resistance_mps2")]
+    # the lag trades with the lateness, whose crease it is about; of these two, 20 seeds differ by 3 % (SD), 9 % at most
+    assert spread[own] == pytest.approx(held.z.std(0)[own], rel=0.25)
