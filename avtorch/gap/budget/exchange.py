@@ -24,15 +24,20 @@ def exchanged(
     kinds: Sequence[type[Effect]],
     progress: Callable[[str, int, int], None] | None = None,
     checkpoint: Checkpoint | None = None,
+    *,
+    settled: str | None = None,
 ) -> tuple[Step, dict[str, Step]]:
     """`now` after all exchanges, and the steps by which new effects entered, by their names.
 
-    `kinds`: effects that may take another's place. Those of `now` are tried from the weakest on, each once.
+    `kinds`: effects that may take another's place. Those of `now` are tried from the weakest on, each once. `settled`:
+    one that was chosen of all `kinds` for its place in this very model, which is not tried while nothing has changed.
     """
     entered: dict[str, Step] = {}
     without = {name: _without(fitting, now, name) for name in now.fit.model.names}
     strengths = {name: fitting.evidence(step.held, now.held).strength() for name, step in without.items()}
     for name in sorted(strengths, key=strengths.__getitem__):
+        if name == settled and not entered:
+            continue
         # those made of a model in which nothing has been exchanged yet still hold
         before = _without(fitting, now, name) if entered else without[name]
         others = [kind for kind in kinds if kind.name != name]

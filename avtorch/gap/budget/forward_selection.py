@@ -58,17 +58,19 @@ def select(
         begun = Selection(fitting, (Step(start, fitting.hold_out(start)),))
     fitting, bare, now = begun.fitting, begun.steps[0], begun.last
     entered = {s.entered: s for s in begun.steps if s.entered is not None}
+    settled = None
     for number in range(_ROUNDS):
         if len(now.fit.model.names) >= most:
             break
-        step = next_step(fitting, now, kinds, progress, f"effect {number + 1}", checkpoint)
-        if step is None:
+        chosen = next_step(fitting, now, kinds, progress, f"effect {number + 1}", checkpoint)
+        if chosen is None:
             break
-        step = taken_over(fitting, step, entered, kinds, checkpoint)
+        step = taken_over(fitting, chosen, entered, kinds, checkpoint)
         entered[step.fit.model.names[-1]] = step
         now, _ = without_the_redundant(fitting, step, spared=step.entered)
+        settled = step.entered if now is chosen else None
     if len(now.fit.model.names) > 1:
-        now, others = exchanged(fitting, now, kinds, progress, checkpoint)
+        now, others = exchanged(fitting, now, kinds, progress, checkpoint, settled=settled)
         entered |= others
     now, _ = without_the_redundant(fitting, now)
     if not now.fit.model.names:

@@ -39,6 +39,26 @@ def test_what_blocks_that_were_held_out_prefer_takes_the_place(
     assert now.held.nats.sum() <= wrong.last.held.nats.sum()
 
 
+def test_what_was_chosen_for_its_place_is_tried_again_only_after_an_exchange(fresh_seed: int) -> None:
+    log = log_of([ConstantResistance(0.25), DeadTime(0.3)], seed=fresh_seed, seconds=100.0)
+    fitting, bare = baseline_noise(AnalysisRecord.for_budget([log]), plant([]))
+    tried: list[str] = []
+
+    def begun_from(*names: str, settled: str) -> set[str]:
+        tried.clear()
+        start = given_effects(fitting, bare, [EFFECTS[name] for name in names], values={}, onsets={}).last
+        now, _ = exchanged(fitting, start, TRIED, lambda role, _a, _b: tried.append(role), settled=settled)
+        return set(now.fit.model.names)
+
+    right = {"constant_resistance", "dead_time"}
+    # nothing takes the place of the other, so this one is not tried
+    assert begun_from("constant_resistance", "dead_time", settled="constant_resistance") == right
+    assert any("dead_time" in role for role in tried)
+    assert not any("in place of constant_resistance" in role for role in tried)
+    # the weaker of two, tried first, finds nothing that it was not chosen before
+    assert begun_from("sensor_bias", "dead_time", settled="sensor_bias") == {"sensor_bias", "dead_time"}
+
+
 @pytest.mark.slow
 def test_an_effect_that_entered_beside_one_that_it_does_for_takes_its_place() -> None:
     """A driveline that rings from 305 s on entered as what a second-order actuator from there on leaves, and from the
