@@ -138,12 +138,14 @@ def _predicted(fitting: RobustFit, shapes: FloatArray, residuals: FloatArray) ->
     row_fold = fitting.fold_of_row
     before = fitting.nats(whitening(residuals))
     best, after = np.zeros_like(residuals), before
+    own = [fold == k for k in range(int(fitting.fold.max()) + 1)]
+    grams = np.array([X[:, rows] @ X[:, rows].T for rows in own])
+    moments = np.array([X[:, rows] @ y[rows] for rows in own])
     for ridge in _RIDGES:
         out = np.zeros_like(residuals)
-        for k in range(int(fitting.fold.max()) + 1):
-            kept = fold != k
-            gram = X[:, kept] @ X[:, kept].T
-            coefficients = np.linalg.solve(gram + ridge * kept.sum() * np.eye(len(X)), X[:, kept] @ y[kept]) / scale
+        for k in range(len(own)):
+            gram = grams.sum(0) - grams[k] + ridge * (~own[k]).sum() * np.eye(len(X))
+            coefficients = np.linalg.solve(gram, moments.sum(0) - moments[k]) / scale
             rows = row_fold == k
             out[:, rows] = np.tensordot(coefficients, shapes[..., rows], 1)
         cost = fitting.nats(whitening(residuals - out))

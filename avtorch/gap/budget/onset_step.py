@@ -15,7 +15,7 @@ from avtorch.arrays import FloatArray, IntArray
 from avtorch.gap.budget.effect_model import EffectModel
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 
-_EVERY_S = 0.2  # between onsets tried; the row is found from there
+_EVERY_S = 0.5  # between onsets tried; the row is found from there
 _LONGEST = 2.5  # step of a parameter [prior SD]
 _DAMPING = 1e-3
 
@@ -78,10 +78,15 @@ def _linear(fitting: RobustFit, model: EffectModel, whole: EffectModel, z: Float
 def _sums(
     white: FloatArray, slope: FloatArray, weight: FloatArray, by_time: IntArray, first: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Curvature (bin, size, size), downhill (bin, size) and cost (bin,) of the rows in each bin."""
+    """Curvature (bin, size, size), downhill (bin, size) and cost (bin,) of the rows in each bin.
 
-    def of_bins(products: FloatArray) -> FloatArray:
-        return np.add.reduceat(products.sum(-2)[..., by_time] * weight, first, axis=-1)
-
-    curvature = np.stack([of_bins(row * slope) for row in slope])
-    return np.moveaxis(curvature, -1, 0), of_bins(slope * white).T, 0.5 * of_bins(white**2)
+    One matrix product for each bin, of few rows: the shorter bins are filled up with zeros.
+    """
+    columns = np.concatenate([slope, white[None]])[..., by_time] * np.sqrt(weight)
+    lengths = np.diff(np.append(first, len(by_time)))
+    number = np.repeat(np.arange(len(first)), lengths)
+    filled = np.zeros((len(first), int(lengths.max()), white.shape[0], len(columns)))
+    filled[number, np.arange(len(by_time)) - first[number]] = np.moveaxis(columns, 0, -1).swapaxes(0, 1)
+    of_bins = filled.reshape(len(first), -1, len(columns))
+    products = of_bins.swapaxes(-1, -2) @ of_bins
+    return products[:, :-1, :-1], products[:, :-1, -1], 0.5 * products[:, -1, -1]
