@@ -20,7 +20,8 @@ from avtorch.gap.budget.score_test import Candidate, ScoreTest
 from avtorch.gap.budget.selection_step import Step, complexity, cost
 from avtorch.gap.simulator.effect import Effect
 
-_LEAST_NATS = 3.0  # in the blocks that fitted it, below which no effect is held out
+LEAST_NATS = 3.0
+"""In the blocks that fitted it, below which no effect is held out."""
 _FAR_FEWER, _MOST_OF_IT = 3, 0.4  # parameters, and share of the gain, with which a simpler effect takes precedence
 _OF_ITS_OWN = 0.5  # share of an effect's gain, on top of another, from which it is no alias of that
 _FITTED = 9  # effects that are fitted, those of which a score test promises most
@@ -91,10 +92,13 @@ def _promise(candidate: Candidate) -> float:
     return candidate.promise if late is None else max(candidate.promise, late.promise - ONSET_NATS)
 
 
-def enter(fitting: RobustFit, now: Step, candidates: Sequence[Candidate]) -> Step | None:
-    """The best of `candidates` in, if the blocks that were held out agree on one."""
-    fits = [fitted(fitting, c) for c in candidates[:_FITTED]]
-    fits = [fit for fit in fits if now.fit.nats - fit.nats > _LEAST_NATS]
+def enter(fitting: RobustFit, now: Step, candidates: Sequence[Candidate], least: float = LEAST_NATS) -> Step | None:
+    """The best of `candidates` in, if the blocks that were held out agree on one.
+
+    `least`: nats in the blocks that fit it, below which no effect is held out.
+    """
+    fits = [fitted(fitting, now, c, least) for c in candidates[:_FITTED]]
+    fits = [fit for fit in fits if now.fit.nats - fit.nats > least]
     fits.sort(key=lambda fit: fit.nats + complexity(fit))
     tried = []
     for rough in fits[:_SCREENED]:
@@ -178,14 +182,17 @@ def _much_simpler(now: Step, best: Step, other: Step) -> bool:
     return fewer >= _FAR_FEWER and cost(now) - cost(other) > _MOST_OF_IT * (cost(now) - cost(best))
 
 
-def fitted(fitting: RobustFit, candidate: Candidate) -> Fit:
-    """The candidate fitted, from the start on or from the onset that promises most."""
+def fitted(fitting: RobustFit, now: Step, candidate: Candidate, least: float = LEAST_NATS) -> Fit:
+    """The candidate fitted, from the start on or from the onset that promises most.
+
+    No onset is sought where neither of the two promises `least` nats: nearly all of the time would go there.
+    """
     fit = fitting.fit(candidate.model, candidate.starts, iterations=_SCREENING)
-    name = candidate.model.names[-1]
-    if not may_set_in(candidate.model, name):
+    name, late = candidate.model.names[-1], candidate.late
+    promises = max(now.fit.nats - fit.nats, -np.inf if late is None else late.promise - ONSET_NATS)
+    if promises < least or not may_set_in(candidate.model, name):
         return fit
     later = set_in(fitting, fit, name, turns=_SCREENING_TURNS, iterations=_SCREENING)
-    late = candidate.late
     if late is not None and late.promise >= candidate.promise + ONSET_NATS:
         starts = np.concatenate([late.starts, late.model.coordinates(fit.known)[None]])
         other = fitting.fit(late.model, starts, iterations=_SCREENING)

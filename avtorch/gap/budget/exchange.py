@@ -10,12 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+from avtorch.gap.budget.entry import LEAST_NATS
 from avtorch.gap.budget.next_step import next_step
 from avtorch.gap.budget.redundancy import driven_to_a_limit
 from avtorch.gap.budget.robust_fit import RobustFit
 from avtorch.gap.budget.selection_step import Step, without_effects
 from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.gap.simulator.effect import Effect
+
+_OF_ITS_GAIN = 0.3  # what takes a place promises that much of what the effect there gains, and reaches all of it
 
 
 def exchanged(
@@ -41,7 +44,8 @@ def exchanged(
         # those made of a model in which nothing has been exchanged yet still hold
         before = _without(fitting, now, name) if entered else without[name]
         others = [kind for kind in kinds if kind.name != name]
-        step = next_step(fitting, before, others, progress, f"in place of {name}", checkpoint)
+        least = max(LEAST_NATS, _OF_ITS_GAIN * (before.fit.nats - now.fit.nats))
+        step = next_step(fitting, before, others, progress, f"in place of {name}", checkpoint, least=least)
         if step is None or fitting.preference(now.held, step.held).strength() <= 0:
             continue
         if driven_to_a_limit(now.fit, step.fit):

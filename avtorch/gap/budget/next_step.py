@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from avtorch.errors import InputError
-from avtorch.gap.budget.entry import candidates_for, enter
+from avtorch.gap.budget.entry import LEAST_NATS, candidates_for, enter
 from avtorch.gap.budget.robust_fit import Fit, RobustFit
 from avtorch.gap.budget.selection_step import Step
 from avtorch.gap.search.checkpoint import REMEDY, Checkpoint, StoredStep
@@ -25,8 +25,12 @@ def next_step(
     progress: Callable[[str, int, int], None] | None,
     role: str,
     checkpoint: Checkpoint | None = None,
+    *,
+    least: float = LEAST_NATS,
 ) -> Step | None:
     """`now` with the best of `kinds` that it lacks, if the blocks that were held out agree on one.
+
+    `least`: nats that it has to gain in the blocks that fit it.
 
     Raises `InputError` for a `checkpoint` whose step is of another model.
     """
@@ -39,7 +43,7 @@ def next_step(
             return _restored(fitting, now, kinds, kept, checkpoint)
     # what was kept of other fits' slopes would make a step depend on the way to it
     fitting.forget()
-    step = enter(fitting, now, candidates_for(fitting, now, kinds, progress, role))
+    step = enter(fitting, now, candidates_for(fitting, now, kinds, progress, role), least)
     fitting.forget()
     if step is not None and step.fit.model.roads:
         step = _held_out(fitting, now, step.fit, step.aliases)

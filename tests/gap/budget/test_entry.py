@@ -31,7 +31,7 @@ def test_what_hides_gain_and_lag_is_found_from_the_fit_without_it(effect: Effect
     now = Step(bare, fitting.hold_out(bare))
     first, *_ = candidates_for(fitting, now, [type(effect), ConstantResistance], None, "")
     assert first.model.names[-1] == effect.name
-    screened = fitted(fitting, first)
+    screened = fitted(fitting, now, first)
     found = fitting.fit(screened.model, screened.z[None])
     own = found.model.plant.parameters()
     values = {f"{effect.name}.{key}": value for key, value in effect.values().items()} | {
