@@ -45,7 +45,7 @@ def given(fitting: RobustFit, bare: Step, kinds: Sequence[type[Effect]], onset: 
     true `onset` on."""
     now, left = bare, list(kinds)
     while left:
-        tried = [fitted(fitting, candidate) for candidate in candidates_for(fitting, now, left, None, "")]
+        tried = [fitted(fitting, now, candidate) for candidate in candidates_for(fitting, now, left, None, "")]
         if onset is not None:
             late = [fit for fit in tried if may_set_in(fit.model, fit.model.names[-1])]
             models = [fit.model.setting_in(fit.model.names[-1], onset) for fit in late]

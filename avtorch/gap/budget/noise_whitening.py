@@ -97,7 +97,7 @@ class NoiseWhitening:
         """
         out = np.empty((*x.shape[:-1], len(self.order)))
         for c, (taps, sd) in enumerate(zip(self.taps, self.sd / np.sqrt(self.share), strict=True)):
-            out[..., c, :] = self.record.filtered(x[..., c, :], taps)[..., self.order] / sd
+            out[..., c, :] = np.take(self.record.filtered(x[..., c, :], taps / sd), self.order, axis=-1)
         return out
 
     def since(self, x: FloatArray) -> FloatArray:

@@ -114,7 +114,8 @@ class RobustFit:
         z, now, at = starts[best], float(cost[best]), white[best]
         for _ in range(iterations):
             slope = self.slope(model, z, at)
-            steps = np.concatenate([self._steps(model, z, at, slope, everything), model.traded(z)])
+            curvature = self._curvature_by_block(slope)
+            steps = np.concatenate([self._steps(model, z, at, slope, curvature, everything), model.traded(z)])
             white = self.white(model, steps)
             cost = self._cost(white, steps, everything)
             best = int(np.argmin(cost))
@@ -178,6 +179,15 @@ class RobustFit:
         size = len(slope)
         return weighed, weighed.reshape(size, -1) @ slope.reshape(size, -1).T + np.eye(size)
 
+    def _curvature_by_block(self, slope: FloatArray) -> FloatArray:
+        """Products (block, size, size) of the slopes, of which a curvature is a weighed sum whatever is held out."""
+        size, ends = len(slope), np.append(self.whitening.first, slope.shape[-1])
+        out = np.empty((self.whitening.blocks, size, size))
+        for k in range(len(out)):
+            own = slope[..., ends[k] : ends[k + 1]].reshape(size, -1)
+            np.matmul(own, own.T, out=out[k])
+        return out
+
     def hold_out(self, fit: Fit[M], *, iterations: int = 2) -> HeldOut:
         """Each fold held out, all folds at once.
 
@@ -189,9 +199,10 @@ class RobustFit:
         z = np.tile(fit.z, (count, 1))
         here = self.white(model, fit.z)
         slope = self.slope(model, fit.z, here)
+        curvature = self._curvature_by_block(slope)
         white = np.tile(here, (count, 1, 1))
         for _ in range(iterations):
-            each = [self._steps(model, z[k], white[k], slope, kept[k], _CLOSE) for k in range(count)]
+            each = [self._steps(model, z[k], white[k], slope, curvature, kept[k], _CLOSE) for k in range(count)]
             most = max(len(x) for x in each)
             steps = np.stack([np.concatenate([x, *[x[:1]] * (most - len(x))]) for x in each])
             tried = self.white(model, steps.reshape(-1, model.size)).reshape(count, most, *here.shape)
@@ -260,8 +271,10 @@ class RobustFit:
 
     def weights(self, white: FloatArray, of_blocks: FloatArray) -> FloatArray:
         """Of rows (counted,) in a step of least squares: blocks that fit badly weigh less, by Student's law."""
-        sums = self.whitening.by_block(white**2)
-        return self.whitening.spread(of_blocks * 2 * self.half / (self.prior + sums))
+        return self.whitening.spread(self._weights_of_blocks(white, of_blocks))
+
+    def _weights_of_blocks(self, white: FloatArray, of_blocks: FloatArray) -> FloatArray:
+        return of_blocks * 2 * self.half / (self.prior + self.whitening.by_block(white**2))
 
     def _cost(self, white: FloatArray, z: FloatArray, weights: FloatArray) -> FloatArray:
         return (self.nats(white) * weights).sum(-1) + 0.5 * (z**2).sum(-1)
@@ -272,16 +285,18 @@ class RobustFit:
         z: FloatArray,
         white: FloatArray,
         slope: FloatArray,
+        by_block: FloatArray,
         of_blocks: FloatArray,
         dampings: Sequence[float] = _DAMPING,
     ) -> FloatArray:
-        """Places (step, size) to try from `z`, more and less damped.
+        """Places (step, size) to try from `z`, more and less damped; `by_block` as `_curvature_by_block` has it.
 
         And one that leaves the lateness alone: where neither channel is late the likelihood has a crease, and slopes on
         one side of it say nothing of the other.
         """
-        weighed, curvature = self._curvature(slope, white, of_blocks)
-        downhill = weighed.reshape(model.size, -1) @ white.ravel() - z
+        weights = self._weights_of_blocks(white, of_blocks)
+        curvature = np.tensordot(weights, by_block, 1) + np.eye(model.size)
+        downhill = slope.reshape(model.size, -1) @ (self.whitening.spread(weights) * white).ravel() - z
         every = np.ones(model.size, bool)
         tries = [(damping, every) for damping in dampings]
         if LATENESS in model.index:

@@ -79,7 +79,7 @@ class RoadGrade(Integrated):
         if self.profile is None:
             return torch.zeros_like(position)
         slope = tensor(self.grade_rms) * _spline(position, self._coefficients(), self.knot_m, row.whole)
-        return -GRAVITY * torch.sin(torch.atan(slope))
+        return -GRAVITY * slope * torch.rsqrt(1 + slope * slope)  # sin(atan(slope)), at a third of its cost
 
     def coordinates(self) -> tuple[Parameter, ...]:
         return *self.parameters, Parameter("profile", "-", None, -1.2816, 1.2816, "real", False, self.knots)

@@ -111,7 +111,7 @@ def _with_instead(selection: Selection, lacking: frozenset[str], instead: Sequen
     for kind in instead:
         now = Step(fit, fitting.hold_out(fit))
         (candidate,) = candidates_for(fitting, now, [kind], None, "")
-        rough = fitted(fitting, candidate)
+        rough = fitted(fitting, now, candidate)
         fit = fitting.fit(rough.model, rough.z[None])
     own = sizing.fit(fit.model, fit.z[None])
     return Step(own, sizing.hold_out(own))
