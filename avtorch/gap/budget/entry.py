@@ -23,6 +23,7 @@ from avtorch.gap.simulator.effect import Effect
 LEAST_NATS = 3.0
 """In the blocks that fitted it, below which no effect is held out."""
 _FAR_FEWER, _MOST_OF_IT = 3, 0.4  # parameters, and share of the gain, with which a simpler effect takes precedence
+_FEW = 5.0  # degrees of freedom, from which blocks can agree
 _OF_ITS_OWN = 0.5  # share of an effect's gain, on top of another, from which it is no alias of that
 _FITTED = 9  # effects that are fitted, those of which a score test promises most
 _SCREENING = 3  # iterations of these fits
@@ -131,17 +132,23 @@ def enter(fitting: RobustFit, now: Step, candidates: Sequence[Candidate], least:
 def _simplest_alike(fitting: RobustFit, steps: Sequence[Step]) -> tuple[Step, list[Step]]:
     """The simplest, with a possible lag if one has it, of those of `steps` that are as good as the best; all those."""
     best = min(steps, key=cost)
-    alike = [s for s in steps if s is best or not _prefers(fitting, s.held, best.held)]
+    alike = [s for s in steps if s is best or not _surpasses(fitting, s.held, best.held)]
     return min([s for s in alike if _possible_lag(s.fit)] or alike, key=lambda s: complexity(s.fit)), alike
 
 
 def _prefers(fitting: RobustFit, one: HeldOut, other: HeldOut) -> bool:
-    """Whether blocks that were held out prefer `other` to `one`: they agree on that, or much is gained.
-
-    In a short drive two or three blocks excite an effect, and no agreement of these is sure enough.
-    """
+    """Whether blocks that were held out prefer `other` to `one`: they agree on that, or much is gained."""
     found = fitting.preference(one, other)
     return found.nats > MUCH or found.strength() > 0
+
+
+def _surpasses(fitting: RobustFit, one: HeldOut, other: HeldOut) -> bool:
+    """Whether these prefer `other`, which may be less simple: by much only where few of them excite the two.
+
+    No agreement of two or three is sure enough. Of many that do not agree, each has something else to mend.
+    """
+    found = fitting.preference(one, other)
+    return found.strength() > 0 or (found.nats > MUCH and found.freedom < _FEW)
 
 
 def _from_the_start_or_not(fitting: RobustFit, fit: Fit, held: HeldOut) -> tuple[Fit, HeldOut]:

@@ -44,16 +44,22 @@ def test_what_hides_gain_and_lag_is_found_from_the_fit_without_it(effect: Effect
     assert bare.nats - found.nats > 0.8 * (bare.nats - exact.nats) > 0
 
 
-@pytest.mark.parametrize(("nats", "chosen"), [(10.0, "dead_band"), (210.0, "gain_change")])
-def test_the_simplest_does_not_lose_much_to_the_best(nats: float, chosen: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("nats", "freedom", "chosen"), [(10.0, 2.0, "dead_band"), (210.0, 2.0, "gain_change"), (35.0, 9.0, "dead_band")]
+)
+def test_the_simplest_does_not_lose_much_to_the_best(
+    nats: float, freedom: float, chosen: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In a drive of a minute no blocks agree on anything, and a dead band of 570 nats stood in for a change of the gain
-    of 780, with four wrong effects more to mend it."""
+    of 780, with four wrong effects more to mend it. On the lap of a race car ten blocks did not agree on 35 nats."""
 
     def step(name: str, cost: float, parameters: int) -> Any:
         return Step(cast(Any, parameters), cast(Any, SimpleNamespace(nats=np.array([cost]))), name)
 
-    # three blocks, which do not agree
-    fitting: Any = SimpleNamespace(preference=lambda one, other: Evidence(float((one.nats - other.nats)[0]), 2.0, 2.0))
+    def preference(one: Any, other: Any) -> Evidence:  # of blocks that do not agree
+        return Evidence(float((one.nats - other.nats)[0]), 1.0, freedom)
+
+    fitting: Any = SimpleNamespace(preference=preference)
     monkeypatch.setattr(entry, "complexity", lambda fit: fit)
     monkeypatch.setattr(entry, "_possible_lag", lambda fit: True)
     steps = [step("gain_change", 100.0, 6), step("dead_band", 100.0 + nats, 5)]
