@@ -31,6 +31,8 @@ def likely_parts(selection: Selection, material: float = MATERIAL, *, seed: int 
         selection = _parts(_without_one_of(selection, unlikely), material, seed)
         without = probabilities(selection)
         there = min(each[name] for name in each if name not in without)
+        if there >= LIKELY:  # it left as it stood in for another, which is likely by what it is without it
+            there = 0.0
         each = {name: there * each[name] + (1 - there) * p for name, p in without.items()}
     return replace(with_sizes(selection), sure=each)
 

@@ -55,20 +55,30 @@ def test_beside_an_effect_that_is_no_part_the_evidence_is_asked_anew(monkeypatch
     assert likely_parts._parts(selection("dead_time"), 0.03, 0).steps[1].evidence == weak
 
 
-def test_an_effect_is_as_likely_as_beside_and_without_one_that_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A gain of the Genesis that changes was likely at 0.84 beside a dead band at 0.49 and 0.3 without it, and nothing
-    was named."""
+@pytest.mark.parametrize(
+    ("stays", "leaves", "alone", "sure"),
+    [
+        # a gain of the Genesis that changes was likely beside a dead band at 0.49, and nothing was named
+        (("gain_change", 0.84), ("dead_band", 0.4), 0.3, 0.4 * 0.84 + 0.6 * 0.3),
+        # the AV-21's drag rested at a limit without the resistance; both were gone, and a dead band stood in for them
+        (("constant_resistance", 0.04), ("aerodynamic_drag", 0.66), 0.98, 0.98),
+    ],
+)
+def test_an_effect_is_as_likely_as_beside_and_without_one_that_leaves(
+    stays: tuple[str, float], leaves: tuple[str, float], alone: float, sure: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is likely itself leaves only as it stands in for another."""
 
     def selection(*names: str) -> Any:
         steps = [Step(cast(Any, name), cast(Any, None), name) for name in ("bare", *names)]
         return Selection(cast(Any, None), tuple(steps), 3)
 
-    each = {2: {"gain_change": 0.84, "dead_band": 0.4}, 1: {"gain_change": 0.3}}
+    each = {2: dict((stays, leaves)), 1: {stays[0]: alone}}
     monkeypatch.setattr(likely_parts, "_parts", lambda selection, material, seed: selection)
     monkeypatch.setattr(likely_parts, "with_sizes", lambda selection: selection)
     monkeypatch.setattr(likely_parts, "at_limits", lambda fit: [])
     monkeypatch.setattr(likely_parts, "probabilities", lambda selection: dict(each[len(selection.steps) - 1]))
-    monkeypatch.setattr(likely_parts, "_without_one_of", lambda s, names: selection("gain_change"))
-    found = likely_parts.likely_parts(selection("gain_change", "dead_band"))
-    assert found.sure == pytest.approx({"gain_change": 0.4 * 0.84 + 0.6 * 0.3})
-    assert [step.entered for step in found.steps[1:]] == ["gain_change"]
+    monkeypatch.setattr(likely_parts, "_without_one_of", lambda s, names: selection(stays[0]))
+    found = likely_parts.likely_parts(selection(stays[0], leaves[0]))
+    assert found.sure == pytest.approx({stays[0]: sure})
+    assert [step.entered for step in found.steps[1:]] == [stays[0]]
