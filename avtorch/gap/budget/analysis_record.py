@@ -288,3 +288,9 @@ def _numbered(block: IntArray, counts: BoolArray, rows: float) -> IntArray:
 def stacked(responses: Sequence[Tensor]) -> FloatArray:
     """(..., channel, row) of the responses (..., row) of one stretch, a channel each."""
     return torch.stack(torch.broadcast_tensors(*responses), -2).numpy()
+
+
+def later(x: FloatArray, rows: int) -> FloatArray:
+    """`x` (..., row) so many `rows` later; before, its first."""
+    rows = min(rows, x.shape[-1])
+    return np.concatenate([np.repeat(x[..., :1], rows, -1), x[..., : x.shape[-1] - rows]], -1)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from avtorch.arrays import BoolArray, FloatArray
-from avtorch.gap.budget.analysis_record import AnalysisRecord, Stretch, stacked
+from avtorch.gap.budget.analysis_record import AnalysisRecord, Stretch, later, stacked
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.parameter import Parameter
@@ -256,19 +256,11 @@ def _delayed(x: FloatArray, rows: FloatArray) -> FloatArray:
     whole = np.floor(rows).astype(int)
     least = int(whole.min())
     if least == whole.max():  # the usual case, in which no row has to be looked up
-        now, before = (_shifted(x, least + k) for k in (0, 1))
+        now, before = (later(x, least + k) for k in (0, 1))
     else:
         place = np.arange(x.shape[-1]) - whole
         now, before = (np.take_along_axis(x, np.maximum(place - k, 0), -1) for k in (0, 1))
     return now + (rows - whole) * (before - now)
-
-
-def _shifted(x: FloatArray, rows: int) -> FloatArray:
-    """`x` (..., row) so many whole `rows` later."""
-    if rows == 0:
-        return x
-    rows = min(rows, x.shape[-1])
-    return np.concatenate([np.repeat(x[..., :1], rows, -1), x[..., : x.shape[-1] - rows]], -1)
 
 
 def _averaged(x: FloatArray, stretch: Stretch, dt: float) -> FloatArray:

@@ -192,7 +192,7 @@ def _much_simpler(now: Step, best: Step, other: Step) -> bool:
 def fitted(fitting: RobustFit, now: Step, candidate: Candidate, least: float = LEAST_NATS) -> Fit:
     """The candidate fitted, from the start on or from the onset that promises most.
 
-    No onset is sought where neither of the two promises `least` nats: nearly all of the time would go there.
+    No onset is sought where neither of the two promises `least` nats: two fifths of a selection's time went there.
     """
     fit = fitting.fit(candidate.model, candidate.starts, iterations=_SCREENING)
     name, late = candidate.model.names[-1], candidate.late

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.budget.analysis_record import AnalysisRecord
+from avtorch.gap.budget.analysis_record import AnalysisRecord, later
 from avtorch.gap.budget.held_out_evidence import Evidence, agreement
 from avtorch.gap.budget.robust_fit import Fit, M, RobustFit
 from avtorch.gap.likelihood.basis import lowpass
@@ -37,7 +37,7 @@ def columns(fit: Fit[M]) -> FloatArray:
     back = max(2, round(_BACK_S / record.dt))
     forces = np.concatenate(
         [
-            _late(_forces(record, rollout[s.rows], speed[s.rows], time[s.rows], record.command[s.rows]), back)
+            later(_forces(record, rollout[s.rows], speed[s.rows], time[s.rows], record.command[s.rows]), back)
             for s in record.stretches
         ],
         -1,
@@ -89,12 +89,6 @@ def _forces(record: AnalysisRecord, a: FloatArray, speed: FloatArray, t: FloatAr
     ]
     rest = [a * v**2, a * t**3, np.tanh(a / 0.1), np.tanh(a / 0.3), np.tanh(jerk / 0.3), play]
     return np.array([*plain, *rest, lowpass(u, 1.0, dt), lowpass(u, 3.0, dt), t, t**2], dtype=float)
-
-
-def _late(x: FloatArray, rows: int) -> FloatArray:
-    """`x` (..., row) so many `rows` later."""
-    rows = min(rows, x.shape[-1])
-    return np.concatenate([np.repeat(x[..., :1], rows, -1), x[..., : x.shape[-1] - rows]], -1)
 
 
 def left_over(fitting: RobustFit, fit: Fit[M], *, places: bool = False) -> FloatArray:

@@ -39,7 +39,7 @@ def test_what_blocks_that_were_held_out_prefer_takes_the_place(
     assert now.held.nats.sum() <= wrong.last.held.nats.sum()
 
 
-def test_what_was_chosen_for_its_place_is_tried_again_only_after_an_exchange(fresh_seed: int) -> None:
+def test_what_was_chosen_for_its_place_is_not_tried_again(fresh_seed: int) -> None:
     log = log_of([ConstantResistance(0.25), DeadTime(0.3)], seed=fresh_seed, seconds=100.0)
     fitting, bare = baseline_noise(AnalysisRecord.for_budget([log]), plant([]))
     tried: list[str] = []
@@ -55,7 +55,7 @@ def test_what_was_chosen_for_its_place_is_tried_again_only_after_an_exchange(fre
     assert begun_from("constant_resistance", "dead_time", settled="constant_resistance") == right
     assert any("dead_time" in role for role in tried)
     assert not any("in place of constant_resistance" in role for role in tried)
-    # the weaker of two, tried first, finds nothing that it was not chosen before
+    # nor is what would be exchanged if it were tried, as the test above does
     assert begun_from("sensor_bias", "dead_time", settled="sensor_bias") == {"sensor_bias", "dead_time"}
 
 
