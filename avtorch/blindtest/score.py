@@ -12,6 +12,7 @@ from scipy.stats import rankdata
 from avtorch.arrays import FloatArray
 from avtorch.blindtest import budget_score as of_budget
 from avtorch.blindtest.answers import Answered, read_answer
+from avtorch.blindtest.calibration_error import calibration_by_chance, calibration_error
 from avtorch.blindtest.deck import KINDS
 from avtorch.blindtest.intervals import Interval, bootstrap, cases_for, cases_for_mean, wilson
 from avtorch.blindtest.parameter_score import found_sizes
@@ -47,7 +48,8 @@ def score(
     - `parameters_covered`, `parameters_right`: of the sizes of parts that are named and true, the share whose 90 %
       interval holds the true one, and the share within a quarter of it (`avtorch.blindtest.parameter_score`).
     - `utility.group`, `.weighted`, `.by_kind`: of the alias set as an ambiguity group (`avtorch.blindtest.ambiguity`).
-    - `confident_errors`, `ece` (ten bins of the highest probability), `brier`: all cases.
+    - `confident_errors`, `ece` (ten bins of the highest probability), `brier`: all cases. `ece_by_chance`,
+      `part_ece_by_chance`: what `ece` and `part_ece` would be were these probabilities exactly right.
     - `macro_f1`: over the labels that occur; an effect found within a pair counts for that effect.
     - `closed_error`, `closed_covered` (by the 90 % interval), `onset_error_s` (median): where the verdict is right.
       `placebo_closed`: mean over the answers that report one; `placebo_nothing`: how often its interval reaches 0.
@@ -86,12 +88,14 @@ def score(
     sheet.share("partial_wrong", [r.partial for r in rows if not r.outside])
     sheet.share("confident_errors", [r.confidence > 0.9 and r.favourite != r.truth for r in rows])
     sheet.measure("ece", rows, ece)
+    sheet.by_chance("ece", [r.confidence for r in rows], seed)
     sheet.mean("brier", [r.brier for r in rows])
     sheet.measure("macro_f1", rows, macro_f1)
     sheet.share("pairs_exact", [r.right for r in by_kind["pair"]])
     sheet.mean("pairs_jaccard", [_jaccard(r) for r in by_kind["pair"]])
     _several(sheet, by_kind["several"])
     sheet.measure("part_ece", [r for r in rows if of_budget.part_probabilities(r)], part_ece)
+    sheet.by_chance("part_ece", [p for r in rows for p, _ in of_budget.part_probabilities(r)], seed)
     sizes = [size for r in rows for size in found_sizes(r)]
     sheet.share("parameters_covered", [size.covered for size in sizes if size.covered is not None])
     sheet.share("parameters_right", [size.right for size in sizes if size.right is not None])
@@ -166,20 +170,13 @@ def ece(rows: Rows, bins: int = 10) -> float | None:
     """Expected calibration error: mean difference between confidence and the share of right answers, in equal bins."""
     if not rows:
         return None
-    return _calibration_error([r.confidence for r in rows], [r.favourite == r.truth for r in rows], bins)
+    return calibration_error([r.confidence for r in rows], [r.favourite == r.truth for r in rows], bins)
 
 
 def part_ece(rows: Rows, bins: int = 10) -> float | None:
     """Expected calibration error of the probabilities that budgets give to their parts, each part for itself."""
     parts = [part for r in rows for part in of_budget.part_probabilities(r)]
-    return _calibration_error([p for p, _ in parts], [true for _, true in parts], bins) if parts else None
-
-
-def _calibration_error(probabilities: Sequence[float], true: Sequence[bool], bins: int) -> float:
-    confidence, right = np.array(probabilities), np.array(true, float)
-    which = np.minimum((confidence * bins).astype(int), bins - 1)
-    gaps = np.bincount(which, weights=confidence - right, minlength=bins)
-    return float(np.abs(gaps).sum() / len(confidence))
+    return calibration_error([p for p, _ in parts], [true for _, true in parts], bins) if parts else None
 
 
 def macro_f1(rows: Rows) -> float | None:
@@ -240,6 +237,11 @@ class _Sheet:
         self._put(key, of(rows) if rows else None, len(rows), interval)
         if planned:
             _set(self.needed, key, cases_for_mean(interval, len(rows)))
+
+    def by_chance(self, key: str, probabilities: Sequence[float], seed: int) -> None:
+        """What the calibration error `key` would be were these probabilities right."""
+        value = calibration_by_chance(probabilities, seed=seed) if probabilities else None
+        self._put(f"{key}_by_chance", value, len(probabilities), None)
 
 
 def _set(sheet: dict[str, Any], key: str, entry: Any) -> None:

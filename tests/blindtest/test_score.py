@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from avtorch.blindtest.answers import canonical_name, read_answer
 from avtorch.blindtest.catalogue import EFFECTS
@@ -164,7 +165,13 @@ def test_calibration_error_of_known_size() -> None:
         else answer({"none": 0.75, t["verdict"]: 0.25}, "none")
         for i, t in enumerate(cases)
     ]
-    assert score(cases, given, resamples=10)["ece"] == pytest.approx(0.25)
+    found = score(cases, given, resamples=10)
+    assert found["ece"] == pytest.approx(0.25)
+    # 20 cases at 0.75: the mean distance of a binomial share, by its exact distribution
+    share = np.arange(21) / 20
+    by_chance = float((binom.pmf(np.arange(21), 20, 0.75) * np.abs(share - 0.75)).sum())
+    spread = float(np.sqrt((binom.pmf(np.arange(21), 20, 0.75) * (np.abs(share - 0.75) - by_chance) ** 2).sum()))
+    assert found["ece_by_chance"] == pytest.approx(by_chance, abs=BAR * spread / np.sqrt(1000))
 
 
 def test_bad_answers_are_named() -> None:
