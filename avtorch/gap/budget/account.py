@@ -17,6 +17,7 @@ from avtorch.gap.budget.forward_selection import MOST_PARTS, baseline_noise, sel
 from avtorch.gap.budget.gap_budget import budget_of, by_chance
 from avtorch.gap.budget.given_effects import given_effects
 from avtorch.gap.budget.likely_parts import likely_parts
+from avtorch.gap.budget.one_channel import with_untested
 from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.budget.parts import LIKELY, MATERIAL, Budget, ChancePart, Part, own_onset, percent
 from avtorch.gap.budget.selection_step import Selection
@@ -90,7 +91,7 @@ def account(
     budget = budget_of(selection, epoch_s=epoch, **options)
     rest = placed(budget.unexplained, selection, epoch_s=epoch)
     chance = _all_chance(selection, base, kinds, candidates, verdict, winner, budget)
-    budget = replace(budget, unexplained=rest, chance=chance)
+    budget = with_untested(replace(budget, unexplained=rest, chance=chance), selection, logs, kinds)
     held_out = tuple(shared_out(candidates, budget, kinds))
     return Account(budget, selection, held_out, _verdict(budget, verdict), held_out=True)
 

@@ -20,6 +20,7 @@ from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.flexible_regression import left_over
 from avtorch.gap.budget.forward_selection import select
 from avtorch.gap.budget.likely_parts import likely_parts, probabilities
+from avtorch.gap.budget.one_channel import with_untested
 from avtorch.gap.budget.parts import MATERIAL, Budget, ChancePart, ChannelError, Part, Unexplained, own_onset
 from avtorch.gap.budget.repaired_model import lag_and_gain, parameters_of
 from avtorch.gap.budget.rollout_energy import horizon
@@ -76,7 +77,8 @@ def gap_budget(
     selection = likely_parts(selection, material, seed=seed)
     budget = budget_of(selection, material=material, seed=seed, epoch_s=each[0].epoch_s)
     rest = placed(budget.unexplained, selection, epoch_s=each[0].epoch_s)
-    return replace(budget, unexplained=rest, chance=by_chance(selection, base, kinds))
+    budget = replace(budget, unexplained=rest, chance=by_chance(selection, base, kinds))
+    return with_untested(budget, selection, each, kinds)
 
 
 def by_chance(selection: Selection, base: GapPlant, kinds: Sequence[type[Effect]]) -> tuple[ChancePart, ...]:

@@ -98,6 +98,25 @@ def lookalikes(
     }
 
 
+def in_place_of(
+    name: str,
+    others: Sequence[str],
+    channels: Collection[str],
+    values: Values | None = None,
+    *,
+    specific_force: bool = False,
+    among: Kinds = (),
+) -> set[str]:
+    """Effects that may be the cause in the place of `name`, beside `others`: exact aliases and forces not tested.
+
+    `values`: the fitted parameters of `name`, by the plant's keys.
+    """
+    if set(channels) != {"accel"}:
+        return set()
+    alike = lookalikes(name, channels, values, specific_force=specific_force, among=among)
+    return {*_instead(name, others, values, _known(among)), *alike} - {name, *others}
+
+
 def note(channels: Collection[str], effects: Iterable[type[Effect]]) -> str | None:
     """One sentence on the `effects` that the log cannot test; None where there are none."""
     hidden = sorted((e for e in effects if not is_observable(e, channels)), key=lambda e: e.name)

@@ -48,6 +48,15 @@ def test_the_size_of_a_road_is_that_of_its_coefficients() -> None:
     assert part.parameters["grade_rms"].mean == pytest.approx(float(road.size_along(position)), rel=0.25)
 
 
+def test_acceleration_alone_does_not_tell_whose_force_it_is() -> None:
+    """The verdict was a resistance with no alias, of a car whose accelerometer has an offset."""
+    effects = [*FEW, "aerodynamic_drag", "road_grade"]
+    log = log_of([SensorBias(-0.2)], seed=11)
+    (part,) = gap_budget(replace(log, speed=None), effects=effects).parts
+    assert part.name == "constant_resistance"
+    assert part.alias_set == ("aerodynamic_drag", "constant_resistance", "road_grade", "sensor_bias")
+
+
 def test_a_constant_force_is_no_road_and_may_be_a_slope_all_the_way() -> None:
     """A free course of the road took the place of a resistance of 1.3 m/s², a mean slope of 13 %."""
     log = log_of([ConstantResistance(0.3)], seed=11)
