@@ -16,9 +16,7 @@ from avtorch.gap.simulator.effect import Effect
 from avtorch.io import Log
 
 
-def with_untested(
-    budget: Budget, selection: Selection, logs: Sequence[Log], kinds: Sequence[type[Effect]]
-) -> Budget:
+def with_untested(budget: Budget, selection: Selection, logs: Sequence[Log], kinds: Sequence[type[Effect]]) -> Budget:
     """The budget of a selection, with those of `kinds` in the alias sets that `logs` without a speed cannot tell from
     a part."""
     if any(log.speed is not None for log in logs):
