@@ -11,7 +11,16 @@ import torch
 from scipy.signal import lfilter
 
 from avtorch.errors import InputError
-from avtorch.gap import ConstantResistance, DeadBand, DeadTime, Effect, RoadGrade, SensorBias, gap_budget
+from avtorch.gap import (
+    ConstantResistance,
+    DeadBand,
+    DeadTime,
+    Effect,
+    RoadGrade,
+    SecondOrderActuator,
+    SensorBias,
+    gap_budget,
+)
 from avtorch.io import Log
 from tests.gap.budget.cars import log_of
 
@@ -55,6 +64,15 @@ def test_acceleration_alone_does_not_tell_whose_force_it_is() -> None:
     (part,) = gap_budget(replace(log, speed=None), effects=effects).parts
     assert part.name == "constant_resistance"
     assert part.alias_set == ("aerodynamic_drag", "constant_resistance", "road_grade", "sensor_bias")
+
+
+def test_acceleration_alone_does_not_tell_an_actuator_from_a_sensor() -> None:
+    """A second pole may be the sensor's, unless the actuator overshoots. The answer's parameters are not the fit's."""
+    effects = ["second_order_actuator", "sensor_lag"]
+    for T_L, alike in ((0.65, ("second_order_actuator", "sensor_lag")), (0.2, ("second_order_actuator",))):
+        log = log_of([SecondOrderActuator(inverse_frequency_s=0.25)], T_L=T_L, seed=11)  # damping 1.3 and 0.4
+        (part,) = gap_budget(replace(log, speed=None), effects=effects).parts
+        assert part.alias_set == alike
 
 
 def test_a_constant_force_is_no_road_and_may_be_a_slope_all_the_way() -> None:
