@@ -3,6 +3,9 @@
 The likelihood is the sharper of the two where its equations hold: it names a cause that no rollout shows yet. Where it
 answers `unknown`, or calls for a random force that swallows whatever is reproducible, its noise model does not hold.
 Colour alone is no cause, so the blocks that were held out decide then, under a noise of free spectrum.
+
+With acceleration alone no second channel contradicts the likelihood: behind ordinary recorders it named 16 parts at a
+mean probability of 0.98, of which 7 were there. There its effects stay only where held-out blocks confirm all of them.
 """
 
 from __future__ import annotations
@@ -80,14 +83,24 @@ def account(
     values = {} if winner is None else winner.values
     begun = given_effects(fitting, bare, named, values=values, onsets=_onsets(winner, logs))
     epoch, options = logs[0].epoch_s, {"material": material, "seed": seed}
-    if winner is not None and not winner.blown:
+
+    def continued(begun: Selection) -> Selection:
+        return select(record, base, kinds, begun=begun, most=most, progress=progress, checkpoint=checkpoint)
+
+    holds = winner is not None and not winner.blown
+    selection = None
+    if holds and named and not record.has_speed:
+        selection = likely_parts(continued(begun), material, seed=seed)
+        holds = {kind.name for kind in named} <= {step.entered for step in selection.steps}
+        winner = winner if holds else None
+    if winner is not None and holds:
         selection = largest_first(begun, 0.0)
         budget = _as_adequate(budget_of(selection, epoch_s=epoch, **options), candidates)
         budget = _by_likelihood(budget, candidates, verdict, named, winner, epoch if len(logs) == 1 else None)
         budget = replace(budget, chance=_chance(candidates, verdict, winner, budget.unexplained.probability, selection))
         return Account(budget, selection, tuple(candidates), _verdict(budget, verdict), held_out=False)
-    selection = select(record, base, kinds, begun=begun, most=most, progress=progress, checkpoint=checkpoint)
-    selection = likely_parts(selection, material, seed=seed)
+    if selection is None:
+        selection = likely_parts(continued(begun), material, seed=seed)
     budget = budget_of(selection, epoch_s=epoch, **options)
     rest = placed(budget.unexplained, selection, epoch_s=epoch)
     chance = _all_chance(selection, base, kinds, candidates, verdict, winner, budget)

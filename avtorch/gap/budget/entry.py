@@ -18,6 +18,7 @@ from avtorch.gap.budget.onset_search import ONSET_NATS, may_set_in, set_in
 from avtorch.gap.budget.robust_fit import Fit, HeldOut, RobustFit
 from avtorch.gap.budget.score_test import Candidate, ScoreTest
 from avtorch.gap.budget.selection_step import Step, complexity, cost
+from avtorch.gap.likelihood.observability import is_observable
 from avtorch.gap.simulator.effect import Effect
 
 LEAST_NATS = 3.0
@@ -35,13 +36,7 @@ _SCREENED = 5  # effects that are held out, of those fitted
 
 def observable(kinds: Iterable[type[Effect]], record: AnalysisRecord) -> list[type[Effect]]:
     """Those of `kinds` that predict something, and something that `record` measures."""
-
-    def seen(kind: type[Effect]) -> bool:
-        if kind.random or (kind.needs_speed and not record.has_speed):
-            return False
-        return kind.place != "sensor" or len(record.channels) == 2
-
-    return [kind for kind in kinds if seen(kind)]
+    return [kind for kind in kinds if not kind.random and is_observable(kind, record.channels)]
 
 
 def candidates_for(

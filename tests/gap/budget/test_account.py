@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from avtorch import Leader, diagnose, simulate
+from avtorch.blindtest import draw_case
 from avtorch.errors import InputError
 from avtorch.gap import (
     EFFECTS,
@@ -56,6 +57,14 @@ def faults() -> Callable[[dict], list[str]]:
         return check.faults
 
     return of
+
+
+def test_with_acceleration_alone_held_out_blocks_confirm_the_likelihood() -> None:
+    """A resistance was named at 0.98 of a car that has none, behind an ordinary recorder: nothing contradicted it."""
+    case = draw_case(2, 531601, recorder="ordinary", signals=("accel",))
+    assert case.truth_name == "dead_band"
+    found = diagnose(case.log(signals=("accel",)), effects=["constant_resistance", "dead_band"])
+    assert found.verdict.names == ("none",)
 
 
 @pytest.fixture(scope="module")
