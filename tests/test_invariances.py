@@ -191,6 +191,7 @@ def test_where_a_followers_clock_begins_changes_nothing(behind: Log) -> None:
     _same(_follower(_with(behind, time=behind.time + OFFSETS[1])), _follower(behind))
 
 
+@pytest.mark.slow
 def test_two_drives_need_not_share_a_clock() -> None:
     """Neither in a comparison nor in a diagnosis, which uses only the drives; every row keeps its own stamp."""
     one, two = _drive(60.0, seed=5), _drive(60.0, seed=6)

@@ -35,6 +35,7 @@ def test_causes_are_counted_by_name_and_by_likelihood() -> None:
     assert (found["wrong_names"], found["blocks_prefer_the_truth"]) == (1, 1)
 
 
+@pytest.mark.slow
 def test_a_plain_cause_is_found_and_told() -> None:
     # brakes of another gain, 100 nats: the first such case of a minute of this seed
     case = case_figures(3, 777001, "single", "ordinary")

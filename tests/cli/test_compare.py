@@ -53,7 +53,9 @@ MIXES = {
 }
 
 
-@pytest.mark.parametrize("mix", MIXES)
+@pytest.mark.parametrize(
+    "mix", [m if m == "output, object" else pytest.param(m, marks=pytest.mark.slow) for m in MIXES]
+)
 def test_two_simulators_of_any_kind(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], mix: str) -> None:
     given, nearer, *sources = MIXES[mix]
     arguments = [x.format(folder) for x in given]

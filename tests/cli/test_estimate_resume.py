@@ -87,6 +87,7 @@ def test_windows_done_before_are_not_computed_again(
     assert 0 < sum(fed) < 900 - 600, "a row of the six windows that were finished was fed again"
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_from_what_was_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     line = ["estimate", two_segments(tmp_path / "drive.csv"), "--quiet", "--dead-time", "0"]
     monkeypatch.setattr(kept_windows, "EVERY_S", 0.0)
@@ -108,7 +109,11 @@ def test_a_killed_run_goes_on_from_what_was_written_last(tmp_path: Path, monkeyp
 
 @pytest.mark.parametrize(
     ("more", "words"),
-    [(["--seed", "1"], "seed 0"), (["--window", "1"], "window 2.0"), (["--tau", "1.2"], "other settings")],
+    [
+        (["--seed", "1"], "seed 0"),
+        pytest.param(["--window", "1"], "window 2.0", marks=pytest.mark.slow),
+        pytest.param(["--tau", "1.2"], "other settings", marks=pytest.mark.slow),
+    ],
 )
 def test_other_settings_are_refused_in_one_line(
     interrupted: tuple[list[str], Path], capsys: pytest.CaptureFixture[str], more: list[str], words: str

@@ -14,6 +14,7 @@ from avtorch.cli.talk import Talk
 from avtorch.gap import DeadTime, plant
 
 
+@pytest.mark.slow
 def test_the_report_is_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", lambda address: not opened.append(address))

@@ -186,6 +186,7 @@ def test_every_answer_is_a_few_lines_without_a_tensor(kind: str, log: Log) -> No
     assert len(found._repr_html_()) < 6000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["belief", "diagnosis", "estimates", "log", "posterior", "run", "trajectory"])
 def test_every_answer_of_numbers_is_a_data_frame(kind: str, log: Log) -> None:
     pandas = pytest.importorskip("pandas")

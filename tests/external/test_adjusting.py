@@ -97,6 +97,7 @@ def test_few_rollouts_are_enough_and_no_more_are_made() -> None:
         ExternalSimulator(Truck, adjustable=LIMITS, most_rollouts=3)
 
 
+@pytest.mark.slow
 def test_a_missing_effect_is_not_taken_for_a_wrong_parameter() -> None:
     """Alone the lag would stand in for the dead time, at 0.6 s; with it in place the lag is what it was."""
     car = plant([DeadTime(0.3)], T_L=0.3, sigma=0.05)

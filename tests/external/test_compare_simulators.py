@@ -43,6 +43,7 @@ def test_the_nearer_is_named_by_what_it_has(both: tuple[Log, Log]) -> None:
     assert there["aerodynamic_drag"].brings_nearer
 
 
+@pytest.mark.slow
 def test_the_factors_of_the_differences_multiply_to_all_of_them(both: tuple[Log, Log]) -> None:
     """Between two plants, which are their own surrogates, that is the ratio of the two errors itself: they differ in
     nothing that the differences do not hold. What is left is a rollout at the car's speed beside one at its own."""
@@ -58,6 +59,7 @@ def test_the_factors_of_the_differences_multiply_to_all_of_them(both: tuple[Log,
     assert [d.first for d in turned.differences] == [d.second for d in told.differences]
 
 
+@pytest.mark.slow
 def test_an_object_and_a_plant_that_are_one_are_not_told_apart(both: tuple[Log, Log]) -> None:
     """A plant, and the same plant as an object that is identified by its output."""
     car, _ = both
@@ -69,6 +71,7 @@ def test_an_object_and_a_plant_that_are_one_are_not_told_apart(both: tuple[Log, 
     assert "cannot tell which simulator is nearer (first: dead_time=0.2, T_L=0.4, second: object)" in told.why
 
 
+@pytest.mark.slow
 def test_an_object_beside_a_plant() -> None:
     """A simulator integrated by SciPy; the car has its lag of 0.35 s and its drag."""
     car = log_of(plant(baseline="aerodynamic_drag=0.0005", T_L=0.35), seconds=60.0, rng=np.random.default_rng(5))
@@ -82,6 +85,7 @@ def test_an_object_beside_a_plant() -> None:
     assert answer["first"]["source"] == "simulator"
 
 
+@pytest.mark.slow
 def test_many_small_differences_are_told_together() -> None:
     car = log_of(plant(T_L=0.35), seconds=60.0, rng=np.random.default_rng(5))
     many = ", ".join(
@@ -142,6 +146,7 @@ def test_what_cannot_be_compared_is_refused(both: tuple[Log, Log]) -> None:
         compare_simulators(car[slice(0, 1050)], "T_L=0.3", "T_L=0.4")
 
 
+@pytest.mark.slow
 def test_two_drives_against_one_simulator() -> None:
     """The car before is the simulator; after, it has three quarters of the gain. The simulator's
     errors are those of the plant that it is."""

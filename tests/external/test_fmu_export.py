@@ -48,6 +48,7 @@ def response(car: GapPlant, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return found.accel_measured[1:].numpy(), found.speed[1:].numpy()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "effects",
     [
@@ -81,6 +82,7 @@ def test_its_description_keeps_the_standard_and_states_units(tmp_path: Path) -> 
         assert {unit.name for unit in found.unitDefinitions} >= {"m/s2", "m/s", "s"}
 
 
+@pytest.mark.slow
 def test_a_car_that_stops_does_not_roll_back(tmp_path: Path) -> None:
     with FmuSimulator(write_fmu(plant(T_L=0.3), tmp_path / "car.fmu")) as car:
         _, speed = car.whole_drive(np.repeat([-3.0, 2.0], 60), DT, speed=2.0, accel=0.0)
@@ -137,6 +139,7 @@ os._exit(0)
 """
 
 
+@pytest.mark.slow
 def test_around_a_simulator_the_whole_is_the_plant(tmp_path: Path) -> None:
     lag, gain = 0.4, 0.7
     car = plant([DeadTime(0.1), AerodynamicDrag(4e-4), SensorBias(0.1)], T_L=lag, K_L=gain)

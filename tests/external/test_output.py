@@ -88,6 +88,7 @@ def test_as_many_outputs_as_drives(as_it_is: tuple[Log, Log]) -> None:
 FEW = ["dead_time", "constant_resistance", "sensor_bias", "second_order_actuator", "dead_band"]
 
 
+@pytest.mark.slow
 def test_a_missing_effect_is_named() -> None:
     car, simulated = drive(12, more={"sensor_bias": {"bias_mps2": 0.2}})
     found = diagnose(car, baseline=ExternalSimulator(simulated), effects=FEW, pairs=False, posterior="laplace")
@@ -101,6 +102,7 @@ def test_a_missing_effect_is_named() -> None:
     assert "Of the simulator itself (simulator.csv)" in str(found)
 
 
+@pytest.mark.slow
 def test_a_wrong_parameter_is_no_missing_effect() -> None:
     car, simulated = drive(13, changed={"dead_time": {"delay_s": 0.4}})
     found = diagnose(car, baseline=ExternalSimulator(simulated), effects=FEW, pairs=False, posterior="laplace")
@@ -114,6 +116,7 @@ def test_a_wrong_parameter_is_no_missing_effect() -> None:
     assert str(found).startswith("A parameter of the simulator is wrong")
 
 
+@pytest.mark.slow
 def test_the_right_simulator_lacks_nothing(as_it_is: tuple[Log, Log]) -> None:
     car, simulated = as_it_is
     found = diagnose(car, baseline=ExternalSimulator(simulated), effects=FEW, pairs=False, posterior="laplace")
@@ -123,6 +126,7 @@ def test_the_right_simulator_lacks_nothing(as_it_is: tuple[Log, Log]) -> None:
     assert found.tested.missing == ()
 
 
+@pytest.mark.slow
 def test_a_standstill_is_no_gap() -> None:
     """At rest a car stays at rest, which no effect does: there nothing counts, and nothing is carried over from there.
 

@@ -67,6 +67,7 @@ def test_it_begins_anew_where_the_car_does() -> None:
     assert [(p.start, p.stop) for p in parts] == [(0, 119), (119, 200), (240, 400)]  # from the last row at standstill
 
 
+@pytest.mark.slow
 def test_what_it_leaves_starts_anew_with_it() -> None:
     """A stop and an override, under which the car's speed goes its own way: no offset of speed is left behind them."""
     time = 0.05 * np.arange(2400)
@@ -176,6 +177,7 @@ def test_a_simulator_is_what_it_is() -> None:
     assert found.left < 0.005
 
 
+@pytest.mark.slow
 def test_what_it_lacks_goes_around_it() -> None:
     """Wrapped it does what the answer's own rollout does, and is nearer to the car than as it was."""
 

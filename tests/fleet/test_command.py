@@ -22,6 +22,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_cars_are_printed_in_their_order_with_what_failed(
     here: Path, scheduler: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

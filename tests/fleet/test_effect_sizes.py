@@ -22,6 +22,7 @@ def late(*delays: float, sd: float = 0.01) -> list[dict[str, Any]]:
     return [drive_sizes([cause("dead_time", delay_s=(delay, sd))]) for delay in delays]
 
 
+@pytest.mark.slow
 def test_a_typical_car_its_siblings_and_each_car_are_told_in_seconds() -> None:
     cars = {f"car {i}": late(0.20 + 0.005 * i, 0.205 + 0.005 * i) for i in range(7)}
     common, each = effect_sizes("dead_time", cars)

@@ -117,6 +117,7 @@ def test_a_second_call_computes_nothing(tmp_path: Path, scheduler: str, computed
     assert again["cars"] == first["cars"]
 
 
+@pytest.mark.slow
 def test_what_has_changed_is_computed_again(tmp_path: Path, scheduler: str, computed: list[tuple[str, str]]) -> None:
     write_fleet(tmp_path / "logs", {"red": 0.4, "blue": 0.3})
     out, source = tmp_path / "out", tmp_path / "logs"

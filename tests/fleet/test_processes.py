@@ -49,6 +49,7 @@ def pids(cluster: Cluster) -> dict[str, int]:
     return dict(cluster.client.run(os.getpid))  # type: ignore[call-overload]
 
 
+@pytest.mark.slow
 def test_workers_are_processes_of_one_thread_that_end_with_the_work(tmp_path: Path, scheduler: str) -> None:
     write_fleet(tmp_path / "logs", LAGS)
     seen: dict[str, Any] = {}

@@ -50,6 +50,7 @@ def fleet(tmp_path: Path) -> Fleet:
     return Fleet(tmp_path)
 
 
+@pytest.mark.slow
 def test_cars_in_the_order_in_which_to_look_at_them(fleet: Fleet) -> None:
     fleet.drive("sound", [window(0.3, 1.0)])
     fleet.drive("small gap", [window(0.3, 1.0)], diagnosis("dead_time", 1.5))

@@ -27,6 +27,7 @@ def _drive(rng: np.random.Generator, *, seconds: float = 120.0, **of: float) -> 
     return log_of(plant(**of), seconds=seconds, rng=rng, noise=QUIET)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_a_slower_car_is_detected_with_its_size(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)
@@ -114,6 +115,7 @@ def test_one_car_stays_one_car(rotating_seed: int) -> None:
     assert changed < 5
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_two_simulators_on_one_drive(rotating_seed: int) -> None:
     log = _drive(np.random.default_rng(rotating_seed), T_L=0.4, K_L=0.9)
@@ -133,6 +135,7 @@ def test_two_simulators_on_one_drive(rotating_seed: int) -> None:
     assert "drive" not in avtorch.compare(log, hand, baseline=plant(T_L=0.4, K_L=0.9), effects=[]).why.partition(".")[0]
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_rollouts_of_both_sides_last_as_long_as_they_are_said_to(rotating_seed: int) -> None:
     """Between overrides every 9 s no rollout lasts 10 s, and errors grow with how long they do: once those of 6 s were

@@ -116,6 +116,7 @@ def test_where_the_likelihood_is_lost_held_out_blocks_decide(monkeypatch: pytest
     assert any("tried no pairs" in note for note in answer["notes"])
 
 
+@pytest.mark.slow
 def test_effects_that_were_not_asked_for_are_not_ruled_out() -> None:
     """Once "distinguished from every other hypothesis" and "none of the effects known here", of two effects tried."""
     chosen = ["sensor_bias", "sensor_scale"]

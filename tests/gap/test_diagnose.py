@@ -76,6 +76,7 @@ def test_the_repaired_simulator_reads_back() -> None:
     assert [e.name for e in again.effects] == [e.name for e in answer.plant.effects]
 
 
+@pytest.mark.slow
 def test_the_onset_of_a_part_selected_on_held_out_blocks_is_that_of_the_verdict(
     tmp_path: Path, fresh_seed: int
 ) -> None:

@@ -55,6 +55,7 @@ def test_a_log_without_the_drivers_rows_gives_the_same_answer(fresh_seed: int) -
         assert one.parameters[name].mean == pytest.approx(quantity.mean, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_a_car_is_the_same_under_a_driver_who_takes_over(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)

@@ -154,6 +154,7 @@ def test_nuts_agrees_with_quadrature_and_conjugate(name: str, make_windows, rota
     assert (gap < BAR * f64(*bar)).all()
 
 
+@pytest.mark.slow
 def test_chains_repeat_by_seed_and_leave_the_global_state(make_windows) -> None:
     density = JerkDensity(make_windows(1, [1.0]).statistics)
     before = torch.get_rng_state()

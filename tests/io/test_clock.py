@@ -100,6 +100,7 @@ def test_a_faulty_row_is_named_by_all_digits_of_its_stamp(unix_drive: Path) -> N
     assert "row 6, column 'time': repeats 1700000000.163 s" in said
 
 
+@pytest.mark.slow
 def test_estimates_are_listed_from_the_start_and_kept_on_the_clock(
     unix_drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -141,6 +141,7 @@ def test_several_logs_may_be_of_any_kind(log: Log, tmp_path: Path) -> None:
         as_logs([log, 3])  # type: ignore[list-item]
 
 
+@pytest.mark.slow
 def test_every_function_answers_the_same_of_a_path_a_frame_and_a_log(log: Log, tmp_path: Path) -> None:
     log.write(tmp_path / "a.parquet")
     whole = pa.table({**columns(log), "jerk": log.jerk}) if log.jerk is not None else pa.table(columns(log))

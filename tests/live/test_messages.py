@@ -199,6 +199,7 @@ def test_more_cars_than_are_allowed_are_counted():
     assert {e["car"] for e in entries} == {"red", "blue"}
 
 
+@pytest.mark.slow
 def test_what_is_kept_of_a_car_is_bounded():
     """A sender of a row each 0.1 ms, for ten windows."""
     settings = LiveSettings(window=0.5, lateness=5.0)

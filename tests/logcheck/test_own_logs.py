@@ -145,7 +145,11 @@ def mat(folder: Path, d: Columns) -> Path:
     return path
 
 
-@pytest.mark.parametrize("write", [semicolons, mdf, mcap, blf, mat], ids=lambda write: write.__name__)
+@pytest.mark.parametrize(
+    "write",
+    [semicolons, *(pytest.param(w, marks=pytest.mark.slow) for w in (mdf, mcap, blf, mat))],
+    ids=lambda write: write.__name__,
+)
 def test_check_and_estimate_lead_to_the_cars_lag_and_gain(
     write: Callable[[Path, Columns], Path],
     tmp_path: Path,

@@ -25,7 +25,9 @@ def test_a_log_with_avtorchs_names_needs_no_mapping(data_dir: Path, name: str) -
     assert found.excitation
 
 
-@pytest.mark.parametrize("folder", ["openacc_astazero", "openacc_zalazone", "ngsim"])
+@pytest.mark.parametrize(
+    "folder", ["openacc_astazero", "openacc_zalazone", pytest.param("ngsim", marks=pytest.mark.slow)]
+)
 def test_platoons_without_commands_are_told(data_dir: Path, folder: str) -> None:
     first = next(path for path in sorted((data_dir / folder).glob("*.csv")) if path.name != "Slope.csv")
     found = avtorch.check(first)

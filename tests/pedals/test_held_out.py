@@ -13,6 +13,7 @@ from avtorch.pedals.pedal_drive import PedalDrive
 from tests.pedals.cars import drive, factors, plain, with_dead_zone
 
 
+@pytest.mark.slow
 def test_a_map_beats_one_factor_where_the_car_has_one() -> None:
     assert held_out(drive(with_dead_zone, 21, seconds=100.0)).better_than("factor")
 

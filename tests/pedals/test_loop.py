@@ -100,6 +100,7 @@ def test_a_rollout_of_the_true_controller_is_exact() -> None:
     assert np.sqrt(errors[1:]).max() < 0.1 < np.sqrt(less[1:]).max()
 
 
+@pytest.mark.slow
 def test_it_beats_one_constant_where_the_controller_has_limits() -> None:
     score = held_out(drive(57, seconds=80.0, steps=True))
     assert score.better_than("factor")
@@ -115,6 +116,7 @@ def test_the_command_is_what_the_controller_demands() -> None:
         TRUE.commanded(replace(log, speed_cmd=None))
 
 
+@pytest.mark.slow
 def test_more_of_what_is_missed_never_slows_the_car() -> None:
     made = fit_pedals(drive(59, seconds=80.0, force=0.3)).map
     for name, table in made.pedals.items():

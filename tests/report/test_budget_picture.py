@@ -48,7 +48,11 @@ def test_it_is_of_the_parts(found: Diagnosis) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "before", "unexplained"), [("unknown", 2.0, "75 %"), ("none", 1.01, "2 %"), ("none", 1.0, "0 %")]
+    ("name", "before", "unexplained"),
+    [
+        ("unknown", 2.0, "75 %"),
+        *(pytest.param("none", *more, marks=pytest.mark.slow) for more in ((1.01, "2 %"), (1.0, "0 %"))),
+    ],
 )
 def test_where_nothing_is_named_it_is_of_what_is_unexplained_and_noise(
     found: Diagnosis, name: str, before: float, unexplained: str
@@ -59,6 +63,7 @@ def test_where_nothing_is_named_it_is_of_what_is_unexplained_and_noise(
     assert [row[:2] for row in rows[1:]] == [["unexplained", unexplained], ["noise", noise]]
 
 
+@pytest.mark.slow
 def test_its_caption_says_whether_what_is_left_counts(found: Diagnosis) -> None:
     captions = {}
     for name, before in (("unknown", 2.0), ("none", 1.01), ("nothing", 1.0)):

@@ -7,6 +7,7 @@ import platform
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 import avtorch
@@ -23,6 +24,7 @@ def footer(text: str) -> dict[str, str]:
     return dict(zip(words[::2], words[1::2], strict=True))
 
 
+@pytest.mark.slow
 def test_it_names_command_versions_and_hashes(found: Diagnosis, tmp_path: Path) -> None:
     log = tmp_path / "a <b>.csv"
     log.write_bytes(b"time,speed")
@@ -35,6 +37,7 @@ def test_it_names_command_versions_and_hashes(found: Diagnosis, tmp_path: Path) 
     assert told["versions"] == f"avtorch {avtorch.__version__}, {numbers}"
 
 
+@pytest.mark.slow
 def test_it_leaves_out_what_the_caller_did_not_say(found: Diagnosis) -> None:
     assert list(footer(report_html(found))) == ["versions"]
 

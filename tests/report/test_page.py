@@ -14,6 +14,7 @@ from tests.report.conftest import HOSTILE
 from tests.report.tree import read
 
 
+@pytest.mark.slow
 def test_it_is_whole_and_needs_no_network(found: Diagnosis, tmp_path: Path) -> None:
     path = write_report(found, tmp_path, quality=["2 rows masked"])
     text = path.read_text(encoding="utf-8")
@@ -32,6 +33,7 @@ def test_a_hostile_name_is_text(found: Diagnosis) -> None:
     assert "&lt;script&gt;" in text
 
 
+@pytest.mark.slow
 def test_the_fit_is_told_in_per_cent(found: Diagnosis) -> None:
     traces = found.traces
     assert traces is not None
@@ -50,6 +52,7 @@ def test_answers_with_fewer_entries(found: Diagnosis) -> None:
     assert "How far" not in text
 
 
+@pytest.mark.slow
 def test_a_place_that_cannot_be_written(found: Diagnosis, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="file"):

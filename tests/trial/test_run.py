@@ -57,6 +57,7 @@ def test_answers_are_kept_and_only_missing_ones_are_asked_for(tmp_path: Path) ->
     assert not {"truth", "logs"} & {p.name for p in (tmp_path / "answers").rglob("*")}
 
 
+@pytest.mark.slow
 def test_kept_logs_keep_who_drove(tmp_path: Path) -> None:
     first, again = Asked(), Asked()
     options: dict[str, Any] = {"mix": {"none": 1.0}, "seconds": 60.0, "recorder": "ordinary", "keep_logs": True}

@@ -48,6 +48,7 @@ def test_band_holds_all_points_as_often_as_it_says(level, uniform):
     assert ((ecdf_p_value(uniform, DRAWS) > 1 - level) == inside).double().mean() > 0.98
 
 
+@pytest.mark.slow
 def test_band_of_arviz_is_the_same():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # arviz announces its successor

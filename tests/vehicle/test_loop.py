@@ -186,6 +186,7 @@ def test_platoon_noise_differs_by_vehicle_and_first_vehicle_is_the_single_one():
     assert (correlation - torch.eye(3, dtype=F64)).abs().max() < 5 / 500**0.5
 
 
+@pytest.mark.slow
 def test_unstable_string_amplifies_along_the_platoon_and_stable_does_not():
     leader = Leader.from_speed(np.arange(0, 60, 0.5), 20 + 0.3 * np.sin(0.8 * np.arange(0, 60, 0.5)), smooth_s=0.0)
     for plant, grows in ((QUIET, False), (GLVDPlant(1.5, 0.5, 0.0), True)):

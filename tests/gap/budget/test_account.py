@@ -133,6 +133,7 @@ def test_the_likelihood_decides_where_it_holds(faults: Callable[[dict], list[str
     assert faults(found.to_dict()) == []
 
 
+@pytest.mark.slow
 def test_a_change_of_gain_sets_in_when_its_own_parameter_says(fresh_seed: int) -> None:
     log = log_of([GainChange(0.7, 45.0), SensorBias(0.3)], seconds=90.0, seed=fresh_seed)
     found = diagnose(log, effects=["gain_change", "sensor_bias"], posterior="laplace")

@@ -17,6 +17,7 @@ from avtorch.io import Log
 from tests.gap.budget.cars import log_of
 
 
+@pytest.mark.slow
 def test_a_closed_loop_gets_no_slow_noise_from_its_commands(fresh_seed: int) -> None:
     """Cars without a cause, driven by a controller: 0.5 to 1.1 of 16 draws; up to 3.4 when columns looked ahead."""
     shares: list[float] = []

@@ -80,6 +80,7 @@ def test_acceleration_alone_does_not_tell_an_actuator_from_a_sensor() -> None:
         assert part.alias_set == alike
 
 
+@pytest.mark.slow
 def test_a_constant_force_is_no_road_and_may_be_a_slope_all_the_way() -> None:
     """A free course of the road took the place of a resistance of 1.3 m/s², a mean slope of 13 %."""
     log = log_of([ConstantResistance(0.3)], seed=11)
@@ -90,6 +91,7 @@ def test_a_constant_force_is_no_road_and_may_be_a_slope_all_the_way() -> None:
     assert ConstantResistance.alike({"resistance_mps2": 1.3}) == ()
 
 
+@pytest.mark.slow
 def test_a_slow_force_on_a_road_that_is_driven_once_may_be_that_roads() -> None:
     """What changes within a block belongs to the time as well as to the place, until the place is passed again."""
     log, keep = log_of(seed=11), float(np.exp(-0.05 / 3.0))
@@ -128,6 +130,7 @@ def test_a_cause_is_named_where_slow_noise_hides_what_it_does_to_rollouts() -> N
     assert gap_budget(log, effects=["dead_band"]).names == ("dead_band",)
 
 
+@pytest.mark.slow
 def test_parts_are_in_order_and_sum_to_one() -> None:
     log = log_of([ConstantResistance(0.2), SensorBias(0.1), DeadBand(0.25)], seed=2)  # each over 3 % of the gap
     budget = gap_budget(log, effects=FEW)

@@ -30,6 +30,7 @@ def test_a_dead_time_is_no_driveline_that_rings_by_twice_the_step(data_dir: Path
     assert truth["delay_s"] - 0.08 < delay < truth["delay_s"] + 0.3
 
 
+@pytest.mark.slow
 def test_waves_of_a_road_that_is_driven_three_times_are_the_roads(data_dir: Path) -> None:
     """They are shorter than what is driven in a block: of each lap by itself they could be either."""
     hilly, _ = put_in_front(joined(laps(data_dir)), "road_grade", T_L=0.283, K_L=1.05, size=0.8, seed=8)

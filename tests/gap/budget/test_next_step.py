@@ -50,6 +50,7 @@ def test_a_file_of_steps_changes_nothing(whole: tuple[Selection, Path]) -> None:
     assert content(selected(None)) == content(whole[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("finished", [1, 3, 1000])
 def test_it_goes_on_from_the_steps_that_are_finished(
     whole: tuple[Selection, Path], finished: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

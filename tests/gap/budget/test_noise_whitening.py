@@ -32,6 +32,7 @@ def test_what_an_autoregression_leaves_is_white_and_of_size_one(rotating_seed: i
     assert np.abs(correlation).max() < BAR / np.sqrt(n)
 
 
+@pytest.mark.slow
 def test_a_bias_that_sets_in_is_no_noise() -> None:
     # taken for noise that wanders, a step of the reading hid itself
     log = log_of(seconds=300.0)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from avtorch.blindtest import draw_case
 from avtorch.gap import gap_budget
 from avtorch.io import Log
 
 
+@pytest.mark.slow
 def test_a_steep_road_of_many_waves_is_named() -> None:
     # seven kilometres with waves of 235 m: a dozen knots could not follow them, and two coefficients were at a limit
     case = draw_case(0, 7002, mix={"single": 1.0}, effects=["road_grade"], tiers=["easy"], seconds=300.0)

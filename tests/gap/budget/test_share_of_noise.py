@@ -49,6 +49,7 @@ def test_lost_messages_have_none(selection: Selection) -> None:
     assert share_of_noise(EFFECTS["command_hold"], winner(NoiseModel()), selection) is None
 
 
+@pytest.mark.slow
 def test_outliers_have_their_share_of_the_readings_errors(fresh_seed: int) -> None:
     """A sensor's noise of 0.05 m/s², 2 % of whose readings are off by 8 times that."""
     drive = simulate(Leader.default(start=60.0, duration=100.0, dt=0.02), plant=plant([], sigma=0.05)).log()

@@ -49,6 +49,7 @@ def test_a_slow_force_is_found_with_its_size(rotating_seed: int) -> None:
     assert 0 < part.share_of_noise <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_a_cars_own_noise_is_no_slow_force(rotating_seed: int) -> None:
     """Twenty cars: if 1 in 100 had one named, four of twenty would less than once in 20,000 times."""
@@ -57,6 +58,7 @@ def test_a_cars_own_noise_is_no_slow_force(rotating_seed: int) -> None:
     assert sum(part is not None for part in found) < 4
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_noise_of_an_actuator_whose_lag_a_dead_time_hides_is_no_slow_force(rotating_seed: int) -> None:
     """Beside a dead time a fit had left 0.03 s of the lag of 0.35 s, and half of such cars had a gust by that alone.

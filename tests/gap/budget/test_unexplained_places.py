@@ -13,7 +13,7 @@ from tests.gap.budget.cars import log_of
 _CHANGES_S = 100.0
 
 
-@pytest.mark.parametrize("effect", [SensorBias(0.2), ConstantResistance(0.2)])
+@pytest.mark.parametrize("effect", [SensorBias(0.2), pytest.param(ConstantResistance(0.2), marks=pytest.mark.slow)])
 def test_what_was_not_tried_is_told_by_its_likeness(effect: Effect) -> None:
     rest = gap_budget(log_of([effect], seed=11), effects=["dead_time", "dead_band"]).unexplained
     assert rest.material
@@ -21,6 +21,7 @@ def test_what_was_not_tried_is_told_by_its_likeness(effect: Effect) -> None:
     assert rest.where == ()  # it acts all the time
 
 
+@pytest.mark.slow
 def test_what_begins_late_has_its_place_in_time() -> None:
     rest = gap_budget(log_of([GainChange(0.6, _CHANGES_S)], seed=11), effects=["dead_time"]).unexplained
     assert rest.resembles == "gain_change"

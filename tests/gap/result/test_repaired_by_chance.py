@@ -71,6 +71,7 @@ def test_rollouts_and_what_they_close_are_of_the_parts_alone(both: Diagnosis) ->
     assert both.shrinkage.top.closed is not None
 
 
+@pytest.mark.slow
 def test_a_gust_that_is_named_alone_has_a_repaired_simulator() -> None:
     found = pushed([])
     assert found.verdict.names == ("gust",)

@@ -93,6 +93,7 @@ def test_a_slope_that_stands_in_for_a_resistance_is_of_another_road(selected: tu
     assert not any("profile" in key for key in road.belief)
 
 
+@pytest.mark.slow
 def test_a_manoeuvre_tells_the_sets_apart(selected: tuple[Selection, Budget]) -> None:
     sure, other = {"constant_resistance": 0.99, "sensor_bias": 0.8}, "aerodynamic_drag+sensor_bias"
     models = rivals(selected, sure, {"constant_resistance": ("aerodynamic_drag",)}, other)
@@ -112,6 +113,7 @@ def test_a_manoeuvre_tells_the_sets_apart(selected: tuple[Selection, Budget]) ->
     assert experiment.information.nats > 0.5 * experiment.entropy > 0.3
 
 
+@pytest.mark.slow
 def test_an_answer_by_held_out_blocks_has_them() -> None:
     """A resistance that a slope of the road could be as well, and a bias, behind sensors with coloured noise."""
     log = log_of([ConstantResistance(0.25), SensorBias(0.2)], seconds=100.0, seed=3)

@@ -215,6 +215,7 @@ def refused_as(path: Path, log: Log, **of: Any) -> str:
     return refused(path, work(log))
 
 
+@pytest.mark.slow
 def test_neither_prior_nor_posterior_nor_seed_belong_to_a_fit(log: Log, kept: Path) -> None:
     """They are taken up again, and the answer is that of a run from the start with the same settings."""
     other: dict[str, Any] = {**ONLY, "prior": {"none": 3.0}, "seed": 7}

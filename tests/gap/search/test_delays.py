@@ -83,6 +83,7 @@ def test_at_200_hz_too() -> None:
     assert "dead_time" in found.verdict.alias_set
 
 
+@pytest.mark.slow
 def test_a_delay_within_the_period_is_known_up_to_the_period() -> None:
     """0.24 s under a command of 0.4 s: a dead time it is, of 0.24 or 0.64 s."""
     found = _diagnosed(_log("square", 0.4, 20, delay=0.24))
