@@ -1,7 +1,8 @@
 """The car with all parts of a budget: its parameters with intervals, and the simulator that holds them.
 
 What the folds disagree on is the uncertainty (a jackknife): it counts what differs from one stretch of driving to
-another, where a posterior of misspecified equations does not.
+another, where a posterior of misspecified equations does not. What all folds err in alike is added for the size of an
+effect, as the equation of the table is not quite the car's.
 """
 
 from __future__ import annotations
@@ -24,6 +25,13 @@ from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.plant import GapPlant, plant
 
+SHAPE = 0.03
+"""Standard deviation of an effect's fitted over its true distance from no effect, beyond what folds disagree on.
+
+The likeliest of 0.01 to 0.1 for 54 parts of drives of the reference vehicle, whose equations are not the table's,
+behind ordinary recorders; 0.02 is as likely. Without it 90 % intervals held 63 % of these sizes.
+"""
+
 
 def parameters_of(selection: Selection, name: str) -> dict[str, Quantity]:
     """The parameters of one effect under the answer's names."""
@@ -37,8 +45,18 @@ def parameters_of(selection: Selection, name: str) -> dict[str, Quantity]:
     for key, value in reported.items():
         x = np.broadcast_to(value.numpy(), (len(every),) if value.dim() < 2 else value.shape)
         if x.ndim == 1:
-            out[key] = _jackknife(x)
+            out[key] = _jackknife(x, SHAPE * _distance(effect, key, float(x[0])))
     return out
+
+
+def _distance(effect: Effect, key: str, value: float) -> float:
+    """Of a parameter's value from no effect, or from 0 where that is at infinity; 0 of one that is no size."""
+    if key not in {p.name for p in effect.parameters}:
+        return abs(value)
+    neutral = next(p.neutral for p in effect.parameters if p.name == key)
+    if neutral is None:
+        return 0.0
+    return abs(value - neutral) if np.isfinite(neutral) else abs(value)
 
 
 def places(record: AnalysisRecord) -> Tensor:
@@ -100,9 +118,9 @@ def _folds(selection: Selection) -> FloatArray:
     return np.concatenate([selection.sized.fit.z[None], selection.sized.held.z])
 
 
-def _jackknife(x: FloatArray) -> Quantity:
-    """Of values with all blocks, then without each fold."""
+def _jackknife(x: FloatArray, common: float = 0.0) -> Quantity:
+    """Of values with all blocks, then without each fold; `common`: standard deviation of what all of them err in."""
     count = len(x) - 1
     half = float(student.ppf(0.95, count - 1))  # pyright: ignore[reportUnknownMemberType]
-    sd = float(np.sqrt((count - 1) / count * ((x[1:] - x[1:].mean()) ** 2).sum()))
+    sd = float(np.hypot(np.sqrt((count - 1) / count * ((x[1:] - x[1:].mean()) ** 2).sum()), common))
     return Quantity(float(x[0]), sd, float(x[0] - half * sd), float(x[0] + half * sd))
