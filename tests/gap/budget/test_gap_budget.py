@@ -192,10 +192,12 @@ def test_a_bias_that_is_no_part_among_all_effects_is_found_beside_a_resistance(d
 
 @pytest.mark.slow
 def test_a_model_cars_resistance_is_what_its_authors_say(data_dir: Path) -> None:
-    """Right cause, size within a quarter of the authors' 2.9 m/s²; the interval, 3.14 to 3.88, misses it."""
+    """Right cause, and 2.9 m/s², their model's at this drive's mean speed, in its interval."""
     budget = gap_budget(Log.read(data_dir / "dart" / "09_16_2024_10_27_02_onboard10Hz.csv"))
     assert budget.parts[0].name == "constant_resistance"
-    assert budget.parts[0].parameters["resistance_mps2"].mean == pytest.approx(2.9, rel=0.25)
+    found = budget.parts[0].parameters["resistance_mps2"]
+    assert found.mean == pytest.approx(2.9, rel=0.25)
+    assert found.q05 <= 2.9 <= found.q95
 
 
 @pytest.mark.slow
