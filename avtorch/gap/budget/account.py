@@ -84,13 +84,14 @@ def account(
     begun = given_effects(fitting, bare, named, values=values, onsets=_onsets(winner, logs))
     epoch, options = logs[0].epoch_s, {"material": material, "seed": seed}
 
-    def continued(begun: Selection) -> Selection:
-        return select(record, base, kinds, begun=begun, most=most, progress=progress, checkpoint=checkpoint)
+    def selected() -> Selection:
+        found = select(record, base, kinds, begun=begun, most=most, progress=progress, checkpoint=checkpoint)
+        return likely_parts(found, material, seed=seed)
 
     holds = winner is not None and not winner.blown
     selection = None
     if holds and named and not record.has_speed:
-        selection = likely_parts(continued(begun), material, seed=seed)
+        selection = selected()
         holds = {kind.name for kind in named} <= {step.entered for step in selection.steps}
         winner = winner if holds else None
     if winner is not None and holds:
@@ -100,7 +101,7 @@ def account(
         budget = replace(budget, chance=_chance(candidates, verdict, winner, budget.unexplained.probability, selection))
         return Account(budget, selection, tuple(candidates), _verdict(budget, verdict), held_out=False)
     if selection is None:
-        selection = likely_parts(continued(begun), material, seed=seed)
+        selection = selected()
     budget = budget_of(selection, epoch_s=epoch, **options)
     rest = placed(budget.unexplained, selection, epoch_s=epoch)
     chance = _all_chance(selection, base, kinds, candidates, verdict, winner, budget)

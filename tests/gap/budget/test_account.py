@@ -60,7 +60,7 @@ def faults() -> Callable[[dict], list[str]]:
 
 
 def test_with_acceleration_alone_held_out_blocks_confirm_the_likelihood() -> None:
-    """A resistance was named at 0.98 of a car that has none, behind an ordinary recorder: nothing contradicted it."""
+    """A resistance was named of a car that has none, behind an ordinary recorder: nothing contradicted it."""
     case = draw_case(2, 531601, recorder="ordinary", signals=("accel",))
     assert case.truth_name == "dead_band"
     found = diagnose(case.log(signals=("accel",)), effects=["constant_resistance", "dead_band"])
