@@ -67,11 +67,11 @@ def test_draws_are_grouped_as_all_blocks_are(levels: list[float]) -> None:
 
 
 @pytest.mark.slow
-def test_shares_of_a_real_cars_five_effects_fall(data_dir: Path) -> None:
-    """They were 0, 0, 0, 90 and 4 %: a resistance and a gain that falls with speed reduce the error only together."""
+def test_shares_of_a_real_cars_effects_fall(data_dir: Path) -> None:
+    """They were 0, 0, 0, 90 and 4 %: a resistance and what pushes at low speed reduce the error only together."""
     log = Log.read(data_dir / "roboracer" / "ftg_stanley_total_training.csv")
     parts = gap_budget(log).parts
     shares = [part.share.mean for part in parts]
     assert shares == sorted(shares, reverse=True)
-    assert {"constant_resistance", "speed_dependent_gain"} == {part.name for part in parts[:2]}
+    assert {"constant_resistance", "low_speed_creep"} == {part.name for part in parts[:2]}
     assert min(shares[:2]) > 0.25
