@@ -346,6 +346,7 @@ def test_help_is_there(command: list[str], capsys: pytest.CaptureFixture[str]) -
     assert "Usage: avtorch" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_log_that_only_stands_still_is_no_error(tmp_path: Path) -> None:
     time = np.arange(0.0, 6.0, 0.02)
     calm = Log.from_arrays(

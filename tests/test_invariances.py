@@ -467,6 +467,7 @@ def test_the_sign_of_everything_changes_no_fit_of_the_acceleration(drive: Log) -
 # 7. the same drive twice
 
 
+@pytest.mark.slow
 def test_a_drive_given_twice_halves_the_variance(drive: Log) -> None:
     """Estimates stay within what the prior moves them by, and twice the rows halve that; spreads shrink by sqrt 2 to
     the tenth that the noise model, fitted anew, and the prior's own share allow."""

@@ -17,6 +17,7 @@ from tests.bars import BAR
 SHORT = {"mix": {"several": 1.0}, "seconds": 30.0}
 
 
+@pytest.mark.slow
 def test_three_to_five_that_can_be_seen(fresh_seed: int) -> None:
     case = draw_case(0, fresh_seed, **SHORT)
     assert case.kind == "several"

@@ -277,6 +277,7 @@ def test_fits_of_other_logs_are_not_taken(
     assert search.calls[-1]["fits_before"] == 4
 
 
+@pytest.mark.slow
 def test_fits_that_cannot_be_believed(
     search: Search, drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

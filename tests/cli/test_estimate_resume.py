@@ -74,6 +74,7 @@ def test_the_same_command_goes_on_to_the_same_answer(interrupted: tuple[list[str
     assert not (out / NAME).exists()
 
 
+@pytest.mark.slow
 def test_windows_done_before_are_not_computed_again(
     interrupted: tuple[list[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -64,6 +64,7 @@ def test_output_beside_the_log_and_in_its_columns_say_the_same(files: Path, tmp_
     assert other["effects"][0]["parameters"] == one["effects"][0]["parameters"]
 
 
+@pytest.mark.slow
 def test_is_it_what_i_set(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     simulator = f"{files / 'my_car.py'}:Car"
     assert main(["check-simulator", simulator, "--T", "0.4", "--delay", "0.1"]) == 0

@@ -52,6 +52,7 @@ def test_a_commanded_speed_that_never_moves_is_refused_in_one_line(
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_map_of_an_earlier_log_does_not_stay_beside_an_answer_without_one(tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()

@@ -76,6 +76,7 @@ def test_it_is_chosen_before_a_longer_gap_and_not_with_a_late_link():
     assert float(near.intrusiveness[0]) < float(deaf.intrusiveness[0])
 
 
+@pytest.mark.slow
 def test_it_is_put_in_force_and_watched_with_its_delay():
     def change(loop):
         loop.plant = GLVDPlant(0.8, 0.7, 0.1)

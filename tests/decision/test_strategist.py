@@ -50,6 +50,7 @@ def decide(T, K, *, strategist=None, default=None, limits=(-6.0, 4.0), sd=0.05, 
     )
 
 
+@pytest.mark.slow
 def test_the_choice_is_the_least_of_all_sufficient_ones():
     """Against every setting of the grid, evaluated one by one without the search's shortcuts."""
     T, K = [0.3, 1.0, 1.5, 1.5, 2.0], [0.6, 0.6, 0.5, 0.8, 1.0]
@@ -73,6 +74,7 @@ def test_the_choice_is_the_least_of_all_sufficient_ones():
         assert float(chosen.predicted.clipped_share[i]) == float(seen.clipped_share[i, best.indices[i]])
 
 
+@pytest.mark.slow
 def test_a_scenario_is_decided_alike_in_any_company():
     T, K = [0.2, 1.0, 1.5, 2.0], [1.0, 0.6, 0.5, 0.4]
     draws, past = belief(T, K), history(T, K)
@@ -170,6 +172,7 @@ def test_a_sufficient_setting_in_force_stays():
     assert "stays" in decision.why[0]
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_recovers_is_given_its_default_back():
     drastic = Setting(T_hat=1.5, K_hat=0.5, T_d=0.9, time_gap=2.5, gains=(1.5, 4.0, -3.0))
     decision = decide([0.3], [1.0], current=drastic, default=Setting())

@@ -422,6 +422,7 @@ def test_what_an_mpc_cannot_do_is_refused():
     Supervisor(make_loop(2, controller=MPC()))
 
 
+@pytest.mark.slow
 def test_a_driver_is_not_asked_twice_for_one_gap():
     """While the driver is asked the alarm over the setting in force goes on, but the order stands, and so its time."""
     longer = Setting(time_gap=2.5)

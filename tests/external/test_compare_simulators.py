@@ -29,6 +29,7 @@ def both() -> tuple[Log, Log]:
     return drive(12, more={"sensor_bias": {"bias_mps2": 0.1}}, seconds=45.0)
 
 
+@pytest.mark.slow
 def test_the_nearer_is_named_by_what_it_has(both: tuple[Log, Log]) -> None:
     """An output beside a plant: the output is nearer, by the effects of its own that the plant has not."""
     car, output = both
@@ -124,6 +125,7 @@ def test_only_what_both_cover_is_scored() -> None:
     assert scored[0].errors["rollout_rmse_speed"].first == scored[1].errors["rollout_rmse_speed"].first
 
 
+@pytest.mark.slow
 def test_a_faulty_one_is_told_with_its_time(both: tuple[Log, Log]) -> None:
     class Faulty(OdeCar):
         count = 0
@@ -136,6 +138,7 @@ def test_a_faulty_one_is_told_with_its_time(both: tuple[Log, Log]) -> None:
         compare_simulators(both[0], "T_L=0.3", ExternalSimulator(Faulty, name="mine"))
 
 
+@pytest.mark.slow
 def test_what_cannot_be_compared_is_refused(both: tuple[Log, Log]) -> None:
     car, output = both
     with pytest.raises(InputError, match="level: found 0"):

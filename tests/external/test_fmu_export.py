@@ -90,6 +90,7 @@ def test_a_car_that_stops_does_not_roll_back(tmp_path: Path) -> None:
     assert speed[-1] > 3.0
 
 
+@pytest.mark.slow
 def test_random_effects_are_drawn_by_the_seed(tmp_path: Path) -> None:
     with FmuSimulator(write_fmu(plant([Gust]), tmp_path / "car.fmu")) as car:
         one, other = (car.with_parameters({"seed": seed}) for seed in (1, 2))

@@ -216,6 +216,7 @@ def test_the_manifest_names_cars_anew_without_computing(
         assert (row["car"], row["date"], dict(row["tags"])) == ("blue", "2026-11-02", {"route": "A8"})
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_a_diagnosis_is_a_row(tmp_path: Path, scheduler: str, rotating_seed: int) -> None:
     log = taken_over(seconds=40.0, overrides=(), rng=np.random.default_rng(rotating_seed), delay_s=0.3)

@@ -38,6 +38,7 @@ def test_a_drive_is_known_by_what_its_windows_differ_by_or_by_their_posteriors()
     assert drive_belief([]) is None
 
 
+@pytest.mark.slow
 def test_the_car_that_differs_is_found_and_drawn_in() -> None:
     cars = {f"car {i}": drives_of(*(0.30 + 0.005 * i + 0.003 * k for k in range(2))) for i in range(9)}
     cars["odd"] = drives_of(0.62, 0.6)

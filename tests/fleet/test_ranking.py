@@ -109,6 +109,7 @@ def test_rows_that_went_missing_are_said(fleet: Fleet) -> None:
     assert (car["reason"], car["logs"][0]["errors"]) == ("failed", {"estimate": "its rows are missing or damaged"})
 
 
+@pytest.mark.slow
 def test_a_car_unlike_its_siblings_comes_after_those_that_changed(fleet: Fleet) -> None:
     # drives of many cars tell how far those of one differ, the changed one's among them
     for _ in range(2):
@@ -133,6 +134,7 @@ def test_what_a_verdict_cannot_tell_from_its_cause_is_one_that_the_car_may_have(
     assert (causes["gust"]["cars"], causes["gust"]["may"], causes["gust"]["verdict"]) == (1, 10, "not decided")
 
 
+@pytest.mark.slow
 def test_causes_are_those_of_the_cars_diagnoses(fleet: Fleet) -> None:
     late: dict[str, Any] = {"name": "dead_time", "alias_set": ["dead_time", "slow"], "probability": 0.9}
     for number in range(6):

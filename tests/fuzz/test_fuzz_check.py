@@ -42,6 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("check")
 
 
+@pytest.mark.slow
 @fuzzed("check")
 @given(
     columns=st.lists(st.tuples(NAMES, COURSES), min_size=1, max_size=7),

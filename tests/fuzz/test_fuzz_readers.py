@@ -186,6 +186,7 @@ CELLS = st.one_of(
 )
 
 
+@pytest.mark.slow
 @fuzzed("csv_cells")
 @given(
     cells=st.lists(st.tuples(st.integers(0, ROWS), st.integers(0, 9), CELLS), min_size=1, max_size=2),
@@ -224,6 +225,7 @@ PARQUETS = [
 ]
 
 
+@pytest.mark.slow
 @fuzzed("parquet")
 @given(raw=mutated(PARQUETS))
 def test_damaged_parquet(folder: Path, raw: bytes) -> None:

@@ -74,6 +74,7 @@ def test_a_budget_distinguishes_nothing_from_untried_effects(monkeypatch: pytest
     assert any("dead_time" in note for note in answer["notes"])
 
 
+@pytest.mark.slow
 def test_what_the_budget_kept_from_a_closer_fit_keeps_its_first_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     found = _cut(monkeypatch, _log(), 4)  # three deterministic effects looked at, then a gust, then no more
     assert not found.complete
@@ -136,6 +137,7 @@ def test_effects_that_were_not_asked_for_are_not_ruled_out() -> None:
     assert f"tried, 2 of {len(EFFECTS)}" in sentences.headline(found)
 
 
+@pytest.mark.slow
 def test_a_complete_search_reports_nothing_untried() -> None:
     found = avtorch.diagnose(_log(), effects=[DeadTime, SensorBias, Outliers])
     assert found.scope is not None

@@ -58,6 +58,7 @@ def test_moments_of_a_known_law(rotating_seed: int) -> None:
     assert float((high - 1.697).abs().max()) < bar
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_agreement_with_quadrature(rotating_seed: int) -> None:
     density = synthetic_windows(6, seed=rotating_seed).density

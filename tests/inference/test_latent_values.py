@@ -148,6 +148,7 @@ def test_derivatives_from_values_are_those_of_the_graph(jitter: float, fresh_see
     assert float((hessian - exact[2]).abs().max()) < 10 * 2e-3**2 * scale + 0.05
 
 
+@pytest.mark.slow
 def test_the_mode_from_values_is_the_mode(fresh_seed: int) -> None:
     generator = torch.Generator().manual_seed(fresh_seed)
     density, _ = drawn_window(generator, accel=True, speed=True, rows=100, dt=0.02)

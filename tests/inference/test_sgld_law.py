@@ -216,6 +216,7 @@ def test_averaged_noise_has_hardly_a_bias(rotating_seed, draws_factor):
     assert abs(moment - truth) < 0.1 * plain
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_preconditioned_law_needs_gamma(rotating_seed, draws_factor):
     """pSGLD on a Gaussian, with alpha 0 (G a function of the place alone) and eps 1: the exact kernel's variance.

@@ -151,6 +151,7 @@ def test_an_interruption_at_the_nth_call(start: Callable, tmp_path: Path) -> Non
     raise AssertionError("the sweep has no end")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", starts(before, slow=(of_an_earlier_version, touched, copied)))
 def test_a_reader_at_any_moment(start: Callable, tmp_path: Path) -> None:
     """A killed process leaves what a reader finds at that moment; the next answer must succeed from it."""

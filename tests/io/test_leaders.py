@@ -118,6 +118,7 @@ def test_us06_in_the_figures_everyone_quotes():
     assert sum(US06_SPEED_MPS) / 1609.344 == pytest.approx(8.01, abs=0.005)  # miles
 
 
+@pytest.mark.slow
 def test_every_recording_is_read(data_dir):
     forms = {
         "openacc_astazero": "vehicle 1",
@@ -174,6 +175,7 @@ def test_i24_is_converted_and_its_acceleration_doubted(data_dir):
     assert "times the derivative of the speed" in leader.note
 
 
+@pytest.mark.slow
 def test_joined_events_follow_the_stated_rule(data_dir):
     table = read_table(data_dir / "ngsim" / "events_000_249.csv")
     leader = join_events(table, duration=120)
@@ -202,6 +204,7 @@ def test_the_genesis_laps_as_logs(data_dir):
         assert any("comes at 50 Hz and is held" in note for note in seen.notes)
 
 
+@pytest.mark.slow
 def test_the_platoons_as_following_logs(data_dir):
     for stem in ("platoon7", "platoon8"):
         (path,) = data_dir.glob(f"openacc_astazero/*{stem}.csv")

@@ -18,6 +18,7 @@ def test_a_map_beats_one_factor_where_the_car_has_one() -> None:
     assert held_out(drive(with_dead_zone, 21, seconds=100.0)).better_than("factor")
 
 
+@pytest.mark.slow
 def test_a_map_is_not_said_to_beat_the_factor_that_the_car_is() -> None:
     score = held_out(drive(factors, 22, seconds=100.0))
     assert not score.better_than("factor")

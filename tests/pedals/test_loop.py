@@ -38,7 +38,7 @@ TRUE = PedalMap(
 
 
 @pytest.mark.parametrize("seed", [51, pytest.param(52, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("steps", [True, False])
+@pytest.mark.parametrize("steps", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_known_controller_is_found_again(seed: int, steps: bool) -> None:
     fit = fit_pedals(drive(seed, steps=steps))
     made = fit.map

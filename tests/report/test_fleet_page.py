@@ -92,6 +92,7 @@ def test_links_are_the_reports_and_fleet_json(page: Element) -> None:
         assert "src" not in element.attributes
 
 
+@pytest.mark.slow
 def test_of_many_cars_the_first_are_plain_and_all_are_in_the_data() -> None:
     text = fleet_html(answer_of(10_000))
     assert len(text.encode()) < 3e6

@@ -139,6 +139,7 @@ def test_a_file_in_anothers_place_is_noticed(root: Path) -> None:
         again(root)
 
 
+@pytest.mark.slow
 def test_a_damaged_answer_is_asked_for_again_and_named(root: Path, trial: tuple[Path, dict[str, Any]]) -> None:
     """It can be computed again; a truth may have been changed after the answers were known."""
     folder = settled(root)

@@ -75,6 +75,7 @@ def test_answers_are_of_the_schema(name: str, signals: tuple[str, ...]) -> None:
     assert all(q["q05"] <= q["mean"] <= q["q95"] for e in answer["effects"] for q in e["parameters"].values())
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_black_box_sees_that_something_is_amiss_and_no_more(rotating_seed: int) -> None:
     plain = black_box(drive_of({}, rotating_seed, seconds=300.0))

@@ -96,6 +96,7 @@ def test_other_settings_need_another_folder(tmp_path: Path) -> None:
         run_trial(1, 4, tmp_path, answerers={"other": Asked()}, **SHORT)
 
 
+@pytest.mark.slow
 def test_who_fails_or_breaks_the_schema_has_not_answered(tmp_path: Path) -> None:
     def fails(log: Log) -> dict[str, Any]:
         raise ValueError("out of ideas")

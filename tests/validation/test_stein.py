@@ -108,6 +108,7 @@ def test_thinning(shape: tuple[int, int], points: int, used: int) -> None:
     assert stein_discrepancy(standard(1), draws(1, 0, shape), points=points, bootstrap=2).points == used
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_autocorrelated_draws_need_a_bootstrap_that_knows(rotating_seed: int) -> None:
     rho, windows = 0.8, 60

@@ -42,7 +42,10 @@ def test_slopes_of_a_network_and_a_bend_where_there_is_none() -> None:
     assert kinked.bend > 0.2
 
 
-@pytest.mark.parametrize(("k_f", "delay"), [(0.0, 0.0), (0.8, 0.0), (0.8, 0.3)])
+@pytest.mark.parametrize(
+    ("k_f", "delay"),
+    [pytest.param(0.0, 0.0, marks=pytest.mark.slow), pytest.param(0.8, 0.0, marks=pytest.mark.slow), (0.8, 0.3)],
+)
 def test_what_is_measured_is_the_transfer_function(k_f: float, delay: float) -> None:
     """Simulation against theory, feed-forward and its delay among them; a held command acts half a step late."""
     controller = LinearController(GAINS, 1.0, feedforward=k_f)
@@ -75,6 +78,7 @@ def test_a_black_box_gets_its_slopes_verdict_for_small_motions_only() -> None:
     assert abs(large / said - 1.0) > 0.05
 
 
+@pytest.mark.slow
 def test_who_collides_amplifies_without_bound() -> None:
     blind = LinearController((0.02, 0.0, 0.0), 0.1)
     seen = measured_gain(blind, [0.3], plant=GLVDPlant(1.5, 0.5, 0.0), amplitude=5.0, settle=30.0)

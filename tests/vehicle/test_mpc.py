@@ -49,6 +49,7 @@ STATES = [
 ]
 
 
+@pytest.mark.slow
 def test_plan_against_an_independent_solver():
     mpc = MPC(weights=(1.0, 0.5, 0.2, 1.0), T_hat=0.5, K_hat=0.8)
     plans = mpc.plan(torch.tensor(STATES, dtype=F64))

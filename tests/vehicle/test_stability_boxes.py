@@ -67,6 +67,7 @@ def test_printed_eq3_alone_passes_a_locally_unstable_vehicle():
     assert not stability.local_stable(0.1, 1.0, 1.0, gains).item()
 
 
+@pytest.mark.slow
 def test_least_B_over_a_box_is_found_at_the_vertex(boxes):
     T, K, tau, gains, inside = boxes
     values = stability.string_conditions(T, K, tau, gains, form="rigorous").values

@@ -67,6 +67,7 @@ def test_too_little_driving_is_refused() -> None:
         AnalysisRecord.of([log_of(seconds=15.0)])
 
 
+@pytest.mark.slow
 def test_what_counts_needs_a_second_of_it_before_for_the_noises_filter() -> None:
     """A car taken over every six seconds: blocks count, and none of their rows can be compared."""
     log = log_of(seconds=120.0)

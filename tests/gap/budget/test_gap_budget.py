@@ -35,9 +35,9 @@ FEW = ["dead_time", "dead_band", "constant_resistance", "sensor_bias", "sensor_s
     [
         # a few per cent of each: 150 s, noise of 0.05 m/s² that lasts 1.5 s
         (ConstantResistance(0.2), "resistance_mps2", 0.05),
-        (DeadBand(0.25), "half_width_mps2", 0.06),
+        pytest.param(DeadBand(0.25), "half_width_mps2", 0.06, marks=pytest.mark.slow),
         (DeadTime(0.3), "delay_s", 0.06),
-        (SensorBias(0.2), "bias_mps2", 0.05),
+        pytest.param(SensorBias(0.2), "bias_mps2", 0.05, marks=pytest.mark.slow),
     ],
 )
 def test_a_single_cause_is_the_whole_budget(effect: Effect, key: str, within: float) -> None:
@@ -157,6 +157,7 @@ def test_parts_are_in_order_and_sum_to_one() -> None:
     assert "constant_resistance" in str(budget)
 
 
+@pytest.mark.slow
 def test_the_same_log_has_the_same_budget() -> None:
     log = log_of([DeadBand(0.25)], seed=4, seconds=60.0)
     assert gap_budget(log, effects=FEW).to_dict() == gap_budget(log, effects=FEW).to_dict()
@@ -209,6 +210,7 @@ def test_no_part_rests_at_a_limit_and_intervals_have_a_width(data_dir: Path) -> 
         assert all(q.q95 > q.q05 for q in part.parameters.values()), part.name
 
 
+@pytest.mark.slow
 def test_a_short_drive_is_divided_into_short_blocks() -> None:
     """Twenty seconds hold four blocks of four; `diagnose` answers them, and so does the budget by itself."""
     log = log_of([SensorBias(0.4)], seed=11, seconds=20.0)

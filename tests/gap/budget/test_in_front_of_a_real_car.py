@@ -42,6 +42,7 @@ def test_waves_of_a_road_that_is_driven_three_times_are_the_roads(data_dir: Path
     assert alone.chance[0].alias_set == ("gust", "road_grade")
 
 
+@pytest.mark.slow
 def test_what_commands_predict_is_not_hidden_by_many_places(data_dir: Path) -> None:
     """Three laps have knots three times as close: the regression on all of it was sure of nothing, and they `none`."""
     asked = ["brake_throttle_asymmetry", "constant_resistance", "dead_time", "second_order_actuator"]

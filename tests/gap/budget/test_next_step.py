@@ -45,6 +45,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Selection, Path]:
     return selected(Checkpoint(path, WORK)), path
 
 
+@pytest.mark.slow
 def test_a_file_of_steps_changes_nothing(whole: tuple[Selection, Path]) -> None:
     assert set(whole[0].last.fit.model.names) >= {"dead_time", "road_grade"}
     assert content(selected(None)) == content(whole[0])
@@ -70,6 +71,7 @@ def test_it_goes_on_from_the_steps_that_are_finished(
     assert read_sealed(path, schema=SCHEMA).content["steps"] == steps
 
 
+@pytest.mark.slow
 def test_a_step_of_another_model_is_refused(whole: tuple[Selection, Path], tmp_path: Path) -> None:
     found, path = read_sealed(whole[1], schema=SCHEMA), tmp_path / "fits.json"
     first, *rest = found.content["steps"]

@@ -57,6 +57,7 @@ def test_what_begins_within_a_stretch_is_filtered_as_in_the_whole(joint: bool, f
     assert not whitening(late)[:, whitening.order < begin].any()
 
 
+@pytest.mark.slow
 def test_a_loop_that_feeds_noise_back_has_no_dead_time() -> None:
     # behind a low-pass this car without a cause had a dead time of 0.3 s, and a lag of 0.07 s
     case = draw_case(35, 555, mix={"none": 1.0}, recorder="ordinary", seconds=150.0)

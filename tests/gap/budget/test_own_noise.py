@@ -34,6 +34,7 @@ def with_effects(log: Log, *kinds: type[Effect]) -> tuple[RobustFit, Step, Step]
     return fitting, Step(bare, fitting.hold_out(bare)), Step(fit, fitting.hold_out(fit))
 
 
+@pytest.mark.slow
 def test_what_is_there_stays_and_what_is_not_goes(fresh_seed: int) -> None:
     log = log_of([DeadTime(0.3)], seed=fresh_seed)
     fitting, bare, now = with_effects(log, DeadTime, Backlash)

@@ -18,6 +18,7 @@ def test_a_steep_road_of_many_waves_is_named() -> None:
     assert gap_budget(case.log(), effects=["road_grade", "constant_resistance"]).names == ("road_grade",)
 
 
+@pytest.mark.slow
 def test_a_truck_on_a_grade_has_no_lag_of_ten_seconds(data_dir: Path) -> None:
     """A dead band with such a lag explains as much of it with far fewer parameters, and was named."""
     truck = Log.read(data_dir / "volvo_truck" / "052311_grade.csv")

@@ -37,6 +37,7 @@ def test_what_begins_late_has_its_place_in_time() -> None:
     assert rest.to_dict()["where"][0]["axis"] == "time"
 
 
+@pytest.mark.slow
 def test_where_nothing_is_left_nothing_is_said() -> None:
     rest = gap_budget(log_of([ConstantResistance(0.2)], seed=11), effects=["constant_resistance"]).unexplained
     assert (rest.where, rest.resembles, rest.places()) == ((), None, "")

@@ -242,6 +242,7 @@ def test_sgld_against_nuts(effect: Effect, rotating_seed: int) -> None:
     assert np.all(np.abs(sd - near_sd) < BAR * np.hypot(sd_error, near_sd_error) + 0.05 * sd)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_draws() -> None:
     found = found_of([DeadTime(0.163)])
     one, two, other = (posterior(found, draws=10, seed=s).z for s in (3, 3, 4))

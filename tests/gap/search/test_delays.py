@@ -64,7 +64,14 @@ def test_alternating_commands_of_20_hz_show_no_dead_time() -> None:
 
 @pytest.mark.parametrize(
     ("shape", "period", "rate"),
-    [("square", 0.1, 40), ("square", 0.1, 100), ("square", 0.4, 50), ("sine", 0.25, 40), ("sine", 2.0, 20)],
+    [
+        ("square", 0.1, 40),
+        ("sine", 2.0, 20),
+        *(
+            pytest.param(*more, marks=pytest.mark.slow)
+            for more in (("square", 0.1, 100), ("square", 0.4, 50), ("sine", 0.25, 40))
+        ),
+    ],
 )
 def test_a_multiple_of_the_period_is_no_delay(shape: str, period: float, rate: float) -> None:
     """No dead time is there; one of a period, or under a sine one with less lag, does the same."""

@@ -123,6 +123,7 @@ def test_a_command_that_also_drifts_hides_no_losses(rotating_seed: int) -> None:
     assert np.mean([f.fraction for f in found]) == pytest.approx(0.15, rel=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_messages_that_all_arrive_are_not_lost(rotating_seed: int) -> None:
     rng = np.random.default_rng(rotating_seed)

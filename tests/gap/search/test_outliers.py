@@ -41,6 +41,7 @@ def test_outliers_are_found_with_their_size(fraction: float, scale: float, rotat
     assert found.ratios.shape == (ROWS,)
 
 
+@pytest.mark.slow
 def test_normal_noise_has_no_outliers(rotating_seed: int) -> None:
     """Under normal noise the odds for outliers have a mean of 1 at most, so chance passes `c` nats once in exp(c).
 

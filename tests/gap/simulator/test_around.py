@@ -67,7 +67,7 @@ def whole(effects: Sequence[Effect], speed: np.ndarray) -> tuple[np.ndarray, np.
         [SpeedDependentGain()],
         [SensorLag(0.2), SensorBias(0.1)],
         [AerodynamicDrag(4e-4)],
-        [DrivelineOscillation()],
+        pytest.param([DrivelineOscillation()], marks=pytest.mark.slow),
         [DeadTime(0.15), SpeedDependentGain(), AerodynamicDrag(4e-4), SensorLag(0.2)],
     ],
     ids=lambda effects: "+".join(e.name for e in effects) or "none",

@@ -56,6 +56,7 @@ def trailer():
     EFFECTS.update(before)
 
 
+@pytest.mark.slow
 @pytest.mark.statistical
 def test_it_leads_and_is_measured(trailer: type, rotating_seed: int) -> None:
     log = log_of(plant([trailer(0.4)], T_L=0.4), seconds=40.0, rng=np.random.default_rng(rotating_seed))

@@ -33,6 +33,7 @@ def test_its_median_is_the_mode(make_windows):
     torch.testing.assert_close((belief.q95 / belief.q05).log() / 2 / 1.6448536269514722, _sd(mode), rtol=1e-10, atol=0)
 
 
+@pytest.mark.slow
 def test_without_measured_jerk_its_median_is_the_mode_too(fresh_seed):
     """The mode is sought by values there, and lies within a hundredth of an SD of that sought by derivatives."""
     density, _ = drawn_window(torch.Generator().manual_seed(fresh_seed), accel=True, speed=True, rows=100, dt=0.02)

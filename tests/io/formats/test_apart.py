@@ -49,6 +49,7 @@ def test_the_answers_are_those_of_the_reader(tmp_path: Path, form: str) -> None:
     assert found[here.names[0]].values.flags.writeable
 
 
+@pytest.mark.slow
 def test_what_the_reader_refuses_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "drive.mat"
     path.write_bytes(b"MATLAB 5.0 MAT-file, made by hand".ljust(124) + b"\0\1IM")
@@ -59,6 +60,7 @@ def test_what_the_reader_refuses_is_refused(tmp_path: Path) -> None:
         recording.read(["log.sped"])
 
 
+@pytest.mark.slow
 def test_odd_names_of_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("-c.mat", "größe\n;ls.mat"):
@@ -90,6 +92,7 @@ def test_a_process_that_takes_too_long(tmp_path: Path, monkeypatch: pytest.Monke
         open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
 
 
+@pytest.mark.slow
 def test_the_process_ends_with_its_recording(tmp_path: Path) -> None:
     recording = open_recording(mat5(tmp_path / "drive.mat", STRUCTS))
     assert isinstance(recording, ApartRecording)

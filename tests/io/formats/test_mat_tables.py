@@ -34,7 +34,7 @@ def timetable() -> pd.DataFrame:
     return pd.DataFrame({"AccReq": COMMAND, "VehSpd": SPEED, "driver": "someone"}, index=index.rename("Time"))
 
 
-@pytest.mark.parametrize("version", ["v7", "v7.3"])
+@pytest.mark.parametrize("version", ["v7", pytest.param("v7.3", marks=pytest.mark.slow)])
 def test_a_timetable_has_its_own_time(tmp_path: Path, version: str) -> None:
     file = written(tmp_path / "drive.mat", version, drive=timetable())
     found = open_recording(file)
@@ -48,7 +48,7 @@ def test_a_timetable_has_its_own_time(tmp_path: Path, version: str) -> None:
     assert np.array_equal(log.speed, SPEED)
 
 
-@pytest.mark.parametrize("version", ["v7", "v7.3"])
+@pytest.mark.parametrize("version", ["v7", pytest.param("v7.3", marks=pytest.mark.slow)])
 def test_a_table_has_the_time_among_its_columns_beside_what_is_no_table(tmp_path: Path, version: str) -> None:
     table = pd.DataFrame({"time": TIME, "accel_cmd": COMMAND})
     file = written(tmp_path / "drive.mat", version, t1=table, other={"t": TIME[:, None], "speed": SPEED[:, None]})
@@ -74,6 +74,7 @@ def test_a_damaged_table_does_not_lose_the_rest(tmp_path: Path) -> None:
     assert remarks[0].startswith("its tables and other objects are left out, mat-io cannot read them: ")
 
 
+@pytest.mark.slow
 def test_a_table_without_time_is_told(tmp_path: Path) -> None:
     file = written(tmp_path / "drive.mat", "v7", drive=pd.DataFrame({"accel_cmd": COMMAND}))
     with pytest.raises(InputError, match=r"has no signal with a time; vectors without one: drive\.accel_cmd"):
