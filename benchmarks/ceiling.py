@@ -23,13 +23,13 @@ from avtorch.blindtest import draw_case
 from avtorch.blindtest.cases import Recording
 from avtorch.blindtest.intervals import wilson
 from avtorch.gap import plant
+from avtorch.gap.answer.budget import LIKELY
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.entry import candidates_for, fitted, observable
 from avtorch.gap.budget.forward_selection import select
 from avtorch.gap.budget.likely_parts import likely_parts
 from avtorch.gap.budget.onset_search import may_set_in
 from avtorch.gap.budget.part_odds import PartOdds
-from avtorch.gap.budget.parts import LIKELY
 from avtorch.gap.budget.redundancy import without_one
 from avtorch.gap.budget.robust_fit import RobustFit
 from avtorch.gap.budget.selection_step import Step, cost

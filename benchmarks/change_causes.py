@@ -24,7 +24,7 @@ from avtorch.blindtest import MANOEUVRES, Car, DrivePlan, Recorder, draw_car, dr
 from avtorch.blindtest.intervals import wilson
 from avtorch.errors import InputError
 from avtorch.gap import gap_budget
-from avtorch.gap.change.change_cause import ChangeCause
+from avtorch.gap.answer.change import ChangeCause
 from avtorch.gap.result.comparison import Comparison
 
 TRAINING = "roboracer/ftg_stanley_total_training.csv"

@@ -39,11 +39,11 @@ from avtorch.blindtest import IN_FRONT, draw_case, put_in_front
 from avtorch.blindtest.cases import SIGNALS, Recording
 from avtorch.errors import InputError
 from avtorch.gap import EFFECTS, plant
+from avtorch.gap.answer.budget import LIKELY
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.forward_selection import baseline_noise, select
 from avtorch.gap.budget.held_out_evidence import Evidence
 from avtorch.gap.budget.part_odds import PATH, SCHEMA, PartOdds, by_agreement, figures
-from avtorch.gap.budget.parts import LIKELY
 from avtorch.gap.budget.redundancy import without_one
 from avtorch.gap.budget.rollout_energy import relative_energy
 from avtorch.gap.budget.selection_step import Selection, complexity

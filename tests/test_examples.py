@@ -35,7 +35,7 @@ SLOW = frozenset(
         "avtorch.follower.identify.Identified",
         "avtorch.gap",
         "avtorch.gap.budget.gap_budget.gap_budget",
-        "avtorch.gap.budget.parts.Budget",
+        "avtorch.gap.answer.budget.Budget",
         "avtorch.gap.compare.compare",
         "avtorch.gap.diagnose.diagnose",
         "avtorch.gap.result.diagnosis.Diagnosis",

@@ -25,7 +25,7 @@ import torch
 import avtorch
 from avtorch.follower import diagnose_follower
 from avtorch.gap import AerodynamicDrag, DeadTime, Effect, GainChange, SecondOrderActuator, plant
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
 from avtorch.inference import BeliefStream, SamplerSettings
@@ -293,7 +293,7 @@ def test_what_is_written_is_read_to_the_bit(suffix: str, tmp_path: Path, drive: 
 def test_no_computation_reads_the_recorders_clock() -> None:
     """`Log.time` is for people and files; all else takes `elapsed`. These may show or keep stamps."""
     shown = {
-        "blindtest/oracle_budget.py", "decision/estimation.py", "gap/likelihood/record.py", "io/quality.py",
+        "blindtest/oracle_budget.py", "decision/estimation.py", "gap/drive_record.py", "io/quality.py",
         "live/played_log.py", "trial/folder.py", "trial/rivals/random_guess.py", "validation/windows.py",
     }  # fmt: skip
     package = Path(avtorch.__file__).parent

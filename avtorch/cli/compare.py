@@ -215,7 +215,7 @@ def _table(comparison: Comparison) -> Table:
 
 def _of_cause(comparison: Comparison) -> list[tuple[str, str]]:
     """Rows of the cause: what has changed, by how much, with which probability; or the least change that would show."""
-    from avtorch.gap.change.change_cause import detectable_text
+    from avtorch.gap.answer.change import detectable_text
     from avtorch.gap.quantity import unit_of, words_of
 
     cause = comparison.cause

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from avtorch.gap.budget.parts import Budget
+    from avtorch.gap.answer.budget import Budget
     from avtorch.gap.result.diagnosis import Candidate, Diagnosis, Quantity
 
 ROWS = 8
@@ -34,7 +34,7 @@ def diagnosis_headline(found: Diagnosis) -> list[str]:
 
 def budget_table(budget: Budget, epoch_s: float = 0.0) -> Table:
     """One row per part of the gap, what chance decides, and what is unexplained; times count from `epoch_s`."""
-    from avtorch.gap.budget.parts import percent
+    from avtorch.gap.answer.budget import percent
     from avtorch.gap.result.sentences import number
 
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))

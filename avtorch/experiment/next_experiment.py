@@ -17,7 +17,7 @@ from avtorch.experiment.information import Information, information
 from avtorch.experiment.limits import Limits
 from avtorch.experiment.manoeuvres import Manoeuvre, library
 from avtorch.experiment.prediction import ManoeuvrePrediction, responses
-from avtorch.gap.likelihood.record import grouped
+from avtorch.gap.drive_record import grouped
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.io import atomic

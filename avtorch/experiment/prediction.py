@@ -14,8 +14,8 @@ import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.experiment.manoeuvres import Manoeuvre
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.noise_draws import noise_draws
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.gap.simulator.integrated import Integrated

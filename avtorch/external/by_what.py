@@ -20,7 +20,7 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.external.scored_blocks import LogRatio, ScoredBlocks
 from avtorch.external.simulator_comparison import OTHERS, Difference
-from avtorch.gap.result.traces import rolled_out
+from avtorch.gap.rollout_errors import rolled_out
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant
 

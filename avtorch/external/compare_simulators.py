@@ -23,7 +23,7 @@ from avtorch.external.scored_blocks import ScoredBlocks
 from avtorch.external.simulator_comparison import MATERIAL, ComparedSimulator, ErrorsOfTwo, SimulatorComparison
 from avtorch.external.surrogate import Surrogate, surrogate_of
 from avtorch.gap.compare import LEVEL
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
 from avtorch.gap.result.diagnosis import LogFacts
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.io import Log, LogSource, as_logs

@@ -19,11 +19,10 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
-from avtorch.gap.change.two_sides import FEWEST_BLOCKS
-from avtorch.gap.crossval.folds import blocks_of
-from avtorch.gap.crossval.rollout_errors import HORIZON_S, RolloutMetric, block_squares, reached
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.blocks import FEWEST_BLOCKS, blocks_of
+from avtorch.gap.drive_record import Record
 from avtorch.gap.quantity import Quantity
+from avtorch.gap.rollout_errors import HORIZON_S, RolloutMetric, block_squares, reached
 
 _LEAST = 1e-9  # m/s² or m/s: an error, so that simulators without any have a ratio
 
@@ -80,7 +79,7 @@ class ScoredBlocks:
         >>> import numpy as np
         >>> from avtorch import Leader, simulate
         >>> from avtorch.external.scored_blocks import ScoredBlocks
-        >>> from avtorch.gap.likelihood.record import Record
+        >>> from avtorch.gap.drive_record import Record
         >>> record = Record.of(simulate(Leader.default(start=30.0, duration=60.0, dt=0.05)).log())
         >>> scored = ScoredBlocks.of(record)
         >>> errors = np.random.default_rng(0).normal(size=record.measured.shape)

@@ -23,7 +23,7 @@ from avtorch.follower.identify import Identified, identified, widened
 from avtorch.follower.laws import LAWS, FollowerMeasurements, HeadwayLaw, law_named, tensors
 from avtorch.follower.loop_stability import LoopStability, loop_stability
 from avtorch.gap.diagnose import diagnose
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
 from avtorch.gap.quantity import Quantity, frame_of
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.simulator.effect import delay_effect, delay_key

@@ -18,8 +18,8 @@ import torch
 from avtorch.arrays import FloatArray
 from avtorch.errors import InputError
 from avtorch.follower.laws import FollowerMeasurements, HeadwayLaw
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.hypothesis import Coordinate, Hypothesis
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.simulator.effect import delay_effect, delay_key
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.simulator.simulator_input import SimulatorInput

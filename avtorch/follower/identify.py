@@ -15,10 +15,10 @@ import numpy as np
 
 from avtorch.arrays import FloatArray
 from avtorch.follower.followed import Followed
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import finish, modes, residuals
 from avtorch.gap.likelihood.noise_fit import GUST, fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.posterior.density import root
 from avtorch.gap.simulator.effect import delay_key

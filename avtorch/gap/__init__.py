@@ -11,8 +11,8 @@ Example:
 """
 
 from avtorch.gap import effects
+from avtorch.gap.answer.budget import Budget, ChancePart, ChannelError, Part, Unexplained
 from avtorch.gap.budget.gap_budget import gap_budget
-from avtorch.gap.budget.parts import Budget, ChancePart, ChannelError, Part, Unexplained
 from avtorch.gap.effects import (
     AerodynamicDrag,
     Backlash,

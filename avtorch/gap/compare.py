@@ -26,18 +26,18 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
+from avtorch.gap.answer.change import ChangeCause
 from avtorch.gap.black_box import BlackBoxSimulator
-from avtorch.gap.change.change_cause import ChangeCause, cause_of_change
-from avtorch.gap.change.two_sides import FEWEST_BLOCKS, TwoSides
-from avtorch.gap.crossval.folds import blocks_of
-from avtorch.gap.crossval.rollout_errors import HORIZON_S, RolloutMetric, block_squares, reached
+from avtorch.gap.blocks import FEWEST_BLOCKS, blocks_of
+from avtorch.gap.change.change_cause import cause_of_change
+from avtorch.gap.change.two_sides import TwoSides
 from avtorch.gap.dead_time_or_lag import DeadTimeFit, compare_explanations
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import Change, Comparison, DeadTimeTest, SimulatorChange
 from avtorch.gap.result.diagnosis import LogFacts
-from avtorch.gap.result.traces import rolled_out
+from avtorch.gap.rollout_errors import HORIZON_S, RolloutMetric, block_squares, reached, rolled_out
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.search import Search
 from avtorch.gap.simulator.effect import Effect

@@ -16,8 +16,7 @@ from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.change.two_sides import FEWEST_BLOCKS
-from avtorch.gap.crossval.folds import blocks_of
+from avtorch.gap.blocks import FEWEST_BLOCKS, blocks_of
 from avtorch.gap.likelihood.gauss_newton import whitened_jacobian
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import DeadTimeTest

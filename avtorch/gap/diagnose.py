@@ -12,18 +12,20 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
+from avtorch.gap.answer.budget import MATERIAL, Budget
+from avtorch.gap.answer.given_dead_time import given_dead_time
+from avtorch.gap.answer.location import RowAttribution, localise
+from avtorch.gap.answer.plausibility import implausible
+from avtorch.gap.answer.verdict import Candidate, Verdict, verdict_of
 from avtorch.gap.black_box import BlackBoxSimulator
 from avtorch.gap.budget.account import account, divisible, restated
 from avtorch.gap.budget.forward_selection import MOST_PARTS
-from avtorch.gap.budget.parts import MATERIAL, Budget
 from avtorch.gap.budget.repaired_model import parameter_draws, repaired_plant, with_chance
 from avtorch.gap.budget.shrinkage import shrinkage_of
-from avtorch.gap.crossval.attribution import RowAttribution
+from avtorch.gap.crossval.attribution import row_attribution
 from avtorch.gap.crossval.cross_validate import cross_validate
 from avtorch.gap.crossval.gap_closed import gap_closed
-from avtorch.gap.crossval.localisation import localise
-from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.sensor_noise_floor import with_sensor_noise
+from avtorch.gap.drive_record import Record
 from avtorch.gap.posterior import sample as posteriors
 from avtorch.gap.posterior.draws import Draws
 from avtorch.gap.posterior.summary import belief, lag_and_gain, repaired, reported, reported_draws
@@ -32,17 +34,16 @@ from avtorch.gap.result.diagnosis import Diagnosis, LogFacts
 from avtorch.gap.result.gap_size import gap_size
 from avtorch.gap.result.predictive_model import predictive_models
 from avtorch.gap.result.rival_models import noise_left, rival_models
-from avtorch.gap.result.traces import Traces, rolled_out
+from avtorch.gap.result.traces import Traces
 from avtorch.gap.result.uncounted import uncounted
+from avtorch.gap.rollout_errors import rolled_out
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 from avtorch.gap.search.search import Search
 from avtorch.gap.selection import periodic_commands as delays
 from avtorch.gap.selection.adequacy import Adequacy, adequacy
 from avtorch.gap.selection.aliases import Identifiability
-from avtorch.gap.selection.given_dead_time import given_dead_time
 from avtorch.gap.selection.model_probabilities import favourite, model_probabilities
-from avtorch.gap.selection.plausibility import implausible
-from avtorch.gap.selection.verdict import Candidate, Verdict, verdict_of
+from avtorch.gap.sensor_noise import with_sensor_noise
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.effect_choice import chosen_effects
 from avtorch.gap.simulator.plant import GapPlant, plant
@@ -218,7 +219,7 @@ def diagnose(
     alike = {part for name in verdict.alias_set for part in name.split("+")}
     # where nothing is named, no effect closes anything
     held = cross_validate(race, winner, alike=sorted(alike), progress=stages) if named and winner else None
-    attribution = RowAttribution.of(race, winner or top)
+    attribution = row_attribution(race, winner or top)
     car, beliefs = None, belief(race.none)
     shrinkage = None if held is None else gap_closed(held)
     contenders, errors = predictive_models(race, verdict), (race.none if winner is None else winner).errors

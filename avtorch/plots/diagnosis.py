@@ -15,8 +15,8 @@ from matplotlib.ticker import PercentFormatter
 
 from avtorch.arrays import FloatArray, IntArray
 from avtorch.errors import InputError
-from avtorch.gap.budget.parts import HORIZON_S, LIKELY, Budget, percent
-from avtorch.gap.crossval.localisation import UNITS, Axis
+from avtorch.gap.answer.budget import HORIZON_S, LIKELY, Budget, percent
+from avtorch.gap.answer.location import UNITS, Axis
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Candidate, Diagnosis
 from avtorch.io.clock import time_label

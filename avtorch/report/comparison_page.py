@@ -16,7 +16,7 @@ from avtorch.report.table import Table
 
 if TYPE_CHECKING:
     from avtorch.external import SimulatorComparison
-    from avtorch.gap.change.change_cause import ChangeCause
+    from avtorch.gap.answer.change import ChangeCause
     from avtorch.gap.result.comparison import Comparison
     from avtorch.gap.result.log_facts import LogFacts
 
@@ -135,7 +135,7 @@ def _cause(cause: ChangeCause | None, told: str) -> Section:
     if rows:
         table = Table("Parts of the change", columns, tuple(rows), numeric=("probability",))
         return Section("What has changed", lines, tables=(table,))
-    from avtorch.gap.change.change_cause import detectable_text
+    from avtorch.gap.answer.change import detectable_text
 
     least = tuple(
         f"Least change of {name} that would show: {detectable_text(name, x)}." for name, x in cause.detectable.items()

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from avtorch.gap.budget import parts as budget_parts
-from avtorch.gap.budget.parts import Budget
-from avtorch.gap.crossval.localisation import UNITS
+from avtorch.gap.answer import budget as budget_parts
+from avtorch.gap.answer.budget import Budget
+from avtorch.gap.answer.location import UNITS
 from avtorch.gap.quantity import unit_of, words_of
 from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis, Quantity, Shrinkage

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from avtorch.experiment import Experiment
-from avtorch.gap.budget.parts import Budget, percent
-from avtorch.gap.crossval.localisation import UNITS, Axis
+from avtorch.gap.answer.budget import Budget, percent
+from avtorch.gap.answer.location import UNITS, Axis
 from avtorch.gap.result import sentences
 from avtorch.gap.result.diagnosis import Diagnosis, Shrinkage
 from avtorch.plots.diagnosis import (

@@ -17,11 +17,11 @@ from avtorch.blindtest import MIX, Case, draw_case
 from avtorch.errors import InputError
 from avtorch.gap import plant
 from avtorch.gap.diagnose import left_over
-from avtorch.gap.likelihood.sensor_noise_floor import with_sensor_noise
 from avtorch.gap.search.search import Search
 from avtorch.gap.selection import model_probabilities as odds
 from avtorch.gap.selection.adequacy import Adequacy
 from avtorch.gap.selection.model_probabilities import Weighed
+from avtorch.gap.sensor_noise import with_sensor_noise
 from avtorch.io import read_sealed, write_sealed
 from benchmarks.fit_calibration.fingerprint import Numbers, differences
 

@@ -12,11 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from avtorch.gap import EFFECTS, plant
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import finish
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.noise_segments import whitening_filter
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.search.search import Search
 from avtorch.gap.selection.adequacy import adequacy
 from avtorch.io import Log

@@ -13,15 +13,15 @@ from avtorch.errors import InputError
 from avtorch.experiment import Limits, ManoeuvrePrediction, information, library, next_experiment, write_table
 from avtorch.experiment.prediction import responses
 from avtorch.gap import Effect, plant
+from avtorch.gap.answer.verdict import Candidate, verdict_of
+from avtorch.gap.drive_record import Record
 from avtorch.gap.effects import AerodynamicDrag, ConstantResistance, DeadBand, GainChange, RoadGrade, SensorBias
 from avtorch.gap.likelihood.noise_draws import noise_draws
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.result.diagnosis import Diagnosis, GapSize, LogFacts
 from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.gap.result.sentences import to_drive
-from avtorch.gap.selection.verdict import Candidate, verdict_of
 from avtorch.io import Log
 from tests.bars import BAR
 

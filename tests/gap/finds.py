@@ -8,11 +8,11 @@ import numpy as np
 import torch
 
 from avtorch.gap import Effect, GapPlant, plant
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import finish, modes
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import GUST, PRIORS, fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.fitted_model import FittedModel
 from avtorch.gap.search.lost_messages import LostMessages

@@ -9,8 +9,8 @@ import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.gap import GapPlant, SimulatorInput, plant
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.record import Record
 from avtorch.io import Log
 
 BOTH = ("accel", "speed")

@@ -7,10 +7,10 @@ import torch
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.effect_model import EffectModel
 from avtorch.gap.compare import compare
+from avtorch.gap.drive_record import Record
 from avtorch.gap.effects.speed_dependent_gain import SpeedDependentGain
 from avtorch.gap.effects.speed_dependent_lag import SpeedDependentLag
 from avtorch.gap.likelihood.hypothesis import Hypothesis
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.simulator.plant import GapPlant, plant
 from avtorch.gap.simulator.simulator_input import SimulatorInput
 from avtorch.io import Log

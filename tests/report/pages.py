@@ -11,7 +11,7 @@ import numpy as np
 
 import avtorch
 from avtorch.external.simulator_comparison import Difference, ErrorsOfTwo, SimulatorComparison
-from avtorch.gap.change.change_cause import ChangeCause, ChangePart
+from avtorch.gap.answer.change import ChangeCause, ChangePart
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.comparison import Change, Comparison
 from avtorch.gap.result.log_facts import LogFacts

@@ -15,6 +15,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from avtorch.errors import InputError
+from avtorch.gap.answer.budget import LIKELY, MATERIAL, Budget, ChancePart, Part, own_onset, percent
+from avtorch.gap.answer.plausibility import implausible
+from avtorch.gap.answer.verdict import ALWAYS, Candidate, Verdict, candidate_name
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.forward_selection import MOST_PARTS, baseline_noise, select
 from avtorch.gap.budget.gap_budget import budget_of, by_chance
@@ -22,7 +25,6 @@ from avtorch.gap.budget.given_effects import given_effects
 from avtorch.gap.budget.likely_parts import likely_parts
 from avtorch.gap.budget.one_channel import with_untested
 from avtorch.gap.budget.part_odds import PartOdds
-from avtorch.gap.budget.parts import LIKELY, MATERIAL, Budget, ChancePart, Part, own_onset, percent
 from avtorch.gap.budget.selection_step import Selection
 from avtorch.gap.budget.share_of_noise import share_of_noise
 from avtorch.gap.budget.share_order import largest_first
@@ -30,8 +32,6 @@ from avtorch.gap.budget.unexplained_places import placed
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.gap.search.fitted_model import FittedModel
-from avtorch.gap.selection.plausibility import implausible
-from avtorch.gap.selection.verdict import ALWAYS, Candidate, Verdict, candidate_name
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log

@@ -18,8 +18,8 @@ from avtorch.gap.budget.onset_search import ONSET_NATS, may_set_in, set_in
 from avtorch.gap.budget.robust_fit import Fit, HeldOut, RobustFit
 from avtorch.gap.budget.score_test import Candidate, ScoreTest
 from avtorch.gap.budget.selection_step import Step, complexity, cost
-from avtorch.gap.likelihood.observability import is_observable
 from avtorch.gap.simulator.effect import Effect
+from avtorch.gap.simulator.observability import is_observable
 
 LEAST_NATS = 3.0
 """In the blocks that fitted it, below which no effect is held out."""

@@ -16,12 +16,13 @@ import numpy as np
 from avtorch.arrays import FloatArray
 from avtorch.display.progress import called, shows_progress
 from avtorch.errors import InputError
+from avtorch.gap.answer.budget import MATERIAL, Budget, ChancePart, ChannelError, Part, Unexplained, own_onset
+from avtorch.gap.answer.plausibility import implausible
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.flexible_regression import left_over
 from avtorch.gap.budget.forward_selection import select
 from avtorch.gap.budget.likely_parts import likely_parts, probabilities
 from avtorch.gap.budget.one_channel import with_untested
-from avtorch.gap.budget.parts import MATERIAL, Budget, ChancePart, ChannelError, Part, Unexplained, own_onset
 from avtorch.gap.budget.repaired_model import lag_and_gain, parameters_of
 from avtorch.gap.budget.rollout_energy import horizon
 from avtorch.gap.budget.selection_step import Selection, Step
@@ -29,7 +30,6 @@ from avtorch.gap.budget.share_order import energies, gap_is_there, taken_off
 from avtorch.gap.budget.slow_disturbance import slow_disturbance
 from avtorch.gap.budget.unexplained_places import placed
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.selection.plausibility import implausible
 from avtorch.gap.simulator.effect import Effect
 from avtorch.gap.simulator.effect_choice import chosen_effects
 from avtorch.gap.simulator.integrated import Integrated

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from avtorch.gap.answer.budget import LIKELY, MATERIAL
 from avtorch.gap.budget.own_noise import evidence_by_own_noise, judged, with_sizes
 from avtorch.gap.budget.part_odds import PartOdds
-from avtorch.gap.budget.parts import LIKELY, MATERIAL
 from avtorch.gap.budget.redundancy import at_limits
 from avtorch.gap.budget.selection_step import Selection, one_by_one, without_effects
 from avtorch.gap.budget.share_order import largest_first, own_response

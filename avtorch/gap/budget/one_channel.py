@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from avtorch.gap.budget.parts import Budget, ChancePart, Part
+from avtorch.gap.answer.budget import Budget, ChancePart, Part
 from avtorch.gap.budget.selection_step import Selection
 from avtorch.gap.selection.aliases import in_place_of
 from avtorch.gap.simulator.effect import Effect

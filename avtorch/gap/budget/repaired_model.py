@@ -15,8 +15,8 @@ from scipy.stats import t as student  # pyright: ignore[reportMissingTypeStubs]
 from torch import Tensor
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.answer.budget import Budget
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.parts import Budget
 from avtorch.gap.budget.robust_fit import Fit
 from avtorch.gap.budget.selection_step import Selection, Step
 from avtorch.gap.likelihood.noise_model import NoiseModel

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
+from avtorch.gap.answer.budget import BEGIN_S, HORIZON_S
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.parts import BEGIN_S, HORIZON_S
 from avtorch.gap.budget.selection_step import Selection, Step
 
 

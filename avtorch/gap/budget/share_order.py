@@ -15,8 +15,8 @@ import numpy as np
 from scipy.optimize import isotonic_regression
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.answer.budget import MATERIAL
 from avtorch.gap.budget.flexible_regression import predicted_residuals
-from avtorch.gap.budget.parts import MATERIAL
 from avtorch.gap.budget.rollout_energy import (
     calm_blocks,
     counted_rows,

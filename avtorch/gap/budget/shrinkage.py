@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.answer.shrinkage import MetricShrinkage, Shrinkage
 from avtorch.gap.budget.flexible_regression import predicted_residuals
 from avtorch.gap.budget.rollout_energy import calm_blocks, counted_rows, held_out_residuals, horizon, rollout_squares
 from avtorch.gap.budget.selection_step import Selection
-from avtorch.gap.crossval.gap_closed import MetricShrinkage, Shrinkage
 from avtorch.gap.quantity import Quantity
 
 _DRAWS = 2000

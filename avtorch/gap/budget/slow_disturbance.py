@@ -16,8 +16,8 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.answer.budget import ChancePart
 from avtorch.gap.budget.analysis_record import AnalysisRecord
-from avtorch.gap.budget.parts import ChancePart
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.selection.calibration import CALIBRATION
 from avtorch.gap.simulator.effect import Effect

@@ -16,13 +16,13 @@ from scipy.special import stdtr
 from scipy.stats import false_discovery_control
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.answer.budget import Unexplained
+from avtorch.gap.answer.location import PLAINLY, RATE, Axis, Location, shortest
 from avtorch.gap.budget.entry import candidates_for, observable
 from avtorch.gap.budget.flexible_regression import predicted_residuals
 from avtorch.gap.budget.held_out_evidence import agreement
-from avtorch.gap.budget.parts import Unexplained
 from avtorch.gap.budget.rollout_energy import held_out_residuals
 from avtorch.gap.budget.selection_step import Selection
-from avtorch.gap.crossval.localisation import PLAINLY, RATE, Axis, Location, shortest
 from avtorch.gap.likelihood.basis import lowpass
 from avtorch.gap.simulator.effect import EFFECTS
 

@@ -9,11 +9,10 @@ import numpy as np
 
 from avtorch.arrays import BoolArray, FloatArray
 from avtorch.errors import InputError
+from avtorch.gap.blocks import FEWEST_BLOCKS
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.io import Log
 
-FEWEST_BLOCKS = 5
-"""On either side."""
 _BLOCKS = 12  # aimed at on the shorter side, within these lengths
 _SHORTEST_BLOCK_S, _LONGEST_BLOCK_S = 4.0, 10.0
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.basis import linear_splines, lowpass
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 
 _SIZES = np.exp(np.linspace(np.log(1e-3), np.log(10.0), 25))

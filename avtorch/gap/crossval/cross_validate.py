@@ -12,21 +12,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.blocks import Fold, folds, whole_drive_folds
 from avtorch.gap.crossval.black_box import BlackBoxRegression
 from avtorch.gap.crossval.closed_loop_errors import ClosedLoopMetric, closed_loop_metrics
-from avtorch.gap.crossval.folds import Fold, folds, whole_drive_folds
 from avtorch.gap.crossval.noise_floor import NoiseFloor
 from avtorch.gap.crossval.random_effect_density import RandomEffectDensity
 from avtorch.gap.crossval.refit import Refit
-from avtorch.gap.crossval.rollout_errors import RolloutMetric, rollout_metrics
 from avtorch.gap.crossval.scores import FoldScorer, FoldScores, parameter_spread
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.hypothesis import Hypothesis
-from avtorch.gap.likelihood.observability import is_observable
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.rollout_errors import RolloutMetric, rollout_metrics
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 from avtorch.gap.search.initial_values import effect_starts
 from avtorch.gap.selection.model_probabilities import complexity_penalties
 from avtorch.gap.simulator.effect import EFFECTS, Effect
+from avtorch.gap.simulator.observability import is_observable
 
 Progress = Callable[[str, int, int], None]
 

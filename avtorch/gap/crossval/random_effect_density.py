@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from avtorch.arrays import BoolArray, FloatArray
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search import command_errors
 from avtorch.gap.search.fitted_model import FittedModel

@@ -12,12 +12,12 @@ from functools import cached_property
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import GaussNewtonFit, finish, grade_marginal, modes, residuals
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import GUST, PRIORS, fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.noise_segments import whitening_filter
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter, acting, sensed
 from avtorch.gap.search.fitted_model import FittedModel
 

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.arrays import BoolArray, FloatArray
+from avtorch.gap.blocks import Fold
 from avtorch.gap.crossval.closed_loop_errors import ClosedLoopMetric
-from avtorch.gap.crossval.folds import Fold
 from avtorch.gap.crossval.noise_floor import NoiseFloor
 from avtorch.gap.crossval.refit import Refit
-from avtorch.gap.crossval.rollout_errors import RolloutMetric, products
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.posterior.density import root
+from avtorch.gap.rollout_errors import RolloutMetric, products
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from avtorch.arrays import Float, FloatArray
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
 from avtorch.gap.simulator.effect import Effect, effect_class
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.parameter import Parameter

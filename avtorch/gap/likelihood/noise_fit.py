@@ -9,10 +9,10 @@ from itertools import product
 import numpy as np
 
 from avtorch.arrays import Float, FloatArray
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.noise_model import NAMES, NoiseModel
 from avtorch.gap.likelihood.noise_segments import before_onset, whitening_filter
 from avtorch.gap.likelihood.random_law import RandomLaw
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 
 Prior = tuple[float, float, float]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import Until, WhiteningFilter
 
 CALM = 0.005

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from avtorch.arrays import Float, FloatArray
 from avtorch.errors import InputError
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.hypothesis import Coordinate, Hypothesis
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.simulator.effect import Effect, NoiseChange
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.gap.simulator.simulator_input import SimulatorInput

@@ -17,9 +17,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from avtorch.arrays import Float, FloatArray
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.grade_marginal import GradeMarginal
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.steady_kalman import Filter, designed
 
 Until = tuple[tuple[int, NoiseModel], ...]

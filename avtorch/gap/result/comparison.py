@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from avtorch.display import Card, Displayed, Frame
-from avtorch.gap.change.change_cause import ChangeCause
+from avtorch.gap.answer.change import ChangeCause
 from avtorch.gap.quantity import Quantity, unit_of
 from avtorch.gap.result.diagnosis import LogFacts
 

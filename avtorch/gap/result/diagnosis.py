@@ -14,19 +14,11 @@ from numpy.typing import NDArray
 
 from avtorch.display import Card, Displayed, Frame
 from avtorch.errors import InputError
-from avtorch.gap.budget.parts import Budget
-from avtorch.gap.crossval.gap_closed import MetricShrinkage, Shrinkage
-from avtorch.gap.crossval.localisation import Location
-from avtorch.gap.quantity import Quantity, frame_of, unit_of
-from avtorch.gap.result import sentences
-from avtorch.gap.result.alarm import Alarm
-from avtorch.gap.result.gap_size import GapSize
-from avtorch.gap.result.log_facts import LogFacts
-from avtorch.gap.result.predictive_model import PredictiveModel
-from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
-from avtorch.gap.result.traces import Traces
-from avtorch.gap.search.fitted_model import Scope
-from avtorch.gap.selection.verdict import (
+from avtorch.gap.answer.budget import Budget
+from avtorch.gap.answer.location import Location
+from avtorch.gap.answer.scope import Scope
+from avtorch.gap.answer.shrinkage import MetricShrinkage, Shrinkage
+from avtorch.gap.answer.verdict import (
     Candidate,
     Verdict,
     candidate_name,
@@ -36,6 +28,14 @@ from avtorch.gap.selection.verdict import (
     plausibility,
     verdict_of,
 )
+from avtorch.gap.quantity import Quantity, frame_of, unit_of
+from avtorch.gap.result import sentences
+from avtorch.gap.result.alarm import Alarm
+from avtorch.gap.result.gap_size import GapSize
+from avtorch.gap.result.log_facts import LogFacts
+from avtorch.gap.result.predictive_model import PredictiveModel
+from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
+from avtorch.gap.result.traces import Traces
 from avtorch.gap.simulator.effect import EFFECTS
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.inference.posterior import effective_sample_size, nested_rhat, normal_scores

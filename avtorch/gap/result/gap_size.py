@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.crossval.rollout_errors import HORIZON_S, RolloutMetric, reached, rms
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
 from avtorch.gap.result.repeatability import Repeatability, repeatability
+from avtorch.gap.rollout_errors import HORIZON_S, RolloutMetric, reached, rms
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 
 

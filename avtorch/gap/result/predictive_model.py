@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.answer.verdict import Verdict
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.posterior.summary import belief
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
-from avtorch.gap.selection.verdict import Verdict
 from avtorch.gap.simulator.plant import GapPlant
 
 _DRAWS = 64

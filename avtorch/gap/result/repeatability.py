@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
 
 WINDOW_S = 10.0
 SETTLED_S = 3.0

@@ -10,16 +10,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.answer.budget import LIKELY, Budget
+from avtorch.gap.answer.verdict import ALIAS_RATIO, ALWAYS, Verdict, candidate_name
 from avtorch.gap.budget.entry import candidates_for, fitted, observable
-from avtorch.gap.budget.parts import LIKELY, Budget
 from avtorch.gap.budget.repaired_model import draws_of, places, plant_of
 from avtorch.gap.budget.robust_fit import Fit
 from avtorch.gap.budget.selection_step import Selection, Step, without_effects
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.noise_fit import GUST, PRIORS, fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.result.predictive_model import MOST_MODELS, PredictiveModel
-from avtorch.gap.selection.verdict import ALIAS_RATIO, ALWAYS, Verdict, candidate_name
 from avtorch.gap.simulator.effect import EFFECTS, Effect
 from avtorch.gap.simulator.integrated import Integrated
 from avtorch.gap.simulator.plant import GapPlant, plant

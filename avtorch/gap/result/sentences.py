@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from avtorch.gap.budget.parts import Budget
-from avtorch.gap.crossval.gap_closed import Shrinkage
-from avtorch.gap.crossval.localisation import Location
+from avtorch.gap.answer.budget import Budget
+from avtorch.gap.answer.location import Location
+from avtorch.gap.answer.scope import Scope
+from avtorch.gap.answer.shrinkage import Shrinkage
+from avtorch.gap.answer.verdict import Candidate, Verdict, meanings
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.gap_size import GapSize
 from avtorch.gap.result.log_facts import LogFacts
 from avtorch.gap.result.simulator_under_test import SimulatorUnderTest
-from avtorch.gap.search.fitted_model import Scope
-from avtorch.gap.selection.verdict import Candidate, Verdict, meanings
 from avtorch.gap.simulator.cause_words import named_cause
 from avtorch.io.clock import clock_words
 

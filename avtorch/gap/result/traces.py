@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
 from avtorch.arrays import FloatArray, IntArray
-from avtorch.gap.budget.parts import BEGIN_S, HORIZON_S
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.answer.budget import BEGIN_S, HORIZON_S
 from avtorch.gap.result.uncounted import Uncounted
-from avtorch.gap.simulator.plant import GapPlant
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,30 +72,3 @@ class Traces:
         error = np.linalg.norm(self.measured - self.begun_anew(simulated), axis=1)
         spread = np.linalg.norm(self.measured - self.measured.mean(axis=1, keepdims=True), axis=1)
         return 100 * (1 - np.divide(error, spread, out=np.full_like(error, np.nan), where=spread > 0))
-
-
-def rolled_out(record: Record, simulator: GapPlant, onsets: Mapping[str, float] | None = None) -> FloatArray:
-    """Rollouts (channel, counted, group) of a simulator over the whole drives of a record.
-
-    `onsets` [s from the start of the one log]: from when on effects act. The response switches there, and the speed
-    goes on from where it is.
-    """
-    late = {} if onsets is None else onsets
-    waiting = sorted(late, key=late.__getitem__)
-    out, time = _driven(record, simulator, waiting), record.time[record.source]
-    while waiting:
-        onset = late[waiting.pop(0)]
-        after, acting = _driven(record, simulator, waiting), time >= onset
-        if "speed" in record.channels and acting.any():
-            speed, first = record.channels.index("speed"), int(np.argmax(acting))
-            after[speed] += out[speed, first].mean() - after[speed, first].mean()
-        out = np.where(acting[:, None], after, out)
-    return out
-
-
-def _driven(record: Record, simulator: GapPlant, without: Collection[str]) -> FloatArray:
-    kept = [e for e in simulator.effects if e.name not in without]
-    car = GapPlant(kept, T_L=simulator.T_L, K_L=simulator.K_L, sigma=simulator.sigma) if without else simulator
-    responses = [car.response(drive) for drive in record.drives]
-    channels = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
-    return np.stack([record.at_counted_rows(channels[name]) for name in record.channels])

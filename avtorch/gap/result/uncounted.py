@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
 from avtorch.io import Log
 
 Reason = Literal["driver", "standstill", "gap", "settling"]

@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import finish, modes
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.fitted_model import ALIKE, Delays, FittedModel
 from avtorch.gap.simulator.simulator_input import SimulatorInput

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Self
+from typing import Self
 
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.answer.scope import Scope
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import GaussNewtonFit
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import NoiseFit
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.noise_segments import whitening_filter
-from avtorch.gap.likelihood.observability import is_observable
 from avtorch.gap.likelihood.random_law import RandomLaw
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.lost_messages import LostMessages
 from avtorch.gap.search.outliers import HeavyTails
-from avtorch.gap.simulator.effect import EFFECTS, Effect
+from avtorch.gap.simulator.effect import Effect
 from avtorch.io import Log
 
 
@@ -148,44 +148,6 @@ class FittedModel:
         )
 
 
-Pairs = Literal["all", "some", "none", "lost"]
-
-
-@dataclass(frozen=True)
-class Scope:
-    """What a search tried: names of single effects `scored` and `not_scored`, and which `pairs`.
-
-    `not_scored`: effects excluded by the budget or by the user. `pairs`: "all" that screening selected, "some" before
-    the budget ended, "none", or "lost": none, as the likelihood could no longer give the answer.
-    """
-
-    scored: tuple[str, ...] = ()
-    not_scored: tuple[str, ...] = ()
-    pairs: Pairs = "all"
-
-    @classmethod
-    def of(
-        cls,
-        effects: Sequence[type[Effect]],
-        tried: Collection[str],
-        channels: Collection[str],
-        pairs: Pairs,
-    ) -> Self:
-        """The scope of a search among `effects`, limited to those observable in `channels`; `tried`: by name."""
-        own = {e.name: e for e in effects}
-        kinds = own | {n: e for n, e in EFFECTS.items() if n not in own}
-        names = [n for n, e in kinds.items() if is_observable(e, channels)]
-        return cls(tuple(n for n in names if n in tried), tuple(n for n in names if n not in tried), pairs)
-
-    @property
-    def whole(self) -> bool:
-        """Whether every hypothesis was tried."""
-        return not self.not_scored and self.pairs in ("all", "lost")
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"effects": list(self.not_scored), "pairs": self.pairs}
-
-
 @dataclass(frozen=True, eq=False)
 class SearchResult:
     """All fitted hypotheses, most evidence first, and their data. `complete` False: the budget ended the search."""
@@ -195,7 +157,7 @@ class SearchResult:
     logs: tuple[Log, ...]
     found: tuple[FittedModel, ...]
     complete: bool
-    scope: Scope = Scope()
+    scope: Scope = field(default_factory=Scope)
 
     @property
     def none(self) -> FittedModel:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.hypothesis import Hypothesis
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.fitted_model import FittedModel
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import log_joint, modes, residuals
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.noise_segments import whitening_filter
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.checkpoint import Checkpoint, StoredFit
 from avtorch.gap.search.fitted_model import FittedModel, first_noise, with_or_without_onset

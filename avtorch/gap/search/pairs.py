@@ -9,9 +9,9 @@ from functools import cached_property
 import numpy as np
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import modes, whitened_jacobian
 from avtorch.gap.likelihood.hypothesis import Hypothesis
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.initial_values import effect_starts, start_points
 from avtorch.gap.search.onset import allowed

@@ -15,12 +15,11 @@ import numpy as np
 from scipy.optimize import minimize
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import finish, modes
 from avtorch.gap.likelihood.noise_fit import PRIORS, fit_noise
 from avtorch.gap.likelihood.noise_segments import whitening_filter
-from avtorch.gap.likelihood.observability import is_observable
 from avtorch.gap.likelihood.random_law import Form, RandomLaw
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.command_errors import command_error_gains
 from avtorch.gap.search.fitted_model import ByChance, FittedModel
@@ -28,6 +27,7 @@ from avtorch.gap.search.full_rate import full_rate_errors, full_rate_filter
 from avtorch.gap.search.gusts import gust
 from avtorch.gap.search.outliers import HeavyTails, hessian_of
 from avtorch.gap.simulator.effect import Effect, SearchedAs
+from avtorch.gap.simulator.observability import is_observable
 from avtorch.gap.simulator.plant import GapPlant
 
 _TURNS = 4  # alternations of parameters and noise

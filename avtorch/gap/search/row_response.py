@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from avtorch.arrays import BoolArray, FloatArray, IntArray
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 
 _ORDER = 4  # states at most

@@ -13,15 +13,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from avtorch.gap.answer.scope import Scope
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import finish
 from avtorch.gap.likelihood.hypothesis import Hypothesis
-from avtorch.gap.likelihood.observability import is_observable
 from avtorch.gap.likelihood.random_law import RandomLaw
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.checkpoint import Checkpoint
 from avtorch.gap.search.delays import all_delays
-from avtorch.gap.search.fitted_model import FittedModel, Scope, SearchResult, without_outliers
+from avtorch.gap.search.fitted_model import FittedModel, SearchResult, without_outliers
 from avtorch.gap.search.fitted_work import fitted_work
 from avtorch.gap.search.full_rate import full_rate_errors, full_rate_filter
 from avtorch.gap.search.initial_values import start_points
@@ -33,6 +33,7 @@ from avtorch.gap.search.random_effects import RandomEffects, commanded, glitched
 from avtorch.gap.search.screening import Screened, refine, screen
 from avtorch.gap.search.time_budget import TimeBudget
 from avtorch.gap.simulator.effect import EFFECTS, Effect
+from avtorch.gap.simulator.observability import is_observable
 from avtorch.gap.simulator.plant import GapPlant
 from avtorch.io import Log
 

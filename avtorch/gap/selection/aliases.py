@@ -11,11 +11,11 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from avtorch.gap.likelihood.observability import is_observable
+from avtorch.gap.answer.plausibility import implausible
+from avtorch.gap.answer.verdict import ALIAS_RATIO, Candidate, candidate_name, near
 from avtorch.gap.search.fitted_model import SearchResult
-from avtorch.gap.selection.plausibility import implausible
-from avtorch.gap.selection.verdict import ALIAS_RATIO, Candidate, candidate_name, near
 from avtorch.gap.simulator.effect import EFFECTS, Effect
+from avtorch.gap.simulator.observability import is_observable
 
 Values = Mapping[str, float]
 Kinds = Iterable[type[Effect]]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+from avtorch.gap.answer.verdict import Verdict
 from avtorch.gap.search.fitted_model import FittedModel
-from avtorch.gap.selection.verdict import Verdict
 
 _NAMED = 4  # delays named in a sentence
 

@@ -27,11 +27,11 @@ from avtorch.gap import (
     Unexplained,
     plant,
 )
+from avtorch.gap.answer.verdict import Candidate
 from avtorch.gap.budget.account import shared_out
 from avtorch.gap.budget.part_odds import PartOdds
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.result.diagnosis import Diagnosis
-from avtorch.gap.selection.verdict import Candidate
 from tests.gap.budget.cars import log_of
 
 ROOT = Path(__file__).resolve().parents[3]

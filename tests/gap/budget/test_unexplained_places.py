@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from avtorch.gap import ConstantResistance, Effect, GainChange, SensorBias, gap_budget
-from avtorch.gap.budget.parts import Unexplained
-from avtorch.gap.crossval.localisation import Location
+from avtorch.gap.answer.budget import Unexplained
+from avtorch.gap.answer.location import Location
 from avtorch.gap.quantity import Quantity
 from tests.gap.budget.cars import log_of
 

@@ -18,8 +18,9 @@ import avtorch
 from avtorch.cli.compare import _table
 from avtorch.errors import InputError
 from avtorch.gap import ConstantResistance, DeadTime, Effect, SensorBias, plant
+from avtorch.gap.answer.change import ChangeCause, ChangePart, detectable_text
 from avtorch.gap.change import change_selection
-from avtorch.gap.change.change_cause import ChangeCause, ChangePart, cause_of_change, detectable_text
+from avtorch.gap.change.change_cause import cause_of_change
 from avtorch.gap.change.change_model import Change, ChangeModel, changes
 from avtorch.gap.change.change_selection import Step, _again, _noise, _without_the_redundant
 from avtorch.gap.change.two_sides import TwoSides

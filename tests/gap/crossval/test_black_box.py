@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from avtorch.gap.blocks import folds
 from avtorch.gap.crossval.black_box import BlackBoxRegression
-from avtorch.gap.crossval.folds import folds
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from tests.gap.finds import found_of
 from tests.gap.records import QUIET, errors_of

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from avtorch.blindtest import draw_case
+from avtorch.gap.blocks import folds
 from avtorch.gap.crossval.cross_validate import cross_validate
-from avtorch.gap.crossval.folds import folds
 from avtorch.gap.crossval.gap_closed import DENSITY, gap_closed
 from avtorch.gap.crossval.random_effect_density import RandomEffectDensity
 from avtorch.gap.search.search import Search

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from avtorch.gap import AerodynamicDrag, DeadTime, Gust, SensorScale
-from avtorch.gap.crossval.folds import folds
+from avtorch.gap.blocks import folds
 from avtorch.gap.crossval.noise_floor import drawn, expected
 from avtorch.gap.crossval.refit import Refit
-from avtorch.gap.crossval.rollout_errors import rollout_metrics
 from avtorch.gap.crossval.scores import FoldScorer, parameter_spread
+from avtorch.gap.rollout_errors import rollout_metrics
 from tests.gap.finds import found_of
 
 

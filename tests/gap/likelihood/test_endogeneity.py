@@ -13,10 +13,10 @@ from avtorch.arrays import FloatArray
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest import DrivePlan as BlindDrive
 from avtorch.gap import plant
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import finish, modes
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.search import Search
 from avtorch.io import Log

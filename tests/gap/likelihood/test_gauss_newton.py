@@ -21,11 +21,11 @@ from avtorch.gap import (
     SimulatorInput,
     plant,
 )
+from avtorch.gap.drive_record import Record
 from avtorch.gap.effects.road_grade import GRAVITY
 from avtorch.gap.likelihood.gauss_newton import finish, modes
 from avtorch.gap.likelihood.grade_marginal import SIZES
 from avtorch.gap.likelihood.hypothesis import Hypothesis
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.simulator.effect_context import EffectContext
 from tests.gap.records import QUIET, log_of

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from avtorch.arrays import FloatArray
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.noise_fit import GUST, PRIORS, Prior, fit_noise
 from avtorch.gap.likelihood.noise_model import NAMES, NoiseModel
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.onset import allowed, onset_profile
 from tests.gap.records import BOTH, drawn_errors, errors_of, log_of, ornstein, record_of

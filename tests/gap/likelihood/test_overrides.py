@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from avtorch.errors import InputError
 from avtorch.gap import plant
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.hypothesis import Hypothesis
-from avtorch.gap.likelihood.record import Record
-from avtorch.gap.likelihood.sensor_noise_floor import with_sensor_noise
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.fitted_model import first_noise, without_outliers
 from avtorch.gap.search.outliers import HeavyTails
+from avtorch.gap.sensor_noise import with_sensor_noise
 from avtorch.io import Log
 from tests.gap.records import log_of
 from tests.overridden import deleted

@@ -19,8 +19,8 @@ from avtorch.blindtest.drives import Recorded
 from avtorch.blindtest.vehicle import Run, simulate
 from avtorch.errors import InputError
 from avtorch.gap import AerodynamicDrag, RoadGrade, SensorLag, SimulatorInput, plant
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.hypothesis import Hypothesis
-from avtorch.gap.likelihood.record import Record
 from avtorch.io import Log
 from tests.gap.records import log_of
 

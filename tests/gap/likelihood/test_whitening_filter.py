@@ -11,9 +11,9 @@ from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_are
 
 from avtorch.arrays import FloatArray
 from avtorch.gap import DeadTime, SensorLag, SensorScale
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.likelihood.noise_segments import CALM, before_onset
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.steady_kalman import _steady, error_dynamics
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from tests.bars import BAR

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from avtorch.gap import DeadTime
-from avtorch.gap.crossval.rollout_errors import HORIZON_S
 from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.result.gap_size import gap_size
+from avtorch.gap.rollout_errors import HORIZON_S
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 from tests.gap.finds import found_of
 

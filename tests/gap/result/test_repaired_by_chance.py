@@ -10,7 +10,7 @@ import pytest
 
 from avtorch import diagnose
 from avtorch.gap import Effect, Gust, SensorBias, plant
-from avtorch.gap.budget.parts import Budget, ChancePart, Unexplained
+from avtorch.gap.answer.budget import Budget, ChancePart, Unexplained
 from avtorch.gap.budget.repaired_model import with_chance
 from avtorch.gap.effects import Outliers
 from avtorch.gap.likelihood.noise_model import NoiseModel

@@ -10,6 +10,7 @@ import pytest
 from avtorch import diagnose
 from avtorch.experiment import next_experiment
 from avtorch.gap import EFFECTS, Budget, ConstantResistance, SensorBias, plant
+from avtorch.gap.answer.verdict import Candidate, Verdict
 from avtorch.gap.budget.analysis_record import AnalysisRecord
 from avtorch.gap.budget.forward_selection import baseline_noise
 from avtorch.gap.budget.gap_budget import budget_of
@@ -20,7 +21,6 @@ from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.gap.result.diagnosis import Diagnosis
 from avtorch.gap.result.predictive_model import PredictiveModel
 from avtorch.gap.result.rival_models import rival_models
-from avtorch.gap.selection.verdict import Candidate, Verdict
 from tests.gap.budget.cars import log_of
 
 BASE = plant([])

@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avtorch.gap import plant
-from avtorch.gap.effects import ConstantResistance
-from avtorch.gap.result.traces import Traces, rolled_out
-from tests.gap.records import record_of
+from avtorch.gap.result.traces import Traces
 
 
 def test_the_fit_of_the_exact_the_mean_and_a_known_error() -> None:
@@ -45,16 +42,3 @@ def test_a_simulated_speed_begins_anew_every_ten_seconds_and_in_each_stretch() -
     np.testing.assert_allclose(traces.begun_anew(traces.after)[0], speed)
     accel = Traces(time, zeros, ("accel",), speed[None], drifting[None], speed[None], zeros, stretch)
     assert accel.begun_anew(accel.before) is accel.before
-
-
-def test_a_force_that_sets_in_leaves_the_speed_where_it_is() -> None:
-    """Rolled out from the start on, the speed would have fallen by half a minute's resistance at the onset."""
-    record = record_of(60.0)
-    plain, late = plant([]), plant([ConstantResistance(0.4)])
-    before, found = rolled_out(record, plain), rolled_out(record, late, {"constant_resistance": 30.0})
-    whole, time = rolled_out(record, late), record.time[record.source]
-    early, speed, accel = time < 30.0, record.channels.index("speed"), record.channels.index("accel")
-    np.testing.assert_array_equal(found[:, early], before[:, early])
-    np.testing.assert_array_equal(found[accel][~early], whole[accel][~early])
-    fallen = (before - found)[speed][~early].mean(-1)
-    np.testing.assert_allclose(fallen, 0.4 * (time[~early] - time[~early][0]), atol=0.05)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avtorch import Log
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
 from avtorch.gap.result.uncounted import uncounted
 
 

@@ -8,8 +8,8 @@ import pytest
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest import DrivePlan as BlindDrive
 from avtorch.blindtest.drives import Manoeuvre
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.hypothesis import Hypothesis
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.search.fitted_model import first_noise
 from avtorch.gap.search.initial_values import lag_delay_starts, one_at_a_time, start_points
 from avtorch.gap.search.search import Search

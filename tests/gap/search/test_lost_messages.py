@@ -11,11 +11,11 @@ import torch
 
 from avtorch.arrays import FloatArray
 from avtorch.gap import CommandHold, DeadTime, Effect, RateLimit, Saturation, SimulatorInput, plant
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import modes
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_fit import fit_noise
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.lost_messages import LossHistories, LostMessages, lost_messages
 from avtorch.io import Log

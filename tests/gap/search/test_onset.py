@@ -9,10 +9,10 @@ from avtorch.arrays import FloatArray
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest.drives import Recorded
 from avtorch.gap import DeadTime, SensorBias, plant
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import finish, grade_marginal, modes
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.onset import allowed, onset_evidence, onset_profile, refined_onset, rough_onset
 from avtorch.io import Log

@@ -25,9 +25,9 @@ from avtorch.gap import (
     SpeedDependentLag,
     plant,
 )
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import modes
 from avtorch.gap.likelihood.hypothesis import Hypothesis
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search import pairs
 from avtorch.gap.search.initial_values import effect_starts, start_points

@@ -25,8 +25,8 @@ from avtorch.gap import (
     SimulatorInput,
     plant,
 )
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.steady_kalman import error_dynamics
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search.command_errors import command_error_gains

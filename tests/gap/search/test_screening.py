@@ -9,10 +9,10 @@ from avtorch.arrays import FloatArray
 from avtorch.blindtest import Car, simulate
 from avtorch.blindtest.drives import Recorded
 from avtorch.gap import Saturation
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.gauss_newton import modes
 from avtorch.gap.likelihood.hypothesis import Hypothesis
 from avtorch.gap.likelihood.noise_model import NoiseModel
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.search import screening
 from avtorch.gap.search.initial_values import start_points

@@ -25,7 +25,7 @@ from avtorch.gap import (
     SensorScale,
     plant,
 )
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
 from avtorch.gap.search.fitted_model import FittedModel, SearchResult
 from avtorch.gap.search.search import Search
 from avtorch.io import Log

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.whitening_filter import WhiteningFilter
 from avtorch.gap.selection.adequacy import Adequacy, adequacy
 from avtorch.io import Log

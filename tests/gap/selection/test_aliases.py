@@ -20,12 +20,12 @@ from avtorch.gap import (
     SimulatorInput,
     plant,
 )
-from avtorch.gap.likelihood.observability import is_observable
+from avtorch.gap.answer.verdict import Candidate, verdict_of
 from avtorch.gap.search.fitted_model import SearchResult
 from avtorch.gap.search.search import Search
 from avtorch.gap.selection.aliases import Identifiability, exact_aliases, lookalikes, note
-from avtorch.gap.selection.verdict import Candidate, verdict_of
 from avtorch.gap.simulator.effect import effect_class
+from avtorch.gap.simulator.observability import is_observable
 from tests.bars import log_odds
 from tests.gap.records import command_over, log_of
 

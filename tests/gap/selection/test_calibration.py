@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from avtorch.errors import InputError
-from avtorch.gap.selection import verdict
+from avtorch.gap.answer import verdict
 from avtorch.gap.selection.calibration import CALIBRATION, PATH, Calibration, document
 from avtorch.io import fingerprint
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import pytest
 
 from avtorch.gap import EFFECTS, DeadTime, Effect, register
-from avtorch.gap.budget.parts import Budget, ChancePart, ChannelError, Part, Unexplained
+from avtorch.gap.answer.budget import Budget, ChancePart, ChannelError, Part, Unexplained
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.cause_words import cause_words, named_cause
 

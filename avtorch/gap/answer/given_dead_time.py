@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from avtorch.gap.selection.verdict import Candidate, Verdict
+from avtorch.gap.answer.verdict import Candidate, Verdict
 from avtorch.gap.simulator.effect import delay_effect
 from avtorch.gap.simulator.plant import GapPlant
 

@@ -9,8 +9,8 @@ import pytest
 
 from avtorch.errors import InputError
 from avtorch.gap import plant
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.hypothesis import Hypothesis
-from avtorch.gap.likelihood.record import Record
 from avtorch.io import Log
 from tests.gap.records import log_of
 
@@ -49,7 +49,7 @@ def test_drives_are_rolled_out_at_the_logs_rate_coarse_ones_at_the_groups(
 ) -> None:
     short = Record.of(log_of(seconds=20.0, rate_hz=100))
     assert short.coarse is short.drives
-    monkeypatch.setattr("avtorch.gap.likelihood.record._FEW", 0)
+    monkeypatch.setattr("avtorch.gap.drive_record._FEW", 0)
     log = log_of(seconds=20.0, rate_hz=100)
     record = Record.of(log)
     (fine,), (coarse,) = record.drives, record.coarse
@@ -151,7 +151,7 @@ def test_short_stretches_are_left_out() -> None:
 
 
 def test_segments_are_drives_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avtorch.gap.likelihood.record._FEW", 0)
+    monkeypatch.setattr("avtorch.gap.drive_record._FEW", 0)
     log = log_of(seconds=60.0, rate_hz=100)
     record = Record.of(_cut(log, slice(0, 1503), slice(1600, 4004), slice(4400, 5950)))
     assert [len(d.time) for d in record.drives] == [1500, 2400, 1550]

@@ -9,7 +9,6 @@ from typing import Any
 
 from avtorch.errors import InputError
 from avtorch.gap.quantity import Quantity
-from avtorch.gap.selection.calibration import CALIBRATION
 from avtorch.gap.simulator.effect import EFFECTS
 
 ALWAYS = ("none", "unknown")
@@ -120,9 +119,9 @@ class Verdict:
         }
 
 
-ALIAS_RATIO = CALIBRATION.alias_sets.ratio
+ALIAS_RATIO = 0.03
 """Hypotheses at least this probable, relative to the most probable one, are not distinguished from it."""
-UNKNOWN_RATIO = CALIBRATION.alias_sets.unknown_ratio
+UNKNOWN_RATIO = 0.5
 """The same for `unknown`, which makes no predictions and so is never ruled out by a log: below this it is no rival."""
 
 

@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avtorch.arrays import BoolArray, IntArray
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
 
 FOLDS = 5
+FEWEST_BLOCKS = 5
+"""On either side of a comparison."""
 _BLOCKS = 20  # of a long drive
 _DRIVES = 3  # fewest drives for which whole ones are held out
 _WHOLE_S = 10.0  # a block holds one to six of these, so that rollouts of this length fit in

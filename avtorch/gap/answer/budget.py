@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from avtorch.gap.crossval.localisation import Location
+from avtorch.gap.answer.location import Location
 from avtorch.gap.quantity import Quantity
 from avtorch.gap.simulator.cause_words import named_cause
 from avtorch.gap.simulator.effect import Effect

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from avtorch.gap.crossval.rollout_errors import RolloutMetric, rollout_metrics
+from avtorch.gap.effects import ConstantResistance
+from avtorch.gap.rollout_errors import RolloutMetric, rolled_out, rollout_metrics
 from avtorch.gap.simulator.plant import plant
 from avtorch.gap.simulator.simulator_input import SimulatorInput
-from tests.gap.records import command_over
+from tests.gap.records import command_over, record_of
 
 RATE = 10
 
@@ -55,3 +56,16 @@ def test_the_usual_ones_have_the_schemas_names() -> None:
     rows = np.arange(1.0, 6.0)[None]
     assert RolloutMetric("accel", None).products(rows, [slice(1, 5)], 0.1, 0.3).tolist() == [[[4 + 9 + 16 + 25]]]
     assert RolloutMetric("speed", None).products(rows, [slice(1, 5)], 0.1, 0.3).tolist() == [[[1 + 4 + 9 + 16]]]
+
+
+def test_a_force_that_sets_in_leaves_the_speed_where_it_is() -> None:
+    """Rolled out from the start on, the speed would have fallen by half a minute's resistance at the onset."""
+    record = record_of(60.0)
+    plain, late = plant([]), plant([ConstantResistance(0.4)])
+    before, found = rolled_out(record, plain), rolled_out(record, late, {"constant_resistance": 30.0})
+    whole, time = rolled_out(record, late), record.time[record.source]
+    early, speed, accel = time < 30.0, record.channels.index("speed"), record.channels.index("accel")
+    np.testing.assert_array_equal(found[:, early], before[:, early])
+    np.testing.assert_array_equal(found[accel][~early], whole[accel][~early])
+    fallen = (before - found)[speed][~early].mean(-1)
+    np.testing.assert_allclose(fallen, 0.4 * (time[~early] - time[~early][0]), atol=0.05)

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avtorch.gap.crossval.attribution import RowAttribution
-from avtorch.gap.crossval.localisation import _q_values, localise, shortest
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.answer.location import RowAttribution, _q_values, localise, shortest
+from avtorch.gap.drive_record import Record
 from tests.bars import BAR
 from tests.gap.records import log_of
 

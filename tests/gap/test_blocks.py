@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from avtorch.gap.crossval.folds import folds
+from avtorch.gap.blocks import folds
+from avtorch.gap.drive_record import Record
 from avtorch.gap.likelihood.hypothesis import Hypothesis
-from avtorch.gap.likelihood.record import Record
 from avtorch.gap.simulator.plant import plant
 from avtorch.io import Log
 from tests.gap.records import log_of

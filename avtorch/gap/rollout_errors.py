@@ -12,21 +12,32 @@ mean over all starts within a horizon of `t` is `x y - x M(y) - M(x) y + M2(x y)
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 from scipy.signal import lfilter
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.crossval.closed_loop_errors import ClosedLoopMetric
-from avtorch.gap.likelihood.record import Record
+from avtorch.gap.drive_record import Record
+from avtorch.gap.simulator.plant import GapPlant
 
 HORIZON_S = 10.0
 """The default horizon of both channels, used where a name states none: over a whole drive the speed of any model's
 rollout drifts away."""
 HORIZONS_S = (0.5, 2.0, HORIZON_S)
+
+
+class ErrorMetric(Protocol):
+    """A measure computed from the errors of long rollouts of a `channel`, over `horizon_s` [s]."""
+
+    @property
+    def channel(self) -> str: ...
+    @property
+    def horizon_s(self) -> float | None: ...
+    def products(self, x: FloatArray, blocks: Sequence[slice], dt: float, lag: float, /) -> FloatArray: ...
 
 
 @dataclass(frozen=True)
@@ -79,7 +90,7 @@ def _window(x: FloatArray, length: int, keeps: float) -> FloatArray:
 
 
 def products(
-    metric: RolloutMetric | ClosedLoopMetric, record: Record, errors: FloatArray, blocks: Sequence[slice], lag: float
+    metric: ErrorMetric, record: Record, errors: FloatArray, blocks: Sequence[slice], lag: float
 ) -> FloatArray:
     """(block, one, other): sums of products of `errors` (one, channel, counted, group) of long rollouts, by a measure.
 
@@ -119,7 +130,7 @@ def rms(metric: RolloutMetric, record: Record, errors: FloatArray, lag: float) -
     return float(np.sqrt(total / (record.rows * record.group)))
 
 
-def reached(metric: RolloutMetric | ClosedLoopMetric, record: Record) -> float | None:
+def reached(metric: ErrorMetric, record: Record) -> float | None:
     """Longest rollouts [s] of a measure that the stretches hold; None: as long as the stretches."""
     if metric.horizon_s is None or not np.isfinite(metric.horizon_s):
         return None
@@ -130,3 +141,30 @@ def reached(metric: RolloutMetric | ClosedLoopMetric, record: Record) -> float |
 def rollout_metrics(channels: Iterable[str]) -> tuple[RolloutMetric, ...]:
     """All measures of these channels: over each horizon, and over whole drives."""
     return tuple(RolloutMetric(w, h) for w in channels for h in (*HORIZONS_S, None))
+
+
+def rolled_out(record: Record, simulator: GapPlant, onsets: Mapping[str, float] | None = None) -> FloatArray:
+    """Rollouts (channel, counted, group) of a simulator over the whole drives of a record.
+
+    `onsets` [s from the start of the one log]: from when on effects act. The response switches there, and the speed
+    goes on from where it is.
+    """
+    late = {} if onsets is None else onsets
+    waiting = sorted(late, key=late.__getitem__)
+    out, time = _driven(record, simulator, waiting), record.time[record.source]
+    while waiting:
+        onset = late[waiting.pop(0)]
+        after, acting = _driven(record, simulator, waiting), time >= onset
+        if "speed" in record.channels and acting.any():
+            speed, first = record.channels.index("speed"), int(np.argmax(acting))
+            after[speed] += out[speed, first].mean() - after[speed, first].mean()
+        out = np.where(acting[:, None], after, out)
+    return out
+
+
+def _driven(record: Record, simulator: GapPlant, without: Collection[str]) -> FloatArray:
+    kept = [e for e in simulator.effects if e.name not in without]
+    car = GapPlant(kept, T_L=simulator.T_L, K_L=simulator.K_L, sigma=simulator.sigma) if without else simulator
+    responses = [car.response(drive) for drive in record.drives]
+    channels = {"accel": [r.accel_measured for r in responses], "speed": [r.speed for r in responses]}
+    return np.stack([record.at_counted_rows(channels[name]) for name in record.channels])

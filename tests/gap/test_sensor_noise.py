@@ -7,7 +7,7 @@ import pytest
 
 from avtorch import diagnose
 from avtorch.gap import DeadTime, plant
-from avtorch.gap.likelihood.sensor_noise_floor import FINER, QUIET, with_sensor_noise
+from avtorch.gap.sensor_noise import ADDED, FINER, with_sensor_noise
 from avtorch.io import Log
 from avtorch.vehicle import Leader, simulate
 
@@ -33,7 +33,7 @@ def test_noise_is_added_where_there_is_none(decimals: int | None, sigma: float) 
     read, told = with_sensor_noise(log)
     assert told is not None
     assert "accel (0.02 m/s²) and speed (0.01 m/s)" in told
-    for name, sd, before in (("accel", QUIET.accel_sd, accel), ("speed", QUIET.speed_sd, speed)):
+    for name, sd, before in (("accel", ADDED["accel"], accel), ("speed", ADDED["speed"], speed)):
         after = getattr(read, name)
         # from row to row the force hardly changes; an SD of n draws is off by 1 / sqrt(2 n), five of them
         seen = np.std(np.diff(after - before)) / np.sqrt(2)
@@ -46,7 +46,7 @@ def test_noise_is_added_where_there_is_none(decimals: int | None, sigma: float) 
     gained = np.cumsum(force[:-1] * np.diff(log.time))
     rows = len(gained)
     # white noise of the sensors apart, whose sum walks off by as much as this
-    off = 5 * (QUIET.accel_sd * 0.01 * np.sqrt(rows) + QUIET.speed_sd)
+    off = 5 * (ADDED["accel"] * 0.01 * np.sqrt(rows) + ADDED["speed"])
     assert abs(gained[-1] - (np.asarray(read.speed) - speed)[-1]) < off
 
 

@@ -2,21 +2,21 @@
 
 The contribution of a cause in each row is half the square of its whitened change, its expected gain in nats. On each
 axis the part named is the shortest stretch that holds nearly all of it, if clearly fewer rows lie there. Each part is
-tested by the gain of its rows less the whole cost of the model (`attribution.py`). This is an e-value, for which the
+tested by the gain of its rows less the whole cost of the model. This is an e-value, for which the
 procedure of Wang and Ramdas (2022) controls the false-discovery rate under any dependence between parts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from scipy.signal import lfilter
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.crossval.attribution import RowAttribution
+from avtorch.gap.drive_record import Record
 
 _MOST = 0.95  # share of the cause's effect that a part holds
 _BAND = 0.9  # share of the power
@@ -60,6 +60,29 @@ class Location:
         """An entry of `where` in `diagnosis.json`."""
         part = {"axis": self.axis, "from": self.begin, "to": self.end}
         return part | {"share": self.share, "q_value": self.q_value}
+
+
+@dataclass(frozen=True, eq=False)
+class RowAttribution:
+    """Gain and effect of a model fitted to all drives, for every counted row (counted,).
+
+    `gained` [nats]: gain in log density over the bare baseline. `paid` [nats], for all rows together: the cost of the
+    fitted parameters and of the selection. `does` [nats]: expected gain, half the square of the whitened change in the
+    rollout; `felt` [nats]: the same for the accelerometer's faults alone. `moved` (channel, counted): the change
+    itself.
+    """
+
+    record: Record
+    gained: FloatArray = field(repr=False)
+    paid: float
+    does: FloatArray = field(repr=False)
+    felt: FloatArray = field(repr=False)
+    moved: FloatArray = field(repr=False)
+
+    @property
+    def p_value(self) -> float:
+        """Upper bound on the p-value of the bare baseline against the model: the inverse of the e-value."""
+        return float(np.exp(-np.clip(self.gained.sum() - self.paid, 0.0, 700.0)))
 
 
 def localise(attribution: RowAttribution, *, onset_s: float | None, lag: float) -> tuple[Location, ...]:

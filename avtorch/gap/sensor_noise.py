@@ -13,13 +13,14 @@ import numpy as np
 from scipy.signal import lfilter
 
 from avtorch.arrays import FloatArray
-from avtorch.gap.likelihood.noise_model import NoiseModel
 from avtorch.io import Log
 
 FINER = {"accel": 1e-3, "speed": 4e-4}
 """Row-to-row scatter below this [m/s², m/s] is not sensor noise; rounding to three decimals leaves 3e-4."""
-QUIET = NoiseModel(force_sd=0.005, force_time=3.0, accel_sd=0.02, speed_sd=0.01)
-"""The added noise: that of very good sensors, and the force that the diagnosis assumes in any case."""
+ADDED = {"accel": 0.02, "speed": 0.01}
+"""SD of the added noise [m/s², m/s]: that of very good sensors."""
+_FORCE_SD = 0.005  # [m/s²] of the added force, which the diagnosis assumes in any case
+_FORCE_S = 3.0  # its time constant [s]
 _SEED = 20
 
 
@@ -40,10 +41,10 @@ def with_sensor_noise(log: Log) -> tuple[Log, str | None]:
     white = {name: rng.standard_normal(log.rows) for name in FINER}
     read = {name: x + (force if name == "accel" else gained) for name, x in channels.items()}
     levels = []
-    for name, sd, unit in (("accel", QUIET.accel_sd, "m/s²"), ("speed", QUIET.speed_sd, "m/s")):
+    for name, unit in (("accel", "m/s²"), ("speed", "m/s")):
         if name in bare:
-            read[name] = read[name] + sd * white[name]
-            levels.append(f"{name} ({sd:g} {unit})")
+            read[name] = read[name] + ADDED[name] * white[name]
+            levels.append(f"{name} ({ADDED[name]:g} {unit})")
     added = f"the diagnosis adds noise to {' and '.join(levels)}"
     return replace(log, **read), f"No sensor noise in {' and '.join(bare)}, as if simulated: {added}."
 
@@ -53,9 +54,9 @@ def _force(log: Log, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     force, gained = np.zeros(log.rows), np.zeros(log.rows)
     for part in _drives(log):
         dt = np.diff(log.elapsed[part], append=log.elapsed[part][-1])
-        keep = np.exp(-float(np.median(dt)) / QUIET.force_time)
-        kicks = QUIET.force_sd * np.sqrt(1 - keep**2) * rng.standard_normal(len(dt))
-        kicks[0] = QUIET.force_sd * rng.standard_normal()
+        keep = np.exp(-float(np.median(dt)) / _FORCE_S)
+        kicks = _FORCE_SD * np.sqrt(1 - keep**2) * rng.standard_normal(len(dt))
+        kicks[0] = _FORCE_SD * rng.standard_normal()
         force[part] = lfilter([1.0], [1.0, -keep], kicks)
         gained[part] = np.concatenate([[0.0], np.cumsum(force[part] * dt)[:-1]])
     return force, gained
